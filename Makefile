@@ -1,0 +1,38 @@
+# demo: separate a photograph.  test: everything CI runs.  The rest is for those who change brewster.
+SHELL := /bin/bash
+PYTHON ?= python3
+BIN := .venv/bin
+export BREWSTER_DATA ?= $(wildcard ../shared/data)
+PHOTO ?= tests/pictures
+
+.PHONY: demo test test-slow check docs bench clean
+
+demo: .venv/core
+	$(BIN)/python runs/demo.py "$(PHOTO)"
+
+test: .venv/dev
+	$(BIN)/python -m pytest
+
+test-slow: .venv/dev
+	$(BIN)/python -m pytest -m slow
+
+check: .venv/dev
+	$(BIN)/ruff format --check . && $(BIN)/ruff check . && $(BIN)/mypy && $(BIN)/lint-imports
+
+docs: .venv/dev
+	$(BIN)/python -m brewster.cli.reference > docs/reference.md
+
+bench: .venv/dev
+	$(BIN)/python bench/run.py
+
+clean:
+	rm -rf .venv out build dist src/*.egg-info
+
+.venv/core: pyproject.toml constraints.txt
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable .
+	touch $@
+
+.venv/dev: .venv/core
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@
