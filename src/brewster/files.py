@@ -1,0 +1,216 @@
+"""Find pictures and write results safely: which files, under which names, never half, never over another.
+
+for job in find([Path("holiday")], into=Path("clear")):
+    write_atomically(job.target("transmission"), data, source=job.source)
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import secrets
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from brewster.errors import TargetError
+
+SUFFIXES = {
+    ".jpg": "jpeg",
+    ".jpeg": "jpeg",
+    ".jpe": "jpeg",
+    ".jfif": "jpeg",
+    ".png": "png",
+    ".tif": "tiff",
+    ".tiff": "tiff",
+    ".webp": "webp",
+    ".avif": "avif",
+    ".heic": "heic",
+    ".heif": "heic",
+    ".exr": "exr",
+    ".hdr": "hdr",
+    ".gif": "gif",
+}
+"""What a file name promises to be: lower-case suffix -> container."""
+
+LAYERS = ("transmission", "reflection", "confidence")
+_ALWAYS_PNG = ("confidence",)  # a grey map, not a photograph: no container of the source would suit it better
+
+
+@dataclass(frozen=True)
+class Job:
+    """One picture to separate, and where its layers go: `folder/name.layer.suffix`."""
+
+    source: Path
+    folder: Path
+    name: str
+
+    def target(self, layer: str, suffix: str | None = None) -> Path:
+        """The file for a layer: the source's suffix unless one is given; PNG where that cannot be written."""
+        own = self.source.suffix
+        writable = SUFFIXES.get(own.lower(), "gif") != "gif" and layer not in _ALWAYS_PNG
+        return self.folder / f"{self.name}.{layer}{suffix or (own if writable else '.png')}"
+
+
+def find(sources: Iterable[Path], into: Path | None = None) -> list[Job]:
+    """Every picture in the files and folders given, each once, in a stable order.
+
+    Layers go beside their picture, or under `into`, where the tree below a folder is mirrored. They are
+    called by the picture's stem, or by its full name where a neighbour could want the same: `a.jpg` gives
+    `a`; with `a.png` beside it, `a.jpg` and `a.png`. That depends on the pictures in the folder only, not on
+    what was asked for or done.
+
+    In folders, hidden files, files that are no pictures by name, and brewster's own results are passed over;
+    a real folder is visited once, so link loops end. A file given by name is always taken: opening it will
+    say what is wrong.
+
+    Raises TargetError when two pictures would be written under one name.
+    """
+    jobs: dict[str, Job] = {}
+    wanted: dict[Path, Counter[str]] = {}
+    for source in sources:
+        for picture in _pictures(source):
+            beside = picture.parent
+            if beside not in wanted:
+                wanted[beside] = _wanted_names(beside)
+            inside = Path() if picture == source else beside.relative_to(source)
+            folder = beside if into is None else into / inside
+            job = Job(picture, folder, _layer_name(picture, wanted[beside]))
+            jobs.setdefault(os.path.abspath(picture), job)
+    _refuse_shared_names(jobs.values())
+    return list(jobs.values())
+
+
+def write_atomically(path: Path, data: bytes, *, overwrite: bool = False, source: Path | None = None) -> None:
+    """Write a file whole or not at all, making its folder where needed.
+
+    The bytes go to a hidden file in the same folder, reach the disk, and only then take the name, so that
+    neither a full disk nor Ctrl-C leaves half a picture. Raises TargetError if the target exists and
+    `overwrite` is off, is the `source`, or cannot be written.
+    """
+    _refuse_source(path, source)
+    part = path.parent / f".brewster-{secrets.token_hex(8)}.part"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        _refuse_taken(path, overwrite)
+        _write_through(part, data)
+        _take_name(part, path, overwrite)
+    except OSError as error:
+        raise _target_error(path, error) from error
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink()
+
+
+def _pictures(source: Path) -> Iterator[Path]:
+    if os.path.isdir(source):
+        yield from _walk(source, set())
+    else:
+        yield source
+
+
+def _walk(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
+    try:
+        entries = sorted(folder.iterdir())
+        status = folder.stat()
+    except OSError:
+        yield folder  # opening it will say why, and the rest of the batch goes on
+        return
+    if (status.st_dev, status.st_ino) in seen:
+        return
+    seen.add((status.st_dev, status.st_ino))
+    for entry in entries:
+        if os.path.isdir(entry):
+            if not entry.name.startswith("."):
+                yield from _walk(entry, seen)
+        elif _is_wanted(entry) and (os.path.isfile(entry) or os.path.islink(entry)):
+            yield entry
+
+
+def _wanted_names(folder: Path) -> Counter[str]:
+    """How often the pictures of a folder claim a name: each once by its stem and once in full."""
+    try:
+        pictures = [path for path in folder.iterdir() if _is_wanted(path)]
+    except OSError:
+        return Counter()
+    return Counter(name for path in pictures for name in (path.stem, path.name))
+
+
+def _layer_name(picture: Path, wanted: Counter[str]) -> str:
+    others = wanted[picture.stem] - _is_wanted(picture)
+    return picture.name if others > 0 else picture.stem
+
+
+def _is_wanted(path: Path) -> bool:
+    """Whether a file found in a folder is a picture by name, not hidden, and not one of our own results."""
+    ours = Path(path.stem).suffix.lstrip(".") in LAYERS
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and not ours
+
+
+def _refuse_shared_names(jobs: Iterable[Job]) -> None:
+    owners: dict[str, Job] = {}
+    for job in jobs:
+        name = job.folder / job.name
+        other = owners.setdefault(os.path.abspath(name), job)
+        if other is not job:
+            raise TargetError(
+                f"{other.source} and {job.source} would both be written as {name}.*",
+                "every picture needs a name of its own",
+                "give the folder above them, whose tree is mirrored, or run them into different folders",
+            )
+
+
+def _refuse_source(path: Path, source: Path | None) -> None:
+    with contextlib.suppress(OSError):  # a source or target that is not there is not the same file
+        if source is not None and path.samefile(source):
+            raise TargetError(
+                f"{path} is the picture itself", "sources are never touched", "choose another name"
+            )
+
+
+def _refuse_taken(path: Path, overwrite: bool) -> None:
+    if os.path.isdir(path):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    if path.exists() and not overwrite:
+        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST))
+    if path.exists() and not os.access(path, os.W_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+
+def _write_through(path: Path, data: bytes) -> None:
+    with open(path, "xb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _take_name(part: Path, path: Path, overwrite: bool) -> None:
+    if overwrite:
+        os.replace(part, path)
+        return
+    try:
+        os.link(part, path)  # unlike a rename, a link never replaces what somebody else wrote meanwhile
+    except OSError as error:
+        if error.errno not in (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK):
+            raise
+        os.replace(part, path)  # a file system without links (FAT): _refuse_taken has looked just before
+
+
+_CURES = {
+    errno.EEXIST: ("nothing is overwritten unasked", "pass --overwrite or choose another place"),
+    errno.EISDIR: ("the target must be a file", "name a file in it, or use -o for a folder"),
+    errno.ENOSPC: ("the whole file must fit on the disk", "free some space and run again"),
+    errno.EDQUOT: ("the whole file must fit in the quota", "free some space and run again"),
+    errno.EACCES: ("the place must be writable", "choose another place with -o, or change its permissions"),
+    errno.EPERM: ("the place must be writable", "choose another place with -o, or change its permissions"),
+    errno.EROFS: ("the place must be writable", "choose another place with -o"),
+    errno.ENAMETOOLONG: ("the name must be shorter", "rename the picture"),
+}
+_OTHERWISE = ("the file must be writable", "choose another place with -o")
+
+
+def _target_error(path: Path, error: OSError) -> TargetError:
+    expected, cure = _CURES.get(error.errno or 0, _OTHERWISE)
+    return TargetError(f"{path} was not written ({error.strerror or error})", expected, cure)
