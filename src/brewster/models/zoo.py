@@ -1,0 +1,90 @@
+"""The models that come with brewster: name -> file, sha256, licence, defaults. Imports no torch."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, final
+
+from brewster.errors import ModelError
+
+_WEIGHTS: Final = Path(__file__).parent / "weights"
+
+
+@final
+@dataclass(frozen=True)
+class Model:
+    """A model file, the digest that its bytes must have (None for a user's own file), and its licence."""
+
+    name: str
+    path: Path
+    sha256: str | None
+    licence: str
+
+    def digest(self) -> str:
+        """The SHA-256 of the file's bytes, as they are now."""
+        return hashlib.sha256(self.path.read_bytes()).hexdigest()
+
+    def verify(self) -> str:
+        """The digest, checked.
+
+        Raises:
+            ModelError: missing, or not the bytes that were shipped.
+        """
+        if not self.path.is_file():
+            raise ModelError(
+                f"{self.path} is missing", f"the file of model {self.name}", "reinstall brewster"
+            )
+        digest = self.digest()
+        if self.sha256 not in (None, digest):
+            raise ModelError(
+                f"{self.path} has SHA-256 {digest[:12]}...",
+                f"{self.sha256[:12]}..." if self.sha256 else "",
+                "reinstall brewster",
+            )
+        return digest
+
+    def card(self) -> str:
+        """The model card, Markdown.
+
+        Raises:
+            ModelError: a user's own file without a card beside it.
+        """
+        path = self.path.with_suffix(".md")
+        if not path.is_file():
+            raise ModelError(f"{self.name} has no card", f"a file {path}", "write one beside the model")
+        return path.read_text()
+
+
+MODELS: Final = {
+    model.name: model
+    for model in (
+        Model(
+            "compact",
+            _WEIGHTS / "compact.onnx",
+            "0" * 64,
+            "Apache-2.0",
+        ),
+    )
+}
+
+
+def find_model(name: str) -> Model:
+    """A model by its name in the zoo, or by the path of an .onnx file.
+
+    Raises:
+        ModelError: neither.
+    """
+    if name in MODELS:
+        return MODELS[name]
+    path = Path(name)
+    if path.is_file():
+        return Model(path.stem, path, None, "unknown")
+    close = difflib.get_close_matches(name, MODELS, n=1)
+    raise ModelError(
+        f"there is no model {name!r}",
+        f"one of {', '.join(MODELS)}, or the path of an .onnx file",
+        f"did you mean {close[0]}?" if close else "brewster models list shows them",
+    )

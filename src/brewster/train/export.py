@@ -1,0 +1,29 @@
+"""From a trained network to a file that needs no torch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from brewster.models.compact import STRIDE, CompactNetwork, LinearSeparator
+
+_OPSET = 18
+
+
+def export_onnx(network: CompactNetwork, path: Path) -> None:
+    """Writes `photo` -> `transmission`, `reflection`, linear light (1, 3, H, W), H and W multiples of 32."""
+    height, width = (torch.export.Dim(name, min=1, max=256) for name in ("rows", "columns"))
+    example = torch.rand(1, 3, 4 * STRIDE, 5 * STRIDE)
+    program = torch.onnx.export(
+        LinearSeparator(network).eval(),
+        (example,),
+        input_names=["photo"],
+        output_names=["transmission", "reflection"],
+        dynamic_shapes={"photo": {2: STRIDE * height, 3: STRIDE * width}},
+        opset_version=_OPSET,
+        dynamo=True,
+        verbose=False,
+    )
+    assert program is not None
+    program.save(path, external_data=False)

@@ -1,0 +1,229 @@
+"""The training loop, the only one: `train(recipe_text, out)` runs or resumes, bit for bit.
+
+Every step depends on the checkpoint and on (seed, step) alone: no hidden state, so a killed run that resumes
+ends with the same weights as one that never stopped (same machine, same number of threads).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Final
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from brewster.dataset.mix import Batch, Stream
+from brewster.dataset.sources import read_pairs
+from brewster.errors import ModelError, RecipeError
+from brewster.light import to_linear
+from brewster.models.compact import STRIDE, CompactNetwork, with_imagenet_features
+from brewster.photo import Photo
+from brewster.train.checkpoint import Checkpoint
+from brewster.train.losses import separation_loss
+from brewster.train.recipe import TrainRecipe, data_folder, open_stream
+
+Report = Callable[[int, int, Mapping[str, float]], None]
+"""Called with (step, steps, numbers) after every step."""
+
+_VALIDATION_SIDE_PX: Final = 384
+_MAX_GRADIENT_NORM: Final = 1.0
+
+
+class Trainer:
+    """A run in memory: network, running average, optimiser, and the step they stand at."""
+
+    def __init__(self, recipe: TrainRecipe, stream: Stream) -> None:
+        torch.manual_seed(recipe.seed)
+        self.recipe, self.stream, self.step = recipe, stream, 0
+        self._pool = ThreadPoolExecutor(1)
+        self._ahead: dict[int, Future[Batch]] = {}
+        self.network = with_imagenet_features().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        if recipe.start_from:
+            self.network.load_state_dict(Checkpoint.read(recipe.start_from).average)
+        self.average = {name: value.clone() for name, value in self.network.state_dict().items()}
+        encoder = list(self.network.encoder.parameters())
+        known = set(map(id, encoder))
+        rest = [parameter for parameter in self.network.parameters() if id(parameter) not in known]
+        self.optimizer = torch.optim.AdamW(
+            [
+                {"params": encoder, "peak": recipe.encoder_learning_rate},
+                {"params": rest, "peak": recipe.learning_rate},
+            ],
+            weight_decay=recipe.weight_decay,
+        )
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Continues where the checkpoint was written."""
+        self.network.load_state_dict(checkpoint.network)
+        self.average = checkpoint.average
+        self.optimizer.load_state_dict(checkpoint.optimizer)
+        self.step = checkpoint.step
+
+    def checkpoint(self) -> Checkpoint:
+        """The state after the last whole step."""
+        return Checkpoint(
+            step=self.step,
+            network=self.network.state_dict(),
+            average=self.average,
+            optimizer=self.optimizer.state_dict(),
+            recipe=self.recipe.model_dump_json(),
+        )
+
+    def advance(self) -> dict[str, float]:
+        """One step of AdamW on one batch; returns the parts of the loss.
+
+        Raises:
+            ModelError: the loss is not a number; the last checkpoint is still good.
+        """
+        batch = self._batch(self.step).result()
+        self._batch(self.step + 1)
+        parts = separation_loss(self.network(_channels_last(batch.photo_encoded)), batch)
+        loss = torch.stack(list(parts.values())).sum()
+        if not loss.isfinite():
+            raise ModelError(
+                f"the loss is {loss.item()} at step {self.step}",
+                "a finite loss",
+                "resume from the last checkpoint with a lower learning rate",
+            )
+        self._set_learning_rates()
+        self.optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
+        self.optimizer.step()
+        self.step += 1
+        self._update_average()
+        return {"loss": loss.item(), **{name: part.item() for name, part in parts.items()}}
+
+    def averaged_network(self) -> CompactNetwork:
+        """The network with the running average of its weights, ready to be used."""
+        network = CompactNetwork().eval()
+        network.load_state_dict(self.average)
+        return network
+
+    def _batch(self, step: int) -> Future[Batch]:
+        """The batch of a step, made in the background while the step before it runs."""
+        if step not in self._ahead:
+            task = self.stream, step, self.recipe.batch, self.recipe.size_at(step)
+            self._ahead = {step: self._pool.submit(*task)}
+        return self._ahead[step]
+
+    def _set_learning_rates(self) -> None:
+        warm = min(1.0, (self.step + 1) / self.recipe.warmup_steps)
+        cosine = 0.5 + 0.5 * math.cos(math.pi * self.step / self.recipe.steps)
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["peak"] * warm * cosine
+
+    @torch.no_grad()
+    def _update_average(self) -> None:
+        decay = min(self.recipe.average_decay, (self.step + 1) / (self.step + 10))
+        for name, value in self.network.state_dict().items():
+            self.average[name].lerp_(value, 1 - decay)
+
+
+def train(recipe: TrainRecipe, out: Path, report: Report) -> CompactNetwork:
+    """Runs the recipe to its end in folder `out`, from its checkpoint if there is one.
+
+    `out` receives `checkpoint.pt`, `log.jsonl` and, at every report, `samples.png` (photo, transmission,
+    reflection of the first validation pairs or training samples).
+
+    Raises:
+        RecipeError: data missing, or `out` holds a run of another recipe.
+        ModelError: damaged checkpoint, or the loss is not a number.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    trainer = Trainer(recipe, open_stream(recipe))
+    saved = out / "checkpoint.pt"
+    if saved.exists():
+        trainer.restore(_of_this_recipe(Checkpoint.read(saved), recipe, saved))
+    pairs = _validation_pairs(recipe)
+    started = time.monotonic()
+    while trainer.step < recipe.steps:
+        numbers = trainer.advance()
+        if trainer.step % recipe.report_every == 0 or trainer.step == recipe.steps:
+            network = trainer.averaged_network()
+            numbers |= validate(network, pairs) | {"seconds": time.monotonic() - started}
+            _log(out / "log.jsonl", {"step": trainer.step, **numbers})
+            _write_samples(out / "samples.png", network, pairs or _some(trainer))
+        if trainer.step % recipe.checkpoint_every == 0 or trainer.step == recipe.steps:
+            trainer.checkpoint().write(saved)
+        report(trainer.step, recipe.steps, numbers)
+    return trainer.averaged_network()
+
+
+@torch.no_grad()
+def validate(network: CompactNetwork, pairs: Mapping[str, list[tuple[Tensor, Tensor]]]) -> dict[str, float]:
+    """Mean PSNR gain in dB over doing nothing, per folder, at the (small) size of the given pairs."""
+    gains = {}
+    for name, folder in pairs.items():
+        scores = []
+        for photo, truth in folder:
+            answer = network(photo)[:, :3].clamp(0, 1)
+            errors = [functional.mse_loss(picture, truth) for picture in (photo, answer)]
+            scores.append(10 * math.log10(errors[0] / errors[1]))
+        gains[f"gain_db_{name}"] = sum(scores) / len(scores)
+    return gains
+
+
+def _of_this_recipe(checkpoint: Checkpoint, recipe: TrainRecipe, path: Path) -> Checkpoint:
+    if checkpoint.recipe == recipe.model_dump_json():
+        return checkpoint
+    raise RecipeError(
+        f"{path} belongs to another recipe",
+        "a run resumes only with the recipe that it began with",
+        "choose another folder with -o",
+    )
+
+
+def _validation_pairs(recipe: TrainRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]:
+    root = data_folder() if recipe.data.validate_on else Path()
+    return {
+        folder.name: [(_fit(photo), _fit(truth)) for photo, truth in read_pairs([root / folder])]
+        for folder in recipe.data.validate_on
+    }
+
+
+def _fit(picture: Tensor) -> Tensor:
+    """uint8 (H, W, 3) to float (1, 3, h, w) that the network takes, longest side 384 px."""
+    height, width, _ = picture.shape
+    scale = _VALIDATION_SIDE_PX / max(height, width)
+    size = [max(1, round(side * scale / STRIDE)) * STRIDE for side in (height, width)]
+    planes = picture.permute(2, 0, 1)[None] / 255
+    return functional.interpolate(planes, size, mode="bilinear", antialias=True)
+
+
+def _some(trainer: Trainer) -> dict[str, list[tuple[Tensor, Tensor]]]:
+    batch = trainer.stream(0, trainer.recipe.batch, trainer.recipe.size_at(0))
+    pairs = zip(batch.photo_encoded[:, None], batch.transmission_encoded[:, None], strict=True)
+    return {"training": list(pairs)}
+
+
+def _log(path: Path, numbers: Mapping[str, float]) -> None:
+    with path.open("a") as stream:
+        stream.write(json.dumps({name: round(value, 5) for name, value in numbers.items()}) + "\n")
+
+
+@torch.no_grad()
+def _write_samples(
+    path: Path, network: CompactNetwork, pairs: Mapping[str, list[tuple[Tensor, Tensor]]]
+) -> None:
+    """Rows of photo, truth, transmission and reflection, four of each folder."""
+    rows = []
+    for photo, truth in (pair for folder in pairs.values() for pair in folder[:4]):
+        layers = network(photo)
+        row = torch.cat([photo, truth, layers[:, :3], layers[:, 3:]], dim=3)
+        rows.append(functional.interpolate(row, (160, 960), mode="bilinear", antialias=True)[0])
+    sheet = torch.cat(rows, dim=1).clamp(0, 1).permute(1, 2, 0)
+    Photo.from_array(to_linear(sheet).numpy(), encoding="linear").save(path)
+
+
+def _channels_last(pictures: Tensor) -> Tensor:
+    return pictures.contiguous(memory_format=torch.channels_last)
+
+
+__all__ = ["Batch", "Trainer", "train", "validate"]

@@ -1,0 +1,113 @@
+"""A training recipe: TOML in, frozen values out, unknown or impossible ones refused by name.
+
+Paths in a recipe are relative to the folder that `BREWSTER_DATA` names.
+"""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from brewster.dataset.mix import Blend, MixRecipe, Mixtures, Pairs, Stream
+from brewster.dataset.sources import read_maps, read_pairs, read_photos
+from brewster.errors import RecipeError
+
+Positive = Annotated[int, Field(gt=0)]
+Rate = Annotated[float, Field(gt=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class DataRecipe(_Section):
+    """Which folders, relative to BREWSTER_DATA, and which file names in them to leave out."""
+
+    photos: list[Path]
+    maps: list[Path] = []
+    pairs: list[Path] = []
+    pairs_share: Share = 0.0
+    exclude: list[str] = []
+    validate_on: list[Path] = []
+
+
+class TrainRecipe(_Section):
+    """One run. `sizes` lists (share of the run, side in px): small pictures first, large ones last."""
+
+    seed: int
+    steps: Positive
+    batch: Positive
+    sizes: Annotated[list[tuple[Share, Positive]], Field(min_length=1)]
+    learning_rate: Rate
+    encoder_learning_rate: Rate
+    warmup_steps: Positive
+    weight_decay: Annotated[float, Field(ge=0)]
+    average_decay: Share
+    start_from: Path | None = None
+    """A checkpoint whose averaged weights this run starts from, relative to the recipe."""
+    report_every: Positive
+    checkpoint_every: Positive
+    data: DataRecipe
+    mix: MixRecipe
+
+    def size_at(self, step: int) -> int:
+        """Side of the training pictures in px at this step, a multiple of 32."""
+        return [size for start, size in self.sizes if step >= start * self.steps][-1]
+
+
+def read_recipe(path: Path) -> TrainRecipe:
+    """Reads and checks a recipe.
+
+    Raises:
+        RecipeError: missing, not TOML, or with values that are missing, unknown or impossible.
+    """
+    try:
+        recipe = TrainRecipe.model_validate(tomllib.loads(path.read_text()))
+    except OSError as error:
+        raise RecipeError(f"{path} cannot be read", "a TOML recipe", "see recipes/train/") from error
+    except tomllib.TOMLDecodeError as error:
+        raise RecipeError(f"{path} is not TOML ({error})", "a TOML recipe", "mend that line") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(map(str, first["loc"]))
+        raise RecipeError(
+            f"{path} has a wrong value for {name}",
+            first["msg"],
+            "compare with recipes/train/compact.toml",
+        ) from error
+    if recipe.start_from:
+        return recipe.model_copy(update={"start_from": path.parent / recipe.start_from})
+    return recipe
+
+
+def data_folder() -> Path:
+    """Where recipes find their data: `BREWSTER_DATA`.
+
+    Raises:
+        RecipeError: the variable is unset or names no folder.
+    """
+    folder = os.environ.get("BREWSTER_DATA", "")
+    if not Path(folder or "/nowhere").is_dir():
+        raise RecipeError(
+            f"BREWSTER_DATA is {folder!r}",
+            "the folder that a recipe's paths start from",
+            "export BREWSTER_DATA=/path/to/data",
+        )
+    return Path(folder)
+
+
+def open_stream(recipe: TrainRecipe) -> Stream:
+    """The recipe's training data, read into memory: mixtures, joined by real pairs where it asks for them."""
+    root, data = data_folder(), recipe.data
+    photos = read_photos([root / folder for folder in data.photos], data.exclude)
+    maps = read_maps([root / folder for folder in data.maps], data.exclude)
+    mixtures = Mixtures(photos, maps, recipe.mix, seed=recipe.seed)
+    if not data.pairs:
+        return mixtures
+    pairs = Pairs(read_pairs([root / folder for folder in data.pairs]), recipe.mix.crop, seed=recipe.seed + 1)
+    return Blend(pairs, mixtures, data.pairs_share)

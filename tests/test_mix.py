@@ -1,0 +1,87 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from brewster.dataset.mix import Batch, Blend, MixRecipe, Mixtures, Pairs
+from brewster.light import to_linear
+
+QUIET = MixRecipe(
+    map_probability=0, crop=(1, 1), background_level_log=(0.1, 0.1), reflection_ratio_log=(0.5, 0.5),
+    absent_probability=0, highlight_boost=(0, 0), temperature=(0, 0), transmittance=(1, 1), veil_probability=0,
+    veil=(0, 0), sharp_probability=1, blur_px=(1, 1), ghost_probability=0, ghost_weight=(0.5, 0.5), ghost_px=1,
+    falloff_probability=0, edge_probability=0, exposure=(1, 1), gamma_log=(1, 1), contrast=(0, 0), noise=(0, 0),
+)  # fmt: skip
+
+
+@pytest.fixture
+def photos(random):
+    smooth = [np.kron(random.integers(20, 200, (6, 8, 3)), np.ones((16, 16, 1))) for _ in range(4)]
+    return [torch.from_numpy(picture.astype(np.uint8)) for picture in smooth]
+
+
+@pytest.fixture
+def maps(random):
+    return [torch.from_numpy(random.random((3, 32, 64), np.float32) * 4).half() for _ in range(2)]
+
+
+def test_light_adds_up_in_linear_light(photos):
+    batch = Mixtures(photos, [], QUIET, seed=1)(0, 4, 64)
+    photo, transmission, reflection = (
+        to_linear(layer)
+        for layer in (batch.photo_encoded, batch.transmission_encoded, batch.reflection_encoded)
+    )
+    inside = photo < 0.95
+    torch.testing.assert_close((transmission + reflection)[inside], photo[inside], atol=0.02, rtol=0)
+
+
+def test_the_reflection_has_the_asked_strength(photos):
+    recipe = QUIET.model_copy(update={"reflection_ratio_log": (0.25, 0.25)})
+    batch = Mixtures(photos, [], recipe, seed=1)(0, 8, 64)
+    ratio = to_linear(batch.reflection_encoded).mean() / to_linear(batch.transmission_encoded).mean()
+    assert ratio.item() == pytest.approx(0.25, rel=0.15)
+
+
+def test_absent_reflections_leave_the_photo_as_it_was(photos):
+    recipe = QUIET.model_copy(update={"absent_probability": 1.0})
+    batch = Mixtures(photos, [], recipe, seed=1)(0, 4, 64)
+    assert not batch.reflection_encoded.any()
+    torch.testing.assert_close(
+        batch.photo_encoded, batch.transmission_encoded, atol=0.03, rtol=0
+    )  # glass tint
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from([32, 64, 96]))
+def test_every_sample_is_a_picture_and_depends_on_seed_and_step_alone(step, size):
+    generator = np.random.default_rng(3)
+    photos = [torch.from_numpy(generator.integers(0, 256, (70, 90, 3), np.uint8)) for _ in range(3)]
+    maps = [torch.from_numpy(generator.random((3, 16, 32), np.float32) * 50).half()]
+    wild = QUIET.model_copy(
+        update={"map_probability": 0.5, "crop": (0.3, 1), "sharp_probability": 0.3, "blur_px": (0.5, 6),
+                "ghost_probability": 0.5, "ghost_px": 6, "falloff_probability": 0.5, "edge_probability": 0.5,
+                "veil_probability": 0.5, "veil": (0, 0.3), "noise": (0, 0.02), "highlight_boost": (0, 8)}
+    )  # fmt: skip
+    first, again = (Mixtures(photos, maps, wild, seed=5)(step, 3, size) for _ in range(2))
+    for name in Batch.__dataclass_fields__:
+        values = getattr(first, name)
+        assert torch.equal(values, getattr(again, name))
+        assert values.isfinite().all()
+        assert 0 <= values.min() <= values.max() <= 1
+    other = Mixtures(photos, maps, wild, seed=5)(step + 1, 3, size)
+    assert not torch.equal(first.photo_encoded, other.photo_encoded)
+
+
+def test_real_pairs_stay_aligned(photos):
+    shadowed = [(photo, photo // 2) for photo in photos]
+    batch = Pairs(shadowed, (0.4, 0.9), seed=3)(0, 8, 48)
+    torch.testing.assert_close(batch.transmission_encoded, batch.photo_encoded / 2, atol=0.03, rtol=0)
+    assert (batch.reflection_weight < 1).all()
+
+
+def test_a_blend_takes_its_share_of_each_stream(photos):
+    mixtures, pairs = Mixtures(photos, [], QUIET, seed=1), Pairs([(photos[0], photos[0])], (1, 1), seed=1)
+    batch = Blend(pairs, mixtures, 0.25)(0, 8, 32)
+    assert (batch.reflection_weight < 1).sum() == 2
+    assert batch.photo_encoded.shape == (8, 3, 32, 32)

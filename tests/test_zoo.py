@@ -1,0 +1,28 @@
+from dataclasses import replace
+
+import pytest
+
+from brewster.errors import ModelError
+from brewster.models.zoo import MODELS, find_model
+
+
+def test_every_shipped_model_is_whole_small_enough_and_has_a_card():
+    assert "compact" in MODELS
+    for model in MODELS.values():
+        assert model.verify() == model.sha256
+        assert model.path.stat().st_size <= 25e6
+        card = model.card()
+        for heading in ("Licence", "Trained on", "Scores", "Where it fails"):
+            assert heading in card, (model.name, heading)
+
+
+def test_a_misspelt_model_is_answered_with_the_likely_one():
+    with pytest.raises(ModelError, match="did you mean compact"):
+        find_model("compct")
+
+
+def test_a_damaged_file_does_not_pass(tmp_path):
+    broken = tmp_path / "compact.onnx"
+    broken.write_bytes(MODELS["compact"].path.read_bytes()[:-1])
+    with pytest.raises(ModelError, match="SHA-256"):
+        replace(MODELS["compact"], path=broken).verify()
