@@ -1,0 +1,91 @@
+"""Carries a separation made at work resolution to the photo's full resolution, without blurring the photo.
+
+Reflection adds to light, so in linear light the change from photo to transmission is about as smooth as the
+reflection itself, whatever detail lies behind the glass. The change is described at work resolution by local
+lines, change = slope * photo + offset (the guided filter: He et al. 2013, eq. 5-8; slopes and offsets are
+enlarged as in the fast guided filter, He & Sun 2015), and applied to the full photo: its own detail stays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from jaxtyping import Float32
+
+Floats = NDArray[np.float32]
+
+_RADIUS: Final = 2
+_VARIANCE_FLOOR: Final = 1e-3
+
+
+@final
+@dataclass(frozen=True)
+class Transfer:
+    """The change and the unexplained remainder as maps over the photo, to be read off row by row."""
+
+    slope: Float32[Floats, "h w 3"]
+    offset: Float32[Floats, "h w 3"]
+    remainder: Float32[Floats, "h w 3"]
+
+    @classmethod
+    def learn(cls, photo: Floats, transmission: Floats, reflection: Floats) -> Transfer:
+        """From a photo and its layers at work resolution, each (h, w, 3) in linear light."""
+        change = transmission - photo
+        mean_photo, mean_change = _box(photo), _box(change)
+        covariance = _box(photo * change) - mean_photo * mean_change
+        slope = covariance / (_box(photo * photo) - mean_photo**2 + _VARIANCE_FLOOR)
+        offset = mean_change - slope * mean_photo
+        return cls(_box(slope), _box(offset), -change - reflection)
+
+    def apply(self, photo: Floats, top: int, height: int) -> tuple[Floats, Floats]:
+        """Transmission and reflection of rows top..top+n of a photo `height` rows high, each (n, W, 3)."""
+        rows, width, _ = photo.shape
+        slope, offset, remainder = (
+            enlarge_rows(map_, top, rows, (height, width))
+            for map_ in (self.slope, self.offset, self.remainder)
+        )
+        change = slope * photo + offset
+        transmission = np.maximum(photo + change, 0)
+        reflection = np.maximum(photo - transmission - remainder, 0)
+        return transmission, reflection
+
+
+def enlarge_rows(map_: Floats, top: int, rows: int, size: tuple[int, int]) -> Floats:
+    """Rows top..top+rows of `map_` (h, w, C) enlarged to `size` (H, W), linearly between pixel centres."""
+    vertical = _between(map_, *_positions(map_.shape[0], top, rows, size[0]), axis=0)
+    return _between(vertical, *_positions(map_.shape[1], 0, size[1], size[1]), axis=1)
+
+
+def _positions(small: int, first: int, count: int, large: int) -> tuple[NDArray[np.intp], Floats]:
+    """For large pixels first..first+count: the small pixel before each centre, and how far past it."""
+    centres = (np.arange(first, first + count) + 0.5) * (small / large) - 0.5
+    centres = np.clip(centres, 0, small - 1)
+    before = np.minimum(centres.astype(np.intp), max(small - 2, 0))
+    return before, (centres - before).astype(np.float32)
+
+
+def _between(map_: Floats, before: NDArray[np.intp], past: Floats, *, axis: int) -> Floats:
+    shape = [1] * map_.ndim
+    shape[axis] = -1
+    low = np.take(map_, before, axis=axis)
+    high = np.take(map_, np.minimum(before + 1, map_.shape[axis] - 1), axis=axis)
+    high -= low
+    high *= past.reshape(shape)
+    high += low
+    return high
+
+
+def _box(map_: Floats) -> Floats:
+    """Means over windows of 2 r + 1 pixels a side, edges repeated, (h, w, C)."""
+    for axis in (0, 1):
+        reach = [(0, 0)] * 3
+        reach[axis] = (_RADIUS, _RADIUS)
+        padded = np.pad(map_, reach, mode="edge")
+        parts = [np.take(padded, range(i, i + map_.shape[axis]), axis=axis) for i in range(2 * _RADIUS + 1)]
+        map_ = np.mean(parts, axis=0, dtype=np.float32)
+    return map_

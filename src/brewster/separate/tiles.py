@@ -1,0 +1,62 @@
+"""Runs a backend over a picture in overlapping tiles that fade into each other, where memory asks for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from jaxtyping import Float32
+
+    Picture = Float32[NDArray[np.float32], "h w 3"]
+else:
+    Picture = NDArray
+
+Backend = Callable[[Picture], tuple[Picture, Picture]]
+"""Anything that takes a tile (H, W, 3), float32 linear light in 0..1, and returns its transmission and its
+reflection, both of the same shape and kind."""
+
+
+def in_tiles(backend: Backend, picture: Picture, *, tile_px: int, overlap_px: int) -> tuple[Picture, Picture]:
+    """Both layers of a picture (H, W, 3) of any size; a picture no larger than a tile goes in whole.
+
+    Neighbouring tiles share at least `overlap_px` pixels, over which their answers are cross-faded.
+    """
+    height, width, _ = picture.shape
+    rows, columns = (_spans(side, tile_px, overlap_px) for side in (height, width))
+    if len(rows) == len(columns) == 1:
+        return backend(picture)
+    layers = np.zeros((2, height, width, 3), np.float32)
+    total = np.zeros((height, width, 1), np.float32)
+    for vertical, horizontal in product(rows, columns):
+        window = np.s_[vertical, horizontal]
+        weight = np.outer(_fade(vertical, height, overlap_px), _fade(horizontal, width, overlap_px))[
+            ..., None
+        ]
+        total[window] += weight
+        for layer, answer in zip(layers, backend(picture[window]), strict=True):
+            layer[window] += weight * answer
+    return layers[0] / total, layers[1] / total
+
+
+def _spans(side: int, tile: int, overlap: int) -> list[slice]:
+    """Equal spans of length `tile` that cover 0..side and overlap evenly."""
+    if side <= tile:
+        return [slice(0, side)]
+    count = -(-(side - overlap) // (tile - overlap))
+    starts = np.linspace(0, side - tile, count).round().astype(int)
+    return [slice(int(start), int(start) + tile) for start in starts]
+
+
+def _fade(span: slice, side: int, overlap: int) -> NDArray[np.float32]:
+    """Weights along a span: 1 inside, falling linearly towards edges that are not the picture's own."""
+    length = span.stop - span.start
+    ramp = (np.arange(length, dtype=np.float32) + 1) / (overlap + 1)
+    ones = np.ones(length, np.float32)
+    left = ones if span.start == 0 else np.minimum(ramp, 1)
+    right = ones if span.stop == side else np.minimum(ramp[::-1], 1)
+    return np.minimum(left, right)

@@ -1,0 +1,53 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from brewster.metrics import psnr
+from brewster.separate.detail import Transfer, enlarge_rows
+
+
+def shrink(picture, factor):
+    height, width, channels = picture.shape
+    return picture.reshape(height // factor, factor, width // factor, factor, channels).mean((1, 3))
+
+
+@pytest.fixture
+def sharp_scene_and_soft_reflection(random):
+    scene = np.kron(random.random((40, 60, 3)), np.ones((4, 4, 1))).astype(np.float32) * 0.5
+    y, x = np.mgrid[0:1:160j, 0:1:240j]
+    soft = 0.3 * np.exp(-((x - 0.4) ** 2 + (y - 0.5) ** 2) * 12)[..., None].astype(np.float32)
+    return scene, np.broadcast_to(soft, scene.shape)
+
+
+def test_a_soft_reflection_leaves_and_sharp_detail_stays(sharp_scene_and_soft_reflection):
+    scene, reflection = sharp_scene_and_soft_reflection
+    photo = scene + reflection
+    transfer = Transfer.learn(*(shrink(layer, 8) for layer in (photo, scene, reflection)))
+    transmission, mirrored = transfer.apply(photo, 0, 160)
+    as_bytes = [np.rint(np.clip(layer, 0, 1) * 255).astype(np.uint8) for layer in (transmission, scene)]
+    assert psnr(*as_bytes) > 40
+    assert np.abs(mirrored - reflection).mean() < 0.01
+
+
+def test_a_picture_that_the_backend_left_alone_is_not_touched(random):
+    photo = random.random((64, 48, 3), np.float32) * 3
+    small = np.clip(shrink(photo, 4), 0, 1)
+    transmission, reflection = Transfer.learn(small, small, np.zeros_like(small)).apply(photo, 0, 64)
+    assert (transmission == photo).all()
+    assert (reflection == 0).all()
+
+
+@given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 40), st.integers(1, 40))
+def test_rows_made_one_at_a_time_equal_all_rows_at_once(small_height, small_width, height, width):
+    map_ = np.random.default_rng(1).random((small_height, small_width, 2), np.float32)
+    whole = enlarge_rows(map_, 0, height, (height, width))
+    rows = [enlarge_rows(map_, top, 1, (height, width)) for top in range(height)]
+    assert (np.concatenate(rows) == whole).all()
+
+
+def test_a_ramp_stays_a_ramp_when_enlarged():
+    ramp = np.arange(8, dtype=np.float32).reshape(1, 8, 1)
+    enlarged = enlarge_rows(ramp, 0, 1, (1, 32))[0, :, 0]
+    np.testing.assert_allclose(np.diff(enlarged[2:-2]), 0.25, atol=1e-6)
+    assert enlarged.mean() == pytest.approx(ramp.mean())

@@ -1,0 +1,52 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from brewster.separate.tiles import in_tiles
+
+
+def halves(tile):
+    return tile * 0.75, tile * 0.25
+
+
+@given(st.integers(1, 90), st.integers(1, 90), st.integers(9, 40), st.integers(1, 8))
+def test_a_backend_that_looks_at_single_pixels_cannot_tell_tiles(height, width, tile, overlap):
+    picture = np.random.default_rng(height * width).random((height, width, 3), np.float32)
+    layers = in_tiles(halves, picture, tile_px=tile, overlap_px=overlap)
+    for layer, whole in zip(layers, halves(picture), strict=True):
+        np.testing.assert_allclose(layer, whole, rtol=1e-5)
+
+
+def test_no_tile_is_larger_than_asked():
+    sizes = set()
+
+    def spy(tile):
+        sizes.add(tile.shape)
+        return tile, tile
+
+    in_tiles(spy, np.zeros((70, 130, 3), np.float32), tile_px=50, overlap_px=10)
+    assert sizes == {(50, 50, 3)}
+
+
+def test_neighbouring_tiles_fade_into_each_other_without_a_seam():
+    seen = iter(range(100))
+
+    def each_its_own_grey(tile):
+        return np.full_like(tile, next(seen)), np.zeros_like(tile)
+
+    transmission, _ = in_tiles(
+        each_its_own_grey, np.zeros((20, 100, 3), np.float32), tile_px=40, overlap_px=20
+    )
+    assert np.abs(np.diff(transmission[0, :, 0])).max() <= pytest.approx(1 / 10, abs=1e-5)
+
+
+def test_a_picture_that_fits_goes_in_whole():
+    calls = []
+    in_tiles(
+        lambda tile: calls.append(tile) or (tile, tile),
+        np.zeros((40, 40, 3), np.float32),
+        tile_px=40,
+        overlap_px=8,
+    )
+    assert len(calls) == 1
