@@ -78,7 +78,7 @@ def find(sources: Iterable[Path], into: Path | None = None) -> list[Job]:
             inside = Path() if picture == source else beside.relative_to(source)
             folder = beside if into is None else into / inside
             job = Job(picture, folder, _layer_name(picture, wanted[beside]))
-            jobs.setdefault(os.path.abspath(picture), job)
+            jobs.setdefault(_place(picture), job)
     _refuse_shared_names(jobs.values())
     return list(jobs.values())
 
@@ -105,7 +105,7 @@ def write_atomically(path: Path, data: bytes, *, overwrite: bool = False, source
 
 
 def _pictures(source: Path) -> Iterator[Path]:
-    if os.path.isdir(source):
+    if _is_folder(source):
         yield from _walk(source, set())
     else:
         yield source
@@ -122,11 +122,20 @@ def _walk(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
         return
     seen.add((status.st_dev, status.st_ino))
     for entry in entries:
-        if os.path.isdir(entry):
+        if _is_folder(entry):
             if not entry.name.startswith("."):
                 yield from _walk(entry, seen)
-        elif _is_wanted(entry) and (os.path.isfile(entry) or os.path.islink(entry)):
+        elif _is_wanted(entry):
             yield entry
+
+
+def _place(path: Path) -> str:
+    """A path in one spelling, links as they are: two links to one file are two pictures."""
+    return os.path.abspath(path)  # noqa: PTH100
+
+
+def _is_folder(path: Path) -> bool:
+    return os.path.isdir(path)  # noqa: PTH112  (Path.is_dir raises where we may not look)
 
 
 def _wanted_names(folder: Path) -> Counter[str]:
@@ -153,7 +162,7 @@ def _refuse_shared_names(jobs: Iterable[Job]) -> None:
     owners: dict[str, Job] = {}
     for job in jobs:
         name = job.folder / job.name
-        other = owners.setdefault(os.path.abspath(name), job)
+        other = owners.setdefault(_place(name), job)
         if other is not job:
             raise TargetError(
                 f"{other.source} and {job.source} would both be written as {name}.*",
@@ -171,7 +180,7 @@ def _refuse_source(path: Path, source: Path | None) -> None:
 
 
 def _refuse_taken(path: Path, overwrite: bool) -> None:
-    if os.path.isdir(path):
+    if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     if path.exists() and not overwrite:
         raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST))
@@ -180,7 +189,7 @@ def _refuse_taken(path: Path, overwrite: bool) -> None:
 
 
 def _write_through(path: Path, data: bytes) -> None:
-    with open(path, "xb") as file:
+    with path.open("xb") as file:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
@@ -188,14 +197,14 @@ def _write_through(path: Path, data: bytes) -> None:
 
 def _take_name(part: Path, path: Path, overwrite: bool) -> None:
     if overwrite:
-        os.replace(part, path)
+        part.replace(path)
         return
     try:
         os.link(part, path)  # unlike a rename, a link never replaces what somebody else wrote meanwhile
     except OSError as error:
         if error.errno not in (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK):
             raise
-        os.replace(part, path)  # a file system without links (FAT): _refuse_taken has looked just before
+        part.replace(path)  # a file system without links (FAT): _refuse_taken has looked just before
 
 
 _CURES = {

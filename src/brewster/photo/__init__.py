@@ -1,0 +1,12 @@
+"""Photographs in and out: `Photo` keeps the stored pixels and knows their light and their file.
+
+    photo = Photo.open("window.jpg")
+    photo.with_linear(photo.linear() * 0.5).save("darker.jpg")
+
+pyvips is used in this room only (decode, encode), OpenEXR and pillow-heif only when such a file comes along.
+"""
+
+from brewster.photo.origin import DEPTHS, Origin
+from brewster.photo.photo import DEFAULT_MAX_PIXELS, Encoding, Photo, Source
+
+__all__ = ["DEFAULT_MAX_PIXELS", "DEPTHS", "Encoding", "Origin", "Photo", "Source"]

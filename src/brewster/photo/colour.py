@@ -1,0 +1,261 @@
+"""Colour: stored pixels to linear Rec.709 light and back, through tone curves, matrices and tables.
+
+A `Space` is all that is needed: the tone curve of each channel and the matrix from the space's linear light
+to linear Rec.709. It comes from an ICC matrix profile (ICC.1:2022), from an EXR's chromaticities, or is plain
+sRGB. Light outside the Rec.709 gamut has values below 0 or above 1: nothing is clipped on the way in.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brewster import light
+from brewster.errors import UnsupportedPhoto
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Stored = NDArray[Any]
+Matrix = tuple[tuple[float, float, float], ...]
+
+REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+_D50 = np.array([0.9642, 1.0, 0.8249])
+_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A tone curve: values 0..1 as stored to linear light (ICC.1:2022 10.6 and 10.18).
+
+    Either samples, or seven parameters: (a x + b)^g + e from x = d on, c x + f below.
+    """
+
+    samples: tuple[float, ...] = ()
+    parameters: tuple[float, ...] = (1, 1, 0, 0, 0, 0, 0)
+
+    def decode(self, stored: Float64) -> Float64:
+        """Stored values to linear light, any shape."""
+        if self.samples:
+            return np.interp(stored, np.linspace(0, 1, len(self.samples)), self.samples)
+        g, a, b, c, d, e, f = self.parameters
+        return np.where(stored >= d, np.maximum(a * stored + b, 0) ** g + e, c * stored + f)
+
+    def encode(self, linear: Float64) -> Float64:
+        """Linear light to stored values, any shape: the inverse of `decode`."""
+        if self.samples:
+            rising = np.maximum.accumulate(np.array(self.samples))
+            return np.interp(linear, rising, np.linspace(0, 1, len(self.samples)))
+        g, a, b, c, d, e, f = self.parameters
+        bright = (np.maximum(linear - e, 0) ** (1 / g) - b) / a
+        return np.where(linear >= (a * d + b) ** g + e, bright, (linear - f) / c if c else 0.0)
+
+
+@dataclass(frozen=True)
+class SrgbCurve(Curve):
+    """The curve of sRGB, extended past 1 (brewster.light)."""
+
+    def decode(self, stored: Float64) -> Float64:
+        """Stored values to linear light, any shape."""
+        return light.to_linear(stored)
+
+    def encode(self, linear: Float64) -> Float64:
+        """Linear light to stored values, any shape."""
+        return light.to_encoded(linear)
+
+
+@dataclass(frozen=True)
+class Space:
+    """How stored pixels mean light: a tone curve per channel, then a matrix to linear Rec.709, if any."""
+
+    curves: tuple[Curve, Curve, Curve]
+    matrix: Matrix | None = None
+
+    def to_linear(self, stored: Stored) -> Float32:
+        """Stored pixels (H, W, 1|3), uint8, uint16 or float32, to linear Rec.709, (H, W, 3) float32."""
+        channels = [_decoded(stored[..., i], curve) for i, curve in enumerate(self._curves(stored))]
+        if len(channels) == 1:
+            return np.repeat(channels[0][..., None], 3, axis=2)
+        return np.stack(_product(self.matrix, channels) if self.matrix else channels, axis=2)
+
+    def to_stored(self, linear: Float32, before: Stored) -> Stored:
+        """Linear Rec.709 (H, W, 3) back to the type and channels of `before`, the pixels that stood there.
+
+        Pixels whose light is what `before` means come back as they were, to the bit. Not-a-number becomes
+        black.
+        """
+        stored = np.empty_like(before)
+        curves = self._curves(before)
+        channels = [linear[..., i] for i in range(3)]
+        if len(curves) == 1:
+            channels = [_grey(linear)]
+        elif self.matrix:
+            channels = _product(_inverse(self.matrix), channels)
+        for i, curve in enumerate(curves):
+            stored[..., i] = _encoded(channels[i], curve, before.dtype)
+        if self not in (SRGB, LINEAR_REC709):  # these round-trip by themselves, as the tests prove
+            same = np.all(linear == self.to_linear(before), axis=2)
+            stored[same] = before[same]
+        return stored
+
+    def _curves(self, stored: Stored) -> tuple[Curve, ...]:
+        """Grey takes the green curve: profiles for grey have but one, and neutral is neutral in any RGB."""
+        return self.curves if stored.shape[-1] == 3 else (self.curves[1],)
+
+
+SRGB = Space((SrgbCurve(),) * 3)
+LINEAR_REC709 = Space((Curve(),) * 3)
+
+
+@lru_cache(maxsize=16)
+def space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_float: bool) -> Space:
+    """The space of stored pixels: that of the ICC profile, of the chromaticities, or of nothing said.
+
+    Nothing said means sRGB for whole numbers and linear Rec.709 for floats. Raises UnsupportedPhoto for
+    profiles that are not matrix RGB or grey.
+    """
+    if icc is not None:
+        return _profile_space(icc)
+    if primaries is not None and not np.allclose(primaries, REC709, atol=1e-4):
+        return Space((Curve(),) * 3, _to_rec709(_to_d50(primaries)))
+    return LINEAR_REC709 if is_float else SRGB
+
+
+def _decoded(stored: Stored, curve: Curve) -> Float32:
+    if stored.dtype.kind == "f":
+        is_straight = curve == Curve()
+        return stored if is_straight else curve.decode(stored.astype(np.float64)).astype(np.float32)
+    return _decode_table(curve, np.iinfo(stored.dtype).max).take(stored)
+
+
+def _encoded(linear: Float32, curve: Curve, dtype: np.dtype[Any]) -> Stored:
+    if dtype.kind == "f":
+        is_straight = curve == Curve()
+        return linear if is_straight else curve.encode(linear.astype(np.float64)).astype(np.float32)
+    table = _encode_table(curve, np.iinfo(dtype).max)
+    root = np.sqrt(np.fmin(np.fmax(linear, np.float32(0)), np.float32(1)))
+    return table.take((root * np.float32(len(table) - 1) + np.float32(0.5)).astype(np.intp))
+
+
+@lru_cache(maxsize=16)
+def _decode_table(curve: Curve, white: int) -> Float32:
+    return curve.decode(np.arange(white + 1) / white).astype(np.float32)
+
+
+@lru_cache(maxsize=16)
+def _encode_table(curve: Curve, white: int) -> NDArray[Any]:
+    """Stored whole numbers over the square root of linear light, which spreads the dark as encodings do.
+
+    2**16 steps round 8 bits to within 0.01 of a level, 2**20 steps 16 bits to within 0.1.
+    """
+    roots = np.linspace(0, 1, 2**16 if white < 256 else 2**20)
+    levels = np.rint(np.clip(curve.encode(roots**2), 0, 1) * white)
+    return levels.astype(np.uint8 if white < 256 else np.uint16)
+
+
+def _product(matrix: Matrix, channels: list[Float32]) -> list[Float32]:
+    """A matrix times channels, by plain steps: BLAS would round a pixel by where in the strip it stands."""
+    red, green, blue = channels
+    rows = np.array(matrix, np.float32)
+    return [row[0] * red + row[1] * green + row[2] * blue for row in rows]
+
+
+def _grey(linear: Float32) -> Float32:
+    """Luminance, and exactly the common value where the three agree."""
+    red, green, blue = (linear[..., i] for i in range(3))
+    weights = np.array(light.REC709_LUMINANCE, np.float32)
+    neutral = (red == green) & (green == blue)
+    return np.where(neutral, green, weights[0] * red + weights[1] * green + weights[2] * blue)
+
+
+def _inverse(matrix: Matrix) -> Matrix:
+    return _as_matrix(np.linalg.inv(np.array(matrix)))
+
+
+def _as_matrix(array: Float64) -> Matrix:
+    return tuple((float(row[0]), float(row[1]), float(row[2])) for row in array)
+
+
+def _to_d50(primaries: tuple[float, ...]) -> Float64:
+    """Linear RGB of these chromaticities to XYZ under D50, white adapted by Bradford (ICC.1:2022 annex E)."""
+    xyz = np.array(
+        [[x / y, 1, (1 - x - y) / y] for x, y in zip(primaries[::2], primaries[1::2], strict=True)]
+    ).T
+    white = xyz[:, 3]
+    to_xyz = xyz[:, :3] * np.linalg.solve(xyz[:, :3], white)
+    gains = np.diag((_BRADFORD @ _D50) / (_BRADFORD @ white))
+    return np.asarray(np.linalg.inv(_BRADFORD) @ gains @ _BRADFORD @ to_xyz)
+
+
+def _to_rec709(to_d50: Float64) -> Matrix:
+    return _as_matrix(np.linalg.inv(_to_d50(REC709)) @ to_d50)
+
+
+def _profile_space(icc: bytes) -> Space:
+    try:
+        tags = _tags(icc)
+        if icc[16:20] == b"GRAY":
+            return _snapped(Space((_curve(tags[b"kTRC"]),) * 3))
+        to_d50 = np.array([_xyz(tags[name]) for name in (b"rXYZ", b"gXYZ", b"bXYZ")]).T
+        red, green, blue = (_curve(tags[name]) for name in (b"rTRC", b"gTRC", b"bTRC"))
+        space = _snapped(Space((red, green, blue), _to_rec709(to_d50)))
+        _inverse(space.matrix or _as_matrix(np.eye(3)))
+    except (KeyError, ValueError, struct.error, np.linalg.LinAlgError) as error:
+        raise UnsupportedPhoto(
+            f"the embedded colour profile ({len(icc)} bytes) does not consist of curves and a matrix",
+            "brewster reads those for RGB and grey: sRGB, Display P3, Adobe RGB, ProPhoto and their kind",
+            "convert the picture to one of these first",
+        ) from error
+    return space
+
+
+def _snapped(space: Space) -> Space:
+    """Plain sRGB where a profile means that, to within its rounding and a small part of an 8-bit level."""
+    levels = np.arange(256) / 255
+    off = [np.abs(curve.decode(levels) - light.to_linear(levels)).max() for curve in space.curves]
+    turned = np.abs(np.array(space.matrix) - np.eye(3)).max() if space.matrix else 0.0
+    return SRGB if max(off) < 2e-4 and turned < 1e-3 else space
+
+
+def _tags(icc: bytes) -> dict[bytes, bytes]:
+    (count,) = struct.unpack_from(">I", icc, 128)
+    rows = (struct.unpack_from(">4sII", icc, 132 + 12 * i) for i in range(min(count, 100)))
+    return {name: icc[start : start + size] for name, start, size in rows}
+
+
+def _xyz(tag: bytes) -> tuple[float, float, float]:
+    x, y, z = struct.unpack_from(">3i", tag, 8)
+    return x / 65536, y / 65536, z / 65536
+
+
+_PLACES = ("g", "gab", "gabc", "gabcd", "gabcdef")  # the parameters that each of ICC's function types gives
+
+
+def _curve(tag: bytes) -> Curve:
+    """A curveType or parametricCurveType tag (ICC.1:2022 10.6 and 10.18)."""
+    kind, count = struct.unpack_from(">4s4xI", tag)
+    if kind == b"para":
+        return _parametric(count >> 16, tag)
+    if kind != b"curv":
+        raise ValueError(kind)
+    if count == 0:
+        return Curve()
+    numbers = struct.unpack_from(f">{count}H", tag, 12)
+    if count == 1:
+        return Curve(parameters=(numbers[0] / 256, 1, 0, 0, 0, 0, 0))
+    return Curve(samples=tuple(number / 65535 for number in numbers))
+
+
+def _parametric(function: int, tag: bytes) -> Curve:
+    names = _PLACES[function] if function < len(_PLACES) else ""
+    given = dict(zip(names, struct.unpack_from(f">{len(names)}i", tag, 12), strict=True))
+    g, a, b, c, d, e, f = (given.get(name, 65536 * (name == "a")) / 65536 for name in "gabcdef")
+    if function in (1, 2):  # below -b/a these two are flat
+        c, d, e, f = 0.0, -b / a, c, c
+    if g <= 0 or a <= 0:
+        raise ValueError(names)
+    return Curve(parameters=(g, a, b, c, d, e, f))

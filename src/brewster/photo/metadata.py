@@ -1,0 +1,311 @@
+"""What a file says beside its pixels, read and written byte by byte: JPEG tables, EXIF, PNG and WebP chunks.
+
+libvips rewrites EXIF through libexif, which loses tags it does not know, and passes over EXIF in TIFF. Here
+the block of the source goes into the target as it is. It is kept from its TIFF header on, without the
+"Exif\\0\\0" of JPEG.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from collections.abc import Iterator
+
+from brewster.errors import UnsupportedPhoto
+
+# --- JPEG (ITU-T T.81 annex B)
+
+_EXIF_NAME = b"Exif\0\0"
+_APP0, _APP1, _DQT, _SOS = 0xE0, 0xE1, 0xDB, 0xDA
+_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_LONGEST = 65533  # bytes of a segment's payload
+
+
+def jpeg_segments(data: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """The marker, start and payload of every segment before the pixels."""
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF:
+        marker, size = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
+        if marker == 0xFF:  # fill byte
+            at += 1
+            continue
+        yield marker, at, data[at + 4 : at + 2 + size]
+        if marker == _SOS:
+            return
+        at += 2 + size
+
+
+def jpeg_coarseness(data: bytes) -> dict[int, int]:
+    """Sum of each quantisation table by its number (0: luma, 1: chroma): more is coarser."""
+    sums = {}
+    for marker, _, payload in jpeg_segments(data):
+        while marker == _DQT and payload:
+            wide, number = payload[0] >> 4, payload[0] & 15
+            size = 128 if wide else 64
+            sums[number] = sum(struct.unpack(">64H" if wide else ">64B", payload[1 : 1 + size]))
+            payload = payload[1 + size :]  # noqa: PLW2901
+    return sums
+
+
+def jpeg_subsampling(data: bytes) -> str | None:
+    """Chroma subsampling in the usual words, such as "4:4:4", "4:2:2" or "4:2:0"; None without chroma."""
+    for marker, _, payload in jpeg_segments(data):
+        if marker in _FRAMES and len(payload) >= 15:
+            across, down = payload[7] >> 4, payload[7] & 15
+            chroma_across, chroma_down = payload[10] >> 4, payload[10] & 15
+            kept = 4 * chroma_across // across
+            return f"4:{kept}:{0 if down > chroma_down else kept}"
+    return None
+
+
+def with_jpeg_head(data: bytes, exif: bytes | None, dots_per_inch: tuple[float, float] | None) -> bytes:
+    """A JPEG with its resolution (JFIF) and its EXIF in front, neither of which it has so far.
+
+    Raises UnsupportedPhoto for EXIF beyond the 64 KiB of a segment.
+    """
+    head = b""
+    if dots_per_inch is not None:
+        across, down = (min(max(round(dots), 1), 65535) for dots in dots_per_inch)
+        head += _segment(_APP0, b"JFIF\0" + struct.pack(">HBHHBB", 0x0101, 1, across, down, 0, 0))
+    if exif is not None:
+        head += _segment(_APP1, _EXIF_NAME + exif)
+    return b"".join((data[:2], head, data[2:]))
+
+
+def _segment(marker: int, payload: bytes) -> bytes:
+    if len(payload) > _LONGEST:
+        raise UnsupportedPhoto(
+            f"the EXIF block holds {len(payload)} bytes",
+            f"a JPEG holds at most {_LONGEST}",
+            "write PNG, TIFF or WebP instead",
+        )
+    return struct.pack(">BBH", 0xFF, marker, len(payload) + 2) + payload
+
+
+# --- PNG and WebP chunks
+
+
+def png_chunks(data: bytes) -> dict[bytes, bytes]:
+    """The chunks before the pixels, by name."""
+    found, at = {}, 8
+    while at + 8 <= len(data) and data[at + 4 : at + 8] != b"IDAT":
+        size = int.from_bytes(data[at : at + 4], "big")
+        found[data[at + 4 : at + 8]] = data[at + 8 : at + 8 + size]
+        at += 12 + size
+    return found
+
+
+def with_png_exif(data: bytes, exif: bytes) -> bytes:
+    """A PNG with an eXIf chunk right after its header."""
+    at = 8 + 12 + 13
+    chunk = b"eXIf" + exif
+    sized = struct.pack(">I", len(exif)) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    return b"".join((data[:at], sized, data[at:]))
+
+
+def webp_chunks(data: bytes) -> dict[bytes, bytes]:
+    """The chunks of a WebP by name."""
+    found, at = {}, 12
+    while at + 8 <= len(data):
+        size = int.from_bytes(data[at + 4 : at + 8], "little")
+        found[data[at : at + 4]] = data[at + 8 : at + 8 + size]
+        at += 8 + size + size % 2
+    return found
+
+
+def with_webp_exif(data: bytes, exif: bytes, size: tuple[int, int], has_alpha: bool) -> bytes:
+    """A WebP with an EXIF chunk, in the extended layout (RFC 9649 2.7). `size` is width and height."""
+    chunks = webp_chunks(data)
+    flags = chunks.pop(b"VP8X", bytes(4))[0] | 0x08 | 0x10 * has_alpha
+    canvas = b"".join((side - 1).to_bytes(3, "little") for side in size)
+    xmp = chunks.pop(b"XMP ", None)
+    ordered = {b"VP8X": bytes((flags, 0, 0, 0)) + canvas, **chunks, b"EXIF": exif}
+    if xmp is not None:
+        ordered[b"XMP "] = xmp
+    body = b"".join(
+        name + struct.pack("<I", len(chunk)) + chunk + bytes(len(chunk) % 2)
+        for name, chunk in ordered.items()
+    )
+    return b"RIFF" + struct.pack("<I", len(body) + 4) + b"WEBP" + body
+
+
+def coding_points(data: bytes) -> tuple[int, int, int] | None:
+    """Colour primaries, transfer and matrix as in ITU-T H.273, where an AVIF, HEIC or PNG states them."""
+    if data.startswith(b"\x89PNG"):
+        chunk = png_chunks(data).get(b"cICP", b"")
+        return (chunk[0], chunk[1], chunk[2]) if len(chunk) >= 3 else None
+    found = re.search(rb"colrnclx(.{6})", data[: 1 << 16], re.DOTALL)
+    return struct.unpack(">3H", found[1]) if found else None
+
+
+# --- AVIF items (ISO/IEC 14496-12 8.11)
+
+
+def with_avif_exif(data: bytes, exif: bytes) -> bytes:
+    """An AVIF whose Exif item, written by libvips in its own words, now is this block at the file's end."""
+    item = re.search(rb"infe\x02...(..)..Exif", data, re.DOTALL)
+    row = _location(data, item[1]) if item else None
+    if row is None:
+        return data
+    payload = bytes(4) + exif
+    place = struct.pack(">IHII", 0, 1, len(data) + 8, len(payload))
+    box = struct.pack(">I", len(payload) + 8) + b"mdat" + payload
+    return b"".join((data[:row], place, data[row + len(place) :], box))
+
+
+def _location(data: bytes, item: bytes) -> int | None:
+    """Where an item's base, count, offset and length stand in an iloc box of the kind libheif writes."""
+    table = data.find(b"iloc")
+    version, sizes, more = data[table + 4], data[table + 8], data[table + 9]
+    if table < 0 or version > 1 or (sizes, more) != (0x44, 0x40):
+        return None
+    at = table + 12
+    for _ in range(int.from_bytes(data[table + 10 : table + 12], "big")):
+        row = at + 4 + 2 * (version == 1)
+        count = int.from_bytes(data[row + 4 : row + 6], "big")
+        if data[at : at + 2] == item:
+            return row if count == 1 else None
+        at = row + 6 + 8 * count
+    return None
+
+
+# --- EXIF and TIFF directories (TIFF 6.0 section 2, CIPA DC-008)
+
+Tags = dict[int, "tuple[int, int, bytes] | Tags"]
+"""Tag -> (type, count, value in little-endian) or, for a pointer, the directory it points to."""
+
+_POINTERS = (34665, 34853, 40965)  # Exif, GPS, interoperability
+_CAMERA = (
+    270,
+    271,
+    272,
+    305,
+    306,
+    315,
+    33432,
+    34665,
+    34853,
+)  # what a camera says of a picture in its directory
+_ORIENTATION = 274
+_WIDTHS = {1: 1, 2: 1, 3: 2, 4: 4, 5: 4, 6: 1, 7: 1, 8: 2, 9: 4, 10: 4, 11: 4, 12: 8, 13: 4}
+_FRACTIONS = (5, 10)  # two numbers each
+
+
+def read_tags(data: bytes) -> Tags:
+    """The first directory of a TIFF or EXIF block, with those below it; empty where there is none."""
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
+    if order is None:
+        return {}
+    return _directory(data, order, struct.unpack_from(order + "I", data, 4)[0], _POINTERS)
+
+
+def _directory(data: bytes, order: str, at: int, pointers: tuple[int, ...]) -> Tags:
+    if at + 2 > len(data):
+        return {}
+    (count,) = struct.unpack_from(order + "H", data, at)
+    tags: Tags = {}
+    for row in range(at + 2, min(at + 2 + 12 * count, len(data) - 11), 12):
+        tag, kind, number = struct.unpack_from(order + "HHI", data, row)
+        width = _WIDTHS.get(kind, 0)
+        size = width * number * (2 if kind in _FRACTIONS else 1)
+        (offset,) = struct.unpack_from(order + "I", data, row + 8)
+        start = row + 8 if size <= 4 else offset
+        if tag in pointers:
+            tags[tag] = _directory(data, order, offset, tuple(p for p in pointers if p != tag))
+        elif width and start + size <= len(data):
+            tags[tag] = (kind, number, _swapped(data[start : start + size], width, order))
+    return tags
+
+
+def _swapped(value: bytes, width: int, order: str) -> bytes:
+    if order == "<" or width == 1:
+        return value
+    return b"".join(value[i : i + width][::-1] for i in range(0, len(value), width))
+
+
+def number_of(tags: Tags, tag: int, default: int) -> int:
+    """The first whole number of a tag."""
+    return next(iter(numbers(tags, tag)), default)
+
+
+def end_of_pixels(tags: Tags) -> int:
+    """Where in a TIFF its last strip or tile ends; 0 where its tags do not say."""
+    ends = [0]
+    for starts, sizes in ((273, 279), (324, 325)):
+        ends += [
+            start + size for start, size in zip(numbers(tags, starts), numbers(tags, sizes), strict=False)
+        ]
+    return max(ends)
+
+
+def numbers(tags: Tags, tag: int) -> list[int]:
+    """The whole numbers of a tag; none if it is missing."""
+    entry = tags.get(tag)
+    if not isinstance(entry, tuple) or entry[0] not in (1, 3, 4):
+        return []
+    width = _WIDTHS[entry[0]]
+    return [int.from_bytes(entry[2][i : i + width], "little") for i in range(0, len(entry[2]), width)]
+
+
+def orientation_of(exif: bytes) -> int:
+    """The orientation 1..8 that an EXIF block states; 1 if it states none."""
+    stated = number_of(read_tags(exif.removeprefix(_EXIF_NAME)), _ORIENTATION, 1)
+    return stated if 1 <= stated <= 8 else 1
+
+
+def lay_out(tags: Tags, at: int) -> tuple[bytes, int]:
+    """A directory as bytes to stand at offset `at` of a little-endian file, and the offset of its rows."""
+    values, rows = b"", b""
+    for tag, entry in sorted(tags.items(), key=lambda item: item[0]):
+        if isinstance(entry, dict):
+            below, offset = lay_out(entry, at + len(values))
+            values, entry = values + below, (4, 1, struct.pack("<I", offset))  # noqa: PLW2901
+        kind, count, value = entry
+        if len(value) > 4:
+            place = struct.pack("<I", at + len(values))
+            values += value + bytes(len(value) % 2)
+        else:
+            place = value.ljust(4, b"\0")
+        rows += struct.pack("<HHI", tag, kind, count) + place
+    return values + struct.pack("<H", len(tags)) + rows + bytes(4), at + len(values)
+
+
+def tiff_exif(tags: Tags) -> bytes | None:
+    """An EXIF block of what a TIFF says of its camera; None if it says nothing."""
+    camera: Tags = {tag: entry for tag, entry in tags.items() if tag in _CAMERA}
+    if not camera:
+        return None
+    camera[_ORIENTATION] = (3, 1, b"\x01\0")
+    body, first = lay_out(camera, 8)
+    return b"II*\0" + struct.pack("<I", first) + body
+
+
+def with_tiff_exif(data: bytes, exif: bytes) -> bytes:
+    """A little-endian TIFF of one page with the camera's tags, in a new directory at its end."""
+    tags = read_tags(data)
+    tags.update((tag, entry) for tag, entry in read_tags(exif).items() if tag in _CAMERA)
+    start = len(data) + len(data) % 2
+    body, first = lay_out(tags, start)
+    return b"".join((data[:4], struct.pack("<I", first), data[8:], bytes(len(data) % 2), body))
+
+
+def upright_exif(exif: bytes) -> bytes:
+    """An EXIF block from its TIFF header on, the picture's orientation set to 1 and all else as it was."""
+    exif = exif.removeprefix(_EXIF_NAME)
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
+    if order is None or len(exif) < 10:
+        return exif
+    (at,) = struct.unpack_from(order + "I", exif, 4)
+    (count,) = struct.unpack_from(order + "H", exif, at) if at + 2 <= len(exif) else (0,)
+    for row in range(at + 2, min(at + 2 + 12 * count, len(exif) - 11), 12):
+        tag, kind = struct.unpack_from(order + "HH", exif, row)
+        if tag == _ORIENTATION:
+            one = struct.pack(order + ("I" if kind == 4 else "HH"), *((1,) if kind == 4 else (1, 0)))
+            return exif[: row + 8] + one + exif[row + 12 :]
+    return exif
+
+
+def upright_xmp(xmp: bytes) -> bytes:
+    """An XMP block with tiff:Orientation set to 1 and all else as it was."""
+    return re.sub(rb"""(tiff:Orientation(?:=["']|>))[1-8]""", rb"\g<1>1", xmp)

@@ -1,0 +1,283 @@
+"""The photo: stored pixels that remember their file, and know what light they mean."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brewster import light
+from brewster.errors import PhotoError, UnreadablePhoto, UnsupportedPhoto
+from brewster.files import write_atomically
+from brewster.photo import metadata
+from brewster.photo.colour import Space, space_of
+from brewster.photo.decode import Decoded, decode, split, upright
+from brewster.photo.encode import encode
+from brewster.photo.origin import DEPTHS, LINEAR, Origin, container_of, depth_for
+
+Float32 = NDArray[np.float32]
+Stored = NDArray[Any]
+Encoding = Literal["srgb", "linear"]
+Source = Any
+"""A path, the bytes of a file, a numpy array (with its encoding stated), a PIL image, or a Photo."""
+
+DEFAULT_MAX_PIXELS = 200_000_000
+_STRIP = 1 << 18  # pixels worked on at once: a few megabytes, so that whole float copies are never needed
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """A photograph: pixels as stored, alpha apart, and their file. Upright, immutable, thread-safe.
+
+    `pixels` is (H, W, 1|3) and `alpha` (H, W) or None; both are uint8, uint16 or float32. Whole numbers are
+    encoded by the origin's profile (sRGB if it has none); floats without a profile are linear Rec.709 light.
+    """
+
+    pixels: Stored = field(repr=False)
+    alpha: Stored | None = field(default=None, repr=False)
+    origin: Origin = field(default_factory=Origin, repr=False)
+
+    def __post_init__(self) -> None:
+        """Fix the arrays, so that photos can share them."""
+        _refuse_shapes(self.pixels, self.alpha)
+        self.pixels.flags.writeable = False
+        if self.alpha is not None:
+            self.alpha.flags.writeable = False
+
+    @classmethod
+    def open(
+        cls, source: Source, *, encoding: Encoding | None = None, max_pixels: int = DEFAULT_MAX_PIXELS
+    ) -> Photo:
+        """A photo from whatever holds one: a path, the bytes of a file, an array, a PIL image, or a photo.
+
+        An array needs its `encoding` stated. Raises UnreadablePhoto (missing, empty, truncated, no picture),
+        UnsupportedPhoto (CMYK, animation, five channels, not-a-number, table-based profile), PhotoTooLarge
+        (beyond `max_pixels`, told from the header) or MissingExtra (EXR, HEIC).
+        """
+        if isinstance(source, Photo):
+            return source
+        if isinstance(source, np.ndarray):
+            if encoding is None:
+                raise PhotoError(
+                    "an array came without its encoding",
+                    "numbers alone do not tell what light they mean",
+                    'say encoding="srgb" or encoding="linear"',
+                )
+            return cls.from_array(source, encoding=encoding)
+        if hasattr(source, "getbands"):
+            return cls.from_pil(source)
+        data = bytes(source) if isinstance(source, bytes | bytearray | memoryview) else _read(Path(source))
+        return cls._of(decode(data, max_pixels))
+
+    @classmethod
+    def _of(cls, decoded: Decoded) -> Photo:
+        photo = cls(decoded.pixels, decoded.alpha, decoded.origin)
+        photo.space()  # a profile we cannot use is an error now, not in the middle of the work
+        return photo
+
+    @classmethod
+    def from_array(cls, array: Stored, *, encoding: Encoding) -> Photo:
+        """A photo from (H, W) or (H, W, 1|3|4) numbers: uint8, uint16, or floats where 1.0 is white.
+
+        sRGB whole numbers are stored as they are, all others as linear float32. Raises UnsupportedPhoto for
+        other shapes and types and for values that are not finite.
+        """
+        array = np.array(array)[..., None] if np.ndim(array) == 2 else np.array(array)
+        if array.ndim != 3 or array.shape[2] not in (1, 3, 4) or array.dtype.name not in _LEVELS:
+            raise UnsupportedPhoto(
+                f"the array is {array.shape} of {array.dtype}",
+                "a picture is (H, W) or (H, W, 1|3|4) of uint8, uint16 or float",
+                "reshape or convert it",
+            )
+        if not np.isfinite(array).all():
+            raise UnsupportedPhoto("the array is not finite everywhere", "light is finite", "repair it first")
+        colours = array.shape[2] - (array.shape[2] == 4)
+        pixels, alpha = array[..., :colours], array[..., colours] if array.shape[2] == 4 else None
+        if encoding == "linear" or array.dtype.kind == "f":
+            pixels = pixels / np.float32(_LEVELS[array.dtype.name])
+            pixels = light.to_linear(pixels) if encoding == "srgb" else pixels
+            alpha = None if alpha is None else alpha / np.float32(_LEVELS[array.dtype.name])
+        floats = pixels.dtype.kind == "f"
+        kind = np.dtype(np.float32) if floats else array.dtype
+        return cls(
+            np.ascontiguousarray(pixels, kind),
+            None if alpha is None else np.ascontiguousarray(alpha, kind),
+            Origin(bits=8 * kind.itemsize),
+        )
+
+    @classmethod
+    def from_pil(cls, image: Source) -> Photo:
+        """A photo from a PIL image with its profile and EXIF; palettes become RGB.
+
+        Raises UnsupportedPhoto for CMYK, LAB, floats and other modes whose meaning is not plain.
+        """
+        if image.mode in ("P", "PA", "1"):
+            has_alpha = image.mode == "PA" or "transparency" in image.info
+            image = image.convert("L" if image.mode == "1" else "RGBA" if has_alpha else "RGB")
+        if image.mode not in ("L", "LA", "RGB", "RGBA", "I;16"):
+            raise UnsupportedPhoto(
+                f"the PIL image has mode {image.mode}",
+                "RGB and grey are taken, with or without alpha",
+                'use image.convert("RGB")',
+            )
+        exif, icc = image.info.get("exif"), image.info.get("icc_profile")
+        container = (image.format or "png").lower()
+        array = np.asarray(image).reshape(image.height, image.width, -1)
+        origin = Origin(
+            container=container if container in DEPTHS else "png",
+            bits=16 if image.mode == "I;16" else 8,
+            icc=icc or None,
+            exif=metadata.upright_exif(exif) if exif else None,
+        )
+        return cls._of(split(upright(array, metadata.orientation_of(exif or b"")), origin))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self.pixels.shape[1], self.pixels.shape[0]
+
+    def space(self) -> Space:
+        """What light the stored numbers mean."""
+        return space_of(self.origin.icc, self.origin.primaries, self.pixels.dtype.kind == "f")
+
+    def linear(self) -> Float32:
+        """Linear Rec.709 light, (H, W, 3) float32; below 0 and above 1 where the gamut or range is wider."""
+        linear = np.empty((*self.pixels.shape[:2], 3), np.float32)
+        for rows in self.strips():
+            linear[rows] = self.linear_rows(rows.start, rows.stop)
+        return linear
+
+    def linear_rows(self, top: int, bottom: int) -> Float32:
+        """Linear light of the rows from `top` up to `bottom`: a strip of `linear`."""
+        return self.space().to_linear(self.pixels[top:bottom])
+
+    def stored_rows(self, linear: Float32, top: int) -> Stored:
+        """Light (rows, W, 3) that takes the place of the rows from `top` on, as this photo would store it.
+
+        The inverse of `linear_rows`: pixels whose light is unchanged come back bit-equal; others are clipped
+        to what can be stored. For results made in strips; gather them in an array like `pixels` and call
+        `with_pixels`.
+        """
+        return self.space().to_stored(np.asarray(linear, np.float32), self.pixels[top : top + len(linear)])
+
+    def with_linear(self, linear: Float32) -> Photo:
+        """The same photo with other light, (H, W, 3); pixels whose light is unchanged are bit-equal."""
+        pixels = np.empty_like(self.pixels)
+        for rows in self.strips():
+            pixels[rows] = self.stored_rows(linear[rows], rows.start)
+        return self.with_pixels(pixels)
+
+    def with_pixels(self, pixels: Stored) -> Photo:
+        """The same photo with other stored pixels of the same shape and type, which become read-only."""
+        if pixels.shape != self.pixels.shape or pixels.dtype != self.pixels.dtype:
+            raise PhotoError(
+                f"new pixels are {pixels.shape} of {pixels.dtype}",
+                f"the photo's are {self.pixels.shape} of {self.pixels.dtype}",
+                "use with_linear to convert",
+            )
+        return replace(self, pixels=pixels)
+
+    def strips(self) -> Iterator[slice]:
+        """Slices of rows from top to bottom, each small enough to be worked on in floats."""
+        height, width = self.pixels.shape[:2]
+        step = max(1, _STRIP // width)
+        return (slice(top, min(top + step, height)) for top in range(0, height, step))
+
+    def small(self, width: int, height: int) -> Float32:
+        """The photo at another size, (height, width, 3) linear light: the mean over each new pixel's area."""
+        out = np.empty((height, width, 3), np.float32)
+        full_height = self.size[1]
+        for row in range(height):
+            top, bottom = row * full_height / height, (row + 1) * full_height / height
+            rows = np.arange(math.floor(top), min(math.ceil(bottom), full_height))
+            shares = np.minimum(rows + 1, bottom) - np.maximum(rows, top)
+            strip = self.linear_rows(int(rows[0]), int(rows[-1]) + 1)
+            line = np.tensordot((shares / shares.sum()).astype(np.float32), strip, 1)
+            out[row] = _area_means(line, width)
+        return out
+
+    def encode(self, container: str | None = None, *, depth: int | None = None) -> bytes:
+        """The bytes of a file: the origin's container and depth unless others are asked for (see `DEPTHS`).
+
+        JPEG keeps the source's quality and chroma. Raises UnsupportedPhoto for what the container cannot
+        hold.
+        """
+        container = container or self.origin.container
+        bits = depth_for(self.origin, container, depth)
+        stored = self._stored_as(container, bits)
+        return encode(stored.pixels, stored.alpha, replace(stored.origin, container=container, bits=bits))
+
+    def save(
+        self, path: str | os.PathLike[str], *, depth: int | None = None, overwrite: bool = False
+    ) -> None:
+        """Write a file, whole or not at all, in the container that its suffix names.
+
+        Raises TargetError if it exists (without `overwrite`) or cannot be written, UnsupportedPhoto as
+        `encode`.
+        """
+        data = self.encode(container_of(Path(path)), depth=depth)
+        write_atomically(Path(path), data, overwrite=overwrite)
+
+    def _stored_as(self, container: str, bits: int) -> Photo:
+        """The pixels in the type that a container and its depth need, meaning the same light."""
+        was_linear, is_linear = self.origin.container in LINEAR, container in LINEAR
+        kind = np.dtype(np.float32 if is_linear or bits == 32 else np.uint8 if bits == 8 else np.uint16)
+        moves = container != self.origin.container and (was_linear or is_linear)
+        if kind == self.pixels.dtype and not moves:
+            return self
+        alpha = None if self.alpha is None else _rescaled(self.alpha, kind)
+        has_profile = self.origin.icc is not None and not is_linear
+        if has_profile or (kind.kind == "u" and self.pixels.dtype.kind == "u"):
+            return Photo(_rescaled(self.pixels, kind), alpha, self.origin)
+        pixels, space = np.empty(self.pixels.shape, kind), space_of(None, None, kind.kind == "f")
+        for rows in self.strips():
+            pixels[rows] = space.to_stored(self.linear_rows(rows.start, rows.stop), pixels[rows])
+        return Photo(pixels, alpha, replace(self.origin, icc=None, primaries=None, header=None))
+
+
+_LEVELS = {"uint8": 255, "uint16": 65535, "float16": 1, "float32": 1, "float64": 1}
+
+
+def _rescaled(values: Stored, kind: np.dtype[Any]) -> Stored:
+    """Numbers of one type as another's, white staying white, encoded as they were."""
+    white, new_white = _LEVELS[values.dtype.name], _LEVELS[kind.name]
+    if kind.kind == "f":
+        return values.astype(kind) / np.float32(white)
+    if values.dtype.kind == "f":
+        return np.rint(values.clip(0, 1) * np.float32(new_white)).astype(kind)
+    return ((values.astype(np.uint32) * new_white + white // 2) // white).astype(kind)
+
+
+def _area_means(line: Float32, width: int) -> Float32:
+    """Means of a row (W, 3) over `width` equal parts, by differences of its running sum."""
+    sums = np.vstack([np.zeros((1, 3)), np.cumsum(line, axis=0, dtype=np.float64)])
+    edges = np.linspace(0, len(line), width + 1)
+    at = np.column_stack([np.interp(edges, np.arange(len(sums)), sums[:, i]) for i in range(3)])
+    return (np.diff(at, axis=0) * (width / len(line))).astype(np.float32)
+
+
+def _refuse_shapes(pixels: Stored, alpha: Stored | None) -> None:
+    is_picture = pixels.ndim == 3 and pixels.shape[2] in (1, 3) and pixels.size > 0
+    fits = alpha is None or (alpha.shape == pixels.shape[:2] and alpha.dtype == pixels.dtype)
+    if not (is_picture and fits and pixels.dtype.name in ("uint8", "uint16", "float32")):
+        raise UnsupportedPhoto(
+            f"pixels are {pixels.shape} of {pixels.dtype}, alpha {None if alpha is None else alpha.shape}",
+            "a photo has (H, W, 1|3) pixels of uint8, uint16 or float32 and perhaps (H, W) alpha alike",
+            "use Photo.from_array",
+        )
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        reason = "it is a folder" if path.is_dir() else error.strerror or str(error)
+        raise UnreadablePhoto(
+            f"{path} cannot be read ({reason})", "a picture file is needed", "check its name and permissions"
+        ) from error

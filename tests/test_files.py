@@ -1,0 +1,239 @@
+"""Finding pictures and writing results: names, trees, link loops, and nothing lost whatever happens."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from brewster.errors import TargetError
+from brewster.files import SUFFIXES, Job, find, write_atomically
+
+
+def touch(folder: Path, *names: str) -> Path:
+    for name in names:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"")
+    return folder
+
+
+def names(jobs: list[Job]) -> dict[str, str]:
+    return {job.source.name: job.name for job in jobs}
+
+
+def test_layers_lie_beside_their_picture_and_keep_its_suffix(tmp_path: Path) -> None:
+    (job,) = find([touch(tmp_path, "view.jpg") / "view.jpg"])
+    assert job.target("transmission") == tmp_path / "view.transmission.jpg"
+    assert job.target("reflection") == tmp_path / "view.reflection.jpg"
+    assert job.target("confidence") == tmp_path / "view.confidence.png"
+    assert job.target("reflection", ".tif") == tmp_path / "view.reflection.tif"
+
+
+@pytest.mark.parametrize("name", ["view.gif", "view.unknown", "view"])
+def test_pictures_whose_format_is_not_written_get_png_layers(tmp_path: Path, name: str) -> None:
+    (job,) = find([touch(tmp_path, name) / name])
+    assert job.target("transmission") == tmp_path / "view.transmission.png"
+
+
+def test_a_folder_is_searched_in_order_and_its_tree_is_mirrored(tmp_path: Path) -> None:
+    touch(tmp_path / "in", "b.jpg", "a.PNG", "deep/er/c.webp", "notes.txt")
+    jobs = find([tmp_path / "in"], into=tmp_path / "out")
+    assert [job.source.name for job in jobs] == ["a.PNG", "b.jpg", "c.webp"]
+    assert jobs[2].target("transmission") == tmp_path / "out/deep/er/c.transmission.webp"
+
+
+def test_hidden_files_and_our_own_results_are_passed_over(tmp_path: Path) -> None:
+    ours = [f"a.{layer}.png" for layer in ("transmission", "reflection", "confidence")]
+    touch(tmp_path, "a.jpg", ".hidden.jpg", ".thumbnails/b.jpg", *ours)
+    assert names(find([tmp_path])) == {"a.jpg": "a"}
+
+
+def test_a_file_asked_for_by_name_is_always_taken(tmp_path: Path) -> None:
+    wanted = ["a.transmission.jpg", ".hidden.jpg", "missing.jpg"]
+    touch(tmp_path, *wanted[:2])
+    assert list(names(find([tmp_path / name for name in wanted]))) == wanted
+
+
+def test_two_pictures_of_one_stem_keep_their_suffix(tmp_path: Path) -> None:
+    touch(tmp_path, "a.jpg", "a.png", "b.jpg")
+    assert names(find([tmp_path])) == {"a.jpg": "a.jpg", "a.png": "a.png", "b.jpg": "b"}
+
+
+def test_names_do_not_depend_on_what_is_asked_for_or_already_done(tmp_path: Path) -> None:
+    touch(tmp_path, "a.jpg", "a.png")
+    before = names(find([tmp_path / "a.jpg"]))
+    touch(tmp_path, "a.jpg.transmission.jpg", "a.jpg.confidence.png")
+    assert before == names(find([tmp_path / "a.jpg"])) == {"a.jpg": "a.jpg"}
+
+
+@settings(max_examples=50, deadline=None, database=None)
+@given(
+    st.sets(
+        st.tuples(
+            st.lists(st.sampled_from(["a", "b", "jpg", "png"]), min_size=1, max_size=3),
+            st.sampled_from(sorted(SUFFIXES)),
+        ).map(lambda parts: ".".join(parts[0]) + parts[1]),
+        max_size=8,
+    )
+)
+def test_no_two_pictures_of_a_folder_share_a_target(
+    tmp_path_factory: pytest.TempPathFactory, files: set[str]
+) -> None:
+    jobs = find([touch(tmp_path_factory.mktemp("pictures"), *files)])
+    targets = {job.target(layer) for job in jobs for layer in ("transmission", "confidence")}
+    assert len(jobs) == len(files)
+    assert len(targets) == 2 * len(files)
+
+
+def test_link_loops_end_and_linked_folders_are_searched_once(tmp_path: Path) -> None:
+    touch(tmp_path, "deep/a.jpg")
+    (tmp_path / "deep" / "loop").symlink_to(tmp_path)
+    (tmp_path / "self.jpg").symlink_to(tmp_path / "self.jpg")
+    jobs = find([tmp_path])
+    assert [job.source.name for job in jobs] == ["a.jpg", "self.jpg"]
+
+
+def test_a_picture_named_twice_is_done_once(tmp_path: Path) -> None:
+    touch(tmp_path, "a.jpg")
+    assert len(find([tmp_path, tmp_path / "a.jpg", tmp_path / "." / "a.jpg"])) == 1
+
+
+def test_pictures_of_two_folders_with_one_target_are_refused_before_any_work(tmp_path: Path) -> None:
+    touch(tmp_path, "x/a.jpg", "y/a.jpg")
+    with pytest.raises(TargetError, match="would both be written"):
+        find([tmp_path / "x/a.jpg", tmp_path / "y/a.jpg"], into=tmp_path / "out")
+
+
+def test_a_folder_that_cannot_be_read_is_left_for_opening_to_explain(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    touch(tmp_path, "locked/a.jpg", "z.jpg")
+    listing = Path.iterdir
+
+    def iterdir(path: Path) -> object:
+        if path.name == "locked":
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return listing(path)
+
+    monkeypatch.setattr(Path, "iterdir", iterdir)
+    assert [job.source.name for job in find([tmp_path])] == ["locked", "z.jpg"]
+
+
+@pytest.mark.parametrize("name", ["two words.jpg", "Kühlhaus été 窓.jpg", "line\nbreak.jpg", "-dash.jpg"])
+def test_names_with_spaces_accents_and_newlines_work(tmp_path: Path, name: str) -> None:
+    (job,) = find([touch(tmp_path, name)])
+    write_atomically(job.target("transmission"), b"layer")
+    assert job.target("transmission").read_bytes() == b"layer"
+    assert job.target("transmission").name == name.replace(".jpg", ".transmission.jpg")
+
+
+def test_writing_makes_the_folder_and_leaves_only_the_file(tmp_path: Path) -> None:
+    write_atomically(tmp_path / "new" / "deep" / "a.png", b"whole")
+    assert [path.name for path in (tmp_path / "new" / "deep").iterdir()] == ["a.png"]
+    assert (tmp_path / "new" / "deep" / "a.png").read_bytes() == b"whole"
+
+
+def test_nothing_is_overwritten_unasked(tmp_path: Path) -> None:
+    path = tmp_path / "a.png"
+    path.write_bytes(b"old")
+    with pytest.raises(TargetError, match="overwrite"):
+        write_atomically(path, b"new")
+    assert path.read_bytes() == b"old"
+    write_atomically(path, b"new", overwrite=True)
+    assert path.read_bytes() == b"new"
+
+
+def test_a_file_that_appears_while_we_write_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, fsync = tmp_path / "a.png", os.fsync
+
+    def meanwhile(descriptor: int) -> None:
+        path.write_bytes(b"theirs")
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", meanwhile)
+    with pytest.raises(TargetError, match="exists"):
+        write_atomically(path, b"ours")
+    assert path.read_bytes() == b"theirs"
+
+
+def test_the_source_is_never_the_target(tmp_path: Path) -> None:
+    source, link = tmp_path / "a.png", tmp_path / "link.png"
+    source.write_bytes(b"picture")
+    link.symlink_to(source)
+    for target in (source, link):
+        with pytest.raises(TargetError, match="the picture itself"):
+            write_atomically(target, b"layer", overwrite=True, source=source)
+    assert source.read_bytes() == b"picture"
+
+
+@pytest.mark.parametrize(
+    ("code", "word"),
+    [(errno.ENOSPC, "free some space"), (errno.EROFS, "writable"), (errno.EIO, "was not written")],
+)
+def test_a_full_or_failing_disk_is_explained_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, word: str
+) -> None:
+    def fail(descriptor: int) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(TargetError, match=word):
+        write_atomically(tmp_path / "a.png", b"layer")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_control_c_leaves_the_old_file_and_no_half_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(descriptor: int) -> None:
+        raise KeyboardInterrupt
+
+    (tmp_path / "a.png").write_bytes(b"old")
+    monkeypatch.setattr(os, "fsync", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        write_atomically(tmp_path / "a.png", b"new", overwrite=True)
+    assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a.png", b"old")]
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_read_only_folder_is_explained(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    with pytest.raises(TargetError, match="writable"):
+        write_atomically(tmp_path / "a.png", b"layer")
+    tmp_path.chmod(0o700)
+
+
+def test_a_read_only_target_is_kept_even_with_overwrite(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a.png").write_bytes(b"old")
+    monkeypatch.setattr(os, "access", lambda path, mode: False)  # root ignores the permission bits
+    with pytest.raises(TargetError, match="writable"):
+        write_atomically(tmp_path / "a.png", b"new", overwrite=True)
+    assert (tmp_path / "a.png").read_bytes() == b"old"
+
+
+def test_file_systems_without_links_are_written_to_as_well(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refuse)
+    write_atomically(tmp_path / "a.png", b"whole")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+
+
+@pytest.mark.parametrize(
+    ("target", "word"), [("folder", "a file"), ("file/a.png", "not written"), ("n" * 300, "shorter")]
+)
+def test_impossible_targets_are_explained(tmp_path: Path, target: str, word: str) -> None:
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(TargetError, match=word):
+        write_atomically(tmp_path / target, b"layer", overwrite=True)

@@ -1,0 +1,343 @@
+"""Photos in and out: what was stored comes back, and so does what the file said beside it."""
+
+from __future__ import annotations
+
+import io
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import pyvips
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from PIL import Image, ImageOps
+
+from brewster.errors import MissingExtra, PhotoError, TargetError, UnsupportedPhoto
+from brewster.photo import DEPTHS, Origin, Photo
+
+quick = settings(max_examples=25, deadline=None, database=None)
+
+P3 = bytes(pyvips.Image.profile_load("p3"))
+LOSSLESS = ("png", "tiff")
+
+
+def noise(height: int = 24, width: int = 40, channels: int = 3, kind: type = np.uint8) -> np.ndarray:
+    white = np.iinfo(kind).max
+    return np.random.default_rng(0).integers(0, white, (height, width, channels), kind, endpoint=True)
+
+
+def smooth(height: int = 48, width: int = 64) -> np.ndarray:
+    down, across = np.mgrid[:height, :width]
+    return np.stack([down * 3, across * 3, 255 - down - across], axis=2).astype(np.uint8)
+
+
+def file_of(array: np.ndarray, kind: str, **options: object) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(array.squeeze()).save(file, kind, **options)
+    return file.getvalue()
+
+
+def pil(data: bytes) -> Image.Image:
+    return Image.open(io.BytesIO(data))
+
+
+def exif_block(orientation: int = 6) -> bytes:
+    """EXIF as cameras write it: big-endian, with a maker note, a date below, and GPS."""
+    exif = Image.Exif()
+    exif.endian = ">"
+    exif[274], exif[271], exif[306] = orientation, "Sextant", "2020:01:02 03:04:05"
+    exif.get_ifd(34665).update({33434: (1, 125), 37500: b"maker\0note\xff", 36867: "2020:01:02 03:04:05"})
+    exif.get_ifd(34853).update({1: "N", 2: (48.0, 8.0, 0.0)})
+    return exif.tobytes()
+
+
+# --- pixels
+
+
+@quick
+@given(
+    arrays.arrays(
+        st.sampled_from([np.uint8, np.uint16]), st.tuples(*[st.integers(1, 9)] * 2, st.sampled_from([1, 3]))
+    )
+)
+def test_pixels_survive_lossless_files_bit_for_bit(pixels: np.ndarray) -> None:
+    photo = Photo.from_array(pixels, encoding="srgb")
+    for container in LOSSLESS:
+        again = Photo.open(photo.encode(container))
+        assert again.pixels.dtype == pixels.dtype
+        assert np.array_equal(again.pixels, pixels)
+
+
+@quick
+@given(arrays.arrays(np.float32, (3, 4, 3), elements=st.floats(0, 1e6, width=32)))
+def test_floats_survive_tiff_and_exr_bit_for_bit(pixels: np.ndarray) -> None:
+    photo = Photo.from_array(pixels, encoding="linear")
+    for container in ("tiff", "exr"):
+        assert np.array_equal(Photo.open(photo.encode(container)).pixels, pixels)
+
+
+@pytest.mark.parametrize(("kind", "channels"), [("L", 1), ("LA", 2), ("RGB", 3), ("RGBA", 4)])
+@pytest.mark.parametrize("container", ["png", "tiff", "webp"])
+def test_grey_stays_grey_and_alpha_is_carried(container: str, kind: str, channels: int) -> None:
+    array = noise(channels=channels)
+    data = file_of(array, container, lossless=True) if container == "webp" else file_of(array, container)
+    again = pil(Photo.open(data).encode())
+    if container != "webp":  # which knows RGB only
+        assert again.mode == kind
+    assert np.array_equal(np.asarray(again.convert("RGBA")), np.asarray(pil(data).convert("RGBA")))
+
+
+def test_sixteen_bit_alpha_survives() -> None:
+    pixels = noise(channels=4, kind=np.uint16)
+    again = Photo.open(Photo.from_array(pixels, encoding="srgb").encode())
+    assert np.array_equal(again.alpha, pixels[..., 3])
+    assert np.array_equal(again.pixels, pixels[..., :3])
+
+
+@pytest.mark.parametrize("mode", ["1", "P"])
+def test_bilevel_and_palette_pictures_are_read_as_what_they_show(mode: str) -> None:
+    image = Image.fromarray(smooth()).convert(mode)
+    file = io.BytesIO()
+    image.save(file, "PNG")
+    assert np.array_equal(
+        Photo.open(file.getvalue()).pixels.squeeze(), image.convert("L" if mode == "1" else "RGB")
+    )
+
+
+def test_a_gif_of_one_picture_is_read_and_written_as_png() -> None:
+    image = Image.fromarray(smooth()).convert("P")
+    file = io.BytesIO()
+    image.save(file, "GIF")
+    photo = Photo.open(file.getvalue())
+    assert photo.origin.container == "png"
+    assert np.array_equal(np.asarray(pil(photo.encode()).convert("RGB")), np.asarray(image.convert("RGB")))
+
+
+@pytest.mark.parametrize("container", ["jpeg", "png", "tiff", "webp", "avif", "exr", "hdr"])
+def test_one_pixel_works_in_every_container(container: str) -> None:
+    photo = Photo.from_array(np.full((1, 1, 3), 128, np.uint8), encoding="srgb")
+    again = Photo.open(photo.encode(container))
+    assert again.size == (1, 1)
+    np.testing.assert_allclose(again.linear(), photo.linear(), atol=0.01)
+
+
+def test_a_panorama_of_20000_by_300_works() -> None:
+    photo = Photo.from_array(np.zeros((300, 20000, 1), np.uint8), encoding="srgb")
+    again = Photo.open(photo.encode("jpeg"))
+    assert again.size == (20000, 300)
+    assert again.small(500, 8).shape == (8, 500, 3)
+
+
+# --- floats
+
+
+def test_exr_keeps_its_half_floats_alpha_and_attributes() -> None:
+    exr = pytest.importorskip("OpenEXR")
+    planes = {name: np.random.default_rng(1).random((5, 7)).astype(np.float16) for name in "RGBA"}
+    file = io.BytesIO()
+    exr.File(
+        {"compression": exr.PIZ_COMPRESSION, "type": exr.scanlineimage, "owner": "me"}, dict(planes)
+    ).write(file)
+    photo = Photo.open(file.getvalue())
+    part = exr.File(io.BytesIO(photo.encode()), separate_channels=True).parts[0]
+    assert part.header["owner"] == "me"
+    assert part.header["compression"] == exr.PIZ_COMPRESSION
+    for name in "RGBA":
+        assert part.channels[name].pixels.dtype == np.float16
+        assert np.array_equal(part.channels[name].pixels, planes[name])
+
+
+def test_radiance_pictures_come_back_bit_equal_and_run_lengths_are_read() -> None:
+    rgbe = noise(height=6, width=16, channels=4)
+    rgbe[..., 0] |= 128
+    rgbe[..., 3] = 120 + rgbe[..., 3] % 20
+    head = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\nEXPOSURE=2\n\n-Y 6 +X 16\n"
+    flat = Photo.open(head + rgbe.tobytes())
+    lines = b""
+    for line in rgbe:
+        lines += b"\2\2\0\x10"
+        for plane in line.T[:3]:
+            lines += b"\x10" + plane.tobytes()
+        lines += bytes((128 + 15, line[0, 3], 1, line[0, 3]))
+    rgbe[..., 3] = rgbe[:, :1, 3]
+    coded = Photo.open(head + lines)
+    formula = rgbe[..., :3] * 2.0 ** (rgbe[..., 3:].astype(float) - 136)
+    np.testing.assert_array_equal(coded.linear(), formula.astype(np.float32))
+    for photo in (flat, coded):
+        again = Photo.open(photo.encode())
+        assert np.array_equal(again.pixels, photo.pixels)
+        assert again.origin.header == {"EXPOSURE": "2"}
+
+
+@pytest.mark.parametrize("stated", ["0 0 0 0 0 0 0 0", "none", "0.3 0.3"])
+def test_primaries_that_span_no_colours_are_passed_over(stated: str) -> None:
+    data = f"#?RADIANCE\nPRIMARIES={stated}\n\n-Y 1 +X 1\n".encode() + bytes((128, 64, 32, 129))
+    np.testing.assert_allclose(Photo.open(data).linear()[0, 0], (1, 0.5, 0.25))
+
+
+@pytest.mark.parametrize("container", ["png", "tiff", "exr", "hdr"])
+def test_light_is_the_same_in_every_container(container: str) -> None:
+    photo = Photo(smooth(), None, Origin(icc=P3))
+    again = Photo.open(photo.encode(container)).linear()
+    np.testing.assert_allclose(again, photo.linear().clip(0 if container == "hdr" else -1), atol=5e-3)
+
+
+@pytest.mark.parametrize(("asked", "dtype"), [(8, np.uint8), (16, np.uint16), (32, np.float32)])
+def test_depth_is_changed_only_when_asked(asked: int, dtype: type) -> None:
+    for photo in (Photo(smooth(), None, Origin(icc=P3)), Photo.from_array(smooth() / 255, encoding="srgb")):
+        again = Photo.open(photo.encode("tiff", depth=asked))
+        assert again.pixels.dtype == dtype
+        np.testing.assert_allclose(again.linear(), photo.linear(), atol=5e-3)
+    assert Photo.open(Photo(smooth(), None, Origin()).encode("tiff")).pixels.dtype == np.uint8
+
+
+# --- HEIC
+
+
+def test_heic_keeps_profile_exif_and_pixels() -> None:
+    pytest.importorskip("pillow_heif")
+    photo = Photo(smooth(), None, Origin(icc=P3, exif=exif_block(1).removeprefix(b"Exif\0\0")))
+    for depth in DEPTHS["heic"]:
+        again = Photo.open(photo.encode("heic", depth=depth))
+        assert (again.origin.container, again.origin.bits) == ("heic", depth)
+        assert (again.origin.icc, again.origin.exif) == (P3, photo.origin.exif)
+        assert np.abs(again.linear() - photo.linear()).mean() < 0.01
+
+
+@pytest.mark.parametrize(("container", "module"), [("heic", "pillow_heif"), ("exr", "OpenEXR")])
+def test_a_missing_extra_names_the_line_that_installs_it(
+    container: str, module: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MissingExtra, match=rf"pip install 'brewster\[{container}\]'"):
+        Photo.from_array(smooth(), encoding="srgb").encode(container)
+
+
+# --- arrays, PIL images, small pictures, saving
+
+
+def test_an_array_needs_its_encoding() -> None:
+    with pytest.raises(PhotoError, match="encoding"):
+        Photo.open(smooth())
+    assert np.array_equal(Photo.open(smooth(), encoding="srgb").pixels, smooth())
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float64])
+def test_arrays_mean_what_their_encoding_says(kind: type) -> None:
+    white = np.iinfo(kind).max if kind != np.float64 else 1
+    half = np.full((2, 2), white * 0.5).astype(kind)
+    encoded = Photo.from_array(half, encoding="srgb").linear()
+    linear = Photo.from_array(half, encoding="linear").linear()
+    np.testing.assert_allclose(encoded, 0.214, atol=2e-3)
+    np.testing.assert_allclose(linear, 0.5, atol=2e-3)
+
+
+def test_a_photo_does_not_change_with_the_array_it_came_from() -> None:
+    array = smooth()
+    photo = Photo.from_array(array, encoding="srgb")
+    array[:] = 0
+    assert np.array_equal(photo.pixels, smooth())
+    with pytest.raises(ValueError, match="read-only"):
+        photo.pixels[0] = 1
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "I;16"])
+def test_pil_images_are_taken_as_they_are(mode: str) -> None:
+    wide = Image.fromarray(noise(channels=1, kind=np.uint16)[..., 0])
+    image = wide if mode == "I;16" else Image.fromarray(smooth()).convert(mode)
+    again = pil(Photo.open(image).encode())
+    if mode == "I;16":
+        assert np.array_equal(np.asarray(again), np.asarray(wide))
+    else:
+        assert np.array_equal(np.asarray(again.convert("RGBA")), np.asarray(image.convert("RGBA")))
+
+
+def test_a_pil_image_brings_its_profile_exif_and_orientation() -> None:
+    image = pil(file_of(smooth(), "JPEG", exif=exif_block(), icc_profile=P3))
+    photo = Photo.open(image)
+    assert photo.origin.icc == P3
+    assert photo.origin.exif == exif_block(1).removeprefix(b"Exif\0\0")
+    assert np.array_equal(photo.pixels, np.asarray(ImageOps.exif_transpose(image)))
+
+
+def test_a_pil_image_of_ink_or_lab_is_refused() -> None:
+    for mode in ("CMYK", "LAB"):
+        image = Image.new(mode, (4, 4))
+        with pytest.raises(UnsupportedPhoto, match=mode):
+            Photo.open(image)
+
+
+@quick
+@given(st.integers(1, 12), st.integers(1, 12), st.integers(1, 30), st.integers(1, 30))
+def test_a_small_picture_holds_the_mean_light_of_each_area(
+    width: int, height: int, across: int, down: int
+) -> None:
+    pixels = noise(down, across)
+    photo = Photo.from_array(pixels, encoding="srgb")
+    repeated = photo.linear().repeat(height, axis=0).repeat(width, axis=1)
+    means = repeated.reshape(height, down, width, across, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(photo.small(width, height), means, atol=1e-5)
+
+
+def test_strips_cover_every_row_once() -> None:
+    photo = Photo.from_array(np.zeros((700, 900, 1), np.uint8), encoding="srgb")
+    rows = [row for strip in photo.strips() for row in range(700)[strip]]
+    assert rows == list(range(700))
+
+
+def test_a_photo_may_be_used_by_many_threads() -> None:
+    photo = Photo(noise(200, 200), None, Origin(icc=P3))
+    with ThreadPoolExecutor(4) as pool:
+        linears = list(pool.map(lambda _: photo.with_linear(photo.linear()).encode(), range(8)))
+    assert len(set(linears)) == 1
+
+
+def test_saving_takes_the_container_from_the_suffix_and_overwrites_nothing(tmp_path: Path) -> None:
+    photo = Photo.from_array(smooth(), encoding="srgb")
+    for suffix, kind in (
+        (".jpg", "JPEG"),
+        (".PNG", "PNG"),
+        (".tif", "TIFF"),
+        (".webp", "WEBP"),
+        (".avif", "AVIF"),
+    ):
+        photo.save(tmp_path / f"a{suffix}")
+        assert pil((tmp_path / f"a{suffix}").read_bytes()).format == kind
+    with pytest.raises(TargetError):
+        photo.save(tmp_path / "a.jpg")
+    photo.save(tmp_path / "a.jpg", overwrite=True)
+
+
+@pytest.mark.parametrize("name", ["a.gif", "a", "a.bmp"])
+def test_saving_to_a_format_we_do_not_write_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(UnsupportedPhoto, match="brewster writes"):
+        Photo.from_array(smooth(), encoding="srgb").save(tmp_path / name)
+
+
+def test_alpha_is_not_dropped_unasked_and_impossible_depths_are_refused() -> None:
+    photo = Photo.from_array(noise(channels=4), encoding="srgb")
+    for container in ("jpeg", "hdr"):
+        with pytest.raises(UnsupportedPhoto, match="alpha"):
+            photo.encode(container)
+    with pytest.raises(UnsupportedPhoto, match="16 bits"):
+        photo.encode("webp", depth=16)
+
+
+def test_a_container_too_small_for_the_picture_says_so() -> None:
+    with pytest.raises(UnsupportedPhoto, match="write PNG"):
+        Photo.from_array(np.zeros((1, 17000, 3), np.uint8), encoding="srgb").encode("webp")
+
+
+def test_the_same_photo_gives_the_same_bytes() -> None:
+    for container in ("jpeg", "png", "tiff", "webp", "avif", "exr", "hdr"):
+        photo = Photo.from_array(smooth(), encoding="srgb")
+        assert photo.encode(container) == photo.encode(container)
+
+
+def test_what_only_some_files_need_is_imported_only_then() -> None:
+    code = "import brewster.photo, sys; assert not {'PIL', 'OpenEXR', 'pillow_heif'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,258 @@
+"""Colour: sRGB by table, matrix profiles both ways, grey, chromaticities; against littleCMS or a formula."""
+
+from __future__ import annotations
+
+import io
+import struct
+
+import numpy as np
+import pytest
+import pyvips
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+from PIL import Image, ImageCms
+
+from brewster import light
+from brewster.errors import UnsupportedPhoto
+from brewster.photo import Origin, Photo
+from brewster.photo.colour import SRGB, Curve, space_of
+
+quick = settings(max_examples=25, deadline=None, database=None)
+
+GAMMA = struct.pack(">4s4xIH", b"curv", 1, round(2.2 * 256))
+STRAIGHT = struct.pack(">4s4xI", b"curv", 0)
+SAMPLED = (
+    struct.pack(">4s4xI", b"curv", 1024) + (np.linspace(0, 1, 1024) ** 1.8 * 65535).astype(">u2").tobytes()
+)
+SRGB_PARA = struct.pack(">4s4xHH", b"para", 3, 0) + struct.pack(
+    ">5i", *(round(65536 * x) for x in (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045))
+)
+ADOBE = ((0.60974, 0.31111, 0.01947), (0.20528, 0.62567, 0.06087), (0.14919, 0.06322, 0.74457))
+PRO = ((0.79767, 0.28804, 0.0), (0.13519, 0.71188, 0.0), (0.03134, 0.00009, 0.82491))
+
+
+def profile(curve: bytes, colourants: tuple[tuple[float, ...], ...] | None) -> bytes:
+    """A small ICC profile: matrix RGB, or grey without colourants."""
+    curve += bytes(-len(curve) % 4)
+    xyz = {
+        name: struct.pack(">4s4x3i", b"XYZ ", *(round(65536 * value) for value in values))
+        for name, values in zip((b"rXYZ", b"gXYZ", b"bXYZ"), colourants or (), strict=False)
+    }
+    white = struct.pack(">4s4x3i", b"XYZ ", 63190, 65536, 54061)
+    text = struct.pack(">4s4xI", b"desc", 5) + b"test\0" + bytes(78)
+    curves = dict.fromkeys((b"rTRC", b"gTRC", b"bTRC") if colourants else (b"kTRC",), curve)
+    tags = {b"desc": text + bytes(-len(text) % 4), b"wtpt": white, **xyz, **curves}
+    rows, body = b"", b""
+    for name, tag in tags.items():
+        rows += struct.pack(">4sII", name, 132 + 12 * len(tags) + len(body), len(tag))
+        body += tag
+    body = struct.pack(">I", len(tags)) + rows + body
+    space = b"RGB " if colourants else b"GRAY"
+    head = struct.pack(
+        ">I4sI4s4s4s12x4s", 128 + len(body), bytes(4), 0x02400000, b"mntr", space, b"XYZ ", b"acsp"
+    )
+    return head.ljust(68, b"\0") + struct.pack(">3i", 63190, 65536, 54061) + bytes(48) + body
+
+
+PROFILES = {
+    "Display P3": bytes(pyvips.Image.profile_load("p3")),
+    "Adobe RGB": profile(GAMMA, ADOBE),
+    "ProPhoto, sampled": profile(SAMPLED, PRO),
+    "linear": profile(STRAIGHT, ADOBE),
+}
+
+
+def stored(pixels: np.ndarray, icc: bytes | None) -> Photo:
+    return Photo(pixels, None, Origin(bits=8 * pixels.dtype.itemsize, icc=icc))
+
+
+def ramp(kind: type, channels: int = 3) -> np.ndarray:
+    """Every value of the type, in each channel in another order."""
+    count = np.iinfo(kind).max + 1
+    order = np.random.default_rng(1)
+    return np.stack([order.permutation(count) for _ in range(channels)], axis=1).astype(kind)[None]
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_srgb_light_is_the_curve_and_every_value_comes_back(kind: type) -> None:
+    photo = stored(ramp(kind), None)
+    formula = light.to_linear(photo.pixels / np.iinfo(kind).max)
+    np.testing.assert_allclose(photo.linear(), formula, atol=1e-7)
+    assert np.array_equal(photo.with_linear(photo.linear()).pixels, photo.pixels)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_new_light_is_rounded_to_the_nearest_value(kind: type) -> None:
+    linear = np.linspace(-0.1, 1.1, 30_000, dtype=np.float32).reshape(10, 1000, 3)
+    white = np.iinfo(kind).max
+    found = stored(np.zeros((10, 1000, 3), kind), None).with_linear(linear).pixels
+    exact = light.to_encoded(linear.clip(0, 1).astype(np.float64)) * white
+    assert np.abs(found - exact).max() <= 0.6
+
+
+@pytest.mark.parametrize("name", PROFILES)
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_unchanged_light_comes_back_bit_equal_through_every_profile(name: str, kind: type) -> None:
+    photo = stored(ramp(kind), PROFILES[name])
+    assert np.array_equal(photo.with_linear(photo.linear()).pixels, photo.pixels)
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_a_profile_agrees_with_littlecms_on_the_way_in(name: str) -> None:
+    pixels = np.random.default_rng(2).integers(0, 256, (32, 32, 3), np.uint8)
+    theirs = ImageCms.profileToProfile(
+        Image.fromarray(pixels),
+        ImageCms.ImageCmsProfile(io.BytesIO(PROFILES[name])),
+        ImageCms.createProfile("sRGB"),
+        renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
+        flags=ImageCms.Flags.NOOPTIMIZE,
+    )
+    ours = light.to_encoded(stored(pixels, PROFILES[name]).linear().clip(0, 1)) * 255
+    assert np.abs(ours - np.asarray(theirs)).max() <= 1
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_a_profile_agrees_with_littlecms_on_the_way_back(name: str) -> None:
+    linear = np.random.default_rng(3).random((32, 32, 3), dtype=np.float32)
+    encoded = np.rint(light.to_encoded(linear) * 255).astype(np.uint8)
+    theirs = ImageCms.profileToProfile(
+        Image.fromarray(encoded),
+        ImageCms.createProfile("sRGB"),
+        ImageCms.ImageCmsProfile(io.BytesIO(PROFILES[name])),
+        renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
+        flags=ImageCms.Flags.NOOPTIMIZE,
+    )
+    ours = stored(np.zeros_like(encoded), PROFILES[name]).with_linear(light.to_linear(encoded / 255)).pixels
+    assert np.abs(ours.astype(int) - np.asarray(theirs)).max() <= 1
+
+
+def test_wide_gamut_is_not_clipped_and_white_stays_white() -> None:
+    green_and_white = np.array([[[0, 255, 0], [255, 255, 255]]], np.uint8)
+    green, white = stored(green_and_white, PROFILES["Display P3"]).linear()[0]
+    assert green[0] < -0.1
+    np.testing.assert_allclose(white, 1, atol=2e-3)
+
+
+@quick
+@given(arrays.arrays(np.float32, (4, 5, 3), elements=st.floats(0, 1, width=32)))
+def test_storing_and_reading_light_is_an_inverse_within_a_sixteen_bit_step(linear: np.ndarray) -> None:
+    for icc in (None, *PROFILES.values()):
+        space = space_of(icc, None, is_float=False)
+        inside = space.to_linear(space.to_stored(linear, np.zeros(linear.shape, np.uint16)))
+        again = space.to_linear(space.to_stored(inside, np.zeros(linear.shape, np.uint16)))
+        np.testing.assert_allclose(again, inside, atol=1e-4)
+
+
+def test_a_strip_means_the_same_light_wherever_it_is_cut() -> None:
+    pixels = np.random.default_rng(4).integers(0, 256, (50, 33, 3), np.uint8)
+    photo = stored(pixels, PROFILES["Adobe RGB"])
+    whole = photo.linear()
+    for top, bottom in ((0, 1), (7, 50), (13, 14)):
+        assert np.array_equal(photo.linear_rows(top, bottom), whole[top:bottom])
+        assert np.array_equal(photo.stored_rows(whole[top:bottom], top), pixels[top:bottom])
+
+
+def test_only_changed_pixels_change() -> None:
+    pixels = np.random.default_rng(5).integers(0, 256, (20, 20, 3), np.uint8)
+    photo = stored(pixels, PROFILES["ProPhoto, sampled"])
+    linear = photo.linear()
+    linear[3, 4] = 0.5
+    changed = (photo.with_linear(linear).pixels != pixels).any(axis=2)
+    assert changed.sum() == 1
+    assert changed[3, 4]
+
+
+@pytest.mark.parametrize(
+    "icc",
+    [
+        bytes(pyvips.Image.profile_load("srgb")),
+        ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes(),
+        profile(
+            SRGB_PARA, ((0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410))
+        ),
+    ],
+)
+def test_a_profile_that_is_srgb_takes_the_fast_path(icc: bytes) -> None:
+    assert space_of(icc, None, is_float=False) == SRGB
+
+
+@pytest.mark.parametrize("icc", [PROFILES["Display P3"], PROFILES["linear"]])
+def test_a_profile_that_is_not_srgb_does_not(icc: bytes) -> None:
+    assert space_of(icc, None, is_float=False) != SRGB
+
+
+def test_grey_profiles_set_the_tone_of_grey_pictures() -> None:
+    photo = stored(ramp(np.uint8, channels=1), profile(GAMMA, None))
+    formula = (photo.pixels[..., 0] / 255) ** (round(2.2 * 256) / 256)
+    np.testing.assert_allclose(photo.linear()[..., 1], formula, atol=1e-6)
+    assert np.array_equal(photo.with_linear(photo.linear()).pixels, photo.pixels)
+
+
+def test_grey_takes_the_luminance_of_coloured_light() -> None:
+    linear = np.zeros((1, 1, 3), np.float32)
+    linear[..., 1] = 1
+    grey = Photo.from_array(np.zeros((1, 1), np.float32), encoding="linear").with_linear(linear)
+    np.testing.assert_allclose(grey.pixels, 0.7152, atol=1e-6)
+
+
+def test_floats_are_stored_as_they_are_beyond_white_and_below_black() -> None:
+    linear = np.array([[[-0.5, 0.25, 7.0]]], np.float32)
+    photo = Photo.from_array(linear, encoding="linear")
+    assert np.array_equal(photo.linear(), linear)
+    assert np.array_equal(photo.with_linear(linear * 2).pixels, linear * 2)
+
+
+def test_floats_with_a_profile_go_through_it_and_back() -> None:
+    pixels = np.random.default_rng(6).random((8, 8, 3), dtype=np.float32)
+    photo = stored(pixels, PROFILES["Adobe RGB"])
+    assert np.array_equal(photo.with_linear(photo.linear()).pixels, pixels)
+    moved = photo.with_linear(photo.linear() * np.float32(0.5)).linear()
+    np.testing.assert_allclose(moved, photo.linear() * 0.5, atol=1e-5)
+
+
+def test_chromaticities_turn_into_rec709_with_white_on_white() -> None:
+    aces = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
+    light_of = space_of(None, aces, is_float=True).to_linear
+    np.testing.assert_allclose(light_of(np.ones((1, 1, 3), np.float32)), 1, atol=1e-4)
+    red = light_of(np.array([[[1, 0, 0]]], np.float32))[0, 0]
+    np.testing.assert_allclose(
+        red, (2.5217, -0.2765, -0.0154), atol=0.01
+    )  # ACES2065-1 to linear sRGB, Bradford
+
+
+@pytest.mark.parametrize(
+    "parameters", [(2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045, 0, 0), (1.8, 1, 0, 0, 0, 0, 0)]
+)
+def test_a_parametric_curve_and_its_inverse_agree(parameters: tuple[float, ...]) -> None:
+    values = np.linspace(0, 1.5, 1000)
+    curve = Curve(parameters=parameters)
+    np.testing.assert_allclose(curve.encode(curve.decode(values)), values, atol=1e-4)
+
+
+@pytest.mark.parametrize(("function", "count"), [(0, 1), (1, 3), (2, 4), (3, 5), (4, 7)])
+def test_all_parametric_functions_of_icc_agree_with_littlecms(function: int, count: int) -> None:
+    numbers = (2.2, 0.9, 0.1, 0.0 if function == 2 else 0.08, 0.05, 0.0, 0.0)[:count]
+    curve = struct.pack(">4s4xHH", b"para", function, 0)
+    curve += struct.pack(f">{count}i", *(round(65536 * number) for number in numbers))
+    test_profile = profile(curve, ADOBE)
+    pixels = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
+    theirs = ImageCms.profileToProfile(
+        Image.fromarray(pixels),
+        ImageCms.ImageCmsProfile(io.BytesIO(test_profile)),
+        ImageCms.createProfile("sRGB"),
+        renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
+        flags=ImageCms.Flags.NOOPTIMIZE,
+    )
+    ours = light.to_encoded(stored(pixels, test_profile).linear().clip(0, 1)) * 255
+    assert np.abs(ours - np.asarray(theirs)).max() <= 1.5
+
+
+@pytest.mark.parametrize(
+    "icc",
+    [b"no profile at all" * 20, bytes(pyvips.Image.profile_load("cmyk")), profile(GAMMA, ADOBE)[:200], b""],
+    ids=["garbage", "tables", "cut short", "empty"],
+)
+def test_profiles_without_curves_and_matrix_are_refused(icc: bytes) -> None:
+    with pytest.raises(UnsupportedPhoto, match="curves and a matrix"):
+        space_of(icc, None, is_float=False)

@@ -1,0 +1,191 @@
+"""What a file says beside its pixels: EXIF, profile, orientation, resolution, quality, compression."""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+
+import numpy as np
+import pytest
+import pyvips
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image, ImageOps
+
+from brewster.photo import Origin, Photo, metadata
+
+quick = settings(max_examples=25, deadline=None, database=None)
+
+P3 = bytes(pyvips.Image.profile_load("p3"))
+XMP = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf tiff:Orientation="6" note="kept"/></x:xmpmeta>'
+UPRIGHT_XMP = XMP.replace(b'"6"', b'"1"')
+
+
+def smooth(height: int = 48, width: int = 64) -> np.ndarray:
+    down, across = np.mgrid[:height, :width]
+    return np.stack([down * 3, across * 3, 255 - down - across], axis=2).astype(np.uint8)
+
+
+def file_of(array: np.ndarray, kind: str, **options: object) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(array.squeeze()).save(file, kind, **options)
+    return file.getvalue()
+
+
+def pil(data: bytes) -> Image.Image:
+    return Image.open(io.BytesIO(data))
+
+
+def exif_block(orientation: int = 6) -> bytes:
+    """EXIF as cameras write it: big-endian, with a maker note, a date below, and GPS."""
+    exif = Image.Exif()
+    exif.endian = ">"
+    exif[274], exif[271], exif[306] = orientation, "Sextant", "2020:01:02 03:04:05"
+    exif.get_ifd(34665).update({33434: (1, 125), 37500: b"maker\0note\xff", 36867: "2020:01:02 03:04:05"})
+    exif.get_ifd(34853).update({1: "N", 2: (48.0, 8.0, 0.0)})
+    return exif.tobytes()
+
+
+# --- lossy files
+
+
+@pytest.mark.parametrize("quality", [1, 30, 75, 92, 100])
+@pytest.mark.parametrize(("subsampling", "word"), [(0, "4:4:4"), (1, "4:2:2"), (2, "4:2:0")])
+def test_jpeg_quality_and_chroma_are_no_worse_than_the_source(
+    quality: int, subsampling: int, word: str
+) -> None:
+    source = file_of(smooth(), "JPEG", quality=quality, subsampling=subsampling)
+    photo = Photo.open(source)
+    written = photo.encode()
+    assert (photo.origin.jpeg_quality, photo.origin.subsampling) == (quality, word)
+    assert metadata.jpeg_subsampling(written) == ("4:2:0" if word == "4:2:0" else "4:4:4")
+    theirs, ours = pil(source).quantization, pil(written).quantization
+    assert all(sum(ours[table]) <= sum(theirs[table]) for table in theirs)
+
+
+def test_odd_quantisation_tables_are_matched_from_below() -> None:
+    flat = [[10] * 64, [12] * 64]
+    written = Photo.open(file_of(smooth(), "JPEG", qtables=flat)).encode()
+    assert [
+        sum(table) <= 64 * row[0] for table, row in zip(pil(written).quantization.values(), flat, strict=True)
+    ]
+
+
+def test_a_grey_jpeg_keeps_its_quality() -> None:
+    photo = Photo.open(file_of(smooth()[..., 0], "JPEG", quality=81))
+    assert photo.origin.jpeg_quality == 81
+    assert pil(photo.encode()).mode == "L"
+
+
+@pytest.mark.parametrize("container", ["webp", "avif"])
+def test_lossless_webp_and_avif_stay_lossless(container: str) -> None:
+    pixels = np.random.default_rng(0).integers(0, 256, (24, 40, 3), np.uint8)
+    origin = Origin(container=container, lossless=True)
+    photo = Photo.open(Photo(pixels, None, origin).encode())
+    assert photo.origin.lossless
+    assert np.array_equal(photo.pixels, pixels)
+    assert np.array_equal(Photo.open(photo.encode()).pixels, pixels)
+
+
+def test_lossy_webp_and_avif_stay_lossy_and_close() -> None:
+    for container in ("webp", "avif"):
+        photo = Photo.open(file_of(smooth(), container))
+        assert not photo.origin.lossless
+        assert np.abs(Photo.open(photo.encode()).pixels.astype(int) - photo.pixels).mean() < 2
+
+
+@pytest.mark.parametrize("bits", [10, 12])
+def test_avif_of_ten_and_twelve_bits_keeps_them_and_its_white(bits: int) -> None:
+    levels = np.linspace(0, 2**bits - 1, 2**bits).round().astype(np.uint16)
+    shifted = np.repeat((levels << (16 - bits)).reshape(32, -1, 1), 3, axis=2)
+    photo = Photo.open(Photo(shifted, None, Origin(container="avif", bits=bits, lossless=True)).encode())
+    assert photo.origin.bits == bits
+    assert photo.pixels.max() == 65535
+    assert np.array_equal(photo.pixels >> (16 - bits), shifted >> (16 - bits))
+    assert np.array_equal(Photo.open(photo.encode()).pixels, photo.pixels)
+
+
+# --- what files say beside their pixels
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("container", ["jpeg", "png", "tiff", "webp"])
+def test_orientation_is_applied_once_as_pillow_does(container: str, orientation: int) -> None:
+    data = file_of(smooth(24, 40), container, exif=exif_block(orientation), quality=95, lossless=True)
+    expected = ImageOps.exif_transpose(pil(data))
+    photo = Photo.open(data)
+    assert photo.size == expected.size
+    assert np.abs(photo.pixels.astype(int) - np.asarray(expected)).max() <= (12 if container == "jpeg" else 0)
+    written = pil(photo.encode())
+    assert written.size == expected.size
+    assert written.getexif()[274] == 1
+
+
+@pytest.mark.parametrize("container", ["jpeg", "png", "webp", "avif"])
+def test_exif_profile_and_xmp_are_kept_byte_for_byte(container: str) -> None:
+    exif, upright = exif_block(), exif_block(1)
+    data = file_of(smooth(), container, exif=exif, icc_profile=P3)
+    photo = Photo.open(data)
+    photo = Photo(photo.pixels, None, Origin(**{**vars(photo.origin), "xmp": UPRIGHT_XMP}))
+    written = pil(photo.encode())
+    found = written.info["exif"].removeprefix(b"Exif\0\0")
+    if container != "avif":  # whose orientation Pillow has taken out before
+        assert found == upright.removeprefix(b"Exif\0\0")
+    assert found == photo.origin.exif
+    assert written.info["icc_profile"] == P3
+    again = Photo.open(photo.encode()).origin
+    assert (again.exif, again.icc, again.xmp) == (photo.origin.exif, P3, UPRIGHT_XMP)
+
+
+def test_a_tiff_keeps_its_cameras_tags() -> None:
+    data = file_of(smooth(), "TIFF", exif=exif_block(), icc_profile=P3)
+    written = pil(Photo.open(data).encode()).getexif()
+    assert (written[271], written[306], written[274]) == ("Sextant", "2020:01:02 03:04:05", 1)
+    assert written.get_ifd(34665)[33434] == (1, 125)
+    assert written.get_ifd(34665)[37500] == b"maker\0note\xff"
+    assert written.get_ifd(34853)[2] == (48.0, 8.0, 0.0)
+    assert Photo.open(Photo.open(data).encode()).origin.icc == P3
+
+
+@pytest.mark.parametrize("container", ["jpeg", "png", "tiff", "webp", "avif"])
+def test_the_cameras_tags_survive_a_change_of_container(container: str) -> None:
+    source = Photo.open(file_of(smooth(), "JPEG", exif=exif_block()))
+    written = pil(source.encode(container)).getexif()
+    assert written[271] == "Sextant"
+    assert written.get_ifd(34665)[36867] == "2020:01:02 03:04:05"
+
+
+@pytest.mark.parametrize("container", ["jpeg", "png", "tiff"])
+def test_resolution_is_kept(container: str) -> None:
+    written = pil(Photo.open(file_of(smooth(), container, dpi=(300, 300))).encode())
+    np.testing.assert_allclose(np.array(written.info["dpi"], float), 300, atol=0.01)
+
+
+@pytest.mark.parametrize("kind", ["raw", "tiff_lzw", "tiff_adobe_deflate", "packbits", "jpeg"])
+def test_a_tiff_keeps_its_kind_of_compression(kind: str) -> None:
+    data = file_of(smooth(), "TIFF", compression=kind)
+    assert pil(Photo.open(data).encode()).info["compression"] == kind
+
+
+def test_xmp_orientation_is_reset_with_the_other() -> None:
+    photo = Photo.open(file_of(smooth(), "JPEG", xmp=XMP, exif=exif_block()))
+    assert photo.origin.xmp == UPRIGHT_XMP
+
+
+@quick
+@given(st.binary(max_size=60), st.sampled_from([b"II*\0", b"MM\0*", b""]), st.integers(0, 70))
+def test_broken_exif_never_breaks_a_picture(rubbish: bytes, order: bytes, at: int) -> None:
+    exif = order + struct.pack("<I", at) + rubbish
+    photo = Photo.open(metadata.with_png_exif(file_of(smooth(4, 4), "PNG"), exif))
+    for container in ("png", "tiff", "jpeg"):
+        assert Photo.open(photo.encode(container)).size == photo.size
+
+
+def test_display_p3_stated_by_number_gets_its_profile() -> None:
+    chunk = b"cICP" + bytes((12, 13, 0, 1))
+    data = file_of(smooth(), "PNG")
+    sized = struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    photo = Photo.open(data[:33] + sized + data[33:])
+    assert photo.origin.icc == P3
+    assert np.array_equal(photo.pixels, smooth())

@@ -1,0 +1,223 @@
+"""Bad pictures: each gives one clear error of three beats, told before a pixel is decoded where possible."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import pyvips
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from brewster.errors import PhotoError, PhotoTooLarge, UnreadablePhoto, UnsupportedPhoto
+from brewster.photo import Photo, metadata
+
+NOISE = np.random.default_rng(0).integers(0, 256, (40, 64, 3), np.uint8)
+
+
+def file_of(kind: str, array: np.ndarray = NOISE, **options: object) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(array).save(file, kind, **options)
+    return file.getvalue()
+
+
+def tiff_of(array: np.ndarray, **options: object) -> bytes:
+    height, width, bands = array.shape
+    kind = {"uint8": "uchar", "uint32": "uint", "float64": "double"}[array.dtype.name]
+    image = pyvips.Image.new_from_memory(np.ascontiguousarray(array).data, width, height, bands, kind)
+    return bytes(image.tiffsave_buffer(**options))
+
+
+def refused(source: object, kind: type[PhotoError], word: str, **options: int) -> None:
+    with pytest.raises(kind, match=word) as caught:
+        Photo.open(source, **options)
+    assert str(caught.value).count("; ") >= 2  # what happened, what was expected, what to do
+
+
+@pytest.mark.parametrize("part", [0.03, 0.3, 0.6, 0.9])
+@pytest.mark.parametrize(
+    ("kind", "options"),
+    [
+        ("JPEG", {}),
+        ("JPEG", {"progressive": True}),
+        ("PNG", {}),
+        ("TIFF", {}),
+        ("TIFF", {"compression": "tiff_lzw"}),
+        ("WEBP", {}),
+        ("WEBP", {"lossless": True}),
+        ("AVIF", {}),
+        ("GIF", {}),
+    ],
+)
+def test_a_truncated_picture_is_no_grey_picture(kind: str, options: dict[str, object], part: float) -> None:
+    data = file_of(kind, **options)
+    refused(data[: int(len(data) * part)], UnreadablePhoto, "read whole")
+
+
+def test_a_tiff_with_missing_tiles_is_truncated_too() -> None:
+    data = tiff_of(NOISE, tile=True, tile_width=16, tile_height=16)
+    assert np.array_equal(Photo.open(data).pixels, NOISE)
+    last = metadata.numbers(metadata.read_tags(data), 324)[-1]
+    beyond = data.replace(struct.pack("<I", last), struct.pack("<I", last + len(data)))
+    refused(beyond, UnreadablePhoto, "pixels are missing")
+
+
+@pytest.mark.parametrize("part", [0.02, 0.5, 0.99])
+@pytest.mark.parametrize("container", ["exr", "hdr"])
+def test_truncated_floats_are_refused(container: str, part: float) -> None:
+    data = Photo.from_array(NOISE, encoding="srgb").encode(container)
+    refused(data[: int(len(data) * part)], PhotoError, "; ")
+
+
+def test_an_empty_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_bytes(b"")
+    refused(tmp_path / "a.jpg", UnreadablePhoto, "empty")
+
+
+def test_text_called_jpg_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_text("Dear diary, today I photographed a window.")
+    refused(str(tmp_path / "a.jpg"), UnreadablePhoto, "Dear diary")
+
+
+def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
+    refused(tmp_path / "none.jpg", UnreadablePhoto, "No such file")
+    refused(tmp_path, UnreadablePhoto, "folder")
+
+
+def test_a_file_we_may_not_read_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def deny(path: Path) -> bytes:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_bytes", deny)
+    refused(tmp_path / "a.jpg", UnreadablePhoto, "Permission denied")
+
+
+@pytest.mark.parametrize("kind", ["BMP", "JPEG2000", "PPM", "ICO"])
+def test_formats_we_do_not_read_are_named(kind: str) -> None:
+    refused(file_of(kind), UnreadablePhoto, "no picture brewster knows")
+
+
+@pytest.mark.parametrize("kind", ["GIF", "WEBP", "PNG", "AVIF", "TIFF"])
+def test_animations_and_pages_are_refused(kind: str) -> None:
+    frames = [Image.fromarray(255 - NOISE)]
+    refused(file_of(kind, save_all=True, append_images=frames), UnsupportedPhoto, "extract the frames")
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "TIFF"])
+def test_cmyk_is_refused(kind: str) -> None:
+    file = io.BytesIO()
+    Image.fromarray(NOISE).convert("CMYK").save(file, kind)
+    refused(file.getvalue(), UnsupportedPhoto, "CMYK")
+
+
+@pytest.mark.parametrize("bands", [5, 6])
+def test_five_channels_and_more_are_refused(bands: int) -> None:
+    refused(tiff_of(np.zeros((4, 4, bands), np.uint8)), UnsupportedPhoto, f"{bands} channels")
+
+
+@pytest.mark.parametrize("kind", [np.uint32, np.float64])
+def test_odd_number_types_are_refused(kind: type) -> None:
+    refused(tiff_of(np.zeros((4, 4, 3), kind)), PhotoError, "3 channels of|common kind")
+
+
+def test_raw_files_are_refused_instead_of_their_preview() -> None:
+    image = Image.fromarray(NOISE)
+    file = io.BytesIO()
+    image.save(file, "TIFF", tiffinfo={50706: b"\1\4\0\0"})
+    refused(file.getvalue(), UnsupportedPhoto, "raw")
+    file = io.BytesIO()
+    image.save(file, "TIFF", tiffinfo={254: 1})
+    refused(file.getvalue(), UnsupportedPhoto, "raw")
+
+
+@pytest.mark.parametrize("transfer", [16, 18])
+def test_hdr_video_colours_are_refused(transfer: int) -> None:
+    data = file_of("PNG")
+    chunk = b"cICP" + bytes((9, transfer, 0, 1))
+    marked = data[:33] + struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) + data[33:]
+    refused(marked, UnsupportedPhoto, "HDR video")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("container", ["exr", "tiff"])
+def test_floats_that_are_no_light_are_refused(container: str, value: float) -> None:
+    pixels = np.zeros((4, 4, 3), np.float32)
+    whole = Photo.from_array(pixels, encoding="linear")
+    broken = pixels.copy()
+    broken[2, 1, 0] = value
+    bad = Photo(broken, None, whole.origin)
+    if container == "tiff" or np.isnan(value):
+        refused(bad.encode(container, depth=32), UnsupportedPhoto, "1 pixels")
+    with pytest.raises(UnsupportedPhoto, match="finite"):
+        Photo.from_array(broken, encoding="linear")
+
+
+def test_an_exr_without_a_picture_is_refused() -> None:
+    exr = pytest.importorskip("OpenEXR")
+    file = io.BytesIO()
+    header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
+    exr.File(header, {"Z": np.zeros((4, 4), np.float32)}).write(file)
+    refused(file.getvalue(), UnsupportedPhoto, "channels Z")
+
+
+def test_a_radiance_picture_of_xyz_or_turned_lines_is_refused() -> None:
+    for head in (b"FORMAT=32-bit_rle_xyze\n\n-Y 1 +X 1\n", b"FORMAT=32-bit_rle_rgbe\n\n+Y 1 +X 1\n"):
+        refused(b"#?RADIANCE\n" + head + bytes(4), UnsupportedPhoto, "RGBE")
+
+
+@settings(max_examples=40, deadline=None, database=None)
+@given(
+    st.sampled_from(["JPEG", "PNG", "TIFF", "WEBP", "AVIF", "GIF"]),
+    st.lists(st.tuples(st.integers(0, 400), st.integers(0, 255)), min_size=1, max_size=5),
+)
+def test_damaged_files_give_a_photo_or_an_error_of_ours(kind: str, damage: list[tuple[int, int]]) -> None:
+    data = bytearray(file_of(kind, NOISE[:16, :16]))
+    for place, value in damage:
+        data[place % len(data)] = value
+    with contextlib.suppress(PhotoError):
+        Photo.open(bytes(data), max_pixels=10_000).encode("png")
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF", "WEBP", "AVIF", "GIF"])
+def test_more_pixels_than_the_limit_are_refused(kind: str) -> None:
+    data = file_of(kind)
+    refused(data, PhotoTooLarge, "64 x 40", max_pixels=64 * 40 - 1)
+    assert Photo.open(data, max_pixels=64 * 40).size == (64, 40)
+
+
+@pytest.mark.parametrize("container", ["exr", "hdr"])
+def test_more_floats_than_the_limit_are_refused(container: str) -> None:
+    data = Photo.from_array(NOISE, encoding="srgb").encode(container)
+    refused(data, PhotoTooLarge, "64 x 40", max_pixels=64 * 40 - 1)
+
+
+def test_a_decompression_bomb_is_refused_from_its_header() -> None:
+    header = struct.pack(">2I5B", 60_000, 60_000, 8, 2, 0, 0, 0)
+    chunk = struct.pack(">I", 13) + b"IHDR" + header + struct.pack(">I", zlib.crc32(b"IHDR" + header))
+    body = struct.pack(">I", 2) + b"IDAT" + b"\x78\x9c" + struct.pack(">I", zlib.crc32(b"IDAT\x78\x9c"))
+    refused(b"\x89PNG\r\n\x1a\n" + chunk + body, PhotoTooLarge, "60000 x 60000")
+
+
+@pytest.mark.parametrize("shape", [(4,), (4, 4, 2), (4, 4, 5), (0, 4, 3), (1, 4, 4, 3)])
+def test_arrays_that_are_no_pictures_are_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(UnsupportedPhoto):
+        Photo.from_array(np.zeros(shape, np.uint8), encoding="srgb")
+
+
+@pytest.mark.parametrize("kind", [np.int8, np.int64, np.complex64, bool])
+def test_arrays_of_odd_numbers_are_refused(kind: type) -> None:
+    with pytest.raises(UnsupportedPhoto):
+        Photo.from_array(np.zeros((4, 4, 3), kind), encoding="srgb")
+
+
+def test_new_pixels_must_fit_the_photo() -> None:
+    photo = Photo.from_array(NOISE, encoding="srgb")
+    for other in (NOISE[:-1], NOISE.astype(np.uint16)):
+        with pytest.raises(PhotoError, match="with_linear"):
+            photo.with_pixels(other)
