@@ -1,5 +1,20 @@
-"""How do I use it? `Separator` and `separate`; a photograph here wakes no renderer and no trainer."""
+"""How do I use it? `Separator` and `separate`; a photograph here wakes no renderer and no trainer.
 
-from brewster.separate.separator import QUALITIES, Quality, Separation, Separator, separate
+`brewster.separate` names this room and the function in it, so the room can be called:
+`brewster.separate("window.jpg")` is `brewster.separate.separate("window.jpg")`.
+"""
+
+import sys
+from types import ModuleType
+
+from brewster.options import Quality
+from brewster.separate.separator import QUALITIES, Separation, Separator, separate
 
 __all__ = ["QUALITIES", "Quality", "Separation", "Separator", "separate"]
+
+
+class _Room(ModuleType):
+    __call__ = staticmethod(separate)
+
+
+sys.modules[__name__].__class__ = _Room

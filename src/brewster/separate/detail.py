@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float32]
 
 _RADIUS: Final = 2
-_VARIANCE_FLOOR: Final = 1e-3
+_VARIANCE_FLOOR: Final = 4e-3
 
 
 @final
@@ -73,7 +73,7 @@ def _between(map_: Floats, before: NDArray[np.intp], past: Floats, *, axis: int)
     shape = [1] * map_.ndim
     shape[axis] = -1
     low = np.take(map_, before, axis=axis)
-    high = np.take(map_, np.minimum(before + 1, map_.shape[axis] - 1), axis=axis)
+    high: Floats = np.take(map_, np.minimum(before + 1, map_.shape[axis] - 1), axis=axis)
     high -= low
     high *= past.reshape(shape)
     high += low

@@ -15,28 +15,26 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from typing import Final, Literal, final
+from dataclasses import dataclass, field, replace
+from typing import Final, final
 
 import numpy as np
 
 from brewster.errors import BrewsterError
 from brewster.light import to_encoded
 from brewster.models.zoo import find_model
-from brewster.photo import Photo, Source
+from brewster.options import Quality
+from brewster.photo import DEFAULT_MAX_PIXELS, Encoding, Origin, Photo, Source
 from brewster.separate.detail import Floats, Transfer, enlarge_rows
 from brewster.separate.runtime import OnnxBackend
 from brewster.separate.tiles import Backend, in_tiles
 
-Quality = Literal["draft", "standard", "best"]
-
-QUALITIES: Final[dict[str, int]] = {"draft": 100_000, "standard": 250_000, "best": 600_000}
+QUALITIES: Final[dict[Quality, int]] = {"draft": 100_000, "standard": 250_000, "best": 600_000}
 """Pixels of the small copy that the network sees."""
 
 _SHORTEST_SIDE_PX: Final = 192
 _TILE_PX: Final = 1024
 _OVERLAP_PX: Final = 192
-_STRIP_PX: Final = 1_000_000
 _WORKERS: Final = 2
 _UNSURE: Final = 0.05
 """Disagreement of the two views, in sRGB-encoded units, at which confidence has fallen to 1/e."""
@@ -86,61 +84,70 @@ class Separator:
 
     def __call__(
         self,
-        source: Source | Photo,
+        source: Source,
         *,
         strength: float = 1.0,
         quality: Quality = "standard",
         additive: bool = False,
+        encoding: Encoding | None = None,
+        max_pixels: int = DEFAULT_MAX_PIXELS,
     ) -> Separation:
-        """Separates a path, bytes, PIL image, array (see `Photo.from_array`) or `Photo`.
+        """Separates a photograph; safe to call from many threads at once.
 
         Args:
-            source: the photograph.
+            source: a path, the bytes of a file, a PIL image, a `Photo`, or an array (see `Photo.from_array`).
             strength: 0 returns the photo itself, 1 the whole separation; between, a share of it.
             quality: how large a copy the network sees.
             additive: layers of 32-bit floats that sum to the photo exactly in linear light, for compositing.
+            encoding: what an array's numbers mean, "srgb" or "linear".
+            max_pixels: larger pictures are refused before they are decoded.
 
         Raises:
-            PhotoError: the source cannot be read.
+            PhotoError: the source cannot be read, or is too large.
             BrewsterError: strength or quality out of range.
         """
         _check(strength, quality)
         seconds: dict[str, float] = {}
         with _clock(seconds, "decode"):
-            photo = source if isinstance(source, Photo) else Photo.of(source)
+            photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
             small = np.clip(photo.small(*_work_size(photo.size, QUALITIES[quality])), 0, 1)
         with _clock(seconds, "network"):
             transmission, reflection, sure = self._two_views(small)
         with _clock(seconds, "detail"):
             transfer = Transfer.learn(small, small + strength * (transmission - small), strength * reflection)
-            layers, remainder = _at_full_size(photo, transfer, additive=additive)
-            confidence = _enlarged(sure, photo.size)
-        return Separation(photo, *layers, confidence, remainder, self.name, self.sha256, self.device, seconds)
+            at_full_size = _at_full_size_additive if additive else _at_full_size
+            whole, mirrored, remainder = at_full_size(photo, transfer)
+            confidence = _enlarged(sure, photo)
+        made_by = self.name, self.sha256, self.device
+        return Separation(photo, whole, mirrored, confidence, remainder, *made_by, seconds)
 
     def _two_views(self, small: Floats) -> tuple[Floats, Floats, Floats]:
         """Transmission, reflection and confidence (h, w, 1) of the small copy."""
         plain = self._separate(small)
         mirrored = [layer[:, ::-1] for layer in self._separate(np.ascontiguousarray(small[:, ::-1]))]
-        transmission, reflection = ((one + other) / 2 for one, other in zip(plain, mirrored, strict=True))
+        transmission, reflection = (
+            (one + other) * np.float32(0.5) for one, other in zip(plain, mirrored, strict=True)
+        )
         apart = np.abs(to_encoded(plain[0]) - to_encoded(mirrored[0])).max(axis=2, keepdims=True)
-        return transmission, reflection, np.exp(-apart / _UNSURE)
+        return transmission, reflection, np.exp(-apart / np.float32(_UNSURE))
 
     def _separate(self, small: Floats) -> tuple[Floats, Floats]:
         return in_tiles(self._backend, small, tile_px=_TILE_PX, overlap_px=_OVERLAP_PX)
 
 
 def separate(
-    source: Source | Photo,
+    source: Source,
     *,
     model: str = "compact",
     device: str = "auto",
     strength: float = 1.0,
     quality: Quality = "standard",
     additive: bool = False,
+    encoding: Encoding | None = None,
 ) -> Separation:
-    """Separates one photograph; for many, `Separator.load` once and call it. Raises what they raise."""
+    """Separates one photograph; for many, `Separator.load` once and call it. Options and errors are theirs."""
     separator = Separator.load(model, device=device)
-    return separator(source, strength=strength, quality=quality, additive=additive)
+    return separator(source, strength=strength, quality=quality, additive=additive, encoding=encoding)
 
 
 def _check(strength: float, quality: str) -> None:
@@ -158,43 +165,42 @@ def _work_size(size: tuple[int, int], pixels: int) -> tuple[int, int]:
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def _at_full_size(photo: Photo, transfer: Transfer, *, additive: bool) -> tuple[list[Photo], float]:
-    """Both layers as photos, made strip by strip, and the mean unexplained remainder."""
-    width, height = photo.size
-    kind = (np.float32, 3) if additive else (photo.pixels.dtype, photo.pixels.shape[2])
-    canvases = [np.empty((height, width, kind[1]), kind[0]) for _ in range(2)]
+def _at_full_size(photo: Photo, transfer: Transfer) -> tuple[Photo, Photo, float]:
+    """Both layers, stored as the photo is, and the mean unexplained remainder."""
+    canvases = np.empty_like(photo.pixels), np.empty_like(photo.pixels)
 
     def fill(rows: slice) -> float:
         linear = photo.linear_rows(rows.start, rows.stop)
-        layers = transfer.apply(linear, rows.start, height)
-        if additive:
-            layers = _summing_exactly(linear, layers[0])
+        layers = transfer.apply(linear, rows.start, photo.size[1])
         for canvas, layer in zip(canvases, layers, strict=True):
-            canvas[rows] = layer if additive else photo.stored_rows(layer, rows.start)
+            canvas[rows] = photo.stored_rows(layer, rows.start)
         return float(np.abs(linear - layers[0] - layers[1]).sum(dtype=np.float64))
 
-    step = max(1, _STRIP_PX // width)
-    strips = [slice(top, min(top + step, height)) for top in range(0, height, step)]
     with ThreadPoolExecutor(_WORKERS) as pool:
-        unexplained = sum(pool.map(fill, strips))
-    layers = [photo.with_pixels(canvas) for canvas in canvases]
-    return layers, unexplained / (width * height * 3)
+        unexplained = sum(pool.map(fill, photo.strips()))
+    transmission, reflection = (photo.with_pixels(canvas) for canvas in canvases)
+    return transmission, reflection, unexplained / (math.prod(photo.size) * 3)
 
 
-def _summing_exactly(photo: Floats, transmission: Floats) -> tuple[Floats, Floats]:
-    """Two layers whose float sum is the photo, to the last bit: one difference is exact (Sterbenz 1974)."""
-    reflection = photo - np.minimum(transmission, photo)
-    return photo - reflection, reflection
+def _at_full_size_additive(photo: Photo, transfer: Transfer) -> tuple[Photo, Photo, float]:
+    """Both layers as 32-bit floats whose sum is the photo's light to the last bit: nothing is unexplained."""
+    linear = photo.linear()
+    transmission, _ = transfer.apply(linear, 0, photo.size[1])
+    reflection = linear - np.minimum(transmission, linear)
+    # Of these two differences at least one is exact (Sterbenz 1974), which makes the sum exact.
+    layers = linear - reflection, reflection
+    origin = Origin(container="tiff", bits=32, exif=photo.origin.exif, resolution=photo.origin.resolution)
+    one, other = (replace(Photo.from_array(layer, encoding="linear"), origin=origin) for layer in layers)
+    return one, other, 0.0
 
 
-def _enlarged(map_: Floats, size: tuple[int, int]) -> Photo:
-    width, height = size
-    step = max(1, _STRIP_PX // width)
-    rows = [
-        np.rint(255 * enlarge_rows(map_, top, min(step, height - top), (height, width))).astype(np.uint8)
-        for top in range(0, height, step)
-    ]
-    return Photo.from_array(np.concatenate(rows), encoding="srgb")
+def _enlarged(map_: Floats, photo: Photo) -> Photo:
+    """A map (h, w, 1) in 0..1 as a grey 8-bit picture of the photo's size."""
+    width, height = photo.size
+    canvas = np.empty((height, width, 1), np.uint8)
+    for rows in photo.strips():
+        canvas[rows] = np.rint(255 * enlarge_rows(map_, rows.start, rows.stop - rows.start, (height, width)))
+    return Photo(canvas)
 
 
 @contextmanager
