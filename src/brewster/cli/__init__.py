@@ -1,0 +1,78 @@
+"""How do I use it? The command `brewster`; click and rich are used in this room only.
+
+Commands import what they need when they run, so that `brewster --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from pathlib import Path
+
+import click
+
+import brewster
+from brewster.cli import doctor, models, separate, train
+from brewster.cli.terminal import complain, interrupts, say
+from brewster.errors import BrewsterError
+
+_STOPPED = 130  # what a shell expects after Ctrl-C: 128 + SIGINT
+_OWN_OPTIONS = {"--help", "--version"}
+
+
+class _FrontDoor(click.Group):
+    """Whatever is no command is a photo."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """`PHOTO...` becomes `separate PHOTO...`."""
+        if args and args[0] not in self.commands and args[0] not in _OWN_OPTIONS:
+            self._refuse_misspelt(ctx, args[0])
+            args = ["separate", *args]
+        return super().parse_args(ctx, args)
+
+    def _refuse_misspelt(self, ctx: click.Context, word: str) -> None:
+        close = difflib.get_close_matches(word, self.commands, n=1, cutoff=0.7)
+        if close and word.isalpha() and not Path(word).exists():
+            ctx.fail(f"There is neither a photo nor a command {word!r}. Did you mean {close[0]}?")
+
+
+def _print_version(context: click.Context, _parameter: click.Parameter, asked: bool) -> None:
+    if asked and not context.resilient_parsing:
+        click.echo(f"brewster {brewster.__version__}")
+        context.exit()
+
+
+@click.group(cls=_FrontDoor, subcommand_metavar="PHOTO... | COMMAND [ARGS]...")
+@click.option(
+    "--version",
+    is_flag=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_print_version,
+    help="Print the version.",
+)
+def cli() -> None:
+    """Separate a photograph taken through glass into what is behind the glass and what is mirrored in it.
+
+    `brewster PHOTO...` is short for `brewster separate PHOTO...`, whose options `brewster separate --help` shows.
+    """
+
+
+for _command in (separate.separate, models.models, doctor.doctor, train.train):
+    cli.add_command(_command)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Runs the command line; returns the exit code: 0 fine, 1 an error, 2 a wrong usage, 130 Ctrl-C."""
+    try:
+        with interrupts.noticed():
+            return int(cli.main(args, prog_name="brewster", standalone_mode=False) or 0)
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except click.Abort:
+        say("stopped: what was finished is kept, and the same command goes on from there")
+        return _STOPPED
+    except BrewsterError as error:
+        complain(error)
+        return 1

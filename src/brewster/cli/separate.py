@@ -1,0 +1,151 @@
+"""`brewster separate`: the command and its options, which are made from `Options`."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import sys
+from collections.abc import Callable
+from types import NoneType
+from typing import Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
+
+import click
+from click.core import ParameterSource
+
+from brewster.cli.batch import Batch, goes_to_one_file, plan
+from brewster.errors import BrewsterError
+from brewster.options import Options
+
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+
+
+class _Number(click.FloatRange):
+    """A number in a range; `nan` is neither below nor above it, and no number."""
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """The number, or a usage error."""
+        number = float(super().convert(cast("float", value), param, ctx))
+        if math.isnan(number):
+            self.fail(f"{value} is not a number.", param, ctx)
+        return number
+
+
+class _Words(click.ParamType[tuple[str, ...]]):
+    """Words with commas between, each of them known."""
+
+    name = "words"
+
+    def __init__(self, known: tuple[str, ...]) -> None:
+        self.known = known
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:  # noqa: ARG002
+        """How help shows the value."""
+        return "LAYER,..."
+
+    def convert(
+        self, value: object, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, ...]:
+        """The words, each once, in the known order; or a usage error."""
+        words = str(value).split(",")
+        unknown = [word for word in words if word not in self.known]
+        if unknown:
+            self.fail(f"{unknown[0]!r} is not one of {', '.join(self.known)}.", param, ctx)
+        return tuple(word for word in self.known if word in words)
+
+
+def _with_options(command: _Command) -> _Command:
+    """Gives a command one option for every field of `Options`."""
+    hints = get_type_hints(Options)
+    for field in reversed(dataclasses.fields(Options)):
+        command = _option(field, hints[field.name])(command)
+    return command
+
+
+def _option(field: dataclasses.Field[Any], hint: object) -> Callable[[_Command], _Command]:
+    name, description = f"--{field.name.replace('_', '-')}", field.metadata["description"]
+    if hint is bool:
+        return click.option(name, is_flag=True, help=description)
+    default = ",".join(field.default) if isinstance(field.default, tuple) else field.default
+    return click.option(
+        name,
+        type=_kind(hint, field),
+        default=default,
+        show_default=default is not None,
+        metavar="NUMBER" if hint in (int, float) else None,
+        help=description,
+    )
+
+
+def _kind(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[Any]:
+    low, high = field.metadata.get("ge"), field.metadata.get("le")
+    if NoneType in get_args(hint):
+        return _kind(get_args(hint)[0], field)
+    if hint is float:
+        return _Number(low, high)
+    if hint is int:
+        return click.IntRange(low, high)
+    if get_origin(hint) is tuple:
+        return _Words(get_args(get_args(hint)[0]))
+    return click.Choice(get_args(hint)) if get_origin(hint) is Literal else click.STRING
+
+
+@click.command
+@click.argument("photos", nargs=-1, required=True, metavar="PHOTO...")
+@click.option(
+    "-o",
+    "--output",
+    metavar="FOLDER|PICTURE|-",
+    help="Where the layers go: a folder, the name of a picture for one layer, or - for standard output.",
+)
+@_with_options
+@click.option(
+    "--json", "as_json", is_flag=True, help="Print one line of JSON for each photo on standard output."
+)
+@click.option("--quiet", is_flag=True, help="Say nothing but errors.")
+@click.option("--dry-run", is_flag=True, help="Print what would be written, and write nothing.")
+@click.option("--overwrite", is_flag=True, help="Replace layers that are there already.")
+@click.pass_context
+def separate(
+    context: click.Context,
+    /,
+    *,
+    photos: tuple[str, ...],
+    output: str | None,
+    as_json: bool,
+    quiet: bool,
+    dry_run: bool,
+    overwrite: bool,
+    **asked: object,
+) -> None:
+    """Separate photographs taken through glass.
+
+    PHOTO is a picture, a folder of pictures, or - for standard input. The layers of photo.jpg are written beside
+    it as photo.transmission.jpg and photo.reflection.jpg, or into the folder named with -o, where the tree below
+    a folder is mirrored. Where there is place for one layer only (standard output, or a picture named with -o),
+    it is the transmission unless --layers says otherwise.
+
+    Photos whose layers are there already are skipped. A photo that fails does not stop the others: it is named at
+    the end, and the exit code is 1.
+    """
+    one_file = goes_to_one_file(photos, output)
+    if one_file and context.get_parameter_source("layers") is ParameterSource.DEFAULT:
+        asked["layers"] = ("transmission",)
+    try:
+        options = Options(**cast("dict[str, Any]", asked))
+    except BrewsterError as error:
+        raise click.UsageError(str(error)) from error
+    tasks = plan(photos, output, options)
+    if None in tasks[0].targets.values() and not dry_run:
+        _refuse_occupied_output(as_json=as_json)
+    batch = Batch(options, overwrite=overwrite, dry_run=dry_run, as_json=as_json, quiet=quiet)
+    context.exit(0 if batch.run(tasks) else 1)
+
+
+def _refuse_occupied_output(*, as_json: bool) -> None:
+    """A picture goes to standard output: nothing else may, and nobody may be reading there."""
+    if as_json:
+        raise click.UsageError("--json and a picture cannot share standard output: name the picture with -o.")
+    if sys.stdout.isatty():
+        raise click.UsageError(
+            "A picture would go to the terminal: send it on with > or |, or name it with -o."
+        )

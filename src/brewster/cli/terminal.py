@@ -1,0 +1,112 @@
+"""What the command line says and where, results on standard output and all else on standard error; and Ctrl-C."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, final
+
+from brewster.errors import TargetError
+
+if TYPE_CHECKING:
+    from sys import UnraisableHookArgs
+
+Advance = Callable[[int, str], None]
+"""Called with how many are done and what comes next, or how it goes."""
+
+
+@final
+class _Interrupts:
+    """Ctrl-C that got lost.
+
+    Where C code calls Python (libvips does, whenever it has something to log), no exception can pass: Python drops
+    a KeyboardInterrupt there, and the work would go on as if nobody had pressed anything.
+    """
+
+    def __init__(self) -> None:
+        self._lost = False
+
+    @contextmanager
+    def noticed(self) -> Iterator[None]:
+        """Notices within this block when an interrupt is dropped."""
+        hook = sys.unraisablehook
+
+        def notice(dropped: UnraisableHookArgs) -> None:
+            if dropped.exc_type is KeyboardInterrupt:
+                self._lost = True
+            else:
+                hook(dropped)
+
+        self._lost, sys.unraisablehook = False, notice
+        try:
+            yield
+        finally:
+            sys.unraisablehook = hook
+
+    def heed(self) -> None:
+        """Raises the interrupt that was dropped, if there was one: to be called before what cannot be undone."""
+        if self._lost:
+            self._lost = False
+            raise KeyboardInterrupt
+
+
+interrupts = _Interrupts()
+
+
+def one_line(text: object) -> str:
+    """Text as it can stand in one line: file names may hold newlines, and bytes that are no text."""
+    return "".join(
+        letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in str(text)
+    )
+
+
+def say(text: object) -> None:
+    """One line on standard error."""
+    sys.stderr.write(f"{one_line(text)}\n")
+    sys.stderr.flush()
+
+
+def complain(text: object) -> None:
+    """One line on standard error that says what went wrong."""
+    say(f"error: {text}")
+
+
+def write_out(data: bytes) -> None:
+    """Bytes to standard output, now.
+
+    Raises:
+        TargetError: they cannot be written.
+    """
+    try:
+        sys.stdout.buffer.write(data)
+        sys.stdout.flush()
+    except OSError as error:
+        # What is still in the buffer must not fail again when Python ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise TargetError(
+            f"standard output was not written ({error.strerror})",
+            "somebody must take all of it",
+            "write to a file with -o",
+        ) from error
+
+
+@contextmanager
+def progress(total: int, *, shown: bool) -> Iterator[Advance]:
+    """A bar on standard error, if that is a terminal and the bar is to be shown."""
+    if not (shown and sys.stderr.isatty()):
+        yield lambda _done, _text: None
+        return
+    from rich.console import Console  # noqa: PLC0415  (only a terminal pays for it)
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn  # noqa: PLC0415
+
+    columns = (
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.description}", markup=False),
+    )
+    with Progress(*columns, console=Console(stderr=True), redirect_stdout=False, transient=True) as bar:
+        task = bar.add_task("", total=total)
+        yield lambda done, text: bar.update(task, completed=done, description=one_line(text))

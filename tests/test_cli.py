@@ -1,0 +1,550 @@
+"""The front door: what may be asked, what stands in the help, and where the answers go."""
+
+import io
+import json
+import os
+import pty
+import subprocess
+import sys
+import tomllib
+from dataclasses import fields
+from pathlib import Path
+from typing import get_args, get_type_hints
+
+import click
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper
+from pydantic import TypeAdapter, ValidationError
+
+import brewster
+from brewster import Photo, files, photo
+from brewster.cli import cli, main
+from brewster.cli.doctor import CORE, EXTRAS
+from brewster.cli.reference import reference
+from brewster.errors import BrewsterError
+from brewster.models import zoo
+from brewster.options import Options
+from brewster.separate import QUALITIES
+from brewster.separate.runtime import DEVICES
+
+ROOT = Path(__file__).parents[1]
+
+
+def write_pane(path):
+    """An ONNX model of a pane that lets 80 % through and mirrors 20 %."""
+    shape = [1, 3, "height", "width"]
+    shares = {"transmission": 0.8, "reflection": 0.2}
+    graph = helper.make_graph(
+        [helper.make_node("Mul", ["photo", f"{name}_share"], [name]) for name in shares],
+        "pane",
+        [helper.make_tensor_value_info("photo", TensorProto.FLOAT, shape)],
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name in shares],
+        [
+            helper.make_tensor(f"{name}_share", TensorProto.FLOAT, [], [share])
+            for name, share in shares.items()
+        ],
+    )
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10), path)
+    return path
+
+
+def picture(width=60, height=40, container="jpeg", seed=1):
+    """The bytes of a picture."""
+    small = np.random.default_rng(seed).integers(0, 256, (height // 10 + 1, width // 10 + 1, 3), np.uint8)
+    array = np.kron(small, np.ones((10, 10, 1), np.uint8))[:height, :width]
+    return Photo.from_array(array, encoding="srgb").encode(container)
+
+
+@pytest.fixture(scope="session")
+def model(tmp_path_factory):
+    return write_pane(tmp_path_factory.mktemp("model") / "pane.onnx")
+
+
+@pytest.fixture
+def run(model, monkeypatch, tmp_path, capfdbinary):
+    """Runs a command in an empty folder: exit code, standard output (bytes) and standard error (text)."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*args, stdin=b"", with_model=True):
+        monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(stdin)))
+        code = main([*map(str, args), *(["--model", str(model)] if with_model else [])])
+        out, err = capfdbinary.readouterr()
+        return code, out, err.decode()
+
+    return run
+
+
+@pytest.fixture
+def bare(run):
+    """The same for commands that take no model."""
+    return lambda *args: run(*args, with_model=False)
+
+
+def as_user(*args, **how):
+    """The same in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "brewster", *map(str, args)], capture_output=True, check=False, **how
+    )
+
+
+def commands(command=cli, path=()):
+    yield path, command
+    if isinstance(command, click.Group):
+        for name, child in command.commands.items():
+            yield from commands(child, (*path, name))
+
+
+def tree(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+# --- help and documentation
+
+
+@pytest.mark.parametrize("start", ["import brewster", "import brewster.cli; brewster.cli.main(['--help'])"])
+def test_help_comes_without_waking_a_library(start):
+    code = f"{start}\nimport sys; print(' '.join(sys.modules), file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    heavy = {"torch", "onnxruntime", "pyvips", "numpy", "pydantic", "rich", "OpenEXR", "onnx", "PIL"}
+    assert not heavy & set(done.stderr.split())
+
+
+def test_help_answers_at_once():
+    """0.35 s where nothing else runs; processor time is measured, with room for a busy machine."""
+    before = os.times()
+    assert as_user("--help").returncode == 0
+    after = os.times()
+    assert after.children_user + after.children_system - before.children_user - before.children_system < 0.7
+
+
+def test_every_command_and_every_option_is_explained_in_a_sentence():
+    for path, command in commands():
+        assert command.help, path
+        for option in (param for param in command.params if isinstance(param, click.Option)):
+            assert option.help, f"{path} {option.name}"
+            assert option.help[0].isupper(), option.help
+            assert option.help.endswith("."), option.help
+
+
+def test_the_reference_in_the_docs_is_the_one_that_the_commands_give():
+    assert (ROOT / "docs" / "reference.md").read_text() == reference(), "run make docs"
+
+
+def test_the_reference_names_every_command_and_every_option():
+    text = reference()
+    for path, command in commands():
+        assert f"## {' '.join(('brewster', *path))}\n" in text
+        for option in (param for param in command.params if isinstance(param, click.Option)):
+            assert option.opts[-1] in text
+
+
+def test_the_version_is_the_packages(bare):
+    assert bare("--version") == (0, f"brewster {brewster.__version__}\n".encode(), "")
+
+
+# --- the options are those of the rooms below
+
+
+def test_the_options_offer_what_the_rooms_below_take():
+    hints = get_type_hints(Options)
+    assert get_args(hints["quality"]) == tuple(QUALITIES)
+    assert set(get_args(hints["device"])) == set(DEVICES)
+    assert get_args(get_args(hints["layers"])[0]) == files.LAYERS
+    assert set(get_args(get_args(hints["format"])[0])) == set(photo.DEPTHS)
+    assert Options().max_pixels == photo.DEFAULT_MAX_PIXELS
+
+
+def test_every_option_of_a_separation_is_an_option_of_the_command():
+    offered = {param.name for param in cli.commands["separate"].params}
+    assert {field.name for field in fields(Options)} <= offered
+
+
+def test_a_web_form_can_be_made_from_the_same_options():
+    form = TypeAdapter(Options)
+    schema = form.json_schema()["properties"]
+    assert schema["strength"]["maximum"] == 1
+    assert all(field["description"] for field in schema.values())
+    assert form.validate_python({"strength": "0.5", "layers": ["confidence"]}).strength == 0.5
+    with pytest.raises(ValidationError):
+        form.validate_python({"strength": 2})
+
+
+def test_additive_layers_are_refused_in_containers_without_floats():
+    with pytest.raises(BrewsterError, match="tiff or exr"):
+        Options(additive=True, format="jpeg")
+
+
+# --- one photo
+
+
+def test_a_photo_without_a_command_is_separated_beside_itself(run, tmp_path):
+    (tmp_path / "photo.jpg").write_bytes(picture())
+    code, out, err = run("photo.jpg")
+    assert (code, out) == (0, b"")
+    assert tree(tmp_path) == ["photo.jpg", "photo.reflection.jpg", "photo.transmission.jpg"]
+    assert "photo.transmission.jpg, photo.reflection.jpg" in err
+
+
+@pytest.mark.parametrize(
+    "words", [["separate", "a.png", "-o", "x"], ["a.png", "-o", "x"], ["-o", "x", "a.png"]]
+)
+def test_separate_may_be_said_or_not_and_options_may_come_first(run, tmp_path, words):
+    (tmp_path / "a.png").write_bytes(picture(container="png"))
+    assert run(*words)[0] == 0
+    assert tree(tmp_path / "x") == ["a.reflection.png", "a.transmission.png"]
+
+
+def test_the_layers_are_what_the_model_says(run, tmp_path):
+    grey = np.full((40, 40, 3), 128, np.uint8)
+    (tmp_path / "a.png").write_bytes(Photo.from_array(grey, encoding="srgb").encode("png"))
+    assert run("a.png")[0] == 0
+    light = Photo.from_array(grey, encoding="srgb").linear().mean()
+    for layer, share in (("transmission", 0.8), ("reflection", 0.2)):
+        assert Photo.open(tmp_path / f"a.{layer}.png").linear().mean() == pytest.approx(
+            share * light, rel=0.03
+        )
+
+
+def test_strength_nought_gives_the_photo_back_bit_by_bit(run, tmp_path):
+    (tmp_path / "a.png").write_bytes(picture(container="png"))
+    assert run("a.png", "--strength", 0)[0] == 0
+    same = Photo.open(tmp_path / "a.transmission.png").pixels == Photo.open(tmp_path / "a.png").pixels
+    assert same.all()
+
+
+def test_the_layers_asked_for_are_written_and_no_others(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    assert run("a.jpg", "--layers", "confidence,reflection", "-o", "x")[0] == 0
+    assert tree(tmp_path / "x") == ["a.confidence.png", "a.reflection.jpg"]
+
+
+def test_another_container_may_be_asked_for(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    assert run("a.jpg", "--format", "webp", "--layers", "transmission,confidence", "-o", "x")[0] == 0
+    assert tree(tmp_path / "x") == ["a.confidence.png", "a.transmission.webp"]
+    assert Photo.open(tmp_path / "x" / "a.transmission.webp").origin.container == "webp"
+
+
+def test_the_suffix_of_the_photo_stays_when_its_container_is_asked_for(run, tmp_path):
+    (tmp_path / "A.JPEG").write_bytes(picture())
+    assert run("A.JPEG", "--format", "jpeg", "--layers", "transmission", "-o", "x")[0] == 0
+    assert tree(tmp_path / "x") == ["A.transmission.JPEG"]
+
+
+@pytest.mark.parametrize(("format_", "suffix"), [(None, "tiff"), ("exr", "exr")])
+def test_additive_layers_are_floats_that_sum_to_the_photo(run, tmp_path, format_, suffix):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    assert run("a.jpg", "--additive", *(["--format", format_] if format_ else []))[0] == 0
+    layers = [Photo.open(tmp_path / f"a.{layer}.{suffix}") for layer in ("transmission", "reflection")]
+    assert all(layer.pixels.dtype == np.float32 for layer in layers)
+    assert (layers[0].linear() + layers[1].linear() == Photo.open(tmp_path / "a.jpg").linear()).all()
+
+
+def test_a_picture_named_as_the_output_takes_the_transmission(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    assert run("a.jpg", "-o", "new/clear.png")[0] == 0
+    assert tree(tmp_path / "new") == ["clear.png"]
+    assert Photo.open(tmp_path / "new" / "clear.png").origin.container == "png"
+
+
+def test_a_folder_may_be_called_like_a_picture(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "old.png").mkdir()
+    for folder in ("old.png", "new.png/"):
+        assert run("a.jpg", "-o", folder, "--layers", "reflection")[0] == 0
+        assert tree(tmp_path / folder) == ["a.reflection.jpg"]
+
+
+# --- standard input and output
+
+
+@pytest.mark.parametrize("container", ["jpeg", "png", "tiff", "webp"])
+def test_standard_input_goes_to_standard_output_in_its_container(run, container):
+    code, out, err = run("-", stdin=picture(container=container))
+    assert (code, Photo.open(out).origin.container) == (0, container)
+    assert "- -> -" in err
+
+
+def test_standard_output_takes_another_layer_and_container_on_demand(run):
+    confidence = run("-", "--layers", "confidence", "--quiet", stdin=picture())
+    assert confidence[0] == 0
+    assert confidence[2] == ""
+    assert Photo.open(confidence[1]).pixels.shape == (40, 60, 1)
+    exr = Photo.open(run("-", "--additive", "--format", "exr", stdin=picture())[1])
+    assert exr.origin.container == "exr"
+
+
+def test_a_file_may_go_to_standard_output_and_standard_input_to_a_file(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    code, out, _ = run("a.jpg", "-o", "-")
+    assert code == 0
+    assert run("-", "-o", "b.jpg", "--json", stdin=picture())[0] == 0
+    assert (tmp_path / "b.jpg").read_bytes() == out
+
+
+@pytest.mark.parametrize("stdin", [b"", b"hello"])
+def test_standard_input_without_a_picture_is_an_error_and_gives_no_output(run, stdin):
+    code, out, err = run("-", stdin=stdin)
+    assert (code, out) == (1, b"")
+    assert err.startswith("error: -: ")
+    assert err.count("\n") == 1
+
+
+def test_a_full_standard_output_is_one_line_of_error(model, tmp_path):
+    with Path("/dev/full").open("wb") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "brewster", "-", "--model", model],
+            input=picture(),
+            stdout=full,
+            stderr=subprocess.PIPE,
+            check=False,
+        )
+    assert done.returncode == 1
+    assert (
+        done.stderr.decode()
+        .splitlines()[-1]
+        .startswith("error: -: standard output was not written (No space")
+    )
+
+
+def test_no_picture_is_poured_into_a_terminal(run, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+    code, out, err = run("-", stdin=picture())
+    assert (code, out) == (2, b"")
+    assert "terminal" in err
+
+
+# --- usage
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        [],
+        ["separate"],
+        ["a.jpg", "--strength", "2"],
+        ["a.jpg", "--strength", "nan"],
+        ["a.jpg", "--quality", "superb"],
+        ["a.jpg", "--layers", "background"],
+        ["a.jpg", "--layers", ""],
+        ["a.jpg", "--device", "toaster"],
+        ["a.jpg", "--max-pixels", "0"],
+        ["a.jpg", "--sharpen"],
+        ["a.jpg", "--additive", "--format", "jpeg"],
+        ["a.jpg", "b.jpg", "-o", "clear.jpg"],
+        ["a.jpg", "-", "-o", "x"],
+        ["-", "-o", "folder"],
+        ["-", "--json"],
+        ["-", "--layers", "transmission,reflection"],
+        ["a.jpg", "-o", "clear.jpg", "--format", "png"],
+        ["a.jpg", "-o", "clear.jpg", "--additive"],
+        ["a.jpg", "-o", "clear.gif"],
+        ["modles"],
+        ["models", "burn"],
+        ["train", "recipe.toml"],
+    ],
+    ids=" ".join,
+)
+def test_what_cannot_be_meant_is_a_wrong_usage(bare, tmp_path, words):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    code, out, err = bare(*words)
+    assert (code, out) == (2, b"")
+    assert "Traceback" not in err
+    assert tree(tmp_path) == ["a.jpg"]
+
+
+def test_a_misspelt_command_is_named_and_a_photo_of_that_name_is_taken(run, bare, tmp_path):
+    assert "Did you mean models?" in bare("modles")[2]
+    (tmp_path / "modles").write_bytes(picture())
+    assert run("modles")[0] == 0
+    assert (tmp_path / "modles.transmission.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (["a.jpg", "--model", "compcat"], "did you mean compact?"),
+        (["a.jpg", "--model", "a.jpg"], "is not a model"),
+        (["a.jpg", "--device", "coreml"], "device coreml is not available"),
+        (["missing.jpg"], "missing.jpg cannot be read"),
+        (["empty"], "there is no picture in empty"),
+    ],
+)
+def test_an_error_is_one_line_with_exit_code_1(run, bare, tmp_path, words, reason):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "empty").mkdir()
+    code, out, err = (bare if "--model" in words else run)(*words)
+    assert (code, out) == (1, b"")
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    assert reason in err
+
+
+# --- progress
+
+
+def test_a_terminal_shows_progress_and_standard_output_stays_clean(model, tmp_path):
+    """The bar is drawn on a real terminal (a pseudo one); nothing of it goes to standard output."""
+    for index in range(3):
+        (tmp_path / f"{index}.jpg").write_bytes(picture())
+    terminal, end = pty.openpty()
+    command = [sys.executable, "-m", "brewster", tmp_path, "--model", model]
+    done = subprocess.run(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=end,
+        check=False,
+        env=os.environ | {"TERM": "xterm", "COLUMNS": "200"},
+    )
+    os.close(end)
+    shown = os.read(terminal, 1 << 16).decode()
+    os.close(terminal)
+    assert (done.returncode, done.stdout) == (0, b"")
+    assert "\x1b[" in shown
+    assert "/3" in shown
+    assert "0.transmission.jpg" in shown
+
+
+# --- models
+
+
+@pytest.fixture
+def shipped(model, monkeypatch, tmp_path):
+    """A zoo with a whole model and a damaged one."""
+    whole = zoo.Model("compact", model, zoo.Model("", model, None, "").digest(), "Apache-2.0")
+    broken = tmp_path.parent / f"{tmp_path.name}.onnx"
+    broken.write_bytes(b"half a mod")
+    model.with_suffix(".md").write_text("# pane\nFails at night.\n")
+    damaged = zoo.Model("research", broken, "0" * 64, "CC-BY-NC-4.0")
+    monkeypatch.setattr(zoo, "MODELS", {"compact": whole, "research": damaged})
+
+
+def test_models_are_listed_with_licence_and_state(bare, shipped):
+    code, out, _ = bare("models", "list")
+    assert code == 0
+    assert [line.split()[0] for line in out.decode().splitlines()] == ["compact", "research"]
+    assert b"damaged" in out
+    rows = json.loads(bare("models", "list", "--json")[1])
+    assert rows[0]["licence"] == "Apache-2.0"
+    assert rows[1]["error"]
+
+
+def test_a_model_has_a_card_and_a_path(bare, shipped, model):
+    assert bare("models", "card") == (0, b"# pane\nFails at night.\n\n", "")
+    assert bare("models", "path", "compact") == (0, f"{model}\n".encode(), "")
+    assert bare("models", "path", "research")[0] == 1
+    assert bare("models", "card", "nonsense")[0] == 1
+
+
+def test_damaged_models_are_found(bare, shipped):
+    assert bare("models", "verify", "compact")[0] == 0
+    code, out, err = bare("models", "verify")
+    assert code == 1
+    assert out.startswith(b"compact: ")
+    assert err.startswith("error: ")
+    code, out, _ = bare("models", "verify", "--json")
+    assert (code, [bool(row["error"]) for row in json.loads(out)]) == (1, [False, True])
+
+
+def test_the_model_may_be_named_in_the_zoo(bare, shipped, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    code, out, _ = bare("a.jpg", "--json")
+    assert (code, json.loads(out)["model"]) == (0, "compact")
+
+
+# --- doctor
+
+
+def test_the_doctor_knows_every_dependency():
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert set(CORE) == {line.split(">")[0] for line in settings["dependencies"]}
+    extras = {
+        name: {line.split(">")[0] for line in lines}
+        for name, lines in settings["optional-dependencies"].items()
+        if name != "dev"
+    }
+    assert extras == {name: set(packages) for name, packages in EXTRAS.items()}
+
+
+def test_the_doctor_finds_a_healthy_house_and_a_damaged_model(bare, shipped, monkeypatch):
+    code, out, _ = bare("doctor", "--json")
+    told = json.loads(out)
+    assert (code, told["ok"]) == (1, False)
+    assert [check["name"] for check in told["checks"] if check["needed"] and check["status"] != "ok"] == [
+        "research"
+    ]
+    monkeypatch.delitem(zoo.MODELS, "research")
+    code, out, _ = bare("doctor")
+    assert code == 0
+    assert b"All that is needed works." in out
+
+
+def test_the_doctor_says_what_is_missing_and_the_line_that_installs_it(bare, shipped, monkeypatch):
+    monkeypatch.setitem(CORE, "no-such-package", "nothing")
+    code, out, _ = bare("doctor")
+    assert code == 1
+    assert b"--  no-such-package" in out
+    assert b"pip install no-such-package" in out
+
+
+def test_a_package_that_does_not_load_is_broken(bare, shipped, monkeypatch):
+    monkeypatch.setitem(CORE, "click", "no_such_module")
+    code, out, _ = bare("doctor", "--json")
+    broken = next(check for check in json.loads(out)["checks"] if check["name"] == "click")
+    assert (code, broken["status"]) == (1, "broken")
+
+
+# --- train
+
+
+def test_training_without_its_extra_names_the_line_that_installs_it(bare, monkeypatch):
+    find_spec = __import__("importlib.util").util.find_spec
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "torch" else find_spec(name))
+    code, _, err = bare("train", "recipe.toml", "-o", "run")
+    assert code == 1
+    assert "pip install 'brewster[train]'" in err
+
+
+def test_a_recipe_that_is_not_there_is_an_error_and_leaves_nothing(bare, tmp_path):
+    code, _, err = bare("train", "recipe.toml", "-o", "run")
+    assert code == 1
+    assert "recipe.toml" in err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_tells_its_progress_and_ends_in_a_model(bare, tmp_path, monkeypatch):
+    def train(recipe, out, report):
+        report(1, recipe.steps, {"loss": 0.5})
+        report(2, recipe.steps, {"loss": 0.25, "seconds": 3.0})
+        return "network"
+
+    monkeypatch.setattr("brewster.train.loop.train", train)
+    monkeypatch.setattr("brewster.train.export.export_onnx", lambda network, path: path.write_text(network))
+    recipe = ROOT / "recipes" / "train" / "tiny.toml"
+    code, out, err = bare("train", recipe, "-o", "run")
+    assert (code, out) == (0, b"")
+    assert "loss 0.25" in err
+    assert (tmp_path / "run" / "model.onnx").read_text() == "network"
+    assert tree(tmp_path / "run") == ["model.onnx"]
+    assert bare("train", recipe, "-o", "run", "--quiet")[2] == ""
+
+
+def test_a_run_that_has_no_place_is_an_error(bare, tmp_path):
+    (tmp_path / "file").touch()
+    code, _, err = bare("train", ROOT / "recipes" / "train" / "tiny.toml", "-o", "file/run")
+    assert code == 1
+    assert err.startswith("error: file/run cannot be made")
+
+
+# --- Python
+
+
+def test_the_names_of_the_house_are_there_in_any_order_of_import():
+    for start in ("import brewster", "import brewster.separate.tiles as brewster_tiles; import brewster"):
+        code = f"{start}\nassert callable(brewster.separate) and callable(brewster.separate)\n"
+        code += "from brewster import Separator; assert brewster.separate.Separator is Separator\n"
+        code += "assert callable(brewster.separate) and not hasattr(brewster, 'nonsense')\n"
+        code += "assert set(brewster.__all__) <= set(dir(brewster)); from brewster import *"
+        subprocess.run([sys.executable, "-c", code], check=True)

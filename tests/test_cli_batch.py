@@ -1,0 +1,497 @@
+"""Bad pictures, bad places and many photos: nothing is lost, nothing is half written, the rest is done."""
+# ruff: noqa: F811  (the fixtures of test_cli serve here too)
+
+import ctypes
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+import pyvips
+
+from brewster import Photo
+from brewster.errors import UnreadablePhoto
+from brewster.separate import Separator
+from test_cli import model, picture, run, tree  # noqa: F401  (two of them are fixtures)
+
+LAYERS = ("transmission", "reflection")
+
+
+def results(*names, suffix="jpg"):
+    return sorted(f"{name}.{layer}.{suffix}" for name in names for layer in LAYERS)
+
+
+def lines(out):
+    return [json.loads(line) for line in out.splitlines()]
+
+
+def errors(err):
+    return [line for line in err.splitlines() if line.startswith("error: ")]
+
+
+# --- bad pictures
+
+
+def truncated():
+    data = picture(600, 400)
+    return data[: len(data) // 2]
+
+
+def animated(suffix):
+    black = pyvips.Image.black(8, 8, bands=3)
+    pages = black.join(black + 255, "vertical").cast("uchar").copy(interpretation="srgb")
+    pages.set_type(pyvips.GValue.gint_type, "page-height", 8)
+    return pages.write_to_buffer(suffix)
+
+
+def five_channels():
+    return pyvips.Image.black(8, 8, bands=5).tiffsave_buffer()
+
+
+def cmyk():
+    return pyvips.Image.black(8, 8, bands=4).copy(interpretation="cmyk").jpegsave_buffer()
+
+
+def not_a_number(folder):
+    pixels = np.ones((4, 4, 3), np.float32)
+    pixels[1, 2] = np.nan
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.NO_COMPRESSION}
+    with OpenEXR.File(header, {"RGB": OpenEXR.Channel(pixels)}) as file:
+        file.write(str(folder / "nan.exr"))
+
+
+def test_bad_pictures_are_named_at_the_end_and_the_rest_is_done(run, tmp_path):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    bad = {
+        "animated.gif": animated(".gif"),
+        "animated.webp": animated(".webp"),
+        "cmyk.jpg": cmyk(),
+        "empty.jpg": b"",
+        "five.tiff": five_channels(),
+        "half.jpg": truncated(),
+        "text.jpg": b"I am no picture.",
+    }
+    for name, data in bad.items():
+        (folder / name).write_bytes(data)
+    not_a_number(folder)
+    for name in ("a", "good", "zebra"):
+        (folder / f"{name}.jpg").write_bytes(picture())
+    code, out, err = run("in", "-o", "out", "--quiet")
+    assert (code, out) == (1, b"")
+    assert tree(tmp_path / "out") == results("a", "good", "zebra")
+    assert len(err.splitlines()) == len(errors(err)) == len(bad) + 1
+    for name in (*bad, "nan.exr"):
+        assert sum(f"in/{name}" in line for line in errors(err)) == 1, name
+    assert len(tree(folder)) == len(bad) + 4
+
+
+def test_a_picture_of_one_pixel_is_separated(run, tmp_path):
+    (tmp_path / "a.png").write_bytes(picture(1, 1, "png"))
+    assert run("a.png")[0] == 0
+    assert Photo.open(tmp_path / "a.transmission.png").size == (1, 1)
+
+
+def test_a_long_panorama_keeps_its_size(run, tmp_path):
+    (tmp_path / "wide.jpg").write_bytes(picture(20_000, 300))
+    assert run("wide.jpg", "--quality", "draft", "--layers", "transmission")[0] == 0
+    assert Photo.open(tmp_path / "wide.transmission.jpg").size == (20_000, 300)
+
+
+def test_a_picture_beyond_the_pixel_limit_is_refused_and_one_at_the_limit_is_not(run, tmp_path):
+    (tmp_path / "large.jpg").write_bytes(picture(61, 40))
+    (tmp_path / "small.jpg").write_bytes(picture(60, 40))
+    code, _, err = run("large.jpg", "small.jpg", "--max-pixels", 2400, "-o", "out")
+    assert code == 1
+    assert len(errors(err)) == 1
+    assert "large.jpg" in errors(err)[0]
+    assert tree(tmp_path / "out") == results("small")
+
+
+def test_a_stumble_of_brewster_itself_is_shown_whole_after_the_rest_is_done(
+    run, tmp_path, monkeypatch, capfdbinary
+):
+    for name in ("a", "b", "c"):
+        (tmp_path / f"{name}.jpg").write_bytes(picture())
+    separate = Separator.__call__
+
+    def stumble(self, source, **options):
+        if source.name == "a.jpg":
+            raise ZeroDivisionError("a bug")
+        return separate(self, source, **options)
+
+    monkeypatch.setattr(Separator, "__call__", stumble)
+    with pytest.raises(ZeroDivisionError):
+        run(".", "-o", "out")
+    assert tree(tmp_path / "out") == results("b", "c")
+    assert (
+        "error: a.jpg: brewster stumbled (ZeroDivisionError: a bug)" in capfdbinary.readouterr().err.decode()
+    )
+
+
+def test_a_photo_that_does_not_fit_into_memory_does_not_stop_the_others(run, tmp_path, monkeypatch):
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.jpg").write_bytes(picture())
+    separate = Separator.__call__
+
+    def fill(self, source, **options):
+        if source.name == "a.jpg":
+            raise MemoryError
+        return separate(self, source, **options)
+
+    monkeypatch.setattr(Separator, "__call__", fill)
+    code, _, err = run(".", "-o", "out")
+    assert code == 1
+    assert "error: a.jpg: the photo does not fit into memory" in err
+    assert tree(tmp_path / "out") == results("b")
+
+
+# --- names and folders
+
+
+def test_two_pictures_that_differ_in_suffix_only_give_two_results(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "a.png").write_bytes(picture(container="png"))
+    assert run(".", "-o", "out")[0] == 0
+    assert tree(tmp_path / "out") == sorted(results("a.jpg") + results("a.png", suffix="png"))
+
+
+def test_the_tree_below_a_folder_is_mirrored(run, tmp_path):
+    for place in ("in/x", "in/y/z"):
+        (tmp_path / place).mkdir(parents=True)
+        (tmp_path / place / "a.jpg").write_bytes(picture())
+    assert run("in", "-o", "out")[0] == 0
+    assert tree(tmp_path / "out") == sorted(
+        f"{place}/{name}" for place in ("x", "y/z") for name in results("a")
+    )
+
+
+NAMES = ["with space", "Schöne Fenster é", "two\nlines", "[bold]red", "-dash", b"\xff\xfe no text"]
+
+
+def test_any_name_will_do_and_errors_stay_in_one_line(run, tmp_path):
+    names = [os.fsdecode(name) for name in NAMES]
+    for name in names:
+        (tmp_path / f"{name}.jpg").write_bytes(picture())
+    (tmp_path / "bad\nname.jpg").write_bytes(b"")
+    code, out, err = run(".", "-o", "out", "--json")
+    assert code == 1
+    assert tree(tmp_path / "out") == results(*names)
+    assert {line["source"] for line in lines(out)} == {f"{name}.jpg" for name in (*names, "bad\nname")}
+    assert len(errors(err)) == 1
+    assert r"bad\nname.jpg" in errors(err)[0]
+
+
+def test_a_name_that_looks_like_an_option_comes_after_two_dashes(run, tmp_path, model):
+    (tmp_path / "-dash.jpg").write_bytes(picture())
+    assert run("--quiet", "--model", model, "--", "-dash.jpg", with_model=False)[0] == 0
+    assert tree(tmp_path) == ["-dash.jpg", *results("-dash")]
+
+
+def test_link_loops_end(run, tmp_path):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    (folder / "a.jpg").write_bytes(picture())
+    (folder / "round").symlink_to(folder)
+    (folder / "self.jpg").symlink_to("self.jpg")
+    code, _, err = run("in", "-o", "out")
+    assert code == 1
+    assert len(errors(err)) == 1
+    assert "self.jpg" in errors(err)[0]
+    assert tree(tmp_path / "out") == results("a")
+
+
+# --- places
+
+
+def test_a_place_that_cannot_be_written_to_is_an_error(run, tmp_path):
+    """A path below a regular file: unlike permission bits, that stops root too."""
+    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "file").write_bytes(b"kept")
+    code, _, err = run("a.jpg", "-o", "file/below")
+    assert code == 1
+    assert len(errors(err)) == 1
+    assert "file/below/a.transmission.jpg was not written" in errors(err)[0]
+    assert (tmp_path / "file").read_bytes() == b"kept"
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write to read-only folders")
+def test_a_read_only_folder_is_an_error(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "out").mkdir(mode=0o500)
+    code, _, err = run("a.jpg", "-o", "out")
+    assert code == 1
+    assert "permissions" in err
+
+
+def test_a_full_disk_leaves_no_half_file_and_the_next_photo_is_tried(run, tmp_path, monkeypatch):
+    """The disk is full when the bytes are to reach it, which is where the kernel says so at the latest."""
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.jpg").write_bytes(picture())
+    fsync, calls = os.fsync, []
+
+    def full_for_a_while(file):
+        calls.append(file)
+        if len(calls) == 2:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        fsync(file)
+
+    monkeypatch.setattr(os, "fsync", full_for_a_while)
+    code, out, err = run(".", "-o", "out", "--json")
+    assert code == 1
+    assert errors(err)[0].startswith(
+        "error: a.jpg: out/a.reflection.jpg was not written (No space left on device)"
+    )
+    assert tree(tmp_path / "out") == ["a.transmission.jpg", *results("b")]
+    assert lines(out)[0]["outputs"] == {"transmission": "out/a.transmission.jpg"}
+
+
+def test_a_real_limit_on_file_size_leaves_no_half_file(model, tmp_path):
+    resource = pytest.importorskip("resource")
+    (tmp_path / "a.png").write_bytes(picture(400, 300, "png"))
+
+    def limit():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (500, 500))
+
+    command = [sys.executable, "-m", "brewster", "a.png", "--format", "tiff", "--model", model]
+    done = subprocess.run(command, cwd=tmp_path, preexec_fn=limit, capture_output=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith(b"error: a.png: a.transmission.tiff was not written (File too large)")
+    assert tree(tmp_path) == ["a.png"]
+
+
+@pytest.mark.parametrize("make", ["same", "symlink", "hardlink"])
+def test_a_photo_is_never_written_over_itself(run, tmp_path, make):
+    data = picture()
+    (tmp_path / "a.jpg").write_bytes(data)
+    target = "a.jpg" if make == "same" else "b.jpg"
+    if make == "symlink":
+        (tmp_path / "b.jpg").symlink_to("a.jpg")
+    if make == "hardlink":
+        (tmp_path / "b.jpg").hardlink_to(tmp_path / "a.jpg")
+    for overwrite in ([], ["--overwrite"]):
+        code, _, err = run("a.jpg", "-o", target, *overwrite)
+        assert code == 1
+        assert "is itself a photo" in errors(err)[0]
+    assert (tmp_path / "a.jpg").read_bytes() == data
+
+
+def test_no_photo_of_the_batch_is_written_over(run, tmp_path):
+    for name in ("a.jpg", "a.transmission.jpg"):
+        (tmp_path / name).write_bytes(picture())
+    before = (tmp_path / "a.transmission.jpg").read_bytes()
+    code, _, err = run("a.jpg", "a.transmission.jpg", "--overwrite")
+    assert code == 1
+    assert len(errors(err)) == 1
+    assert (tmp_path / "a.transmission.jpg").read_bytes() == before
+    assert (tmp_path / "a.transmission.transmission.jpg").exists()
+
+
+def test_two_photos_that_would_share_a_name_are_refused_before_any_is_done(run, tmp_path):
+    for folder in ("x", "y"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "a.jpg").write_bytes(picture())
+    code, _, err = run("x/a.jpg", "y/a.jpg", "-o", "out")
+    assert code == 1
+    assert "x/a.jpg and y/a.jpg" in err
+    assert not (tmp_path / "out").exists()
+
+
+# --- again
+
+
+def test_finished_photos_are_skipped_and_the_model_is_not_even_loaded(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    assert run("a.jpg")[0] == 0
+    times = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    code, out, err = run("a.jpg", "--json", "--model", "no-such-model", with_model=False)
+    assert code == 0
+    assert "a.jpg: skipped" in err
+    assert lines(out)[0]["status"] == "skipped"
+    assert times == {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+
+
+def test_a_photo_half_done_gets_its_missing_layer_and_keeps_the_other(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "a.transmission.jpg").write_bytes(b"mine")
+    code, out, _ = run("a.jpg", "--json")
+    assert (code, lines(out)[0]["outputs"]) == (0, {"reflection": "a.reflection.jpg"})
+    assert (tmp_path / "a.transmission.jpg").read_bytes() == b"mine"
+
+
+def test_overwrite_replaces_what_is_there(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "a.transmission.jpg").write_bytes(b"old")
+    assert run("a.jpg", "--overwrite")[0] == 0
+    assert Photo.open(tmp_path / "a.transmission.jpg").size == (60, 40)
+
+
+def test_a_folder_run_twice_does_not_separate_its_own_results(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    run(".")
+    assert run(".")[0] == 0
+    assert tree(tmp_path) == ["a.jpg", *results("a")]
+
+
+def test_the_same_photo_gives_the_same_bytes_twice(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(picture(300, 200))
+    for folder in ("one", "two"):
+        assert run("a.jpg", "-o", folder, "--layers", "transmission,reflection,confidence")[0] == 0
+    for name in tree(tmp_path / "one"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+
+# --- what is told
+
+
+def test_a_dry_run_tells_what_would_be_done_and_does_nothing(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "b.jpg").write_bytes(picture())
+    (tmp_path / "a.reflection.jpg").write_bytes(b"")
+    before = tree(tmp_path)
+    code, out, _ = run(".", "--dry-run", "--model", "no-such-model", with_model=False)
+    assert (code, out) == (
+        0,
+        b"a.jpg -> a.transmission.jpg\nb.jpg -> b.transmission.jpg, b.reflection.jpg\n",
+    )
+    told = lines(run(".", "--dry-run", "--json")[1])
+    assert [line["status"] for line in told] == ["planned", "planned"]
+    assert tree(tmp_path) == before
+
+
+def test_json_says_what_became_of_every_photo(run, tmp_path, model):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "b.jpg").write_bytes(b"")
+    code, out, err = run(".", "--json", "--quiet")
+    done, failed = lines(out)
+    assert code == 1
+    assert len(err.splitlines()) == 1
+    keys = {"source", "status", "outputs", "model", "sha256", "device", "seconds", "remainder", "error"}
+    assert keys == set(done) == set(failed)
+    assert done["outputs"] == {layer: f"a.{layer}.jpg" for layer in LAYERS}
+    assert (done["source"], done["status"], done["model"], done["error"]) == (
+        "a.jpg",
+        "separated",
+        "pane",
+        None,
+    )
+    assert len(done["sha256"]) == 64
+    assert done["device"]
+    assert set(done["seconds"]) == {"decode", "network", "detail", "encode"}
+    assert done["remainder"] == pytest.approx(0, abs=0.01)
+    assert (failed["source"], failed["status"], failed["outputs"]) == ("b.jpg", "failed", {})
+    assert failed["error"]
+
+
+def test_the_batch_is_summed_up(run, tmp_path):
+    for name in ("a", "b", "c"):
+        (tmp_path / f"{name}.jpg").write_bytes(picture())
+    run("a.jpg")
+    (tmp_path / "b.jpg").write_bytes(b"")
+    assert "1 separated, 1 skipped, 1 failed" in run(".")[2].splitlines()
+
+
+def test_quiet_says_nothing_when_all_is_well(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    assert run("a.jpg", "--quiet") == (0, b"", "")
+    assert run("a.jpg", "--quiet") == (0, b"", "")
+
+
+# --- Ctrl-C
+
+
+def test_ctrl_c_while_a_file_is_written_leaves_no_half_file(run, tmp_path, monkeypatch):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    fsync, calls = os.fsync, []
+
+    def interrupted(file):
+        calls.append(file)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        fsync(file)
+
+    monkeypatch.setattr(os, "fsync", interrupted)
+    code, _, err = run("a.jpg")
+    assert code == 130
+    assert "stopped" in err
+    assert tree(tmp_path) == ["a.jpg", "a.transmission.jpg"]
+
+
+def interrupt_that_gets_lost():
+    """As when Ctrl-C is pressed while libvips logs through Python: C code has nowhere to pass the exception to."""
+
+    def press():
+        raise KeyboardInterrupt
+
+    ctypes.CFUNCTYPE(None)(press)()
+
+
+@pytest.mark.parametrize("goes_wrong", [False, True])
+def test_ctrl_c_that_c_code_drops_stops_the_batch_before_anything_is_written(
+    run, tmp_path, monkeypatch, goes_wrong
+):
+    for name in ("a", "b", "c"):
+        (tmp_path / f"{name}.jpg").write_bytes(picture())
+    separate = Separator.__call__
+
+    def interrupted(self, source, **options):
+        if source.name == "b.jpg":
+            interrupt_that_gets_lost()
+            if goes_wrong:
+                raise UnreadablePhoto("half a call", "a whole one", "do not press Ctrl-C")
+        return separate(self, source, **options)
+
+    monkeypatch.setattr(Separator, "__call__", interrupted)
+    code, out, err = run(".", "-o", "out", "--json")
+    assert code == 130
+    assert tree(tmp_path / "out") == results("a")
+    assert [line["source"] for line in lines(out)] == ["a.jpg"]
+    assert "Traceback" not in err
+    assert not errors(err)
+    assert run(".", "-o", "out")[0] == 130  # b is interrupted again: nothing of the first time is left over
+    monkeypatch.setattr(Separator, "__call__", separate)
+    assert run(".", "-o", "out")[0] == 0
+
+
+def test_what_else_c_code_drops_is_still_reported(run, tmp_path, monkeypatch):
+    dropped = []
+    monkeypatch.setattr(sys, "unraisablehook", dropped.append)
+    (tmp_path / "a.jpg").write_bytes(picture())
+    fsync = os.fsync
+
+    def stumble():
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(os, "fsync", lambda file: (ctypes.CFUNCTYPE(None)(stumble)(), fsync(file)))
+    assert run("a.jpg")[0] == 0
+    assert [what.exc_type for what in dropped] == [ZeroDivisionError] * 2
+
+
+def test_ctrl_c_in_mid_batch_leaves_whole_files_only_and_the_same_command_goes_on(run, tmp_path, model):
+    count = 12
+    (tmp_path / "in").mkdir()
+    for index in range(count):
+        (tmp_path / "in" / f"{index}.jpg").write_bytes(picture(400, 300, seed=index))
+    command = [sys.executable, "-m", "brewster", "in", "-o", "out", "--model", model, "--quality", "draft"]
+    batch = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE)
+    patience = time.monotonic() + 30
+    while len(list(tmp_path.glob("out/*.jpg"))) < 5 and time.monotonic() < patience:
+        time.sleep(0.01)
+    batch.send_signal(signal.SIGINT)
+    _, err = batch.communicate(timeout=30)
+    assert batch.returncode == 130
+    assert b"Traceback" not in err
+    written = [Path(path) for path in tmp_path.glob("out/*")]
+    assert 5 <= len(written) < 2 * count
+    assert {path.suffix for path in tmp_path.glob("out/.*")} <= set()
+    assert all(Photo.open(path).size == (400, 300) for path in written)
+    assert run("in", "-o", "out", "--quality", "draft")[0] == 0
+    assert len(tree(tmp_path / "out")) == 2 * count
