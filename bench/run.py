@@ -1,0 +1,21 @@
+"""What `make bench` plays: quality on the development pairs beside doing nothing and beside a peer, what happens
+to photographs without any reflection, and the cost of a 12-megapixel photograph.
+
+    BREWSTER_DATA=../shared/data .venv/bin/python bench/run.py
+"""
+
+import os
+import sys
+from pathlib import Path
+
+import plain
+import quality
+import speed
+
+if __name__ == "__main__":
+    if not os.environ.get("BREWSTER_DATA"):
+        sys.exit("BREWSTER_DATA is unset: the pairs and photographs to measure on are not part of brewster")
+    data = Path(os.environ["BREWSTER_DATA"])
+    quality.main(data)
+    plain.main(data)
+    speed.main(data)

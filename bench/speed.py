@@ -1,0 +1,72 @@
+"""A 12-megapixel JPEG through the command line, and the start of the command.
+
+    BREWSTER_DATA=../shared/data .venv/bin/python bench/speed.py
+
+Wall time and peak memory of the whole process at `standard`, with the share of each part as the tool reports it;
+beside it, the same file merely decoded and encoded again twice, so that a busy machine shows.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from brewster import Photo
+
+OUT = Path("out/bench")
+SIDE_PX = (4000, 3000)
+COPY = """
+import sys
+from brewster import Photo
+for name in ("one", "two"):
+    Photo.open(sys.argv[1]).save(f"{sys.argv[2]}/{name}.jpg", overwrite=True)
+"""
+
+
+def main(data: Path) -> None:
+    OUT.mkdir(parents=True, exist_ok=True)
+    photo = twelve_megapixels(data)
+    brewster = [sys.executable, "-m", "brewster"]
+    copied, _, _ = measure([sys.executable, "-c", COPY, str(photo), str(OUT)])
+    wall, peak, line = measure(
+        [*brewster, str(photo), "-o", str(OUT), "--json", "--overwrite", "--device", "cpu"]
+    )
+    seconds = json.loads(line)["seconds"]
+    shares = ", ".join(f"{name} {value:.2f} s ({value / wall:.0%})" for name, value in seconds.items())
+    print(f"12 megapixels: {wall:.2f} s, {peak / 2**20:.2f} GiB; {shares}")
+    print(f"  merely decoded and encoded twice: {copied:.2f} s; ratio {wall / copied:.1f}")
+    helps = sorted(measure([*brewster, "--help"])[0] for _ in range(5))
+    bare = sorted(measure([sys.executable, "-c", "pass"])[0] for _ in range(5))
+    print(f"brewster --help: {helps[2]:.2f} s (median of 5); python alone {bare[2]:.2f} s")
+
+
+def twelve_megapixels(data: Path) -> Path:
+    """A photo enlarged to 4000x3000 with fresh grain, so that it costs what a camera's costs."""
+    small = Photo.open(data / "photos/permissive/kodak24__05.jpg").pixels.astype(np.float32)
+    rows, columns = (
+        np.arange(side) * small.shape[axis] // side for axis, side in ((0, SIDE_PX[1]), (1, SIDE_PX[0]))
+    )
+    grain = np.random.default_rng(7).normal(0, 3, (SIDE_PX[1], SIDE_PX[0], 1))
+    pixels = np.clip(small[rows][:, columns] + grain, 0, 255).astype(np.uint8)
+    path = OUT / "twelve.jpg"
+    Photo.from_array(pixels, encoding="srgb").save(path, overwrite=True)
+    return path
+
+
+def measure(command: list[str]) -> tuple[float, int, str]:
+    """Wall seconds, peak KiB of the process, and its standard output."""
+    started = time.perf_counter()
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    output = process.stdout.read()
+    _, status, usage = os.wait4(process.pid, 0)
+    if status:
+        sys.exit(f"{' '.join(command)} failed")
+    return time.perf_counter() - started, usage.ru_maxrss, output
+
+
+if __name__ == "__main__":
+    main(Path(os.environ["BREWSTER_DATA"]))

@@ -1,0 +1,59 @@
+"""What `make demo` plays: separates photographs and lays before and after side by side on a sheet.
+
+.venv/bin/python runs/demo.py tests/pictures
+"""
+
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from brewster import Photo, Separation, Separator
+from brewster.errors import BrewsterError
+from brewster.files import Job, find
+
+OUT = Path("out/demo")
+ROW_PX = 240
+
+
+def main(source: Path) -> int:
+    separator = Separator.load("compact")
+    OUT.mkdir(parents=True, exist_ok=True)
+    rows, failures = [], 0
+    for job in find([source], into=OUT):
+        try:
+            rows.append(separate(separator, job))
+        except BrewsterError as error:
+            failures += 1
+            print(f"error: {error}", file=sys.stderr)
+    if rows:
+        width = max(row.shape[1] for row in rows)
+        padded = [np.pad(row, [(0, 8), (0, width - row.shape[1]), (0, 0)], constant_values=1) for row in rows]
+        sheet = OUT / "sheet.png"
+        Photo.from_array(np.concatenate(padded), encoding="linear").save(sheet, overwrite=True)
+        print(f"photo | transmission | reflection, side by side: {sheet}")
+    return 1 if failures or not rows else 0
+
+
+def separate(separator: Separator, job: Job) -> np.ndarray:
+    """Separates one photo, saves its layers and returns its row of the sheet."""
+    started = time.perf_counter()
+    result = separator(job.source)
+    targets = [job.target(layer) for layer in ("transmission", "reflection")]
+    for layer, target in zip((result.transmission, result.reflection), targets, strict=True):
+        layer.save(target, overwrite=True)
+    print(f"{job.source}: {time.perf_counter() - started:.2f} s")
+    print(*(f"  {target}" for target in targets), sep="\n")
+    return side_by_side(result)
+
+
+def side_by_side(result: Separation) -> np.ndarray:
+    width, height = result.photo.size
+    size = max(1, round(width * ROW_PX / height)), ROW_PX
+    pictures = (result.photo, result.transmission, result.reflection)
+    return np.concatenate([np.clip(picture.small(*size), 0, 1) for picture in pictures], axis=1)
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))

@@ -1,0 +1,130 @@
+"""The house keeps its own rules: imports, light start, documented names, a README that tells the truth."""
+
+import ast
+import importlib
+import inspect
+import pkgutil
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import brewster
+import brewster.errors
+
+ROOT = Path(__file__).parents[1]
+SOURCE = ROOT / "src" / "brewster"
+README = (ROOT / "README.md").read_text()
+FILES = sorted(SOURCE.rglob("*.py"))
+HEAVY = {"torch", "diffusers", "mitsuba", "fastapi", "ray", "onnxruntime", "pyvips"}
+
+
+def functions():
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef):
+                yield path, node
+
+
+def test_rooms_import_from_below_only():
+    done = subprocess.run(
+        [Path(sys.executable).with_name("lint-imports")],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.parametrize("command", [["-c", "import brewster"], ["-m", "brewster", "--help"]])
+def test_a_light_start_wakes_no_heavy_library(command):
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", *command], capture_output=True, text=True, check=True
+    )
+    imported = {line.split("|")[-1].strip().split(".")[0] for line in done.stderr.splitlines()}
+    assert not imported & HEAVY
+
+
+def test_separating_a_photo_needs_no_torch():
+    code = "import brewster.separate, sys; assert not {'torch', 'scipy', 'PIL'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_every_public_name_is_exported_and_documented():
+    for name in brewster.__all__:
+        value = getattr(brewster, name)
+        assert name.startswith("__") or inspect.getdoc(value), name
+
+
+def test_every_module_and_every_public_function_says_what_it_is():
+    for module in pkgutil.walk_packages(brewster.__path__, "brewster."):
+        if not module.name.endswith("__main__"):
+            assert importlib.import_module(module.name).__doc__, module.name
+    undocumented = [
+        f"{path.name}:{node.name}"
+        for path, node in functions()
+        if not node.name.startswith("_") and not ast.get_docstring(node) and isinstance_of_public(path, node)
+    ]
+    assert not undocumented
+
+
+def isinstance_of_public(path, node):
+    """Public functions of modules and of public classes; helpers inside other functions are not."""
+    tree = ast.parse(path.read_text())
+    public = [
+        *tree.body,
+        *(
+            child
+            for item in tree.body
+            if isinstance(item, ast.ClassDef) and item.name[0] != "_"
+            for child in item.body
+        ),
+    ]
+    known = {(item.name, item.lineno) for item in public if isinstance(item, ast.FunctionDef)}
+    return (node.name, node.lineno) in known and node.name not in {"forward"}
+
+
+def test_every_error_is_in_the_tree_that_its_docstring_draws():
+    tree = inspect.getdoc(brewster.errors)
+    for name, value in vars(brewster.errors).items():
+        if inspect.isclass(value):
+            assert name in tree
+
+
+def test_files_and_signatures_stay_small():
+    for path in FILES:
+        assert len(path.read_text().splitlines()) <= 400, path
+    for path, node in functions():
+        positional = [argument.arg for argument in node.args.args if argument.arg not in {"self", "cls"}]
+        assert len(positional) <= 5, f"{path}:{node.name}"
+
+
+def test_the_tree_in_the_readme_equals_the_tree_on_disk():
+    block = re.search(r"```\n(src/brewster/.*?)```", README, re.S)[1]
+    rows = [line.split()[0] for line in block.splitlines()[1:]]
+    drawn = {row.rstrip("/") for row in rows}
+    on_disk = {
+        path.relative_to(SOURCE).with_suffix("").as_posix().split("/")[0]
+        for path in FILES
+        if not path.name.startswith("__")
+    }
+    assert drawn == on_disk
+
+
+def test_the_python_in_the_readme_runs(tmp_path, monkeypatch):
+    blocks = re.findall(r"```python\n(.*?)```", README, re.S)
+    assert blocks
+    picture = next((ROOT / "tests" / "pictures").glob("mixture*.jpg"))
+    (tmp_path / "window.jpg").write_bytes(picture.read_bytes())
+    monkeypatch.chdir(tmp_path)
+    for block in blocks:
+        exec(compile(block, "README.md", "exec"), {})
+
+
+def test_every_test_file_is_named_after_a_module_or_a_rule():
+    modules = {path.stem for path in FILES} | {path.name for path in SOURCE.iterdir()} | {"house"}
+    for path in (ROOT / "tests").glob("test_*.py"):
+        assert path.stem.removeprefix("test_").split("_")[0] in modules, path.name
