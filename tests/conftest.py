@@ -8,8 +8,12 @@ os.environ.setdefault("VIPS_CONCURRENCY", "1")
 import socket
 from pathlib import Path
 
+import hypothesis
 import numpy as np
 import pytest
+
+hypothesis.settings.register_profile("shared machine", deadline=None)
+hypothesis.settings.load_profile("shared machine")
 
 
 @pytest.fixture(autouse=True)

@@ -52,7 +52,7 @@ def test_absent_reflections_leave_the_photo_as_it_was(photos):
     )  # glass tint
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(0, 10**6), st.sampled_from([32, 64, 96]))
 def test_every_sample_is_a_picture_and_depends_on_seed_and_step_alone(step, size):
     generator = np.random.default_rng(3)

@@ -1,5 +1,4 @@
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -38,7 +37,7 @@ def test_neighbouring_tiles_fade_into_each_other_without_a_seam():
     transmission, _ = in_tiles(
         each_its_own_grey, np.zeros((20, 100, 3), np.float32), tile_px=40, overlap_px=20
     )
-    assert np.abs(np.diff(transmission[0, :, 0])).max() <= pytest.approx(1 / 10, abs=1e-5)
+    assert np.abs(np.diff(transmission[0, :, 0])).max() < 0.1
 
 
 def test_a_picture_that_fits_goes_in_whole():

@@ -17,11 +17,13 @@ def to_linear(encoded: Array) -> Array:
     """sRGB-encoded values to linear light, any shape; 1.0 stays 1.0 (IEC 61966-2-1)."""
     dark = encoded <= 0.04045
     safe = encoded * ~dark + dark  # 1 where the straight part rules: no NaN, no infinite gradient
-    return encoded / 12.92 * dark + ((safe + 0.055) / 1.055) ** 2.4 * ~dark
+    linear: Array = encoded / 12.92 * dark + ((safe + 0.055) / 1.055) ** 2.4 * ~dark
+    return linear
 
 
 def to_encoded(linear: Array) -> Array:
     """Linear light to sRGB-encoded values, any shape; 1.0 stays 1.0 (IEC 61966-2-1)."""
     dark = linear <= 0.0031308
     safe = linear * ~dark + dark
-    return linear * 12.92 * dark + (1.055 * safe ** (1 / 2.4) - 0.055) * ~dark
+    encoded: Array = linear * 12.92 * dark + (1.055 * safe ** (1 / 2.4) - 0.055) * ~dark
+    return encoded

@@ -179,8 +179,8 @@ class Pairs:
         samples = [self._sample(_Dice(self._seed, step, slot), size) for slot in range(count)]
         photo, transmission = (torch.stack(layer) for layer in zip(*samples, strict=True))
         reflection = (photo - transmission).clamp(min=0)
-        encoded = (to_encoded(layer) for layer in (photo, transmission, reflection))
-        return Batch(*encoded, torch.full((count,), self.reflection_weight))
+        weight = torch.full((count,), self.reflection_weight)
+        return Batch(to_encoded(photo), to_encoded(transmission), to_encoded(reflection), weight)
 
     def _sample(self, dice: _Dice, size: int) -> tuple[Tensor, Tensor]:
         both = torch.cat(self._pairs[dice.choose(len(self._pairs))], dim=2)

@@ -32,9 +32,9 @@ _BLOCKS: Final = (
 _SCALE_ENDS: Final = (0, 2, 4, 10, 15)
 """The last block of each scale: strides 2, 4, 8, 16, 32."""
 _SKIP_WIDTHS: Final = (16, 24, 40, 112, 320)
-_DECODER_WIDTHS: Final = (24, 40, 72, 128)
+_DECODER_WIDTHS: Final = (32, 64, 128, 256)
 _BATCH_NORM_EPSILON: Final = 1e-3
-_FULL_WIDTH: Final = 12
+_FULL_WIDTH: Final = 16
 
 
 @final
@@ -111,8 +111,10 @@ class _Decoder(nn.Module):
 class CompactNetwork(nn.Module):
     """Separates sRGB-encoded photos: (N, 3, H, W) in 0..1, H and W multiples of 32, to six channels.
 
-    The first three are the encoded transmission, predicted as a change to the photo, the last three the
-    encoded reflection. Values are not clamped, so that training sees the gradient of what overshoots.
+    The first three are the encoded transmission, the last three the encoded reflection, not clamped, so that
+    training sees the gradient of what overshoots. The head knows how glass works: it predicts the light that
+    the pane added and the gain that undoes what the pane took away, both smooth where the photo is not, and
+    two small repairs, for what was overexposed and for added light that is not a reflection.
     """
 
     def __init__(self) -> None:
@@ -124,7 +126,7 @@ class CompactNetwork(nn.Module):
         )
         self.squeeze = nn.Conv2d(_DECODER_WIDTHS[0], _FULL_WIDTH, 1)
         self.join = nn.Conv2d(_FULL_WIDTH + 3, _FULL_WIDTH, 3, padding=1)
-        self.head = nn.Conv2d(_FULL_WIDTH, 6, 3, padding=1)
+        self.head = nn.Conv2d(_FULL_WIDTH, 12, 3, padding=1)
         nn.init.zeros_(self.head.weight)  # an untrained network changes nothing
         nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
 
@@ -135,8 +137,10 @@ class CompactNetwork(nn.Module):
         for decoder, skip in zip(reversed(self.decoders), reversed(skips), strict=True):
             x = decoder(x, skip)
         x = functional.interpolate(self.squeeze(x), scale_factor=2.0, mode="bilinear")
-        change = self.head(functional.relu(self.join(torch.cat([x, normal], dim=1))))
-        return torch.cat([photo_encoded + change[:, :3], change[:, 3:]], dim=1)
+        x = self.head(functional.relu(self.join(torch.cat([x, normal], dim=1))))
+        added, gain, repair, other = x.split(3, dim=1)
+        transmission = to_encoded((to_linear(photo_encoded) - added) * gain.exp()) + repair
+        return torch.cat([transmission, to_encoded(added + other)], dim=1)
 
 
 @final

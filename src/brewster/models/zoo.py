@@ -64,7 +64,7 @@ MODELS: Final = {
         Model(
             "compact",
             _WEIGHTS / "compact.onnx",
-            "0" * 64,
+            "fd5380dc801d02017bdf0a1ce1acc4e3c41d491a5f05e617b5639a7b3e044941",
             "Apache-2.0",
         ),
     )

@@ -1,13 +1,15 @@
-"""The training loop, the only one: `train(recipe_text, out)` runs or resumes, bit for bit.
+"""The training loop, the only one: `train(recipe, out, report)` runs or resumes, bit for bit.
 
-Every step depends on the checkpoint and on (seed, step) alone: no hidden state, so a killed run that resumes
-ends with the same weights as one that never stopped (same machine, same number of threads).
+It runs on the GPU where torch sees one, else on the CPU. Every step depends on the checkpoint and on
+(seed, step) alone: no hidden state, so on the CPU a killed run that resumes ends with the same weights, to the
+last bit, as one that never stopped (same machine, same number of threads).
 """
 
 from __future__ import annotations
 
 import json
 import math
+import os
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -41,11 +43,14 @@ class Trainer:
     def __init__(self, recipe: TrainRecipe, stream: Stream) -> None:
         torch.manual_seed(recipe.seed)
         self.recipe, self.stream, self.step = recipe, stream, 0
-        self._pool = ThreadPoolExecutor(1)
+        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self._workers = 1 if self.device.type == "cpu" else os.cpu_count() or 1
+        self._pool = ThreadPoolExecutor(self._workers)
         self._ahead: dict[int, Future[Batch]] = {}
-        self.network = with_imagenet_features().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        network = with_imagenet_features()
         if recipe.start_from:
-            self.network.load_state_dict(Checkpoint.read(recipe.start_from).average)
+            network.load_state_dict(Checkpoint.read(recipe.start_from).average)
+        self.network = network.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = {name: value.clone() for name, value in self.network.state_dict().items()}
         encoder = list(self.network.encoder.parameters())
         known = set(map(id, encoder))
@@ -61,7 +66,7 @@ class Trainer:
     def restore(self, checkpoint: Checkpoint) -> None:
         """Continues where the checkpoint was written."""
         self.network.load_state_dict(checkpoint.network)
-        self.average = checkpoint.average
+        self.average = {name: value.to(self.device) for name, value in checkpoint.average.items()}
         self.optimizer.load_state_dict(checkpoint.optimizer)
         self.step = checkpoint.step
 
@@ -81,8 +86,7 @@ class Trainer:
         Raises:
             ModelError: the loss is not a number; the last checkpoint is still good.
         """
-        batch = self._batch(self.step).result()
-        self._batch(self.step + 1)
+        batch = self._next_batch().to(self.device)
         parts = separation_loss(self.network(_channels_last(batch.photo_encoded)), batch)
         loss = torch.stack(list(parts.values())).sum()
         if not loss.isfinite():
@@ -106,12 +110,13 @@ class Trainer:
         network.load_state_dict(self.average)
         return network
 
-    def _batch(self, step: int) -> Future[Batch]:
-        """The batch of a step, made in the background while the step before it runs."""
-        if step not in self._ahead:
-            task = self.stream, step, self.recipe.batch, self.recipe.size_at(step)
-            self._ahead = {step: self._pool.submit(*task)}
-        return self._ahead[step]
+    def _next_batch(self) -> Batch:
+        """The batch of this step; those of the next steps are made in the background meanwhile."""
+        for step in range(self.step, self.step + 1 + self._workers):
+            if step not in self._ahead:
+                size = self.recipe.size_at(step)
+                self._ahead[step] = self._pool.submit(self.stream, step, self.recipe.batch, size)
+        return self._ahead.pop(self.step).result()
 
     def _set_learning_rates(self) -> None:
         warm = min(1.0, (self.step + 1) / self.recipe.warmup_steps)
@@ -219,7 +224,7 @@ def _write_samples(
         row = torch.cat([photo, truth, layers[:, :3], layers[:, 3:]], dim=3)
         rows.append(functional.interpolate(row, (160, 960), mode="bilinear", antialias=True)[0])
     sheet = torch.cat(rows, dim=1).clamp(0, 1).permute(1, 2, 0)
-    Photo.from_array(to_linear(sheet).numpy(), encoding="linear").save(path)
+    Photo.from_array(to_linear(sheet).numpy(), encoding="linear").save(path, depth=8, overwrite=True)
 
 
 def _channels_last(pictures: Tensor) -> Tensor:
