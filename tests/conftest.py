@@ -1,5 +1,6 @@
 """Every test runs offline, with one thread (two shared cores spin against each other), and leaves no trace."""
 
+import io
 import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -11,6 +12,9 @@ from pathlib import Path
 import hypothesis
 import numpy as np
 import pytest
+
+from brewster.cli import main
+from front_door import write_pane
 
 hypothesis.settings.register_profile("shared machine", deadline=None)
 hypothesis.settings.load_profile("shared machine")
@@ -36,3 +40,28 @@ def data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no data: BREWSTER_DATA is unset and {folder} does not exist")
     return folder
+
+
+@pytest.fixture(scope="session")
+def model(tmp_path_factory):
+    return write_pane(tmp_path_factory.mktemp("model") / "pane.onnx")
+
+
+@pytest.fixture
+def run(model, monkeypatch, tmp_path, capfdbinary):
+    """Runs a command in an empty folder: exit code, standard output (bytes) and standard error (text)."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*args, stdin=b"", with_model=True):
+        monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(stdin)))
+        code = main([*map(str, args), *(["--model", str(model)] if with_model else [])])
+        out, err = capfdbinary.readouterr()
+        return code, out, err.decode()
+
+    return run
+
+
+@pytest.fixture
+def bare(run):
+    """The same for commands that take no model."""
+    return lambda *args: run(*args, with_model=False)

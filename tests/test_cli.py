@@ -1,92 +1,29 @@
 """The front door: what may be asked, what stands in the help, and where the answers go."""
 
-import io
-import json
 import os
 import pty
 import subprocess
 import sys
-import tomllib
 from dataclasses import fields
 from pathlib import Path
 from typing import get_args, get_type_hints
 
 import click
 import numpy as np
-import onnx
 import pytest
-from onnx import TensorProto, helper
 from pydantic import TypeAdapter, ValidationError
 
 import brewster
 from brewster import Photo, files, photo
-from brewster.cli import cli, main
-from brewster.cli.doctor import CORE, EXTRAS
+from brewster.cli import cli
 from brewster.cli.reference import reference
 from brewster.errors import BrewsterError
-from brewster.models import zoo
 from brewster.options import Options
 from brewster.separate import QUALITIES
 from brewster.separate.runtime import DEVICES
+from front_door import picture, tree
 
 ROOT = Path(__file__).parents[1]
-
-
-def write_pane(path):
-    """An ONNX model of a pane that lets 80 % through and mirrors 20 %."""
-    shape = [1, 3, "height", "width"]
-    shares = {"transmission": 0.8, "reflection": 0.2}
-    graph = helper.make_graph(
-        [helper.make_node("Mul", ["photo", f"{name}_share"], [name]) for name in shares],
-        "pane",
-        [helper.make_tensor_value_info("photo", TensorProto.FLOAT, shape)],
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name in shares],
-        [
-            helper.make_tensor(f"{name}_share", TensorProto.FLOAT, [], [share])
-            for name, share in shares.items()
-        ],
-    )
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10), path)
-    return path
-
-
-def picture(width=60, height=40, container="jpeg", seed=1):
-    """The bytes of a picture."""
-    small = np.random.default_rng(seed).integers(0, 256, (height // 10 + 1, width // 10 + 1, 3), np.uint8)
-    array = np.kron(small, np.ones((10, 10, 1), np.uint8))[:height, :width]
-    return Photo.from_array(array, encoding="srgb").encode(container)
-
-
-@pytest.fixture(scope="session")
-def model(tmp_path_factory):
-    return write_pane(tmp_path_factory.mktemp("model") / "pane.onnx")
-
-
-@pytest.fixture
-def run(model, monkeypatch, tmp_path, capfdbinary):
-    """Runs a command in an empty folder: exit code, standard output (bytes) and standard error (text)."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*args, stdin=b"", with_model=True):
-        monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(stdin)))
-        code = main([*map(str, args), *(["--model", str(model)] if with_model else [])])
-        out, err = capfdbinary.readouterr()
-        return code, out, err.decode()
-
-    return run
-
-
-@pytest.fixture
-def bare(run):
-    """The same for commands that take no model."""
-    return lambda *args: run(*args, with_model=False)
-
-
-def as_user(*args, **how):
-    """The same in a process of its own."""
-    return subprocess.run(
-        [sys.executable, "-m", "brewster", *map(str, args)], capture_output=True, check=False, **how
-    )
 
 
 def commands(command=cli, path=()):
@@ -96,27 +33,7 @@ def commands(command=cli, path=()):
             yield from commands(child, (*path, name))
 
 
-def tree(folder):
-    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
-
-
 # --- help and documentation
-
-
-@pytest.mark.parametrize("start", ["import brewster", "import brewster.cli; brewster.cli.main(['--help'])"])
-def test_help_comes_without_waking_a_library(start):
-    code = f"{start}\nimport sys; print(' '.join(sys.modules), file=sys.stderr)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    heavy = {"torch", "onnxruntime", "pyvips", "numpy", "pydantic", "rich", "OpenEXR", "onnx", "PIL"}
-    assert not heavy & set(done.stderr.split())
-
-
-def test_help_answers_at_once():
-    """0.35 s where nothing else runs; processor time is measured, with room for a busy machine."""
-    before = os.times()
-    assert as_user("--help").returncode == 0
-    after = os.times()
-    assert after.children_user + after.children_system - before.children_user - before.children_system < 0.7
 
 
 def test_every_command_and_every_option_is_explained_in_a_sentence():
@@ -405,137 +322,6 @@ def test_a_terminal_shows_progress_and_standard_output_stays_clean(model, tmp_pa
     assert "\x1b[" in shown
     assert "/3" in shown
     assert "0.transmission.jpg" in shown
-
-
-# --- models
-
-
-@pytest.fixture
-def shipped(model, monkeypatch, tmp_path):
-    """A zoo with a whole model and a damaged one."""
-    whole = zoo.Model("compact", model, zoo.Model("", model, None, "").digest(), "Apache-2.0")
-    broken = tmp_path.parent / f"{tmp_path.name}.onnx"
-    broken.write_bytes(b"half a mod")
-    model.with_suffix(".md").write_text("# pane\nFails at night.\n")
-    damaged = zoo.Model("research", broken, "0" * 64, "CC-BY-NC-4.0")
-    monkeypatch.setattr(zoo, "MODELS", {"compact": whole, "research": damaged})
-
-
-def test_models_are_listed_with_licence_and_state(bare, shipped):
-    code, out, _ = bare("models", "list")
-    assert code == 0
-    assert [line.split()[0] for line in out.decode().splitlines()] == ["compact", "research"]
-    assert b"damaged" in out
-    rows = json.loads(bare("models", "list", "--json")[1])
-    assert rows[0]["licence"] == "Apache-2.0"
-    assert rows[1]["error"]
-
-
-def test_a_model_has_a_card_and_a_path(bare, shipped, model):
-    assert bare("models", "card") == (0, b"# pane\nFails at night.\n\n", "")
-    assert bare("models", "path", "compact") == (0, f"{model}\n".encode(), "")
-    assert bare("models", "path", "research")[0] == 1
-    assert bare("models", "card", "nonsense")[0] == 1
-
-
-def test_damaged_models_are_found(bare, shipped):
-    assert bare("models", "verify", "compact")[0] == 0
-    code, out, err = bare("models", "verify")
-    assert code == 1
-    assert out.startswith(b"compact: ")
-    assert err.startswith("error: ")
-    code, out, _ = bare("models", "verify", "--json")
-    assert (code, [bool(row["error"]) for row in json.loads(out)]) == (1, [False, True])
-
-
-def test_the_model_may_be_named_in_the_zoo(bare, shipped, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(picture())
-    code, out, _ = bare("a.jpg", "--json")
-    assert (code, json.loads(out)["model"]) == (0, "compact")
-
-
-# --- doctor
-
-
-def test_the_doctor_knows_every_dependency():
-    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert set(CORE) == {line.split(">")[0] for line in settings["dependencies"]}
-    extras = {
-        name: {line.split(">")[0] for line in lines}
-        for name, lines in settings["optional-dependencies"].items()
-        if name != "dev"
-    }
-    assert extras == {name: set(packages) for name, packages in EXTRAS.items()}
-
-
-def test_the_doctor_finds_a_healthy_house_and_a_damaged_model(bare, shipped, monkeypatch):
-    code, out, _ = bare("doctor", "--json")
-    told = json.loads(out)
-    assert (code, told["ok"]) == (1, False)
-    assert [check["name"] for check in told["checks"] if check["needed"] and check["status"] != "ok"] == [
-        "research"
-    ]
-    monkeypatch.delitem(zoo.MODELS, "research")
-    code, out, _ = bare("doctor")
-    assert code == 0
-    assert b"All that is needed works." in out
-
-
-def test_the_doctor_says_what_is_missing_and_the_line_that_installs_it(bare, shipped, monkeypatch):
-    monkeypatch.setitem(CORE, "no-such-package", "nothing")
-    code, out, _ = bare("doctor")
-    assert code == 1
-    assert b"--  no-such-package" in out
-    assert b"pip install no-such-package" in out
-
-
-def test_a_package_that_does_not_load_is_broken(bare, shipped, monkeypatch):
-    monkeypatch.setitem(CORE, "click", "no_such_module")
-    code, out, _ = bare("doctor", "--json")
-    broken = next(check for check in json.loads(out)["checks"] if check["name"] == "click")
-    assert (code, broken["status"]) == (1, "broken")
-
-
-# --- train
-
-
-def test_training_without_its_extra_names_the_line_that_installs_it(bare, monkeypatch):
-    find_spec = __import__("importlib.util").util.find_spec
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "torch" else find_spec(name))
-    code, _, err = bare("train", "recipe.toml", "-o", "run")
-    assert code == 1
-    assert "pip install 'brewster[train]'" in err
-
-
-def test_a_recipe_that_is_not_there_is_an_error_and_leaves_nothing(bare, tmp_path):
-    code, _, err = bare("train", "recipe.toml", "-o", "run")
-    assert code == 1
-    assert "recipe.toml" in err
-    assert not (tmp_path / "run").exists()
-
-
-def test_a_run_tells_its_progress_and_ends_in_a_model(bare, tmp_path, monkeypatch):
-    def train(recipe, out, report):
-        report(1, recipe.steps, {"loss": 0.5})
-        report(2, recipe.steps, {"loss": 0.25, "seconds": 3.0})
-        return "network"
-
-    monkeypatch.setattr("brewster.train.loop.train", train)
-    monkeypatch.setattr("brewster.train.export.export_onnx", lambda network, path: path.write_text(network))
-    recipe = ROOT / "recipes" / "train" / "tiny.toml"
-    code, out, err = bare("train", recipe, "-o", "run")
-    assert (code, out) == (0, b"")
-    assert "loss 0.25" in err
-    assert (tmp_path / "run" / "model.onnx").read_text() == "network"
-    assert tree(tmp_path / "run") == ["model.onnx"]
-    assert bare("train", recipe, "-o", "run", "--quiet")[2] == ""
-
-
-def test_a_run_that_has_no_place_is_an_error(bare, tmp_path):
-    (tmp_path / "file").touch()
-    code, _, err = bare("train", ROOT / "recipes" / "train" / "tiny.toml", "-o", "file/run")
-    assert code == 1
-    assert err.startswith("error: file/run cannot be made")
 
 
 # --- Python

@@ -75,3 +75,8 @@ def test_a_file_that_is_no_model_is_named(tmp_path):
         OnnxBackend(tmp_path / "text.onnx")
     with pytest.raises(ModelError, match=r"missing\.onnx"):
         OnnxBackend(tmp_path / "missing.onnx")
+
+
+def test_a_model_that_fails_while_it_runs_is_an_error_of_the_model(exported):
+    with pytest.raises(ModelError, match="tile of 0x0"):
+        OnnxBackend(exported, "cpu")(np.zeros((0, 0, 3), np.float32))

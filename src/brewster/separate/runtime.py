@@ -55,7 +55,7 @@ class OnnxBackend:
             raise ModelError(
                 f"{model} is not a model that ONNX Runtime can load",
                 "an .onnx file exported by brewster train",
-                f"check the file ({str(error).splitlines()[0][:120]})",
+                f"check the file ({_first_line(error)})",
             ) from error
         self._check_names(model)
 
@@ -65,10 +65,15 @@ class OnnxBackend:
         margins = [(0, -side % _STRIDE) for side in (height, width)]
         padded = np.pad(tile, [*margins, (0, 0)], mode="symmetric")
         feed = {"photo": np.ascontiguousarray(padded.transpose(2, 0, 1)[None], dtype=np.float32)}
-        transmission, reflection = (
-            layer[0, :, :height, :width].transpose(1, 2, 0)
-            for layer in self._session.run(["transmission", "reflection"], feed)
-        )
+        try:
+            answers = self._session.run(["transmission", "reflection"], feed)
+        except Exception as error:  # noqa: BLE001 - ONNX Runtime's errors share no base class
+            raise ModelError(
+                f"the model failed on a tile of {width}x{height} pixels ({_first_line(error)})",
+                "a model that takes any size that is a multiple of 32",
+                "check it with brewster models verify, or try --device cpu",
+            ) from error
+        transmission, reflection = (layer[0, :, :height, :width].transpose(1, 2, 0) for layer in answers)
         return transmission, reflection
 
     def _check_names(self, model: Path) -> None:
@@ -80,6 +85,10 @@ class OnnxBackend:
                 "a model with input photo and outputs transmission and reflection",
                 "export it with brewster train",
             )
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0][:120] if str(error) else type(error).__name__
 
 
 def _resolve(device: str) -> str:

@@ -1,0 +1,61 @@
+"""What the tests of the command line share: a model that is a pane, pictures, and the command as a user calls it."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper
+
+from brewster import Photo
+
+LAYERS = ("transmission", "reflection")
+
+
+def write_pane(path):
+    """An ONNX model of a pane that lets 80 % through and mirrors 20 %."""
+    shape = [1, 3, "height", "width"]
+    shares = {"transmission": 0.8, "reflection": 0.2}
+    graph = helper.make_graph(
+        [helper.make_node("Mul", ["photo", f"{name}_share"], [name]) for name in shares],
+        "pane",
+        [helper.make_tensor_value_info("photo", TensorProto.FLOAT, shape)],
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name in shares],
+        [
+            helper.make_tensor(f"{name}_share", TensorProto.FLOAT, [], [share])
+            for name, share in shares.items()
+        ],
+    )
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10), path)
+    return path
+
+
+def picture(width=60, height=40, container="jpeg", seed=1):
+    """The bytes of a picture."""
+    small = np.random.default_rng(seed).integers(0, 256, (height // 10 + 1, width // 10 + 1, 3), np.uint8)
+    array = np.kron(small, np.ones((10, 10, 1), np.uint8))[:height, :width]
+    return Photo.from_array(array, encoding="srgb").encode(container)
+
+
+def as_user(*args, **how):
+    """The same in a process of its own."""
+    return subprocess.run(
+        [sys.executable, "-m", "brewster", *map(str, args)], capture_output=True, check=False, **how
+    )
+
+
+def tree(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def results(*names, suffix="jpg"):
+    return sorted(f"{name}.{layer}.{suffix}" for name in names for layer in LAYERS)
+
+
+def lines(out):
+    return [json.loads(line) for line in out.splitlines()]
+
+
+def errors(err):
+    return [line for line in err.splitlines() if line.startswith("error: ")]

@@ -1,0 +1,145 @@
+"""The commands beside `separate`: models, doctor and train."""
+
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from brewster import Photo, Separator
+from brewster.cli.doctor import CORE, EXTRAS
+from brewster.models import zoo
+from front_door import picture
+
+ROOT = Path(__file__).parents[1]
+
+# --- models
+
+
+@pytest.fixture
+def shipped(model, monkeypatch, tmp_path):
+    """A zoo with a whole model and a damaged one."""
+    whole = zoo.Model("compact", model, zoo.Model("", model, None, "").digest(), "Apache-2.0")
+    broken = tmp_path.parent / f"{tmp_path.name}.onnx"
+    broken.write_bytes(b"half a mod")
+    model.with_suffix(".md").write_text("# pane\nFails at night.\n")
+    damaged = zoo.Model("research", broken, "0" * 64, "CC-BY-NC-4.0")
+    monkeypatch.setattr(zoo, "MODELS", {"compact": whole, "research": damaged})
+
+
+def test_models_are_listed_with_licence_and_state(bare, shipped):
+    code, out, _ = bare("models", "list")
+    assert code == 0
+    assert [line.split()[0] for line in out.decode().splitlines()] == ["compact", "research"]
+    assert b"damaged" in out
+    rows = json.loads(bare("models", "list", "--json")[1])
+    assert rows[0]["licence"] == "Apache-2.0"
+    assert rows[1]["error"]
+
+
+def test_a_model_has_a_card_and_a_path(bare, shipped, model):
+    assert bare("models", "card") == (0, b"# pane\nFails at night.\n\n", "")
+    assert bare("models", "path", "compact") == (0, f"{model}\n".encode(), "")
+    assert bare("models", "path", "research")[0] == 1
+    assert bare("models", "card", "nonsense")[0] == 1
+
+
+def test_damaged_models_are_found(bare, shipped):
+    assert bare("models", "verify", "compact")[0] == 0
+    code, out, err = bare("models", "verify")
+    assert code == 1
+    assert out.startswith(b"compact: ")
+    assert err.startswith("error: ")
+    code, out, _ = bare("models", "verify", "--json")
+    assert (code, [bool(row["error"]) for row in json.loads(out)]) == (1, [False, True])
+
+
+def test_the_model_may_be_named_in_the_zoo(bare, shipped, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    code, out, _ = bare("a.jpg", "--json")
+    assert (code, json.loads(out)["model"]) == (0, "compact")
+
+
+# --- doctor
+
+
+def test_the_doctor_knows_every_dependency():
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert set(CORE) == {line.split(">")[0] for line in settings["dependencies"]}
+    extras = {
+        name: {line.split(">")[0] for line in lines}
+        for name, lines in settings["optional-dependencies"].items()
+        if name != "dev"
+    }
+    assert extras == {name: set(packages) for name, packages in EXTRAS.items()}
+
+
+def test_the_doctor_finds_a_healthy_house_and_a_damaged_model(bare, shipped, monkeypatch):
+    code, out, _ = bare("doctor", "--json")
+    told = json.loads(out)
+    assert (code, told["ok"]) == (1, False)
+    assert [check["name"] for check in told["checks"] if check["needed"] and check["status"] != "ok"] == [
+        "research"
+    ]
+    monkeypatch.delitem(zoo.MODELS, "research")
+    code, out, _ = bare("doctor")
+    assert code == 0
+    assert b"All that is needed works." in out
+
+
+def test_the_doctor_says_what_is_missing_and_the_line_that_installs_it(bare, shipped, monkeypatch):
+    monkeypatch.setitem(CORE, "no-such-package", "nothing")
+    code, out, _ = bare("doctor")
+    assert code == 1
+    assert b"--  no-such-package" in out
+    assert b"pip install no-such-package" in out
+
+
+def test_a_package_that_does_not_load_is_broken(bare, shipped, monkeypatch):
+    monkeypatch.setitem(CORE, "click", "no_such_module")
+    code, out, _ = bare("doctor", "--json")
+    broken = next(check for check in json.loads(out)["checks"] if check["name"] == "click")
+    assert (code, broken["status"]) == (1, "broken")
+
+
+# --- train
+
+
+def test_training_without_its_extra_names_the_line_that_installs_it(bare, monkeypatch):
+    find_spec = __import__("importlib.util").util.find_spec
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "torch" else find_spec(name))
+    code, _, err = bare("train", "recipe.toml", "-o", "run")
+    assert code == 1
+    assert "pip install 'brewster[train]'" in err
+
+
+def test_a_recipe_that_is_not_there_is_an_error_and_leaves_nothing(bare, tmp_path):
+    code, _, err = bare("train", "recipe.toml", "-o", "run")
+    assert code == 1
+    assert "recipe.toml" in err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_tells_its_progress_and_ends_in_a_model_that_separates(bare, tmp_path, monkeypatch):
+    folder = tmp_path / "data" / "photos" / "permissive"
+    folder.mkdir(parents=True)
+    for index in range(3):
+        (folder / f"{index}.png").write_bytes(picture(120, 90, "png", seed=index))
+    monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "data"))
+    recipe = ROOT / "recipes" / "train" / "tiny.toml"
+    code, out, err = bare("train", recipe, "-o", "run")
+    assert (code, out) == (0, b"")
+    assert "step 6 of 6: loss" in err
+    assert {"checkpoint.pt", "log.jsonl", "model.onnx", "samples.png"} == {
+        path.name for path in (tmp_path / "run").iterdir()
+    }
+    photo = Photo.from_array(np.full((50, 70, 3), 128, np.uint8), encoding="srgb")
+    assert Separator.load(str(tmp_path / "run" / "model.onnx"))(photo).transmission.size == (70, 50)
+
+
+def test_a_run_that_has_no_place_is_an_error(bare, tmp_path):
+    (tmp_path / "file").touch()
+    code, _, err = bare("train", ROOT / "recipes" / "train" / "tiny.toml", "-o", "file/run")
+    assert code == 1
+    assert err.startswith("error: file/run cannot be made")
