@@ -80,7 +80,8 @@ def peer(pairs: list[Pair]) -> Method:
         target = OUT / "peer.npy"
         np.save(target, pixels(pair.photo))
         print(target, file=worker.stdin, flush=True)
-        worker.stdout.readline()
+        if worker.stdout.readline() != "done\n":
+            sys.exit("the peer failed: see its error above")
         return np.load(target)
 
     ask(pairs[0])  # imports are not part of its time

@@ -6,6 +6,7 @@ import torch
 
 from brewster.errors import DeviceError, ModelError
 from brewster.models.compact import LinearSeparator, with_imagenet_features
+from brewster.separate import runtime
 from brewster.separate.runtime import OnnxBackend, available_devices
 from brewster.train.export import export_onnx
 
@@ -67,6 +68,18 @@ def test_a_device_that_is_not_there_is_an_error_with_the_line_that_installs_it(e
 
 def test_auto_finds_a_device(exported):
     assert OnnxBackend(exported).device == available_devices()[0]
+
+
+def test_a_device_that_is_installed_but_does_not_start_is_an_error_and_auto_goes_on(exported, monkeypatch):
+    """As with onnxruntime-gpu where there is no driver: the provider is listed, and its session is the CPU's."""
+    monkeypatch.setitem(runtime._PROVIDERS, "cuda", ("AzureExecutionProvider", "pip install onnxruntime-gpu"))
+    monkeypatch.setattr(
+        runtime.ort, "get_available_providers", lambda: ["AzureExecutionProvider", "CPUExecutionProvider"]
+    )
+    monkeypatch.setattr(runtime.ort.InferenceSession, "get_providers", lambda self: ["CPUExecutionProvider"])
+    with pytest.raises(DeviceError, match="does not start"):
+        OnnxBackend(exported, "cuda")
+    assert OnnxBackend(exported, "auto").device == "cpu"
 
 
 def test_a_file_that_is_no_model_is_named(tmp_path):

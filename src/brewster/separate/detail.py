@@ -2,8 +2,9 @@
 
 Reflection adds to light, so in linear light the change from photo to transmission is about as smooth as the
 reflection itself, whatever detail lies behind the glass. The change is described at work resolution by local
-lines, change = slope * photo + offset (the guided filter: He et al. 2013, eq. 5-8; slopes and offsets are
-enlarged as in the fast guided filter, He & Sun 2015), and applied to the full photo: its own detail stays.
+lines, change = slope * photo + offset (slopes as in the guided filter: He et al. 2013, eq. 5; enlarged as in the
+fast guided filter: He & Sun 2015), and applied to the full photo: its own detail stays. At the same size the
+lines give back exactly what they were learned from.
 """
 
 from __future__ import annotations
@@ -25,34 +26,51 @@ _VARIANCE_FLOOR: Final = 4e-3
 
 @final
 @dataclass(frozen=True)
-class Transfer:
-    """The change and the unexplained remainder as maps over the photo, to be read off row by row."""
+class _Lines:
+    """A picture as local lines over the photo, picture = slope * photo + offset, maps of work resolution."""
 
     slope: Float32[Floats, "h w 3"]
     offset: Float32[Floats, "h w 3"]
-    remainder: Float32[Floats, "h w 3"]
 
     @classmethod
-    def learn(cls, photo: Floats, transmission: Floats, reflection: Floats) -> Transfer:
-        """From a photo and its layers at work resolution, each (h, w, 3) in linear light."""
-        change = transmission - photo
-        mean_photo, mean_change = _box(photo), _box(change)
-        covariance = _box(photo * change) - mean_photo * mean_change
-        slope = covariance / (_box(photo * photo) - mean_photo**2 + _VARIANCE_FLOOR)
-        offset = mean_change - slope * mean_photo
-        return cls(_box(slope), _box(offset), -change - reflection)
+    def fit(cls, photo: Floats, picture: Floats) -> _Lines:
+        """Slopes from windows, smoothed; offsets that make the lines meet the picture exactly."""
+        covariance = _box(photo * picture) - _box(photo) * _box(picture)
+        variance = _box(photo * photo) - _box(photo) ** 2
+        slope = _box(covariance / (variance + _VARIANCE_FLOOR))
+        return cls(slope, picture - slope * photo)
+
+    def read(self, photo: Floats, top: int, height: int) -> Floats:
+        """The picture over rows top..top+n of the full photo, (n, W, 3)."""
+        rows, width, _ = photo.shape
+        picture = enlarge_rows(self.slope, top, rows, (height, width))
+        picture *= photo
+        picture += enlarge_rows(self.offset, top, rows, (height, width))
+        return picture
+
+
+@final
+@dataclass(frozen=True)
+class Transfer:
+    """A separation at work resolution, ready to be read at the photo's, row by row."""
+
+    change: _Lines
+    reflection: _Lines
+
+    @classmethod
+    def learn(cls, photo: Floats, change: Floats, reflection: Floats) -> Transfer:
+        """From a photo, transmission - photo, and the reflection at work resolution, (h, w, 3), linear light."""
+        return cls(_Lines.fit(photo, change), _Lines.fit(photo, reflection))
 
     def apply(self, photo: Floats, top: int, height: int) -> tuple[Floats, Floats]:
-        """Transmission and reflection of rows top..top+n of a photo `height` rows high, each (n, W, 3)."""
-        rows, width, _ = photo.shape
-        slope, offset, remainder = (
-            enlarge_rows(map_, top, rows, (height, width))
-            for map_ in (self.slope, self.offset, self.remainder)
-        )
-        change = slope * photo + offset
-        transmission = np.maximum(photo + change, 0)
-        reflection = np.maximum(photo - transmission - remainder, 0)
-        return transmission, reflection
+        """Transmission and reflection of rows top..top+n of a photo `height` rows high, each (n, W, 3).
+
+        Light is not negative, except where a wide-gamut photo's own values are.
+        """
+        transmission = self.change.read(photo, top, height)
+        transmission += photo
+        np.maximum(transmission, np.minimum(photo, 0), out=transmission)
+        return transmission, np.maximum(self.reflection.read(photo, top, height), 0)
 
 
 def enlarge_rows(map_: Floats, top: int, rows: int, size: tuple[int, int]) -> Floats:

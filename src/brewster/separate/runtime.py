@@ -39,25 +39,18 @@ class OnnxBackend:
     """
 
     def __init__(self, model: Path, device: str = "auto") -> None:
-        self.device = _resolve(device)
-        options = ort.SessionOptions()
-        options.log_severity_level = 3
-        provider, _ = _PROVIDERS[self.device]
-        try:
-            self._session = ort.InferenceSession(model.read_bytes(), options, [provider])
-        except OSError as error:
-            raise ModelError(
-                f"{model} cannot be read ({error.strerror})",
-                "a model file",
-                "brewster models list names what is there",
-            ) from error
-        except Exception as error:
-            raise ModelError(
-                f"{model} is not a model that ONNX Runtime can load",
-                "an .onnx file exported by brewster train",
-                f"check the file ({_first_line(error)})",
-            ) from error
-        self._check_names(model)
+        data = _read(model)
+        for candidate in _candidates(device):
+            session = _start(model, data, candidate)
+            if session.get_providers()[0] == _PROVIDERS[candidate][0]:
+                self.device, self._session = candidate, session
+                self._check_names(model)
+                return
+        raise DeviceError(
+            f"device {device} is installed but does not start",
+            "a driver and libraries that fit it",
+            "use --device auto, or see what ONNX Runtime says with --device cpu",
+        )
 
     def __call__(self, tile: Picture) -> tuple[Picture, Picture]:
         """Separates one tile (H, W, 3), linear light in 0..1, of any size."""
@@ -67,7 +60,7 @@ class OnnxBackend:
         feed = {"photo": np.ascontiguousarray(padded.transpose(2, 0, 1)[None], dtype=np.float32)}
         try:
             answers = self._session.run(["transmission", "reflection"], feed)
-        except Exception as error:  # noqa: BLE001 - ONNX Runtime's errors share no base class
+        except Exception as error:
             raise ModelError(
                 f"the model failed on a tile of {width}x{height} pixels ({_first_line(error)})",
                 "a model that takes any size that is a multiple of 32",
@@ -91,10 +84,37 @@ def _first_line(error: Exception) -> str:
     return str(error).splitlines()[0][:120] if str(error) else type(error).__name__
 
 
-def _resolve(device: str) -> str:
+def _read(model: Path) -> bytes:
+    try:
+        return model.read_bytes()
+    except OSError as error:
+        raise ModelError(
+            f"{model} cannot be read ({error.strerror})",
+            "a model file",
+            "brewster models list names what is there",
+        ) from error
+
+
+def _start(model: Path, data: bytes, device: str) -> ort.InferenceSession:
+    """A session on the device, or on the CPU where the device's own libraries do not load."""
+    options = ort.SessionOptions()
+    options.log_severity_level = 3
+    providers = dict.fromkeys([_PROVIDERS[device][0], "CPUExecutionProvider"])
+    try:
+        return ort.InferenceSession(data, options, list(providers), enable_fallback=0)
+    except Exception as error:
+        raise ModelError(
+            f"{model} is not a model that ONNX Runtime can load on {device}",
+            "an .onnx file exported by brewster train",
+            f"check the file ({_first_line(error)})",
+        ) from error
+
+
+def _candidates(device: str) -> list[str]:
+    """The devices to try, the preferred one first; a device named by the user is the only one."""
     available = available_devices()
     if device == "auto":
-        return available[0]
+        return available
     if device not in _PROVIDERS:
         raise DeviceError(
             f"there is no device {device!r}", f"one of {', '.join(DEVICES)}", "use --device auto"
@@ -105,4 +125,4 @@ def _resolve(device: str) -> str:
             f"one of {', '.join(available)}",
             f"{_PROVIDERS[device][1]}, or use --device auto",
         )
-    return device
+    return [device]

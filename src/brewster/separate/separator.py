@@ -24,7 +24,7 @@ from brewster.errors import BrewsterError
 from brewster.light import to_encoded
 from brewster.models.zoo import find_model
 from brewster.options import Quality
-from brewster.photo import DEFAULT_MAX_PIXELS, Encoding, Origin, Photo, Source
+from brewster.photo import DEFAULT_MAX_PIXELS, Encoding, Photo, Source
 from brewster.separate.detail import Floats, Transfer, enlarge_rows
 from brewster.separate.runtime import OnnxBackend
 from brewster.separate.tiles import Backend, in_tiles
@@ -33,9 +33,13 @@ QUALITIES: Final[dict[Quality, int]] = {"draft": 100_000, "standard": 250_000, "
 """Pixels of the small copy that the network sees."""
 
 _SHORTEST_SIDE_PX: Final = 192
+_LONG_PHOTO: Final = 3.0
+"""How much larger than the dial says the small copy of a long thin photo may be, a side."""
 _TILE_PX: Final = 1024
 _OVERLAP_PX: Final = 192
 _WORKERS: Final = 2
+_WHITE_PERCENTILE: Final = 99.0
+"""Of a photo brighter than white, such as an EXR, this percentile is shown to the network as white."""
 _UNSURE: Final = 0.05
 """Disagreement of the two views, in sRGB-encoded units, at which confidence has fallen to 1/e."""
 
@@ -110,13 +114,16 @@ class Separator:
         seconds: dict[str, float] = {}
         with _clock(seconds, "decode"):
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
-            small = np.clip(photo.small(*_work_size(photo.size, QUALITIES[quality])), 0, 1)
+            small = photo.small(*_work_size(photo.size, QUALITIES[quality]))
+            white = max(1.0, float(np.percentile(small, _WHITE_PERCENTILE)))
+            seen = np.clip(small / np.float32(white), 0, 1)
         with _clock(seconds, "network"):
-            transmission, reflection, sure = self._two_views(small)
+            transmission, reflection, sure = self._two_views(seen)
         with _clock(seconds, "detail"):
-            transfer = Transfer.learn(small, small + strength * (transmission - small), strength * reflection)
-            at_full_size = _at_full_size_additive if additive else _at_full_size
-            whole, mirrored, remainder = at_full_size(photo, transfer)
+            share = np.float32(strength * white)
+            change = share * (transmission - seen)
+            transfer = Transfer.learn(np.float32(white) * seen, change, share * reflection)
+            whole, mirrored, remainder = _at_full_size(photo, transfer, additive=additive)
             confidence = _enlarged(sure, photo)
         made_by = self.name, self.sha256, self.device
         return Separation(photo, whole, mirrored, confidence, remainder, *made_by, seconds)
@@ -144,10 +151,12 @@ def separate(
     quality: Quality = "standard",
     additive: bool = False,
     encoding: Encoding | None = None,
+    max_pixels: int = DEFAULT_MAX_PIXELS,
 ) -> Separation:
     """Separates one photograph; for many, `Separator.load` once and call it. Options and errors are theirs."""
     separator = Separator.load(model, device=device)
-    return separator(source, strength=strength, quality=quality, additive=additive, encoding=encoding)
+    asked = {"strength": strength, "quality": quality, "additive": additive}
+    return separator(source, **asked, encoding=encoding, max_pixels=max_pixels)
 
 
 def _check(strength: float, quality: str) -> None:
@@ -158,40 +167,58 @@ def _check(strength: float, quality: str) -> None:
 
 
 def _work_size(size: tuple[int, int], pixels: int) -> tuple[int, int]:
-    """Width and height of the small copy: about `pixels` in all, no side too short, never enlarged."""
+    """Width and height of the small copy: about `pixels` in all, more for long thin photos, never enlarged."""
     width, height = size
-    scale = max(math.sqrt(pixels / (width * height)), _SHORTEST_SIDE_PX / min(size))
-    scale = min(1.0, scale)
+    scale = math.sqrt(pixels / (width * height))
+    scale = min(1.0, max(scale, min(_LONG_PHOTO * scale, _SHORTEST_SIDE_PX / min(size))))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def _at_full_size(photo: Photo, transfer: Transfer) -> tuple[Photo, Photo, float]:
-    """Both layers, stored as the photo is, and the mean unexplained remainder."""
-    canvases = np.empty_like(photo.pixels), np.empty_like(photo.pixels)
+def _at_full_size(photo: Photo, transfer: Transfer, *, additive: bool) -> tuple[Photo, Photo, float]:
+    """Both layers, stored as the photo is or as exact floats, and the mean unexplained remainder."""
+    store = _as_floats(photo) if additive else photo
+    canvases = [np.empty(store.pixels.shape, store.pixels.dtype) for _ in range(2)]
 
     def fill(rows: slice) -> float:
         linear = photo.linear_rows(rows.start, rows.stop)
         layers = transfer.apply(linear, rows.start, photo.size[1])
-        for canvas, layer in zip(canvases, layers, strict=True):
-            canvas[rows] = photo.stored_rows(layer, rows.start)
-        return float(np.abs(linear - layers[0] - layers[1]).sum(dtype=np.float64))
+        stored = [store.stored_rows(layer, rows.start) for layer in layers]
+        if additive:
+            stored = _summing_exactly(store.stored_rows(linear, rows.start), stored[0])
+        for canvas, layer in zip(canvases, stored, strict=True):
+            canvas[rows] = layer
+        return 0.0 if additive else float(np.abs(linear - layers[0] - layers[1]).sum(dtype=np.float64))
 
     with ThreadPoolExecutor(_WORKERS) as pool:
         unexplained = sum(pool.map(fill, photo.strips()))
-    transmission, reflection = (photo.with_pixels(canvas) for canvas in canvases)
+    transmission, reflection = (store.with_pixels(canvas) for canvas in canvases)
     return transmission, reflection, unexplained / (math.prod(photo.size) * 3)
 
 
-def _at_full_size_additive(photo: Photo, transfer: Transfer) -> tuple[Photo, Photo, float]:
-    """Both layers as 32-bit floats whose sum is the photo's light to the last bit: nothing is unexplained."""
-    linear = photo.linear()
-    transmission, _ = transfer.apply(linear, 0, photo.size[1])
-    reflection = linear - np.minimum(transmission, linear)
-    # Of these two differences at least one is exact (Sterbenz 1974), which makes the sum exact.
-    layers = linear - reflection, reflection
-    origin = Origin(container="tiff", bits=32, exif=photo.origin.exif, resolution=photo.origin.resolution)
-    one, other = (replace(Photo.from_array(layer, encoding="linear"), origin=origin) for layer in layers)
-    return one, other, 0.0
+def _as_floats(photo: Photo) -> Photo:
+    """The photo's like, black, in 32-bit floats of linear light, to be filled; alpha and EXIF are kept."""
+    like = {
+        "container": "tiff",
+        "bits": 32,
+        "icc": None,
+        "primaries": None,
+        "header": None,
+        "compression": None,
+    }
+    alpha = photo.alpha
+    if alpha is not None and alpha.dtype.kind == "u":
+        alpha = alpha / np.float32(np.iinfo(alpha.dtype).max)
+    black = np.broadcast_to(np.float32(0), photo.pixels.shape)
+    return Photo(black, alpha, replace(photo.origin, **like))
+
+
+def _summing_exactly(photo: Floats, transmission: Floats) -> list[Floats]:
+    """Two layers, none negative where the photo is not, whose float sum is the photo to the last bit.
+
+    Of the two differences at least one is exact (Sterbenz 1974), which makes the sum exact.
+    """
+    reflection = photo - np.minimum(transmission, photo)
+    return [photo - reflection, reflection]
 
 
 def _enlarged(map_: Floats, photo: Photo) -> Photo:
