@@ -173,6 +173,12 @@ def test_radiance_pictures_come_back_bit_equal_and_run_lengths_are_read() -> Non
         assert again.origin.header == {"EXPOSURE": "2"}
 
 
+@pytest.mark.parametrize("width", [1 << 15, 1 << 16])
+def test_a_radiance_picture_too_wide_for_run_lengths_is_flat(width: int) -> None:
+    photo = Photo.from_array(np.full((1, width, 3), 0.5, np.float32), encoding="linear")
+    assert np.array_equal(Photo.open(photo.encode("hdr")).pixels, photo.pixels)
+
+
 @pytest.mark.parametrize("stated", ["0 0 0 0 0 0 0 0", "none", "0.3 0.3"])
 def test_primaries_that_span_no_colours_are_passed_over(stated: str) -> None:
     data = f"#?RADIANCE\nPRIMARIES={stated}\n\n-Y 1 +X 1\n".encode() + bytes((128, 64, 32, 129))
@@ -226,6 +232,20 @@ def test_an_array_needs_its_encoding() -> None:
     assert np.array_equal(Photo.open(smooth(), encoding="srgb").pixels, smooth())
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.float32])
+def test_an_encoding_we_do_not_know_is_refused(kind: type) -> None:
+    for make in (Photo.open, Photo.from_array):
+        with pytest.raises(PhotoError, match=r"'sRGB'; .*; say encoding"):
+            make(smooth().astype(kind), encoding="sRGB")
+
+
+def test_an_encoding_is_refused_for_what_tells_its_own() -> None:
+    data = file_of(smooth(), "PNG")
+    for source in (data, "a.png", pil(data), Photo.open(data)):
+        with pytest.raises(PhotoError, match="only arrays need one: .*; leave it out"):
+            Photo.open(source, encoding="srgb")
+
+
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float64])
 def test_arrays_mean_what_their_encoding_says(kind: type) -> None:
     white = np.iinfo(kind).max if kind != np.float64 else 1
@@ -262,6 +282,12 @@ def test_a_pil_image_brings_its_profile_exif_and_orientation() -> None:
     assert photo.origin.icc == P3
     assert photo.origin.exif == exif_block(1).removeprefix(b"Exif\0\0")
     assert np.array_equal(photo.pixels, np.asarray(ImageOps.exif_transpose(image)))
+
+
+def test_a_pil_jpeg_with_previews_behind_it_is_one_picture() -> None:
+    image = Image.fromarray(smooth())
+    data = file_of(smooth(), "MPO", save_all=True, append_images=[image.resize((8, 8))])
+    assert Photo.open(pil(data)).size == Photo.open(data).size == image.size
 
 
 def test_a_pil_image_of_ink_or_lab_is_refused() -> None:

@@ -211,6 +211,14 @@ def test_floats_with_a_profile_go_through_it_and_back() -> None:
     np.testing.assert_allclose(moved, photo.linear() * 0.5, atol=1e-5)
 
 
+@pytest.mark.parametrize("channels", [1, 3])
+def test_unchanged_floats_with_the_srgb_profile_come_back_bit_equal(channels: int) -> None:
+    pixels = np.random.default_rng(7).uniform(-0.5, 2, (64, 64, channels)).astype(np.float32)
+    photo = stored(pixels, bytes(pyvips.Image.profile_load("srgb")))
+    assert photo.space() == SRGB
+    assert np.array_equal(photo.with_linear(photo.linear()).pixels, pixels)
+
+
 def test_chromaticities_turn_into_rec709_with_white_on_white() -> None:
     aces = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
     light_of = space_of(None, aces, is_float=True).to_linear

@@ -34,7 +34,7 @@ def tiff_of(array: np.ndarray, **options: object) -> bytes:
     return bytes(image.tiffsave_buffer(**options))
 
 
-def refused(source: object, kind: type[PhotoError], word: str, **options: int) -> None:
+def refused(source: object, kind: type[PhotoError], word: str, **options: object) -> None:
     with pytest.raises(kind, match=word) as caught:
         Photo.open(source, **options)
     assert str(caught.value).count("; ") >= 2  # what happened, what was expected, what to do
@@ -109,6 +109,14 @@ def test_animations_and_pages_are_refused(kind: str) -> None:
     refused(file_of(kind, save_all=True, append_images=frames), UnsupportedPhoto, "extract the frames")
 
 
+@pytest.mark.parametrize("kind", ["GIF", "WEBP", "PNG", "AVIF", "TIFF"])
+def test_a_pil_image_of_several_frames_is_refused_and_its_copy_is_not(kind: str) -> None:
+    data = file_of(kind, save_all=True, append_images=[Image.fromarray(255 - NOISE)])
+    image = Image.open(io.BytesIO(data))
+    refused(image, UnsupportedPhoto, "2 frames")
+    assert Photo.open(image.copy()).size == (64, 40)
+
+
 @pytest.mark.parametrize("kind", ["JPEG", "TIFF"])
 def test_cmyk_is_refused(kind: str) -> None:
     file = io.BytesIO()
@@ -171,6 +179,17 @@ def test_a_radiance_picture_of_xyz_or_turned_lines_is_refused() -> None:
         refused(b"#?RADIANCE\n" + head + bytes(4), UnsupportedPhoto, "RGBE")
 
 
+@pytest.mark.parametrize(("height", "width"), [(0, 8), (8, 0), (0, 0)])
+def test_a_radiance_picture_without_pixels_is_refused(height: int, width: int) -> None:
+    head = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode()
+    refused(head, UnreadablePhoto, f"{width} x {height} pixels; a picture has at least one; ")
+
+
+@pytest.mark.parametrize("width", ["70000", "999999999", "9" * 5000])
+def test_a_radiance_picture_that_promises_too_much_is_refused(width: str) -> None:
+    refused(f"#?RADIANCE\n\n-Y 1 +X {width}\n".encode(), PhotoError, "70000|ends early|million|RGBE")
+
+
 @settings(max_examples=40, deadline=None, database=None)
 @given(
     st.sampled_from(["JPEG", "PNG", "TIFF", "WEBP", "AVIF", "GIF"]),
@@ -195,6 +214,12 @@ def test_more_pixels_than_the_limit_are_refused(kind: str) -> None:
 def test_more_floats_than_the_limit_are_refused(container: str) -> None:
     data = Photo.from_array(NOISE, encoding="srgb").encode(container)
     refused(data, PhotoTooLarge, "64 x 40", max_pixels=64 * 40 - 1)
+
+
+def test_more_pixels_than_the_limit_are_refused_in_memory_too() -> None:
+    for source, options in ((NOISE, {"encoding": "srgb"}), (Image.fromarray(NOISE), {})):
+        refused(source, PhotoTooLarge, "64 x 40", max_pixels=64 * 40 - 1, **options)
+        assert Photo.open(source, max_pixels=64 * 40, **options).size == (64, 40)
 
 
 def test_a_decompression_bomb_is_refused_from_its_header() -> None:

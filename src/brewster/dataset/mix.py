@@ -1,6 +1,6 @@
 """Linear-light mixtures of photographs: training data without a renderer, live and without end.
 
-    stream = Mixtures(Sources.read(folders), MixRecipe(), seed=7)
+    stream = Mixtures(read_photos([Path("photos")]), read_maps([Path("hdri")]), MixRecipe(), seed=7)
     batch = stream(step=0, count=8, size=192)
 
 Each sample is a function of (seed, step, slot) alone. In linear light I = t B + R + veil: the target is the
@@ -13,10 +13,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Annotated, Final, Protocol
 
 import torch
-from pydantic import BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from torch import Generator, Tensor
 from torch.nn import functional
 
@@ -53,40 +53,52 @@ class Stream(Protocol):
         ...
 
 
-Range = tuple[float, float]
+def _rising(bounds: tuple[float, float]) -> tuple[float, float]:
+    if bounds[0] > bounds[1]:
+        raise ValueError(f"a range goes up, and this one goes from {bounds[0]} to {bounds[1]}")
+    return bounds
+
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Range = Annotated[tuple[float, float], AfterValidator(_rising)]
+_Above0 = Annotated[float, Field(gt=0)]
+LogRange = Annotated[tuple[_Above0, _Above0], AfterValidator(_rising)]
 
 
 class MixRecipe(BaseModel):
-    """The distributions of a mixture; ranges are uniform, `_log` ranges uniform in the logarithm."""
+    """The distributions of a mixture; ranges are uniform, `_log` ranges uniform in the logarithm.
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    The defaults are those that the shipped model learns from; a recipe names what it changes.
+    """
 
-    map_probability: float
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    map_probability: Share = 0.45
     """Of the reflection's content coming from an HDR map; the background uses a third of it."""
-    crop: Range
-    background_level_log: Range
+    crop: Range = (0.45, 1.0)
+    background_level_log: LogRange = (0.03, 0.4)
     """Mean linear luminance of the background before the camera's exposure."""
-    reflection_ratio_log: Range
-    """Mean of the reflection over the mean of the background, lamps left out."""
-    absent_probability: float
+    reflection_ratio_log: LogRange = (0.03, 2.0)
+    """Mean of the reflection, its lamps left out, over the mean of the background, lamps included."""
+    absent_probability: Share = 0.1
     """Samples without any glass, from which a network learns to leave plain photographs alone."""
-    highlight_boost: Range
-    temperature: Range
-    transmittance: Range
-    veil_probability: float
-    veil: Range
-    sharp_probability: float
-    blur_px: Range
-    ghost_probability: float
-    ghost_weight: Range
-    ghost_px: float
-    falloff_probability: float
-    edge_probability: float
-    exposure: Range
+    highlight_boost: Range = (0.0, 6.0)
+    temperature: Range = (-0.35, 0.35)
+    transmittance: Range = (0.72, 1.0)
+    veil_probability: Share = 0.3
+    veil: Range = (0.0, 0.25)
+    sharp_probability: Share = 0.3
+    blur_px: Range = (0.5, 5.0)
+    ghost_probability: Share = 0.4
+    ghost_weight: Range = (0.4, 0.95)
+    ghost_px: float = 6.0
+    falloff_probability: Share = 0.5
+    edge_probability: Share = 0.3
+    exposure: Range = (0.2, 0.55)
     """The largest mean that the camera lets the whole photo have."""
-    gamma_log: Range
-    contrast: Range
-    noise: Range
+    gamma_log: LogRange = (0.8, 1.25)
+    contrast: Range = (-0.3, 0.5)
+    noise: Range = (0.0, 0.012)
 
 
 class _Dice:

@@ -12,23 +12,34 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from brewster.errors import RecipeError
+from brewster.files import SUFFIXES
 from brewster.light import to_encoded
 from brewster.photo import Photo
 
-_PICTURES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".avif"}
-_MAPS = {".exr", ".hdr"}
+_MAPS = {suffix for suffix, container in SUFFIXES.items() if container in ("exr", "hdr")}
+_PICTURES = SUFFIXES.keys() - _MAPS
 _PHOTO_SIDE_PX = 640
 _MAP_HEIGHT_PX = 512
 _LARGEST_HALF = 65504.0
 
 
 def read_photos(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list[Tensor]:
-    """Every photo of the folders, uint8 sRGB (H, W, 3), longest side at most 640 px, in order of name."""
+    """Every photo of the folders, uint8 sRGB (H, W, 3), longest side at most 640 px, in order of name.
+
+    Raises:
+        RecipeError: a folder cannot be read, or there is no photo in any of them.
+        PhotoError: a photo cannot be read.
+    """
     return [_read_photo(path, _PHOTO_SIDE_PX) for path in _list(folders, _PICTURES, exclude)]
 
 
 def read_maps(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list[Tensor]:
-    """Every lat-long map of the folders, half precision (3, H, 2 H), at most 512 px high, linear light."""
+    """Every lat-long map of the folders, half precision (3, H, 2 H), at most 512 px high, linear light.
+
+    Raises:
+        RecipeError: a folder cannot be read, or there is no map in any of them.
+        PhotoError: a map cannot be read.
+    """
     return [_read_map(path) for path in _list(folders, _MAPS, exclude)]
 
 
@@ -36,7 +47,8 @@ def read_pairs(folders: Sequence[Path]) -> list[tuple[Tensor, Tensor]]:
     """Aligned (photo, transmission) pairs of folders with `blended/` and `transmission*/`, joined by name.
 
     Raises:
-        RecipeError: a photo has no partner, or a partner of another size.
+        RecipeError: a folder cannot be read or is empty; a photo has no partner, or one of another size.
+        PhotoError: a picture cannot be read.
     """
     return [_read_pair(path) for folder in folders for path in _list([folder / "blended"], _PICTURES)]
 
@@ -83,7 +95,7 @@ def _list(folders: Iterable[Path], suffixes: set[str], exclude: Sequence[str] = 
     found = sorted(
         path
         for folder in folders
-        for path in folder.iterdir()
+        for path in _entries(folder)
         if path.suffix.lower() in suffixes and not any(fnmatch(path.name, pattern) for pattern in exclude)
     )
     if folders and not found:
@@ -93,3 +105,14 @@ def _list(folders: Iterable[Path], suffixes: set[str], exclude: Sequence[str] = 
             "name another folder in the recipe, or set BREWSTER_DATA to where the data lies",
         )
     return found
+
+
+def _entries(folder: Path) -> list[Path]:
+    try:
+        return list(folder.iterdir())
+    except OSError as error:
+        raise RecipeError(
+            f"{folder} cannot be read ({error.strerror})",
+            "a folder with pictures",
+            "name another folder in the recipe, or set BREWSTER_DATA to where the data lies",
+        ) from error

@@ -91,6 +91,11 @@ class _Encoder(nn.Module):
         return scales
 
 
+def _leaky(x: Tensor) -> Tensor:
+    """A rectifier that cannot die: with plain ones, a whole run once ended in a constant reflection."""
+    return functional.leaky_relu(x, 0.1)
+
+
 @final
 class _Decoder(nn.Module):
     """One step up the U-Net: enlarge, join the encoder's features, mix twice."""
@@ -103,8 +108,8 @@ class _Decoder(nn.Module):
 
     def forward(self, below: Tensor, skip: Tensor) -> Tensor:
         enlarged = functional.interpolate(self.squeeze(below), scale_factor=2.0, mode="bilinear")
-        x = functional.relu(self.join(torch.cat([enlarged, skip], dim=1)))
-        return x + functional.relu(self.mix(x))
+        x = _leaky(self.join(torch.cat([enlarged, skip], dim=1)))
+        return x + _leaky(self.mix(x))
 
 
 @final
@@ -137,7 +142,7 @@ class CompactNetwork(nn.Module):
         for decoder, skip in zip(reversed(self.decoders), reversed(skips), strict=True):
             x = decoder(x, skip)
         x = functional.interpolate(self.squeeze(x), scale_factor=2.0, mode="bilinear")
-        x = self.head(functional.relu(self.join(torch.cat([x, normal], dim=1))))
+        x = self.head(_leaky(self.join(torch.cat([x, normal], dim=1))))
         added, gain, repair, other = x.split(3, dim=1)
         transmission = to_encoded((to_linear(photo_encoded) - added) * gain.exp()) + repair
         return torch.cat([transmission, to_encoded(added + other)], dim=1)

@@ -97,7 +97,8 @@ class Space:
             channels = _product(_inverse(self.matrix), channels)
         for i, curve in enumerate(curves):
             stored[..., i] = _encoded(channels[i], curve, before.dtype)
-        if self not in (SRGB, LINEAR_REC709):  # these round-trip by themselves, as the tests prove
+        is_exact = self == LINEAR_REC709 or (self == SRGB and before.dtype.kind == "u")
+        if not is_exact:  # those round-trip by themselves, as the tests prove
             same = np.all(linear == self.to_linear(before), axis=2)
             stored[same] = before[same]
         return stored

@@ -273,7 +273,7 @@ def _decode_heic(data: bytes, max_pixels: int) -> Decoded:
         exif=metadata.upright_exif(exif) if exif else None,
         xmp=metadata.upright_xmp(xmp) if xmp else None,
     )
-    return split(array.reshape(*array.shape[:2], -1), origin)
+    return split(_full_scale(array.reshape(*array.shape[:2], -1), origin.bits), origin)
 
 
 # --- arrays

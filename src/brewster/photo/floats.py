@@ -132,11 +132,12 @@ def write_exr(floats: Floats) -> bytes:
 def read_hdr(data: bytes, most: int) -> Floats:
     """A Radiance picture: red, green and blue with a common exponent.
 
-    Raises PhotoTooLarge, UnreadablePhoto if it ends early, UnsupportedPhoto for XYZ or turned scan lines.
+    Raises PhotoTooLarge, UnreadablePhoto if it is empty or ends early, UnsupportedPhoto for XYZ or turned
+    scan lines.
     """
     head, blank, rest = data.partition(b"\n\n")
     size, _, body = rest.partition(b"\n")
-    sides = re.fullmatch(rb"-Y (\d+) \+X (\d+)\s*", size)
+    sides = re.fullmatch(rb"-Y (\d{1,9}) \+X (\d{1,9})\s*", size)
     lines = head.decode("latin-1").splitlines()[1:]
     if not blank or sides is None or any("xyze" in line for line in lines):
         raise UnsupportedPhoto(
@@ -145,6 +146,10 @@ def read_hdr(data: bytes, most: int) -> Floats:
             "export it so",
         )
     height, width = int(sides[1]), int(sides[2])
+    if width * height == 0:
+        raise UnreadablePhoto(
+            f"the HDR picture has {width} x {height} pixels", "a picture has at least one", "export it again"
+        )
     if width * height > most:
         raise too_large(width, height, most)
     return Floats(_from_rgbe(_scan_lines(body, width, height)), None, _hdr_origin(lines))
@@ -158,8 +163,8 @@ def _hdr_origin(lines: list[str]) -> Origin:
 
 
 def _scan_lines(body: bytes, width: int, height: int) -> NDArray[np.uint8]:
-    """Bytes (H, W, 4) of run-length coded or flat lines."""
-    is_coded = body.startswith(b"\2\2" + width.to_bytes(2, "big"))
+    """Bytes (H, W, 4) of run-length coded or flat lines; lines of 2**15 pixels and more are always flat."""
+    is_coded = width < 1 << 15 and body.startswith(b"\2\2" + width.to_bytes(2, "big"))
     try:
         if is_coded:
             planes = np.frombuffer(_unpacked(body, width, height), np.uint8)

@@ -19,6 +19,7 @@ from brewster.photo import metadata
 from brewster.photo.colour import Space, space_of
 from brewster.photo.decode import Decoded, decode, split, upright
 from brewster.photo.encode import encode
+from brewster.photo.floats import too_large
 from brewster.photo.origin import DEPTHS, LINEAR, Origin, container_of, depth_for
 
 Float32 = NDArray[np.float32]
@@ -56,21 +57,25 @@ class Photo:
     ) -> Photo:
         """A photo from whatever holds one: a path, the bytes of a file, an array, a PIL image, or a photo.
 
-        An array needs its `encoding` stated. Raises UnreadablePhoto (missing, empty, truncated, no picture),
-        UnsupportedPhoto (CMYK, animation, five channels, not-a-number, table-based profile), PhotoTooLarge
-        (beyond `max_pixels`, told from the header) or MissingExtra (EXR, HEIC).
+        An array needs its `encoding` stated, the others tell theirs. Raises UnreadablePhoto (missing, empty,
+        truncated, no picture), UnsupportedPhoto (CMYK, animation, five channels, not-a-number, table-based
+        profile), PhotoTooLarge (beyond `max_pixels`, told from the header), MissingExtra (EXR, HEIC), or
+        PhotoError for an encoding that is missing, unknown or out of place.
         """
+        if isinstance(source, np.ndarray):
+            height, width = (*source.shape, 1, 1)[:2]
+            _refuse_large(width, height, max_pixels)
+            return cls.from_array(source, encoding=_stated(encoding))
+        if encoding is not None:
+            raise PhotoError(
+                f"encoding={encoding!r} came with a {type(source).__name__}",
+                "only arrays need one: files, PIL images and photos tell their own",
+                "leave it out",
+            )
         if isinstance(source, Photo):
             return source
-        if isinstance(source, np.ndarray):
-            if encoding is None:
-                raise PhotoError(
-                    "an array came without its encoding",
-                    "numbers alone do not tell what light they mean",
-                    'say encoding="srgb" or encoding="linear"',
-                )
-            return cls.from_array(source, encoding=encoding)
         if hasattr(source, "getbands"):
+            _refuse_large(source.width, source.height, max_pixels)
             return cls.from_pil(source)
         data = bytes(source) if isinstance(source, bytes | bytearray | memoryview) else _read(Path(source))
         return cls._of(decode(data, max_pixels))
@@ -86,8 +91,9 @@ class Photo:
         """A photo from (H, W) or (H, W, 1|3|4) numbers: uint8, uint16, or floats where 1.0 is white.
 
         sRGB whole numbers are stored as they are, all others as linear float32. Raises UnsupportedPhoto for
-        other shapes and types and for values that are not finite.
+        other shapes and types and for values that are not finite, PhotoError for other encodings.
         """
+        encoding = _stated(encoding)
         array = np.array(array)[..., None] if np.ndim(array) == 2 else np.array(array)
         if array.ndim != 3 or array.shape[2] not in (1, 3, 4) or array.dtype.name not in _LEVELS:
             raise UnsupportedPhoto(
@@ -115,8 +121,14 @@ class Photo:
     def from_pil(cls, image: Source) -> Photo:
         """A photo from a PIL image with its profile and EXIF; palettes become RGB.
 
-        Raises UnsupportedPhoto for CMYK, LAB, floats and other modes whose meaning is not plain.
+        Raises UnsupportedPhoto for animations, CMYK, LAB, floats and other modes whose meaning is not plain.
         """
+        if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":  # a JPEG with previews behind it
+            raise UnsupportedPhoto(
+                f"the PIL image has {image.n_frames} frames",
+                "brewster takes one picture at a time",
+                "seek the frame and give its image.copy()",
+            )
         if image.mode in ("P", "PA", "1"):
             has_alpha = image.mode == "PA" or "transparency" in image.info
             image = image.convert("L" if image.mode == "1" else "RGBA" if has_alpha else "RGB")
@@ -260,6 +272,21 @@ def _area_means(line: Float32, width: int) -> Float32:
     edges = np.linspace(0, len(line), width + 1)
     at = np.column_stack([np.interp(edges, np.arange(len(sums)), sums[:, i]) for i in range(3)])
     return (np.diff(at, axis=0) * (width / len(line))).astype(np.float32)
+
+
+def _stated(encoding: str | None) -> Encoding:
+    if encoding not in ("srgb", "linear"):
+        raise PhotoError(
+            f"the array's encoding is {encoding!r}",
+            "numbers alone do not tell what light they mean",
+            'say encoding="srgb" or encoding="linear"',
+        )
+    return encoding
+
+
+def _refuse_large(width: int, height: int, most: int) -> None:
+    if width * height > most:
+        raise too_large(width, height, most)
 
 
 def _refuse_shapes(pixels: Stored, alpha: Stored | None) -> None:

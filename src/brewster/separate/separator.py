@@ -155,8 +155,14 @@ def separate(
 ) -> Separation:
     """Separates one photograph; for many, `Separator.load` once and call it. Options and errors are theirs."""
     separator = Separator.load(model, device=device)
-    asked = {"strength": strength, "quality": quality, "additive": additive}
-    return separator(source, **asked, encoding=encoding, max_pixels=max_pixels)
+    return separator(
+        source,
+        strength=strength,
+        quality=quality,
+        additive=additive,
+        encoding=encoding,
+        max_pixels=max_pixels,
+    )
 
 
 def _check(strength: float, quality: str) -> None:
@@ -197,19 +203,14 @@ def _at_full_size(photo: Photo, transfer: Transfer, *, additive: bool) -> tuple[
 
 def _as_floats(photo: Photo) -> Photo:
     """The photo's like, black, in 32-bit floats of linear light, to be filled; alpha and EXIF are kept."""
-    like = {
-        "container": "tiff",
-        "bits": 32,
-        "icc": None,
-        "primaries": None,
-        "header": None,
-        "compression": None,
-    }
+    origin = replace(
+        photo.origin, container="tiff", bits=32, compression=None, icc=None, primaries=None, header=None
+    )
     alpha = photo.alpha
     if alpha is not None and alpha.dtype.kind == "u":
         alpha = alpha / np.float32(np.iinfo(alpha.dtype).max)
     black = np.broadcast_to(np.float32(0), photo.pixels.shape)
-    return Photo(black, alpha, replace(photo.origin, **like))
+    return Photo(black, alpha, origin)
 
 
 def _summing_exactly(photo: Floats, transmission: Floats) -> list[Floats]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import io
 import pickle
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,9 @@ import torch
 from torch import Tensor
 
 from brewster.errors import ModelError
+from brewster.files import write_atomically
+
+AFRESH = "delete it to start afresh, or name another folder with -o"
 
 
 @dataclass(frozen=True)
@@ -25,20 +28,21 @@ class Checkpoint:
     recipe: str
 
     def write(self, path: Path) -> None:
-        """Replaces the file in one move: a kill leaves the old checkpoint or the new one."""
-        partial = path.with_suffix(".partial")
-        with partial.open("wb") as stream:
-            torch.save(vars(self), stream)
-            stream.flush()
-            os.fsync(stream.fileno())
-        partial.replace(path)
-
-    @classmethod
-    def read(cls, path: Path) -> Checkpoint:
-        """Reads a checkpoint; no code in it is run.
+        """Replaces the file in one move: a kill leaves the old checkpoint or the new one.
 
         Raises:
-            ModelError: not a checkpoint of ours, or damaged.
+            TargetError: it cannot be written.
+        """
+        stream = io.BytesIO()
+        torch.save(vars(self), stream)
+        write_atomically(path, stream.getvalue(), overwrite=True)
+
+    @classmethod
+    def read(cls, path: Path, cure: str = AFRESH) -> Checkpoint:
+        """Reads a checkpoint; no code in it is run. `cure` is what an error advises.
+
+        Raises:
+            ModelError: missing, damaged, or not a checkpoint of ours.
         """
         try:
             return cls(**torch.load(path, map_location="cpu", weights_only=True))
@@ -46,5 +50,5 @@ class Checkpoint:
             raise ModelError(
                 f"{path} cannot be read ({type(error).__name__})",
                 "a checkpoint written by brewster train",
-                "delete it to start afresh, or name another folder with -o",
+                cure,
             ) from error

@@ -6,13 +6,18 @@ from pathlib import Path
 
 import torch
 
+from brewster.files import write_atomically
 from brewster.models.compact import STRIDE, CompactNetwork, LinearSeparator
 
 _OPSET = 18
 
 
 def export_onnx(network: CompactNetwork, path: Path) -> None:
-    """Writes `photo` -> `transmission`, `reflection`, linear light (1, 3, H, W), H and W multiples of 32."""
+    """Writes `photo` -> `transmission`, `reflection`, linear light (1, 3, H, W), H and W multiples of 32.
+
+    Raises:
+        TargetError: the file cannot be written.
+    """
     height, width = (torch.export.Dim(name, min=1, max=256) for name in ("rows", "columns"))
     example = torch.rand(1, 3, 4 * STRIDE, 5 * STRIDE)
     program = torch.onnx.export(
@@ -26,4 +31,4 @@ def export_onnx(network: CompactNetwork, path: Path) -> None:
         verbose=False,
     )
     assert program is not None
-    program.save(path, external_data=False)
+    write_atomically(path, program.model_proto.SerializeToString(), overwrite=True)

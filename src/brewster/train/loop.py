@@ -11,8 +11,9 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
@@ -23,18 +24,20 @@ from torch.nn import functional
 from brewster.dataset.mix import Batch, Stream
 from brewster.dataset.sources import read_pairs
 from brewster.errors import ModelError, RecipeError
+from brewster.files import write_atomically
 from brewster.light import to_linear
 from brewster.models.compact import STRIDE, CompactNetwork, with_imagenet_features
 from brewster.photo import Photo
-from brewster.train.checkpoint import Checkpoint
+from brewster.train.checkpoint import AFRESH, Checkpoint
 from brewster.train.losses import separation_loss
 from brewster.train.recipe import TrainRecipe, data_folder, open_stream
 
-Report = Callable[[int, int, Mapping[str, float]], None]
-"""Called with (step, steps, numbers) after every step."""
+Report = Callable[[int, int, Mapping[str, float], bool], None]
+"""Called with (step, steps, numbers, logged) after every step; `logged` says that the numbers went into the log."""
 
 _VALIDATION_SIDE_PX: Final = 384
 _MAX_GRADIENT_NORM: Final = 1.0
+_TRAIN_IT_FIRST: Final = "train the recipe that makes it first, or mend start_from in this one"
 
 
 class Trainer:
@@ -48,10 +51,8 @@ class Trainer:
         self._pool = ThreadPoolExecutor(self._workers)
         self._ahead: dict[int, Future[Batch]] = {}
         network = with_imagenet_features()
-        if recipe.start_from:
-            network.load_state_dict(Checkpoint.read(recipe.start_from).average)
         self.network = network.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.average = {name: value.clone() for name, value in self.network.state_dict().items()}
+        self._begin_average()
         encoder = list(self.network.encoder.parameters())
         known = set(map(id, encoder))
         rest = [parameter for parameter in self.network.parameters() if id(parameter) not in known]
@@ -62,6 +63,11 @@ class Trainer:
             ],
             weight_decay=recipe.weight_decay,
         )
+
+    def start_from(self, checkpoint: Checkpoint) -> None:
+        """Begins with the averaged weights of another run."""
+        self.network.load_state_dict(checkpoint.average)
+        self._begin_average()
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Continues where the checkpoint was written."""
@@ -110,6 +116,9 @@ class Trainer:
         network.load_state_dict(self.average)
         return network
 
+    def _begin_average(self) -> None:
+        self.average = {name: value.clone() for name, value in self.network.state_dict().items()}
+
     def _next_batch(self) -> Batch:
         """The batch of this step; those of the next steps are made in the background meanwhile."""
         for step in range(self.step, self.step + 1 + self._workers):
@@ -139,25 +148,28 @@ def train(recipe: TrainRecipe, out: Path, report: Report) -> CompactNetwork:
 
     Raises:
         RecipeError: data missing, or `out` holds a run of another recipe.
-        ModelError: damaged checkpoint, or the loss is not a number.
+        PhotoError: a picture cannot be read.
+        ModelError: a checkpoint is missing, damaged or of another network, or the loss is not a number.
+        TargetError: `out` cannot be written to.
     """
     out.mkdir(parents=True, exist_ok=True)
     trainer = Trainer(recipe, open_stream(recipe))
-    saved = out / "checkpoint.pt"
-    if saved.exists():
-        trainer.restore(_of_this_recipe(Checkpoint.read(saved), recipe, saved))
+    saved, log = out / "checkpoint.pt", out / "log.jsonl"
+    _take_up(trainer, saved)
+    _forget_after(trainer.step, log)
     pairs = _validation_pairs(recipe)
     started = time.monotonic()
     while trainer.step < recipe.steps:
         numbers = trainer.advance()
-        if trainer.step % recipe.report_every == 0 or trainer.step == recipe.steps:
+        logged = trainer.step % recipe.report_every == 0 or trainer.step == recipe.steps
+        if logged:
             network = trainer.averaged_network()
             numbers |= validate(network, pairs) | {"seconds": time.monotonic() - started}
-            _log(out / "log.jsonl", {"step": trainer.step, **numbers})
+            _log(log, {"step": trainer.step, **numbers})
             _write_samples(out / "samples.png", network, pairs or _some(trainer))
         if trainer.step % recipe.checkpoint_every == 0 or trainer.step == recipe.steps:
             trainer.checkpoint().write(saved)
-        report(trainer.step, recipe.steps, numbers)
+        report(trainer.step, recipe.steps, numbers, logged)
     return trainer.averaged_network()
 
 
@@ -175,14 +187,42 @@ def validate(network: CompactNetwork, pairs: Mapping[str, list[tuple[Tensor, Ten
     return gains
 
 
+def _take_up(trainer: Trainer, saved: Path) -> None:
+    """Goes on with the run if it has begun, else begins it where its recipe says."""
+    recipe = trainer.recipe
+    if saved.exists():
+        checkpoint = _of_this_recipe(Checkpoint.read(saved), recipe, saved)
+        with _fitting(saved, AFRESH):
+            trainer.restore(checkpoint)
+    elif recipe.start_from:
+        checkpoint = Checkpoint.read(recipe.start_from, _TRAIN_IT_FIRST)
+        with _fitting(recipe.start_from, _TRAIN_IT_FIRST):
+            trainer.start_from(checkpoint)
+
+
+@contextmanager
+def _fitting(path: Path, cure: str) -> Iterator[None]:
+    try:
+        yield
+    except (RuntimeError, ValueError, KeyError) as error:
+        raise ModelError(
+            f"{path} holds another network", "a checkpoint of the compact network", cure
+        ) from error
+
+
 def _of_this_recipe(checkpoint: Checkpoint, recipe: TrainRecipe, path: Path) -> Checkpoint:
-    if checkpoint.recipe == recipe.model_dump_json():
+    if _identity(checkpoint.recipe) == _identity(recipe.model_dump_json()):
         return checkpoint
     raise RecipeError(
         f"{path} belongs to another recipe",
         "a run resumes only with the recipe that it began with",
         "choose another folder with -o",
     )
+
+
+def _identity(recipe: str) -> dict[str, object]:
+    """What a run must keep to be resumed: all but the place of the file that it started from."""
+    return {name: value for name, value in json.loads(recipe).items() if name != "start_from"}
 
 
 def _validation_pairs(recipe: TrainRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]:
@@ -211,6 +251,14 @@ def _some(trainer: Trainer) -> dict[str, list[tuple[Tensor, Tensor]]]:
 def _log(path: Path, numbers: Mapping[str, float]) -> None:
     with path.open("a") as stream:
         stream.write(json.dumps({name: round(value, 5) for name, value in numbers.items()}) + "\n")
+
+
+def _forget_after(step: int, log: Path) -> None:
+    """Drops the lines that a killed run wrote after its last checkpoint, the last of them perhaps half."""
+    lines = log.read_text().splitlines() if log.exists() else []
+    kept = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= step]
+    if kept != lines:
+        write_atomically(log, "".join(f"{line}\n" for line in kept).encode(), overwrite=True)
 
 
 @torch.no_grad()

@@ -8,27 +8,39 @@ from __future__ import annotations
 import os
 import tomllib
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from brewster.dataset.mix import Blend, MixRecipe, Mixtures, Pairs, Stream
+from brewster.dataset.mix import Blend, MixRecipe, Mixtures, Pairs, Share, Stream
 from brewster.dataset.sources import read_maps, read_pairs, read_photos
 from brewster.errors import RecipeError
+from brewster.models.compact import STRIDE
 
 Positive = Annotated[int, Field(gt=0)]
 Rate = Annotated[float, Field(gt=0)]
-Share = Annotated[float, Field(ge=0, le=1)]
+Seed = Annotated[int, Field(ge=0, lt=2**32)]
+Side = Annotated[int, Field(gt=0, multiple_of=STRIDE)]
+
+
+def _rising_from_0(sizes: list[tuple[float, int]]) -> list[tuple[float, int]]:
+    starts, sides = zip(*sizes, strict=True)
+    if starts[0] != 0 or list(starts) != sorted(set(starts)) or list(sides) != sorted(sides):
+        raise ValueError("the shares start at 0 and rise, and so do the sides")
+    return sizes
+
+
+Sizes = Annotated[list[tuple[Share, Side]], Field(min_length=1), AfterValidator(_rising_from_0)]
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class DataRecipe(_Section):
     """Which folders, relative to BREWSTER_DATA, and which file names in them to leave out."""
 
-    photos: list[Path]
+    photos: Annotated[list[Path], Field(min_length=1)]
     maps: list[Path] = []
     pairs: list[Path] = []
     pairs_share: Share = 0.0
@@ -39,10 +51,10 @@ class DataRecipe(_Section):
 class TrainRecipe(_Section):
     """One run. `sizes` lists (share of the run, side in px): small pictures first, large ones last."""
 
-    seed: int
+    seed: Seed
     steps: Positive
     batch: Positive
-    sizes: Annotated[list[tuple[Share, Positive]], Field(min_length=1)]
+    sizes: Sizes
     learning_rate: Rate
     encoder_learning_rate: Rate
     warmup_steps: Positive
@@ -53,7 +65,17 @@ class TrainRecipe(_Section):
     report_every: Positive
     checkpoint_every: Positive
     data: DataRecipe
-    mix: MixRecipe
+    mix: MixRecipe = MixRecipe()
+
+    @model_validator(mode="after")
+    def _blends(self) -> Self:
+        real = round(self.batch * self.data.pairs_share)
+        if real == self.batch or bool(real) != bool(self.data.pairs):
+            raise ValueError(
+                f"pairs_share makes {real} of a batch of {self.batch} pairs, out of {len(self.data.pairs)} folders;"
+                " with folders some, but not all, without folders none"
+            )
+        return self
 
     def size_at(self, step: int) -> int:
         """Side of the training pictures in px at this step, a multiple of 32."""
@@ -67,17 +89,17 @@ def read_recipe(path: Path) -> TrainRecipe:
         RecipeError: missing, not TOML, or with values that are missing, unknown or impossible.
     """
     try:
-        recipe = TrainRecipe.model_validate(tomllib.loads(path.read_text()))
+        recipe = TrainRecipe.model_validate(tomllib.loads(path.read_text("utf-8")))
     except OSError as error:
         raise RecipeError(f"{path} cannot be read", "a TOML recipe", "see recipes/train/") from error
-    except tomllib.TOMLDecodeError as error:
-        raise RecipeError(f"{path} is not TOML ({error})", "a TOML recipe", "mend that line") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise RecipeError(f"{path} is not TOML ({error})", "a TOML recipe", "mend that place") from error
     except ValidationError as error:
         first = error.errors()[0]
         name = ".".join(map(str, first["loc"]))
         raise RecipeError(
-            f"{path} has a wrong value for {name}",
-            first["msg"],
+            f"{path} has a wrong value for {name}" if name else f"{path} contradicts itself",
+            first["msg"].removeprefix("Value error, "),
             "compare with recipes/train/compact.toml",
         ) from error
     if recipe.start_from:
@@ -102,7 +124,12 @@ def data_folder() -> Path:
 
 
 def open_stream(recipe: TrainRecipe) -> Stream:
-    """The recipe's training data, read into memory: mixtures, joined by real pairs where it asks for them."""
+    """The recipe's training data, read into memory: mixtures, joined by real pairs where it asks for them.
+
+    Raises:
+        RecipeError: a folder is missing or empty, or pairs do not fit together.
+        PhotoError: a picture cannot be read.
+    """
     root, data = data_folder(), recipe.data
     photos = read_photos([root / folder for folder in data.photos], data.exclude)
     maps = read_maps([root / folder for folder in data.maps], data.exclude)
