@@ -70,7 +70,6 @@ def test_the_options_offer_what_the_rooms_below_take():
     assert set(get_args(hints["device"])) == set(DEVICES)
     assert get_args(get_args(hints["layers"])[0]) == files.LAYERS
     assert set(get_args(get_args(hints["format"])[0])) == set(photo.DEPTHS)
-    assert Options().max_pixels == photo.DEFAULT_MAX_PIXELS
 
 
 def test_every_option_of_a_separation_is_an_option_of_the_command():

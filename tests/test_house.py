@@ -13,6 +13,8 @@ import pytest
 
 import brewster
 import brewster.errors
+import brewster.photo
+import brewster.separate
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "brewster"
@@ -54,6 +56,15 @@ def test_separating_a_photo_needs_no_torch():
 
 
 def test_every_public_name_is_exported_and_documented():
+    """What a module defines without an underscore and other rooms use is what it exports."""
+    for module in (brewster.photo, brewster.separate):
+        assert module.__all__ == sorted(module.__all__, key=lambda name: (not name.isupper(), name))
+        defined = {
+            name
+            for name, value in vars(module).items()
+            if getattr(value, "__module__", "").startswith("brewster")
+        }
+        assert {name for name in defined if name[0] != "_"} <= set(module.__all__)
     for name in brewster.__all__:
         value = getattr(brewster, name)
         assert name.startswith("__") or inspect.getdoc(value), name
@@ -122,6 +133,13 @@ def test_the_python_in_the_readme_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for block in blocks:
         exec(compile(block, "README.md", "exec"), {})
+
+
+def test_every_link_in_the_documents_leads_somewhere():
+    for document in [ROOT / "README.md", *ROOT.glob("docs/*.md")]:
+        links = re.findall(r"\]\(([^)#]+)", document.read_text())
+        for link in (link for link in links if "://" not in link):
+            assert (document.parent / link).exists(), f"{document.name}: {link}"
 
 
 def test_every_test_file_is_named_after_a_module_or_a_rule():

@@ -242,7 +242,7 @@ def test_an_encoding_we_do_not_know_is_refused(kind: type) -> None:
 def test_an_encoding_is_refused_for_what_tells_its_own() -> None:
     data = file_of(smooth(), "PNG")
     for source in (data, "a.png", pil(data), Photo.open(data)):
-        with pytest.raises(PhotoError, match="only arrays need one: .*; leave it out"):
+        with pytest.raises(PhotoError, match="only arrays need one"):
             Photo.open(source, encoding="srgb")
 
 

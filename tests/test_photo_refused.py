@@ -185,9 +185,11 @@ def test_a_radiance_picture_without_pixels_is_refused(height: int, width: int) -
     refused(head, UnreadablePhoto, f"{width} x {height} pixels; a picture has at least one; ")
 
 
-@pytest.mark.parametrize("width", ["70000", "999999999", "9" * 5000])
-def test_a_radiance_picture_that_promises_too_much_is_refused(width: str) -> None:
-    refused(f"#?RADIANCE\n\n-Y 1 +X {width}\n".encode(), PhotoError, "70000|ends early|million|RGBE")
+@pytest.mark.parametrize(
+    ("width", "word"), [("70000", "ends early"), ("999999999", "limit"), ("9" * 5000, "RGBE")]
+)
+def test_a_radiance_picture_that_promises_too_much_is_refused(width: str, word: str) -> None:
+    refused(f"#?RADIANCE\n\n-Y 1 +X {width}\n".encode(), PhotoError, word)
 
 
 @settings(max_examples=40, deadline=None, database=None)

@@ -35,6 +35,9 @@ SUFFIXES = {
 }
 """What a file name promises to be: lower-case suffix -> container."""
 
+DEFAULT_MAX_PIXELS = 200_000_000
+"""Larger pictures are refused before they are decoded: a small file can hold an enormous one."""
+
 LAYERS = ("transmission", "reflection", "confidence")
 _ALWAYS_PNG = ("confidence",)  # a grey map, not a photograph: no container of the source would suit it better
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal, final
 
 from brewster.errors import BrewsterError
-from brewster.files import SUFFIXES
+from brewster.files import DEFAULT_MAX_PIXELS, SUFFIXES
 
 Layer = Literal["transmission", "reflection", "confidence"]
 Quality = Literal["draft", "standard", "best"]
@@ -66,7 +66,7 @@ class Options:
         metadata=_about("Where the network runs; auto takes the fastest device that is there."),
     )
     max_pixels: int = field(
-        default=200_000_000,
+        default=DEFAULT_MAX_PIXELS,
         metadata=_about("Refuse photos of more pixels than this, before decoding them.", ge=1),
     )
 

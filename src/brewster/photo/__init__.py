@@ -6,7 +6,8 @@
 pyvips is used in this room only (decode, encode), OpenEXR and pillow-heif only when such a file comes along.
 """
 
+from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.photo.origin import DEPTHS, Origin
-from brewster.photo.photo import DEFAULT_MAX_PIXELS, Encoding, Photo, Source
+from brewster.photo.photo import Encoding, Photo, Source
 
 __all__ = ["DEFAULT_MAX_PIXELS", "DEPTHS", "Encoding", "Origin", "Photo", "Source"]

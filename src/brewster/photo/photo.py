@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from brewster import light
 from brewster.errors import PhotoError, UnreadablePhoto, UnsupportedPhoto
-from brewster.files import write_atomically
+from brewster.files import DEFAULT_MAX_PIXELS, write_atomically
 from brewster.photo import metadata
 from brewster.photo.colour import Space, space_of
 from brewster.photo.decode import Decoded, decode, split, upright
@@ -28,7 +28,6 @@ Encoding = Literal["srgb", "linear"]
 Source = Any
 """A path, the bytes of a file, a numpy array (with its encoding stated), a PIL image, or a Photo."""
 
-DEFAULT_MAX_PIXELS = 200_000_000
 _STRIP = 1 << 18  # pixels worked on at once: a few megabytes, so that whole float copies are never needed
 
 
@@ -274,7 +273,7 @@ def _area_means(line: Float32, width: int) -> Float32:
     return (np.diff(at, axis=0) * (width / len(line))).astype(np.float32)
 
 
-def _stated(encoding: str | None) -> Encoding:
+def _stated(encoding: Encoding | None) -> Encoding:
     if encoding not in ("srgb", "linear"):
         raise PhotoError(
             f"the array's encoding is {encoding!r}",
