@@ -259,7 +259,6 @@ def test_no_picture_is_poured_into_a_terminal(run, tmp_path, monkeypatch):
         ["a.jpg", "-o", "clear.gif"],
         ["modles"],
         ["models", "burn"],
-        ["train", "recipe.toml"],
     ],
     ids=" ".join,
 )

@@ -128,14 +128,16 @@ def test_a_run_tells_its_progress_and_ends_in_a_model_that_separates(bare, tmp_p
         (folder / f"{index}.png").write_bytes(picture(120, 90, "png", seed=index))
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "data"))
     recipe = ROOT / "recipes" / "train" / "tiny.toml"
-    code, out, err = bare("train", recipe, "-o", "run")
+    code, out, err = bare("train", recipe)
     assert (code, out) == (0, b"")
-    assert "step 6 of 6: loss" in err
+    told = [line.split(",")[0].rsplit(maxsplit=1)[0] for line in err.splitlines() if line.startswith("step")]
+    assert told == ["step 3 of 6: loss", "step 6 of 6: loss"]
+    run = tmp_path / "out" / "tiny"
     assert {"checkpoint.pt", "log.jsonl", "model.onnx", "samples.png"} == {
-        path.name for path in (tmp_path / "run").iterdir()
+        path.name for path in run.iterdir()
     }
     photo = Photo.from_array(np.full((50, 70, 3), 128, np.uint8), encoding="srgb")
-    assert Separator.load(str(tmp_path / "run" / "model.onnx"))(photo).transmission.size == (70, 50)
+    assert Separator.load(str(run / "model.onnx"))(photo).transmission.size == (70, 50)
 
 
 def test_a_run_that_has_no_place_is_an_error(bare, tmp_path):
@@ -143,3 +145,10 @@ def test_a_run_that_has_no_place_is_an_error(bare, tmp_path):
     code, _, err = bare("train", ROOT / "recipes" / "train" / "tiny.toml", "-o", "file/run")
     assert code == 1
     assert err.startswith("error: file/run cannot be made")
+
+
+def test_a_run_goes_by_the_name_of_its_recipe_unless_told_otherwise(bare, tmp_path):
+    (tmp_path / "out").touch()
+    code, _, err = bare("train", ROOT / "recipes" / "train" / "tiny.toml")
+    assert code == 1
+    assert err.startswith("error: out/tiny cannot be made")

@@ -72,8 +72,7 @@ class TrainRecipe(_Section):
         real = round(self.batch * self.data.pairs_share)
         if real == self.batch or bool(real) != bool(self.data.pairs):
             raise ValueError(
-                f"pairs_share makes {real} of a batch of {self.batch} pairs, out of {len(self.data.pairs)} folders;"
-                " with folders some, but not all, without folders none"
+                f"pairs_share gives {real} of {self.batch} samples, where pairs need some but not all, and no pairs 0"
             )
         return self
 
@@ -100,7 +99,7 @@ def read_recipe(path: Path) -> TrainRecipe:
         raise RecipeError(
             f"{path} has a wrong value for {name}" if name else f"{path} contradicts itself",
             first["msg"].removeprefix("Value error, "),
-            "compare with recipes/train/compact.toml",
+            "compare with the recipes in recipes/train/",
         ) from error
     if recipe.start_from:
         return recipe.model_copy(update={"start_from": path.parent / recipe.start_from})
