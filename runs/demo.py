@@ -26,7 +26,7 @@ def main(source: Path) -> int:
             rows.append(separate(separator, job))
         except BrewsterError as error:
             failures += 1
-            print(f"error: {error}", file=sys.stderr)
+            print(f"error: {job.source}: {error}", file=sys.stderr)
     if rows:
         width = max(row.shape[1] for row in rows)
         padded = [np.pad(row, [(0, 8), (0, width - row.shape[1]), (0, 0)], constant_values=1) for row in rows]

@@ -48,7 +48,8 @@ def test_glass_that_only_dims_leaves_no_trace_of_the_scene_in_the_reflection(ran
 
 
 def test_where_nothing_is_enlarged_the_answer_is_kept_as_it_is(random):
-    photo, transmission, reflection = (random.random((33, 47, 3), np.float32) for _ in range(3))
+    photo, transmission, share = (random.random((33, 47, 3), np.float32) for _ in range(3))
+    reflection = share * photo
     layers = learn(photo, transmission, reflection).apply(photo, 0, 33)
     np.testing.assert_allclose(layers, (transmission, reflection), atol=1e-5)
 
@@ -59,6 +60,13 @@ def test_a_picture_that_the_backend_left_alone_is_not_touched_even_where_its_lig
     transmission, reflection = learn(small, small, np.zeros_like(small)).apply(photo, 0, 64)
     assert (transmission == photo).all()
     assert (reflection == 0).all()
+
+
+def test_no_reflection_is_brighter_than_the_photo(random):
+    photo = random.random((20, 20, 3), np.float32)
+    photo[:5] = 0
+    _, reflection = learn(photo, photo, np.full_like(photo, 0.2)).apply(photo, 0, 20)
+    assert (reflection <= photo).all()
 
 
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 40), st.integers(1, 40))

@@ -199,3 +199,16 @@ def test_display_p3_stated_by_number_gets_its_profile() -> None:
     photo = Photo.open(data[:33] + sized + data[33:])
     assert photo.origin.icc == P3
     assert np.array_equal(photo.pixels, smooth())
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_the_thumbnail_of_the_unseparated_picture_is_unlinked_and_nothing_else_moves(order):
+    mark = b"II*\0" if order == "<" else b"MM\0*"
+    entry = struct.pack(f"{order}HHIHH", 274, 3, 1, 8, 0)
+    block = (
+        mark + struct.pack(f"{order}IH", 8, 1) + entry + struct.pack(f"{order}I", 26) + b"second directory"
+    )
+    upright = metadata.upright_exif(block)
+    assert upright[:18] == block[:18]
+    assert struct.unpack_from(f"{order}HHI", upright, 18) == (1, 0, 0)
+    assert upright[26:] == block[26:]

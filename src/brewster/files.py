@@ -211,7 +211,10 @@ def _take_name(part: Path, path: Path, overwrite: bool) -> None:
 
 
 _CURES = {
-    errno.EEXIST: ("nothing is overwritten unasked", "pass --overwrite or choose another place"),
+    errno.EEXIST: (
+        "nothing is overwritten unasked",
+        "pass --overwrite (in Python overwrite=True) or choose another place",
+    ),
     errno.EISDIR: ("the target must be a file", "name a file in it, or use -o for a folder"),
     errno.ENOSPC: ("the whole file must fit on the disk", "free some space and run again"),
     errno.EDQUOT: ("the whole file must fit in the quota", "free some space and run again"),

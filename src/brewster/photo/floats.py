@@ -35,7 +35,7 @@ def too_large(width: int, height: int, most: int) -> PhotoTooLarge:
     return PhotoTooLarge(
         f"the picture has {width} x {height} pixels ({width * height / 1e6:.3g} million)",
         f"the limit is {most / 1e6:g} million",
-        "raise max_pixels if you trust it",
+        "raise --max-pixels (in Python max_pixels) if you trust it",
     )
 
 

@@ -291,19 +291,27 @@ def with_tiff_exif(data: bytes, exif: bytes) -> bytes:
 
 
 def upright_exif(exif: bytes) -> bytes:
-    """An EXIF block from its TIFF header on, the picture's orientation set to 1 and all else as it was."""
+    """An EXIF block from its TIFF header on: orientation 1, no thumbnail, and all else as it was.
+
+    The thumbnail shows the picture as it was, unturned and unseparated; it is unlinked from the first directory.
+    """
     exif = exif.removeprefix(_EXIF_NAME)
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
     if order is None or len(exif) < 10:
         return exif
-    (at,) = struct.unpack_from(order + "I", exif, 4)
-    (count,) = struct.unpack_from(order + "H", exif, at) if at + 2 <= len(exif) else (0,)
-    for row in range(at + 2, min(at + 2 + 12 * count, len(exif) - 11), 12):
-        tag, kind = struct.unpack_from(order + "HH", exif, row)
+    block = bytearray(exif)
+    (at,) = struct.unpack_from(order + "I", block, 4)
+    (count,) = struct.unpack_from(order + "H", block, at) if at + 2 <= len(block) else (0,)
+    next_directory = at + 2 + 12 * count
+    for row in range(at + 2, min(next_directory, len(block) - 11), 12):
+        tag, kind = struct.unpack_from(order + "HH", block, row)
         if tag == _ORIENTATION:
-            one = struct.pack(order + ("I" if kind == 4 else "HH"), *((1,) if kind == 4 else (1, 0)))
-            return exif[: row + 8] + one + exif[row + 12 :]
-    return exif
+            struct.pack_into(
+                order + ("I" if kind == 4 else "HH"), block, row + 8, *((1,) if kind == 4 else (1, 0))
+            )
+    if next_directory + 4 <= len(block):
+        struct.pack_into(order + "I", block, next_directory, 0)
+    return bytes(block)
 
 
 def upright_xmp(xmp: bytes) -> bytes:

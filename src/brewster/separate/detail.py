@@ -65,12 +65,14 @@ class Transfer:
     def apply(self, photo: Floats, top: int, height: int) -> tuple[Floats, Floats]:
         """Transmission and reflection of rows top..top+n of a photo `height` rows high, each (n, W, 3).
 
-        Light is not negative, except where a wide-gamut photo's own values are.
+        Light is not negative, except where a wide-gamut photo's own values are, and no reflection is brighter
+        than the photo it is part of.
         """
         transmission = self.change.read(photo, top, height)
         transmission += photo
         np.maximum(transmission, np.minimum(photo, 0), out=transmission)
-        return transmission, np.maximum(self.reflection.read(photo, top, height), 0)
+        reflection = self.reflection.read(photo, top, height)
+        return transmission, np.clip(reflection, 0, np.maximum(photo, 0), out=reflection)
 
 
 def enlarge_rows(map_: Floats, top: int, rows: int, size: tuple[int, int]) -> Floats:
