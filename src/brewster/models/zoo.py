@@ -64,7 +64,7 @@ MODELS: Final = {
         Model(
             "compact",
             _WEIGHTS / "compact.onnx",
-            "fd5380dc801d02017bdf0a1ce1acc4e3c41d491a5f05e617b5639a7b3e044941",
+            "7adbca68093de4e874becce062b3758af61fc1a9474c30a67275bafdd2bfd4ee",
             "Apache-2.0",
         ),
     )

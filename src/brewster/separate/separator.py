@@ -4,7 +4,7 @@
     separation = separator("window.jpg")
     separation.transmission.save("clear.jpg")
 
-The network sees a small linear copy of the photo (tiles.py cuts it where it is large), twice: as it is and
+The network sees small linear copies of the photo (tiles.py cuts them where they are large), each as it is and
 mirrored. The mean is the answer, the disagreement tells how sure it is. detail.py brings it to full size.
 """
 
@@ -29,10 +29,14 @@ from brewster.separate.detail import Floats, Transfer, enlarge_rows
 from brewster.separate.runtime import OnnxBackend
 from brewster.separate.tiles import Backend, in_tiles
 
-QUALITIES: Final[dict[Quality, int]] = {"draft": 100_000, "standard": 250_000, "best": 600_000}
-"""Pixels of the small copy that the network sees."""
+QUALITIES: Final[dict[Quality, tuple[int, ...]]] = {
+    "draft": (50_000,),
+    "standard": (30_000, 100_000),
+    "best": (20_000, 50_000, 100_000, 180_000),
+}
+"""Pixels of the small copies that the network sees, the largest last."""
 
-_SHORTEST_SIDE_PX: Final = 192
+_SHORTEST_SIDE_PX: Final = 160
 _LONG_PHOTO: Final = 3.0
 """How much larger than the dial says the small copy of a long thin photo may be, a side."""
 _TILE_PX: Final = 1024
@@ -41,7 +45,7 @@ _WORKERS: Final = 2
 _WHITE_PERCENTILE: Final = 99.0
 """Of a photo brighter than white, such as an EXR, this percentile is shown to the network as white."""
 _UNSURE: Final = 0.05
-"""Disagreement of the two views, in sRGB-encoded units, at which confidence has fallen to 1/e."""
+"""Disagreement of the views, in sRGB-encoded units, at which confidence has fallen to 1/e."""
 
 
 @final
@@ -101,7 +105,7 @@ class Separator:
         Args:
             source: a path, the bytes of a file, a PIL image, a `Photo`, or an array (see `Photo.from_array`).
             strength: 0 returns the photo itself, 1 the whole separation; between, a share of it.
-            quality: how large a copy the network sees.
+            quality: how many copies of the photo the network sees, and how large.
             additive: layers of 32-bit floats that sum to the photo exactly in linear light, for compositing.
             encoding: what an array's numbers mean, "srgb" or "linear".
             max_pixels: larger pictures are refused before they are decoded.
@@ -114,29 +118,37 @@ class Separator:
         seconds: dict[str, float] = {}
         with _clock(seconds, "decode"):
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
-            small = photo.small(*_work_size(photo.size, QUALITIES[quality]))
-            white = max(1.0, float(np.percentile(small, _WHITE_PERCENTILE)))
-            seen = np.clip(small / np.float32(white), 0, 1)
+            copies = [photo.small(*size) for size in _work_sizes(photo.size, QUALITIES[quality])]
+            white = np.float32(max(1.0, np.percentile(copies[-1], _WHITE_PERCENTILE)))
+            copies = [np.clip(copy / white, 0, 1) for copy in copies]
         with _clock(seconds, "network"):
-            transmission, reflection, sure = self._two_views(seen)
+            change, reflection, sure = self._look(copies)
         with _clock(seconds, "detail"):
-            share = np.float32(strength * white)
-            change = share * (transmission - seen)
-            transfer = Transfer.learn(np.float32(white) * seen, change, share * reflection)
+            share = np.float32(strength) * white
+            transfer = Transfer.learn(white * copies[-1], share * change, share * reflection)
             whole, mirrored, remainder = _at_full_size(photo, transfer, additive=additive)
             confidence = _enlarged(sure, photo)
         made_by = self.name, self.sha256, self.device
         return Separation(photo, whole, mirrored, confidence, remainder, *made_by, seconds)
 
-    def _two_views(self, small: Floats) -> tuple[Floats, Floats, Floats]:
-        """Transmission, reflection and confidence (h, w, 1) of the small copy."""
-        plain = self._separate(small)
-        mirrored = [layer[:, ::-1] for layer in self._separate(np.ascontiguousarray(small[:, ::-1]))]
-        transmission, reflection = (
-            (one + other) * np.float32(0.5) for one, other in zip(plain, mirrored, strict=True)
-        )
-        apart = np.abs(to_encoded(plain[0]) - to_encoded(mirrored[0])).max(axis=2, keepdims=True)
-        return transmission, reflection, np.exp(-apart / np.float32(_UNSURE))
+    def _look(self, copies: list[Floats]) -> tuple[Floats, Floats, Floats]:
+        """Change (transmission - photo), reflection and confidence (h, w, 1), all of the largest copy's size."""
+        size = copies[-1].shape[:2]
+        views = [
+            [enlarge_rows(map_, 0, size[0], size) for map_ in (transmission - copy, reflection)]
+            for copy in copies
+            for transmission, reflection in self._both_ways(copy)
+        ]
+        changes, reflections = (np.stack(maps) for maps in zip(*views, strict=True))
+        seen = to_encoded(np.maximum(copies[-1] + changes, 0))
+        apart = np.ptp(seen, axis=0).max(axis=2, keepdims=True)
+        return changes.mean(axis=0), reflections.mean(axis=0), np.exp(-apart / np.float32(_UNSURE))
+
+    def _both_ways(self, copy: Floats) -> Iterator[tuple[Floats, Floats]]:
+        """Both layers of a copy as it is, and as seen in a mirror."""
+        yield self._separate(copy)
+        transmission, reflection = self._separate(np.ascontiguousarray(copy[:, ::-1]))
+        yield transmission[:, ::-1], reflection[:, ::-1]
 
     def _separate(self, small: Floats) -> tuple[Floats, Floats]:
         return in_tiles(self._backend, small, tile_px=_TILE_PX, overlap_px=_OVERLAP_PX)
@@ -172,12 +184,15 @@ def _check(strength: float, quality: str) -> None:
         raise BrewsterError(f"quality is {quality!r}", f"one of {', '.join(QUALITIES)}", "choose one of them")
 
 
-def _work_size(size: tuple[int, int], pixels: int) -> tuple[int, int]:
-    """Width and height of the small copy: about `pixels` in all, more for long thin photos, never enlarged."""
+def _work_sizes(size: tuple[int, int], budgets: tuple[int, ...]) -> list[tuple[int, int]]:
+    """Width and height of each small copy, smallest first, each once; more pixels for long thin photos."""
     width, height = size
-    scale = math.sqrt(pixels / (width * height))
-    scale = min(1.0, max(scale, min(_LONG_PHOTO * scale, _SHORTEST_SIDE_PX / min(size))))
-    return max(1, round(width * scale)), max(1, round(height * scale))
+    sizes = []
+    for pixels in budgets:
+        scale = math.sqrt(pixels / (width * height))
+        scale = min(1.0, max(scale, min(_LONG_PHOTO * scale, _SHORTEST_SIDE_PX / min(size))))
+        sizes.append((max(1, round(width * scale)), max(1, round(height * scale))))
+    return list(dict.fromkeys(sizes))
 
 
 def _at_full_size(photo: Photo, transfer: Transfer, *, additive: bool) -> tuple[Photo, Photo, float]:
