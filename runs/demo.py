@@ -31,7 +31,7 @@ def main(source: Path) -> int:
         width = max(row.shape[1] for row in rows)
         padded = [np.pad(row, [(0, 8), (0, width - row.shape[1]), (0, 0)], constant_values=1) for row in rows]
         sheet = OUT / "sheet.png"
-        Photo.from_array(np.concatenate(padded), encoding="linear").save(sheet, overwrite=True)
+        Photo.from_array(np.concatenate(padded), encoding="linear").save(sheet, depth=8, overwrite=True)
         print(f"photo | transmission | reflection, side by side: {sheet}")
     return 1 if failures or not rows else 0
 
