@@ -18,6 +18,7 @@ from PIL import Image, ImageOps
 
 from brewster.errors import MissingExtra, PhotoError, TargetError, UnsupportedPhoto
 from brewster.photo import DEPTHS, Origin, Photo
+from picture_files import exif_block, file_of, pil, smooth
 
 quick = settings(max_examples=25, deadline=None, database=None)
 
@@ -28,31 +29,6 @@ LOSSLESS = ("png", "tiff")
 def noise(height: int = 24, width: int = 40, channels: int = 3, kind: type = np.uint8) -> np.ndarray:
     white = np.iinfo(kind).max
     return np.random.default_rng(0).integers(0, white, (height, width, channels), kind, endpoint=True)
-
-
-def smooth(height: int = 48, width: int = 64) -> np.ndarray:
-    down, across = np.mgrid[:height, :width]
-    return np.stack([down * 3, across * 3, 255 - down - across], axis=2).astype(np.uint8)
-
-
-def file_of(array: np.ndarray, kind: str, **options: object) -> bytes:
-    file = io.BytesIO()
-    Image.fromarray(array.squeeze()).save(file, kind, **options)
-    return file.getvalue()
-
-
-def pil(data: bytes) -> Image.Image:
-    return Image.open(io.BytesIO(data))
-
-
-def exif_block(orientation: int = 6) -> bytes:
-    """EXIF as cameras write it: big-endian, with a maker note, a date below, and GPS."""
-    exif = Image.Exif()
-    exif.endian = ">"
-    exif[274], exif[271], exif[306] = orientation, "Sextant", "2020:01:02 03:04:05"
-    exif.get_ifd(34665).update({33434: (1, 125), 37500: b"maker\0note\xff", 36867: "2020:01:02 03:04:05"})
-    exif.get_ifd(34853).update({1: "N", 2: (48.0, 8.0, 0.0)})
-    return exif.tobytes()
 
 
 # --- pixels

@@ -119,7 +119,7 @@ class Separator:
         with _clock(seconds, "decode"):
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
             copies = [photo.small(*size) for size in _work_sizes(photo.size, QUALITIES[quality])]
-            white = np.float32(max(1.0, np.percentile(copies[-1], _WHITE_PERCENTILE)))
+            white = np.float32(max(1.0, float(np.percentile(copies[-1], _WHITE_PERCENTILE))))
             copies = [np.clip(copy / white, 0, 1) for copy in copies]
         with _clock(seconds, "network"):
             change, reflection, sure = self._look(copies)
