@@ -38,9 +38,9 @@ def random() -> np.random.Generator:
 @pytest.fixture(scope="session")
 def data() -> Path:
     """The shared data; BREWSTER_DATA or ../shared/data, else the test is skipped."""
-    folder = Path(os.environ.get("BREWSTER_DATA", Path(__file__).parents[2] / "shared" / "data"))
+    folder = Path(os.environ.get("BREWSTER_DATA") or Path(__file__).parents[2] / "shared" / "data")
     if not folder.is_dir():
-        pytest.skip(f"no data: BREWSTER_DATA is unset and {folder} does not exist")
+        pytest.skip(f"no data: {folder} does not exist, and BREWSTER_DATA names no other folder")
     return folder
 
 

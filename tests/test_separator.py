@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 import brewster
 from brewster import Photo, Separator
 from brewster.errors import BrewsterError, PhotoError
-from brewster.metrics import psnr
+from brewster.metrics import psnr, ssim
 from brewster.photo import Origin
 from brewster.separate import QUALITIES
 
@@ -179,3 +179,23 @@ def test_every_quality_works_and_more_quality_sees_more_pixels():
 def test_a_source_that_is_no_picture_is_refused():
     with pytest.raises(PhotoError):
         Separator(nothing)(b"hello")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("folder", ["nature", "real"])
+def test_the_shipped_model_beats_doing_nothing_on_the_development_pairs(separator, data, folder):
+    gains = []
+    for path in sorted((data / "real/dev" / folder / "blended").iterdir()):
+        (partner,) = (data / "real/dev" / folder).glob(f"transmission*/{path.stem}.*")
+        photo, truth = Photo.open(path), Photo.open(partner).pixels
+        answer = separator(photo).transmission.pixels
+        gains.append([metric(answer, truth) - metric(photo.pixels, truth) for metric in (psnr, ssim)])
+    assert len(gains) == 10
+    assert (np.mean(gains, axis=0) > [0.4, 0]).all()
+
+
+@pytest.mark.slow
+def test_the_shipped_model_hardly_changes_photographs_without_glass(separator, data):
+    photos = [Photo.open(data / "photos/permissive" / f"kodak24__{number:02}.jpg") for number in range(1, 11)]
+    scores = [psnr(separator(photo).transmission.pixels, photo.pixels) for photo in photos]
+    assert np.mean(scores) >= 32
