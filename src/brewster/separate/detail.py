@@ -32,14 +32,6 @@ class _Lines:
     slope: Float32[Floats, "h w 3"]
     offset: Float32[Floats, "h w 3"]
 
-    @classmethod
-    def fit(cls, photo: Floats, picture: Floats) -> _Lines:
-        """Slopes from windows, smoothed; offsets that make the lines meet the picture exactly."""
-        covariance = _box(photo * picture) - _box(photo) * _box(picture)
-        variance = _box(photo * photo) - _box(photo) ** 2
-        slope = _box(covariance / (variance + _VARIANCE_FLOOR))
-        return cls(slope, picture - slope * photo)
-
     def read(self, photo: Floats, top: int, height: int) -> Floats:
         """The picture over rows top..top+n of the full photo, (n, W, 3)."""
         rows, width, _ = photo.shape
@@ -60,7 +52,15 @@ class Transfer:
     @classmethod
     def learn(cls, photo: Floats, change: Floats, reflection: Floats) -> Transfer:
         """From a photo, transmission - photo, and the reflection at work resolution, (h, w, 3), linear light."""
-        return cls(_Lines.fit(photo, change), _Lines.fit(photo, reflection))
+        mean = _box(photo)
+        spread = _box(photo * photo) - mean**2 + _VARIANCE_FLOOR
+
+        def fit(picture: Floats) -> _Lines:
+            """Slopes from windows, smoothed; offsets that make the lines meet the picture exactly."""
+            slope = _box((_box(photo * picture) - mean * _box(picture)) / spread)
+            return _Lines(slope, picture - slope * photo)
+
+        return cls(fit(change), fit(reflection))
 
     def apply(self, photo: Floats, top: int, height: int) -> tuple[Floats, Floats]:
         """Transmission and reflection of rows top..top+n of a photo `height` rows high, each (n, W, 3).
