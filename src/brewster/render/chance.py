@@ -1,0 +1,51 @@
+"""Random numbers for a renderer: low-discrepancy, different in every pixel, the same on every device.
+
+Each pair of numbers is a Sobol' point of its own scramble for each sample, turned by a random shift a pixel
+(Cranley-Patterson), so that samples of one pixel spread evenly and neighbouring pixels do not repeat each other.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.quasirandom import SobolEngine
+
+
+class Chance:
+    """Pairs of numbers in 0..1 for N pixels; in each sample, the same sequence of questions gets fresh answers."""
+
+    def __init__(self, seed: int, index: int, pixels: int, samples: int, device: torch.device | str) -> None:
+        self._generator = torch.Generator().manual_seed(seed * 1_000_003 + index)
+        self._pixels, self._samples, self._device = pixels, samples, device
+        self._pairs: list[tuple[Tensor, Tensor]] = []
+        self._number = self._asked = 0
+
+    def turn_to(self, number: int) -> None:
+        """Starts the sample of this number, 0 up to `samples`."""
+        self._number, self._asked = number, 0
+
+    def pair(self) -> Tensor:
+        """Two numbers for every pixel, (2, N) in 0..1."""
+        if self._asked == len(self._pairs):
+            self._pairs.append(self._fresh())
+        points, shift = self._pairs[self._asked]
+        self._asked += 1
+        turned = points[self._number][:, None] + shift
+        return turned - turned.floor()
+
+    def disc(self) -> Tensor:
+        """A point on the unit disc for every pixel, (2, N), uniform by area (Shirley and Chiu 1997)."""
+        x, y = self.pair() * 2 - 1
+        wide = x.abs() > y.abs()
+        radius = torch.where(wide, x, y)
+        ratio = torch.where(wide, y, x) / torch.where(radius == 0, 1, radius)
+        angle = torch.where(wide, ratio * (math.pi / 4), math.pi / 2 - ratio * (math.pi / 4))
+        return torch.stack([radius * angle.cos(), radius * angle.sin()])
+
+    def _fresh(self) -> tuple[Tensor, Tensor]:
+        scramble = int(torch.randint(2**31, (), generator=self._generator))
+        points = SobolEngine(2, scramble=True, seed=scramble).draw(self._samples)
+        shift = torch.rand(2, self._pixels, generator=self._generator)
+        return points.to(self._device), shift.to(self._device)

@@ -1,0 +1,202 @@
+"""The light of one side as a renderer asks for it: along any ray, filtered to the size of what is asked.
+
+All geometry is in the glass's frame, in millimetres: the first surface is z = 0, the camera stands at z > 0.
+Vectors are (3, N). Far light depends on direction alone; near light (a dome, a plane) on the whole ray. A footprint
+is the angle, in radians as seen from the glass, that one look stands for.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from brewster.render.assets import Assets
+from brewster.render.odds import Odds, lat_long
+from brewster.scene.camera import axes
+from brewster.scene.world import Plane, Side
+
+Device = torch.device | str
+
+
+class Texture:
+    """A picture (H, W, 3) with its halvings, sampled between texel centres; a map also wraps around."""
+
+    def __init__(self, texels: Tensor, *, wraps: bool) -> None:
+        self.width, self.wraps = texels.shape[1], wraps
+        self._levels = [texels.permute(2, 0, 1)[None]]
+        while min(self._levels[-1].shape[2:]) > 8:
+            self._levels.append(functional.avg_pool2d(self._levels[-1], 2))
+        self._padded: dict[int, Tensor] = {}
+
+    @property
+    def texels(self) -> Tensor:
+        """The picture itself, (3, H, W)."""
+        return self._levels[0][0]
+
+    def __call__(self, u: Tensor, v: Tensor, span: float) -> Tensor:
+        """Values (3, N) at (u, v) in 0..1, where one sample stands for `span` texels of the full picture."""
+        level = min(math.floor(math.log2(max(span, 1.0))), len(self._levels) - 1)
+        texels = self._level(level)
+        if self.wraps:
+            width = self._levels[level].shape[3]
+            u = (u * width + 1) / (width + 2)
+        grid = torch.stack([u, v], dim=-1)[None, None] * 2 - 1
+        return functional.grid_sample(
+            texels, grid, mode="bilinear", padding_mode="border", align_corners=False
+        )[0, :, 0]
+
+    def _level(self, level: int) -> Tensor:
+        if not self.wraps:
+            return self._levels[level]
+        if level not in self._padded:
+            self._padded[level] = functional.pad(self._levels[level], (1, 1, 0, 0), mode="circular")
+        return self._padded[level]
+
+
+@dataclass(frozen=True)
+class _Board:
+    """A plane in the glass's frame: where its centre is, its axes, and half its sides, in mm."""
+
+    texture: Texture
+    centre: Tensor
+    right: Tensor
+    up: Tensor
+    half_width: float
+    half_height: float
+
+
+class Light:
+    """All the light of one side."""
+
+    def __init__(
+        self, side: Side, assets: Assets, *, behind: bool, to_world: Tensor, device: Device
+    ) -> None:
+        self._drawn: Odds | None = None
+        self.radius_mm = side.map.radius_mm if side.map else math.inf
+        self.map = Texture(torch.from_numpy(assets.map_light(side.map)).to(device), wraps=True) if side.map else None
+        self._turn = -(side.map.heading_deg if side.map else 0.0) / 360
+        self._behind = behind
+        self._to_world = to_world
+        self.board = _board(side.plane, assets, behind, device) if side.plane else None
+        self.plane_mm = side.plane.distance_mm if side.plane else math.inf
+
+    @property
+    def is_dome(self) -> bool:
+        """Whether the map has parallax."""
+        return self.map is not None and math.isfinite(self.radius_mm)
+
+    @property
+    def is_near(self) -> bool:
+        """Whether any of this light depends on where a ray starts."""
+        return self.is_dome or self.board is not None
+
+    @property
+    def distance_mm(self) -> float:
+        """To the nearest light, infinite where all is far."""
+        return min(self.radius_mm, self.plane_mm)
+
+    def texels_per_radian(self) -> float:
+        """The finest detail, as seen from the glass: what a filter must not miss."""
+        finest = self.map.width / (2 * math.pi) if self.map else 0.0
+        if self.board:
+            finest = max(finest, self.plane_mm * self.board.texture.width / (2 * self.board.half_width))
+        return finest
+
+    def far(self, direction: Tensor, footprint: float) -> Tensor | None:
+        """Light from infinity along unit directions (3, N); None where there is none."""
+        if self.map is None or self.is_dome:
+            return None
+        return self.look_up(direction, footprint)
+
+    def near(self, origin: Tensor, direction: Tensor, footprint: float) -> tuple[Tensor, Tensor | None]:
+        """Near light along rays, (3, N), and how much of the far light is seen past it, (N,) or None for nothing."""
+        seen, clear = torch.zeros_like(direction), None
+        if self.is_dome:
+            along = (origin * direction).sum(0)
+            away = torch.sqrt((along**2 - (origin**2).sum(0) + self.radius_mm**2).clamp(min=0)) - along
+            seen = self.look_up((origin + away * direction) / self.radius_mm, footprint)
+        elif self.map is not None:
+            clear = torch.ones_like(direction[0])
+        if self.board is not None:
+            picture, hit = self._before(self.board, origin, direction, footprint)
+            seen = torch.where(hit, picture, seen)
+            clear = None if clear is None else clear * ~hit
+        return seen, clear
+
+    def along(self, origin: Tensor, direction: Tensor, footprint: float) -> Tensor:
+        """All light along rays from `origin` to unit `direction`, both (3, N): (3, N)."""
+        if not self.is_near:
+            far = self.far(direction, footprint)
+            return torch.zeros_like(direction) if far is None else far
+        seen, clear = self.near(origin, direction, footprint)
+        far = self.far(direction, footprint) if clear is not None else None
+        return seen if far is None or clear is None else seen + clear * far
+
+    def look_up(self, direction: Tensor, footprint: float) -> Tensor:
+        """The map along unit directions (3, N) from its centre."""
+        assert self.map is not None
+        u, v = lat_long(self._to_world @ direction, self._turn)
+        return self.map(u, v, footprint * self.map.width / (2 * math.pi))
+
+    def draw(self, origin: Tensor, pair: Tensor) -> tuple[Tensor, Tensor]:
+        """Directions (3, N) from `origin` to the map, bright places more often, and their density, (N,).
+
+        `pair` is (2, N) in 0..1. Densities are per solid angle at `origin`.
+        """
+        place = self._to_world.T @ self._odds().draw(pair, self._turn)
+        direction = place * self.radius_mm - origin if self.is_dome else place
+        direction = direction / direction.norm(dim=0)
+        return direction, self.density(origin, direction)
+
+    def density(self, origin: Tensor, direction: Tensor) -> Tensor:
+        """How densely `draw` goes along unit directions (3, N), per solid angle at `origin`: (N,)."""
+        if not self.is_dome:
+            return self._odds().density(self._to_world @ direction, self._turn)
+        along = (origin * direction).sum(0)
+        away = torch.sqrt((along**2 - (origin**2).sum(0) + self.radius_mm**2).clamp(min=0)) - along
+        place = (origin + away * direction) / self.radius_mm
+        facing = (place * direction).sum(0).clamp(min=1e-6)
+        return self._odds().density(self._to_world @ place, self._turn) * (away / self.radius_mm) ** 2 / facing
+
+    def _odds(self) -> Odds:
+        """The map's bright places on its own side of the glass; made when first needed."""
+        if self._drawn is None:
+            assert self.map is not None
+            outward = self._to_world @ self._to_world.new_tensor([0, 0, -1 if self._behind else 1])
+            self._drawn = Odds(self.map.texels, outward, self._turn)
+        return self._drawn
+
+    def _before(
+        self, board: _Board, origin: Tensor, direction: Tensor, footprint: float
+    ) -> tuple[Tensor, Tensor]:
+        normal = torch.linalg.cross(board.right, board.up)
+        towards = normal @ direction
+        away = normal @ (board.centre[:, None] - origin) / torch.where(towards == 0, 1e-9, towards)
+        place = origin + away * direction - board.centre[:, None]
+        u, v = (board.right @ place) / board.half_width, -(board.up @ place) / board.half_height
+        hit = (away > 0) & (u.abs() <= 1) & (v.abs() <= 1)
+        texels = footprint * self.plane_mm * board.texture.width / (2 * board.half_width)
+        return board.texture(u / 2 + 0.5, v / 2 + 0.5, texels), hit
+
+
+def _board(plane: Plane, assets: Assets, behind: bool, device: Device) -> _Board:
+    """The plane's frame: it faces the glass, and is turned about the glass's own upright axis."""
+    picture = torch.from_numpy(assets.plane_light(plane)).to(device)
+    facing = 1.0 if behind else -1.0
+    side = torch.tensor([facing, 1.0, facing], device=device)
+    right, up, _ = (torch.tensor(axis, device=device) * side for axis in axes(plane.heading_deg, plane.pitch_deg))
+    x, y = plane.offset_mm
+    height, width = picture.shape[:2]
+    return _Board(
+        texture=Texture(picture, wraps=False),
+        centre=torch.tensor([x, y, -facing * plane.distance_mm], device=device),
+        right=right,
+        up=up,
+        half_width=plane.width_mm / 2,
+        half_height=plane.width_mm / 2 * height / width,
+    )
+

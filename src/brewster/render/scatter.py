@@ -1,0 +1,224 @@
+"""Rough or wedged panes: each order is followed surface by surface, at each rough surface through a random facet.
+
+All orders of a ray are followed (no chance decides between reflection and transmission); where a path leaves
+through a rough surface into light from a map, light drawn from the map joins in (multiple importance sampling,
+Veach 1995), or a small sun would be noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Final
+
+import torch
+from torch import Tensor
+
+from brewster.render.chance import Chance
+from brewster.render.facets import dot, seen_density, shadowing, visible_facet
+from brewster.render.lights import Light
+from brewster.render.stack import FAINTEST, fresnel
+from brewster.scene.glass import Glazing
+
+_WORTH_LIGHT: Final = 3e-3
+"""Orders fainter than this are lit by chance alone."""
+_USUAL_REFLECTANCE: Final = 0.05
+
+
+@dataclass(frozen=True)
+class Surface:
+    """One side of a pane: a point on its axis, its normal towards the camera, (3, 1), and what is below it."""
+
+    height_mm: float
+    normal: Tensor
+    alpha: float
+    index: float
+    glass_is_below: bool
+    absorption: Tensor
+    """Of the pane it belongs to, per mm, (3, 1)."""
+    pane: int
+
+
+@dataclass(frozen=True)
+class _Path:
+    """Rays on their way: where, whereto, and their weights (3, N) for s and p light."""
+
+    origin: Tensor
+    direction: Tensor
+    s: Tensor
+    p: Tensor
+    surface: int
+    down: bool
+    typical: float
+    reflections: int
+    entered_last: bool
+
+
+@dataclass(frozen=True)
+class Exit:
+    """What one order brings from one side, (3, N)."""
+
+    behind: bool
+    in_paper: bool
+    light: Tensor
+
+
+def surfaces(glass: Glazing, like: Tensor) -> list[Surface]:
+    """The glazing's surfaces from the camera on, in its own frame; a wedge turns a pane's far surface."""
+    found, height = [], 0.0
+    for number, pane in enumerate(glass.panes):
+        absorption = like.new_tensor(pane.absorption_per_m)[:, None] / 1000
+        for far in (False, True):
+            wedge = torch.tensor(pane.wedge_deg if far else 0.0).deg2rad()
+            normal = like.new_tensor([wedge.sin(), 0, wedge.cos()])[:, None]
+            height -= pane.thickness_mm if far else 0.0
+            found.append(Surface(height, normal, pane.roughness, pane.index, not far, absorption, number))
+        height -= glass.gap_mm
+    return found
+
+
+def follow(
+    glass: Glazing, origin: Tensor, direction: Tensor, sides: tuple[Light, Light], footprint: float, chance: Chance
+) -> Iterator[Exit]:
+    """Every order of the rays (3, N) until it is too faint, and what light it meets behind or in front."""
+    stack = surfaces(glass, direction)
+    behind, front = sides
+    ones = torch.ones_like(direction)
+    waiting = [_Path(origin, direction, ones, ones, 0, True, 1.0, 0, False)]
+    while waiting:
+        path = waiting.pop()
+        for following, meeting in _meet(path, stack, chance):
+            if 0 <= following.surface < len(stack):
+                if following.typical > FAINTEST:
+                    waiting.append(following)
+                continue
+            is_behind = following.surface > 0
+            light = _arriving(following, meeting, behind if is_behind else front, footprint, chance)
+            in_paper = following.reflections == 0 if is_behind else not following.entered_last
+            yield Exit(is_behind, in_paper, light)
+
+
+@dataclass(frozen=True)
+class _Meeting:
+    """A ray at a surface: what a light sample needs to know of it."""
+
+    towards: Tensor
+    normal: Tensor
+    alpha: float
+    index_here: float
+    index_beyond: float
+    reflects: bool
+    before: _Path
+    """The path as it arrives, with the weights it has there."""
+    point: Tensor
+
+
+def _meet(path: _Path, stack: list[Surface], chance: Chance) -> Iterator[tuple[_Path, _Meeting]]:
+    """A path reflected and a path transmitted at the surface that it comes to."""
+    surface = stack[path.surface]
+    in_glass = surface.glass_is_below != path.down
+    away = (_height(surface) - dot(surface.normal, path.origin)) / dot(surface.normal, path.direction)
+    point = path.origin + away * path.direction
+    left = torch.exp(-surface.absorption * away) if in_glass else torch.ones_like(surface.absorption)
+    before = replace(path, origin=point, s=path.s * left, p=path.p * left)
+    normal = surface.normal if path.down else -surface.normal
+    towards = -path.direction
+    facet = visible_facet(towards, normal, surface.alpha, chance.pair()) if surface.alpha else normal
+    here, beyond = (surface.index, 1.0) if in_glass else (1.0, surface.index)
+    for reflects in (True, False):
+        meeting = _Meeting(towards, normal, surface.alpha, here, beyond, reflects, before, point)
+        direction = _turned(meeting, facet)
+        share_s, share_p = _shares(meeting, facet, direction)
+        yield _onward(path, before, direction, (share_s, share_p), reflects, len(stack)), meeting
+
+
+def _onward(
+    path: _Path, before: _Path, direction: Tensor, shares: tuple[Tensor, Tensor], reflects: bool, count: int
+) -> _Path:
+    down = path.down != reflects
+    return _Path(
+        before.origin,
+        direction,
+        before.s * shares[0],
+        before.p * shares[1],
+        path.surface + (1 if down else -1),
+        down,
+        path.typical * (_USUAL_REFLECTANCE if reflects else 1 - _USUAL_REFLECTANCE),
+        path.reflections + reflects,
+        path.entered_last or (path.surface == count - 2 and down and not reflects),
+    )
+
+
+def _height(surface: Surface) -> Tensor:
+    return surface.normal[2] * surface.height_mm
+
+
+def _turned(meeting: _Meeting, facet: Tensor) -> Tensor:
+    """The direction after reflection or refraction at facets; where there is none (total reflection), any."""
+    cosine = dot(meeting.towards, facet)
+    if meeting.reflects:
+        return 2 * cosine * facet - meeting.towards
+    ratio = meeting.index_here / meeting.index_beyond
+    beyond = (1 - ratio**2 * (1 - cosine**2)).clamp(min=0).sqrt()
+    return (ratio * cosine - beyond) * facet - ratio * meeting.towards
+
+
+def _shares(meeting: _Meeting, facet: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+    """Weights of a drawn facet for s and p light: Fresnel's share, and the shadowing on the way out."""
+    cosine = dot(meeting.towards, facet)
+    reflected = _reflectances(cosine, meeting.index_here, meeting.index_beyond)
+    leaving = dot(direction, meeting.normal) * (1 if meeting.reflects else -1)
+    lit = (leaving > 0) & (cosine > 0)
+    seen = shadowing(leaving, meeting.alpha) * lit if meeting.alpha else lit.float()
+    s, p = ((r if meeting.reflects else 1 - r) * seen for r in reflected)
+    return s, p
+
+
+def _reflectances(cosine: Tensor, here: float, beyond: float) -> tuple[Tensor, Tensor]:
+    """Fresnel's reflectances from either side, 1 where the reflection is total."""
+    if here <= beyond:
+        return fresnel(cosine.clamp(1e-4, 1), beyond)
+    squared = 1 - here**2 * (1 - cosine**2)
+    s, p = fresnel(squared.clamp(min=1e-8).sqrt(), here)
+    return torch.where(squared <= 0, 1.0, s), torch.where(squared <= 0, 1.0, p)
+
+
+def _arriving(path: _Path, meeting: _Meeting, light: Light, footprint: float, chance: Chance) -> Tensor:
+    """The light that an order brings: along its own direction, joined by light drawn from the map."""
+    weight = (path.s + path.p) / 2
+    seen = light.along(path.origin, path.direction, footprint)
+    if not (meeting.alpha and light.map and path.typical > _WORTH_LIGHT):
+        return weight * seen
+    own = _density(meeting, path.direction)
+    balance = own / (own + light.density(path.origin, path.direction)).clamp(min=1e-20)
+    direction, density = light.draw(path.origin, chance.pair())
+    facet = _half(meeting, direction)
+    s, p = _shares(meeting, facet, direction)
+    other = _density(meeting, direction) / (density + _density(meeting, direction)).clamp(min=1e-20)
+    weight_drawn = (meeting.before.s * s + meeting.before.p * p) / 2 * other
+    # Where the balance divides by both densities, the facet's own cancels the one in its weight.
+    return weight * seen * balance + weight_drawn * light.along(path.origin, direction, footprint)
+
+
+def _half(meeting: _Meeting, direction: Tensor) -> Tensor:
+    """The facet that sends light between the two directions."""
+    if meeting.reflects:
+        half = meeting.towards + direction
+    else:
+        half = -(meeting.index_here * meeting.towards + meeting.index_beyond * direction)
+    half = half / half.norm(dim=0).clamp(min=1e-9)
+    return half * torch.sign(dot(half, meeting.normal))
+
+
+def _density(meeting: _Meeting, direction: Tensor) -> Tensor:
+    """How densely facets send light into `direction`, per solid angle, (N,)."""
+    facet = _half(meeting, direction)
+    cosine, leaving = dot(meeting.towards, facet), dot(direction, facet)
+    seen = seen_density(meeting.towards, meeting.normal, facet, meeting.alpha)
+    if meeting.reflects:
+        density, right = seen / 4, leaving > 0
+    else:
+        span = meeting.index_here * cosine + meeting.index_beyond * leaving
+        jacobian = meeting.index_beyond**2 * leaving.abs() / span.square().clamp(min=1e-12)
+        density, right = seen * cosine * jacobian, leaving < 0
+    return torch.where(right & (cosine > 0), density, 0.0)
