@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import re
 import types
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -124,6 +124,60 @@ def write_exr(floats: Floats) -> bytes:
     file = io.BytesIO()
     exr.File(header, channels).write(file)
     return file.getvalue()
+
+
+# --- OpenEXR of several pictures
+
+_LAYER_CHANNELS = ("R", "G", "B")
+_RESERVED = {"channels", "chunkCount", "compression", "dataWindow", "lineOrder", "tiles", "type", "version"}
+"""Attributes that OpenEXR keeps for itself: text under some of these names is dropped without a word."""
+
+
+def write_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -> bytes:
+    """One EXR of several pictures (H, W, 3) of equal size, as halfs, with text attributes beside them.
+
+    Channels are called "photo.R" for the layer "photo", as programs for compositing expect ("Technical
+    Introduction to OpenEXR", layers). Light beyond a half's range, 65504, is clipped. Raises MissingExtra,
+    or UnsupportedPhoto for attributes named as EXR's own.
+    """
+    exr = _openexr()
+    if taken := _RESERVED & header.keys():
+        raise UnsupportedPhoto(
+            f"attributes are called {', '.join(sorted(taken))}", "EXR keeps these names", "choose others"
+        )
+    most = float(np.finfo(np.float16).max)
+    halfs = {name: layer.clip(-most, most).astype(np.float16) for name, layer in layers.items()}
+    channels = {
+        f"{name}.{channel}": np.ascontiguousarray(half[..., i])
+        for name, half in halfs.items()
+        for i, channel in enumerate(_LAYER_CHANNELS)
+    }
+    file = io.BytesIO()
+    said = {**header, "compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
+    exr.File(said, channels).write(file)
+    return file.getvalue()
+
+
+def read_layers(data: bytes) -> dict[str, Float32]:
+    """The pictures (H, W, 3) of an EXR by layer, in the order of their names; other channels are passed over.
+
+    Raises MissingExtra, or UnreadablePhoto if it is no whole EXR or has no layer of R, G and B.
+    """
+    channels = _exr_part(data, header_only=False).channels
+    stems = sorted(name.removesuffix(".R") for name in channels if name.endswith(".R"))
+    names = {stem: [f"{stem}.{channel}" for channel in _LAYER_CHANNELS] for stem in stems}
+    layers = {
+        stem: np.stack([channels[name].pixels.astype(np.float32) for name in three], axis=2)
+        for stem, three in names.items()
+        if channels.keys() >= set(three)
+    }
+    if not layers:
+        raise UnreadablePhoto(
+            f"the EXR has the channels {', '.join(sorted(channels))}",
+            'layers have the channels "name.R", "name.G" and "name.B"',
+            "open it as a photo, or write it again",
+        )
+    return layers
 
 
 # --- Radiance HDR (G. Ward, "Real Pixels", Graphics Gems II; the RADIANCE reference manual)

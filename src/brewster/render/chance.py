@@ -20,23 +20,23 @@ class Chance:
         self._generator = torch.Generator().manual_seed(seed * 1_000_003 + index)
         self._pixels, self._samples, self._device = pixels, samples, device
         self._pairs: list[tuple[Tensor, Tensor]] = []
-        self._number = self._asked = 0
+        self.turn_to(0, slice(0, pixels))
 
-    def turn_to(self, number: int) -> None:
-        """Starts the sample of this number, 0 up to `samples`."""
-        self._number, self._asked = number, 0
+    def turn_to(self, number: int, pixels: slice) -> None:
+        """Starts the sample of this number, 0 up to `samples`, for some of the pixels."""
+        self._number, self._some, self._asked = number, pixels, 0
 
     def pair(self) -> Tensor:
-        """Two numbers for every pixel, (2, N) in 0..1."""
+        """Two numbers for each of the pixels, (2, n) in 0..1."""
         if self._asked == len(self._pairs):
             self._pairs.append(self._fresh())
         points, shift = self._pairs[self._asked]
         self._asked += 1
-        turned = points[self._number][:, None] + shift
+        turned = points[self._number][:, None] + shift[:, self._some]
         return turned - turned.floor()
 
     def disc(self) -> Tensor:
-        """A point on the unit disc for every pixel, (2, N), uniform by area (Shirley and Chiu 1997)."""
+        """A point on the unit disc for each of the pixels, (2, n), uniform by area (Shirley and Chiu 1997)."""
         x, y = self.pair() * 2 - 1
         wide = x.abs() > y.abs()
         radius = torch.where(wide, x, y)

@@ -10,10 +10,7 @@ import math
 import torch
 from torch import Tensor
 
-
-def dot(one: Tensor, other: Tensor) -> Tensor:
-    """Inner products, (N,)."""
-    return (one * other).sum(0)
+from brewster.render.vectors import dot, unit
 
 
 def visible_facet(towards: Tensor, normal: Tensor, alpha: float, pair: Tensor) -> Tensor:
@@ -31,8 +28,7 @@ def visible_facet(towards: Tensor, normal: Tensor, alpha: float, pair: Tensor) -
     nx = -y / across * one - x * z / across * two + x * three
     ny = x / across * one - y * z / across * two + y * three
     nz = (across * two + z * three).clamp(min=1e-6)
-    facet = x_axis * (alpha * nx) + y_axis * (alpha * ny) + normal * nz
-    return facet / facet.norm(dim=0)
+    return unit(x_axis * (alpha * nx) + y_axis * (alpha * ny) + normal * nz)
 
 
 def shadowing(cosine: Tensor, alpha: float) -> Tensor:
@@ -50,6 +46,5 @@ def seen_density(towards: Tensor, normal: Tensor, facet: Tensor, alpha: float) -
 
 def _tangents(normal: Tensor) -> tuple[Tensor, Tensor]:
     """Two axes across unit normals (3, 1) or (3, N)."""
-    x_axis = torch.stack([normal[2], torch.zeros_like(normal[0]), -normal[0]])
-    x_axis = x_axis / x_axis.norm(dim=0)
+    x_axis = unit(torch.stack([normal[2], torch.zeros_like(normal[0]), -normal[0]]))
     return x_axis, torch.linalg.cross(normal, x_axis, dim=0)

@@ -16,6 +16,7 @@ from torch.nn import functional
 
 from brewster.render.assets import Assets
 from brewster.render.odds import Odds, lat_long
+from brewster.render.vectors import dot, unit
 from brewster.scene.camera import axes
 from brewster.scene.world import Plane, Side
 
@@ -116,8 +117,8 @@ class Light:
         """Near light along rays, (3, N), and how much of the far light is seen past it, (N,) or None for nothing."""
         seen, clear = torch.zeros_like(direction), None
         if self.is_dome:
-            along = (origin * direction).sum(0)
-            away = torch.sqrt((along**2 - (origin**2).sum(0) + self.radius_mm**2).clamp(min=0)) - along
+            along = dot(origin, direction)
+            away = torch.sqrt((along**2 - dot(origin, origin) + self.radius_mm**2).clamp(min=0)) - along
             seen = self.look_up((origin + away * direction) / self.radius_mm, footprint)
         elif self.map is not None:
             clear = torch.ones_like(direction[0])
@@ -149,17 +150,17 @@ class Light:
         """
         place = self._to_world.T @ self._odds().draw(pair, self._turn)
         direction = place * self.radius_mm - origin if self.is_dome else place
-        direction = direction / direction.norm(dim=0)
+        direction = unit(direction)
         return direction, self.density(origin, direction)
 
     def density(self, origin: Tensor, direction: Tensor) -> Tensor:
         """How densely `draw` goes along unit directions (3, N), per solid angle at `origin`: (N,)."""
         if not self.is_dome:
             return self._odds().density(self._to_world @ direction, self._turn)
-        along = (origin * direction).sum(0)
-        away = torch.sqrt((along**2 - (origin**2).sum(0) + self.radius_mm**2).clamp(min=0)) - along
+        along = dot(origin, direction)
+        away = torch.sqrt((along**2 - dot(origin, origin) + self.radius_mm**2).clamp(min=0)) - along
         place = (origin + away * direction) / self.radius_mm
-        facing = (place * direction).sum(0).clamp(min=1e-6)
+        facing = dot(place, direction).clamp(min=1e-6)
         return self._odds().density(self._to_world @ place, self._turn) * (away / self.radius_mm) ** 2 / facing
 
     def _odds(self) -> Odds:

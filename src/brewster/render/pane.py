@@ -33,11 +33,16 @@ from brewster.render.stack import (
     paper_orders,
     shift_per_traversal,
 )
+from brewster.render.vectors import unit
 from brewster.scene.camera import axes
+from brewster.scene.camera import dot as inner
 from brewster.scene.scene import Scene
 
-_MOST_GRID = 4
-_STRIP = 1 << 18  # rays worked on at once
+_MOST_GRID = 2
+_SAME_PX = 0.1  # orders that land closer together than this are looked up once
+_STEEPEST_REFLECTANCE = 0.08  # what is fainter than FAINTEST at this is lumped; it falls on the side's last order
+_STRIP = 1 << 15  # rays worked on at once on a CPU, so that they stay in its cache
+_WIDE_STRIP = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -50,12 +55,21 @@ class Rays:
 
 
 @dataclass(frozen=True)
+class _Side:
+    """One side's light, and its orders in groups that land on the same place."""
+
+    light: Light
+    depth_mm: float
+    groups: list[list[Order]]
+
+
+@dataclass(frozen=True)
 class _Room:
     """A scene made ready: its lights and camera in the glass's frame."""
 
     scene: Scene
-    behind: Light
-    front: Light
+    behind: _Side
+    front: _Side
     origin: Tensor
     right: Tensor
     up: Tensor
@@ -88,15 +102,16 @@ def _furnish(scene: Scene, assets: Assets, device: Device) -> _Room:
     origin = to_glass @ (position - torch.tensor(scene.glass.position_mm, device=device))
     right, up, back = (to_glass @ axis for axis in torch.tensor(
         axes(scene.camera.heading_deg, scene.camera.pitch_deg), device=device))  # fmt: skip
-    behind, front = (
-        Light(side, assets, behind=side is scene.behind, to_world=to_glass.T, device=device)
-        for side in (scene.behind, scene.front)
-    )
-    return _Room(scene, behind, front, origin, right, up, back)
+    sides = []
+    for side, behind in ((scene.behind, True), (scene.front, False)):
+        light = Light(side, assets, behind=behind, to_world=to_glass.T, device=device)
+        groups = _groups(scene, light, behind=behind)
+        sides.append(_Side(light, scene.glass.depth_mm if behind else 0.0, groups))
+    return _Room(scene, *sides, origin, right, up, back)
 
 
 def _needs_chance(room: _Room) -> bool:
-    return room.scene.camera.aperture_mm > 0 and (room.behind.is_near or room.front.is_near)
+    return room.scene.camera.aperture_mm > 0 and (room.behind.light.is_near or room.front.light.is_near)
 
 
 def _without_chance(room: _Room) -> list[Tensor]:
@@ -115,8 +130,8 @@ def _without_chance(room: _Room) -> list[Tensor]:
 
 
 def _grid(room: _Room) -> int:
-    """Looks a pixel and direction, so that neighbouring looks are at most half a texel apart, or four."""
-    finest = max(room.behind.texels_per_radian(), room.front.texels_per_radian())
+    """Looks a pixel and direction, so that neighbouring looks are at most half a texel apart, or two; beyond, the light is filtered."""
+    finest = max(side.light.texels_per_radian() for side in (room.behind, room.front))
     return min(max(1, math.ceil(2 * room.scene.camera.pixel_rad * finest)), _MOST_GRID)
 
 
@@ -129,7 +144,7 @@ def _pinhole(
     x = (torch.arange(width, device=room.origin.device) - margin + place[0]) / camera.width * 2 - 1
     y = (torch.arange(height, device=room.origin.device) - margin + place[1]) / camera.width * 2
     y = camera.height / camera.width - y
-    rows = max(1, _STRIP // width)
+    rows = max(1, (_WIDE_STRIP if room.origin.is_cuda else _STRIP) // width)
     for top in range(0, height, rows):
         some = y[top : top + rows]
         across, upward = x.expand(len(some), -1).reshape(-1), some[:, None].expand(-1, width).reshape(-1)
@@ -137,7 +152,7 @@ def _pinhole(
         direction = direction - room.back[:, None]
         origin = room.origin[:, None].expand(3, len(across))
         yield (
-            Rays(origin, direction / direction.norm(dim=0), footprint),
+            Rays(origin, unit(direction), footprint),
             slice(top * width, top * width + len(across)),
         )
 
@@ -145,20 +160,23 @@ def _pinhole(
 def _by_chance(room: _Room, device: Device) -> list[Tensor]:
     """`samples` random rays a pixel: over the pixel, the lens, and where the glass is rough, its facets."""
     scene, camera = room.scene, room.scene.camera
-    chance = Chance(scene.seed, scene.index, camera.width * camera.height, scene.samples, device)
-    total = torch.zeros(5, 3, camera.width * camera.height, device=room.origin.device)
-    for number in range(scene.samples):
-        chance.turn_to(number)
-        rays = _through_lens(room, chance)
-        exact = not (scene.glass.is_rough or scene.glass.is_wedged)
-        total += torch.stack(_split(room, rays) if exact else _scattered(room, rays, chance))
+    count = camera.width * camera.height
+    chance = Chance(scene.seed, scene.index, count, scene.samples, device)
+    split = _scattered if scene.glass.is_rough or scene.glass.is_wedged else _split
+    total = torch.zeros(5, 3, count, device=room.origin.device)
+    strip = _WIDE_STRIP if room.origin.is_cuda else _STRIP
+    for start in range(0, count, strip):
+        pixels = slice(start, min(start + strip, count))
+        for number in range(scene.samples):
+            chance.turn_to(number, pixels)
+            total[:, :, pixels] += torch.stack(split(room, _through_lens(room, pixels, chance), chance))
     return list((total / scene.samples).view(5, 3, camera.height, camera.width))
 
 
-def _through_lens(room: _Room, chance: Chance) -> Rays:
-    """A ray a pixel, from anywhere on the lens through anywhere in the pixel's image at the focus (thin lens)."""
+def _through_lens(room: _Room, pixels: slice, chance: Chance) -> Rays:
+    """A ray for each of the pixels, from anywhere on the lens through anywhere in the pixel's image at the focus (thin lens)."""
     camera = room.scene.camera
-    pixel = torch.arange(camera.width * camera.height, device=room.origin.device)
+    pixel = torch.arange(pixels.start, pixels.stop, device=room.origin.device)
     jitter = chance.pair()
     across = ((pixel % camera.width + jitter[0]) / camera.width * 2 - 1) * camera.half_width
     upward = (camera.height - (pixel // camera.width + jitter[1]) * 2) / camera.width * camera.half_width
@@ -168,13 +186,13 @@ def _through_lens(room: _Room, chance: Chance) -> Rays:
         x, y = chance.disc() * (camera.aperture_mm / 2)
         lens = _outer(room.right, x) + _outer(room.up, y)
         origin, direction = origin + lens, direction - lens / camera.focus_mm
-    return Rays(origin, direction / direction.norm(dim=0), _sample_footprint(room))
+    return Rays(origin, unit(direction), _sample_footprint(room))
 
 
 def _sample_footprint(room: _Room) -> float:
     """What one of many samples stands for: its part of the pixel and of the lens's circle of confusion."""
     camera, samples = room.scene.camera, room.scene.samples
-    nearest = min(room.behind.distance_mm, room.front.distance_mm)
+    nearest = min(side.light.distance_mm for side in (room.behind, room.front))
     spread = camera.aperture_mm * abs(1 / camera.focus_mm - 1 / nearest) if camera.aperture_mm else 0.0
     return (camera.pixel_rad + spread) / (2 * math.sqrt(samples))
 
@@ -183,77 +201,97 @@ def _outer(axis: Tensor, values: Tensor) -> Tensor:
     return axis[:, None] * values
 
 
-def _split(room: _Room, rays: Rays) -> list[Tensor]:
+def _split(room: _Room, rays: Rays, _: Chance | None = None) -> list[Tensor]:
     """I, T, B, R and MR along the rays, for smooth parallel panes: no chance, all orders."""
     glass = room.scene.glass
-    cosine = -rays.direction[2]
     point, mirrored = _at_first_surface(rays)
-    paper = room.scene.orders == "paper"
+    cosine = mirrored[2]
     whole = all_orders(glass, cosine)
-    kept = paper_orders(glass, cosine) if paper else whole
-    sides = []
-    for light, origin, direction, far_whole, far_kept in (
+    kept = paper_orders(glass, cosine) if room.scene.orders == "paper" else whole
+    layers = []
+    for side, origin, direction, far_whole, far_kept in (
         (room.behind, rays.origin, rays.direction, whole.transmitted, kept.transmitted),
         (room.front, point, mirrored, whole.reflected, kept.reflected),
     ):
-        bare = light.along(origin, direction, rays.footprint)
-        if light.is_near:
-            every, mine = _near_orders(room, light, Rays(point, direction, rays.footprint))
+        bare = side.light.along(origin, direction, rays.footprint)
+        if len(side.groups) > 1:
+            every, mine = _shifted_orders(room, side, Rays(point, direction, rays.footprint))
         else:
-            every, mine = far_whole * bare, far_kept * bare
-        sides.append((every, mine, bare))
-    (through, transmission, background), (back, reflection, mirror) = sides
+            every = far_whole * bare
+            mine = far_kept * bare if kept is not whole else every
+        layers.append((every, mine, bare))
+    (through, transmission, background), (back, reflection, mirror) = layers
     return [through + back, transmission, background, reflection, mirror]
 
 
-def _near_orders(room: _Room, light: Light, leaving: Rays) -> tuple[Tensor, Tensor]:
+def _shifted_orders(room: _Room, side: _Side, leaving: Rays) -> tuple[Tensor, Tensor]:
     """One side's light through each order's own shift: of all orders, and of those that T or R keeps."""
     glass, direction = room.scene.glass, leaving.direction
     cosine = direction[2].abs()
-    table = _table(room.scene)
     shifts = shift_per_traversal(glass, cosine)
-    level = direction * direction.new_tensor([1, 1, 0])[:, None]
-    ahead = level / level.norm(dim=0).clamp(min=1e-9)
+    ahead = unit(direction * direction.new_tensor([1, 1, 0])[:, None])
     surface = leaving.origin.clone()
-    surface[2] = -glass.depth_mm if light is room.behind else 0.0
-    far = light.far(direction, leaving.footprint)
+    surface[2] = -side.depth_mm
+    shares = iter(order_shares(glass, cosine, [order for group in side.groups for order in group]))
+    far = side.light.far(direction, leaving.footprint)
     every, mine = torch.zeros_like(direction), torch.zeros_like(direction)
-    for order, share in zip(table, order_shares(glass, cosine, table), strict=True):
-        if order.behind != (light is room.behind):
-            continue
-        shift = sum((n * s for n, s in zip(order.traversals, shifts, strict=True)), torch.zeros_like(cosine))
-        seen, clear = light.near(surface + ahead * shift, direction, leaving.footprint)
+    for group in side.groups:
+        seen, clear = side.light.near(surface + ahead * _shift(group[0], shifts), direction, leaving.footprint)
         if far is not None and clear is not None:
             seen = seen + clear * far
-        every += share * seen
-        if room.scene.orders == "all" or order.in_paper:
-            mine += share * seen
-    return every, mine
+        whole, kept = torch.zeros_like(cosine), torch.zeros_like(cosine)
+        for order, share in zip(group, shares, strict=False):
+            whole = whole + share
+            kept = kept + share if order.in_paper else kept
+        every += whole * seen
+        mine += kept * seen
+    return every, every if room.scene.orders == "all" else mine
 
 
-def _table(scene: Scene) -> tuple[Order, ...]:
-    """The scene's orders, as many as its steepest ray needs."""
+def _shift(order: Order, shifts: list[Tensor]) -> Tensor:
+    return sum((n * shift for n, shift in zip(order.traversals, shifts, strict=True)), torch.zeros_like(shifts[0]))
+
+
+def _groups(scene: Scene, light: Light, *, behind: bool) -> list[list[Order]]:
+    """The side's orders, brightest first, joined by those that land within a tenth of a pixel of them."""
+    if not light.is_near:
+        return []
+    steepest = _steepest_cosine(scene)
+    reflectances = (float(sum(fresnel(steepest, pane.index))) / 2 for pane in scene.glass.panes)
+    table = orders(tuple(round(min(r, _STEEPEST_REFLECTANCE), 3) for r in reflectances))
+    shifts = shift_per_traversal(scene.glass, steepest)
+    pixel_mm = scene.camera.pixel_rad * (scene.camera_above_glass_mm + light.distance_mm)
+    groups: list[tuple[float, list[Order]]] = []
+    for order in table:
+        if order.behind != behind:
+            continue
+        place = float(_shift(order, shifts) * steepest) / pixel_mm
+        for first, group in groups:
+            if abs(place - first) < _SAME_PX:
+                group.append(order)
+                break
+        else:
+            groups.append((place, [order]))
+    return [group for _, group in groups]
+
+
+def _steepest_cosine(scene: Scene) -> Tensor:
     _, _, normal = axes(scene.glass.heading_deg, scene.glass.pitch_deg)
-    steepest = min(
-        -sum(a * b for a, b in zip(corner, normal, strict=True)) / math.hypot(*corner)
-        for corner in scene.camera.corners()
-    )
-    cosine = torch.tensor(steepest)
-    return orders(tuple(round(float(sum(fresnel(cosine, pane.index)) / 2), 3) for pane in scene.glass.panes))
+    return torch.tensor(min(-inner(corner, normal) / math.hypot(*corner) for corner in scene.camera.corners()))
 
 
 def _scattered(room: _Room, rays: Rays, chance: Chance) -> list[Tensor]:
     """I, T, B, R and MR along the rays, for panes that are rough or wedged."""
     through, transmission, back, reflection = torch.zeros(4, *rays.direction.shape, device=rays.direction.device)
-    lights = room.behind, room.front
+    lights = room.behind.light, room.front.light
     for part in follow(room.scene.glass, rays.origin, rays.direction, lights, rays.footprint, chance):
         kept = room.scene.orders == "all" or part.in_paper
         for whole, layer in ((through, transmission),) if part.behind else ((back, reflection),):
             whole += part.light
             layer += part.light * kept
     point, mirrored = _at_first_surface(rays)
-    background = room.behind.along(rays.origin, rays.direction, rays.footprint)
-    mirror = room.front.along(point, mirrored, rays.footprint)
+    background = room.behind.light.along(rays.origin, rays.direction, rays.footprint)
+    mirror = room.front.light.along(point, mirrored, rays.footprint)
     return [through + back, transmission, background, reflection, mirror]
 
 

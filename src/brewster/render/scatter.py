@@ -15,9 +15,10 @@ import torch
 from torch import Tensor
 
 from brewster.render.chance import Chance
-from brewster.render.facets import dot, seen_density, shadowing, visible_facet
+from brewster.render.facets import seen_density, shadowing, visible_facet
 from brewster.render.lights import Light
 from brewster.render.stack import FAINTEST, fresnel
+from brewster.render.vectors import dot, unit
 from brewster.scene.glass import Glazing
 
 _WORTH_LIGHT: Final = 3e-3
@@ -206,7 +207,7 @@ def _half(meeting: _Meeting, direction: Tensor) -> Tensor:
         half = meeting.towards + direction
     else:
         half = -(meeting.index_here * meeting.towards + meeting.index_beyond * direction)
-    half = half / half.norm(dim=0).clamp(min=1e-9)
+    half = unit(half)
     return half * torch.sign(dot(half, meeting.normal))
 
 

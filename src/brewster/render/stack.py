@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, reduce
 
 import torch
 from torch import Tensor
@@ -180,24 +181,50 @@ def _weight(counts: tuple[_Counts, _Counts] | list[_Counts], reflectances: tuple
     )
 
 
-def order_shares(glazing: Glazing, cosine: Tensor, table: tuple[Order, ...]) -> list[Tensor]:
+def order_shares(glazing: Glazing, cosine: Tensor, table: Sequence[Order]) -> list[Tensor]:
     """Each order's share of its light, (3, ...) or (...); per side they sum to `all_orders`."""
-    lanes = _lanes(glazing, cosine)
-    shares = [sum((_order_share(order, lane) for lane in lanes), torch.zeros_like(cosine)) / 2 for order in table]
+    left = [_powers(pass_once(pane, cosine)) if any(pane.absorption_per_m) else None for pane in glazing.panes]
+    lanes = [
+        [(_powers(r), _powers(1 - r)) for r in polarised]
+        for polarised in zip(*(fresnel(cosine, pane.index) for pane in glazing.panes), strict=True)
+    ]
+    shares = []
+    for order in table:
+        share = sum((_surfaces(order, lane) for lane in lanes), torch.zeros_like(cosine)) * (order.count / 2)
+        for powers, times in zip(left, order.traversals[::2], strict=True):
+            share = share * powers(times) if powers and times else share
+        shares.append(share)
     whole = all_orders(glazing, cosine)
     for behind, total in ((True, whole.transmitted), (False, whole.reflected)):
         mine = [i for i, order in enumerate(table) if order.behind == behind]
-        shares[mine[-1]] = shares[mine[-1]] + (total - sum(shares[i] for i in mine))
+        if mine:
+            shares[mine[-1]] = shares[mine[-1]] + (total - sum(shares[i] for i in mine))
     return shares
 
 
-def _order_share(order: Order, lane: _Lane) -> Tensor:
-    share = torch.as_tensor(float(order.count))
-    for which, (_, r, a) in enumerate(lane):
-        share = share * r ** order.reflections[which] * (1 - r) ** order.transmissions[which]
-        if isinstance(a, Tensor):
-            share = share * a ** order.traversals[2 * which]
-    return share
+def _powers(base: Tensor) -> Callable[[int], Tensor]:
+    """The base's powers, each multiplied out once."""
+    known = [torch.ones_like(base), base]
+
+    def power(exponent: int) -> Tensor:
+        while len(known) <= exponent:
+            known.append(known[-1] * base)
+        return known[exponent]
+
+    return power
+
+
+def _surfaces(order: Order, lane: list[tuple[Callable[[int], Tensor], Callable[[int], Tensor]]]) -> Tensor:
+    """What the surfaces leave to one path of an order, for one polarisation."""
+    factors = [
+        power(times)
+        for (reflect, transmit), reflections, transmissions in zip(
+            lane, order.reflections, order.transmissions, strict=True
+        )
+        for power, times in ((reflect, reflections), (transmit, transmissions))
+        if times
+    ]
+    return reduce(torch.mul, factors)
 
 
 def shift_per_traversal(glazing: Glazing, cosine: Tensor) -> list[Tensor]:

@@ -1,0 +1,256 @@
+"""Draws scenes: (recipe, catalog, seed, index) to a Scene, the same on every machine.
+
+    scene = draw(read_scene_recipe("window"), catalog, seed=7, index=12)
+"""
+
+from __future__ import annotations
+
+import math
+from random import Random
+from typing import Final
+
+from pydantic import ValidationError
+
+from brewster import __version__
+from brewster.errors import RecipeError
+from brewster.scene.camera import Camera, axes, dot
+from brewster.scene.glass import Glazing, Pane, Point
+from brewster.scene.recipe import CameraRecipe, DevelopmentRecipe, GlassRecipe, SceneRecipe, SideRecipe
+from brewster.scene.scene import Development, Scene
+from brewster.scene.values import Values
+from brewster.scene.world import Map, Plane, Side, Source
+
+_TRIES: Final = 100
+_FAR_MM: Final = 1e6
+
+
+class Asset(Values):
+    """A file that can light a scene: its size, and a category such as indoor, outdoor or night."""
+
+    source: Source
+    width: int
+    height: int
+    category: str = ""
+
+
+class Catalog(Values):
+    """The maps and pictures to draw from."""
+
+    maps: tuple[Asset, ...] = ()
+    pictures: tuple[Asset, ...] = ()
+
+
+def draw(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) -> Scene:
+    """The scene of this number. What turns out impossible (a view that grazes the glass, say) is drawn again.
+
+    Raises:
+        RecipeError: the recipe asks for maps or pictures that the catalog lacks, or for the impossible.
+    """
+    dice = _Dice(f"{recipe.name}/{seed}/{index}")
+    reason = ""
+    for _ in range(_TRIES):
+        try:
+            return _try(recipe, catalog, dice, seed, index)
+        except ValidationError as error:
+            reason = error.errors()[0]["msg"].removeprefix("Value error, ")
+    raise RecipeError(
+        f"the recipe {recipe.name!r} gave no possible scene in {_TRIES} tries", reason, "change its ranges"
+    )
+
+
+class _Dice(Random):
+    """Random numbers by the words of a recipe; six digits, so that scenes read well."""
+
+    def within(self, bounds: tuple[float, float]) -> float:
+        return float(f"{self.uniform(*bounds):.6g}")
+
+    def within_log(self, bounds: tuple[float, float]) -> float:
+        return float(f"{math.exp(self.uniform(*map(math.log, bounds))):.6g}")
+
+    def chance(self, probability: float) -> bool:
+        return self.random() < probability
+
+
+def _try(recipe: SceneRecipe, catalog: Catalog, dice: _Dice, seed: int, index: int) -> Scene:
+    glass = _glass(recipe.glass, dice)
+    behind_map = _choose_map(recipe.behind, recipe.camera, catalog, dice)
+    front_map = _choose_map(recipe.front, recipe.camera, catalog, dice)
+    camera = _camera(recipe, glass, [(recipe.behind, behind_map), (recipe.front, front_map)], dice)
+    behind = _side(recipe.behind, behind_map, catalog, camera, glass, dice, behind=True)
+    front = _side(recipe.front, front_map, catalog, camera, glass, dice, behind=False)
+    return Scene(
+        recipe=recipe.name,
+        seed=seed,
+        index=index,
+        version=__version__,
+        orders=recipe.orders,
+        samples=recipe.rough_samples if glass.is_rough else recipe.samples,
+        glass=glass,
+        camera=_focused(camera, recipe.camera, glass, {"behind": behind, "front": front}, dice),
+        behind=behind,
+        front=front,
+        development=_development(recipe.development, dice),
+    )
+
+
+def _glass(recipe: GlassRecipe, dice: _Dice) -> Glazing:
+    count = 2 if dice.chance(recipe.double_probability) else 1
+    structural = dice.chance(recipe.structural_probability)
+    tint, strength = dice.choice(recipe.tints), dice.within_log(recipe.tint_strength_log)
+    rough = dice.within_log(recipe.roughness_log) if dice.chance(recipe.rough_probability) else 0.0
+    wedged = dice.chance(recipe.wedge_probability)
+    red, green, blue = (float(f"{colour * strength:.6g}") for colour in tint)
+    index = dice.within(recipe.index)
+
+    def pane() -> Pane:
+        return Pane(
+            thickness_mm=dice.within_log(recipe.structural_mm if structural else recipe.thickness_mm),
+            index=index,
+            absorption_per_m=(red, green, blue),
+            roughness=rough,
+            wedge_deg=dice.within_log(recipe.wedge_deg_log) * dice.choice((-1, 1)) if wedged else 0.0,
+        )
+
+    return Glazing(
+        panes=tuple(pane() for _ in range(count)),
+        gap_mm=dice.within(recipe.gap_mm) if count > 1 else 0.0,
+        pitch_deg=dice.within(recipe.pitch_deg),
+    )
+
+
+def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, dice: _Dice) -> Asset | None:
+    """A map that is sharp enough for the widest view that the recipe allows; None for a side of pictures."""
+    wanted = [asset for asset in catalog.maps if not recipe.maps or asset.category in ("", *recipe.maps)]
+    sharp = [asset for asset in wanted if _least_fov(asset, recipe, camera) <= camera.fov_deg[1]]
+    if not dice.chance(recipe.map_probability) or (not sharp and recipe.picture_probability > 0):
+        return None
+    if not sharp:
+        raise RecipeError(
+            f"of {len(catalog.maps)} maps none fits the recipe",
+            f"categories {', '.join(recipe.maps) or 'any'}, and texels finer than {recipe.most_px_per_texel:g} px"
+            f" at {camera.fov_deg[1]:g} degrees",
+            "give other --maps, larger ones, or a smaller --size",
+        )
+    return dice.choice(sharp)
+
+
+def _least_fov(asset: Asset, recipe: SideRecipe, camera: CameraRecipe) -> float:
+    """The narrowest view in degrees in which a texel of the map is not too many pixels wide."""
+    return camera.width * 360 / asset.width / recipe.most_px_per_texel
+
+
+def _camera(
+    recipe: SceneRecipe, glass: Glazing, maps: list[tuple[SideRecipe, Asset | None]], dice: _Dice
+) -> Camera:
+    """A camera whose axis meets the glass near its middle; where it focuses is settled later."""
+    wanted = recipe.camera
+    least = max([wanted.fov_deg[0], *(_least_fov(asset, side, wanted) for side, asset in maps if asset)])
+    heading, pitch = dice.within(wanted.incidence_deg), dice.within(wanted.pitch_deg)
+    _, _, back = axes(heading, pitch)
+    away = dice.within_log(wanted.distance_mm_log) / max(back[2], 0.1)
+    x, y, z = (float(f"{away * part:.6g}") for part in back)
+    return Camera(
+        position_mm=(x, y, z),
+        heading_deg=heading,
+        pitch_deg=pitch,
+        fov_deg=dice.within((least, wanted.fov_deg[1])),
+        width=wanted.width,
+        height=wanted.height,
+    )
+
+
+def _side(
+    recipe: SideRecipe, map_: Asset | None, catalog: Catalog, camera: Camera, glass: Glazing, dice: _Dice, *, behind: bool
+) -> Side:
+    luminance = dice.within_log(recipe.luminance_log)
+    world = plane = None
+    if map_:
+        is_dome = dice.chance(recipe.dome_probability)
+        world = Map(
+            source=map_.source,
+            heading_deg=dice.within((0, 360)),
+            luminance=luminance,
+            radius_mm=dice.within_log(recipe.radius_mm_log) if is_dome else math.inf,
+        )
+    if dice.chance(recipe.picture_probability) or not map_:
+        plane = _plane(recipe, catalog, luminance, camera, glass, dice, behind=behind)
+    return Side(map=world, plane=plane)
+
+
+def _plane(
+    recipe: SideRecipe, catalog: Catalog, luminance: float, camera: Camera, glass: Glazing, dice: _Dice, *, behind: bool
+) -> Plane:
+    """A picture that covers as much of the view, straight or mirrored, as the recipe says."""
+    if not catalog.pictures:
+        raise RecipeError("there are no pictures to draw from", "the recipe asks for them", "name a folder with --photos")
+    asset = dice.choice(catalog.pictures)
+    away = dice.within_log(recipe.distance_mm_log)
+    distance = float(f"{away + (glass.depth_mm if behind else camera_height(camera, glass)):.6g}")
+    (left, right), (bottom, top) = _reach(camera, glass, distance)
+    cover = max(right - left, (top - bottom) * asset.width / asset.height)
+    return Plane(
+        source=asset.source,
+        distance_mm=distance,
+        offset_mm=(float(f"{(left + right) / 2:.6g}"), float(f"{(bottom + top) / 2:.6g}")),
+        width_mm=float(f"{cover * dice.within(recipe.fill):.6g}"),
+        heading_deg=dice.within(recipe.turn_deg),
+        pitch_deg=dice.within(recipe.turn_deg) / 2,
+        luminance=luminance,
+        highlights=dice.within(recipe.highlights),
+    )
+
+
+def camera_height(camera: Camera, glass: Glazing) -> float:
+    """The camera's distance in mm from the plane of the first surface."""
+    return _in_glass(tuple(a - b for a, b in zip(camera.position_mm, glass.position_mm, strict=True)), glass)[2]  # type: ignore[arg-type]
+
+
+def _in_glass(vector: Point, glass: Glazing) -> Point:
+    right, up, back = axes(glass.heading_deg, glass.pitch_deg)
+    return dot(vector, right), dot(vector, up), dot(vector, back)
+
+
+def _reach(camera: Camera, glass: Glazing, distance_mm: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """What the view spans on a plane this far beyond the glass, or as far before it in the mirror: x and y, in mm."""
+    offset: Point = tuple(a - b for a, b in zip(camera.position_mm, glass.position_mm, strict=True))  # type: ignore[assignment]
+    x, y, z = _in_glass(offset, glass)
+    places = []
+    for corner in camera.corners():
+        across, upward, towards = _in_glass(corner, glass)
+        away = (z + distance_mm) / max(-towards, 1e-3)
+        places.append((x + away * across, y + away * upward))
+    xs, ys = zip(*places, strict=True)
+    return (min(xs), max(xs)), (min(ys), max(ys))
+
+
+def _focused(camera: Camera, recipe: CameraRecipe, glass: Glazing, sides: dict[str, Side], dice: _Dice) -> Camera:
+    """The camera with its lens set on something of the scene."""
+    on = dice.choices(list(recipe.focus_on), list(recipe.focus_on.values()))[0]
+    is_pinhole, aperture = dice.chance(recipe.pinhole_probability), dice.within_log(recipe.aperture_mm_log)
+    height = camera_height(camera, glass)
+    away = 0.98 * height if on == "glass" else height + _distance(sides[on])
+    slant = _in_glass(axes(camera.heading_deg, camera.pitch_deg)[2], glass)[2]
+    return camera.model_copy(
+        update={
+            "focus_mm": float(f"{min(away / max(slant, 0.1), _FAR_MM):.6g}"),
+            "aperture_mm": 0.0 if is_pinhole else aperture,
+        }
+    )
+
+
+def _distance(side: Side) -> float:
+    if side.plane:
+        return side.plane.distance_mm
+    return side.map.radius_mm if side.map else math.inf
+
+
+def _development(recipe: DevelopmentRecipe, dice: _Dice) -> Development:
+    return Development(
+        exposure=dice.within_log(recipe.exposure),
+        white_balance=dice.choice(recipe.white_balance),
+        white_balance_strength=dice.within(recipe.white_balance_strength),
+        contrast=dice.within(recipe.contrast),
+        shot_noise=dice.within(recipe.shot_noise),
+        read_noise=dice.within(recipe.read_noise),
+        jpeg_quality=dice.randint(*recipe.jpeg_quality),
+    )
