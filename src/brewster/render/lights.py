@@ -1,8 +1,8 @@
 """The light of one side as a renderer asks for it: along any ray, filtered to the size of what is asked.
 
 All geometry is in the glass's frame, in millimetres: the first surface is z = 0, the camera stands at z > 0.
-Vectors are (3, N). Far light depends on direction alone; near light (a dome, a plane) on the whole ray. A footprint
-is the angle, in radians as seen from the glass, that one look stands for.
+Vectors are (3, N). Far light depends on direction alone; near light (a dome, a plane) on the whole ray. One look
+stands for a share of a pixel, and of its circle of confusion; light is filtered to that size before it is looked up.
 """
 
 from __future__ import annotations
@@ -70,15 +70,35 @@ class _Board:
     half_height: float
 
 
+@dataclass(frozen=True)
+class View:
+    """How a camera `height_mm` above the glass sees: its pixels' angle, and its lens (0: none to filter for)."""
+
+    height_mm: float
+    pixel_rad: float
+    aperture_mm: float
+    focus_mm: float
+
+    def span_mm(self, beyond_mm: float) -> float:
+        """What a pixel and its circle of confusion span on a surface this far beyond the glass (thin lens)."""
+        away = self.height_mm + beyond_mm
+        return self.pixel_rad * away + self.aperture_mm * abs(1 - away / self.focus_mm)
+
+    def span_rad(self) -> float:
+        """The same for what is infinitely far, as an angle."""
+        return self.pixel_rad + self.aperture_mm / self.focus_mm
+
+
 class Light:
     """All the light of one side."""
 
     def __init__(
-        self, side: Side, assets: Assets, *, behind: bool, to_world: Tensor, device: Device
+        self, side: Side, assets: Assets, view: View, *, behind: bool, to_world: Tensor, device: Device
     ) -> None:
         self._drawn: Odds | None = None
         self.radius_mm = side.map.radius_mm if side.map else math.inf
         self.map = Texture(torch.from_numpy(assets.map_light(side.map)).to(device), wraps=True) if side.map else None
+        self._view = view
         self._turn = -(side.map.heading_deg if side.map else 0.0) / 360
         self._behind = behind
         self._to_world = to_world
@@ -100,48 +120,56 @@ class Light:
         """To the nearest light, infinite where all is far."""
         return min(self.radius_mm, self.plane_mm)
 
-    def texels_per_radian(self) -> float:
-        """The finest detail, as seen from the glass: what a filter must not miss."""
-        finest = self.map.width / (2 * math.pi) if self.map else 0.0
-        if self.board:
-            finest = max(finest, self.plane_mm * self.board.texture.width / (2 * self.board.half_width))
-        return finest
+    def texels_per_pixel(self) -> float:
+        """How many texels a pixel spans at most: what a grid of looks must not miss."""
+        return max(self._map_span(1.0), self._board_span(1.0))
 
-    def far(self, direction: Tensor, footprint: float) -> Tensor | None:
+    def _map_span(self, share: float) -> float:
+        if self.map is None:
+            return 0.0
+        angle = self._view.span_mm(self.radius_mm) / self.radius_mm if self.is_dome else self._view.span_rad()
+        return share * angle * self.map.width / (2 * math.pi)
+
+    def _board_span(self, share: float) -> float:
+        if self.board is None:
+            return 0.0
+        return share * self._view.span_mm(self.plane_mm) * self.board.texture.width / (2 * self.board.half_width)
+
+    def far(self, direction: Tensor, share: float) -> Tensor | None:
         """Light from infinity along unit directions (3, N); None where there is none."""
         if self.map is None or self.is_dome:
             return None
-        return self.look_up(direction, footprint)
+        return self.look_up(direction, share)
 
-    def near(self, origin: Tensor, direction: Tensor, footprint: float) -> tuple[Tensor, Tensor | None]:
+    def near(self, origin: Tensor, direction: Tensor, share: float) -> tuple[Tensor, Tensor | None]:
         """Near light along rays, (3, N), and how much of the far light is seen past it, (N,) or None for nothing."""
         seen, clear = torch.zeros_like(direction), None
         if self.is_dome:
             along = dot(origin, direction)
             away = torch.sqrt((along**2 - dot(origin, origin) + self.radius_mm**2).clamp(min=0)) - along
-            seen = self.look_up((origin + away * direction) / self.radius_mm, footprint)
+            seen = self.look_up((origin + away * direction) / self.radius_mm, share)
         elif self.map is not None:
             clear = torch.ones_like(direction[0])
         if self.board is not None:
-            picture, hit = self._before(self.board, origin, direction, footprint)
-            seen = torch.where(hit, picture, seen)
-            clear = None if clear is None else clear * ~hit
+            picture, covered = self._before(self.board, origin, direction, share)
+            seen = seen + covered * (picture - seen)
+            clear = None if clear is None else clear * (1 - covered)
         return seen, clear
 
-    def along(self, origin: Tensor, direction: Tensor, footprint: float) -> Tensor:
+    def along(self, origin: Tensor, direction: Tensor, share: float) -> Tensor:
         """All light along rays from `origin` to unit `direction`, both (3, N): (3, N)."""
         if not self.is_near:
-            far = self.far(direction, footprint)
+            far = self.far(direction, share)
             return torch.zeros_like(direction) if far is None else far
-        seen, clear = self.near(origin, direction, footprint)
-        far = self.far(direction, footprint) if clear is not None else None
+        seen, clear = self.near(origin, direction, share)
+        far = self.far(direction, share) if clear is not None else None
         return seen if far is None or clear is None else seen + clear * far
 
-    def look_up(self, direction: Tensor, footprint: float) -> Tensor:
+    def look_up(self, direction: Tensor, share: float) -> Tensor:
         """The map along unit directions (3, N) from its centre."""
         assert self.map is not None
         u, v = lat_long(self._to_world @ direction, self._turn)
-        return self.map(u, v, footprint * self.map.width / (2 * math.pi))
+        return self.map(u, v, self._map_span(share))
 
     def draw(self, origin: Tensor, pair: Tensor) -> tuple[Tensor, Tensor]:
         """Directions (3, N) from `origin` to the map, bright places more often, and their density, (N,).
@@ -172,16 +200,21 @@ class Light:
         return self._drawn
 
     def _before(
-        self, board: _Board, origin: Tensor, direction: Tensor, footprint: float
+        self, board: _Board, origin: Tensor, direction: Tensor, share: float
     ) -> tuple[Tensor, Tensor]:
         normal = torch.linalg.cross(board.right, board.up)
         towards = normal @ direction
         away = normal @ (board.centre[:, None] - origin) / torch.where(towards == 0, 1e-9, towards)
         place = origin + away * direction - board.centre[:, None]
-        u, v = (board.right @ place) / board.half_width, -(board.up @ place) / board.half_height
-        hit = (away > 0) & (u.abs() <= 1) & (v.abs() <= 1)
-        texels = footprint * self.plane_mm * board.texture.width / (2 * board.half_width)
-        return board.texture(u / 2 + 0.5, v / 2 + 0.5, texels), hit
+        across, upward = board.right @ place, board.up @ place
+        u, v = across / (2 * board.half_width) + 0.5, 0.5 - upward / (2 * board.half_height)
+        edge_mm = share * self._view.span_mm(self.plane_mm)
+        covered = (
+            ((board.half_width - across.abs()) / edge_mm + 0.5).clamp(0, 1)
+            * ((board.half_height - upward.abs()) / edge_mm + 0.5).clamp(0, 1)
+            * (away > 0)
+        )
+        return board.texture(u, v, self._board_span(share)), covered
 
 
 def _board(plane: Plane, assets: Assets, behind: bool, device: Device) -> _Board:

@@ -21,7 +21,7 @@ from brewster.errors import RecipeError
 from brewster.render.assets import Assets
 from brewster.render.chance import Chance
 from brewster.render.lens import blurred, margin_px
-from brewster.render.lights import Device, Light
+from brewster.render.lights import Device, Light, View
 from brewster.render.sample import LAYERS, Sample
 from brewster.render.scatter import follow
 from brewster.render.stack import (
@@ -47,11 +47,11 @@ _WIDE_STRIP = 1 << 20
 
 @dataclass(frozen=True)
 class Rays:
-    """Camera rays in the glass's frame: origins and unit directions, (3, N) each, and the angle of a pixel's side."""
+    """Camera rays in the glass's frame: origins and unit directions, (3, N) each, and the share of a pixel's side."""
 
     origin: Tensor
     direction: Tensor
-    footprint: float
+    share: float
 
 
 @dataclass(frozen=True)
@@ -89,10 +89,7 @@ def render(scene: Scene, assets: Assets, device: Device = "cpu") -> Sample:
         )
     room = _furnish(scene, assets, device)
     with torch.no_grad():
-        if scene.glass.is_rough or scene.glass.is_wedged or _needs_chance(room):
-            layers = _by_chance(room, device)
-        else:
-            layers = _without_chance(room)
+        layers = _by_chance(room, device) if _needs_chance(scene) else _without_chance(room)
     return Sample(scene, **dict(zip(LAYERS, layers, strict=True)))
 
 
@@ -102,16 +99,25 @@ def _furnish(scene: Scene, assets: Assets, device: Device) -> _Room:
     origin = to_glass @ (position - torch.tensor(scene.glass.position_mm, device=device))
     right, up, back = (to_glass @ axis for axis in torch.tensor(
         axes(scene.camera.heading_deg, scene.camera.pitch_deg), device=device))  # fmt: skip
+    by_chance = _needs_chance(scene)
+    view = View(
+        scene.camera_above_glass_mm,
+        scene.camera.pixel_rad,
+        scene.camera.aperture_mm if by_chance else 0.0,
+        scene.camera.focus_mm,
+    )
     sides = []
     for side, behind in ((scene.behind, True), (scene.front, False)):
-        light = Light(side, assets, behind=behind, to_world=to_glass.T, device=device)
+        light = Light(side, assets, view, behind=behind, to_world=to_glass.T, device=device)
         groups = _groups(scene, light, behind=behind)
         sides.append(_Side(light, scene.glass.depth_mm if behind else 0.0, groups))
     return _Room(scene, *sides, origin, right, up, back)
 
 
-def _needs_chance(room: _Room) -> bool:
-    return room.scene.camera.aperture_mm > 0 and (room.behind.light.is_near or room.front.light.is_near)
+def _needs_chance(scene: Scene) -> bool:
+    """Rough or wedged glass, and lenses over near content, whose blur is not the same everywhere."""
+    is_near = any(side.plane or (side.map and math.isfinite(side.map.radius_mm)) for side in (scene.behind, scene.front))
+    return scene.glass.is_rough or scene.glass.is_wedged or (scene.camera.aperture_mm > 0 and bool(is_near))
 
 
 def _without_chance(room: _Room) -> list[Tensor]:
@@ -124,19 +130,19 @@ def _without_chance(room: _Room) -> list[Tensor]:
     for row in range(grid):
         for column in range(grid):
             place = (column + 0.5) / grid, (row + 0.5) / grid
-            for rays, pixels in _pinhole(room, place, margin, camera.pixel_rad / grid):
+            for rays, pixels in _pinhole(room, place, margin, 1 / grid):
                 total[:, :, pixels] += torch.stack(_split(room, rays)) / grid**2
     return [blurred(layer.view(3, height, width), camera, margin) for layer in total]
 
 
 def _grid(room: _Room) -> int:
     """Looks a pixel and direction, so that neighbouring looks are at most half a texel apart, or two; beyond, the light is filtered."""
-    finest = max(side.light.texels_per_radian() for side in (room.behind, room.front))
-    return min(max(1, math.ceil(2 * room.scene.camera.pixel_rad * finest)), _MOST_GRID)
+    finest = max(side.light.texels_per_pixel() for side in (room.behind, room.front))
+    return min(max(1, math.ceil(2 * finest)), _MOST_GRID)
 
 
 def _pinhole(
-    room: _Room, place: tuple[float, float], margin: int, footprint: float
+    room: _Room, place: tuple[float, float], margin: int, share: float
 ) -> Iterator[tuple[Rays, slice]]:
     """Rays through one place in every pixel, in strips of rows; `margin` pixels more on every side."""
     camera = room.scene.camera
@@ -152,7 +158,7 @@ def _pinhole(
         direction = direction - room.back[:, None]
         origin = room.origin[:, None].expand(3, len(across))
         yield (
-            Rays(origin, unit(direction), footprint),
+            Rays(origin, unit(direction), share),
             slice(top * width, top * width + len(across)),
         )
 
@@ -186,15 +192,7 @@ def _through_lens(room: _Room, pixels: slice, chance: Chance) -> Rays:
         x, y = chance.disc() * (camera.aperture_mm / 2)
         lens = _outer(room.right, x) + _outer(room.up, y)
         origin, direction = origin + lens, direction - lens / camera.focus_mm
-    return Rays(origin, unit(direction), _sample_footprint(room))
-
-
-def _sample_footprint(room: _Room) -> float:
-    """What one of many samples stands for: its part of the pixel and of the lens's circle of confusion."""
-    camera, samples = room.scene.camera, room.scene.samples
-    nearest = min(side.light.distance_mm for side in (room.behind, room.front))
-    spread = camera.aperture_mm * abs(1 / camera.focus_mm - 1 / nearest) if camera.aperture_mm else 0.0
-    return (camera.pixel_rad + spread) / (2 * math.sqrt(samples))
+    return Rays(origin, unit(direction), 1 / (2 * math.sqrt(room.scene.samples)))
 
 
 def _outer(axis: Tensor, values: Tensor) -> Tensor:
@@ -213,9 +211,9 @@ def _split(room: _Room, rays: Rays, _: Chance | None = None) -> list[Tensor]:
         (room.behind, rays.origin, rays.direction, whole.transmitted, kept.transmitted),
         (room.front, point, mirrored, whole.reflected, kept.reflected),
     ):
-        bare = side.light.along(origin, direction, rays.footprint)
+        bare = side.light.along(origin, direction, rays.share)
         if len(side.groups) > 1:
-            every, mine = _shifted_orders(room, side, Rays(point, direction, rays.footprint))
+            every, mine = _shifted_orders(room, side, Rays(point, direction, rays.share))
         else:
             every = far_whole * bare
             mine = far_kept * bare if kept is not whole else every
@@ -233,10 +231,10 @@ def _shifted_orders(room: _Room, side: _Side, leaving: Rays) -> tuple[Tensor, Te
     surface = leaving.origin.clone()
     surface[2] = -side.depth_mm
     shares = iter(order_shares(glass, cosine, [order for group in side.groups for order in group]))
-    far = side.light.far(direction, leaving.footprint)
+    far = side.light.far(direction, leaving.share)
     every, mine = torch.zeros_like(direction), torch.zeros_like(direction)
     for group in side.groups:
-        seen, clear = side.light.near(surface + ahead * _shift(group[0], shifts), direction, leaving.footprint)
+        seen, clear = side.light.near(surface + ahead * _shift(group[0], shifts), direction, leaving.share)
         if far is not None and clear is not None:
             seen = seen + clear * far
         whole, kept = torch.zeros_like(cosine), torch.zeros_like(cosine)
@@ -284,14 +282,14 @@ def _scattered(room: _Room, rays: Rays, chance: Chance) -> list[Tensor]:
     """I, T, B, R and MR along the rays, for panes that are rough or wedged."""
     through, transmission, back, reflection = torch.zeros(4, *rays.direction.shape, device=rays.direction.device)
     lights = room.behind.light, room.front.light
-    for part in follow(room.scene.glass, rays.origin, rays.direction, lights, rays.footprint, chance):
+    for part in follow(room.scene.glass, rays.origin, rays.direction, lights, rays.share, chance):
         kept = room.scene.orders == "all" or part.in_paper
         for whole, layer in ((through, transmission),) if part.behind else ((back, reflection),):
             whole += part.light
             layer += part.light * kept
     point, mirrored = _at_first_surface(rays)
-    background = room.behind.light.along(rays.origin, rays.direction, rays.footprint)
-    mirror = room.front.light.along(point, mirrored, rays.footprint)
+    background = room.behind.light.along(rays.origin, rays.direction, rays.share)
+    mirror = room.front.light.along(point, mirrored, rays.share)
     return [through + back, transmission, background, reflection, mirror]
 
 

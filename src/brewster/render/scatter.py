@@ -79,7 +79,7 @@ def surfaces(glass: Glazing, like: Tensor) -> list[Surface]:
 
 
 def follow(
-    glass: Glazing, origin: Tensor, direction: Tensor, sides: tuple[Light, Light], footprint: float, chance: Chance
+    glass: Glazing, origin: Tensor, direction: Tensor, sides: tuple[Light, Light], share: float, chance: Chance
 ) -> Iterator[Exit]:
     """Every order of the rays (3, N) until it is too faint, and what light it meets behind or in front."""
     stack = surfaces(glass, direction)
@@ -94,7 +94,7 @@ def follow(
                     waiting.append(following)
                 continue
             is_behind = following.surface > 0
-            light = _arriving(following, meeting, behind if is_behind else front, footprint, chance)
+            light = _arriving(following, meeting, behind if is_behind else front, share, chance)
             in_paper = following.reflections == 0 if is_behind else not following.entered_last
             yield Exit(is_behind, in_paper, light)
 
@@ -184,10 +184,10 @@ def _reflectances(cosine: Tensor, here: float, beyond: float) -> tuple[Tensor, T
     return torch.where(squared <= 0, 1.0, s), torch.where(squared <= 0, 1.0, p)
 
 
-def _arriving(path: _Path, meeting: _Meeting, light: Light, footprint: float, chance: Chance) -> Tensor:
+def _arriving(path: _Path, meeting: _Meeting, light: Light, share: float, chance: Chance) -> Tensor:
     """The light that an order brings: along its own direction, joined by light drawn from the map."""
     weight = (path.s + path.p) / 2
-    seen = light.along(path.origin, path.direction, footprint)
+    seen = light.along(path.origin, path.direction, share)
     if not (meeting.alpha and light.map and path.typical > _WORTH_LIGHT):
         return weight * seen
     own = _density(meeting, path.direction)
@@ -198,7 +198,7 @@ def _arriving(path: _Path, meeting: _Meeting, light: Light, footprint: float, ch
     other = _density(meeting, direction) / (density + _density(meeting, direction)).clamp(min=1e-20)
     weight_drawn = (meeting.before.s * s + meeting.before.p * p) / 2 * other
     # Where the balance divides by both densities, the facet's own cancels the one in its weight.
-    return weight * seen * balance + weight_drawn * light.along(path.origin, direction, footprint)
+    return weight * seen * balance + weight_drawn * light.along(path.origin, direction, share)
 
 
 def _half(meeting: _Meeting, direction: Tensor) -> Tensor:

@@ -303,7 +303,8 @@ class Studio:
         right, up, back = (self._to_glass @ axis for axis in np.array(axes(lit.heading_deg, 0)))
         return {
             "type": "sphere",
-            "to_world": self._placed((-back, -right, up), (0, 0, 0), (lit.radius_mm,) * 3),
+            "to_world": self._placed((-back, -right, up), (0, 0, 0)),
+            "radius": lit.radius_mm,
             "flip_normals": True,
             "bsdf": _BLACK,
             "emitter": {"type": "area", "radiance": texture},

@@ -28,8 +28,8 @@ from brewster.scene.scene import Scene
 
 _POLARISED: Final = "llvm_ad_mono_polarized"
 _FEWEST_PASSES: Final = 4
-_MOST_RAYS: Final = 1 << 23
-"""Of one pass: about 2 GB."""
+_MOST_RAYS: Final = 1 << 22
+"""Of one pass: about 1 GB."""
 _DARKNESS: Final = 0.01
 """This share of a picture's mean light is added to each pixel's before its relative error is taken."""
 
@@ -162,7 +162,7 @@ class _Estimate:
 def _rays_a_pass(pixels: int, most_samples: int) -> int:
     """A square number, which the sampler spreads evenly over a pixel, small enough for memory and four passes."""
     most = min(most_samples // _FEWEST_PASSES, _MOST_RAYS // pixels)
-    return next((samples for samples in (16, 4) if samples <= most), 1)
+    return next((samples for samples in (64, 16, 4) if samples <= most), 1)
 
 
 def _converge(estimates: Sequence[_Estimate], noise: float, most_samples: int) -> None:
