@@ -10,9 +10,13 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import torch
+from torch import Tensor
 
+from brewster.render import scatter
 from brewster.render.assets import Assets
 from brewster.render.pane import render
 from brewster.render.sample import LAYERS, Sample
@@ -55,10 +59,30 @@ SCENES = {
 }
 
 
+@contextmanager
+def averaged_at_every_surface() -> Iterator[None]:
+    """Our rough glass as Mitsuba's colour variants have theirs: s and p averaged at every facet."""
+
+    def averaged(cosine: Tensor, here: float, beyond: float) -> tuple[Tensor, Tensor]:
+        s, p = apart(cosine, here, beyond)
+        return (s + p) / 2, (s + p) / 2
+
+    apart = scatter._reflectances  # noqa: SLF001
+    scatter._reflectances = averaged  # noqa: SLF001
+    try:
+        yield
+    finally:
+        scatter._reflectances = apart  # noqa: SLF001
+
+
 def compared(scene: Scene, assets: Assets, samples: int) -> list[str]:
     """For I, T, B, R and MR: ratio of the means, its standard error, and error over what noise explains."""
-    ours, again = render(scene, assets), render(_reseeded(scene, 1), assets)
-    first, second = (trace(_reseeded(scene, seed), assets, noise=0, most_samples=samples) for seed in (2, 3))
+    with averaged_at_every_surface():
+        ours, again = render(scene, assets), render(_reseeded(scene, 1), assets)
+    polarised = scene.camera.heading_deg > 30
+    first, second = (
+        trace(_reseeded(scene, seed), assets, noise=0, most_samples=samples, polarised=polarised) for seed in (2, 3)
+    )
     return [_line(name, ours, again, first, second) for name in LAYERS]
 
 

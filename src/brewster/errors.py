@@ -9,6 +9,7 @@
     |-- ModelError             unknown model, damaged file, wrong inputs
     |-- DeviceError            the asked device is not there
     |-- RecipeError            a TOML recipe that does not say what it must
+    |-- DownloadError          a server cannot be reached, or did not send what it promised
     `-- MissingExtra           an optional part is not installed
 
 Messages have three beats: what happened (with the value), what was expected, what to do.
@@ -54,6 +55,10 @@ class DeviceError(BrewsterError):
 
 class RecipeError(BrewsterError):
     """A recipe is not TOML, or its values are missing, unknown or impossible."""
+
+
+class DownloadError(BrewsterError):
+    """A server cannot be reached, refuses, or did not send what it promised."""
 
 
 class MissingExtra(BrewsterError):

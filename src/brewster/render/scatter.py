@@ -23,7 +23,6 @@ from brewster.scene.glass import Glazing
 
 _WORTH_LIGHT: Final = 3e-3
 """Orders fainter than this are lit by chance alone."""
-_USUAL_REFLECTANCE: Final = 0.05
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,6 @@ class _Path:
     p: Tensor
     surface: int
     down: bool
-    typical: float
     reflections: int
     entered_last: bool
 
@@ -85,18 +83,23 @@ def follow(
     stack = surfaces(glass, direction)
     behind, front = sides
     ones = torch.ones_like(direction)
-    waiting = [_Path(origin, direction, ones, ones, 0, True, 1.0, 0, False)]
+    waiting = [_Path(origin, direction, ones, ones, 0, True, 0, False)]
     while waiting:
         path = waiting.pop()
         for following, meeting in _meet(path, stack, chance):
             if 0 <= following.surface < len(stack):
-                if following.typical > FAINTEST:
+                if _remaining(following) > FAINTEST:
                     waiting.append(following)
                 continue
             is_behind = following.surface > 0
             light = _arriving(following, meeting, behind if is_behind else front, share, chance)
             in_paper = following.reflections == 0 if is_behind else not following.entered_last
             yield Exit(is_behind, in_paper, light)
+
+
+def _remaining(path: _Path) -> float:
+    """The mean weight of the rays: facets may turn some to where glass reflects all, so none is typical."""
+    return float((path.s + path.p).mean()) / 2
 
 
 @dataclass(frozen=True)
@@ -144,7 +147,6 @@ def _onward(
         before.p * shares[1],
         path.surface + (1 if down else -1),
         down,
-        path.typical * (_USUAL_REFLECTANCE if reflects else 1 - _USUAL_REFLECTANCE),
         path.reflections + reflects,
         path.entered_last or (path.surface == count - 2 and down and not reflects),
     )
@@ -188,7 +190,7 @@ def _arriving(path: _Path, meeting: _Meeting, light: Light, share: float, chance
     """The light that an order brings: along its own direction, joined by light drawn from the map."""
     weight = (path.s + path.p) / 2
     seen = light.along(path.origin, path.direction, share)
-    if not (meeting.alpha and light.map and path.typical > _WORTH_LIGHT):
+    if not (meeting.alpha and light.map and _remaining(path) > _WORTH_LIGHT):
         return weight * seen
     own = _density(meeting, path.direction)
     balance = own / (own + light.density(path.origin, path.direction)).clamp(min=1e-20)

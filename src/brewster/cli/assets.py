@@ -1,0 +1,140 @@
+"""`brewster assets`: what brewster does not ship and fetches when asked, such as maps to light rooms with."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from brewster.cli.terminal import complain, one_line, progress, say, write_out
+
+if TYPE_CHECKING:
+    from brewster.dataset.assets import Order, Result
+
+_COUNT = click.IntRange(min=0)
+
+
+@click.group
+def assets() -> None:
+    """Fetch what brewster does not ship."""
+
+
+@assets.command
+@click.argument("source", type=click.Choice(["polyhaven"]))
+@click.argument("out", required=False, type=click.Path(path_type=Path))
+@click.option(
+    "--indoor", type=_COUNT, default=140, show_default=True, metavar="NUMBER", help="How many indoor maps."
+)
+@click.option(
+    "--outdoor", type=_COUNT, default=30, show_default=True, metavar="NUMBER", help="How many outdoor maps."
+)
+@click.option(
+    "--resolution",
+    type=click.Choice(["1k", "2k", "4k", "8k", "16k"]),
+    default="4k",
+    show_default=True,
+    help="The width of the maps, in 1024 pixels.",
+)
+@click.option(
+    "--format",
+    type=click.Choice(["hdr", "exr"]),
+    default="hdr",
+    show_default=True,
+    help="The container of the maps; reading exr needs the extra brewster[exr].",
+)
+@click.option(
+    "--server",
+    metavar="URL",
+    default="https://api.polyhaven.com",
+    show_default=True,
+    help="Where to ask: Poly Haven, or a mirror that answers alike.",
+)
+@click.option(
+    "--json", "as_json", is_flag=True, help="Print one line of JSON for each map on standard output."
+)
+@click.option("--quiet", is_flag=True, help="Say nothing but errors.")
+@click.option("--dry-run", is_flag=True, help="Print what would be downloaded, and write nothing.")
+@click.pass_context
+def pull(
+    context: click.Context,
+    /,
+    *,
+    source: str,  # noqa: ARG001  (there is one)
+    out: Path | None,
+    as_json: bool,
+    quiet: bool,
+    **asked: Any,  # noqa: ANN401  (the fields of Order)
+) -> None:
+    """Download CC0 maps (360-degree HDR photographs) from Poly Haven into the folder OUT.
+
+    OUT is brewster/maps in the user's cache folder unless it is named. The maps are taken in order of their ids, and
+    manifest.csv names them, their authors and their MD5 sums.
+
+    Maps that are there already are skipped, and a download that was stopped goes on where it was. A map that fails
+    does not stop the others: it is named at the end, and the exit code is 1.
+    """
+    from brewster.dataset.assets import Order, maps_folder  # noqa: PLC0415  (wakes urllib)
+
+    order = Order(**asked)
+    results = _fetch(order, out or maps_folder(), as_json=as_json, quiet=quiet)
+    if not quiet:
+        _own_up(order, results)
+        say("powered by Poly Haven, polyhaven.com")  # its terms of service ask for these words
+    context.exit(1 if any(result.error for result in results) else 0)
+
+
+def _fetch(order: Order, folder: Path, *, as_json: bool, quiet: bool) -> list[Result]:
+    """Fetches the maps and tells of each; those that failed are named at the end, whatever the end is."""
+    from brewster.dataset.assets import pull as fetch  # noqa: PLC0415
+
+    results: list[Result] = []
+    talks_over_bar = as_json and sys.stdout.isatty()
+    try:
+        with progress(order.indoor + order.outdoor, shown=not quiet and not talks_over_bar) as advance:
+            for result in fetch(order, folder):
+                results.append(result)
+                _tell(result, as_json=as_json, quiet=quiet)
+                advance(sum(result.status != "missing" for result in results), result.asset)
+    finally:
+        _sum_up(results, quiet=quiet)
+    return results
+
+
+def _tell(result: Result, *, as_json: bool, quiet: bool) -> None:
+    if as_json:
+        write_out(f"{json.dumps(asdict(result))}\n".encode())
+    elif result.status == "planned":
+        write_out(f"{one_line(result.url)} -> {one_line(result.file)}\n".encode())
+    if quiet:
+        return
+    if result.status == "missing":
+        say(f"{result.asset}: passed over, it has no such file")
+    elif result.status == "skipped":
+        say(f"{result.file}: skipped, it is there")
+    elif result.status == "downloaded":
+        say(f"{result.asset} -> {result.file} ({(result.bytes or 0) / 1e6:.1f} MB)")
+
+
+def _sum_up(results: Sequence[Result], *, quiet: bool) -> None:
+    counts = Counter(result.status for result in results)
+    if counts and not quiet:
+        say(", ".join(f"{count} {status}" for status, count in sorted(counts.items())))
+    for result in results:
+        if result.error:
+            complain(f"{result.asset}: {result.error}")
+
+
+def _own_up(order: Order, results: Sequence[Result]) -> None:
+    """Says aloud when the server has fewer maps than were asked for."""
+    for category, asked in (("indoor", order.indoor), ("outdoor", order.outdoor)):
+        found = sum(result.category == category and result.status != "missing" for result in results)
+        if found < asked:
+            say(
+                f"{found} of {asked} {category} maps: the server has no more in {order.resolution} {order.format}"
+            )

@@ -1,0 +1,275 @@
+"""`brewster render`: a recipe in; a set of samples out, each with its five pictures and their cause."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import sys
+from collections import Counter
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, final
+
+import click
+from click.core import ParameterSource
+
+from brewster.cli.terminal import complain, interrupts, progress, say, write_out
+from brewster.errors import MissingExtra
+
+if TYPE_CHECKING:
+    from brewster.dataset.build import Crew, Job, Result
+    from brewster.scene.recipe import SceneRecipe
+
+_NEEDS: Final = {"OpenEXR": "OpenEXR", "pyarrow": "pyarrow", "tomli-w": "tomli_w", "torch": "torch"}
+_OF_A_SCENE: Final = {"out", "output", "scene", "renderer", "maps", "photos", "quiet"}
+_MOST_WORKERS: Final = 8
+_FOLDER: Final = click.Path(path_type=Path, file_okay=False, exists=True)
+
+
+@final
+class _Size(click.ParamType[tuple[int, int]]):
+    """Two numbers with an x between."""
+
+    name = "WxH"
+
+    def convert(
+        self, value: object, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[int, int]:
+        """Width and height, or a usage error."""
+        if isinstance(value, tuple):
+            return value
+        width, _, height = str(value).lower().partition("x")
+        if not all(
+            side.isascii() and side.isdigit() and 16 <= int(side) <= 16384 for side in (width, height)
+        ):
+            self.fail(f"{value!r} is no size; 512x384 is one, and sides go from 16 to 16384.", param, ctx)
+        return int(width), int(height)
+
+
+@click.command
+@click.argument("out", required=False, type=click.Path(path_type=Path))
+@click.option(
+    "-o",
+    "--output",
+    metavar="FOLDER",
+    type=click.Path(path_type=Path),
+    help="The same as OUT.",
+)
+@click.option(
+    "--recipe",
+    default="window",
+    show_default=True,
+    metavar="NAME|FILE",
+    help="What is drawn: window, shopfront, vitrine, office, tiny, or a TOML file.",
+)
+@click.option("--count", type=click.IntRange(min=0), default=10, show_default=True, help="How many samples.")
+@click.option(
+    "--first", type=click.IntRange(min=0), default=0, show_default=True, help="The index of the first sample."
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(0, 2**32 - 1),
+    default=0,
+    show_default=True,
+    help="Another seed makes another set.",
+)
+@click.option("--size", type=_Size(), help="Of the pictures, such as 512x384, if not the recipe's.")
+@click.option(
+    "--orders",
+    type=click.Choice(["all", "paper"]),
+    help="What T and R hold: all light, so that I = T + R, or the paper's single paths; if not the recipe's.",
+)
+@click.option(
+    "--renderer",
+    type=click.Choice(["pane", "tracer"]),
+    help="pane is analytic, for flat glass; tracer follows paths, for all glass. By default pane, or what --scene names.",
+)
+@click.option(
+    "--maps",
+    metavar="DIR",
+    type=_FOLDER,
+    multiple=True,
+    help="A folder of HDR maps to light scenes with; may be given again. Without any, built-in worlds do.",
+)
+@click.option(
+    "--photos",
+    metavar="DIR",
+    type=_FOLDER,
+    multiple=True,
+    help="A folder of photos to put before maps; may be given again.",
+)
+@click.option(
+    "--shards", is_flag=True, help="Pack each hundred samples into a tar, as WebDataset reads them."
+)
+@click.option("--preview", is_flag=True, help="Make preview.png too, a sheet of the first 40 samples.")
+@click.option(
+    "--workers",
+    type=click.IntRange(min=0),
+    help="How many processes render; 0 is this one. By default one a core, and at most 8.",
+)
+@click.option(
+    "--cluster", metavar="local|ADDRESS", help="Render on a Ray cluster; its nodes share the folder OUT."
+)
+@click.option(
+    "--scene",
+    type=click.Path(path_type=Path),
+    help="Render this scene.toml again, into OUT itself, and nothing else.",
+)
+@click.option(
+    "--json", "as_json", is_flag=True, help="Print one line of JSON for each sample on standard output."
+)
+@click.option("--quiet", is_flag=True, help="Say nothing but errors.")
+@click.pass_context
+def render(
+    context: click.Context,
+    /,
+    *,
+    out: Path | None,
+    output: Path | None,
+    scene: Path | None,
+    **asked: Any,  # noqa: ANN401  (the fields of _Order)
+) -> None:
+    """Render photographs through glass whose truth is known, into the folder OUT.
+
+    Each sample is a folder: photo.jpg, its layers transmission.jpg and reflection.jpg, background.jpg (without
+    glass), mirror.jpg (a mirror in place of the glass), all five in linear light in layers.exr, and scene.toml, from
+    which `brewster render --scene` makes the same bytes again. index.parquet lists all samples.
+
+    What is there is kept: the same command goes on where a run was stopped, and a larger --count adds to it. A sample
+    that fails does not stop the others: it is named, and the exit code is 1.
+    """
+    if (out is None) == (output is None):
+        raise click.UsageError("Name one folder to render into: brewster render OUT.")
+    _refuse_without_extra()
+    order = _Order(out or output or Path(), **asked)
+    if scene:
+        _refuse_out_of_place(context)
+        order.render_again(scene)
+    else:
+        context.exit(0 if order.render_set() else 1)
+
+
+@final
+@dataclass(frozen=True)
+class _Order:
+    """What was asked for; imports wait until it is carried out, as torch takes two seconds to wake."""
+
+    out: Path
+    recipe: str
+    count: int
+    first: int
+    seed: int
+    size: tuple[int, int] | None
+    orders: str | None
+    renderer: str | None
+    maps: tuple[Path, ...]
+    photos: tuple[Path, ...]
+    shards: bool
+    preview: bool
+    workers: int | None
+    cluster: str | None
+    as_json: bool
+    quiet: bool
+
+    def render_again(self, scene: Path) -> None:
+        """Renders one scene."""
+        from brewster.dataset.workers import render_again  # noqa: PLC0415
+
+        render_again(scene, self.out, (*self.maps, *self.photos), self.renderer)
+        if not self.quiet:
+            say(f"{scene} -> {self.out}")
+
+    def render_set(self) -> bool:
+        """Renders a set and tells; whether all went well."""
+        from brewster.dataset.build import build  # noqa: PLC0415
+        from brewster.dataset.overview import write_preview  # noqa: PLC0415
+
+        job, told = self._job(), _Told(self.as_json, self.quiet)
+        over_bar = self.as_json and sys.stdout.isatty()
+        with progress(self.count, shown=not self.quiet and not over_bar) as advance:
+
+            def report(result: Result) -> None:
+                told.tell(result)
+                advance(told.counts.total(), f"sample {result.index}")
+                interrupts.heed()
+
+            indices = range(self.first, self.first + self.count)
+            build(job, indices, self._crew(job), shards=self.shards, report=report)
+        if self.preview:
+            write_preview(self.out)
+        told.sum_up(self.out)
+        return not told.counts["failed"]
+
+    def _job(self) -> Job:
+        from brewster.dataset.build import Job  # noqa: PLC0415
+        from brewster.render.catalog import read_catalog  # noqa: PLC0415
+
+        recipe = self._recipe()
+        catalog, left_out = read_catalog(self.maps, self.photos)
+        for error in left_out:
+            complain(f"left out: {error}")
+        folders = tuple(folder.resolve() for folder in (*self.maps, *self.photos))
+        return Job(self.out.resolve(), recipe, catalog, self.seed, self.renderer or "pane", folders)
+
+    def _recipe(self) -> SceneRecipe:
+        """The recipe with the size and orders that were asked for instead of its own."""
+        from brewster.scene.recipe import read_scene_recipe  # noqa: PLC0415
+
+        recipe = read_scene_recipe(self.recipe)
+        if self.size:
+            width, height = self.size
+            camera = recipe.camera.model_copy(update={"width": width, "height": height})
+            recipe = recipe.model_copy(update={"camera": camera})
+        return recipe.model_copy(update={"orders": self.orders}) if self.orders else recipe
+
+    def _crew(self, job: Job) -> Crew:
+        from brewster.dataset.workers import Here, Workers  # noqa: PLC0415
+
+        if self.cluster:
+            from brewster.dataset.cluster import Cluster  # noqa: PLC0415
+
+            return Cluster(job, self.cluster, self.workers)
+        workers = min(_MOST_WORKERS, os.cpu_count() or 1) if self.workers is None else self.workers
+        return Workers(job, workers) if workers else Here(job)
+
+
+@final
+class _Told:
+    """Tells of samples as they come, and counts them: what is kept does not grow."""
+
+    def __init__(self, as_json: bool, quiet: bool) -> None:
+        self._as_json, self._quiet = as_json, quiet
+        self.counts: Counter[str] = Counter()
+
+    def tell(self, result: Result) -> None:
+        """One line at once for what was rendered or failed."""
+        self.counts[result.status] += 1
+        if self._as_json:
+            write_out(f"{json.dumps(asdict(result))}\n".encode())
+        if result.error:
+            complain(f"sample {result.index}: {result.error}")
+        elif result.status == "rendered" and not self._quiet:
+            say(f"sample {result.index} ({result.seconds:.1f} s)")
+
+    def sum_up(self, out: Path) -> None:
+        """How many there were of each kind."""
+        if not self._quiet:
+            say(f"{out}: " + ", ".join(f"{count} {status}" for status, count in sorted(self.counts.items())))
+
+
+def _refuse_without_extra() -> None:
+    missing = [package for package, module in _NEEDS.items() if importlib.util.find_spec(module) is None]
+    if missing:
+        raise MissingExtra(
+            f"rendering needs {', '.join(missing)}",
+            "the extra brewster[render]",
+            "run: pip install 'brewster[render]'",
+        )
+
+
+def _refuse_out_of_place(context: click.Context) -> None:
+    """A scene says all of its sample; what chooses samples of a set has nothing to choose."""
+    for name in context.params.keys() - _OF_A_SCENE:
+        if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            raise click.UsageError(f"--scene renders what the scene says, and --{name} belongs to a set.")

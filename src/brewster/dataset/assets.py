@@ -1,0 +1,362 @@
+"""Downloads CC0 lat-long maps from Poly Haven: which they are, and whether they came whole.
+
+    for result in pull(Order(indoor=2, outdoor=1), maps_folder()):
+        print(result.status, result.file)
+
+One connection at a time. What was begun lies beside its target as `.part`, and the next call goes on from there.
+"""
+
+from __future__ import annotations
+
+import csv
+import functools
+import hashlib
+import io
+import json
+import os
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from http.client import HTTPException, HTTPResponse, InvalidURL
+from importlib import metadata
+from pathlib import Path
+from time import sleep
+from typing import Literal, NamedTuple, TypeVar, cast, final
+from urllib import request
+from urllib.error import HTTPError
+
+from brewster.errors import DownloadError, TargetError
+from brewster.files import write_atomically
+
+_COLUMNS = ("file", "asset", "category", "resolution", "md5", "authors", "licence")  # of manifest.csv
+_SAFE_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,200}", re.ASCII)
+_BUSY = (408, 425, 429, 500, 502, 503, 504)
+_PAUSES_S = (1.0, 2.0, 4.0, 8.0)  # between five attempts
+_LONGEST_WAIT_S = 120.0
+_TIMEOUT_S = 30.0
+_PATIENCE = 5  # when so many assets in a row have failed, it is the server or the line
+_BLOCK = 1 << 18
+_WEB = "http:// or https://"
+
+_T = TypeVar("_T")
+
+
+@final
+@dataclass(frozen=True)
+class Order:
+    """What is wanted: how many maps of each category, which files of them, and from which server."""
+
+    indoor: int = 140
+    outdoor: int = 30
+    resolution: str = "4k"
+    format: str = "hdr"
+    server: str = "https://api.polyhaven.com"
+    dry_run: bool = False
+
+
+@final
+@dataclass(frozen=True)
+class Result:
+    """What became of an asset; `missing` is one that has no file of the resolution and format asked for."""
+
+    asset: str
+    category: str
+    status: Literal["downloaded", "skipped", "planned", "missing", "failed"] = "missing"
+    file: str | None = None
+    url: str | None = None
+    bytes: int | None = None
+    md5: str | None = None
+    error: str | None = None
+
+
+class _Asset(NamedTuple):
+    """A map in the server's list; its id is what the server says, and not yet safe as a file name."""
+
+    id: str
+    category: str
+    authors: str
+
+
+class _Promise(NamedTuple):
+    """A file as the server promises it."""
+
+    url: str
+    size: int
+    md5: str
+
+
+@final
+class _Lost(Exception):
+    """The line broke, or the server asks for patience: worth another attempt, after so many seconds."""
+
+    def __init__(self, why: object, wait_s: float = 0.0) -> None:
+        super().__init__(str(why) or type(why).__name__)
+        self.wait_s = wait_s
+
+
+def maps_folder() -> Path:
+    """Where maps lie unless another folder is named: brewster/maps in the user's cache folder."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (cache if cache.is_absolute() else Path.home() / ".cache") / "brewster" / "maps"
+
+
+def pull(order: Order, out: Path) -> Iterator[Result]:
+    """Downloads maps into a folder, asset by asset in order of their ids, and notes them in its manifest.csv.
+
+    A map that is there already is skipped. Where an asset has no such file, the next one takes its place; where a
+    download fails none does, so that the next call asks for the same maps.
+
+    Raises:
+        DownloadError: the server's list cannot be had, or several assets in a row failed.
+        TargetError: the folder cannot be written.
+    """
+    _read_manifest(out)  # another's manifest is refused before anything is fetched
+    assets = _list_assets(order)
+    in_a_row = 0
+    for category, asked in (("indoor", order.indoor), ("outdoor", order.outdoor)):
+        candidates = (asset for asset in assets if asset.category == category)
+        taken = 0
+        while taken < asked and (asset := next(candidates, None)):
+            result = _settle(asset, order, out)
+            yield result
+            taken += result.status != "missing"
+            in_a_row = in_a_row + 1 if result.status == "failed" else 0
+            if in_a_row == _PATIENCE:
+                cure = "see why they did, and run again: what came is kept"
+                raise DownloadError(f"{in_a_row} assets in a row failed", "the rest was not tried", cure)
+
+
+def _settle(asset: _Asset, order: Order, out: Path) -> Result:
+    result = Result(asset.id, asset.category)
+    try:
+        target = out / _file_name(asset, order)
+        promise = _ask_for_file(asset, order)
+        if promise is None:
+            return result
+        url, size, md5 = promise
+        result = replace(result, status="skipped", file=str(target), url=url, bytes=size, md5=md5)
+        if not _is_there(target, promise):
+            if order.dry_run:
+                return replace(result, status="planned")
+            _download(promise, target)
+            result = replace(result, status="downloaded")
+    except DownloadError as error:
+        return replace(result, status="failed", error=str(error))
+    if not order.dry_run:
+        row = (target.name, asset.id, asset.category, order.resolution, md5, asset.authors, "CC0")
+        _note(out, dict(zip(_COLUMNS, row, strict=True)))
+    return result
+
+
+# --- what the server says (api.polyhaven.com; swagger.yml in github.com/Poly-Haven/Public-API)
+
+
+def _list_assets(order: Order) -> list[_Asset]:
+    listed = _fetch_json(f"{order.server.rstrip('/')}/assets?type=hdris")
+    return [
+        _Asset(name, category, _authors(record))
+        for name, record in sorted(listed.items())
+        if (category := _category(record))
+    ]
+
+
+def _category(record: object) -> str | None:
+    """Indoor before outdoor; `attributes` are to replace `categories` one day, and both are looked at."""
+    categories = _dig(record, "categories")
+    words = [*categories] if isinstance(categories, list) else []
+    words.append(_dig(record, "attributes", "environment"))
+    return next((category for category in ("indoor", "outdoor") if category in words), None)
+
+
+def _authors(record: object) -> str:
+    authors = _dig(record, "authors")
+    return "; ".join(authors)[:1000] if isinstance(authors, dict) else ""
+
+
+def _ask_for_file(asset: _Asset, order: Order) -> _Promise | None:
+    url = f"{order.server.rstrip('/')}/files/{asset.id}"
+    match _dig(_fetch_json(url), "hdri", order.resolution, order.format):
+        case None:
+            return None
+        case {"url": str(address), "size": int(size), "md5": str(md5)} if size > 0:
+            return _Promise(address, size, md5.lower())
+    raise DownloadError(f"{url} promises no file", "address, size and MD5 sum", "try another --server")
+
+
+def _file_name(asset: _Asset, order: Order) -> str:
+    name = f"{asset.id}_{order.resolution}.{order.format}"
+    if not _SAFE_NAME.fullmatch(name):
+        expected, cure = "letters, digits, '_', '-' and '.' only", "try another --server: this may mean harm"
+        raise DownloadError(f"{name!r} is no name for a file", expected, cure)
+    return name
+
+
+def _fetch_json(url: str) -> dict[str, object]:
+    def fetch() -> bytes:
+        with _open(url) as response:
+            return _read(response)
+
+    try:
+        said = json.loads(_patiently(url, fetch))
+    except (ValueError, RecursionError) as error:
+        raise DownloadError(f"{url} answered no JSON ({error})", "JSON", "check --server") from error
+    if not isinstance(said, dict):
+        raise DownloadError(f"{url} answered {said!r:.40}", "a JSON object", "check --server")
+    return said
+
+
+def _dig(tree: object, *keys: str) -> object:
+    for key in keys:
+        tree = tree.get(key) if isinstance(tree, dict) else None
+    return tree
+
+
+# --- over the line
+
+
+def _patiently(url: str, attempt: Callable[[], _T]) -> _T:
+    pauses = iter(_PAUSES_S)
+    while True:
+        try:
+            return attempt()
+        except _Lost as lost:
+            if (pause := next(pauses, None)) is None:
+                happened = f"{url} did not come in {len(_PAUSES_S) + 1} attempts ({lost})"
+                cure = "check the connection, or run again later: what came is kept"
+                raise DownloadError(happened, "a server that answers, and a line that holds", cure) from lost
+            sleep(max(pause, lost.wait_s))
+
+
+def _open(url: str, start: int = 0) -> HTTPResponse:
+    """The answer, from this byte on if the server can do that."""
+    headers = {"User-Agent": _agent()} | ({"Range": f"bytes={start}-"} if start else {})
+    try:
+        asked = request.Request(url, headers=headers)  # noqa: S310  (the opener knows http and https only)
+        answer = _opener().open(asked, timeout=_TIMEOUT_S)
+    except HTTPError as error:
+        error.close()
+        if error.code in _BUSY:
+            wait = error.headers.get("Retry-After", "")
+            raise _Lost(error, min(float(wait), _LONGEST_WAIT_S) if wait.isdecimal() else 0) from error
+        raise DownloadError(f"{url} was refused ({error})", "a file", "run again later") from error
+    except (ValueError, InvalidURL) as error:
+        raise DownloadError(f"{url!r} is no address ({error})", _WEB, "check --server") from error
+    except (OSError, HTTPException) as error:
+        raise _Lost(error) from error
+    if answer is None:
+        raise DownloadError(f"{url!r} leads elsewhere", _WEB, "check --server")
+    return cast("HTTPResponse", answer)
+
+
+@functools.cache
+def _opener() -> request.OpenerDirector:
+    """Opens http and https only, also where a server redirects to; for all else it has no answer."""
+    opener = request.OpenerDirector()
+    for handler in (
+        request.ProxyHandler,
+        request.HTTPHandler,
+        request.HTTPSHandler,
+        request.HTTPRedirectHandler,
+        request.HTTPErrorProcessor,
+        request.HTTPDefaultErrorHandler,
+    ):
+        opener.add_handler(handler())
+    return opener
+
+
+@functools.cache
+def _agent() -> str:
+    """Poly Haven asks that programs name themselves."""
+    try:
+        version = metadata.version("brewster")
+    except metadata.PackageNotFoundError:
+        version = "source"
+    return f"brewster/{version} (+separates reflections in photographs; one download at a time)"
+
+
+def _read(response: HTTPResponse, most: int | None = None) -> bytes:
+    """All of it, or what has come of the next so many bytes: none of them is lost with the line."""
+    try:
+        return response.read() if most is None else response.read1(most)
+    except (OSError, HTTPException) as error:
+        raise _Lost(error) from error
+
+
+# --- onto the disk
+
+
+def _is_there(target: Path, promise: _Promise) -> bool:
+    with _writing(target):
+        there = target.exists()
+        if there and _md5(target) != promise.md5:
+            expected, cure = f"one with the MD5 sum {promise.md5}", "move it away, and run again"
+            raise DownloadError(f"{target} is there, and is not the server's file", expected, cure)
+    return there
+
+
+def _download(promise: _Promise, target: Path) -> None:
+    part = target.with_name(f"{target.name}.part")
+    with _writing(target):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _patiently(promise.url, lambda: _fetch_rest(promise, part))
+        if (came := _md5(part)) != promise.md5:
+            part.unlink()
+            happened = f"{promise.url} came with the MD5 sum {came}, and was dropped"
+            raise DownloadError(happened, f"{promise.md5} was promised", "run again, to fetch all of it anew")
+        part.replace(target)
+
+
+def _fetch_rest(promise: _Promise, part: Path) -> None:
+    came = part.stat().st_size if part.exists() else 0
+    if came == promise.size:
+        return
+    start = came if came < promise.size else 0
+    with _open(promise.url, start) as response:
+        there = start if response.status == 206 else 0  # a server may ignore from where we asked
+        with part.open("ab" if there else "wb") as file:
+            while block := _read(response, min(_BLOCK, promise.size - there)):
+                there += file.write(block)
+            file.flush()
+            os.fsync(file.fileno())
+    if there < promise.size:
+        raise _Lost(f"it ended after {there} of {promise.size} bytes")
+
+
+def _md5(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, lambda: hashlib.md5(usedforsecurity=False)).hexdigest()
+
+
+def _read_manifest(out: Path) -> list[dict[str, str]]:
+    """The rows for the maps that are still there."""
+    path = out / "manifest.csv"
+    with _writing(path):
+        text = path.read_text("utf-8", errors="replace") if path.exists() else ",".join(_COLUMNS)
+        rows = csv.DictReader(io.StringIO(text, newline=""))
+        if tuple(rows.fieldnames or ()) != _COLUMNS:
+            expected, cure = f"a table with the columns {','.join(_COLUMNS)}", "name another folder"
+            raise TargetError(f"{path} is not one of brewster's", expected, cure)
+        return [row for row in rows if (out / row["file"]).is_file()]
+
+
+def _note(out: Path, row: dict[str, str]) -> None:
+    """Puts a map into the manifest, which is written anew each time: stopped at any moment, it is true."""
+    rows = _read_manifest(out)
+    if row not in rows:
+        rows = [other for other in rows if other["file"] != row["file"]]
+        text = io.StringIO()
+        table = csv.DictWriter(text, _COLUMNS, extrasaction="ignore")
+        table.writeheader()
+        table.writerows(sorted([*rows, row], key=lambda row: row["file"]))
+        write_atomically(out / "manifest.csv", text.getvalue().encode(errors="replace"), overwrite=True)
+
+
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        happened = f"{path} cannot be read or written ({error.strerror or error})"
+        cure = "free some space or name another folder, and run again: it goes on from there"
+        raise TargetError(happened, "a folder of yours on a disk with room", cure) from error

@@ -1,0 +1,37 @@
+"""What the tests of rendered sets share: jobs with a fake renderer, and what a folder holds."""
+
+import hashlib
+
+from brewster.dataset.build import Job, build
+from brewster.dataset.workers import Here
+from brewster.render.catalog import BUILTIN_CATALOG
+from brewster.scene.recipe import read_scene_recipe
+
+
+def job(out, renderer="render", seed=7, recipe="tiny"):
+    return Job(out, read_scene_recipe(recipe), BUILTIN_CATALOG, seed, f"fake_renderer:{renderer}")
+
+
+def make(out, count=4, first=0, crew=Here, shards=False, **of_job):
+    """Builds a set; what became of its samples."""
+    results = []
+    asked = job(out, **of_job)
+    build(asked, range(first, first + count), crew(asked), shards=shards, report=results.append)
+    return results
+
+
+def statuses(results):
+    return {result.index: result.status for result in results}
+
+
+def names(folder):
+    return {path.name for path in folder.iterdir()}
+
+
+def hashes(out):
+    """The sha256 of every file by its path."""
+    return {
+        str(path.relative_to(out)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(out.rglob("*"))
+        if path.is_file()
+    }

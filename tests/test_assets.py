@@ -1,0 +1,473 @@
+"""Maps from a Poly Haven that stands on this machine, and all that can go wrong on the way."""
+
+import csv
+import hashlib
+import json
+import socket
+import subprocess
+import sys
+from dataclasses import fields
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from threading import Event, Thread
+from urllib.parse import urlsplit
+
+import pytest
+
+from brewster.cli import cli
+from brewster.dataset import assets
+from brewster.dataset.assets import Order, maps_folder, pull
+from brewster.errors import DownloadError, TargetError
+from front_door import errors, lines, tree
+
+IN, OUT = {"categories": ["indoor", "urban"]}, {"categories": ["outdoor", "night"]}
+BOTH = {"categories": ["outdoor", "indoor"]}
+NEW = {"attributes": {"environment": "outdoor"}}
+SIZE = 100_000
+
+
+@pytest.fixture(autouse=True)
+def _network_off(monkeypatch):
+    """Loopback only, where the other tests have no network at all."""
+    connect = socket.socket.connect
+
+    def loopback(self, address):
+        assert address[0] == "127.0.0.1", address
+        return connect(self, address)
+
+    monkeypatch.setattr(socket.socket, "connect", loopback)
+
+
+@pytest.fixture(autouse=True)
+def pauses(monkeypatch):
+    """What would have been waited."""
+    waited = []
+    monkeypatch.setattr(assets, "sleep", waited.append)
+    return waited
+
+
+class _Answers(BaseHTTPRequestHandler):
+    def do_GET(self):
+        haven, path = self.server.haven, urlsplit(self.path).path
+        haven.asked.append((path, self.headers["Range"], self.headers["User-Agent"]))
+        faults = haven.faults.get(path)
+        match faults.pop(0) if faults else None:
+            case None:
+                self.send(haven.body(path), ranged=True)
+            case "cut":
+                self.send(haven.body(path), ranged=True, most=SIZE // 4)
+            case "stall":
+                self.send(haven.body(path), most=SIZE // 4)
+                haven.silence.wait(5)
+            case "no range":
+                self.send(haven.body(path))
+            case bytes(body):
+                self.send(body)
+            case str(place):
+                self.head(302, Location=place)
+            case code:
+                self.head(code, **({"Retry-After": "7"} if code == 429 else {}))
+
+    def send(self, body, *, ranged=False, most=None):
+        if body is None:
+            return self.head(404)
+        start = int((self.headers["Range"] or "=0-").split("=")[1][:-1]) if ranged else 0
+        rest = body[start:]
+        self.head(206 if start else 200, length=len(rest))
+        self.wfile.write(rest[:most])
+        return None
+
+    def head(self, code, length=0, **headers):
+        self.send_response(code)
+        for name, value in ({"Content-Length": length} | headers).items():
+            self.send_header(name, str(value))
+        self.end_headers()
+
+    def log_message(self, *_):
+        pass
+
+
+class _Haven:
+    """A Poly Haven: assets by id, `/file/ID` for each; faults by path, one for each request."""
+
+    def __init__(self, url):
+        self.url, self.asked, self.faults, self.silence = url, [], {}, Event()
+        self.assets = {"b_hall": IN, "a_room": IN, "street": OUT, "atrium": BOTH, "sky": NEW, "desk": {}}
+        self.resolutions = dict.fromkeys(self.assets, "4k")
+
+    @staticmethod
+    def picture(name):
+        return (hashlib.sha256(name.encode()).digest() * SIZE)[:SIZE]
+
+    def promise(self, name):
+        picture = self.picture(name)
+        sums = {"size": SIZE, "md5": hashlib.md5(picture).hexdigest()}
+        file = {"url": f"{self.url}/file/{name}"} | sums
+        return {"hdri": {self.resolutions.get(name, "4k"): {"hdr": file}}}
+
+    def body(self, path):
+        kind, _, name = path[1:].partition("/")
+        if kind == "assets":
+            named = {"authors": {'Ann, "A."': "All", "Bo": "Sky"}}
+            return json.dumps({asset: named | record for asset, record in self.assets.items()}).encode()
+        if name not in self.assets:
+            return None
+        return self.picture(name) if kind == "file" else json.dumps(self.promise(name)).encode()
+
+    def ranges(self, name):
+        return [asked for path, asked, _ in self.asked if path == f"/file/{name}"]
+
+
+@pytest.fixture
+def haven():
+    with ThreadingHTTPServer(("127.0.0.1", 0), _Answers) as server:
+        server.haven = _Haven(f"http://127.0.0.1:{server.server_port}")
+        thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        yield server.haven
+        server.haven.silence.set()
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture
+def fetch(haven, tmp_path):
+    """Pulls into a folder: what became of each asset."""
+
+    def fetch(indoor=1, outdoor=0, **how):
+        order = Order(indoor=indoor, outdoor=outdoor, **({"server": haven.url} | how))
+        return list(pull(order, tmp_path / "maps"))
+
+    return fetch
+
+
+@pytest.fixture
+def maps(tmp_path):
+    return tmp_path / "maps"
+
+
+def states(results):
+    return [(result.asset, result.status) for result in results]
+
+
+def manifest(maps):
+    return list(csv.DictReader((maps / "manifest.csv").read_text().splitlines()))
+
+
+# --- which maps
+
+
+def test_maps_are_taken_in_order_of_their_ids_and_indoor_comes_before_outdoor(fetch, maps):
+    found = fetch(indoor=2, outdoor=9)
+    assert [(result.asset, result.category) for result in found] == [
+        ("a_room", "indoor"),
+        ("atrium", "indoor"),
+        ("sky", "outdoor"),
+        ("street", "outdoor"),
+    ]
+    assert {result.status for result in found} == {"downloaded"}
+    assert (maps / "a_room_4k.hdr").read_bytes() == _Haven.picture("a_room")
+
+
+def test_the_manifest_names_every_map_its_authors_and_its_licence(fetch, maps):
+    fetch(indoor=1, outdoor=1)
+    old = (maps / "manifest.csv").read_text()
+    (maps / "manifest.csv").write_text(old.replace("Ann", "Zoe").replace("CC0", "CC0,noted by hand"))
+    fetch(indoor=2, outdoor=1)
+    rows = manifest(maps)
+    assert [row["file"] for row in rows] == ["a_room_4k.hdr", "atrium_4k.hdr", "sky_4k.hdr"]
+    md5 = hashlib.md5(_Haven.picture("sky")).hexdigest()
+    said = ("sky_4k.hdr", "sky", "outdoor", "4k", md5, 'Ann, "A."; Bo', "CC0")
+    assert tuple(rows[2].values()) == said
+    (maps / "sky_4k.hdr").unlink()
+    fetch(indoor=3)
+    assert [row["asset"] for row in manifest(maps)] == ["a_room", "atrium", "b_hall"]
+
+
+def test_an_asset_without_the_resolution_is_named_and_the_next_takes_its_place(haven, fetch):
+    haven.resolutions["a_room"] = "2k"
+    assert states(fetch(indoor=1)) == [("a_room", "missing"), ("atrium", "downloaded")]
+    assert states(fetch(indoor=1, format="exr")) == [
+        (name, "missing") for name in ("a_room", "atrium", "b_hall")
+    ]
+
+
+def test_finished_maps_are_skipped_and_nobody_elses_are_replaced(haven, fetch, maps):
+    fetch()
+    assert states(fetch()) == [("a_room", "skipped")]
+    assert len(haven.ranges("a_room")) == 1
+    own = b"own!" * (SIZE // 4)
+    (maps / "a_room_4k.hdr").write_bytes(own)
+    [result] = fetch()
+    assert result.status == "failed"
+    assert "move it away" in result.error
+    assert (maps / "a_room_4k.hdr").read_bytes() == own
+
+
+@pytest.mark.parametrize("authors", [{"\ud800": "All"}, {"a" * 200_000: "All"}, ["Ann"], {}])
+def test_authors_may_be_called_anything(haven, fetch, authors):
+    haven.assets = {"a": IN | {"authors": authors}, "b": IN}
+    assert states(fetch(indoor=2)) == [("a", "downloaded"), ("b", "downloaded")]
+    assert states(fetch(indoor=2)) == [("a", "skipped"), ("b", "skipped")]
+
+
+def test_an_id_cannot_lead_out_of_the_folder(haven, fetch, tmp_path):
+    haven.assets = {"../../escaped": IN, "/etc/passwd": IN, "..": IN, "a\\b": IN, "a_room": IN}
+    found = fetch(indoor=9)
+    assert [result.status for result in found] == ["failed"] * 4 + ["downloaded"]
+    assert tree(tmp_path) == ["maps/a_room_4k.hdr", "maps/manifest.csv"]
+    assert {path for path, *_ in haven.asked} == {"/assets", "/files/a_room", "/file/a_room"}
+
+
+# --- the line
+
+
+def test_every_request_says_who_asks(haven, fetch):
+    fetch()
+    assert all(agent.startswith("brewster/") for *_, agent in haven.asked)
+
+
+def test_a_broken_download_goes_on_where_it_was(haven, fetch, maps):
+    haven.faults["/file/a_room"] = ["cut", "cut"]
+    assert states(fetch()) == [("a_room", "downloaded")]
+    assert haven.ranges("a_room") == [None, "bytes=25000-", "bytes=50000-"]
+    assert tree(maps) == ["a_room_4k.hdr", "manifest.csv"]
+
+
+def test_what_came_is_kept_for_the_next_call(haven, fetch, maps, monkeypatch):
+    monkeypatch.setattr(assets, "_PAUSES_S", ())
+    haven.faults["/file/a_room"] = ["cut"]
+    [result] = fetch()
+    assert "ended after 25000 of 100000 bytes" in result.error
+    assert tree(maps) == ["a_room_4k.hdr.part"]
+    assert states(fetch()) == [("a_room", "downloaded")]
+    assert haven.ranges("a_room")[-1] == "bytes=25000-"
+
+
+def test_a_server_that_ignores_the_range_starts_again(haven, fetch, maps):
+    haven.faults["/file/a_room"] = ["cut", "no range"]
+    assert states(fetch()) == [("a_room", "downloaded")]
+    assert haven.ranges("a_room") == [None, "bytes=25000-"]
+    assert (maps / "a_room_4k.hdr").read_bytes() == _Haven.picture("a_room")
+
+
+@pytest.mark.parametrize(("size", "ranges"), [(SIZE, []), (SIZE + 1, [None])])
+def test_a_part_that_is_whole_is_not_fetched_and_one_that_is_too_long_is_fetched_anew(
+    haven, fetch, maps, size, ranges
+):
+    maps.mkdir()
+    (maps / "a_room_4k.hdr.part").write_bytes((_Haven.picture("a_room") + b"?")[:size])
+    assert states(fetch()) == [("a_room", "downloaded")]
+    assert haven.ranges("a_room") == ranges
+
+
+def test_bytes_beyond_the_promised_size_are_not_taken(haven, fetch, maps):
+    haven.faults["/file/a_room"] = [_Haven.picture("a_room") + b"and more"]
+    assert states(fetch(server=f"{haven.url}/")) == [("a_room", "downloaded")]
+    assert (maps / "a_room_4k.hdr").read_bytes() == _Haven.picture("a_room")
+
+
+def test_what_came_before_the_line_went_silent_is_kept(haven, fetch, monkeypatch):
+    monkeypatch.setattr(assets, "_TIMEOUT_S", 0.2)
+    haven.faults["/file/a_room"] = ["stall"]
+    assert states(fetch()) == [("a_room", "downloaded")]
+    assert haven.ranges("a_room") == [None, "bytes=25000-"]
+
+
+@pytest.mark.parametrize("wrong", [b"x" * SIZE, b"x" * SIZE * 2])
+def test_a_map_with_a_wrong_sum_is_dropped_and_named_and_the_others_are_fetched(haven, fetch, maps, wrong):
+    haven.faults["/file/a_room"] = [wrong]
+    found = fetch(indoor=2)
+    assert states(found) == [("a_room", "failed"), ("atrium", "downloaded")]
+    assert "MD5" in found[0].error
+    assert tree(maps) == ["atrium_4k.hdr", "manifest.csv"]
+
+
+def test_a_busy_server_is_given_the_time_it_asks_for(haven, fetch, pauses):
+    haven.faults = {"/assets": [429], "/file/a_room": [503, 500, 429]}
+    assert states(fetch()) == [("a_room", "downloaded")]
+    assert pauses == [7, 1, 2, 7]
+
+
+def test_patience_grows_and_ends(haven, fetch, pauses):
+    haven.faults["/file/a_room"] = [503] * 5
+    [result] = fetch()
+    assert "in 5 attempts (HTTP Error 503" in result.error
+    assert pauses == [1, 2, 4, 8]
+
+
+def test_a_server_that_is_not_there_is_an_error(fetch, pauses):
+    with socket.socket() as unheard:
+        unheard.bind(("127.0.0.1", 0))
+        with pytest.raises(DownloadError, match="refused"):
+            fetch(server=f"http://127.0.0.1:{unheard.getsockname()[1]}")
+    assert len(pauses) == 4
+
+
+def test_what_is_not_found_is_not_asked_for_again(haven, fetch, pauses):
+    haven.faults = {"/files/a_room": [404], "/file/atrium": [404]}
+    assert states(fetch(indoor=3)) == [("a_room", "failed"), ("atrium", "failed"), ("b_hall", "downloaded")]
+    assert pauses == []
+
+
+def test_when_all_fail_the_rest_is_not_tried(haven, tmp_path):
+    haven.assets = {f"room_{i}": IN for i in range(9)}
+    haven.faults = {f"/file/room_{i}": [404] for i in range(9)}
+    with pytest.raises(DownloadError, match="5 assets in a row"):
+        list(pull(Order(server=haven.url), tmp_path))
+    assert haven.ranges("room_4")
+    assert not haven.ranges("room_5")
+    haven.faults = {f"/file/room_{i}": [404] for i in (0, 1, 2, 3, 5, 6, 7, 8)}
+    assert len(list(pull(Order(server=haven.url), tmp_path))) == 9
+
+
+@pytest.mark.parametrize("body", [b"<html>", b"", b"\xff", b"[" * 100_000, b"[]", b"null"])
+def test_garbage_instead_of_json_is_named(haven, fetch, body):
+    haven.faults["/files/a_room"] = [body]
+    found = fetch(indoor=2)
+    assert states(found) == [("a_room", "failed"), ("atrium", "downloaded")]
+    assert "/files/a_room answered" in found[0].error
+    haven.faults["/assets"] = [body]
+    with pytest.raises(DownloadError, match="answered"):
+        fetch()
+
+
+def test_json_that_was_cut_is_asked_for_again(haven, fetch, monkeypatch):
+    haven.assets |= {f"z{i}": {"tags": ["x" * 1000]} for i in range(99)}
+    haven.faults["/assets"] = ["cut"]
+    assert states(fetch()) == [("a_room", "downloaded")]
+
+
+@pytest.mark.parametrize("wrong", [{"md5": None}, {"size": "big"}, {"size": 0}, {"url": 3}])
+def test_a_promise_without_address_size_or_sum_is_not_taken(haven, fetch, wrong):
+    promise = haven.promise("a_room")
+    promise["hdri"]["4k"]["hdr"] |= wrong
+    haven.faults["/files/a_room"] = [json.dumps(promise).encode()]
+    assert "promises no file" in fetch()[0].error
+
+
+@pytest.mark.parametrize("tree", [[], "map", {"hdri": []}, {"hdri": {"4k": "x"}}, {"hdri": None}])
+def test_a_list_of_files_may_have_any_shape(haven, fetch, tree):
+    haven.faults["/files/a_room"] = [json.dumps(tree).encode()]
+    assert fetch()[0].status in ("missing", "failed")
+
+
+@pytest.mark.parametrize(
+    "url", ["file:///etc/hosts", "ftp://127.0.0.1/a", "data:,a", "a", "http://[", "http://a b/"]
+)
+def test_only_the_web_is_opened_not_even_when_a_server_leads_elsewhere(haven, fetch, url, maps, pauses):
+    promise = haven.promise("a_room")
+    promise["hdri"]["4k"]["hdr"]["url"] = url
+    haven.faults["/files/a_room"] = [json.dumps(promise).encode()]
+    assert "http:// or https://" in fetch()[0].error
+    with pytest.raises(DownloadError):
+        fetch(server=url)
+    assert pauses == []
+    assert tree(maps) == []
+
+
+def test_redirections_are_followed_on_the_web_only(haven, fetch):
+    haven.faults["/file/a_room"] = [f"{haven.url}/file/a_room"]
+    haven.faults["/file/atrium"] = ["ftp://127.0.0.1/file/atrium"]
+    haven.faults["/file/b_hall"] = ["file:///etc/hosts"]
+    assert [result.status for result in fetch(indoor=3)] == ["downloaded", "failed", "failed"]
+
+
+# --- the disk
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a disk that is always full")
+def test_a_full_disk_ends_the_call(fetch, maps):
+    maps.mkdir()
+    (maps / "a_room_4k.hdr.part").symlink_to("/dev/full")
+    with pytest.raises(TargetError, match=r"No space left .* free some space"):
+        fetch(indoor=2)
+
+
+def test_a_place_that_is_no_folder_is_an_error(fetch, maps):
+    maps.write_bytes(b"")
+    with pytest.raises(TargetError, match="maps"):
+        fetch()
+
+
+def test_another_manifest_is_left_alone_and_nothing_is_fetched(haven, fetch, maps):
+    maps.mkdir()
+    (maps / "manifest.csv").write_bytes(b"name,price\n\xff,1\n")
+    with pytest.raises(TargetError, match="not one of brewster's"):
+        fetch()
+    assert haven.asked == []
+
+
+def test_maps_lie_in_the_users_cache_folder(monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", "/cache")
+    assert maps_folder() == Path("/cache/brewster/maps")
+    monkeypatch.setenv("HOME", "/home/ann")
+    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
+    assert maps_folder() == Path("/home/ann/.cache/brewster/maps")
+
+
+# --- the command
+
+
+@pytest.fixture
+def command(bare, haven):
+    return lambda *args: bare("assets", "pull", "polyhaven", "--server", haven.url, *args)
+
+
+def test_the_command_offers_what_an_order_takes():
+    command = cli.commands["assets"].commands["pull"]
+    taken = command.make_context("pull", ["polyhaven"]).params
+    assert {field.name: taken[field.name] for field in fields(Order)} == vars(Order())
+
+
+def test_the_command_tells_what_it_did_and_that_the_server_had_fewer(command, tmp_path):
+    code, out, err = command("maps", "--indoor", 2, "--outdoor", 5)
+    assert (code, out) == (0, b"")
+    said = err.splitlines()
+    assert said[0] == "a_room -> maps/a_room_4k.hdr (0.1 MB)"
+    assert said[4] == "4 downloaded"
+    assert said[5].startswith("2 of 5 outdoor maps: the server has no more")
+    assert said[6].startswith("powered by Poly Haven")
+    assert len(tree(tmp_path / "maps")) == 5
+
+
+def test_failed_maps_are_named_at_the_end_and_the_exit_code_says_so(command, haven):
+    haven.faults["/file/a_room"] = [b"wrong"] * 5
+    code, out, err = command("maps", "--indoor", 2, "--outdoor", 0, "--quiet")
+    assert (code, out) == (1, b"")
+    assert [line.split(": ")[1] for line in errors(err)] == ["a_room"]
+    assert errors(err) == err.splitlines()
+
+
+def test_json_has_a_line_for_each_asset(command, haven):
+    haven.resolutions["a_room"] = "1k"
+    code, out, _ = command("maps", "--json", "--indoor", 1, "--outdoor", 0)
+    assert code == 0
+    assert [(row["asset"], row["status"], row["bytes"]) for row in lines(out)] == [
+        ("a_room", "missing", None),
+        ("atrium", "downloaded", SIZE),
+    ]
+
+
+def test_a_dry_run_prints_what_would_be_downloaded_and_writes_nothing(command, haven, tmp_path):
+    code, out, _ = command("maps", "--dry-run", "--indoor", 1, "--outdoor", 0)
+    assert (code, out.decode()) == (0, f"{haven.url}/file/a_room -> maps/a_room_4k.hdr\n")
+    assert tree(tmp_path) == []
+
+
+def test_the_cache_folder_is_where_maps_go_unless_told_otherwise(command, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    assert command("--indoor", 1, "--outdoor", 0)[0] == 0
+    assert "a_room_4k.hdr" in tree(tmp_path / "cache" / "brewster" / "maps")
+
+
+def test_a_server_that_fails_is_one_sentence(command, haven):
+    haven.faults["/assets"] = [404]
+    code, out, err = command("maps")
+    assert (code, out, len(err.splitlines())) == (1, b"", 1)
+    assert errors(err)
+
+
+def test_fetching_wakes_no_torch():
+    code = "import brewster.dataset.assets, sys; assert not {'torch', 'numpy', 'click'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

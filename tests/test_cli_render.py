@@ -1,0 +1,195 @@
+"""`brewster render`, as a user calls it."""
+
+import importlib.util
+import json
+import os
+import resource
+import subprocess
+import sys
+import tarfile
+import time
+from pathlib import Path
+
+import pytest
+from pyarrow import parquet
+
+from brewster import Photo
+from brewster.cli import main
+from brewster.dataset import sets, workers
+from brewster.render import assets
+from front_door import as_user, errors, lines
+from set_folders import hashes
+
+FAKED = """
+import sys
+from brewster.cli import main
+from brewster.dataset import workers
+workers.RENDERERS["pane"] = "fake_renderer:{}"
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.fixture
+def fake(monkeypatch):
+    monkeypatch.setitem(workers.RENDERERS, "pane", "fake_renderer:render")
+
+
+def faked(*args, renderer="render", **how):
+    """The command with a fake renderer, in a process of its own."""
+    path = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    command = [sys.executable, "-c", FAKED.format(renderer), "render", *map(str, args), "--workers", "0"]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=path, **how)
+
+
+def test_a_set_is_rendered_shown_and_each_of_its_scenes_rendered_again(bare, tmp_path, monkeypatch):
+    """The real renderer and worlds; these are small ones, as large ones take seconds each."""
+    monkeypatch.setattr(assets, "BUILTIN_HEIGHT", 32)
+    options = ("--recipe", "tiny", "--count", 2, "--seed", 7, "--size", "48x32", "--orders", "paper")
+    code, out, err = bare("render", "set", *options, "--workers", 0, "--json", "--preview")
+    assert code == 0, err
+    assert [(line["index"], line["status"]) for line in lines(out)] == [(0, "rendered"), (1, "rendered")]
+    assert "2 rendered" in err
+    assert {path.name for path in (tmp_path / "set" / "000001").iterdir()} == set(sets.FILES)
+    assert Photo.open(tmp_path / "set" / "000001" / "photo.jpg").size == (48, 32)
+    assert Photo.open(tmp_path / "set" / "preview.png").size == (800, 240)
+    assert parquet.read_table(tmp_path / "set" / "index.parquet")["orders"].to_pylist() == ["paper"] * 2
+    for index in ("000000", "000001"):
+        assert bare("render", "--scene", f"set/{index}/scene.toml", "-o", f"again/{index}")[0] == 0
+        assert hashes(tmp_path / "again" / index) == hashes(tmp_path / "set" / index)
+
+
+def test_the_same_command_goes_on_and_a_larger_count_adds(bare, fake, tmp_path):
+    bare("render", "set", "--recipe", "tiny", "--count", 2, "--workers", 0)
+    code, out, err = bare("render", "-o", "set", "--recipe", "tiny", "--count", 3, "--workers", 0, "--json")
+    assert (code, [line["status"] for line in lines(out)]) == (0, ["skipped", "skipped", "rendered"])
+    assert "sample 2 (" in err
+    assert "1 rendered, 2 skipped" in err
+
+
+def test_shards_are_one_option_away(bare, fake, tmp_path):
+    assert (
+        bare("render", "set", "--recipe", "tiny", "--count", 2, "--first", 99, "--workers", 0, "--shards")[0]
+        == 0
+    )
+    for shard, key in (("shard-000000.tar", "000099"), ("shard-000001.tar", "000100")):
+        with tarfile.open(tmp_path / "set" / shard) as tar:
+            assert tar.getnames() == [f"{key}.{name}" for name in sets.FILES]
+
+
+def test_quiet_says_nothing(bare, fake):
+    assert bare("render", "set", "--recipe", "tiny", "--count", 1, "--workers", 0, "--quiet") == (0, b"", "")
+
+
+def test_a_sample_that_fails_is_named_and_the_exit_code_says_so(bare, monkeypatch):
+    monkeypatch.setitem(workers.RENDERERS, "pane", "fake_renderer:picky")
+    code, _, err = bare("render", "set", "--recipe", "tiny", "--count", 3, "--workers", 0, "--quiet")
+    assert code == 1
+    assert errors(err) == ["error: sample 1: sample 1 is odd; it should be even; count by two."]
+
+
+def test_another_job_in_the_folder_is_one_line(bare, fake):
+    bare("render", "set", "--recipe", "tiny", "--count", 1, "--workers", 0)
+    code, _, err = bare("render", "set", "--recipe", "tiny", "--count", 1, "--workers", 0, "--seed", 3)
+    assert code == 1
+    assert len(errors(err)) == 1
+    assert "its seed is 0, and 3 was asked for" in err
+
+
+def test_a_photo_that_cannot_light_a_scene_is_left_out_and_named(bare, fake, tmp_path):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "broken.jpg").write_bytes(b"no picture")
+    grey = Photo.open(next((Path(__file__).parent / "pictures").glob("mixture*.jpg")))
+    grey.save(tmp_path / "photos" / "fine.jpg")
+    code, _, err = bare(
+        "render", "set", "--recipe", "tiny", "--count", 1, "--workers", 0, "--photos", "photos"
+    )
+    assert code == 0
+    assert "left out" in errors(err)[0]
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        ((), "Name one folder"),
+        (("set", "-o", "other"), "Name one folder"),
+        (("set", "--size", "512"), "512x384 is one"),
+        (("set", "--size", "8x8"), "sides go from 16"),
+        (("set", "--count", "-1"), "--count"),
+        (("set", "--maps", "nowhere"), "--maps"),
+        (("set", "--scene", "scene.toml", "--count", "3"), "--count belongs to a set"),
+    ],
+)
+def test_a_wrong_usage_is_explained(bare, args, says):
+    code, _, err = bare("render", *args)
+    assert code == 2
+    assert says in err
+
+
+def test_what_is_missing_comes_with_the_line_that_installs_it(bare, monkeypatch):
+    found = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *rest: None if name == "torch" else found(name, *rest)
+    )
+    code, _, err = bare("render", "set")
+    assert code == 1
+    assert "rendering needs torch" in err
+    assert "pip install 'brewster[render]'" in err
+
+
+def test_help_wakes_nothing_heavy():
+    code = "import sys; from brewster.cli import main; main(['render', '--help']); assert not {'torch', 'pyarrow', 'ray', 'pyvips'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+
+
+def test_a_full_disk_is_one_line(tmp_path):
+    def little():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
+
+    run = faked("set", "--recipe", "tiny", "--count", 2, cwd=tmp_path, preexec_fn=little)
+    _, err = run.communicate()
+    assert run.returncode == 1
+    assert err.startswith(b"error: ")
+    assert b"File too large" in err
+    assert len(err.splitlines()) == 1
+    assert sorted(path.name for path in (tmp_path / "set").iterdir()) == [".lock", "set.toml"]
+
+
+def test_killed_in_the_middle_and_begun_again_it_ends_as_if_undisturbed(bare, fake, tmp_path):
+    command = ("--recipe", "tiny", "--count", 20, "--shards")
+    run = faked("set", *command, renderer="slow", cwd=tmp_path)
+    patience = time.monotonic() + 30
+    while len(list(tmp_path.glob("set/0*"))) < 4 and time.monotonic() < patience:
+        time.sleep(0.01)
+    code, _, err = bare("render", "set", *command, "--workers", 0)
+    assert (code, len(errors(err))) == (1, 1)
+    assert "another run is writing in" in err
+    run.kill()
+    run.communicate()
+    assert 4 <= len(list(tmp_path.glob("set/0*"))) < 20
+    for name in ("set", "undisturbed"):
+        assert bare("render", name, *command, "--workers", 0)[0] == 0
+    assert hashes(tmp_path / "set") == hashes(tmp_path / "undisturbed")
+
+
+@pytest.mark.slow
+def test_the_whole_play_with_two_workers_killed_and_resumed(tmp_path):
+    command = ("--recipe", "tiny", "--count", 6, "--seed", 7, "--workers", 2)
+    run = subprocess.Popen(
+        [sys.executable, "-m", "brewster", "render", "set", *map(str, command)], cwd=tmp_path
+    )
+    patience = time.monotonic() + 120
+    while not list(tmp_path.glob("set/0*")) and time.monotonic() < patience:
+        time.sleep(0.05)
+    run.kill()
+    run.wait()
+    time.sleep(1)  # the workers have noticed
+    for name in ("set", "undisturbed"):
+        done = as_user("render", name, *command, "--json", cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+    assert {json.loads(line)["status"] for line in done.stdout.splitlines()} == {"rendered"}
+    assert hashes(tmp_path / "set") == hashes(tmp_path / "undisturbed")
+
+
+def test_render_is_a_command_of_brewster(capsys):
+    assert main(["--help"]) == 0
+    assert "render " in capsys.readouterr().out

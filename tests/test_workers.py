@@ -1,0 +1,154 @@
+"""Several processes: the same bytes as one, whoever dies."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+
+from brewster.dataset import sets, workers
+from brewster.dataset.workers import Here, Workers, render_again
+from brewster.errors import DeviceError, RecipeError, TargetError
+from set_folders import hashes, job, make, names, statuses
+
+TESTS = Path(__file__).parent
+
+
+def two(job):
+    return Workers(job, 2)
+
+
+def in_a_process(out, count, renderer="slow"):
+    """A run with a worker, in a process that can be killed."""
+    code = f"""
+from pathlib import Path
+from brewster.dataset.workers import Workers
+from set_folders import make
+make(Path({str(out)!r}), {count}, renderer={renderer!r}, crew=lambda job: Workers(job, 1))
+"""
+    return subprocess.Popen([sys.executable, "-c", code], cwd=TESTS, stderr=subprocess.PIPE)
+
+
+def wait_for(condition, seconds=30):
+    patience = time.monotonic() + seconds
+    while not condition() and time.monotonic() < patience:
+        time.sleep(0.01)
+    assert condition()
+
+
+def children(process):
+    return Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+
+
+def is_alive(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().split()[2] != "Z"
+    except OSError:
+        return False
+
+
+def test_two_workers_make_what_one_process_makes_even_if_one_of_them_dies(tmp_path, monkeypatch):
+    monkeypatch.setenv("FAKE_MARK", str(tmp_path / "mark"))
+    results = make(tmp_path / "two", count=5, renderer="deadly_once", crew=two)
+    assert (tmp_path / "mark").exists()
+    assert statuses(results) == dict.fromkeys(range(5), "rendered")
+    make(tmp_path / "one", count=5, renderer="deadly_once")
+    assert hashes(tmp_path / "one") == hashes(tmp_path / "two")
+
+
+def test_a_run_killed_in_the_middle_takes_its_workers_along_and_is_resumed(tmp_path):
+    out, count = tmp_path / "set", 8
+    run = in_a_process(out, count)
+    wait_for(lambda: len(list(out.glob("0*"))) >= 2)
+    crew = children(run)
+    run.kill()
+    run.communicate()
+    wait_for(lambda: not any(map(is_alive, crew)))
+    finished = list(out.glob("0*"))
+    assert 2 <= len(finished) < count
+    assert all(names(folder) == set(sets.FILES) for folder in finished)
+    results = make(out, count=count, renderer="slow")
+    assert sorted(statuses(results).values()) == ["rendered"] * (count - len(finished)) + ["skipped"] * len(
+        finished
+    )
+    make(tmp_path / "undisturbed", count=count, renderer="slow")
+    assert hashes(out) == hashes(tmp_path / "undisturbed")
+
+
+def test_ctrl_c_stops_all_at_once_and_leaves_nothing_half(tmp_path):
+    out = tmp_path / "set"
+    run = in_a_process(out, 400)
+    wait_for(lambda: len(list(out.glob("0*"))) >= 2)
+    crew = children(run)
+    for pid in [*map(int, crew), run.pid]:  # a terminal sends it to everybody
+        os.kill(pid, signal.SIGINT)
+    _, err = run.communicate(timeout=20)
+    assert err.count(b"KeyboardInterrupt") == 1
+    wait_for(lambda: not any(map(is_alive, crew)))
+    assert not list(out.glob(".brewster-*"))
+
+
+def test_a_sample_that_kills_every_worker_is_named_and_the_rest_goes_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(workers, "TRIES", 1)
+    results = make(tmp_path / "set", renderer="deadly", crew=partial(Workers, count=1))
+    assert statuses(results) == {0: "rendered", 1: "rendered", 2: "failed", 3: "rendered"}
+    assert "its worker died 1 times (exit code -9)" in next(
+        result.error for result in results if result.error
+    )
+
+
+def test_what_ends_the_run_ends_it_from_another_process_too(tmp_path):
+    with pytest.raises(DeviceError, match=r"^there is no light; a lamp; or two; buy one\.$"):
+        make(tmp_path / "set", renderer="deviceless", crew=partial(Workers, count=1))
+
+
+def test_rendering_here_leaves_the_threads_of_torch_as_they_were(tmp_path):
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        make(tmp_path / "set", count=1)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_a_scene_is_rendered_again_byte_for_byte(tmp_path):
+    make(tmp_path / "set", count=2)
+    scene = tmp_path / "set" / "000001" / sets.SCENE
+    render_again(scene, tmp_path / "again", renderer="fake_renderer:render")
+    assert hashes(tmp_path / "again") == hashes(scene.parent)
+
+
+def test_a_scene_file_cannot_choose_what_code_is_run(tmp_path):
+    make(tmp_path / "set", count=1)
+    with pytest.raises(RecipeError, match="was rendered by 'fake_renderer:render'"):
+        render_again(tmp_path / "set" / "000000" / sets.SCENE, tmp_path / "again")
+
+
+def test_a_scene_is_never_rendered_over_something(tmp_path):
+    make(tmp_path / "set", count=1)
+    scene = tmp_path / "set" / "000000" / sets.SCENE
+    for taken in (scene, scene.parent):
+        with pytest.raises(TargetError, match="is taken"):
+            render_again(scene, taken, renderer="fake_renderer:render")
+
+
+def test_every_renderer_is_there():
+    pytest.importorskip("mitsuba")
+    assert all(callable(workers.find_renderer(name)) for name in workers.RENDERERS)
+
+
+def test_an_unfinished_task_is_done_only_where_it_is_not(tmp_path):
+    asked = job(tmp_path)
+    hand = workers.Hand(asked)
+    task = workers.Task("render", (0, 1))
+    hand(task)
+    before = (tmp_path / "000000").stat().st_ino
+    assert [result.status for result in hand(task)] == ["rendered", "rendered"]
+    assert (tmp_path / "000000").stat().st_ino == before
+    assert not Here(asked).is_busy()
