@@ -16,15 +16,15 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-from brewster.render import scatter
-from brewster.render.assets import Assets
 from brewster.render.pane import render
+from brewster.render.rays import scatter
 from brewster.render.sample import LAYERS, Sample
 from brewster.render.tracer import trace
 from brewster.scene.camera import Camera
 from brewster.scene.glass import Glazing, Pane
 from brewster.scene.scene import Scene
 from brewster.scene.world import Map, Plane, Side, Source
+from brewster.worlds.assets import Assets
 
 STREET = Map(source=Source(file="builtin:street:3"), heading_deg=200)
 ROOM = Map(source=Source(file="builtin:room:2"), heading_deg=70)
@@ -41,7 +41,9 @@ NEAR = {"behind": Side(map=STREET, plane=ART), "front": Side(map=DOME, plane=POR
 SCENES = {
     "single, far": Scene(camera=CAMERA, **FAR),
     "single, paper orders": Scene(camera=CAMERA, orders="paper", **FAR),
-    "tinted, dome": Scene(camera=CAMERA, glass=Glazing(panes=(TINTED,)), behind=Side(map=STREET), front=Side(map=DOME)),
+    "tinted, dome": Scene(
+        camera=CAMERA, glass=Glazing(panes=(TINTED,)), behind=Side(map=STREET), front=Side(map=DOME)
+    ),
     "double": Scene(camera=CAMERA, glass=Glazing(panes=(CLEAR, CLEAR), gap_mm=12), **FAR),
     "double tinted, near": Scene(camera=CAMERA, glass=Glazing(panes=(TINTED, TINTED), gap_mm=12), **NEAR),
     "double, paper orders, near": Scene(
@@ -67,12 +69,12 @@ def averaged_at_every_surface() -> Iterator[None]:
         s, p = apart(cosine, here, beyond)
         return (s + p) / 2, (s + p) / 2
 
-    apart = scatter._reflectances  # noqa: SLF001
-    scatter._reflectances = averaged  # noqa: SLF001
+    apart = scatter._reflectances
+    scatter._reflectances = averaged
     try:
         yield
     finally:
-        scatter._reflectances = apart  # noqa: SLF001
+        scatter._reflectances = apart
 
 
 def compared(scene: Scene, assets: Assets, samples: int) -> list[str]:
@@ -81,7 +83,8 @@ def compared(scene: Scene, assets: Assets, samples: int) -> list[str]:
         ours, again = render(scene, assets), render(_reseeded(scene, 1), assets)
     polarised = scene.camera.heading_deg > 30
     first, second = (
-        trace(_reseeded(scene, seed), assets, noise=0, most_samples=samples, polarised=polarised) for seed in (2, 3)
+        trace(_reseeded(scene, seed), assets, noise=0, most_samples=samples, polarised=polarised)
+        for seed in (2, 3)
     )
     return [_line(name, ours, again, first, second) for name in LAYERS]
 

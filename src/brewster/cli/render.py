@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import sys
@@ -14,14 +13,14 @@ from typing import TYPE_CHECKING, Any, Final, final
 import click
 from click.core import ParameterSource
 
+from brewster.cli.doctor import require_extra
 from brewster.cli.terminal import complain, interrupts, progress, say, write_out
-from brewster.errors import MissingExtra
 
 if TYPE_CHECKING:
     from brewster.dataset.build import Crew, Job, Result
     from brewster.scene.recipe import SceneRecipe
 
-_NEEDS: Final = {"OpenEXR": "OpenEXR", "pyarrow": "pyarrow", "tomli-w": "tomli_w", "torch": "torch"}
+_OF_THE_TRACER: Final = frozenset({"mitsuba", "mitsuba-oidn"})
 _OF_A_SCENE: Final = {"out", "output", "scene", "renderer", "maps", "photos", "quiet"}
 _MOST_WORKERS: Final = 8
 _FOLDER: Final = click.Path(path_type=Path, file_okay=False, exists=True)
@@ -141,7 +140,7 @@ def render(
     """
     if (out is None) == (output is None):
         raise click.UsageError("Name one folder to render into: brewster render OUT.")
-    _refuse_without_extra()
+    require_extra("render", "rendering", without=_OF_THE_TRACER)
     order = _Order(out or output or Path(), **asked)
     if scene:
         _refuse_out_of_place(context)
@@ -203,7 +202,7 @@ class _Order:
 
     def _job(self) -> Job:
         from brewster.dataset.build import Job  # noqa: PLC0415
-        from brewster.render.catalog import read_catalog  # noqa: PLC0415
+        from brewster.worlds.catalog import read_catalog  # noqa: PLC0415
 
         recipe = self._recipe()
         catalog, left_out = read_catalog(self.maps, self.photos)
@@ -256,16 +255,6 @@ class _Told:
         """How many there were of each kind."""
         if not self._quiet:
             say(f"{out}: " + ", ".join(f"{count} {status}" for status, count in sorted(self.counts.items())))
-
-
-def _refuse_without_extra() -> None:
-    missing = [package for package, module in _NEEDS.items() if importlib.util.find_spec(module) is None]
-    if missing:
-        raise MissingExtra(
-            f"rendering needs {', '.join(missing)}",
-            "the extra brewster[render]",
-            "run: pip install 'brewster[render]'",
-        )
 
 
 def _refuse_out_of_place(context: click.Context) -> None:

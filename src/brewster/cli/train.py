@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Mapping
 from pathlib import Path
 
 import click
 
-from brewster.cli.doctor import EXTRAS
+from brewster.cli.doctor import require_extra
 from brewster.cli.terminal import interrupts, progress, say
-from brewster.errors import MissingExtra, TargetError
+from brewster.errors import TargetError
 
 
 @click.command
@@ -30,7 +29,7 @@ def train(*, recipe: Path, out: Path | None, quiet: bool) -> None:
     The folder BREWSTER_DATA holds the data. A run that was stopped goes on from its last checkpoint when the same
     command is given again, and ends with the same weights.
     """
-    _refuse_without_extra()
+    require_extra("train", "training")
     from brewster.train.recipe import read_recipe  # noqa: PLC0415  (wakes torch, in two seconds)
 
     read, out = read_recipe(recipe), out or Path("out") / recipe.stem
@@ -52,18 +51,6 @@ def train(*, recipe: Path, out: Path | None, quiet: bool) -> None:
     export_onnx(network, model)
     if not quiet:
         say(f"the model is {model}")
-
-
-def _refuse_without_extra() -> None:
-    missing = [
-        package for package, module in EXTRAS["train"].items() if importlib.util.find_spec(module) is None
-    ]
-    if missing:
-        raise MissingExtra(
-            f"training needs {', '.join(missing)}",
-            "the extra brewster[train]",
-            "run: pip install 'brewster[train]'",
-        )
 
 
 def _make(folder: Path) -> None:

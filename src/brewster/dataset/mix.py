@@ -13,14 +13,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 import torch
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from torch import Generator, Tensor
 from torch.nn import functional
 
 from brewster.light import to_encoded, to_linear
+from brewster.scene.values import LogRange, Range, Share, Values
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -53,25 +53,11 @@ class Stream(Protocol):
         ...
 
 
-def _rising(bounds: tuple[float, float]) -> tuple[float, float]:
-    if bounds[0] > bounds[1]:
-        raise ValueError(f"a range goes up, and this one goes from {bounds[0]} to {bounds[1]}")
-    return bounds
-
-
-Share = Annotated[float, Field(ge=0, le=1)]
-Range = Annotated[tuple[float, float], AfterValidator(_rising)]
-_Above0 = Annotated[float, Field(gt=0)]
-LogRange = Annotated[tuple[_Above0, _Above0], AfterValidator(_rising)]
-
-
-class MixRecipe(BaseModel):
+class MixRecipe(Values):
     """The distributions of a mixture; ranges are uniform, `_log` ranges uniform in the logarithm.
 
     The defaults are those that the shipped model learns from; a recipe names what it changes.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     map_probability: Share = 0.45
     """Of the reflection's content coming from an HDR map; the background uses a third of it."""

@@ -26,10 +26,10 @@ import torch
 from brewster.dataset import sets
 from brewster.dataset.build import Job, Result, Task
 from brewster.errors import BrewsterError, RecipeError, TargetError
-from brewster.render.assets import Assets
 from brewster.render.sample import Sample
 from brewster.scene.sampler import draw
 from brewster.scene.scene import Scene, read_scene
+from brewster.worlds.assets import Assets
 
 Renderer = Callable[[Scene, Assets], Sample]
 

@@ -18,13 +18,11 @@ import torch
 from torch import Tensor
 
 from brewster.errors import RecipeError
-from brewster.render.assets import Assets
-from brewster.render.chance import Chance
-from brewster.render.lens import blurred, margin_px
-from brewster.render.lights import Device, Light, View
-from brewster.render.sample import LAYERS, Sample
-from brewster.render.scatter import follow
-from brewster.render.stack import (
+from brewster.render.rays.chance import Chance
+from brewster.render.rays.lens import blurred, margin_px
+from brewster.render.rays.lights import Device, Light, View
+from brewster.render.rays.scatter import follow
+from brewster.render.rays.stack import (
     Order,
     all_orders,
     fresnel,
@@ -33,14 +31,17 @@ from brewster.render.stack import (
     paper_orders,
     shift_per_traversal,
 )
-from brewster.render.vectors import unit
+from brewster.render.rays.vectors import unit
+from brewster.render.sample import LAYERS, Sample
 from brewster.scene.camera import axes
 from brewster.scene.camera import dot as inner
 from brewster.scene.scene import Scene
+from brewster.worlds.assets import Assets
 
-_MOST_GRID = 2
 _SAME_PX = 0.1  # orders that land closer together than this are looked up once
-_STEEPEST_REFLECTANCE = 0.08  # what is fainter than FAINTEST at this is lumped; it falls on the side's last order
+_STEEPEST_REFLECTANCE = (
+    0.08  # what is fainter than FAINTEST at this is lumped; it falls on the side's last order
+)
 _STRIP = 1 << 15  # rays worked on at once on a CPU, so that they stay in its cache
 _WIDE_STRIP = 1 << 20
 
@@ -85,7 +86,9 @@ def render(scene: Scene, assets: Assets, device: Device = "cpu") -> Sample:
     """
     if not scene.glass.is_flat:
         raise RecipeError(
-            "the glass is framed or curved", "the pane renderer takes flat glass that fills the view", "use --renderer tracer"
+            "the glass is framed or curved",
+            "the pane renderer takes flat glass that fills the view",
+            "use --renderer tracer",
         )
     room = _furnish(scene, assets, device)
     with torch.no_grad():
@@ -116,7 +119,9 @@ def _furnish(scene: Scene, assets: Assets, device: Device) -> _Room:
 
 def _needs_chance(scene: Scene) -> bool:
     """Rough or wedged glass, and lenses over near content, whose blur is not the same everywhere."""
-    is_near = any(side.plane or (side.map and math.isfinite(side.map.radius_mm)) for side in (scene.behind, scene.front))
+    is_near = any(
+        side.plane or (side.map and math.isfinite(side.map.radius_mm)) for side in (scene.behind, scene.front)
+    )
     return scene.glass.is_rough or scene.glass.is_wedged or (scene.camera.aperture_mm > 0 and bool(is_near))
 
 
@@ -136,9 +141,9 @@ def _without_chance(room: _Room) -> list[Tensor]:
 
 
 def _grid(room: _Room) -> int:
-    """Looks a pixel and direction, so that neighbouring looks are at most half a texel apart, or two; beyond, the light is filtered."""
+    """Looks a pixel and direction: a third of a texel apart, or as close as `samples` allows, and then filtered."""
     finest = max(side.light.texels_per_pixel() for side in (room.behind, room.front))
-    return min(max(1, math.ceil(2 * finest)), _MOST_GRID)
+    return min(max(1, math.ceil(3 * finest)), math.isqrt(room.scene.samples))
 
 
 def _pinhole(
@@ -154,7 +159,9 @@ def _pinhole(
     for top in range(0, height, rows):
         some = y[top : top + rows]
         across, upward = x.expand(len(some), -1).reshape(-1), some[:, None].expand(-1, width).reshape(-1)
-        direction = _outer(room.right, across * camera.half_width) + _outer(room.up, upward * camera.half_width)
+        direction = _outer(room.right, across * camera.half_width) + _outer(
+            room.up, upward * camera.half_width
+        )
         direction = direction - room.back[:, None]
         origin = room.origin[:, None].expand(3, len(across))
         yield (
@@ -247,7 +254,9 @@ def _shifted_orders(room: _Room, side: _Side, leaving: Rays) -> tuple[Tensor, Te
 
 
 def _shift(order: Order, shifts: list[Tensor]) -> Tensor:
-    return sum((n * shift for n, shift in zip(order.traversals, shifts, strict=True)), torch.zeros_like(shifts[0]))
+    return sum(
+        (n * shift for n, shift in zip(order.traversals, shifts, strict=True)), torch.zeros_like(shifts[0])
+    )
 
 
 def _groups(scene: Scene, light: Light, *, behind: bool) -> list[list[Order]]:
@@ -275,12 +284,16 @@ def _groups(scene: Scene, light: Light, *, behind: bool) -> list[list[Order]]:
 
 def _steepest_cosine(scene: Scene) -> Tensor:
     _, _, normal = axes(scene.glass.heading_deg, scene.glass.pitch_deg)
-    return torch.tensor(min(-inner(corner, normal) / math.hypot(*corner) for corner in scene.camera.corners()))
+    return torch.tensor(
+        min(-inner(corner, normal) / math.hypot(*corner) for corner in scene.camera.corners())
+    )
 
 
 def _scattered(room: _Room, rays: Rays, chance: Chance) -> list[Tensor]:
     """I, T, B, R and MR along the rays, for panes that are rough or wedged."""
-    through, transmission, back, reflection = torch.zeros(4, *rays.direction.shape, device=rays.direction.device)
+    through, transmission, back, reflection = torch.zeros(
+        4, *rays.direction.shape, device=rays.direction.device
+    )
     lights = room.behind.light, room.front.light
     for part in follow(room.scene.glass, rays.origin, rays.direction, lights, rays.share, chance):
         kept = room.scene.orders == "all" or part.in_paper

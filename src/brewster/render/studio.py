@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brewster.errors import RecipeError
-from brewster.render.assets import Assets
 from brewster.scene.camera import axes
 from brewster.scene.glass import Glazing, Pane
 from brewster.scene.scene import Scene
 from brewster.scene.world import Map, Plane
+from brewster.worlds.assets import Assets
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]

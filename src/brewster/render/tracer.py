@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from brewster.errors import DeviceError, MissingExtra
-from brewster.render.assets import Assets
 from brewster.render.llvm import COMPILED, variant
 from brewster.render.sample import Sample
 from brewster.render.studio import Glass, Studio
 from brewster.scene.scene import Scene
+from brewster.worlds.assets import Assets
 
 _POLARISED: Final = "llvm_ad_mono_polarized"
 _FEWEST_PASSES: Final = 4

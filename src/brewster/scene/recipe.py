@@ -125,6 +125,8 @@ def read_scene_recipe(name: str) -> SceneRecipe:
         return read_toml(SceneRecipe, _FOLDER / f"{name}.toml", compare="the packaged recipes")
     if not name.endswith(".toml"):
         raise RecipeError(
-            f"there is no recipe {name!r}", f"known are {', '.join(RECIPES)}", "name one, or give a .toml file"
+            f"there is no recipe {name!r}",
+            f"known are {', '.join(RECIPES)}",
+            "name one, or give a .toml file",
         )
     return read_toml(SceneRecipe, Path(name), compare="the packaged recipes")

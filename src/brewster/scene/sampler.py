@@ -1,6 +1,6 @@
 """Draws scenes: (recipe, catalog, seed, index) to a Scene, the same on every machine.
 
-    scene = draw(read_scene_recipe("window"), catalog, seed=7, index=12)
+scene = draw(read_scene_recipe("window"), catalog, seed=7, index=12)
 """
 
 from __future__ import annotations
@@ -160,7 +160,14 @@ def _camera(
 
 
 def _side(
-    recipe: SideRecipe, map_: Asset | None, catalog: Catalog, camera: Camera, glass: Glazing, dice: _Dice, *, behind: bool
+    recipe: SideRecipe,
+    map_: Asset | None,
+    catalog: Catalog,
+    camera: Camera,
+    glass: Glazing,
+    dice: _Dice,
+    *,
+    behind: bool,
 ) -> Side:
     luminance = dice.within_log(recipe.luminance_log)
     world = plane = None
@@ -178,11 +185,20 @@ def _side(
 
 
 def _plane(
-    recipe: SideRecipe, catalog: Catalog, luminance: float, camera: Camera, glass: Glazing, dice: _Dice, *, behind: bool
+    recipe: SideRecipe,
+    catalog: Catalog,
+    luminance: float,
+    camera: Camera,
+    glass: Glazing,
+    dice: _Dice,
+    *,
+    behind: bool,
 ) -> Plane:
     """A picture that covers as much of the view, straight or mirrored, as the recipe says."""
     if not catalog.pictures:
-        raise RecipeError("there are no pictures to draw from", "the recipe asks for them", "name a folder with --photos")
+        raise RecipeError(
+            "there are no pictures to draw from", "the recipe asks for them", "name a folder with --photos"
+        )
     asset = dice.choice(catalog.pictures)
     away = dice.within_log(recipe.distance_mm_log)
     distance = float(f"{away + (glass.depth_mm if behind else camera_height(camera, glass)):.6g}")
@@ -202,7 +218,9 @@ def _plane(
 
 def camera_height(camera: Camera, glass: Glazing) -> float:
     """The camera's distance in mm from the plane of the first surface."""
-    return _in_glass(tuple(a - b for a, b in zip(camera.position_mm, glass.position_mm, strict=True)), glass)[2]  # type: ignore[arg-type]
+    return _in_glass(tuple(a - b for a, b in zip(camera.position_mm, glass.position_mm, strict=True)), glass)[
+        2
+    ]  # type: ignore[arg-type]
 
 
 def _in_glass(vector: Point, glass: Glazing) -> Point:
@@ -210,7 +228,9 @@ def _in_glass(vector: Point, glass: Glazing) -> Point:
     return dot(vector, right), dot(vector, up), dot(vector, back)
 
 
-def _reach(camera: Camera, glass: Glazing, distance_mm: float) -> tuple[tuple[float, float], tuple[float, float]]:
+def _reach(
+    camera: Camera, glass: Glazing, distance_mm: float
+) -> tuple[tuple[float, float], tuple[float, float]]:
     """What the view spans on a plane this far beyond the glass, or as far before it in the mirror: x and y, in mm."""
     offset: Point = tuple(a - b for a, b in zip(camera.position_mm, glass.position_mm, strict=True))  # type: ignore[assignment]
     x, y, z = _in_glass(offset, glass)
@@ -223,7 +243,9 @@ def _reach(camera: Camera, glass: Glazing, distance_mm: float) -> tuple[tuple[fl
     return (min(xs), max(xs)), (min(ys), max(ys))
 
 
-def _focused(camera: Camera, recipe: CameraRecipe, glass: Glazing, sides: dict[str, Side], dice: _Dice) -> Camera:
+def _focused(
+    camera: Camera, recipe: CameraRecipe, glass: Glazing, sides: dict[str, Side], dice: _Dice
+) -> Camera:
     """The camera with its lens set on something of the scene."""
     on = dice.choices(list(recipe.focus_on), list(recipe.focus_on.values()))[0]
     is_pinhole, aperture = dice.chance(recipe.pinhole_probability), dice.within_log(recipe.aperture_mm_log)

@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 
 from brewster.scene.camera import Camera, axes, dot
 from brewster.scene.glass import Glazing
-from brewster.scene.values import Above0, From0, Positive, Seed, Share, Values, read_toml
+from brewster.scene.values import From0, Positive, Seed, Share, Values, read_toml
 from brewster.scene.world import Side
 
 STEEPEST_DEG = 85.0
@@ -55,7 +55,7 @@ class Scene(Values):
     """Of brewster, when the scene was drawn."""
     orders: Literal["all", "paper"] = "all"
     samples: Positive = 16
-    """Rays a pixel wherever chance is needed: lens, rough glass."""
+    """Rays a pixel: as many where chance is needed (lens, rough glass), at most as many elsewhere."""
     glass: Glazing = Glazing()
     camera: Camera = Camera()
     behind: Side = Side()
@@ -78,9 +78,7 @@ class Scene(Values):
     def camera_above_glass_mm(self) -> float:
         """The camera's distance from the plane of the first surface."""
         _, _, normal = axes(self.glass.heading_deg, self.glass.pitch_deg)
-        x, y, z = (
-            a - b for a, b in zip(self.camera.position_mm, self.glass.position_mm, strict=True)
-        )
+        x, y, z = (a - b for a, b in zip(self.camera.position_mm, self.glass.position_mm, strict=True))
         return dot((x, y, z), normal)
 
     def _refuse_grazing(self, normal: tuple[float, float, float]) -> None:
@@ -96,7 +94,9 @@ class Scene(Values):
         _, _, back = axes(self.camera.heading_deg, self.camera.pitch_deg)
         depth = self.camera.focus_mm * dot(back, normal) - offset
         if self.camera.aperture_mm > 0 and 0 <= depth <= self.glass.depth_mm:
-            raise ValueError(f"the focus lies {depth:g} mm inside the glass; move focus_mm before or behind it")
+            raise ValueError(
+                f"the focus lies {depth:g} mm inside the glass; move focus_mm before or behind it"
+            )
 
     def _refuse_outside(self, offset: float) -> None:
         """A dome holds the whole glass and the camera; a plane stands clear of the glass."""

@@ -6,20 +6,17 @@ Paths in a recipe are relative to the folder that `BREWSTER_DATA` names.
 from __future__ import annotations
 
 import os
-import tomllib
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from brewster.dataset.mix import Blend, MixRecipe, Mixtures, Pairs, Share, Stream
+from brewster.dataset.mix import Blend, MixRecipe, Mixtures, Pairs, Stream
 from brewster.dataset.sources import read_maps, read_pairs, read_photos
 from brewster.errors import RecipeError
 from brewster.models.compact import STRIDE
+from brewster.scene.values import Above0, Positive, Seed, Share, Values, read_toml
 
-Positive = Annotated[int, Field(gt=0)]
-Rate = Annotated[float, Field(gt=0)]
-Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Side = Annotated[int, Field(gt=0, multiple_of=STRIDE)]
 
 
@@ -33,11 +30,7 @@ def _rising_from_0(sizes: list[tuple[float, int]]) -> list[tuple[float, int]]:
 Sizes = Annotated[list[tuple[Share, Side]], Field(min_length=1), AfterValidator(_rising_from_0)]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class DataRecipe(_Section):
+class DataRecipe(Values):
     """Which folders, relative to BREWSTER_DATA, and which file names in them to leave out."""
 
     photos: Annotated[list[Path], Field(min_length=1)]
@@ -48,15 +41,15 @@ class DataRecipe(_Section):
     validate_on: list[Path] = []
 
 
-class TrainRecipe(_Section):
+class TrainRecipe(Values):
     """One run. `sizes` lists (share of the run, side in px): small pictures first, large ones last."""
 
     seed: Seed
     steps: Positive
     batch: Positive
     sizes: Sizes
-    learning_rate: Rate
-    encoder_learning_rate: Rate
+    learning_rate: Above0
+    encoder_learning_rate: Above0
     warmup_steps: Positive
     weight_decay: Annotated[float, Field(ge=0)]
     average_decay: Share
@@ -87,20 +80,7 @@ def read_recipe(path: Path) -> TrainRecipe:
     Raises:
         RecipeError: missing, not TOML, or with values that are missing, unknown or impossible.
     """
-    try:
-        recipe = TrainRecipe.model_validate(tomllib.loads(path.read_text("utf-8")))
-    except OSError as error:
-        raise RecipeError(f"{path} cannot be read", "a TOML recipe", "see recipes/train/") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise RecipeError(f"{path} is not TOML ({error})", "a TOML recipe", "mend that place") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        name = ".".join(map(str, first["loc"]))
-        raise RecipeError(
-            f"{path} has a wrong value for {name}" if name else f"{path} contradicts itself",
-            first["msg"].removeprefix("Value error, "),
-            "compare with the recipes in recipes/train/",
-        ) from error
+    recipe = read_toml(TrainRecipe, path, compare="the recipes in recipes/train/")
     if recipe.start_from:
         return recipe.model_copy(update={"start_from": path.parent / recipe.start_from})
     return recipe

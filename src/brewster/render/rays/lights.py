@@ -14,11 +14,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from brewster.render.assets import Assets
-from brewster.render.odds import Odds, lat_long
-from brewster.render.vectors import dot, unit
+from brewster.render.rays.odds import Odds, lat_long
+from brewster.render.rays.vectors import dot, unit
 from brewster.scene.camera import axes
 from brewster.scene.world import Plane, Side
+from brewster.worlds.assets import Assets
 
 Device = torch.device | str
 
@@ -97,7 +97,9 @@ class Light:
     ) -> None:
         self._drawn: Odds | None = None
         self.radius_mm = side.map.radius_mm if side.map else math.inf
-        self.map = Texture(torch.from_numpy(assets.map_light(side.map)).to(device), wraps=True) if side.map else None
+        self.map = (
+            Texture(torch.from_numpy(assets.map_light(side.map)).to(device), wraps=True) if side.map else None
+        )
         self._view = view
         self._turn = -(side.map.heading_deg if side.map else 0.0) / 360
         self._behind = behind
@@ -133,7 +135,9 @@ class Light:
     def _board_span(self, share: float) -> float:
         if self.board is None:
             return 0.0
-        return share * self._view.span_mm(self.plane_mm) * self.board.texture.width / (2 * self.board.half_width)
+        return (
+            share * self._view.span_mm(self.plane_mm) * self.board.texture.width / (2 * self.board.half_width)
+        )
 
     def far(self, direction: Tensor, share: float) -> Tensor | None:
         """Light from infinity along unit directions (3, N); None where there is none."""
@@ -189,7 +193,9 @@ class Light:
         away = torch.sqrt((along**2 - dot(origin, origin) + self.radius_mm**2).clamp(min=0)) - along
         place = (origin + away * direction) / self.radius_mm
         facing = dot(place, direction).clamp(min=1e-6)
-        return self._odds().density(self._to_world @ place, self._turn) * (away / self.radius_mm) ** 2 / facing
+        return (
+            self._odds().density(self._to_world @ place, self._turn) * (away / self.radius_mm) ** 2 / facing
+        )
 
     def _odds(self) -> Odds:
         """The map's bright places on its own side of the glass; made when first needed."""
@@ -222,7 +228,9 @@ def _board(plane: Plane, assets: Assets, behind: bool, device: Device) -> _Board
     picture = torch.from_numpy(assets.plane_light(plane)).to(device)
     facing = 1.0 if behind else -1.0
     side = torch.tensor([facing, 1.0, facing], device=device)
-    right, up, _ = (torch.tensor(axis, device=device) * side for axis in axes(plane.heading_deg, plane.pitch_deg))
+    right, up, _ = (
+        torch.tensor(axis, device=device) * side for axis in axes(plane.heading_deg, plane.pitch_deg)
+    )
     x, y = plane.offset_mm
     height, width = picture.shape[:2]
     return _Board(
@@ -233,4 +241,3 @@ def _board(plane: Plane, assets: Assets, behind: bool, device: Device) -> _Board
         half_width=plane.width_mm / 2,
         half_height=plane.width_mm / 2 * height / width,
     )
-

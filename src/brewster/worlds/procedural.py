@@ -15,8 +15,8 @@ import numpy as np
 from numpy.random import PCG64, Generator
 from numpy.typing import NDArray
 
-from brewster.render.furnish import UP, Lamp, Lamps, bookshelf, box, cabinet, flat, plain, upright
-from brewster.render.pictures import (
+from brewster.worlds.furnish import UP, Lamp, Lamps, bookshelf, box, cabinet, flat, plain, upright
+from brewster.worlds.pictures import (
     curtain,
     door,
     figure,
@@ -28,8 +28,8 @@ from brewster.render.pictures import (
     tree,
     wallpaper,
 )
-from brewster.render.streets import street_world
-from brewster.render.surfaces import Canvas, Floats, Glow, Quad, World, render, resize, tint, unit, vector
+from brewster.worlds.streets import street_world
+from brewster.worlds.surfaces import Canvas, Floats, Glow, Quad, World, render, resize, tint, unit, vector
 
 __all__ = ["WORLDS", "night", "painting", "room", "street"]
 

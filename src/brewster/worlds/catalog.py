@@ -12,9 +12,9 @@ import numpy as np
 from brewster.errors import BrewsterError, RecipeError
 from brewster.files import SUFFIXES
 from brewster.photo import Photo
-from brewster.render.assets import BUILTIN_HEIGHT, check_map
 from brewster.scene.sampler import Asset, Catalog
 from brewster.scene.world import BUILTIN, Source
+from brewster.worlds.assets import BUILTIN_HEIGHT, check_map
 
 _MAP_KINDS = ("exr", "hdr")
 _WORLD_COUNT = 8
@@ -77,7 +77,9 @@ def _asset(path: Path, category: str, is_map: bool) -> Asset:
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise RecipeError(f"{path} cannot be read ({error.strerror})", "a picture file", "leave it out") from error
+        raise RecipeError(
+            f"{path} cannot be read ({error.strerror})", "a picture file", "leave it out"
+        ) from error
     photo = Photo.open(data)
     if is_map:
         check_map(np.asarray(photo.linear()), str(path))

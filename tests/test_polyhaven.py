@@ -15,8 +15,8 @@ from urllib.parse import urlsplit
 import pytest
 
 from brewster.cli import cli
-from brewster.dataset import assets
-from brewster.dataset.assets import Order, maps_folder, pull
+from brewster.dataset import polyhaven
+from brewster.dataset.polyhaven import Order, maps_folder, pull
 from brewster.errors import DownloadError, TargetError
 from front_door import errors, lines, tree
 
@@ -42,7 +42,7 @@ def _network_off(monkeypatch):
 def pauses(monkeypatch):
     """What would have been waited."""
     waited = []
-    monkeypatch.setattr(assets, "sleep", waited.append)
+    monkeypatch.setattr(polyhaven, "sleep", waited.append)
     return waited
 
 
@@ -235,7 +235,7 @@ def test_a_broken_download_goes_on_where_it_was(haven, fetch, maps):
 
 
 def test_what_came_is_kept_for_the_next_call(haven, fetch, maps, monkeypatch):
-    monkeypatch.setattr(assets, "_PAUSES_S", ())
+    monkeypatch.setattr(polyhaven, "_PAUSES_S", ())
     haven.faults["/file/a_room"] = ["cut"]
     [result] = fetch()
     assert "ended after 25000 of 100000 bytes" in result.error
@@ -268,7 +268,7 @@ def test_bytes_beyond_the_promised_size_are_not_taken(haven, fetch, maps):
 
 
 def test_what_came_before_the_line_went_silent_is_kept(haven, fetch, monkeypatch):
-    monkeypatch.setattr(assets, "_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(polyhaven, "_TIMEOUT_S", 0.2)
     haven.faults["/file/a_room"] = ["stall"]
     assert states(fetch()) == [("a_room", "downloaded")]
     assert haven.ranges("a_room") == [None, "bytes=25000-"]
@@ -469,5 +469,5 @@ def test_a_server_that_fails_is_one_sentence(command, haven):
 
 
 def test_fetching_wakes_no_torch():
-    code = "import brewster.dataset.assets, sys; assert not {'torch', 'numpy', 'click'} & set(sys.modules)"
+    code = "import brewster.dataset.polyhaven, sys; assert not {'torch', 'numpy', 'click'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -14,11 +14,11 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from brewster.render.chance import Chance
-from brewster.render.facets import seen_density, shadowing, visible_facet
-from brewster.render.lights import Light
-from brewster.render.stack import FAINTEST, fresnel
-from brewster.render.vectors import dot, unit
+from brewster.render.rays.chance import Chance
+from brewster.render.rays.facets import seen_density, shadowing, visible_facet
+from brewster.render.rays.lights import Light
+from brewster.render.rays.stack import FAINTEST, fresnel
+from brewster.render.rays.vectors import dot, unit
 from brewster.scene.glass import Glazing
 
 _WORTH_LIGHT: Final = 3e-3
@@ -77,7 +77,12 @@ def surfaces(glass: Glazing, like: Tensor) -> list[Surface]:
 
 
 def follow(
-    glass: Glazing, origin: Tensor, direction: Tensor, sides: tuple[Light, Light], share: float, chance: Chance
+    glass: Glazing,
+    origin: Tensor,
+    direction: Tensor,
+    sides: tuple[Light, Light],
+    share: float,
+    chance: Chance,
 ) -> Iterator[Exit]:
     """Every order of the rays (3, N) until it is too faint, and what light it meets behind or in front."""
     stack = surfaces(glass, direction)

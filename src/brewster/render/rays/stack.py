@@ -54,7 +54,9 @@ class Shares:
 
 def all_orders(glazing: Glazing, cosine: Tensor) -> Shares:
     """The sum of all orders in closed form: panes joined by the adding formula, s and p apart."""
-    return _averaged([_add_up([_pane(pane, r, a) for pane, r, a in lane]) for lane in _lanes(glazing, cosine)])
+    return _averaged(
+        [_add_up([_pane(pane, r, a) for pane, r, a in lane]) for lane in _lanes(glazing, cosine)]
+    )
 
 
 def paper_orders(glazing: Glazing, cosine: Tensor) -> Shares:
@@ -68,12 +70,11 @@ _Lane = list[tuple[Pane, Tensor, Tensor | float]]
 
 def _lanes(glazing: Glazing, cosine: Tensor) -> list[_Lane]:
     """For s and for p: each pane with its surfaces' reflectance and what one traversal leaves."""
-    left = [
-        pass_once(pane, cosine) if any(pane.absorption_per_m) else 1.0 for pane in glazing.panes
-    ]
+    left = [pass_once(pane, cosine) if any(pane.absorption_per_m) else 1.0 for pane in glazing.panes]
     both = [fresnel(cosine, pane.index) for pane in glazing.panes]
     return [
-        [(pane, r[which], a) for pane, r, a in zip(glazing.panes, both, left, strict=True)] for which in (0, 1)
+        [(pane, r[which], a) for pane, r, a in zip(glazing.panes, both, left, strict=True)]
+        for which in (0, 1)
     ]
 
 
@@ -146,7 +147,9 @@ def orders(reflectances: tuple[float, ...]) -> tuple[Order, ...]:
                     following[(surface, down, *counts)] += count  # type: ignore[index]
         reached = following
     found = [Order(*key, count) for key, count in ended.items()]
-    return tuple(sorted(found, key=lambda o: -o.count * _weight((o.reflections, o.transmissions), reflectances)))
+    return tuple(
+        sorted(found, key=lambda o: -o.count * _weight((o.reflections, o.transmissions), reflectances))
+    )
 
 
 _Counts = tuple[int, ...]
@@ -183,7 +186,9 @@ def _weight(counts: tuple[_Counts, _Counts] | list[_Counts], reflectances: tuple
 
 def order_shares(glazing: Glazing, cosine: Tensor, table: Sequence[Order]) -> list[Tensor]:
     """Each order's share of its light, (3, ...) or (...); per side they sum to `all_orders`."""
-    left = [_powers(pass_once(pane, cosine)) if any(pane.absorption_per_m) else None for pane in glazing.panes]
+    left = [
+        _powers(pass_once(pane, cosine)) if any(pane.absorption_per_m) else None for pane in glazing.panes
+    ]
     lanes = [
         [(_powers(r), _powers(1 - r)) for r in polarised]
         for polarised in zip(*(fresnel(cosine, pane.index) for pane in glazing.panes), strict=True)

@@ -8,9 +8,9 @@ from typing import Final
 import numpy as np
 from numpy.random import Generator
 
-from brewster.render.furnish import UP, Lamp, Lamps, box, car, facade, flat, plain, upright
-from brewster.render.pictures import figure, painting, tree
-from brewster.render.surfaces import (
+from brewster.worlds.furnish import UP, Lamp, Lamps, box, car, facade, flat, plain, upright
+from brewster.worlds.pictures import figure, painting, tree
+from brewster.worlds.surfaces import (
     Canvas,
     Floats,
     Glow,

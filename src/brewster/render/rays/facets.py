@@ -10,7 +10,7 @@ import math
 import torch
 from torch import Tensor
 
-from brewster.render.vectors import dot, unit
+from brewster.render.rays.vectors import dot, unit
 
 
 def visible_facet(towards: Tensor, normal: Tensor, alpha: float, pair: Tensor) -> Tensor:

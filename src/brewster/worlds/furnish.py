@@ -9,7 +9,7 @@ from typing import Final, TypeAlias
 import numpy as np
 from numpy.random import Generator
 
-from brewster.render.surfaces import Box, Canvas, Colour, Floats, Lighting, Quad, tint, unit, vector
+from brewster.worlds.surfaces import Box, Canvas, Colour, Floats, Lighting, Quad, tint, unit, vector
 
 UP: Final = vector(0, 1, 0)
 Painter: TypeAlias = Callable[[str, float, float], Canvas]

@@ -27,7 +27,9 @@ class Odds:
     def __init__(self, texels: Tensor, outward: Tensor, turn: float) -> None:
         _, height, width = texels.shape
         luminance = (texels * texels.new_tensor(REC709_LUMINANCE)[:, None, None]).sum(0)
-        spread = functional.avg_pool2d(functional.pad(luminance[None, None], (1, 1, 1, 1), mode="replicate"), 3, 1)[0, 0]
+        spread = functional.avg_pool2d(
+            functional.pad(luminance[None, None], (1, 1, 1, 1), mode="replicate"), 3, 1
+        )[0, 0]
         self._latitude = (torch.arange(height, device=texels.device) + 0.5) / height * math.pi
         solid_angle = self._latitude.sin() * (math.pi / height) * (2 * math.pi / width)
         u = (torch.arange(width, device=texels.device) + 0.5) / width
@@ -63,4 +65,6 @@ def _direction(u: Tensor, v: Tensor, turn: float) -> Tensor:
     """The inverse of `lat_long`, (3, ...)."""
     heading, latitude = (u - turn) * (2 * math.pi), v * math.pi
     across = latitude.sin()
-    return torch.stack(torch.broadcast_tensors(across * heading.sin(), latitude.cos(), -across * heading.cos()))
+    return torch.stack(
+        torch.broadcast_tensors(across * heading.sin(), latitude.cos(), -across * heading.cos())
+    )

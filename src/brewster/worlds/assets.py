@@ -1,7 +1,7 @@
 """Where scenes find their light: maps and pictures in folders, by name and sha256, or computed when built in.
 
-    assets = Assets([Path("hdri"), Path("photos")])
-    assets.map_light(Map(source=Source(file="builtin:street:7")))  # (H, 2 H, 3) float32
+assets = Assets([Path("hdri"), Path("photos")])
+assets.map_light(Map(source=Source(file="builtin:street:7")))  # (H, 2 H, 3) float32
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from brewster.errors import RecipeError, UnsupportedPhoto
 from brewster.light import REC709_LUMINANCE
 from brewster.photo import Photo
-from brewster.render.procedural import WORLDS, painting
 from brewster.scene.world import BUILTIN, Map, Plane, Source
+from brewster.worlds.procedural import WORLDS, painting
 
 Float32 = NDArray[np.float32]
 
@@ -116,7 +116,9 @@ def check_map(texels: Float32, name: str) -> Float32:
     brightest = texels.max()
     if not np.isfinite(texels).all() or brightest <= 0:
         raise UnsupportedPhoto(
-            f"{name} is not finite everywhere, or black", "every texel of a map is light", "repair or leave it out"
+            f"{name} is not finite everywhere, or black",
+            "every texel of a map is light",
+            "repair or leave it out",
         )
     if (texels.max(axis=2) >= brightest).mean() > _CLIPPED_SHARE:
         raise UnsupportedPhoto(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.random import PCG64, Generator
 from numpy.typing import NDArray
 
-from brewster.render.surfaces import Canvas, Floats, fractal, lettering, resize, tint, vector
+from brewster.worlds.surfaces import Canvas, Floats, fractal, lettering, resize, tint, vector
 
 
 def painting(seed: int, width: int, height: int) -> NDArray[np.float32]:

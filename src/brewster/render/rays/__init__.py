@@ -1,0 +1,1 @@
+"""What rays meet: stacks of glass, rough surfaces, light all around, and chance."""
