@@ -26,9 +26,7 @@ RED_RIGHT = WHITE.copy()
 RED_RIGHT[:, 64:, 1:] = 0
 RED_TOP = WHITE.copy()
 RED_TOP[:32, :, 1:] = 0
-RAMP = np.repeat(np.linspace(0.5 / 64, 1 - 0.5 / 64, 64, dtype=np.float32)[None, :, None], 3, axis=2).repeat(
-    8, 0
-)
+RAMP = np.broadcast_to(((np.arange(64, dtype=np.float32) + 0.5) / 64)[:, None], (64, 64, 3))
 MOTTLED = np.random.default_rng(3).random((8, 16, 3), np.float32)
 PICTURES = {"white": WHITE, "red right": RED_RIGHT, "red top": RED_TOP, "ramp": RAMP, "mottled": MOTTLED}
 

@@ -7,6 +7,7 @@ pyvips is used in this room only (decode, encode), OpenEXR and pillow-heif only 
 """
 
 from brewster.files import DEFAULT_MAX_PIXELS
+from brewster.photo.decode import read_size
 from brewster.photo.floats import read_layers, write_layers
 from brewster.photo.origin import DEPTHS, Origin
 from brewster.photo.photo import Encoding, Photo, Source
@@ -19,5 +20,6 @@ __all__ = [
     "Photo",
     "Source",
     "read_layers",
+    "read_size",
     "write_layers",
 ]

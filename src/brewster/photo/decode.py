@@ -18,7 +18,9 @@ import pyvips
 from numpy.typing import NDArray
 
 from brewster.errors import MissingExtra, PhotoError, UnreadablePhoto, UnsupportedPhoto
+from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.photo import metadata
+from brewster.photo.colour import space_of
 from brewster.photo.floats import read_exr, read_hdr, too_large
 from brewster.photo.origin import Origin
 
@@ -53,6 +55,27 @@ def decode(data: bytes, max_pixels: int) -> Decoded:
             f"{count} pixels are infinite or not a number", "light is finite", "repair them in the renderer"
         )
     return decoded
+
+
+def read_size(data: bytes) -> tuple[int, int]:
+    """Width and height of the upright picture in these bytes, as Photo.open(data).size, by the header alone.
+
+    What Photo.open refuses by the header is refused here too; damage further on is not seen. Pictures of
+    floats are read whole.
+    """
+    container = _container(data)
+    if container in ("exr", "hdr"):
+        height, width = decode(data, DEFAULT_MAX_PIXELS).pixels.shape[:2]
+        return width, height
+    if container == "heic":
+        heif = _open_heic(data, DEFAULT_MAX_PIXELS)
+        space_of(_heic_profile(heif, data), None, is_float=False)
+        return heif.size[0], heif.size[1]
+    image = _open_vips(data, container, DEFAULT_MAX_PIXELS)
+    icc = image.get("icc-profile-data") if image.get_typeof("icc-profile-data") else None
+    space_of(icc or _profile_of(data, container), None, is_float=image.format == "float")
+    sides = int(image.width), int(image.height)
+    return sides[::-1] if _orientation(image, container) in _SIDEWAYS else sides
 
 
 _STARTS = (
@@ -100,16 +123,30 @@ _TYPES = {"uchar": np.uint8, "ushort": np.uint16, "float": np.float32}
 
 
 def _decode_vips(data: bytes, container: str, max_pixels: int) -> Decoded:
+    image = _open_vips(data, container, max_pixels)
     try:
-        image = _LOADERS[container](data, access="sequential", fail_on=_STRICT.get(container, "truncated"))
-        _refuse_odd(image, data, container, max_pixels)
         origin = _origin(image, data, container)
         array = np.frombuffer(image.write_to_memory(), _TYPES[image.format])
     except pyvips.Error as error:
         raise _unreadable(container, error) from error
     array = _full_scale(array.reshape(image.height, image.width, image.bands), origin.bits)
+    return split(upright(array, _orientation(image, container)), origin)
+
+
+def _open_vips(data: bytes, container: str, max_pixels: int) -> pyvips.Image:
+    """The header; pixels come when they are asked for."""
+    try:
+        image = _LOADERS[container](data, access="sequential", fail_on=_STRICT.get(container, "truncated"))
+        _refuse_odd(image, data, container, max_pixels)
+    except pyvips.Error as error:
+        raise _unreadable(container, error) from error
+    return image
+
+
+def _orientation(image: pyvips.Image, container: str) -> int:
+    """How pixels are still to be turned: libvips has turned the others itself."""
     turned = container in ("jpeg", "png", "tiff", "webp") and image.get_typeof("orientation")
-    return split(upright(array, image.get("orientation") if turned else 1), origin)
+    return int(image.get("orientation")) if turned else 1
 
 
 def _unreadable(container: str, error: Exception | str) -> PhotoError:
@@ -250,8 +287,11 @@ _MORE = {"jpeg": _more_jpeg, "tiff": _more_tiff, "webp": _more_webp, "avif": _mo
 
 # --- HEIC
 
+_HEIC_ERRORS = (ValueError, RuntimeError, OSError, SyntaxError)
 
-def _decode_heic(data: bytes, max_pixels: int) -> Decoded:
+
+def _open_heic(data: bytes, max_pixels: int) -> Any:  # noqa: ANN401  (pillow-heif has no types)
+    """The header; pixels come when they are asked for."""
     try:
         import pillow_heif  # noqa: PLC0415  (an extra, for the patents on HEVC)
     except ImportError as error:
@@ -262,14 +302,26 @@ def _decode_heic(data: bytes, max_pixels: int) -> Decoded:
         heif = pillow_heif.open_heif(data, convert_hdr_to_8bit=False)
         if heif.size[0] * heif.size[1] > max_pixels:
             raise too_large(heif.size[0], heif.size[1], max_pixels)
+    except _HEIC_ERRORS as error:
+        raise _unreadable("heic", error) from error
+    return heif
+
+
+def _heic_profile(heif: Any, data: bytes) -> bytes | None:  # noqa: ANN401
+    return heif.info.get("icc_profile") or _profile_of(data, "heic")
+
+
+def _decode_heic(data: bytes, max_pixels: int) -> Decoded:
+    heif = _open_heic(data, max_pixels)
+    try:
         array = np.array(heif)
-    except (ValueError, RuntimeError, OSError, SyntaxError) as error:
+    except _HEIC_ERRORS as error:
         raise _unreadable("heic", error) from error
     exif, xmp = heif.info.get("exif"), heif.info.get("xmp")
     origin = Origin(
         container="heic",
         bits=heif.info.get("bit_depth", 8),
-        icc=heif.info.get("icc_profile") or _profile_of(data, "heic"),
+        icc=_heic_profile(heif, data),
         exif=metadata.upright_exif(exif) if exif else None,
         xmp=metadata.upright_xmp(xmp) if xmp else None,
     )
@@ -277,6 +329,8 @@ def _decode_heic(data: bytes, max_pixels: int) -> Decoded:
 
 
 # --- arrays
+
+_SIDEWAYS = (5, 6, 7, 8)
 
 
 def _full_scale(array: Stored, bits: int) -> Stored:
@@ -286,7 +340,7 @@ def _full_scale(array: Stored, bits: int) -> Stored:
 
 def upright(array: Stored, orientation: int) -> Stored:
     """The array (H, W, C) turned as EXIF orientation 1..8 says (CIPA DC-008, tag 274)."""
-    if orientation in (5, 6, 7, 8):
+    if orientation in _SIDEWAYS:
         array = array.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
         array = array[::-1]

@@ -20,7 +20,7 @@ from torch import Tensor
 from brewster.errors import RecipeError
 from brewster.render.rays.chance import Chance
 from brewster.render.rays.lens import blurred, margin_px
-from brewster.render.rays.lights import Device, Light, View
+from brewster.render.rays.lights import Device, Light, Rays, View
 from brewster.render.rays.scatter import follow
 from brewster.render.rays.stack import (
     Order,
@@ -44,15 +44,6 @@ _STEEPEST_REFLECTANCE = (
 )
 _STRIP = 1 << 15  # rays worked on at once on a CPU, so that they stay in its cache
 _WIDE_STRIP = 1 << 20
-
-
-@dataclass(frozen=True)
-class Rays:
-    """Camera rays in the glass's frame: origins and unit directions, (3, N) each, and the share of a pixel's side."""
-
-    origin: Tensor
-    direction: Tensor
-    share: float
 
 
 @dataclass(frozen=True)
@@ -109,12 +100,18 @@ def _furnish(scene: Scene, assets: Assets, device: Device) -> _Room:
         scene.camera.aperture_mm if by_chance else 0.0,
         scene.camera.focus_mm,
     )
-    sides = []
-    for side, behind in ((scene.behind, True), (scene.front, False)):
-        light = Light(side, assets, view, behind=behind, to_world=to_glass.T, device=device)
-        groups = _groups(scene, light, behind=behind)
-        sides.append(_Side(light, scene.glass.depth_mm if behind else 0.0, groups))
-    return _Room(scene, *sides, origin, right, up, back)
+    behind, front = (
+        _side(scene, assets, view, to_glass.T, behind=behind, device=device) for behind in (True, False)
+    )
+    return _Room(scene, behind, front, origin, right, up, back)
+
+
+def _side(
+    scene: Scene, assets: Assets, view: View, to_world: Tensor, *, behind: bool, device: Device
+) -> _Side:
+    side = scene.behind if behind else scene.front
+    light = Light(side, assets, view, behind=behind, to_world=to_world, device=device)
+    return _Side(light, scene.glass.depth_mm if behind else 0.0, _groups(scene, light, behind=behind))
 
 
 def _needs_chance(scene: Scene) -> bool:
@@ -239,18 +236,16 @@ def _shifted_orders(room: _Room, side: _Side, leaving: Rays) -> tuple[Tensor, Te
     surface[2] = -side.depth_mm
     shares = iter(order_shares(glass, cosine, [order for group in side.groups for order in group]))
     far = side.light.far(direction, leaving.share)
-    every, mine = torch.zeros_like(direction), torch.zeros_like(direction)
+    every, kept = torch.zeros_like(direction), torch.zeros_like(direction)
     for group in side.groups:
         seen, clear = side.light.near(surface + ahead * _shift(group[0], shifts), direction, leaving.share)
         if far is not None and clear is not None:
             seen = seen + clear * far
-        whole, kept = torch.zeros_like(cosine), torch.zeros_like(cosine)
-        for order, share in zip(group, shares, strict=False):
-            whole = whole + share
-            kept = kept + share if order.in_paper else kept
-        every += whole * seen
-        mine += kept * seen
-    return every, every if room.scene.orders == "all" else mine
+        mine = list(zip(group, shares, strict=False))
+        every += sum((share for _, share in mine), torch.zeros_like(cosine)) * seen
+        if room.scene.orders == "paper":
+            kept += sum((share for order, share in mine if order.in_paper), torch.zeros_like(cosine)) * seen
+    return every, every if room.scene.orders == "all" else kept
 
 
 def _shift(order: Order, shifts: list[Tensor]) -> Tensor:
@@ -291,15 +286,12 @@ def _steepest_cosine(scene: Scene) -> Tensor:
 
 def _scattered(room: _Room, rays: Rays, chance: Chance) -> list[Tensor]:
     """I, T, B, R and MR along the rays, for panes that are rough or wedged."""
-    through, transmission, back, reflection = torch.zeros(
-        4, *rays.direction.shape, device=rays.direction.device
-    )
-    lights = room.behind.light, room.front.light
-    for part in follow(room.scene.glass, rays.origin, rays.direction, lights, rays.share, chance):
-        kept = room.scene.orders == "all" or part.in_paper
-        for whole, layer in ((through, transmission),) if part.behind else ((back, reflection),):
-            whole += part.light
-            layer += part.light * kept
+    nothing = torch.zeros(2, *rays.direction.shape, device=rays.direction.device)
+    sides = {True: nothing, False: nothing.clone()}
+    for part in follow(room.scene.glass, rays, room.behind.light, room.front.light, chance):
+        sides[part.behind][0] += part.light
+        sides[part.behind][1] += part.light * (room.scene.orders == "all" or part.in_paper)
+    (through, transmission), (back, reflection) = sides[True], sides[False]
     point, mirrored = _at_first_surface(rays)
     background = room.behind.light.along(rays.origin, rays.direction, rays.share)
     mirror = room.front.light.along(point, mirrored, rays.share)

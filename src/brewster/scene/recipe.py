@@ -58,10 +58,10 @@ class CameraRecipe(Values):
     incidence_deg: Range = (-35.0, 35.0)
     pitch_deg: Range = (-12.0, 12.0)
     fov_deg: Range = (30.0, 90.0)
-    pinhole_probability: Share = 0.6
+    pinhole_probability: Share = 0.7
     aperture_mm_log: LogRange = (1.0, 15.0)
-    focus_on: dict[Literal["behind", "front", "glass"], From0] = {"behind": 0.85, "front": 0.15}
-    """What is sharp, by weight; a focus on the glass lies a little before it."""
+    focus_on_front_probability: Share = 0.15
+    """Of a lens that is set on what is mirrored, instead of on what is behind the glass."""
 
 
 class SideRecipe(Values):

@@ -6,6 +6,7 @@ scene = draw(read_scene_recipe("window"), catalog, seed=7, index=12)
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from random import Random
 from typing import Final
 
@@ -58,26 +59,42 @@ def draw(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) -> Scene:
     )
 
 
+def _six(number: float) -> float:
+    """Six digits, so that scenes read well."""
+    return float(f"{number:.6g}")
+
+
 class _Dice(Random):
-    """Random numbers by the words of a recipe; six digits, so that scenes read well."""
+    """Random numbers by the words of a recipe."""
 
     def within(self, bounds: tuple[float, float]) -> float:
-        return float(f"{self.uniform(*bounds):.6g}")
+        return _six(self.uniform(*bounds))
 
     def within_log(self, bounds: tuple[float, float]) -> float:
-        return float(f"{math.exp(self.uniform(*map(math.log, bounds))):.6g}")
+        return _six(math.exp(self.uniform(*map(math.log, bounds))))
 
     def chance(self, probability: float) -> bool:
         return self.random() < probability
+
+
+@dataclass(frozen=True)
+class _Draft:
+    """What is settled when the sides are drawn."""
+
+    dice: _Dice
+    catalog: Catalog
+    glass: Glazing
+    camera: Camera
 
 
 def _try(recipe: SceneRecipe, catalog: Catalog, dice: _Dice, seed: int, index: int) -> Scene:
     glass = _glass(recipe.glass, dice)
     behind_map = _choose_map(recipe.behind, recipe.camera, catalog, dice)
     front_map = _choose_map(recipe.front, recipe.camera, catalog, dice)
-    camera = _camera(recipe, glass, [(recipe.behind, behind_map), (recipe.front, front_map)], dice)
-    behind = _side(recipe.behind, behind_map, catalog, camera, glass, dice, behind=True)
-    front = _side(recipe.front, front_map, catalog, camera, glass, dice, behind=False)
+    camera = _camera(recipe, [(recipe.behind, behind_map), (recipe.front, front_map)], dice)
+    draft = _Draft(dice, catalog, glass, camera)
+    behind = _side(recipe.behind, behind_map, draft, glass.depth_mm)
+    front = _side(recipe.front, front_map, draft, _camera_in_glass(camera, glass)[2])
     return Scene(
         recipe=recipe.name,
         seed=seed,
@@ -86,7 +103,7 @@ def _try(recipe: SceneRecipe, catalog: Catalog, dice: _Dice, seed: int, index: i
         orders=recipe.orders,
         samples=recipe.rough_samples if glass.is_rough else recipe.samples,
         glass=glass,
-        camera=_focused(camera, recipe.camera, glass, {"behind": behind, "front": front}, dice),
+        camera=_focused(recipe.camera, draft, behind, front),
         behind=behind,
         front=front,
         development=_development(recipe.development, dice),
@@ -99,7 +116,7 @@ def _glass(recipe: GlassRecipe, dice: _Dice) -> Glazing:
     tint, strength = dice.choice(recipe.tints), dice.within_log(recipe.tint_strength_log)
     rough = dice.within_log(recipe.roughness_log) if dice.chance(recipe.rough_probability) else 0.0
     wedged = dice.chance(recipe.wedge_probability)
-    red, green, blue = (float(f"{colour * strength:.6g}") for colour in tint)
+    red, green, blue = (_six(colour * strength) for colour in tint)
     index = dice.within(recipe.index)
 
     def pane() -> Pane:
@@ -139,16 +156,14 @@ def _least_fov(asset: Asset, recipe: SideRecipe, camera: CameraRecipe) -> float:
     return camera.width * 360 / asset.width / recipe.most_px_per_texel
 
 
-def _camera(
-    recipe: SceneRecipe, glass: Glazing, maps: list[tuple[SideRecipe, Asset | None]], dice: _Dice
-) -> Camera:
+def _camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]], dice: _Dice) -> Camera:
     """A camera whose axis meets the glass near its middle; where it focuses is settled later."""
     wanted = recipe.camera
     least = max([wanted.fov_deg[0], *(_least_fov(asset, side, wanted) for side, asset in maps if asset)])
     heading, pitch = dice.within(wanted.incidence_deg), dice.within(wanted.pitch_deg)
     _, _, back = axes(heading, pitch)
     away = dice.within_log(wanted.distance_mm_log) / max(back[2], 0.1)
-    x, y, z = (float(f"{away * part:.6g}") for part in back)
+    x, y, z = (_six(away * part) for part in back)
     return Camera(
         position_mm=(x, y, z),
         heading_deg=heading,
@@ -159,56 +174,38 @@ def _camera(
     )
 
 
-def _side(
-    recipe: SideRecipe,
-    map_: Asset | None,
-    catalog: Catalog,
-    camera: Camera,
-    glass: Glazing,
-    dice: _Dice,
-    *,
-    behind: bool,
-) -> Side:
+def _side(recipe: SideRecipe, asset: Asset | None, draft: _Draft, nearest_mm: float) -> Side:
+    """A map, a picture, or both; the picture stands further from the glass than `nearest_mm`."""
+    dice = draft.dice
     luminance = dice.within_log(recipe.luminance_log)
     world = plane = None
-    if map_:
+    if asset:
         is_dome = dice.chance(recipe.dome_probability)
         world = Map(
-            source=map_.source,
+            source=asset.source,
             heading_deg=dice.within((0, 360)),
             luminance=luminance,
             radius_mm=dice.within_log(recipe.radius_mm_log) if is_dome else math.inf,
         )
-    if dice.chance(recipe.picture_probability) or not map_:
-        plane = _plane(recipe, catalog, luminance, camera, glass, dice, behind=behind)
+    if dice.chance(recipe.picture_probability) or not asset:
+        plane = _plane(recipe, draft, luminance, nearest_mm + dice.within_log(recipe.distance_mm_log))
     return Side(map=world, plane=plane)
 
 
-def _plane(
-    recipe: SideRecipe,
-    catalog: Catalog,
-    luminance: float,
-    camera: Camera,
-    glass: Glazing,
-    dice: _Dice,
-    *,
-    behind: bool,
-) -> Plane:
+def _plane(recipe: SideRecipe, draft: _Draft, luminance: float, distance_mm: float) -> Plane:
     """A picture that covers as much of the view, straight or mirrored, as the recipe says."""
-    if not catalog.pictures:
+    if not draft.catalog.pictures:
         raise RecipeError(
             "there are no pictures to draw from", "the recipe asks for them", "name a folder with --photos"
         )
-    asset = dice.choice(catalog.pictures)
-    away = dice.within_log(recipe.distance_mm_log)
-    distance = float(f"{away + (glass.depth_mm if behind else camera_height(camera, glass)):.6g}")
-    (left, right), (bottom, top) = _reach(camera, glass, distance)
+    dice, asset = draft.dice, draft.dice.choice(draft.catalog.pictures)
+    (left, right), (bottom, top) = _reach(draft.camera, draft.glass, distance_mm)
     cover = max(right - left, (top - bottom) * asset.width / asset.height)
     return Plane(
         source=asset.source,
-        distance_mm=distance,
-        offset_mm=(float(f"{(left + right) / 2:.6g}"), float(f"{(bottom + top) / 2:.6g}")),
-        width_mm=float(f"{cover * dice.within(recipe.fill):.6g}"),
+        distance_mm=_six(distance_mm),
+        offset_mm=(_six((left + right) / 2), _six((bottom + top) / 2)),
+        width_mm=_six(cover * dice.within(recipe.fill)),
         heading_deg=dice.within(recipe.turn_deg),
         pitch_deg=dice.within(recipe.turn_deg) / 2,
         luminance=luminance,
@@ -216,11 +213,9 @@ def _plane(
     )
 
 
-def camera_height(camera: Camera, glass: Glazing) -> float:
-    """The camera's distance in mm from the plane of the first surface."""
-    return _in_glass(tuple(a - b for a, b in zip(camera.position_mm, glass.position_mm, strict=True)), glass)[
-        2
-    ]  # type: ignore[arg-type]
+def _camera_in_glass(camera: Camera, glass: Glazing) -> Point:
+    (x, y, z), (at_x, at_y, at_z) = camera.position_mm, glass.position_mm
+    return _in_glass((x - at_x, y - at_y, z - at_z), glass)
 
 
 def _in_glass(vector: Point, glass: Glazing) -> Point:
@@ -232,8 +227,7 @@ def _reach(
     camera: Camera, glass: Glazing, distance_mm: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """What the view spans on a plane this far beyond the glass, or as far before it in the mirror: x and y, in mm."""
-    offset: Point = tuple(a - b for a, b in zip(camera.position_mm, glass.position_mm, strict=True))  # type: ignore[assignment]
-    x, y, z = _in_glass(offset, glass)
+    x, y, z = _camera_in_glass(camera, glass)
     places = []
     for corner in camera.corners():
         across, upward, towards = _in_glass(corner, glass)
@@ -243,18 +237,16 @@ def _reach(
     return (min(xs), max(xs)), (min(ys), max(ys))
 
 
-def _focused(
-    camera: Camera, recipe: CameraRecipe, glass: Glazing, sides: dict[str, Side], dice: _Dice
-) -> Camera:
+def _focused(recipe: CameraRecipe, draft: _Draft, behind: Side, front: Side) -> Camera:
     """The camera with its lens set on something of the scene."""
-    on = dice.choices(list(recipe.focus_on), list(recipe.focus_on.values()))[0]
+    dice, camera = draft.dice, draft.camera
+    on = front if dice.chance(recipe.focus_on_front_probability) else behind
     is_pinhole, aperture = dice.chance(recipe.pinhole_probability), dice.within_log(recipe.aperture_mm_log)
-    height = camera_height(camera, glass)
-    away = 0.98 * height if on == "glass" else height + _distance(sides[on])
-    slant = _in_glass(axes(camera.heading_deg, camera.pitch_deg)[2], glass)[2]
+    away = _camera_in_glass(camera, draft.glass)[2] + _distance(on)
+    slant = _in_glass(axes(camera.heading_deg, camera.pitch_deg)[2], draft.glass)[2]
     return camera.model_copy(
         update={
-            "focus_mm": float(f"{min(away / max(slant, 0.1), _FAR_MM):.6g}"),
+            "focus_mm": _six(min(away / max(slant, 0.1), _FAR_MM)),
             "aperture_mm": 0.0 if is_pinhole else aperture,
         }
     )

@@ -71,7 +71,7 @@ class Scene(Values):
         if self.glass.is_flat:
             self._refuse_grazing(normal)
         self._refuse_focus_in_glass(normal, offset)
-        self._refuse_outside(offset)
+        self._refuse_outside()
         return self
 
     @property
@@ -98,7 +98,7 @@ class Scene(Values):
                 f"the focus lies {depth:g} mm inside the glass; move focus_mm before or behind it"
             )
 
-    def _refuse_outside(self, offset: float) -> None:
+    def _refuse_outside(self) -> None:
         """A dome holds the whole glass and the camera; a plane stands clear of the glass."""
         reach = math.dist(self.camera.position_mm, self.glass.position_mm)
         for side, nearest in ((self.behind, self.glass.depth_mm), (self.front, 0.0)):
@@ -124,7 +124,7 @@ def read_scene(path: Path) -> Scene:
 class _SceneFile(Scene):
     """A scene and what was made of it."""
 
-    outcome: dict[str, Any] = {}
+    outcome: dict[str, Any] = Field(default_factory=dict)
 
     def scene(self) -> Scene:
         return Scene.model_validate(self.model_dump(exclude={"outcome"}))

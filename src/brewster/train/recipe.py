@@ -34,11 +34,11 @@ class DataRecipe(Values):
     """Which folders, relative to BREWSTER_DATA, and which file names in them to leave out."""
 
     photos: Annotated[list[Path], Field(min_length=1)]
-    maps: list[Path] = []
-    pairs: list[Path] = []
+    maps: tuple[Path, ...] = ()
+    pairs: tuple[Path, ...] = ()
     pairs_share: Share = 0.0
-    exclude: list[str] = []
-    validate_on: list[Path] = []
+    exclude: tuple[str, ...] = ()
+    validate_on: tuple[Path, ...] = ()
 
 
 class TrainRecipe(Values):

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.errors import RecipeError, UnsupportedPhoto
+from brewster.errors import BrewsterError, RecipeError, UnsupportedPhoto
 from brewster.light import REC709_LUMINANCE
 from brewster.photo import Photo
 from brewster.scene.world import BUILTIN, Map, Plane, Source
@@ -29,11 +30,11 @@ _LUMINANCE = np.array(REC709_LUMINANCE, np.float32)
 
 
 class Assets:
-    """Reads sources from folders, the first that has the file; keeps what was used last in memory."""
+    """Reads sources from folders, the first that has this very file; keeps what was used last in memory."""
 
     def __init__(self, folders: Sequence[Path] = ()) -> None:
         self._folders = tuple(folders)
-        self._kept: OrderedDict[tuple[str, str], Float32] = OrderedDict()
+        self._kept: OrderedDict[tuple[str, str, str], Float32] = OrderedDict()
 
     def map_light(self, lit: Map) -> Float32:
         """A lat-long map's light, (H, 2 H, 3): its mean luminance, lamps left out, is the scene's.
@@ -43,7 +44,8 @@ class Assets:
             UnsupportedPhoto: it is not 2:1, holds values that are no light, or is clipped (no HDR map).
             PhotoError: it cannot be read.
         """
-        return self._once("map", lit.source, self._read_map) * np.float32(lit.luminance)
+        light: Float32 = self._once("map", lit.source, self._read_map) * np.float32(lit.luminance)
+        return light
 
     def plane_light(self, plane: Plane) -> Float32:
         """A picture's light, (H, W, 3), by the file's profile or else sRGB's curve; whites raised as the plane says.
@@ -55,10 +57,13 @@ class Assets:
         picture = self._once("picture", plane.source, self._read_picture)
         bright = ((picture.max(axis=2, keepdims=True) - 0.8) / 0.2).clip(0, 1)
         mean = (picture @ _LUMINANCE).mean() + np.float32(1e-4)
-        return picture * (1 + np.float32(plane.highlights) * bright**2) * (np.float32(plane.luminance) / mean)
+        light: Float32 = (
+            picture * (1 + np.float32(plane.highlights) * bright**2) * (np.float32(plane.luminance) / mean)
+        )
+        return light
 
     def _once(self, kind: str, source: Source, read: Callable[[Source], Float32]) -> Float32:
-        key = (kind, source.file)
+        key = (kind, source.file, source.sha256)
         if key not in self._kept:
             self._kept[key] = read(source)
             while sum(array.nbytes for array in self._kept.values()) > _KEPT_BYTES and len(self._kept) > 1:
@@ -71,35 +76,64 @@ class Assets:
             name, seed = _builtin(source, WORLDS)
             texels = WORLDS[name](seed, BUILTIN_HEIGHT)
         else:
-            texels = check_map(Photo.open(self._bytes(source)).linear(), source.file)
-        return np.maximum(texels, 0) / _level(texels)
+            texels = check_map(self._open(source).linear(), source.file)
+        light: Float32 = np.maximum(texels, np.float32(0))
+        light /= _level(texels)
+        return light
 
     def _read_picture(self, source: Source) -> Float32:
         if source.file.startswith(BUILTIN):
             _, seed = _builtin(source, ("painting",))
             return painting(seed, 768, 512)
-        return np.clip(Photo.open(self._bytes(source)).linear(), 0, 1)
+        return self._open(source).linear().clip(0, 1)
+
+    def _open(self, source: Source) -> Photo:
+        with naming(source.file):
+            return Photo.open(self._bytes(source))
 
     def _bytes(self, source: Source) -> bytes:
-        for folder in self._folders:
-            path = folder / source.file
-            if path.is_file():
-                data = path.read_bytes()
-                break
-        else:
-            searched = ", ".join(map(str, self._folders)) or "no folder"
+        paths = [path for folder in self._folders if (path := folder / source.file).is_file()]
+        for path in paths:
+            data = read_bytes(path)
+            if not source.sha256 or hashlib.sha256(data).hexdigest() == source.sha256:
+                return data
+        if paths:
             raise RecipeError(
-                f"{source.file} was not found in {searched}",
-                "the scene's own files are needed",
-                "name their folders with --maps and --photos",
-            )
-        if source.sha256 and hashlib.sha256(data).hexdigest() != source.sha256:
-            raise RecipeError(
-                f"{path} is not the file that the scene was drawn with",
+                f"{paths[0]} is not the file that the scene was drawn with",
                 f"its sha256 should be {source.sha256}",
                 "name the folder that holds the original",
             )
-        return data
+        searched = ", ".join(map(str, self._folders)) or "no folder"
+        raise RecipeError(
+            f"{source.file} was not found in {searched}",
+            "the scene's own files are needed",
+            "name their folders with --maps and --photos",
+        )
+
+
+@contextmanager
+def naming(name: str) -> Iterator[None]:
+    """Errors that arise while a file is read say which file, unless they do already."""
+    try:
+        yield
+    except BrewsterError as error:
+        if name not in str(error):
+            error.args = (f"{name}: {error}",)
+        raise
+
+
+def read_bytes(path: Path) -> bytes:
+    """What the file holds.
+
+    Raises:
+        RecipeError: it cannot be read.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise RecipeError(
+            f"{path} cannot be read ({error.strerror})", "a picture file", "leave it out"
+        ) from error
 
 
 def check_map(texels: Float32, name: str) -> Float32:
@@ -139,7 +173,7 @@ def _level(texels: Float32) -> np.float32:
     return np.float32((np.minimum(luminance, most) * shares).sum())
 
 
-def _builtin(source: Source, known: Sequence[str] | dict[str, object]) -> tuple[str, int]:
+def _builtin(source: Source, known: Iterable[str]) -> tuple[str, int]:
     _, name, seed = (*source.file.split(":"), "", "")[:3]
     if name not in known or not seed.isdigit():
         raise RecipeError(

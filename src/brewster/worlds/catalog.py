@@ -7,14 +7,12 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from brewster.errors import BrewsterError, RecipeError
 from brewster.files import SUFFIXES
-from brewster.photo import Photo
+from brewster.photo import Photo, read_size
 from brewster.scene.sampler import Asset, Catalog
 from brewster.scene.world import BUILTIN, Source
-from brewster.worlds.assets import BUILTIN_HEIGHT, check_map
+from brewster.worlds.assets import BUILTIN_HEIGHT, check_map, naming, read_bytes
 
 _MAP_KINDS = ("exr", "hdr")
 _WORLD_COUNT = 8
@@ -41,13 +39,14 @@ BUILTIN_CATALOG = Catalog(
 
 
 def read_catalog(maps: Sequence[Path], pictures: Sequence[Path]) -> tuple[Catalog, list[BrewsterError]]:
-    """The maps and pictures of some folders, each opened once, and what was wrong with those left out.
+    """The maps and pictures of some folders, and what was wrong with those left out.
 
+    Maps are read whole; of a picture only the header, so one that is damaged further on is refused when drawn.
     A `manifest.csv` with the columns file and category tells what a map is. Where no folder is given for maps
     or for pictures, the builtin ones take their place.
 
     Raises:
-        RecipeError: a folder cannot be read, or none of its files can be used.
+        RecipeError: a folder or its manifest cannot be read, or none of its files can be used.
     """
     refused: list[BrewsterError] = []
     found_maps = _read(maps, refused, are_maps=True) if maps else BUILTIN_CATALOG.maps
@@ -74,18 +73,16 @@ def _read(folders: Sequence[Path], refused: list[BrewsterError], *, are_maps: bo
 
 
 def _asset(path: Path, category: str, is_map: bool) -> Asset:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise RecipeError(
-            f"{path} cannot be read ({error.strerror})", "a picture file", "leave it out"
-        ) from error
-    photo = Photo.open(data)
-    if is_map:
-        check_map(np.asarray(photo.linear()), str(path))
-    width, height = photo.size
+    data = read_bytes(path)
+    with naming(str(path)):
+        width, height = _map_size(data, str(path)) if is_map else read_size(data)
     source = Source(file=path.name, sha256=hashlib.sha256(data).hexdigest())
     return Asset(source=source, width=width, height=height, category=category)
+
+
+def _map_size(data: bytes, name: str) -> tuple[int, int]:
+    height, width = check_map(Photo.open(data).linear(), name).shape[:2]
+    return width, height
 
 
 def _files(folder: Path, are_maps: bool) -> Iterator[Path]:
@@ -103,7 +100,13 @@ def _files(folder: Path, are_maps: bool) -> Iterator[Path]:
 
 def _categories(folder: Path) -> dict[str, str]:
     try:
-        with (folder / "manifest.csv").open(newline="", encoding="utf-8") as file:
+        with (folder / "manifest.csv").open(newline="", encoding="utf-8-sig") as file:
             return {row["file"]: row.get("category") or "" for row in csv.DictReader(file) if row.get("file")}
     except OSError:
         return {}
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise RecipeError(
+            f"{folder / 'manifest.csv'} cannot be read ({error})",
+            "a table with the columns file and category, as UTF-8",
+            "save it so, or remove it",
+        ) from error

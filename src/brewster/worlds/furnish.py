@@ -48,7 +48,8 @@ class Lamps:
             if lamp.facing is not None:
                 weight *= np.clip(-(way @ lamp.facing), 0, None) / np.sqrt(squared)
             light += weight[..., None] * lamp.intensity
-        return light * self.shade(points, normal)
+        unshaded: Floats = light
+        return unshaded * self.shade(points, normal)
 
     def shade(self, points: Floats, normal: Floats) -> Floats:
         """What the contacts leave (h, w, 1) of the light on a floor; all of it elsewhere."""

@@ -140,7 +140,7 @@ def _landscape(random: Generator, height: int, width: int) -> Floats:
         tint(random, 0.3, 0.5) * vector(0.6, 0.9, 1.5),
         tint(random, 0.7, 0.15) * vector(1.1, 1, 0.95),
     )
-    picture = zenith + (haze - zenith) * np.clip(y * 1.6 + 0.7 + 0 * x, 0, 1)[..., None] ** 1.5
+    picture: Floats = zenith + (haze - zenith) * np.clip(y * 1.6 + 0.7 + 0 * x, 0, 1)[..., None] ** 1.5
     clouds = np.clip(fractal(random, height, width, 4, 7) * 0.5 - 0.1, 0, 0.9) * np.clip(0.3 - y, 0, 1)
     _cover(picture, clouds[..., None] * 1.5, vector(0.95, 0.92, 0.9))
     sun = random.uniform(-0.5, 0.5), random.uniform(-0.4, 0)

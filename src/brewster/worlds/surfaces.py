@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.random import Generator
@@ -33,7 +33,8 @@ def vector(*values: float) -> Floats:
 
 def unit(values: Floats) -> Floats:
     """The same direction, (..., 3), with length 1."""
-    return values / np.linalg.norm(values, axis=-1, keepdims=True)
+    directed: Floats = values / np.linalg.norm(values, axis=-1, keepdims=True)
+    return directed
 
 
 def tint(random: Generator, value: float, saturation: float) -> Floats:
@@ -55,8 +56,9 @@ def _stretch(picture: Floats, size: int, axis: int, wrap: bool) -> Floats:
     place = (np.arange(size, dtype=np.float32) + 0.5) * (old / size) - 0.5
     low = np.floor(place).astype(np.int32)
     share = (place - low).reshape([-1 if side == axis else 1 for side in range(picture.ndim)])
-    mode = "wrap" if wrap else "clip"
-    first, second = (picture.take(index, axis, mode=mode) for index in (low, low + 1))
+    mode: Literal["wrap", "clip"] = "wrap" if wrap else "clip"
+    first: Floats = picture.take(low, axis, mode=mode)
+    second: Floats = picture.take(low + 1, axis, mode=mode)
     second -= first
     second *= share
     second += first
@@ -73,7 +75,8 @@ def fractal(random: Generator, height: int, width: int, cells: float = 4, octave
         if size == (height, width):
             break
     total = resize(total, height, width, wrap=True)
-    return (total - total.mean()) / (total.std() + 1e-6)
+    noise: Floats = (total - total.mean()) / (total.std() + 1e-6)
+    return noise
 
 
 def lettering(random: Generator, count: int, height: int, width: int) -> Floats:
@@ -134,7 +137,8 @@ class Canvas:
 
     def roughen(self, random: Generator, amount: float, cells: float = 6, octaves: int = 6) -> None:
         """Weathers the colours by fractal noise; `amount` is its relative deviation."""
-        noise = fractal(random, *self.pixels.shape[:2], cells, octaves)
+        height, width = self.pixels.shape[:2]
+        noise = fractal(random, height, width, cells, octaves)
         self.pixels[..., :3] *= np.clip(1 + amount * noise, 0.2, 2)[..., None]
 
 
@@ -157,7 +161,8 @@ class Texture:
         rows, columns = self._rows[level], self._columns[level]
         row = (down * rows).astype(np.int32) % rows
         column = (across * columns).astype(np.int32) % columns
-        return self._texels.take(self._starts[level] + row * columns + column, axis=0)
+        texels: Floats = self._texels.take(self._starts[level] + row * columns + column, axis=0)
+        return texels
 
 
 class Quad:
@@ -223,7 +228,7 @@ class World:
 
     quads: Sequence[Quad]
     glows: Sequence[Glow]
-    sky: Callable[[Floats, Floats], Floats]
+    sky: Callable[[Floats, float], Floats]
     """Radiance (h, w, 3) in unit directions (h, w, 3) where no surface is; the texel's angle comes second."""
     turn: float
     """Azimuth of the world's -z axis in the map, in radians."""
@@ -254,9 +259,10 @@ def _strip(world: World, height: int, top: int) -> Floats:
     blocks = colours.reshape(rows, 2, 2 * height, 2, 3)
     solid = blocks[:, 0, :, 0] + blocks[:, 0, :, 1] + blocks[:, 1, :, 0] + blocks[:, 1, :, 1]
     free = (closeness == 0).reshape(rows, 2, 2 * height, 2).mean((1, 3), dtype=np.float32)[..., None]
-    if not free.any():
-        return solid * 0.25
-    return solid * 0.25 + free * world.sky(directions(height, world.turn, top, rows), np.pi / height)
+    radiance: Floats = solid * 0.25
+    if free.any():
+        radiance = radiance + free * world.sky(directions(height, world.turn, top, rows), np.pi / height)
+    return radiance
 
 
 def directions(height: int, turn: float, top: int, rows: int) -> Floats:
@@ -308,7 +314,7 @@ def _hidden(world: World, position: Floats) -> bool:
         across, down, near = quad.forms @ position
         if near > 1.05 and 0 <= across < near and 0 <= down < near:
             place = np.array([[across / near], [down / near]], np.float32)
-            if quad.texture.sample(*place, np.ones(1, np.float32))[0, 3] > 0.5:
+            if quad.texture.sample(place[0], place[1], np.ones(1, np.float32))[0, 3] > 0.5:
                 return True
     return False
 

@@ -46,4 +46,5 @@ def _disc(radius_px: float, reach: int) -> Tensor:
     place = (torch.arange(side) + 0.5) / _FINENESS - reach - 0.5
     inside = (place[:, None] ** 2 + place**2 <= radius_px**2).double()
     disc = functional.avg_pool2d(inside[None], _FINENESS)[0]
-    return disc / disc.sum()
+    shares: Tensor = disc / disc.sum()
+    return shares

@@ -71,6 +71,15 @@ class _Board:
 
 
 @dataclass(frozen=True)
+class Rays:
+    """Rays with origins and unit directions, (3, N) each; each stands for this share of a pixel's side."""
+
+    origin: Tensor
+    direction: Tensor
+    share: float
+
+
+@dataclass(frozen=True)
 class View:
     """How a camera `height_mm` above the glass sees: its pixels' angle, and its lens (0: none to filter for)."""
 

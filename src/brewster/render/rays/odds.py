@@ -58,7 +58,8 @@ class Odds:
         height, width = self._density.shape
         u, v = lat_long(direction, turn)
         row, column = (v * height).long().clamp(0, height - 1), (u * width).long().clamp(0, width - 1)
-        return self._density[row, column]
+        density: Tensor = self._density[row, column]
+        return density
 
 
 def _direction(u: Tensor, v: Tensor, turn: float) -> Tensor:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from brewster.render.rays.chance import Chance
 from brewster.render.rays.facets import seen_density, shadowing, visible_facet
-from brewster.render.rays.lights import Light
+from brewster.render.rays.lights import Light, Rays
 from brewster.render.rays.stack import FAINTEST, fresnel
 from brewster.render.rays.vectors import dot, unit
 from brewster.scene.glass import Glazing
@@ -76,19 +76,11 @@ def surfaces(glass: Glazing, like: Tensor) -> list[Surface]:
     return found
 
 
-def follow(
-    glass: Glazing,
-    origin: Tensor,
-    direction: Tensor,
-    sides: tuple[Light, Light],
-    share: float,
-    chance: Chance,
-) -> Iterator[Exit]:
-    """Every order of the rays (3, N) until it is too faint, and what light it meets behind or in front."""
-    stack = surfaces(glass, direction)
-    behind, front = sides
-    ones = torch.ones_like(direction)
-    waiting = [_Path(origin, direction, ones, ones, 0, True, 0, False)]
+def follow(glass: Glazing, rays: Rays, behind: Light, front: Light, chance: Chance) -> Iterator[Exit]:
+    """Every order of the rays until it is too faint, and what light it meets behind or in front."""
+    stack = surfaces(glass, rays.direction)
+    ones = torch.ones_like(rays.direction)
+    waiting = [_Path(rays.origin, rays.direction, ones, ones, 0, True, 0, False)]
     while waiting:
         path = waiting.pop()
         for following, meeting in _meet(path, stack, chance):
@@ -97,7 +89,7 @@ def follow(
                     waiting.append(following)
                 continue
             is_behind = following.surface > 0
-            light = _arriving(following, meeting, behind if is_behind else front, share, chance)
+            light = _arriving(following, meeting, behind if is_behind else front, rays.share, chance)
             in_paper = following.reflections == 0 if is_behind else not following.entered_last
             yield Exit(is_behind, in_paper, light)
 
@@ -119,7 +111,6 @@ class _Meeting:
     reflects: bool
     before: _Path
     """The path as it arrives, with the weights it has there."""
-    point: Tensor
 
 
 def _meet(path: _Path, stack: list[Surface], chance: Chance) -> Iterator[tuple[_Path, _Meeting]]:
@@ -135,25 +126,24 @@ def _meet(path: _Path, stack: list[Surface], chance: Chance) -> Iterator[tuple[_
     facet = visible_facet(towards, normal, surface.alpha, chance.pair()) if surface.alpha else normal
     here, beyond = (surface.index, 1.0) if in_glass else (1.0, surface.index)
     for reflects in (True, False):
-        meeting = _Meeting(towards, normal, surface.alpha, here, beyond, reflects, before, point)
+        meeting = _Meeting(towards, normal, surface.alpha, here, beyond, reflects, before)
         direction = _turned(meeting, facet)
-        share_s, share_p = _shares(meeting, facet, direction)
-        yield _onward(path, before, direction, (share_s, share_p), reflects, len(stack)), meeting
+        shares = _shares(meeting, facet, direction)
+        yield _onward(meeting, direction, shares, last=path.surface == len(stack) - 2), meeting
 
 
-def _onward(
-    path: _Path, before: _Path, direction: Tensor, shares: tuple[Tensor, Tensor], reflects: bool, count: int
-) -> _Path:
-    down = path.down != reflects
+def _onward(meeting: _Meeting, direction: Tensor, shares: tuple[Tensor, Tensor], *, last: bool) -> _Path:
+    """The path that leaves a surface; `last` says that the surface is the last pane's first."""
+    before, down = meeting.before, meeting.before.down != meeting.reflects
     return _Path(
         before.origin,
         direction,
         before.s * shares[0],
         before.p * shares[1],
-        path.surface + (1 if down else -1),
+        before.surface + (1 if down else -1),
         down,
-        path.reflections + reflects,
-        path.entered_last or (path.surface == count - 2 and down and not reflects),
+        before.reflections + meeting.reflects,
+        before.entered_last or (last and before.down and not meeting.reflects),
     )
 
 
@@ -204,7 +194,6 @@ def _arriving(path: _Path, meeting: _Meeting, light: Light, share: float, chance
     s, p = _shares(meeting, facet, direction)
     other = _density(meeting, direction) / (density + _density(meeting, direction)).clamp(min=1e-20)
     weight_drawn = (meeting.before.s * s + meeting.before.p * p) / 2 * other
-    # Where the balance divides by both densities, the facet's own cancels the one in its weight.
     return weight * seen * balance + weight_drawn * light.along(path.origin, direction, share)
 
 
