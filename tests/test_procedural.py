@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from brewster.light import REC709_LUMINANCE
+from brewster.worlds import procedural
 from brewster.worlds.procedural import WORLDS, painting
 from brewster.worlds.surfaces import Canvas, Glow, Quad, World, directions, fractal, render, vector
 
@@ -21,13 +22,22 @@ def solid_angles(height):
 
 
 @pytest.fixture(scope="module")
-def maps():
-    return {name: WORLDS[name](7, 64) for name in NAMES}
+def both_maps():
+    """Each world built once, which takes a second, and shown at two heights."""
+    heights = 64, 128
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(procedural, "render", lambda world, _height: [render(world, each) for each in heights])
+        return {name: WORLDS[name](7, 0) for name in NAMES}
 
 
 @pytest.fixture(scope="module")
-def fine_maps():
-    return {name: WORLDS[name](7, 128) for name in NAMES}
+def maps(both_maps):
+    return {name: coarse for name, (coarse, _) in both_maps.items()}
+
+
+@pytest.fixture(scope="module")
+def fine_maps(both_maps):
+    return {name: fine for name, (_, fine) in both_maps.items()}
 
 
 def test_the_worlds_are_the_three_that_recipes_name():

@@ -24,9 +24,9 @@ from brewster.render.rays.stack import (
 from brewster.scene.glass import Glazing, Pane
 from worlds_of_one import WORLDS, a_scene, at, board
 
-some = settings(max_examples=60, deadline=None, database=None)
+some = settings(max_examples=40, deadline=None, database=None)
 COSINES = st.floats(0.05, 1)
-INDICES = st.floats(1, 2.5)
+INDICES = st.floats(1, 2)
 TINTS = st.tuples(*[st.floats(0, 100)] * 3)
 PANES = st.lists(
     st.builds(Pane, index=INDICES, thickness_mm=st.floats(1, 50), absorption_per_m=TINTS),
@@ -36,6 +36,7 @@ PANES = st.lists(
 
 
 def glazing(panes):
+    panes = list(panes)
     return Glazing(panes=tuple(panes), gap_mm=10.0 if len(panes) > 1 else 0.0)
 
 
@@ -152,7 +153,7 @@ def table_of(panes, cosine):
 
 
 @some
-@given(PANES.filter(lambda panes: len(panes) < 3), st.floats(0.2, 1))
+@given(PANES.filter(lambda panes: len(panes) < 3), st.floats(0.4, 1))
 def test_the_orders_shares_sum_to_the_closed_form(panes, cosine):
     table = table_of(panes, cosine)
     shares = order_shares(glazing(panes), exact(cosine), table)
@@ -164,7 +165,7 @@ def test_the_orders_shares_sum_to_the_closed_form(panes, cosine):
             mine = sum(
                 s for s, order in zip(shares, table, strict=True) if order.behind == behind and kept(order)
             )
-            torch.testing.assert_close(mine + torch.zeros_like(whole), whole, rtol=0, atol=3e-3)
+            assert float((mine - whole).abs().max()) < 3e-3
     assert all((share >= -1e-9).all() for share in shares)
 
 
@@ -238,27 +239,30 @@ def test_traversals_go_by_snells_angle_in_glass_and_straight_on_in_the_gap():
 
 
 def line_mirrored(incidence_deg, thickness_mm):
-    """Light by column of a line before the glass, mirrored to the middle; a pixel's size in mm there."""
-    before, away = 600.0, 400.0
-    slant = math.radians(incidence_deg)
-    camera = at(incidence_deg, distance_mm=before, fov_deg=2, width=48, height=16)
-    line = board("line", distance_mm=away, width_mm=64, offset_mm=(away * math.tan(slant), 0))
+    """Light by column of a thin line before the glass, mirrored in the middle; a pixel's size in mm there."""
+    before, away, slant = 600.0, 400.0, math.radians(incidence_deg)
+    camera = at(incidence_deg, distance_mm=before / math.cos(slant), fov_deg=0.6, width=48, height=16)
+    line = board(
+        "line",
+        distance_mm=away,
+        width_mm=20 / math.cos(slant),
+        offset_mm=(away * math.tan(slant) + 10 / 64 / math.cos(slant), 0),
+    )
     scene = a_scene(camera=camera, panes=[{"thickness_mm": thickness_mm}], front=line, samples=25)
-    reflection = render(scene, WORLDS).reflection
-    return reflection.mean((0, 1)).numpy(), scene.camera.pixel_rad * (before + away / math.cos(slant))
+    columns = render(scene, WORLDS).reflection.mean((0, 1)).numpy()
+    return columns, scene.camera.pixel_rad * (before + away) / math.cos(slant)
 
 
-@pytest.mark.parametrize(("incidence_deg", "thickness_mm"), [(20, 25), (45, 14), (60, 18), (70, 30)])
+@pytest.mark.parametrize(("incidence_deg", "thickness_mm"), [(20, 6), (45, 4), (60, 5), (70, 9)])
 def test_a_line_near_the_glass_is_mirrored_twice_as_far_apart_as_the_formula_says(incidence_deg, thickness_mm):
     columns, pixel_mm = line_mirrored(incidence_deg, thickness_mm)
     apart = ghost_distance_mm(Pane(thickness_mm=thickness_mm), incidence_deg) / pixel_mm
-    assert apart > 5
+    assert 7 < apart < 20
     places = np.arange(48) + 0.5
-    main = np.abs(places - 24) < apart / 2
-    side = -1 if columns[places < 24 - apart / 2].sum() > columns[places > 24 + apart / 2].sum() else 1
-    ghost = np.abs(places - 24 - side * apart) < apart / 2
+    main, ghost = (np.abs(places - place) < apart / 2 for place in (24, 24 - apart))
     found, other = (np.average(places[mine], weights=columns[mine]) for mine in (main, ghost))
-    assert abs(other - found) == pytest.approx(apart, rel=0.02)
+    assert found == pytest.approx(24, abs=0.1)
+    assert found - other == pytest.approx(apart, rel=0.02)
     r_s, r_p = surface(math.cos(math.radians(incidence_deg)), 1, 1.5)
     fainter = (r_s * (1 - r_s) ** 2 + r_p * (1 - r_p) ** 2) / (r_s + r_p)
-    assert columns[ghost].sum() / columns[main].sum() == pytest.approx(fainter, rel=0.02)
+    assert columns[ghost].sum() / columns[main].sum() == pytest.approx(fainter, rel=0.03)

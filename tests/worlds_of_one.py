@@ -15,7 +15,7 @@ class Worlds:
     """Assets without files: pictures (H, W, 3) by the names of their sources."""
 
     def __init__(self, **pictures):
-        self.pictures = pictures
+        self.pictures = {"white": np.ones((16, 32, 3), np.float32), **pictures}
 
     def map_light(self, lit):
         return self.pictures[lit.source.file] * np.float32(lit.luminance)
@@ -55,7 +55,6 @@ def bright(shape, where):
 
 
 WORLDS = Worlds(
-    white=np.ones((16, 32, 3), np.float32),
     soft=soft(64),
     mottled=np.random.default_rng(3).random((16, 32, 3), np.float32),
     right=bright((32, 64), np.s_[:, 32:]),

@@ -59,8 +59,10 @@ def _read(folders: Sequence[Path], refused: list[BrewsterError], *, are_maps: bo
     for folder in folders:
         categories = _categories(folder)
         for path in _files(folder, are_maps):
+            if path.name in found:
+                continue
             try:
-                found.setdefault(path.name, _asset(path, categories.get(path.name, ""), are_maps))
+                found[path.name] = _asset(path, categories.get(path.name, ""), are_maps)
             except BrewsterError as error:
                 refused.append(error)
     if not found:

@@ -37,7 +37,7 @@ class Lamps:
 
     def __call__(self, points: Floats, normal: Floats) -> Floats:
         """Light (h, w, 3) on points of a surface: irradiance / pi."""
-        light = np.zeros_like(points) + self.ambient * (0.8 + 0.2 * normal[1])
+        light: Floats = np.zeros_like(points) + self.ambient * (0.8 + 0.2 * normal[1])
         middle, span = (points[0, 0] + points[-1, -1]) / 2, np.linalg.norm(points[0, 0] - points[-1, -1]) / 2
         for lamp in self.lamps:
             if np.linalg.norm(lamp.position - middle) > span + 30:
@@ -48,8 +48,7 @@ class Lamps:
             if lamp.facing is not None:
                 weight *= np.clip(-(way @ lamp.facing), 0, None) / np.sqrt(squared)
             light += weight[..., None] * lamp.intensity
-        unshaded: Floats = light
-        return unshaded * self.shade(points, normal)
+        return light * self.shade(points, normal)
 
     def shade(self, points: Floats, normal: Floats) -> Floats:
         """What the contacts leave (h, w, 1) of the light on a floor; all of it elsewhere."""

@@ -1,0 +1,321 @@
+import hashlib
+import io
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from brewster.errors import PhotoError, RecipeError, UnreadablePhoto, UnsupportedPhoto
+from brewster.light import REC709_LUMINANCE, to_linear
+from brewster.photo import Photo
+from brewster.scene.world import Map, Plane, Source
+from brewster.worlds import assets as worlds
+from brewster.worlds.assets import Assets
+from picture_files import file_of, smooth
+
+HEIGHT, WIDTH = 32, 64
+
+
+def luminance(light):
+    return light @ np.array(REC709_LUMINANCE, np.float32)
+
+
+def sphere_mean(values):
+    share = np.sin((np.arange(len(values)) + 0.5) * np.pi / len(values))
+    return (values.mean(axis=1) * share).sum() / share.sum()
+
+
+def sky(random):
+    """A map without lamps: (32, 64, 3), nothing brighter than a few times the mean, one texel the brightest."""
+    texels = random.uniform(0.2, 1.8, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    texels[8, 9] = 3
+    return texels
+
+
+def hdr_of(texels):
+    return Photo.from_array(texels, encoding="linear").encode("hdr")
+
+
+def exr_of(texels):
+    file = io.BytesIO()
+    channels = {name: np.ascontiguousarray(texels[..., i]) for i, name in enumerate("RGB")}
+    OpenEXR.File({"type": OpenEXR.scanlineimage}, channels).write(file)
+    return file.getvalue()
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "maps").mkdir()
+    return tmp_path / "maps"
+
+
+def map_light(folder, name, data, **values):
+    (folder / name).write_bytes(data)
+    return Assets([folder]).map_light(Map(source=Source(file=name), **values))
+
+
+def plane_light(folder, name, data, **values):
+    (folder / name).write_bytes(data)
+    plane = Plane(source=Source(file=name), distance_mm=1000, width_mm=1000, **values)
+    return Assets([folder]).plane_light(plane)
+
+
+def refused(error, name, *words):
+    """The error of this call is a sentence of three beats that names the file."""
+    told = str(error.value)
+    assert name in told
+    assert told.count("; ") >= 2
+    assert all(word in told for word in words), told
+
+
+# --- maps
+
+
+def test_a_map_has_the_mean_luminance_that_the_scene_says(folder, random):
+    texels = sky(random)
+    light = map_light(folder, "sky.exr", exr_of(texels * 37), luminance=2.5)
+    assert light.dtype == np.float32
+    assert sphere_mean(luminance(light)) == pytest.approx(2.5, rel=1e-4)
+    np.testing.assert_allclose(light / light.mean(), texels / texels.mean(), rtol=1e-4)
+
+
+def test_lamps_are_left_out_of_the_mean_but_not_of_the_light(folder, random):
+    texels = sky(random)
+    plain = map_light(folder, "plain.exr", exr_of(texels))
+    texels[20, 30] = 1e5
+    lit = map_light(folder, "lamp.exr", exr_of(texels))
+    # The lamp brings the cap of ten means, not its light, to the mean: one texel of 2048, at most.
+    wide = sphere_mean(luminance(lit))
+    assert wide > 10
+    mean = sphere_mean(np.minimum(luminance(texels), 10 * sphere_mean(luminance(texels))))
+    np.testing.assert_allclose(lit, texels / mean, rtol=1e-4)
+    assert lit[20, 30, 0] > 1e4
+    assert np.median(lit / plain) < 1.01
+
+
+def test_light_below_zero_is_none(folder, random):
+    texels = sky(random)
+    texels[3, 4] = -5
+    light = map_light(folder, "gamut.exr", exr_of(texels))
+    assert light.min() == 0
+    assert not light[3, 4].any()
+
+
+def test_builtin_maps_need_no_folder(monkeypatch, random):
+    asked = []
+    monkeypatch.setitem(
+        worlds.WORLDS, "street", lambda seed, height: asked.append((seed, height)) or sky(random)
+    )
+    light = Assets().map_light(Map(source=Source(file="builtin:street:7"), luminance=3))
+    assert sphere_mean(luminance(light)) == pytest.approx(3, rel=1e-4)
+    assert asked == [(7, worlds.BUILTIN_HEIGHT)]
+
+
+@pytest.mark.parametrize(
+    "name", ["builtin:beach:1", "builtin:street", "builtin:street:-1", "builtin:painting:1"]
+)
+def test_maps_that_are_not_built_in_are_refused(name):
+    with pytest.raises(RecipeError, match="is not built in") as error:
+        Assets().map_light(Map(source=Source(file=name)))
+    refused(error, name, "street, room, night")
+
+
+# --- files that cannot be used
+
+
+def test_a_missing_file_is_named_with_the_folders_that_were_searched(folder):
+    with pytest.raises(RecipeError, match="was not found") as error:
+        Assets([folder]).map_light(Map(source=Source(file="gone.hdr")))
+    refused(error, "gone.hdr", str(folder), "--maps")
+    with pytest.raises(RecipeError, match="no folder"):
+        Assets().map_light(Map(source=Source(file="gone.hdr")))
+
+
+def test_another_file_of_the_same_name_is_refused(folder, random):
+    data = hdr_of(sky(random))
+    (folder / "sky.hdr").write_bytes(data)
+    right, wrong = hashlib.sha256(data).hexdigest(), hashlib.sha256(b"").hexdigest()
+    assets = Assets([folder])
+    assets.map_light(Map(source=Source(file="sky.hdr", sha256=right)))
+    with pytest.raises(RecipeError, match="not the file that the scene was drawn with") as error:
+        assets.map_light(Map(source=Source(file="sky.hdr", sha256=wrong)))  # not even from memory
+    refused(error, str(folder / "sky.hdr"), wrong)
+
+
+def test_the_folder_with_the_right_file_is_found(tmp_path, folder, random):
+    first, second = (hdr_of(sky(random)) for _ in range(2))
+    (tmp_path / "sky.hdr").write_bytes(first)
+    (folder / "sky.hdr").write_bytes(second)
+    assets = Assets([tmp_path, folder])
+    lights = [
+        assets.map_light(Map(source=Source(file="sky.hdr", sha256=sha256)))
+        for sha256 in (hashlib.sha256(first).hexdigest(), hashlib.sha256(second).hexdigest(), "")
+    ]
+    assert not np.array_equal(lights[0], lights[1])
+    assert np.array_equal(lights[0], lights[2])
+
+
+def test_a_file_that_cannot_be_read_is_named(folder, random, monkeypatch):
+    def refuse(_path):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(type(folder), "read_bytes", refuse)
+    (folder / "sky.hdr").write_text("")
+    with pytest.raises(RecipeError, match="Permission denied") as error:
+        Assets([folder]).map_light(Map(source=Source(file="sky.hdr")))
+    refused(error, "sky.hdr")
+
+
+@pytest.mark.parametrize("kind", [hdr_of, exr_of])
+def test_a_map_that_is_not_twice_as_wide_as_high_is_refused(folder, random, kind):
+    with pytest.raises(UnsupportedPhoto, match="60 x 32") as error:
+        map_light(folder, "narrow.hdr", kind(sky(random)[:, :60]))
+    refused(error, "narrow.hdr", "twice as wide")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_texels_that_are_no_numbers_are_refused(folder, random, value):
+    texels = sky(random)
+    texels[5, 6, 1] = value
+    with pytest.raises(UnsupportedPhoto, match="not a number") as error:
+        map_light(folder, "broken.exr", exr_of(texels))
+    refused(error, "broken.exr")
+
+
+def test_a_black_map_is_refused(folder):
+    with pytest.raises(UnsupportedPhoto, match="black") as error:
+        map_light(folder, "night.hdr", hdr_of(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
+    refused(error, "night.hdr")
+
+
+def test_an_ordinary_photo_saved_as_a_map_is_refused(folder, random):
+    """Its sky is white as paper: a true map has one sun, not a tenth of its texels at one value."""
+    encoded = (sky(random) / 2).clip(0, 1)
+    encoded[:4] = 1
+    with pytest.raises(UnsupportedPhoto, match="clipped") as error:
+        map_light(folder, "photo.hdr", hdr_of(to_linear(encoded)))
+    refused(error, "photo.hdr", "use it as a photo")
+
+
+def test_a_map_with_one_sun_is_not_clipped(folder, random):
+    texels = sky(random)
+    texels[10, 10:12] = 5000
+    assert map_light(folder, "sun.hdr", hdr_of(texels)).max() > 1000
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "header", "other"])
+def test_a_corrupt_map_is_refused_by_name(folder, random, damage):
+    data = hdr_of(sky(random))
+    bad = {"empty": b"", "cut": data[:-900], "header": data.replace(b"-Y", b"?Y"), "other": b"<html>"}[damage]
+    with pytest.raises(PhotoError) as error:
+        map_light(folder, "bad.hdr", bad)
+    refused(error, "bad.hdr")
+
+
+def test_an_exr_that_ends_early_is_refused_by_name(folder, random):
+    with pytest.raises(UnreadablePhoto) as error:
+        map_light(folder, "bad.exr", exr_of(sky(random))[:-900])
+    refused(error, "bad.exr")
+
+
+# --- pictures
+
+
+def test_a_picture_has_the_mean_luminance_that_the_scene_says(folder):
+    light = plane_light(folder, "a.png", file_of(smooth(), "PNG"), luminance=4)
+    assert light.shape == (48, 64, 3)
+    assert light.dtype == np.float32
+    assert luminance(light).mean() == pytest.approx(4, rel=2e-3)
+    linear = to_linear(smooth() / 255)
+    np.testing.assert_allclose(light / light.mean(), linear / linear.mean(), rtol=1e-3, atol=1e-4)
+
+
+def test_highlights_raise_whites_and_nothing_else(folder):
+    picture = smooth() // 2 + 40
+    picture[:6, :6] = 255
+    data = file_of(picture, "PNG")
+    plain = plane_light(folder, "a.png", data)
+    raised = plane_light(folder, "a.png", data, highlights=9)
+    factor = raised / plain
+    np.testing.assert_allclose(factor[:6, :6], 10, rtol=1e-5)
+    np.testing.assert_allclose(factor[6:], 1, rtol=1e-6)
+    np.testing.assert_allclose(factor[:6, 6:], 1, rtol=1e-6)
+
+
+def test_near_whites_are_raised_less_than_whites_and_keep_their_hue(folder):
+    greys = np.linspace(150, 255, 64).astype(np.uint8)
+    picture = np.broadcast_to(greys[:, None] * np.array([1, 0.9, 0.5]), (16, 64, 3)).astype(np.uint8)
+    data = file_of(picture, "PNG")
+    factor = plane_light(folder, "a.png", data, highlights=5) / plane_light(folder, "a.png", data)
+    np.testing.assert_allclose(factor, np.broadcast_to(factor[..., :1], factor.shape), rtol=1e-5)
+    assert (np.diff(factor[0, :, 0]) >= -1e-6).all()
+    assert factor[0, 0, 0] == pytest.approx(1)
+    assert factor[0, -1, 0] == pytest.approx(6, rel=1e-5)
+
+
+def test_a_black_picture_is_dark_and_finite(folder):
+    light = plane_light(folder, "a.png", file_of(np.zeros((8, 8, 3), np.uint8), "PNG"), highlights=3)
+    assert not light.any()
+
+
+@pytest.mark.parametrize(("data", "error"), [(b"", UnreadablePhoto), (b"<html>", UnreadablePhoto)])
+def test_a_picture_that_is_none_is_refused_by_name(folder, data, error):
+    with pytest.raises(error) as caught:
+        plane_light(folder, "photo.jpg", data)
+    refused(caught, "photo.jpg")
+
+
+def test_a_picture_whose_pixels_are_missing_is_refused_by_name(folder):
+    data = file_of(smooth(), "JPEG")
+    with pytest.raises(UnreadablePhoto) as caught:
+        plane_light(folder, "photo.jpg", data[: len(data) // 2])
+    refused(caught, "photo.jpg")
+
+
+def test_builtin_paintings_and_no_others():
+    def plane(name):
+        return Plane(source=Source(file=name), distance_mm=1, width_mm=1)
+
+    assert Assets().plane_light(plane("builtin:painting:3")).shape == (512, 768, 3)
+    with pytest.raises(RecipeError, match="is not built in") as error:
+        Assets().plane_light(plane("builtin:street:3"))
+    refused(error, "builtin:street:3", "painting")
+
+
+# --- memory
+
+
+def test_what_was_used_last_is_kept_and_memory_is_bounded(folder, random, monkeypatch):
+    one = sky(random).nbytes
+    monkeypatch.setattr(worlds, "_KEPT_BYTES", 2 * one)
+    opened = []
+    monkeypatch.setattr(Photo, "open", classmethod(lambda _cls, data: opened.append(data) or _original(data)))
+    for name in "abc":
+        (folder / f"{name}.hdr").write_bytes(hdr_of(sky(random)))
+    assets = Assets([folder])
+
+    def read(name):
+        before = len(opened)
+        assets.map_light(Map(source=Source(file=f"{name}.hdr")))
+        return len(opened) - before
+
+    assert [read(name) for name in "ababacacb"] == [1, 1, 0, 0, 0, 1, 0, 0, 1]
+
+
+def test_a_map_larger_than_the_bound_is_kept_alone(folder, random, monkeypatch):
+    monkeypatch.setattr(worlds, "_KEPT_BYTES", 10)
+    (folder / "a.hdr").write_bytes(hdr_of(sky(random)))
+    assets = Assets([folder])
+    first = assets.map_light(Map(source=Source(file="a.hdr")))
+    (folder / "a.hdr").unlink()
+    assert np.array_equal(assets.map_light(Map(source=Source(file="a.hdr"))), first)
+
+
+def test_the_scene_s_luminance_does_not_change_what_is_kept(folder, random):
+    (folder / "a.hdr").write_bytes(hdr_of(sky(random)))
+    assets = Assets([folder])
+    bright, dim = (assets.map_light(Map(source=Source(file="a.hdr"), luminance=value)) for value in (8, 0.5))
+    np.testing.assert_allclose(bright, 16 * dim, rtol=1e-6)
+
+
+_original = Photo.open

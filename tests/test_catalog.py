@@ -1,0 +1,226 @@
+import hashlib
+import io
+from pathlib import Path
+
+import numpy as np
+import pillow_heif
+import pytest
+from PIL import Image
+
+from brewster.errors import PhotoTooLarge, RecipeError, UnreadablePhoto, UnsupportedPhoto
+from brewster.photo import Photo, read_size
+from brewster.photo import decode as decoding
+from brewster.scene.sampler import Catalog
+from brewster.worlds.catalog import BUILTIN_CATALOG, read_catalog
+from picture_files import exif_block, file_of, smooth
+
+KINDS = ["JPEG", "PNG", "TIFF", "WEBP", "AVIF", "GIF"]
+
+
+def sky(random, height=16, width=32):
+    texels = random.uniform(0.2, 1.8, (height, width, 3)).astype(np.float32)
+    texels[3, 4] = 5  # its sun: a map's highest value is no texel's but one's
+    return Photo.from_array(texels, encoding="linear").encode("hdr")
+
+
+@pytest.fixture
+def maps(tmp_path, random):
+    folder = tmp_path / "maps"
+    folder.mkdir()
+    for name in ("b.hdr", "a.hdr", "c.HDR"):
+        (folder / name).write_bytes(sky(random))
+    return folder
+
+
+@pytest.fixture
+def photos(tmp_path):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    (folder / "wide.jpg").write_bytes(file_of(smooth(), "JPEG"))
+    (folder / "turned.jpg").write_bytes(file_of(smooth(), "JPEG", exif=exif_block(6)))
+    (folder / "note.txt").write_text("no picture")
+    return folder
+
+
+# --- catalogs
+
+
+def test_without_folders_everything_is_built_in():
+    catalog, refused = read_catalog([], [])
+    assert catalog == BUILTIN_CATALOG
+    assert not refused
+    assert {asset.category for asset in catalog.maps} == {"outdoor", "indoor", "night"}
+    assert all(asset.source.file.startswith("builtin:") for asset in (*catalog.maps, *catalog.pictures))
+    assert all(asset.width == 2 * asset.height for asset in catalog.maps)
+
+
+def test_a_folder_takes_the_place_of_what_is_built_in(maps, photos):
+    catalog, refused = read_catalog([maps], [])
+    assert [asset.source.file for asset in catalog.maps] == ["a.hdr", "b.hdr", "c.HDR"]
+    assert catalog.pictures == BUILTIN_CATALOG.pictures
+    catalog, more = read_catalog([], [photos])
+    assert catalog.maps == BUILTIN_CATALOG.maps
+    assert [asset.source.file for asset in catalog.pictures] == ["turned.jpg", "wide.jpg"]
+    assert not refused + more
+
+
+def test_an_asset_has_the_size_upright_and_the_sha256_of_its_file(maps, photos):
+    catalog, _ = read_catalog([maps], [photos])
+    assert {(asset.width, asset.height) for asset in catalog.maps} == {(32, 16)}
+    assert [(asset.width, asset.height) for asset in catalog.pictures] == [(48, 64), (64, 48)]
+    for folder, assets in ((maps, catalog.maps), (photos, catalog.pictures)):
+        for asset in assets:
+            data = (folder / asset.source.file).read_bytes()
+            assert asset.source.sha256 == hashlib.sha256(data).hexdigest()
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])  # spreadsheets write the second
+def test_a_manifest_tells_categories(maps, encoding):
+    rows = "file,licence,category\na.hdr,CC0,indoor\nc.HDR,CC0,\nelsewhere.hdr,CC0,night\n"
+    (maps / "manifest.csv").write_text(rows, encoding=encoding)
+    catalog, _ = read_catalog([maps], [])
+    assert [asset.category for asset in catalog.maps] == ["indoor", "", ""]
+
+
+def test_a_manifest_without_categories_tells_none(maps):
+    (maps / "manifest.csv").write_text("name\na.hdr\n")
+    assert {asset.category for asset in read_catalog([maps], [])[0].maps} == {""}
+
+
+def test_a_manifest_that_is_no_text_is_an_error(maps):
+    (maps / "manifest.csv").write_bytes(b"file,category\na.hdr,caf\xe9\n")
+    with pytest.raises(RecipeError, match=r"manifest\.csv cannot be read .*; .*; "):
+        read_catalog([maps], [])
+
+
+@pytest.mark.parametrize("are_maps", [True, False])
+def test_an_empty_folder_is_an_error(tmp_path, are_maps):
+    (tmp_path / ".hidden.jpg").write_bytes(file_of(smooth(), "JPEG"))
+    (tmp_path / ".hidden.hdr").write_bytes(b"")
+    folders = ([tmp_path], []) if are_maps else ([], [tmp_path])
+    with pytest.raises(RecipeError, match=f"no {'maps' if are_maps else 'photos'} in .*; .*; ") as error:
+        read_catalog(*folders)
+    assert str(tmp_path) in str(error.value)
+
+
+def test_maps_are_no_photos_nor_photos_maps(maps, photos):
+    with pytest.raises(RecipeError, match="no maps in"):
+        read_catalog([photos], [])
+    with pytest.raises(RecipeError, match="no photos in"):
+        read_catalog([], [maps])
+
+
+def test_a_missing_folder_is_an_error(tmp_path):
+    with pytest.raises(RecipeError, match="gone cannot be read"):
+        read_catalog([tmp_path / "gone"], [])
+
+
+def test_what_cannot_be_used_is_left_out_and_named(maps, photos, random):
+    whole = sky(random)
+    (maps / "cut.hdr").write_bytes(whole[:-100])
+    (maps / "square.hdr").write_bytes(sky(random, 16, 16))
+    (photos / "empty.jpg").write_bytes(b"")
+    (photos / "page.png").write_bytes(b"<html>")
+    (photos / "folder.webp").mkdir()
+    catalog, refused = read_catalog([maps], [photos])
+    assert [asset.source.file for asset in catalog.maps] == ["a.hdr", "b.hdr", "c.HDR"]
+    assert [asset.source.file for asset in catalog.pictures] == ["turned.jpg", "wide.jpg"]
+    paths = [
+        *(maps / name for name in ("cut.hdr", "square.hdr")),
+        *(photos / name for name in ("empty.jpg", "folder.webp", "page.png")),
+    ]
+    for path, error in zip(paths, refused, strict=True):
+        assert str(path) in str(error)
+        assert str(error).count("; ") >= 2
+
+
+def test_a_folder_of_nothing_usable_tells_why(tmp_path):
+    (tmp_path / "bad.hdr").write_bytes(b"")
+    with pytest.raises(RecipeError, match=r"no maps in .*bad\.hdr: the file is empty"):
+        read_catalog([tmp_path], [])
+
+
+def test_the_order_of_the_file_system_does_not_matter(maps, photos, monkeypatch):
+    (maps / "bad.hdr").write_bytes(b"")
+    (maps / "worse.hdr").write_bytes(b"")
+    entries = Path.iterdir
+    found = []
+    for backwards in (False, True):
+        listed = lambda folder, backwards=backwards: iter(sorted(entries(folder), reverse=backwards))  # noqa: E731
+        monkeypatch.setattr(Path, "iterdir", listed)
+        catalog, refused = read_catalog([maps], [photos])
+        found.append((catalog, [str(error) for error in refused]))
+    assert found[0] == found[1]
+
+
+def test_of_two_files_of_one_name_the_first_folder_s_counts(maps, tmp_path, random):
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "a.hdr").write_bytes(sky(random, 32, 64))
+    (other / "d.hdr").write_bytes(sky(random, 32, 64))
+    widths = {
+        folders: [asset.width for asset in read_catalog(folders, [])[0].maps]
+        for folders in ((maps, other), (other, maps))
+    }
+    assert widths == {(maps, other): [32, 32, 32, 64], (other, maps): [64, 32, 32, 64]}
+
+
+def test_no_pixel_of_a_photo_is_decoded(photos, monkeypatch):
+    data = (photos / "wide.jpg").read_bytes()
+    (photos / "cut.jpg").write_bytes(data[:-100])
+    monkeypatch.setattr(decoding, "decode", lambda *_: pytest.fail("a photo was decoded"))
+    catalog, refused = read_catalog([], [photos])
+    assert isinstance(catalog, Catalog)
+    assert [asset.source.file for asset in catalog.pictures] == ["cut.jpg", "turned.jpg", "wide.jpg"]
+    assert not refused
+
+
+# --- the size of a picture
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_size_is_that_of_the_upright_picture(kind, orientation):
+    options = {} if kind == "GIF" else {"exif": exif_block(orientation)}
+    data = file_of(smooth(), kind, **options)
+    assert read_size(data) == Photo.open(data).size
+    if kind == "JPEG":
+        assert read_size(data) == ((48, 64) if orientation > 4 else (64, 48))
+
+
+@pytest.mark.parametrize("container", ["exr", "hdr"])
+def test_the_size_of_a_picture_of_floats(container):
+    assert read_size(Photo.from_array(smooth(), encoding="srgb").encode(container)) == (64, 48)
+
+
+def test_the_size_of_a_heic():
+    file = io.BytesIO()
+    heif = pillow_heif.from_pillow(Image.fromarray(smooth()))
+    heif.info["exif"] = exif_block(6)
+    heif.save(file)
+    assert read_size(file.getvalue()) == Photo.open(file.getvalue()).size
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF", "WEBP"])
+def test_a_size_needs_the_header_only(kind):
+    data = file_of(np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8), kind)
+    part = data if kind in ("TIFF", "WEBP") else data[: len(data) * 9 // 10]  # these two need their end
+    assert read_size(part) == (64, 48)
+    with pytest.raises(UnreadablePhoto):
+        read_size(data[:9])
+
+
+def test_what_the_header_refuses_has_no_size(monkeypatch):
+    frames = [Image.fromarray(smooth()), Image.fromarray(smooth() // 2)]
+    file = io.BytesIO()
+    frames[0].save(file, "GIF", save_all=True, append_images=frames[1:])
+    cmyk = io.BytesIO()
+    Image.new("CMYK", (8, 8)).save(cmyk, "JPEG")
+    for data, word in ((file.getvalue(), "animation"), (cmyk.getvalue(), "CMYK")):
+        with pytest.raises(UnsupportedPhoto, match=word):
+            read_size(data)
+    monkeypatch.setattr(decoding, "DEFAULT_MAX_PIXELS", 1000)
+    with pytest.raises(PhotoTooLarge, match="64 x 48"):
+        read_size(file_of(smooth(), "PNG"))
+    with pytest.raises(UnreadablePhoto, match="empty"):
+        read_size(b"")
