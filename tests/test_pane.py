@@ -39,7 +39,10 @@ def test_the_photo_is_the_sum_of_its_two_layers(scene):
     assert all(layer.shape == (3, 16, 16) and layer.dtype == torch.float32 for layer in layers)
     assert all(torch.isfinite(layer).all() and (layer >= 0).all() for layer in layers)
     torch.testing.assert_close(
-        sample.transmission + sample.reflection, sample.photo, rtol=1e-6, atol=1e-7 * float(sample.photo.max())
+        sample.transmission + sample.reflection,
+        sample.photo,
+        rtol=1e-6,
+        atol=1e-7 * float(sample.photo.max()),
     )
 
 
@@ -183,8 +186,8 @@ def test_the_bright_right_of_a_map_is_on_the_right_and_its_top_on_top():
     right, top = (
         render(a_scene(behind=around(name, heading_deg=180)), WORLDS).background for name in ("right", "top")
     )
-    assert right[:, :, 13:].min() == top[:, :11].min() == 1
-    assert right[:, :, :11].max() == top[:, 13:].max() == 0
+    assert right[:, :, 15:].min() == top[:, :9].min() == 1
+    assert right[:, :, :9].max() == top[:, 15:].max() == 0
 
 
 @pytest.mark.parametrize("heading_deg", [0, 90, -120])
@@ -220,8 +223,8 @@ def test_a_picture_before_the_glass_is_mirrored_and_one_behind_is_not():
 def test_a_map_before_the_glass_is_mirrored_too():
     right_of_who_looks_back = around("right", heading_deg=0)
     mirror = render(a_scene(front=right_of_who_looks_back), WORLDS).mirror
-    assert mirror[:, :, :11].min() == 1
-    assert mirror[:, :, 13:].max() == 0
+    assert mirror[:, :, :9].min() == 1
+    assert mirror[:, :, 15:].max() == 0
 
 
 PLACES = st.fixed_dictionaries(
@@ -250,10 +253,14 @@ def test_a_plane_is_where_pinhole_geometry_projects_it(drawn):
     """A small plane: its centroid, and for one that faces the glass its area, as a mirror image when in front."""
     heading, pitch = drawn["glass_deg"]
     axes = np.array(pane.axes(heading, pitch))
-    camera = at(heading + drawn["camera_deg"][0], pitch + drawn["camera_deg"][1], fov_deg=40, width=48, height=48)
+    camera = at(
+        heading + drawn["camera_deg"][0], pitch + drawn["camera_deg"][1], fov_deg=40, width=48, height=48
+    )
     position = np.array([30.0, -20.0, 70.0])
     camera["position_mm"] = tuple(np.array(camera["position_mm"]) + position)
-    bare = a_scene(camera=camera, glass=Glazing(heading_deg=heading, pitch_deg=pitch, position_mm=tuple(position)))
+    bare = a_scene(
+        camera=camera, glass=Glazing(heading_deg=heading, pitch_deg=pitch, position_mm=tuple(position))
+    )
     eye = axes @ (np.array(bare.camera.position_mm) - position)
     away = drawn["distance_mm"] + 4
     middle = axes @ looks(bare.camera)[23:25, 23:25].mean((0, 1))
@@ -261,7 +268,7 @@ def test_a_plane_is_where_pinhole_geometry_projects_it(drawn):
     offset = (eye + middle * reach)[:2] + np.array(drawn["offset"]) * reach * bare.camera.half_width
     plane = {
         "distance_mm": away,
-        "width_mm": reach * 0.15,
+        "width_mm": reach * 0.06,
         "offset_mm": tuple(offset),
         "heading_deg": drawn["turn_deg"][0],
         "pitch_deg": drawn["turn_deg"][1],
@@ -277,7 +284,9 @@ def test_a_plane_is_where_pinhole_geometry_projects_it(drawn):
 @pytest.mark.parametrize("is_behind", [True, False])
 def test_a_plane_is_as_large_as_pinhole_geometry_says(is_behind):
     which = "behind" if is_behind else "front"
-    scene = a_scene(**{which: board("wide", distance_mm=700, width_mm=310)}, camera={"width": 40, "height": 40})
+    scene = a_scene(
+        **{which: board("wide", distance_mm=700, width_mm=310)}, camera={"width": 40, "height": 40}
+    )
     sample = render(scene, Worlds(wide=np.ones((16, 32, 3), np.float32)))
     picture = sample.background if is_behind else sample.mirror
     width = 310 / 1200 / (2 * math.tan(math.radians(15))) * 40
@@ -287,15 +296,15 @@ def test_a_plane_is_as_large_as_pinhole_geometry_says(is_behind):
 # --- steadiness
 
 
-@pytest.mark.parametrize(("fov_deg", "samples"), [(20, 16), (45, 16), (70, 36)])
-def test_a_sun_of_one_texel_does_not_sparkle(fov_deg, samples):
-    """As the camera turns by tenths of a pixel, the picture keeps the sun's energy."""
-    light = Worlds(sun=sun(128, 64, 0))
+@pytest.mark.parametrize("texels", [0.5, 1, 1.3, 2])
+def test_a_sun_of_one_texel_does_not_sparkle(texels):
+    """As the camera turns by tenths of a pixel that spans this many texels, the picture keeps the sun's energy."""
+    light, fov_deg = Worlds(sun=sun(256, 128, 0)), 360 / 512 * texels * 32
     energies = []
     for tenth in range(10):
         turn = tenth / 10 * fov_deg / 32
         camera = at(turn, turn / 2, fov_deg=fov_deg, width=32, height=32)
-        sample = render(a_scene(camera=camera, behind=around("sun"), samples=samples), light)
+        sample = render(a_scene(camera=camera, behind=around("sun"), samples=36), light)
         energies.append(float(sample.background.sum()))
     assert max(energies) / min(energies) < 1.01
 
@@ -322,14 +331,15 @@ def test_it_does_not_matter_how_many_rays_are_worked_on_at_once(kind, monkeypatc
     monkeypatch.setattr(pane, "_STRIP", 100)
     strips = render(a_scene(**KINDS[kind], samples=4), WORLDS)
     for first, second in zip(whole.layers().values(), strips.layers().values(), strict=True):
-        torch.testing.assert_close(first, second, rtol=1e-5, atol=1e-4 if kind == "rough" else 1e-6)
+        if kind == "rough":  # which orders are worth following is decided by the mean of a strip
+            assert float(first.mean()) == pytest.approx(float(second.mean()), rel=2e-3)
+        else:
+            torch.testing.assert_close(first, second, rtol=1e-5, atol=1e-6)
 
 
 def test_another_index_is_other_chance_with_the_same_means():
     scene = a_scene(panes=[{"wedge_deg": 0.5}], behind=around("mottled"), samples=16)
-    one, other = (
-        render(scene.model_copy(update={"index": index}), WORLDS).background for index in (0, 1)
-    )
+    one, other = (render(scene.model_copy(update={"index": index}), WORLDS).background for index in (0, 1))
     assert not torch.equal(one, other)
     assert float(one.mean()) == pytest.approx(float(other.mean()), rel=2e-3)
 

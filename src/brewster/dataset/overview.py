@@ -68,7 +68,7 @@ def write_index(out: Path) -> None:
     Raises:
         TargetError: it cannot be written; the disk may be full.
     """
-    import pyarrow as pa  # type: ignore[import-untyped]  # noqa: PLC0415  (readers of a set do without it)
+    import pyarrow as pa  # noqa: PLC0415  (readers of a set do without it)
     from pyarrow import parquet  # noqa: PLC0415
 
     kinds = {"index": "int64", "place": "string", "panes": "int64"} | {

@@ -46,6 +46,7 @@ class Chance:
 
     def _fresh(self) -> tuple[Tensor, Tensor]:
         scramble = int(torch.randint(2**31, (), generator=self._generator))
-        points = SobolEngine(2, scramble=True, seed=scramble).draw(self._samples)
+        points = SobolEngine(2, scramble=True, seed=scramble).draw(self._samples)  # type: ignore[no-untyped-call]
+        points = points[torch.randperm(self._samples, generator=self._generator)]  # or pairs would go in step
         shift = torch.rand(2, self._pixels, generator=self._generator)
         return points.to(self._device), shift.to(self._device)

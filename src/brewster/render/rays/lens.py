@@ -37,7 +37,8 @@ def blurred(picture: Tensor, camera: Camera, margin: int) -> Tensor:
     spectrum = torch.fft.rfft2(picture.double(), (height, width)) * torch.fft.rfft2(kernel, (height, width))
     full = torch.fft.irfft2(spectrum, (height, width)).to(picture.dtype)  # the sun needs double precision
     low, high = 2 * margin, full.shape[1] - 2 * margin
-    return full[:, low:high, 2 * margin : full.shape[2] - 2 * margin].clamp(min=0)
+    seen: Tensor = full[:, low:high, 2 * margin : full.shape[2] - 2 * margin].clamp(min=0)
+    return seen
 
 
 def _disc(radius_px: float, reach: int) -> Tensor:

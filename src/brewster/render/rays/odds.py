@@ -66,6 +66,5 @@ def _direction(u: Tensor, v: Tensor, turn: float) -> Tensor:
     """The inverse of `lat_long`, (3, ...)."""
     heading, latitude = (u - turn) * (2 * math.pi), v * math.pi
     across = latitude.sin()
-    return torch.stack(
-        torch.broadcast_tensors(across * heading.sin(), latitude.cos(), -across * heading.cos())
-    )
+    x, z = across * heading.sin(), -across * heading.cos()
+    return torch.stack([x, latitude.cos().expand_as(x), z])

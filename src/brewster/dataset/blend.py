@@ -1,0 +1,44 @@
+"""8-bit mixtures of a rendered sample's own content: the baseline of the paper's ablation (Table 4, Figure 7).
+
+RDNet blends two tone-mapped pictures, I = alpha T + beta R - T o R. Here T is the background and R the mirrored
+scene of a sample, developed as they are, so that both kinds of data show the same two scenes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from random import Random
+from typing import Final
+
+from torch import Tensor
+
+from brewster.render.develop import Developed
+
+ALPHA: Final = (0.8, 1.0)
+BETA: Final = (0.4, 1.0)
+
+
+def blend(transmission_encoded: Tensor, reflection_encoded: Tensor, alpha: float, beta: float) -> Tensor:
+    """I = alpha T + beta R - T o R of encoded pictures of one shape, rounded to 8 bits, in 0..1 (RDNet)."""
+    t, r = (_eight_bits(layer) for layer in (transmission_encoded, reflection_encoded))
+    return _eight_bits(alpha * t + beta * r - t * r)
+
+
+def blended(developed: Developed) -> Developed:
+    """The same content mixed in 8 bits: background for T, beta times the mirrored scene for R, and their blend.
+
+    alpha and beta are drawn by the scene's seed and index, uniform in 0.8..1 and 0.4..1.
+    """
+    dice = Random(f"blend/{developed.scene.seed}/{developed.scene.index}")  # noqa: S311  (data, not secrets)
+    alpha, beta = dice.uniform(*ALPHA), dice.uniform(*BETA)
+    background, mirror = _eight_bits(developed.background_encoded), _eight_bits(developed.mirror_encoded)
+    return replace(
+        developed,
+        photo_encoded=blend(background, mirror, alpha, beta),
+        transmission_encoded=background,
+        reflection_encoded=_eight_bits(beta * mirror),
+    )
+
+
+def _eight_bits(encoded: Tensor) -> Tensor:
+    return (encoded.clamp(0, 1) * 255).round() / 255

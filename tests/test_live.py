@@ -1,0 +1,53 @@
+import pytest
+import torch
+
+from brewster.dataset.live import Rendered
+from brewster.scene.recipe import read_scene_recipe
+from brewster.worlds.assets import Assets
+from brewster.worlds.catalog import BUILTIN_CATALOG
+
+
+@pytest.fixture(scope="module")
+def assets():
+    return Assets()
+
+
+def stream(assets, **options):
+    catalog = BUILTIN_CATALOG.model_copy(update={"maps": BUILTIN_CATALOG.maps[:2]})
+    return Rendered(read_scene_recipe("tiny"), catalog, assets, seed=7, **options)
+
+
+def same(one, other):
+    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in one.__dataclass_fields__)
+
+
+def test_a_batch_is_a_function_of_seed_and_step_alone(assets):
+    one = stream(assets)
+    second = one(1, 2, 32)
+    assert same(second, stream(assets)(1, 2, 32))
+    assert not torch.equal(second.photo_encoded, one(0, 2, 32).photo_encoded)
+
+
+def test_a_batch_has_square_encoded_pictures(assets):
+    batch = stream(assets)(0, 3, 32)
+    assert batch.photo_encoded.shape == batch.transmission_encoded.shape == (3, 3, 32, 32)
+    assert 0 <= batch.photo_encoded.min() and batch.photo_encoded.max() <= 1
+
+
+def test_iterating_gives_the_samples_in_order_at_the_recipes_size(assets):
+    live = stream(assets)
+    first = next(iter(live))
+    assert first.photo_encoded.shape == (3, 64, 96)
+    assert torch.equal(first.photo_encoded, live.sample(0).photo_encoded)
+
+
+def test_the_target_is_the_background_or_the_transmission(assets):
+    background = stream(assets)(0, 1, 32).transmission_encoded
+    transmission = stream(assets, target="transmission")(0, 1, 32).transmission_encoded
+    assert transmission.mean() < background.mean()
+
+
+def test_both_kinds_of_data_show_the_same_background(assets):
+    light, mixed = (stream(assets, mixing=mixing).sample(3) for mixing in ("light", "8-bit"))
+    assert (light.background_encoded - mixed.transmission_encoded).abs().max() <= 0.5 / 255 + 1e-6
+    assert not torch.equal(light.photo_encoded, mixed.photo_encoded)
