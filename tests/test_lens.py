@@ -29,7 +29,7 @@ def test_a_tiny_aperture_is_a_pinhole_too():
     assert torch.equal(pinhole, tiny)
 
 
-@pytest.mark.parametrize("radius_px", [0.06, 0.5, 1.3, 4.0, 9.7])
+@pytest.mark.parametrize("radius_px", [0.1, 0.5, 1.3, 4.0, 9.7])
 def test_the_disc_sums_to_one_and_has_its_own_radius(radius_px):
     reach = math.ceil(radius_px + 0.5)
     disc = _disc(radius_px, reach)
@@ -39,7 +39,7 @@ def test_the_disc_sums_to_one_and_has_its_own_radius(radius_px):
     assert torch.equal(disc, disc.flip(0))
     if radius_px > 1:
         middle = float(disc[reach, reach])
-        assert 1 / middle == pytest.approx(math.pi * radius_px**2, rel=0.02)
+        assert 1 / middle == pytest.approx(math.pi * radius_px**2, rel=0.04)
 
 
 @pytest.mark.parametrize("aperture_mm", [20.0, 55.0, 100.0])
@@ -61,7 +61,7 @@ def test_a_point_is_seen_as_a_disc_of_half_the_aperture_over_the_focus(aperture_
 def test_the_sun_through_a_lens_keeps_its_place_and_energy():
     light = Worlds(sun=sun(128, 64, 0))
     scenes = (
-        a_scene(camera=at(0, width=48, height=48, aperture_mm=a, focus_mm=500.0), behind=around("sun"))
+        a_scene(camera=at(0, width=48, height=48, aperture_mm=a, focus_mm=600.0), behind=around("sun"))
         for a in (0.0, 40.0)
     )
     sharp, soft = (render(scene, light).background for scene in scenes)
@@ -89,7 +89,7 @@ def test_a_lens_over_far_light_equals_rays_by_chance(incidence_deg):
             a_scene(
                 camera=at(incidence_deg, aperture_mm=40, focus_mm=800, fov_deg=40),
                 panes=[{"wedge_deg": wedge_deg}],
-                behind=around("mottled", heading_deg=180),
+                behind=around("soft", heading_deg=60),
                 front=around("soft"),
                 samples=256,
             ),
@@ -97,7 +97,7 @@ def test_a_lens_over_far_light_equals_rays_by_chance(incidence_deg):
         )
         for wedge_deg in (0.0, 1e-9)
     )
-    for name, most in (("background", 0.02), ("transmission", 0.02), ("mirror", 0.003), ("reflection", 0.01)):
+    for name, most in (("background", 3e-3), ("transmission", 3e-3), ("mirror", 3e-3), ("reflection", 0.01)):
         one, other = getattr(by_convolution, name), getattr(by_chance, name)
         assert float(((one - other).abs() / one.mean()).max()) < most, name
         assert float(one.mean()) == pytest.approx(float(other.mean()), rel=2e-3)
@@ -107,13 +107,13 @@ def test_a_near_picture_is_sharp_where_the_lens_is_set_on_it():
     pictures = [
         render(
             a_scene(
-                camera=at(0, aperture_mm=30, focus_mm=focus_mm),
-                behind=board("line", distance_mm=504, width_mm=500),
+                camera=at(0, aperture_mm=60, focus_mm=focus_mm),
+                behind=board("line", distance_mm=504, width_mm=1600),
                 samples=64,
             ),
             WORLDS,
         ).background
-        for focus_mm in (700, 1004, 2500)
+        for focus_mm in (650, 1004, 3500)
     ]
     peaks = [float(picture.mean((0, 1)).max()) for picture in pictures]
-    assert peaks[1] > 1.4 * max(peaks[0], peaks[2])
+    assert peaks[1] > 1.3 * max(peaks[0], peaks[2])

@@ -28,10 +28,9 @@ def test_polished_glass_is_the_limit_of_rough_glass():
     assert mean(nearly.reflection) == pytest.approx(mean(polished.reflection), rel=5e-3)
 
 
-@pytest.mark.parametrize("alpha", [0.02, 0.05])
-@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize(("alpha", "count"), [(0.02, 1), (0.05, 1), (0.05, 2)])
 def test_in_an_even_world_rough_glass_creates_no_light_and_loses_little(alpha, count):
-    sample = render(rough(alpha, count, samples=8 if count == 2 else 32), WORLDS)
+    sample = render(rough(alpha, count, samples=4 if count == 2 else 16), WORLDS)
     whole = mean(sample.transmission) + mean(sample.reflection)
     assert 0.985 < whole < 1.003
     smooth = all_orders(Glazing(panes=(Pane(),) * count, gap_mm=9), torch.tensor(0.94))
@@ -41,7 +40,7 @@ def test_in_an_even_world_rough_glass_creates_no_light_and_loses_little(alpha, c
 def test_the_rougher_the_glass_the_softer_an_edge_behind_it():
     edges = []
     for alpha in (0.01, 0.05, 0.15):
-        scene = rough(alpha, samples=32, camera=at(0, fov_deg=60), behind=around("right", heading_deg=180))
+        scene = rough(alpha, samples=8, camera=at(0, fov_deg=60), behind=around("right", heading_deg=180))
         columns = render(scene, WORLDS).transmission.mean((0, 1))
         edges.append(float(columns.diff().max()))
     assert edges[0] > 1.2 * edges[1] > 1.5 * edges[2]

@@ -158,7 +158,7 @@ def scenes(draw, **fixed):
             width=16,
             height=16,
             fov_deg=draw(st.floats(5, 55)),
-            aperture_mm=draw(st.sampled_from([0.0, 0.0, 12.0])),
+            aperture_mm=draw(st.sampled_from([0.0, 0.0, 60.0])),
         ),
     }
     return a_scene(**{**values, **fixed})

@@ -82,7 +82,7 @@ class _Size(click.ParamType[tuple[int, int]]):
 @click.option(
     "--renderer",
     type=click.Choice(["pane", "tracer"]),
-    help="pane is analytic, for flat glass; tracer follows paths, for all glass. By default pane, or what --scene names.",
+    help="Analytic for flat glass, or a path tracer for all glass. By default pane, or what --scene names.",
 )
 @click.option(
     "--maps",

@@ -1,0 +1,155 @@
+"""Scenes are drawn alike everywhere, are possible, and keep to what their recipe asks."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from brewster.errors import RecipeError
+from brewster.render.pane import render
+from brewster.scene.recipe import RECIPES, read_scene_recipe
+from brewster.scene.sampler import Asset, Catalog, draw
+from brewster.scene.scene import Scene
+from brewster.scene.world import Source
+from brewster.worlds.catalog import BUILTIN_CATALOG
+from worlds_of_one import WORLDS, Worlds
+
+WIDTHS = {asset.source: asset.width for asset in BUILTIN_CATALOG.maps}
+
+
+def drawn(recipe, index, seed=7, catalog=BUILTIN_CATALOG):
+    return draw(read_scene_recipe(recipe) if isinstance(recipe, str) else recipe, catalog, seed, index)
+
+
+def changed(name, **parts):
+    """A packaged recipe with some values of some parts changed."""
+    recipe = read_scene_recipe(name)
+    return recipe.model_copy(
+        update={part: getattr(recipe, part).model_copy(update=values) for part, values in parts.items()}
+    )
+
+
+@pytest.fixture(scope="module")
+def fifty():
+    return {recipe: [drawn(recipe, index) for index in range(50)] for recipe in RECIPES}
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_every_packaged_recipe_draws_possible_scenes(fifty, recipe):
+    for index, scene in enumerate(fifty[recipe]):
+        assert Scene.model_validate(scene.model_dump()) == scene
+        assert (scene.recipe, scene.seed, scene.index) == (recipe, 7, index)
+        assert scene.glass.is_flat
+    assert len({scene.to_toml() for scene in fifty[recipe]}) == 50
+
+
+def test_a_scene_belongs_to_its_number_and_not_to_what_was_drawn_before(fifty):
+    assert [drawn("tiny", index) for index in (9, 3, 40)] == [fifty["tiny"][index] for index in (9, 3, 40)]
+
+
+def test_another_process_draws_the_same_scene(fifty):
+    code = """
+from brewster.scene.recipe import read_scene_recipe
+from brewster.scene.sampler import draw
+from brewster.worlds.catalog import BUILTIN_CATALOG
+print(draw(read_scene_recipe("tiny"), BUILTIN_CATALOG, 7, 12).to_toml(), end="")
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONHASHSEED": "5"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == fifty["tiny"][12].to_toml()
+
+
+def test_index_seed_and_name_each_make_another_scene():
+    recipe = read_scene_recipe("tiny")
+    scenes = [
+        drawn(recipe, 1),
+        drawn(recipe, 2),
+        drawn(recipe, 1, seed=8),
+        drawn(recipe.model_copy(update={"name": "other"}), 1),
+    ]
+    assert len({scene.camera.position_mm for scene in scenes}) == 4
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_no_texel_of_a_map_spans_more_pixels_than_the_recipe_allows(fifty, recipe):
+    asked = read_scene_recipe(recipe)
+    maps = 0
+    for scene in fifty[recipe]:
+        for side, most in (
+            (scene.behind, asked.behind.most_px_per_texel),
+            (scene.front, asked.front.most_px_per_texel),
+        ):
+            if side.map:
+                maps += 1
+                least = scene.camera.width * 360 / WIDTHS[side.map.source] / most
+                assert scene.camera.fov_deg >= least * (1 - 1e-5)
+    assert maps > 5
+
+
+def test_a_picture_behind_the_glass_fills_the_view():
+    """Whatever its shape, without and through the glass: no pixel is black."""
+    recipe = changed("vitrine", camera={"width": 24, "height": 16, "pinhole_probability": 1.0})
+    for index in range(12):
+        scene = drawn(recipe, index)
+        white = Worlds(**{scene.behind.plane.source.file: WORLDS.pictures["white"][:, :24]})
+        scene = scene.model_copy(update={"front": Scene().front, "samples": 4})
+        sample = render(scene, white)
+        assert float(sample.background.min()) > 0.99 * scene.behind.plane.luminance
+        assert float(sample.transmission.min()) > 0.4 * scene.behind.plane.luminance
+
+
+def test_the_camera_stands_as_far_from_the_glass_as_the_recipe_says(fifty):
+    nearest, farthest = read_scene_recipe("window").camera.distance_mm_log
+    for scene in fifty["window"]:
+        assert 0.9 * nearest < scene.camera_above_glass_mm < 1.1 * farthest
+
+
+def test_rough_glass_gets_more_rays():
+    asked = changed("tiny", glass={"rough_probability": 1.0}).model_copy(update={"rough_samples": 77})
+    assert drawn(asked, 0).samples == 77
+    assert drawn(asked, 0).glass.is_rough
+
+
+def test_categories_are_kept_and_a_map_without_one_fits_everywhere():
+    asked = changed("window", behind={"map_probability": 1.0, "maps": ("indoor",)})
+    rooms = {drawn(asked, index).behind.map.source.file for index in range(20)}
+    assert rooms <= {f"builtin:room:{number}" for number in range(8)}
+    plain = Catalog(maps=(Asset(source=Source(file="a.hdr"), width=4096, height=2048),))
+    assert drawn(asked, 0, catalog=plain).behind.map.source.file == "a.hdr"
+
+
+def test_a_recipe_of_pictures_needs_pictures():
+    with pytest.raises(RecipeError, match="there are no pictures to draw from"):
+        drawn("vitrine", 0, catalog=Catalog(maps=BUILTIN_CATALOG.maps))
+
+
+def test_a_recipe_of_maps_needs_maps_that_are_sharp_enough():
+    asked = changed("window", behind={"map_probability": 1.0, "picture_probability": 0.0})
+    for catalog in (
+        Catalog(pictures=BUILTIN_CATALOG.pictures),
+        Catalog(maps=(Asset(source=Source(file="a.hdr"), width=64, height=32),)),
+    ):
+        with pytest.raises(RecipeError, match=rf"of {len(catalog.maps)} maps none fits the recipe"):
+            drawn(asked, 0, catalog=catalog)
+
+
+@pytest.mark.parametrize(
+    ("camera", "says"),
+    [
+        ({"incidence_deg": (88.0, 89.0)}, "gave no possible scene in 100 tries; a corner of the view"),
+        (
+            {"incidence_deg": (180.0, 180.0)},
+            "gave no possible scene in 100 tries; the camera stands .* behind",
+        ),
+        ({"fov_deg": (155.0, 160.0)}, "gave no possible scene in 100 tries; .*less than 150"),
+    ],
+)
+def test_an_impossible_recipe_says_why(camera, says):
+    with pytest.raises(RecipeError, match=says):
+        drawn(changed("tiny", camera=camera), 0)

@@ -1,0 +1,131 @@
+"""A scene survives being written down, and what cannot be is refused by name."""
+
+import math
+import tomllib
+
+import pytest
+
+from brewster.errors import RecipeError
+from brewster.scene.camera import Camera
+from brewster.scene.recipe import RECIPES, read_scene_recipe
+from brewster.scene.sampler import draw
+from brewster.scene.scene import Scene, read_scene
+from brewster.worlds.catalog import BUILTIN_CATALOG
+from worlds_of_one import looks
+
+MAP = "source.file = 'builtin:street:1'"
+
+
+@pytest.fixture
+def written(tmp_path):
+    def written(text):
+        (tmp_path / "scene.toml").write_text(text)
+        return tmp_path / "scene.toml"
+
+    return written
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_a_scene_that_is_written_and_read_is_the_same(recipe, written):
+    for index in range(12):
+        scene = draw(read_scene_recipe(recipe), BUILTIN_CATALOG, 3, index)
+        assert read_scene(written(scene.to_toml())) == scene
+
+
+def test_an_empty_file_is_the_plainest_scene_and_a_map_is_infinitely_far(written):
+    assert read_scene(written("")) == Scene()
+    scene = read_scene(written(f"behind.map.{MAP}"))
+    assert scene.behind.map.radius_mm == math.inf
+    assert tomllib.loads(scene.to_toml())["behind"]["map"]["radius_mm"] == math.inf
+    assert read_scene(written(scene.to_toml())) == scene
+
+
+def test_what_became_of_a_scene_is_passed_over(written):
+    scene = draw(read_scene_recipe("window"), BUILTIN_CATALOG, 3, 1)
+    text = scene.to_toml(outcome={"exposure_ev": -1.5, "white_balance": [1.0, 1.1, 0.9]})
+    assert "[outcome]" in text
+    found = read_scene(written(text))
+    assert found == scene
+    assert type(found) is Scene
+    assert "outcome" not in found.to_toml()
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[[glass.panes]]\nindex = 0.9", r"glass\.panes\.0\.index; .*greater than or equal to 1"),
+        ("[glass]\ngap_mm = -1", r"glass\.gap_mm; .*greater than or equal to 0"),
+        ("[[glass.panes]]\n[[glass.panes]]", "gap_mm is above 0 when there is more than one"),
+        ("glass.radii_mm = [100, 100]", "curved glass is one pane .* in a frame"),
+        ("[camera]\nfocus_mm = 1002\naperture_mm = 3", "the focus lies 2 mm inside the glass"),
+        ("camera.position_mm = [0, 0, -5]", "the camera stands 5 mm behind the glass"),
+        ("camera.heading_deg = 80", "more than 85 degrees"),
+        ("glass.pitch_deg = 75", "more than 85 degrees"),
+        (f"[behind.map]\n{MAP}\nradius_mm = 500", "outside the dome of 500 mm"),
+        (f"[front.map]\n{MAP}\nradius_mm = 900", "outside the dome of 900 mm"),
+        (f"[behind.plane]\n{MAP}\ndistance_mm = 2\nwidth_mm = 9", "a plane at 2 mm stands in the glass"),
+        (
+            f"[front.map]\n{MAP}\nradius_mm = 3000\n[front.plane]\n{MAP}\ndistance_mm = 4000\nwidth_mm = 9",
+            "distance_mm is below radius_mm",
+        ),
+        ("colour = 'red'", "wrong value for colour; Extra inputs"),
+        ("camera.zoom = 2", r"wrong value for camera\.zoom; Extra inputs"),
+        ("camera.heading_deg = nan", r"camera\.heading_deg; .*finite"),
+        ("camera.position_mm = [0, 0, nan]", r"camera\.position_mm\.2; .*finite"),
+        ("camera.focus_mm = inf", r"camera\.focus_mm; .*finite"),
+        (f"[behind.map]\n{MAP}\nradius_mm = nan", r"behind\.map\.radius_mm; "),
+        ("orders = 'some'", "wrong value for orders; .*'all' or 'paper'"),
+        ("samples = 0", "wrong value for samples"),
+        ("glass = [", "is not TOML"),
+    ],
+)
+def test_an_impossible_scene_is_refused_and_the_value_named(text, says, written):
+    path = written(text)
+    with pytest.raises(RecipeError, match=says) as caught:
+        read_scene(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("glass.index = [1.6, 1.5]", r"glass\.index; a range goes up, and this one goes from 1.6 to 1.5"),
+        ("glass.index = [0.9, 1.5]", "glass has an index of 1 or more, and this begins at 0.9"),
+        ("glass.gap_mm = [0, 1]\nglass.double_probability = 0.5", "gap_mm begins at 0"),
+        ("glass.thickness_mm = [0, 1]", r"glass\.thickness_mm\.0"),
+        ("glass.tints = []", "at least one colour"),
+        ("camera.fov_deg = [nan, 50]", r"camera\.fov_deg"),
+        ("development.jpeg_quality = [97, 60]", "jpeg_quality goes up"),
+        ("behind.map_probability = 1.5", r"behind\.map_probability; .*less than or equal to 1"),
+        ("colour = 'red'", "wrong value for colour"),
+    ],
+)
+def test_an_impossible_recipe_is_refused_and_the_value_named(text, says, written):
+    path = written(f"name = 'mine'\nabout = ''\n{text}")
+    with pytest.raises(RecipeError, match=says):
+        read_scene_recipe(str(path))
+
+
+def test_files_that_are_missing_or_no_text_are_refused(tmp_path):
+    with pytest.raises(RecipeError, match=r"nowhere\.toml cannot be read"):
+        read_scene(tmp_path / "nowhere.toml")
+    with pytest.raises(RecipeError, match="cannot be read"):
+        read_scene(tmp_path)
+    (tmp_path / "picture.toml").write_bytes(b"\xff\xd8\xff")
+    with pytest.raises(RecipeError, match="is not TOML"):
+        read_scene(tmp_path / "picture.toml")
+    with pytest.raises(RecipeError, match=r"there is no recipe 'windw'; known are .*window"):
+        read_scene_recipe("windw")
+
+
+def test_framed_glass_may_be_seen_at_any_angle_and_a_pinhole_has_no_focus_to_hit_glass(written):
+    read_scene(written("glass.frame_mm = [500, 400]\ncamera.heading_deg = 80"))
+    read_scene(written("camera.focus_mm = 1002"))
+
+
+def test_a_cameras_corners_frame_its_pixels():
+    camera = Camera(heading_deg=33, pitch_deg=-12, fov_deg=60, width=48, height=32)
+    pixels = looks(camera)
+    for corner, place in zip(camera.corners(), [(-1, 0), (0, 0), (-1, -1), (0, -1)], strict=True):
+        cosine = pixels[place] @ corner / math.hypot(*corner)
+        assert math.degrees(math.acos(min(cosine, 1))) < 1.3
