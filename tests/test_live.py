@@ -31,7 +31,8 @@ def test_a_batch_is_a_function_of_seed_and_step_alone(assets):
 def test_a_batch_has_square_encoded_pictures(assets):
     batch = stream(assets)(0, 3, 32)
     assert batch.photo_encoded.shape == batch.transmission_encoded.shape == (3, 3, 32, 32)
-    assert batch.photo_encoded.min() >= 0 and batch.photo_encoded.max() <= 1
+    assert batch.photo_encoded.min() >= 0
+    assert batch.photo_encoded.max() <= 1
 
 
 def test_iterating_gives_the_samples_in_order_at_the_recipes_size(assets):

@@ -94,7 +94,11 @@ def test_no_texel_of_a_map_spans_more_pixels_than_the_recipe_allows(fifty, recip
 
 def test_a_picture_behind_the_glass_fills_the_view():
     """Whatever its shape, without and through the glass: no pixel is black."""
-    recipe = changed("vitrine", camera={"width": 24, "height": 16, "pinhole_probability": 1.0})
+    recipe = changed(
+        "vitrine",
+        camera={"width": 24, "height": 16, "pinhole_probability": 1.0},
+        behind={"fill": (1.05, 1.5), "turn_deg": (0.0, 0.0)},
+    )
     for index in range(12):
         scene = drawn(recipe, index)
         white = Worlds(**{scene.behind.plane.source.file: WORLDS.pictures["white"][:, :24]})

@@ -30,7 +30,7 @@ def test_polished_glass_is_the_limit_of_rough_glass():
 
 @pytest.mark.parametrize(("alpha", "count"), [(0.02, 1), (0.05, 1), (0.05, 2)])
 def test_in_an_even_world_rough_glass_creates_no_light_and_loses_little(alpha, count):
-    sample = render(rough(alpha, count, samples=4 if count == 2 else 16), WORLDS)
+    sample = render(rough(alpha, count, samples=2 if count == 2 else 16), WORLDS)
     whole = mean(sample.transmission) + mean(sample.reflection)
     assert 0.985 < whole < 1.003
     smooth = all_orders(Glazing(panes=(Pane(),) * count, gap_mm=9), torch.tensor(0.94))
@@ -46,18 +46,18 @@ def test_the_rougher_the_glass_the_softer_an_edge_behind_it():
     assert edges[0] > 1.2 * edges[1] > 1.5 * edges[2]
 
 
-@pytest.mark.parametrize("radius_mm", [float("inf"), 2500.0], ids=["far", "dome"])
-@pytest.mark.parametrize("alpha", [0.1, 0.3])
+@pytest.mark.parametrize(("alpha", "radius_mm"), [(0.1, float("inf")), (0.3, 2500.0)], ids=["far", "dome"])
 def test_light_found_by_facets_alone_or_drawn_from_the_map_too_is_the_same(monkeypatch, alpha, radius_mm):
     """A furnace that is brighter on one side."""
     side = around("soft", heading_deg=30, radius_mm=radius_mm)
-    scene = rough(alpha, samples=64, behind=side, front=side)
+    scene = rough(alpha, samples=32, behind=side, front=side)
     both = render(scene, WORLDS)
     monkeypatch.setattr(scatter, "_WORTH_LIGHT", 2.0)
     alone = render(scene, WORLDS)
     assert not torch.equal(both.photo, alone.photo)
+    assert mean(both.photo) == pytest.approx(mean(alone.photo), rel=5e-3)
     assert mean(both.transmission) == pytest.approx(mean(alone.transmission), rel=5e-3)
-    assert mean(both.reflection) == pytest.approx(mean(alone.reflection), rel=5e-3)
+    assert mean(both.reflection) == pytest.approx(mean(alone.reflection), rel=0.02)  # a noisy eighth of it
 
 
 def test_a_small_sun_in_frosted_glass_is_steady_only_when_its_light_is_drawn(monkeypatch):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from brewster.render.pane import render
@@ -152,20 +152,20 @@ def table_of(panes, cosine):
     return orders(tuple(float(sum(fresnel(exact(cosine), pane.index))) / 2 for pane in panes))
 
 
-@some
+@settings(max_examples=40, phases=[Phase.generate], deadline=None, database=None)
 @given(PANES.filter(lambda panes: len(panes) < 3), st.floats(0.4, 1))
 def test_the_orders_shares_sum_to_the_closed_form(panes, cosine):
     table = table_of(panes, cosine)
     shares = order_shares(glazing(panes), exact(cosine), table)
-    for closed, kept in (
-        (all_orders(glazing(panes), exact(cosine)), lambda _: True),
-        (paper_orders(glazing(panes), exact(cosine)), lambda order: order.in_paper),
+    for closed, kept, error in (
+        (all_orders(glazing(panes), exact(cosine)), lambda _: True, 1e-12),
+        (paper_orders(glazing(panes), exact(cosine)), lambda order: order.in_paper, 6e-3),
     ):
         for behind, whole in ((True, closed.transmitted), (False, closed.reflected)):
             mine = sum(
                 s for s, order in zip(shares, table, strict=True) if order.behind == behind and kept(order)
             )
-            assert float((mine - whole).abs().max()) < 3e-3
+            assert float((mine - whole).abs().max()) < error
     assert all((share >= -1e-9).all() for share in shares)
 
 

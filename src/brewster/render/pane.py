@@ -174,9 +174,8 @@ def _by_chance(room: _Room, device: Device) -> list[Tensor]:
     chance = Chance(scene.seed, scene.index, count, scene.samples, device)
     split = _scattered if scene.glass.is_rough or scene.glass.is_wedged else _split
     total = torch.zeros(5, 3, count, device=room.origin.device)
-    strip = _WIDE_STRIP if room.origin.is_cuda else _STRIP
-    for start in range(0, count, strip):
-        pixels = slice(start, min(start + strip, count))
+    for start in range(0, count, _STRIP):
+        pixels = slice(start, min(start + _STRIP, count))
         for number in range(scene.samples):
             chance.turn_to(number, pixels)
             total[:, :, pixels] += torch.stack(split(room, _through_lens(room, pixels, chance), chance))

@@ -86,7 +86,12 @@ class DevelopmentRecipe(Values):
     """How the photographs are developed; see `Development`."""
 
     exposure: LogRange = (0.2, 0.5)
-    white_balance: tuple[WhiteBalance, ...] = ("none", "grey-world", "white-patch", "grey-edge")
+    white_balance: Annotated[tuple[WhiteBalance, ...], Field(min_length=1)] = (
+        "none",
+        "grey-world",
+        "white-patch",
+        "grey-edge",
+    )
     white_balance_strength: Range = (0.3, 1.0)
     contrast: Range = (-0.1, 0.5)
     shot_noise: Range = (0.0, 0.02)

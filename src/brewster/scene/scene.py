@@ -99,12 +99,12 @@ class Scene(Values):
             )
 
     def _refuse_outside(self) -> None:
-        """A dome holds the whole glass and the camera; a plane stands clear of the glass."""
+        """A dome holds the glass and the camera; a plane, turned or not, stands clear of the glass."""
         reach = math.dist(self.camera.position_mm, self.glass.position_mm)
-        for side, nearest in ((self.behind, self.glass.depth_mm), (self.front, 0.0)):
+        for side, surface_mm in ((self.behind, self.glass.depth_mm), (self.front, 0.0)):
             if side.map and side.map.radius_mm <= max(reach, self.glass.depth_mm):
                 raise ValueError(f"the camera stands outside the dome of {side.map.radius_mm:g} mm")
-            if side.plane and side.plane.distance_mm <= nearest:
+            if side.plane and side.plane.nearest_mm <= surface_mm:
                 raise ValueError(f"a plane at {side.plane.distance_mm:g} mm stands in the glass")
 
     def to_toml(self, **more: dict[str, Any]) -> str:

@@ -34,7 +34,11 @@ class Map(Values):
 
 
 class Plane(Values):
-    """A picture on an upright plane, seen from the glass; its height follows from the picture's own shape."""
+    """A picture on an upright plane, seen from the glass; its height follows from the picture's own shape.
+
+    In front of the glass it is seen in the mirror alone: between glass and camera it belongs beside the view, since
+    the pane renderer does not show it directly.
+    """
 
     source: Source
     distance_mm: Above0
@@ -48,6 +52,12 @@ class Plane(Values):
     """Its mean luminance, before highlights are raised."""
     highlights: From0 = 0.0
     """How much light the file's clipped whites get back: white shines (1 + highlights) times as bright."""
+
+    @property
+    def nearest_mm(self) -> float:
+        """How near to the glass a turned plane comes, if it is square."""
+        turned = sum(abs(math.sin(math.radians(angle))) for angle in (self.heading_deg, self.pitch_deg))
+        return self.distance_mm - turned * self.width_mm / 2
 
 
 class Side(Values):

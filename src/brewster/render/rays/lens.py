@@ -15,7 +15,7 @@ from torch.nn import functional
 from brewster.scene.camera import Camera
 
 _FINENESS = 8  # places per pixel and direction where the disc is tested
-_SMALLEST_PX = 0.05
+_SMALLEST_PX = 0.1
 
 
 def _radius_px(camera: Camera) -> float:

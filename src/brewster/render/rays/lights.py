@@ -22,6 +22,9 @@ from brewster.worlds.assets import Assets
 
 Device = torch.device | str
 
+_BETWEEN = 1.2
+"""Texels that one look may stand for before it turns to the next halving: above, a sun would sparkle."""
+
 
 class Texture:
     """A picture (H, W, 3) with its halvings, sampled between texel centres; a map also wraps around."""
@@ -40,7 +43,7 @@ class Texture:
 
     def __call__(self, u: Tensor, v: Tensor, span: float) -> Tensor:
         """Values (3, N) at (u, v) in 0..1, where one sample stands for `span` texels of the full picture."""
-        level = min(math.floor(math.log2(max(span, 1.0))), len(self._levels) - 1)
+        level = min(math.ceil(math.log2(max(span / _BETWEEN, 1.0))), len(self._levels) - 1)
         texels = self._level(level)
         if self.wraps:
             width = self._levels[level].shape[3]

@@ -21,6 +21,7 @@ from brewster.render.rays.stack import FAINTEST, fresnel
 from brewster.render.rays.vectors import dot, unit
 from brewster.scene.glass import Glazing
 
+_FARTHEST_MM: Final = 1e7
 _WORTH_LIGHT: Final = 3e-3
 """Orders fainter than this are lit by chance alone."""
 
@@ -36,7 +37,6 @@ class Surface:
     glass_is_below: bool
     absorption: Tensor
     """Of the pane it belongs to, per mm, (3, 1)."""
-    pane: int
 
 
 @dataclass(frozen=True)
@@ -65,13 +65,14 @@ class Exit:
 def surfaces(glass: Glazing, like: Tensor) -> list[Surface]:
     """The glazing's surfaces from the camera on, in its own frame; a wedge turns a pane's far surface."""
     found, height = [], 0.0
-    for number, pane in enumerate(glass.panes):
+    for pane in glass.panes:
         absorption = like.new_tensor(pane.absorption_per_m)[:, None] / 1000
         for far in (False, True):
             wedge = torch.tensor(pane.wedge_deg if far else 0.0).deg2rad()
             normal = like.new_tensor([wedge.sin(), 0, wedge.cos()])[:, None]
             height -= pane.thickness_mm if far else 0.0
-            found.append(Surface(height, normal, pane.roughness, pane.index, not far, absorption, number))
+            alpha = pane.roughness if pane.index > 1 else 0.0  # what does not bend light does not scatter it
+            found.append(Surface(height, normal, alpha, pane.index, not far, absorption))
         height -= glass.gap_mm
     return found
 
@@ -118,6 +119,7 @@ def _meet(path: _Path, stack: list[Surface], chance: Chance) -> Iterator[tuple[_
     surface = stack[path.surface]
     in_glass = surface.glass_is_below != path.down
     away = (_height(surface) - dot(surface.normal, path.origin)) / dot(surface.normal, path.direction)
+    away = away.nan_to_num(0, 0, 0).clamp(0, _FARTHEST_MM)  # paths of no weight may run along the glass
     point = path.origin + away * path.direction
     left = torch.exp(-surface.absorption * away) if in_glass else torch.ones_like(surface.absorption)
     before = replace(path, origin=point, s=path.s * left, p=path.p * left)

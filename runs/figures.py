@@ -1,0 +1,58 @@
+"""Draws the pictures of docs/rendering.md: samples of every recipe, and 8-bit mixtures above rendered light.
+
+    BREWSTER_DATA=../shared/data .venv/bin/python runs/figures.py   # CC0 maps there, paintings of our own
+
+Without BREWSTER_DATA the builtin worlds light everything.
+"""
+
+import os
+from pathlib import Path
+
+import torch
+
+from brewster.dataset.blend import blended
+from brewster.photo import Photo
+from brewster.render.develop import develop, to_bytes
+from brewster.render.pane import render
+from brewster.scene.recipe import RECIPES, read_scene_recipe
+from brewster.scene.sampler import draw
+from brewster.worlds.assets import Assets
+from brewster.worlds.catalog import read_catalog
+
+DATA = os.environ.get("BREWSTER_DATA")
+MAPS = [Path(DATA) / "hdri"] if DATA else []
+DOCS = Path(__file__).parent.parent / "docs"
+WIDTH, HEIGHT = 256, 192
+
+
+def developed(name, seed, index):
+    recipe = read_scene_recipe(name)
+    camera = recipe.camera.model_copy(update={"width": WIDTH, "height": HEIGHT})
+    catalog, _ = read_catalog(MAPS, [])
+    scene = draw(recipe.model_copy(update={"camera": camera}), catalog, seed, index)
+    return develop(render(scene, Assets(MAPS)))
+
+
+def save(rows, name):
+    sheet = torch.cat([torch.cat(row, dim=2) for row in rows], dim=1)
+    Photo.from_array(to_bytes(sheet), encoding="srgb").save(DOCS / name, overwrite=True)
+
+
+def scenes():
+    save(
+        [list(developed(name, 3, i).layers().values()) for name in RECIPES if name != "tiny" for i in (0, 1)],
+        "scenes.jpg",
+    )
+
+
+def mixtures():
+    rendered = [
+        developed(name, 5, i)
+        for name, i in (("window", 0), ("window", 3), ("office", 1), ("shopfront", 2), ("window", 5))
+    ]
+    save([[blended(d).photo_encoded for d in rendered], [d.photo_encoded for d in rendered]], "mixtures.jpg")
+
+
+if __name__ == "__main__":
+    scenes()
+    mixtures()
