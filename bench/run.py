@@ -1,5 +1,5 @@
 """What `make bench` plays: quality on the development pairs beside doing nothing and beside a peer, what happens
-to photographs without any reflection, and the cost of a 12-megapixel photograph.
+to photographs without any reflection, the cost of a 12-megapixel photograph, and the renderer beside Mitsuba.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/run.py
 """
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import plain
 import quality
+import render
 import speed
 
 if __name__ == "__main__":
@@ -19,3 +20,4 @@ if __name__ == "__main__":
     quality.main(data)
     plain.main(data)
     speed.main(data)
+    render.main(data)

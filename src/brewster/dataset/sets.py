@@ -34,6 +34,7 @@ from brewster.files import write_atomically
 from brewster.light import REC709_LUMINANCE
 from brewster.photo import read_layers, write_layers
 from brewster.render.develop import Developed, develop, jpeg
+from brewster.render.pane import ghost_distance_px
 from brewster.render.sample import LAYERS, Sample
 from brewster.scene.scene import Scene
 from brewster.scene.values import wrong_value
@@ -66,9 +67,10 @@ def _luminance(layer: Tensor) -> float:
 STATISTICS: Final[dict[str, Callable[[Sample, Developed], float]]] = {
     "reflection_to_transmission": _reflection_to_transmission,
     "overexposed": lambda _, developed: developed.overexposed,
+    "ghost_px": lambda sample, _: ghost_distance_px(sample.scene),
 }
 """Numbers to choose samples by, in every scene.toml and the index: the ratio of mean luminances, the share of
-pixels that are white in any channel."""
+pixels that are white in any channel, and how far apart the first two mirror images are."""
 
 
 def statistics(sample: Sample, developed: Developed) -> dict[str, float]:

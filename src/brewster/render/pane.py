@@ -26,6 +26,7 @@ from brewster.render.rays.stack import (
     Order,
     all_orders,
     fresnel,
+    ghost_distance_mm,
     order_shares,
     orders,
     paper_orders,
@@ -85,6 +86,17 @@ def render(scene: Scene, assets: Assets, device: Device = "cpu") -> Sample:
     with torch.no_grad():
         layers = _by_chance(room, device) if _needs_chance(scene) else _without_chance(room)
     return Sample(scene, **dict(zip(LAYERS, layers, strict=True)))
+
+
+def ghost_distance_px(scene: Scene) -> float:
+    """How far apart the first two mirror images of the near pane land in the view's middle; 0 for far content."""
+    near = [scene.front.plane.distance_mm] if scene.front.plane else []
+    near += [scene.front.map.radius_mm] if scene.front.map else []
+    _, _, normal = axes(scene.glass.heading_deg, scene.glass.pitch_deg)
+    _, _, back = axes(scene.camera.heading_deg, scene.camera.pitch_deg)
+    incidence = math.degrees(math.acos(min(1.0, inner(back, normal))))
+    away = scene.camera_above_glass_mm + min(near, default=math.inf)
+    return ghost_distance_mm(scene.glass.panes[0], incidence) / (scene.camera.pixel_rad * away)
 
 
 def _furnish(scene: Scene, assets: Assets, device: Device) -> _Room:

@@ -24,7 +24,7 @@ from brewster.worlds.procedural import WORLDS, painting
 Float32 = NDArray[np.float32]
 
 BUILTIN_HEIGHT = 512
-_KEPT_BYTES = 600_000_000
+_KEPT_BYTES = 300_000_000
 _CLIPPED_SHARE = 0.002
 _LUMINANCE = np.array(REC709_LUMINANCE, np.float32)
 
