@@ -363,3 +363,19 @@ def test_a_dome_and_a_map_at_infinity_agree_when_the_dome_is_large():
         for radius in (math.inf, 1e7)
     )
     torch.testing.assert_close(far.transmission, dome.transmission, rtol=1e-3, atol=0)
+
+
+# --- ghosts
+
+
+def test_the_ghost_of_a_scene_is_the_formula_over_what_a_pixel_spans():
+    scene = a_scene(
+        camera=at(30, distance_mm=1000 / math.cos(math.radians(30))), front=around(radius_mm=3000.0)
+    )
+    inside = math.asin(math.sin(math.radians(30)) / 1.5)
+    apart = 2 * 4 * math.tan(inside) * math.cos(math.radians(30))
+    assert pane.ghost_distance_px(scene) == pytest.approx(apart / (scene.camera.pixel_rad * 4000), rel=1e-3)
+
+
+def test_far_content_has_no_ghost():
+    assert pane.ghost_distance_px(a_scene(camera=at(30))) == 0

@@ -56,11 +56,9 @@ def test_only_the_photo_has_the_quality_of_the_scene(scene):
 def test_statistics_compare_the_luminance_of_the_layers(scene):
     grey = render(scene, None).each(lambda layer: torch.full_like(layer, 0.5))
     mirrored = sets.Sample(**{**vars(grey), "reflection": grey.reflection * 0.1})
-    assert sets.statistics(mirrored, sets.develop(mirrored)) == {
-        "reflection_to_transmission": pytest.approx(0.1),
-        "overexposed": 0,
-        "ghost_px": pytest.approx(0, abs=1e3),
-    }
+    found = sets.statistics(mirrored, sets.develop(mirrored))
+    assert found["reflection_to_transmission"] == pytest.approx(0.1)
+    assert found["overexposed"] == 0
 
 
 def test_folders_and_shards_read_alike(four, tmp_path):

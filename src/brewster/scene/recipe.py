@@ -112,7 +112,7 @@ class SceneRecipe(Values):
     about: str
     orders: Literal["all", "paper"] = "all"
     samples: Positive = 8
-    rough_samples: Positive = 32
+    rough_samples: Positive = 16
     glass: GlassRecipe = GlassRecipe()
     camera: CameraRecipe = CameraRecipe()
     behind: SideRecipe = SideRecipe()

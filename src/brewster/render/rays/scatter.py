@@ -17,10 +17,12 @@ from torch import Tensor
 from brewster.render.rays.chance import Chance
 from brewster.render.rays.facets import seen_density, shadowing, visible_facet
 from brewster.render.rays.lights import Light, Rays
-from brewster.render.rays.stack import FAINTEST, fresnel
+from brewster.render.rays.stack import fresnel
 from brewster.render.rays.vectors import dot, unit
 from brewster.scene.glass import Glazing
 
+FAINTEST: Final = 1e-4
+"""Orders whose rays carry less on average are not followed: rough glass has very many."""
 _FARTHEST_MM: Final = 1e7
 _WORTH_LIGHT: Final = 3e-3
 """Orders fainter than this are lit by chance alone."""
