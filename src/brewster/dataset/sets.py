@@ -26,14 +26,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
-from torch import Tensor
 
 import brewster
 from brewster.errors import RecipeError, TargetError
 from brewster.files import write_atomically
-from brewster.light import REC709_LUMINANCE
 from brewster.photo import read_layers, write_layers
-from brewster.render.develop import Developed, develop, jpeg
+from brewster.render.develop import Developed, develop, jpeg, luminance
 from brewster.render.pane import ghost_distance_px
 from brewster.render.sample import LAYERS, Sample
 from brewster.scene.scene import Scene
@@ -55,13 +53,10 @@ _AGAIN: Final = "delete that sample and render the set again"
 
 
 def _reflection_to_transmission(sample: Sample, _: Developed) -> float:
-    return _luminance(sample.reflection) / max(_luminance(sample.transmission), 1e-12)
-
-
-def _luminance(layer: Tensor) -> float:
-    """The mean luminance of a linear picture (3, H, W)."""
-    means: list[float] = layer.double().mean((1, 2)).tolist()
-    return sum(weight * mean for weight, mean in zip(REC709_LUMINANCE, means, strict=True))
+    reflected, transmitted = (
+        luminance(layer.double().mean((1, 2))) for layer in (sample.reflection, sample.transmission)
+    )
+    return reflected / max(transmitted, 1e-12)
 
 
 STATISTICS: Final[dict[str, Callable[[Sample, Developed], float]]] = {

@@ -126,7 +126,8 @@ def _toned(linear: Tensor, contrast: float) -> Tensor:
     return torch.lerp(encoded, smooth, contrast).clamp(0, 1) if contrast else encoded
 
 
-def _luminance(colour: Tensor) -> float:
+def luminance(colour: Tensor) -> float:
+    """The Rec.709 luminance of a linear colour, (3,)."""
     return float(sum(map(operator.mul, REC709_LUMINANCE, colour.tolist())))
 
 
@@ -141,7 +142,7 @@ def _exposure_ev(light: Tensor, wanted: float) -> float:
     """
 
     def mean(ev: float) -> float:
-        return _luminance((light * math.exp2(ev)).clamp_(0, 1).mean((1, 2)))
+        return luminance((light * math.exp2(ev)).clamp_(0, 1).mean((1, 2)))
 
     low, high = _EV_RANGE
     wanted = min(wanted, _NEARLY * mean(high))
@@ -172,12 +173,12 @@ def _white_balance(photo: Tensor, wish: Development) -> tuple[float, float, floa
 
 def _gains(colour: Tensor, strength: float) -> tuple[float, float, float]:
     """Gains for a light's colour (3,); ones where nothing is lit enough to have one."""
-    luminance = _luminance(colour)
-    if luminance < 1e-9:
+    before = luminance(colour)
+    if before < 1e-9:
         return 1.0, 1.0, 1.0
-    full = luminance / colour.clamp(min=luminance * 1e-6)
+    full = before / colour.clamp(min=before * 1e-6)
     partly = full**strength
-    kept = partly * (luminance / _luminance(colour * partly))
+    kept = partly * (before / luminance(colour * partly))
     red, green, blue = kept.clamp(1 / _STRONGEST, _STRONGEST).tolist()
     return round(red, 4), round(green, 4), round(blue, 4)
 

@@ -90,12 +90,10 @@ def render(scene: Scene, assets: Assets, device: Device = "cpu") -> Sample:
 
 def ghost_distance_px(scene: Scene) -> float:
     """How far apart the first two mirror images of the near pane land in the view's middle; 0 for far content."""
-    near = [scene.front.plane.distance_mm] if scene.front.plane else []
-    near += [scene.front.map.radius_mm] if scene.front.map else []
     _, _, normal = axes(scene.glass.heading_deg, scene.glass.pitch_deg)
     _, _, back = axes(scene.camera.heading_deg, scene.camera.pitch_deg)
     incidence = math.degrees(math.acos(min(1.0, inner(back, normal))))
-    away = scene.camera_above_glass_mm + min(near, default=math.inf)
+    away = scene.camera_above_glass_mm + scene.front.distance_mm
     return ghost_distance_mm(scene.glass.panes[0], incidence) / (scene.camera.pixel_rad * away)
 
 
@@ -128,10 +126,8 @@ def _side(
 
 def _needs_chance(scene: Scene) -> bool:
     """Rough or wedged glass, and lenses over near content, whose blur is not the same everywhere."""
-    is_near = any(
-        side.plane or (side.map and math.isfinite(side.map.radius_mm)) for side in (scene.behind, scene.front)
-    )
-    return scene.glass.is_rough or scene.glass.is_wedged or (scene.camera.aperture_mm > 0 and bool(is_near))
+    is_near = math.isfinite(min(scene.behind.distance_mm, scene.front.distance_mm))
+    return scene.glass.is_rough or scene.glass.is_wedged or (scene.camera.aperture_mm > 0 and is_near)
 
 
 def _without_chance(room: _Room) -> list[Tensor]:
@@ -226,9 +222,10 @@ def _split(room: _Room, rays: Rays, _: Chance | None = None) -> list[Tensor]:
         (room.behind, rays.origin, rays.direction, whole.transmitted, kept.transmitted),
         (room.front, point, mirrored, whole.reflected, kept.reflected),
     ):
-        bare = side.light.along(origin, direction, rays.share)
+        far = side.light.far(direction, rays.share)
+        bare = side.light.before(far, origin, direction, rays.share)
         if len(side.groups) > 1:
-            every, mine = _shifted_orders(room, side, Rays(point, direction, rays.share))
+            every, mine = _shifted_orders(room, side, Rays(point, direction, rays.share), far)
         else:
             every = far_whole * bare
             mine = far_kept * bare if kept is not whole else every
@@ -237,7 +234,7 @@ def _split(room: _Room, rays: Rays, _: Chance | None = None) -> list[Tensor]:
     return [through + back, transmission, background, reflection, mirror]
 
 
-def _shifted_orders(room: _Room, side: _Side, leaving: Rays) -> tuple[Tensor, Tensor]:
+def _shifted_orders(room: _Room, side: _Side, leaving: Rays, far: Tensor | None) -> tuple[Tensor, Tensor]:
     """One side's light through each order's own shift: of all orders, and of those that T or R keeps."""
     glass, direction = room.scene.glass, leaving.direction
     cosine = direction[2].abs()
@@ -246,12 +243,10 @@ def _shifted_orders(room: _Room, side: _Side, leaving: Rays) -> tuple[Tensor, Te
     surface = leaving.origin.clone()
     surface[2] = -side.depth_mm
     shares = iter(order_shares(glass, cosine, [order for group in side.groups for order in group]))
-    far = side.light.far(direction, leaving.share)
     every, kept = torch.zeros_like(direction), torch.zeros_like(direction)
     for group in side.groups:
-        seen, clear = side.light.near(surface + ahead * _shift(group[0], shifts), direction, leaving.share)
-        if far is not None and clear is not None:
-            seen = seen + clear * far
+        leaves = surface + ahead * _shift(group[0], shifts)
+        seen = side.light.before(far, leaves, direction, leaving.share)
         mine = list(zip(group, shares, strict=False))
         every += sum((share for _, share in mine), torch.zeros_like(cosine)) * seen
         if room.scene.orders == "paper":

@@ -242,7 +242,7 @@ def _focused(recipe: CameraRecipe, draft: _Draft, behind: Side, front: Side) -> 
     dice, camera = draft.dice, draft.camera
     on = front if dice.chance(recipe.focus_on_front_probability) else behind
     is_pinhole, aperture = dice.chance(recipe.pinhole_probability), dice.within_log(recipe.aperture_mm_log)
-    away = _camera_in_glass(camera, draft.glass)[2] + _distance(on)
+    away = _camera_in_glass(camera, draft.glass)[2] + on.distance_mm
     slant = _in_glass(axes(camera.heading_deg, camera.pitch_deg)[2], draft.glass)[2]
     return camera.model_copy(
         update={
@@ -250,12 +250,6 @@ def _focused(recipe: CameraRecipe, draft: _Draft, behind: Side, front: Side) -> 
             "aperture_mm": 0.0 if is_pinhole else aperture,
         }
     )
-
-
-def _distance(side: Side) -> float:
-    if side.plane:
-        return side.plane.distance_mm
-    return side.map.radius_mm if side.map else math.inf
 
 
 def _development(recipe: DevelopmentRecipe, dice: _Dice) -> Development:

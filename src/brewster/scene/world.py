@@ -71,3 +71,10 @@ class Side(Values):
         if self.map and self.plane and self.plane.distance_mm >= self.map.radius_mm:
             raise ValueError("the plane stands inside the map's dome: distance_mm is below radius_mm")
         return self
+
+    @property
+    def distance_mm(self) -> float:
+        """From the glass to the nearest content, infinite where all is far."""
+        distances = [self.plane.distance_mm] if self.plane else []
+        distances += [self.map.radius_mm] if self.map else []
+        return min(distances, default=math.inf)

@@ -118,6 +118,7 @@ class Light:
         self._to_world = to_world
         self.board = _board(side.plane, assets, behind, device) if side.plane else None
         self.plane_mm = side.plane.distance_mm if side.plane else math.inf
+        self.distance_mm = side.distance_mm
 
     @property
     def is_dome(self) -> bool:
@@ -128,11 +129,6 @@ class Light:
     def is_near(self) -> bool:
         """Whether any of this light depends on where a ray starts."""
         return self.is_dome or self.board is not None
-
-    @property
-    def distance_mm(self) -> float:
-        """To the nearest light, infinite where all is far."""
-        return min(self.radius_mm, self.plane_mm)
 
     def texels_per_pixel(self) -> float:
         """How many texels a pixel spans at most: what a grid of looks must not miss."""
@@ -161,9 +157,8 @@ class Light:
         """Near light along rays, (3, N), and how much of the far light is seen past it, (N,) or None for nothing."""
         seen, clear = torch.zeros_like(direction), None
         if self.is_dome:
-            along = dot(origin, direction)
-            away = torch.sqrt((along**2 - dot(origin, origin) + self.radius_mm**2).clamp(min=0)) - along
-            seen = self.look_up((origin + away * direction) / self.radius_mm, share)
+            place, _ = self._on_dome(origin, direction)
+            seen = self.look_up(place, share)
         elif self.map is not None:
             clear = torch.ones_like(direction[0])
         if self.board is not None:
@@ -174,11 +169,13 @@ class Light:
 
     def along(self, origin: Tensor, direction: Tensor, share: float) -> Tensor:
         """All light along rays from `origin` to unit `direction`, both (3, N): (3, N)."""
+        return self.before(self.far(direction, share), origin, direction, share)
+
+    def before(self, far: Tensor | None, origin: Tensor, direction: Tensor, share: float) -> Tensor:
+        """All light along rays whose `far` light, (3, N), is known already."""
         if not self.is_near:
-            far = self.far(direction, share)
             return torch.zeros_like(direction) if far is None else far
         seen, clear = self.near(origin, direction, share)
-        far = self.far(direction, share) if clear is not None else None
         return seen if far is None or clear is None else seen + clear * far
 
     def look_up(self, direction: Tensor, share: float) -> Tensor:
@@ -201,13 +198,17 @@ class Light:
         """How densely `draw` goes along unit directions (3, N), per solid angle at `origin`: (N,)."""
         if not self.is_dome:
             return self._odds().density(self._to_world @ direction, self._turn)
-        along = dot(origin, direction)
-        away = torch.sqrt((along**2 - dot(origin, origin) + self.radius_mm**2).clamp(min=0)) - along
-        place = (origin + away * direction) / self.radius_mm
+        place, away = self._on_dome(origin, direction)
         facing = dot(place, direction).clamp(min=1e-6)
         return (
             self._odds().density(self._to_world @ place, self._turn) * (away / self.radius_mm) ** 2 / facing
         )
+
+    def _on_dome(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        """Where rays meet the dome, as unit directions from its centre, (3, N), and how far away, (N,) in mm."""
+        along = dot(origin, direction)
+        away = torch.sqrt((along**2 - dot(origin, origin) + self.radius_mm**2).clamp(min=0)) - along
+        return (origin + away * direction) / self.radius_mm, away
 
     def _odds(self) -> Odds:
         """The map's bright places on its own side of the glass; made when first needed."""

@@ -196,7 +196,8 @@ def _arriving(path: _Path, meeting: _Meeting, light: Light, share: float, chance
     direction, density = light.draw(path.origin, chance.pair())
     facet = _half(meeting, direction)
     s, p = _shares(meeting, facet, direction)
-    other = _density(meeting, direction) / (density + _density(meeting, direction)).clamp(min=1e-20)
+    own = _density(meeting, direction)
+    other = own / (density + own).clamp(min=1e-20)
     weight_drawn = (meeting.before.s * s + meeting.before.p * p) / 2 * other
     return weight * seen * balance + weight_drawn * light.along(path.origin, direction, share)
 

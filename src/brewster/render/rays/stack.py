@@ -54,9 +54,7 @@ class Shares:
 
 def all_orders(glazing: Glazing, cosine: Tensor) -> Shares:
     """The sum of all orders in closed form: panes joined by the adding formula, s and p apart."""
-    return _averaged(
-        [_add_up([_pane(pane, r, a) for pane, r, a in lane]) for lane in _lanes(glazing, cosine)]
-    )
+    return _averaged([_add_up([_pane(r, a) for r, a in lane]) for lane in _lanes(glazing, cosine)])
 
 
 def paper_orders(glazing: Glazing, cosine: Tensor) -> Shares:
@@ -65,20 +63,17 @@ def paper_orders(glazing: Glazing, cosine: Tensor) -> Shares:
 
 
 _Pair = tuple[Tensor, Tensor]
-_Lane = list[tuple[Pane, Tensor, Tensor | float]]
+_Lane = list[tuple[Tensor, Tensor | float]]
 
 
 def _lanes(glazing: Glazing, cosine: Tensor) -> list[_Lane]:
-    """For s and for p: each pane with its surfaces' reflectance and what one traversal leaves."""
+    """For s and for p: each pane's reflectance at a surface, and what one traversal leaves."""
     left = [pass_once(pane, cosine) if any(pane.absorption_per_m) else 1.0 for pane in glazing.panes]
     both = [fresnel(cosine, pane.index) for pane in glazing.panes]
-    return [
-        [(pane, r[which], a) for pane, r, a in zip(glazing.panes, both, left, strict=True)]
-        for which in (0, 1)
-    ]
+    return [[(r[which], a) for r, a in zip(both, left, strict=True)] for which in (0, 1)]
 
 
-def _pane(_: Pane, r: Tensor, a: Tensor | float) -> _Pair:
+def _pane(r: Tensor, a: Tensor | float) -> _Pair:
     """Transmittance and reflectance of a pane whose surfaces reflect r and whose glass leaves a."""
     through = (1 - r) ** 2 * a / (1 - (r * a) ** 2)
     return through, r + through * r * a
@@ -95,9 +90,9 @@ def _add_up(pairs: list[_Pair]) -> _Pair:
 
 def _paper_pair(lane: _Lane) -> _Pair:
     through: Tensor | float = 1.0
-    for _, r, a in lane:
+    for r, a in lane:
         through = through * (1 - r) ** 2 * a
-    first_surface = lane[-1][1]
+    first_surface, _ = lane[-1]
     before = [_pane(*panes) for panes in lane[:-1]]
     assert isinstance(through, Tensor)
     return through, _add_up([*before, (through, first_surface)])[1]
