@@ -11,7 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from brewster.errors import RecipeError
+from brewster.dataset.layouts import Trio, read_folders
+from brewster.errors import PhotoError, RecipeError
 from brewster.files import SUFFIXES
 from brewster.light import to_encoded
 from brewster.photo import Photo
@@ -44,31 +45,38 @@ def read_maps(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list[Tens
 
 
 def read_pairs(folders: Sequence[Path]) -> list[tuple[Tensor, Tensor]]:
-    """Aligned (photo, transmission) pairs of folders with `blended/` and `transmission*/`, joined by name.
+    """Aligned (photo, transmission) pairs of folders as `layouts.read_folders` joins them, in order of path.
 
     Raises:
-        RecipeError: a folder cannot be read or is empty; a photo has no partner, or one of another size.
+        RecipeError: a folder cannot be read or is empty; a picture has no partner, or one of another size.
         PhotoError: a picture cannot be read.
     """
-    return [_read_pair(path) for folder in folders for path in _list([folder / "blended"], _PICTURES)]
+    return [_read_pair(trio) for folder in folders for trio in _trios(folder)]
 
 
-def _read_pair(blended: Path) -> tuple[Tensor, Tensor]:
-    partners = [
-        path
-        for path in blended.parent.parent.glob(f"transmission*/{blended.stem}.*")
-        if path.suffix.lower() in _PICTURES
-    ]
-    if len(partners) != 1:
+def _trios(folder: Path) -> list[Trio]:
+    try:
+        found = read_folders(folder)
+    except PhotoError as error:
         raise RecipeError(
-            f"{blended} has {len(partners)} partners",
-            "each blended picture needs one of the same name under transmission/",
+            str(error).split("; ")[0],
+            "blended/ and transmission_layer/ beside each other",
+            "name another folder in the recipe, or set BREWSTER_DATA to where the data lies",
+        ) from error
+    if found.refused:
+        raise RecipeError(
+            f"{folder}: {found.refused[0]} ({len(found.refused)} such)",
+            "each photo needs one transmission of its name, and no transmission is left over",
             "add or remove files until the names match",
         )
-    photo, transmission = (_read_photo(path, 10**6) for path in (blended, partners[0]))
+    return sorted(found.trios, key=lambda trio: trio.photo)
+
+
+def _read_pair(trio: Trio) -> tuple[Tensor, Tensor]:
+    photo, transmission = (_read_photo(path, 10**6) for path in (trio.photo, trio.transmission))
     if photo.shape != transmission.shape:
         raise RecipeError(
-            f"{blended} and {partners[0]} differ in size",
+            f"{trio.photo} and {trio.transmission} differ in size",
             "pairs must be aligned pixel by pixel",
             "crop one to the other",
         )

@@ -1,0 +1,70 @@
+"""Tiny copies of the field's benchmarks, in every layout, for the tests that read or score them.
+
+Every picture is 8x6 pixels unless `size` says otherwise; the names, the folders and the counts are the real ones.
+"""
+
+from functools import cache
+from itertools import product
+from pathlib import Path
+
+from picture_files import file_of, smooth
+
+POSTCARD_SCENES = tuple(f"{first}{second}" for first, second in product("abcd", "bcdef"))
+POSTCARD_SHOTS = (
+    *(("Focus", variant) for variant in (11, 13, 16, 19, 22, 27, 32)),
+    *(("Thick", variant) for variant in (3, 5, 10)),
+)
+
+
+@cache
+def picture(size=(8, 6), kind="PNG"):
+    width, height = size
+    return file_of(smooth(height, width), kind)
+
+
+def write(root: Path, *places: str, size=(8, 6), data=None):
+    """Writes a picture at each place below the root; returns the root."""
+    for place in places:
+        path = root / place
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(picture(size) if data is None else data)
+    return root
+
+
+def repacked(root: Path, names, roles=("blended", "transmission_layer"), suffix=".png", size=(8, 6)):
+    """Pairs, or triplets with a third role, with equal names in a folder for each role."""
+    return write(root, *(f"{role}/{name}{suffix}" for name in names for role in roles), size=size)
+
+
+def postcard(root: Path, scenes=POSTCARD_SCENES):
+    """SIR2's Postcard as its authors gave it: 10 shots of each scene, but 9 of the last of all 20."""
+    for scene, (kind, variant) in product(scenes, POSTCARD_SHOTS):
+        if (scene, variant) != (POSTCARD_SCENES[-1], 10):
+            first, last = (variant, 32) if variant in (3, 5) else (variant, 3)
+            if kind == "Focus":
+                first, last = 3, variant
+            write(
+                root, *(f"{kind}/{scene}/{variant}/{scene}-{first}-{letter}-{last}.png" for letter in "mgr")
+            )
+    return root
+
+
+def solidobject(root: Path, scenes=range(1, 21)):
+    """SIR2's SolidObject as its authors gave it: 10 shots of each scene."""
+    for scene, (kind, variant) in product(scenes, POSTCARD_SHOTS):
+        write(root, *(f"{scene}/{kind}/{variant}/{letter}.jpg" for letter in "mgr"))
+    return root
+
+
+def wildscene(root: Path, count=101):
+    """SIR2's Wildscene as its authors gave it: every third folder is named like 7s."""
+    shots = [f"{number}s" if number % 3 == 1 else str(number) for number in range(1, count + 1)]
+    return write(root, *(f"{shot}/{letter}.jpg" for shot in shots for letter in "mgr"))
+
+
+def sir2(root: Path):
+    """All of SIR2: 199 + 200 + 101 triplets."""
+    postcard(root / "Postcard Dataset")
+    solidobject(root / "SolidObjectDataset")
+    wildscene(root / "Wildscene")
+    return root
