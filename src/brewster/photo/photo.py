@@ -16,7 +16,7 @@ from brewster import light
 from brewster.errors import PhotoError, UnreadablePhoto, UnsupportedPhoto
 from brewster.files import DEFAULT_MAX_PIXELS, write_atomically
 from brewster.photo import metadata
-from brewster.photo.colour import Space, space_of
+from brewster.photo.colour import SRGB, Space, space_of
 from brewster.photo.decode import Decoded, decode, split, upright
 from brewster.photo.encode import encode
 from brewster.photo.floats import too_large
@@ -176,6 +176,20 @@ class Photo:
         `with_pixels`.
         """
         return self.space().to_stored(np.asarray(linear, np.float32), self.pixels[top : top + len(linear)])
+
+    def srgb_8bit(self) -> NDArray[np.uint8]:
+        """8-bit sRGB numbers (H, W, 3), clipped to what sRGB can show, without alpha: what benchmarks compare.
+
+        Of an 8-bit photo in sRGB these are the stored numbers; grey is repeated in all three channels.
+        """
+        kind = np.dtype(np.uint8)
+        if self.space() == SRGB and self.pixels.dtype.kind == "u":
+            pixels = _rescaled(self.pixels, kind) if self.pixels.dtype != kind else self.pixels
+            return np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels
+        shown = np.empty((*self.pixels.shape[:2], 3), kind)
+        for rows in self.strips():
+            shown[rows] = SRGB.to_stored(self.linear_rows(rows.start, rows.stop), shown[rows])
+        return shown
 
     def with_linear(self, linear: Float32) -> Photo:
         """The same photo with other light, (H, W, 3); pixels whose light is unchanged are bit-equal."""
