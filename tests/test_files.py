@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brewster.errors import TargetError
-from brewster.files import SUFFIXES, Job, find, write_atomically
+from brewster.files import SUFFIXES, Job, cache_folder, find, write_atomically
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -237,3 +237,12 @@ def test_impossible_targets_are_explained(tmp_path: Path, target: str, word: str
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(TargetError, match=word):
         write_atomically(tmp_path / target, b"layer", overwrite=True)
+
+
+def test_what_was_fetched_is_kept_in_the_users_cache_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", "/cache")
+    assert cache_folder() == Path("/cache/brewster")
+    monkeypatch.setenv("HOME", "/home/ann")
+    for nowhere in ("relative", ""):
+        monkeypatch.setenv("XDG_CACHE_HOME", nowhere)
+        assert cache_folder() == Path("/home/ann/.cache/brewster")

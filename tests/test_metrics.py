@@ -1,3 +1,8 @@
+"""Whether scores are what they say: beside scikit-image, by hand, and in a region."""
+
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -5,35 +10,173 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from brewster.metrics import psnr, ssim
+import brewster.metrics
+from brewster.errors import BrewsterError
+from brewster.metrics import METRICS, Metric, find_metric, psnr, ssim
 
-pictures = arrays(np.uint8, (11, 13, 3))
+GAUSSIAN = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 255}
+PEERS = {"uniform": {"channel_axis": 2}, "gaussian": {"channel_axis": 2, **GAUSSIAN}}
+BORDERS = {"uniform": 3, "gaussian": 5}
+
+pictures = arrays(np.uint8, (13, 17, 3))
+masks = arrays(np.bool_, (13, 17))
+windows = st.sampled_from(sorted(PEERS))
 
 
 @given(pictures, pictures)
-def test_psnr_and_ssim_equal_scikit_image(one, other):
+def test_psnr_equals_scikit_image(one, other):
     if (one != other).any():
         assert psnr(one, other) == pytest.approx(peak_signal_noise_ratio(other, one), abs=1e-9)
-    assert ssim(one, other) == pytest.approx(structural_similarity(other, one, channel_axis=2), abs=1e-9)
+
+
+@given(pictures, pictures, windows)
+def test_ssim_equals_scikit_image_with_either_window(one, other, window):
+    peer = structural_similarity(other, one, **PEERS[window])
+    assert ssim(one, other, window=window) == pytest.approx(peer, abs=1e-9)
+
+
+@pytest.mark.parametrize("window", PEERS)
+@pytest.mark.parametrize("size", [(11, 11), (11, 40), (40, 12), (33, 47)])
+def test_ssim_equals_scikit_image_at_any_size_and_near_white(random, size, window):
+    one, other = random.integers(230, 256, (2, *size, 3), np.uint8)
+    peer = structural_similarity(other, one, **PEERS[window])
+    assert ssim(one, other, window=window) == pytest.approx(peer, abs=1e-9)
 
 
 def test_equal_pictures_are_perfect(random):
-    picture = random.integers(0, 256, (9, 9, 3), np.uint8)
+    picture = random.integers(0, 256, (12, 12, 3), np.uint8)
     assert psnr(picture, picture) == float("inf")
-    assert ssim(picture, picture) == pytest.approx(1)
+    assert ssim(picture, picture) == ssim(picture, picture, window="gaussian") == pytest.approx(1)
 
 
-def test_a_constant_offset_of_ten_is_28_decibels():
+@pytest.mark.parametrize(("offset", "decibels"), [(1, 48.1308), (10, 28.1308), (100, 8.1308)])
+def test_a_constant_offset_has_a_known_psnr(offset, decibels):
     picture = np.full((8, 8, 3), 100, np.uint8)
-    assert psnr(picture + np.uint8(10), picture) == pytest.approx(28.1308, abs=1e-4)
+    assert psnr(picture + np.uint8(offset), picture) == pytest.approx(decibels, abs=1e-4)
+    assert psnr(picture, picture + np.uint8(offset)) == pytest.approx(decibels, abs=1e-4)
 
 
-@given(st.sampled_from([psnr, ssim]))
-def test_pictures_of_different_shapes_are_refused(metric):
-    with pytest.raises(ValueError, match="shape"):
-        metric(np.zeros((8, 8, 3), np.uint8), np.zeros((8, 9, 3), np.uint8))
+def test_two_even_pictures_have_the_ssim_of_their_means():
+    black, white = np.zeros((11, 11, 3), np.uint8), np.full((11, 11, 3), 255, np.uint8)
+    constant = (0.01 * 255) ** 2
+    for window in PEERS:
+        assert ssim(black, white, window=window) == pytest.approx(constant / (255**2 + constant))
 
 
-def test_a_picture_smaller_than_the_window_is_refused():
-    with pytest.raises(ValueError, match="7x7"):
-        ssim(np.zeros((6, 9, 3), np.uint8), np.zeros((6, 9, 3), np.uint8))
+def test_pictures_may_lie_in_memory_as_they_like(random):
+    one, other = random.integers(0, 256, (2, 20, 26, 3), np.uint8)
+    for a, b in ((one[::-1, ::2], other[::-1, ::2]), (one.transpose(1, 0, 2), other.transpose(1, 0, 2))):
+        assert psnr(a, b) == psnr(a.copy(), b.copy())
+        assert ssim(a, b) == pytest.approx(ssim(a.copy(), b.copy()), abs=1e-12)
+
+
+# --- in a region
+
+
+@given(pictures, pictures, windows)
+def test_a_region_that_is_the_whole_picture_changes_nothing(one, other, window):
+    whole = np.ones(one.shape[:2], bool)
+    assert psnr(one, other, region=whole) == psnr(one, other)
+    assert ssim(one, other, window=window, region=whole) == pytest.approx(ssim(one, other, window=window))
+
+
+@given(pictures, pictures, masks, windows)
+def test_ssim_in_a_region_is_the_mean_of_the_map_that_scikit_image_draws(one, other, mask, window):
+    border = BORDERS[window]
+    _, drawn = structural_similarity(other, one, full=True, **PEERS[window])
+    inner = (slice(border, -border),) * 2
+    if mask[inner].any():
+        expected = drawn[inner][mask[inner]].mean()
+        assert ssim(one, other, window=window, region=mask) == pytest.approx(expected, abs=1e-9)
+    else:
+        with pytest.raises(ValueError, match="region"):
+            ssim(one, other, window=window, region=mask)
+
+
+def test_psnr_in_a_region_sees_nothing_else(random):
+    truth = random.integers(0, 200, (9, 9, 3), np.uint8)
+    picture, region = truth.copy(), np.zeros((9, 9), bool)
+    picture[:3] += np.uint8(10)
+    region[:3, 2:5] = True
+    assert psnr(picture, truth, region=region) == pytest.approx(28.1308, abs=1e-4)
+    assert psnr(picture, truth, region=~region & (picture == truth).all(2)) == float("inf")
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim])
+def test_a_region_that_measures_nothing_is_refused(metric):
+    picture = np.zeros((9, 9, 3), np.uint8)
+    with pytest.raises(ValueError, match="empty"):
+        metric(picture, picture, region=np.zeros((9, 9), bool))
+    for wrong in (np.ones((9, 8), bool), np.ones((9, 9), np.uint8), np.ones((9, 9, 1), bool)):
+        with pytest.raises(ValueError, match=r"must be bool \(9, 9\)"):
+            metric(picture, picture, region=wrong)
+
+
+def test_a_region_at_the_border_has_no_ssim():
+    picture, region = np.zeros((9, 9, 3), np.uint8), np.zeros((9, 9), bool)
+    region[:3] = True
+    with pytest.raises(ValueError, match="within 3 pixels of the border"):
+        ssim(picture, picture, region=region)
+
+
+# --- what is refused
+
+
+@pytest.mark.parametrize("metric", [psnr, ssim])
+@pytest.mark.parametrize(
+    ("picture", "why"),
+    [
+        (np.zeros((8, 9, 3), np.uint8), "shape"),
+        (np.zeros((8, 8, 4), np.uint8), r"must be uint8 \(H, W, 3\), not uint8 \(8, 8, 4\)"),
+        (np.zeros((8, 8), np.uint8), "must be uint8"),
+        (np.zeros((8, 8, 3)), "not float64"),
+        (np.zeros((8, 8, 3), np.uint16), "not uint16"),
+        (np.zeros((0, 8, 3), np.uint8), "must be"),
+    ],
+)
+def test_what_is_no_pair_of_pictures_is_refused(metric, picture, why):
+    truth = np.zeros((8, 8, 3), np.uint8)
+    for pair in ((picture, truth), (truth, picture)):
+        with pytest.raises(ValueError, match=why):
+            metric(*pair)
+
+
+@pytest.mark.parametrize(("window", "side"), [("uniform", 7), ("gaussian", 11)])
+def test_a_picture_smaller_than_the_window_is_refused(window, side):
+    with pytest.raises(ValueError, match=f"at least {side}x{side} pixels, not {side - 1}x20"):
+        ssim(*np.zeros((2, side - 1, 20, 3), np.uint8), window=window)
+    assert ssim(*np.zeros((2, side, side, 3), np.uint8), window=window) == 1
+
+
+# --- the table
+
+
+def test_the_table_names_each_metric_once_and_defines_it():
+    assert [metric.name for metric in METRICS.values()] == list(METRICS)
+    assert len({metric.title for metric in METRICS.values()}) == len(METRICS)
+    for metric in METRICS.values():
+        assert metric.about.endswith(".")
+        assert metric.about.count(". ") == 0
+        assert metric.unit == ("dB" if metric.name.startswith("psnr") else "")
+        assert metric.higher_is_better == metric.name.startswith(("psnr", "ssim"))
+        assert (metric.where == "region") == metric.name.endswith("_region")
+
+
+def test_a_metric_is_found_by_name_and_a_slip_is_understood():
+    assert find_metric("ssim_gaussian") is METRICS["ssim_gaussian"]
+    assert isinstance(find_metric("lpips"), Metric)
+    with pytest.raises(BrewsterError, match=r"no metric 'lpisp'.*did you mean lpips\?"):
+        find_metric("lpisp")
+    with pytest.raises(BrewsterError, match=r"metrics are psnr, ssim, .* choose one"):
+        find_metric("beauty")
+
+
+def test_exports_are_in_order():
+    names = brewster.metrics.__all__
+    assert names == sorted(names, key=lambda name: (not name.isupper(), name))
+    assert all(hasattr(brewster.metrics, name) for name in names)
+
+
+def test_metrics_wake_no_torch():
+    code = "import brewster.metrics, sys; assert not {'torch', 'scipy', 'PIL'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -229,3 +229,9 @@ _OTHERWISE = ("the file must be writable", "choose another place with -o")
 def _target_error(path: Path, error: OSError) -> TargetError:
     expected, cure = _CURES.get(error.errno or 0, _OTHERWISE)
     return TargetError(f"{path} was not written ({error.strerror or error})", expected, cure)
+
+
+def cache_folder() -> Path:
+    """Where what was fetched once is kept: brewster in the user's cache folder (XDG Base Directory, 0.8)."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (cache if cache.is_absolute() else Path.home() / ".cache") / "brewster"

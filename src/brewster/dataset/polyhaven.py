@@ -3,43 +3,30 @@
     for result in pull(Order(indoor=2, outdoor=1), maps_folder()):
         print(result.status, result.file)
 
-One connection at a time. What was begun lies beside its target as `.part`, and the next call goes on from there.
+One connection at a time. What was begun is kept, and the next call goes on from there (brewster.download).
 """
 
 from __future__ import annotations
 
 import csv
-import functools
-import hashlib
 import io
 import json
-import os
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from http.client import HTTPException, HTTPResponse, InvalidURL
-from importlib import metadata
 from pathlib import Path
 from time import sleep
-from typing import Literal, NamedTuple, TypeVar, cast, final
-from urllib import request
-from urllib.error import HTTPError
+from typing import Literal, NamedTuple, final
 
+from brewster.download import Line, Promise, digest_of, explained
 from brewster.errors import DownloadError, TargetError
-from brewster.files import write_atomically
+from brewster.files import cache_folder, write_atomically
 
 _COLUMNS = ("file", "asset", "category", "resolution", "md5", "authors", "licence")  # of manifest.csv
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,200}", re.ASCII)
-_BUSY = (408, 425, 429, 500, 502, 503, 504)
 _PAUSES_S = (1.0, 2.0, 4.0, 8.0)  # between five attempts
-_LONGEST_WAIT_S = 120.0
 _TIMEOUT_S = 30.0
 _PATIENCE = 5  # when so many assets in a row have failed, it is the server or the line
-_BLOCK = 1 << 18
-_WEB = "http:// or https://"
-
-_T = TypeVar("_T")
 
 
 @final
@@ -78,27 +65,9 @@ class _Asset(NamedTuple):
     authors: str
 
 
-class _Promise(NamedTuple):
-    """A file as the server promises it."""
-
-    url: str
-    size: int
-    md5: str
-
-
-@final
-class _Lost(Exception):
-    """The line broke, or the server asks for patience: worth another attempt, after so many seconds."""
-
-    def __init__(self, why: object, wait_s: float = 0.0) -> None:
-        super().__init__(str(why) or type(why).__name__)
-        self.wait_s = wait_s
-
-
 def maps_folder() -> Path:
     """Where maps lie unless another folder is named: brewster/maps in the user's cache folder."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return (cache if cache.is_absolute() else Path.home() / ".cache") / "brewster" / "maps"
+    return cache_folder() / "maps"
 
 
 def pull(order: Order, out: Path) -> Iterator[Result]:
@@ -134,12 +103,12 @@ def _settle(asset: _Asset, order: Order, out: Path) -> Result:
         promise = _ask_for_file(asset, order)
         if promise is None:
             return result
-        url, size, md5 = promise
+        url, size, _, md5 = promise
         result = replace(result, status="skipped", file=str(target), url=url, bytes=size, md5=md5)
         if not _is_there(target, promise):
             if order.dry_run:
                 return replace(result, status="planned")
-            _download(promise, target)
+            _line().fetch(promise, target)
             result = replace(result, status="downloaded")
     except DownloadError as error:
         return replace(result, status="failed", error=str(error))
@@ -174,13 +143,13 @@ def _authors(record: object) -> str:
     return "; ".join(authors)[:1000] if isinstance(authors, dict) else ""
 
 
-def _ask_for_file(asset: _Asset, order: Order) -> _Promise | None:
+def _ask_for_file(asset: _Asset, order: Order) -> Promise | None:
     url = f"{order.server.rstrip('/')}/files/{asset.id}"
     match _dig(_fetch_json(url), "hdri", order.resolution, order.format):
         case None:
             return None
         case {"url": str(address), "size": int(size), "md5": str(md5)} if size > 0:
-            return _Promise(address, size, md5.lower())
+            return Promise(address, size, "md5", md5.lower())
     raise DownloadError(f"{url} promises no file", "address, size and MD5 sum", "try another --server")
 
 
@@ -193,12 +162,8 @@ def _file_name(asset: _Asset, order: Order) -> str:
 
 
 def _fetch_json(url: str) -> dict[str, object]:
-    def fetch() -> bytes:
-        with _open(url) as response:
-            return _read(response)
-
     try:
-        said = json.loads(_patiently(url, fetch))
+        said = json.loads(_line().read(url))
     except (ValueError, RecursionError) as error:
         raise DownloadError(f"{url} answered no JSON ({error})", "JSON", "check --server") from error
     if not isinstance(said, dict):
@@ -212,126 +177,26 @@ def _dig(tree: object, *keys: str) -> object:
     return tree
 
 
-# --- over the line
-
-
-def _patiently(url: str, attempt: Callable[[], _T]) -> _T:
-    pauses = iter(_PAUSES_S)
-    while True:
-        try:
-            return attempt()
-        except _Lost as lost:
-            if (pause := next(pauses, None)) is None:
-                happened = f"{url} did not come in {len(_PAUSES_S) + 1} attempts ({lost})"
-                cure = "check the connection, or run again later: what came is kept"
-                raise DownloadError(happened, "a server that answers, and a line that holds", cure) from lost
-            sleep(max(pause, lost.wait_s))
-
-
-def _open(url: str, start: int = 0) -> HTTPResponse:
-    """The answer, from this byte on if the server can do that."""
-    headers = {"User-Agent": _agent()} | ({"Range": f"bytes={start}-"} if start else {})
-    try:
-        asked = request.Request(url, headers=headers)  # noqa: S310  (the opener knows http and https only)
-        answer = _opener().open(asked, timeout=_TIMEOUT_S)
-    except HTTPError as error:
-        error.close()
-        if error.code in _BUSY:
-            wait = error.headers.get("Retry-After", "")
-            raise _Lost(error, min(float(wait), _LONGEST_WAIT_S) if wait.isdecimal() else 0) from error
-        raise DownloadError(f"{url} was refused ({error})", "a file", "run again later") from error
-    except (ValueError, InvalidURL) as error:
-        raise DownloadError(f"{url!r} is no address ({error})", _WEB, "check --server") from error
-    except (OSError, HTTPException) as error:
-        raise _Lost(error) from error
-    if answer is None:
-        raise DownloadError(f"{url!r} leads elsewhere", _WEB, "check --server")
-    return cast("HTTPResponse", answer)
-
-
-@functools.cache
-def _opener() -> request.OpenerDirector:
-    """Opens http and https only, also where a server redirects to; for all else it has no answer."""
-    opener = request.OpenerDirector()
-    for handler in (
-        request.ProxyHandler,
-        request.HTTPHandler,
-        request.HTTPSHandler,
-        request.HTTPRedirectHandler,
-        request.HTTPErrorProcessor,
-        request.HTTPDefaultErrorHandler,
-    ):
-        opener.add_handler(handler())
-    return opener
-
-
-@functools.cache
-def _agent() -> str:
-    """Poly Haven asks that programs name themselves."""
-    try:
-        version = metadata.version("brewster")
-    except metadata.PackageNotFoundError:
-        version = "source"
-    return f"brewster/{version} (+separates reflections in photographs; one download at a time)"
-
-
-def _read(response: HTTPResponse, most: int | None = None) -> bytes:
-    """All of it, or what has come of the next so many bytes: none of them is lost with the line."""
-    try:
-        return response.read() if most is None else response.read1(most)
-    except (OSError, HTTPException) as error:
-        raise _Lost(error) from error
+def _line() -> Line:
+    return Line(_PAUSES_S, _TIMEOUT_S, sleep)
 
 
 # --- onto the disk
 
 
-def _is_there(target: Path, promise: _Promise) -> bool:
-    with _writing(target):
+def _is_there(target: Path, promise: Promise) -> bool:
+    with explained(target):
         there = target.exists()
-        if there and _md5(target) != promise.md5:
-            expected, cure = f"one with the MD5 sum {promise.md5}", "move it away, and run again"
+        if there and digest_of(target, promise.algorithm) != promise.digest:
+            expected, cure = f"one with the MD5 sum {promise.digest}", "move it away, and run again"
             raise DownloadError(f"{target} is there, and is not the server's file", expected, cure)
     return there
-
-
-def _download(promise: _Promise, target: Path) -> None:
-    part = target.with_name(f"{target.name}.part")
-    with _writing(target):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        _patiently(promise.url, lambda: _fetch_rest(promise, part))
-        if (came := _md5(part)) != promise.md5:
-            part.unlink()
-            happened = f"{promise.url} came with the MD5 sum {came}, and was dropped"
-            raise DownloadError(happened, f"{promise.md5} was promised", "run again, to fetch all of it anew")
-        part.replace(target)
-
-
-def _fetch_rest(promise: _Promise, part: Path) -> None:
-    came = part.stat().st_size if part.exists() else 0
-    if came == promise.size:
-        return
-    start = came if came < promise.size else 0
-    with _open(promise.url, start) as response:
-        there = start if response.status == 206 else 0  # a server may ignore from where we asked
-        with part.open("ab" if there else "wb") as file:
-            while block := _read(response, min(_BLOCK, promise.size - there)):
-                there += file.write(block)
-            file.flush()
-            os.fsync(file.fileno())
-    if there < promise.size:
-        raise _Lost(f"it ended after {there} of {promise.size} bytes")
-
-
-def _md5(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, lambda: hashlib.md5(usedforsecurity=False)).hexdigest()
 
 
 def _read_manifest(out: Path) -> list[dict[str, str]]:
     """The rows for the maps that are still there."""
     path = out / "manifest.csv"
-    with _writing(path):
+    with explained(path):
         text = path.read_text("utf-8", errors="replace") if path.exists() else ",".join(_COLUMNS)
         rows = csv.DictReader(io.StringIO(text, newline=""))
         if tuple(rows.fieldnames or ()) != _COLUMNS:
@@ -350,13 +215,3 @@ def _note(out: Path, row: dict[str, str]) -> None:
         table.writeheader()
         table.writerows(sorted([*rows, row], key=lambda row: row["file"]))
         write_atomically(out / "manifest.csv", text.getvalue().encode(errors="replace"), overwrite=True)
-
-
-@contextmanager
-def _writing(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        happened = f"{path} cannot be read or written ({error.strerror or error})"
-        cure = "free some space or name another folder, and run again: it goes on from there"
-        raise TargetError(happened, "a folder of yours on a disk with room", cure) from error

@@ -1,0 +1,167 @@
+"""How close are two pictures? Scores of an answer beside the truth, each stated so that its number can be believed.
+
+    from brewster.metrics import METRICS, psnr, reflection_region
+    psnr(answer, truth, region=reflection_region(photo, truth))
+
+fidelity: PSNR and SSIM. perceptual: LPIPS (torch is woken when it is used). region: where the reflection is.
+failures: what was removed wrongly or left, where the truth is known exactly. Pictures are uint8 sRGB (H, W, 3).
+"""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+from typing import Final, Literal, final
+
+from brewster.errors import BrewsterError
+from brewster.metrics.failures import kept_reflection, removed_content, removed_white
+from brewster.metrics.fidelity import Window, psnr, ssim
+from brewster.metrics.perceptual import Features, Lpips, lpips
+from brewster.metrics.region import DEFAULT_THRESHOLD, reflection_region
+
+__all__ = [
+    "DEFAULT_THRESHOLD",
+    "METRICS",
+    "Features",
+    "Lpips",
+    "Metric",
+    "Window",
+    "find_metric",
+    "kept_reflection",
+    "lpips",
+    "psnr",
+    "reflection_region",
+    "removed_content",
+    "removed_white",
+    "ssim",
+]
+
+
+@final
+@dataclass(frozen=True)
+class Metric:
+    """What a score is: how to print it, and how to read it."""
+
+    name: str
+    title: str
+    unit: str
+    """"dB", or nothing for a pure number."""
+    higher_is_better: bool
+    digits: int
+    """After the point, in tables."""
+    about: str
+    """The definition with its parameters, in one sentence."""
+    of: Literal["transmission", "reflection", "rendered"]
+    """Which truth it needs: the transmission, the reflection, or all layers of a rendered sample."""
+    where: Literal["picture", "region"] = "picture"
+    """Over the whole picture, or in the reflection region only."""
+
+
+_PSNR: Final = "10 log10(255^2 / MSE) over the three channels of 8-bit sRGB"
+_SSIM: Final = "per RGB channel of 8-bit sRGB, K1 0.01, K2 0.03, range 255"
+_UNIFORM: Final = f"uniform 7x7 window, sample covariance, {_SSIM}, outermost 3 pixels left out"
+_LPIPS: Final = "LPIPS 0.1 of AlexNet, 8-bit sRGB scaled to -1..1 at the truth's size"
+_REGION: Final = (
+    "the reflection region, where |photo - truth| / 255 in its largest channel, averaged over 7x7 pixels,"
+    f" is above {DEFAULT_THRESHOLD} unless the report states another threshold"
+)
+_GAIN: Final = (
+    "after one gain, the median of background over answer where nothing is mirrored, in linear luminance"
+)
+
+_ROWS: Final = (
+    Metric("psnr", "PSNR", "dB", True, 2, f"{_PSNR} of all pixels.", "transmission"),
+    Metric("ssim", "SSIM", "", True, 3, f"Mean local SSIM, {_UNIFORM}.", "transmission"),
+    Metric(
+        "ssim_gaussian",
+        "SSIM (Gaussian)",
+        "",
+        True,
+        3,
+        f"Mean local SSIM, Gaussian 11x11 window of sigma 1.5, population covariance, {_SSIM},"
+        " outermost 5 pixels left out.",
+        "transmission",
+    ),
+    Metric("lpips", "LPIPS", "", False, 3, f"{_LPIPS}, each layer averaged over its map.", "transmission"),
+    Metric(
+        "psnr_region", "PSNR in region", "dB", True, 2, f"{_PSNR} of {_REGION}.", "transmission", "region"
+    ),
+    Metric(
+        "ssim_region",
+        "SSIM in region",
+        "",
+        True,
+        3,
+        f"Mean local SSIM, {_UNIFORM}, over {_REGION}.",
+        "transmission",
+        "region",
+    ),
+    Metric(
+        "lpips_region",
+        "LPIPS in region",
+        "",
+        False,
+        3,
+        f"{_LPIPS}, each layer's map enlarged to the picture (bilinear), averaged over {_REGION}.",
+        "transmission",
+        "region",
+    ),
+    Metric("psnr_reflection", "PSNR of R", "dB", True, 2, f"{_PSNR} of all pixels.", "reflection"),
+    Metric("ssim_reflection", "SSIM of R", "", True, 3, f"Mean local SSIM, {_UNIFORM}.", "reflection"),
+    Metric(
+        "lpips_reflection",
+        "LPIPS of R",
+        "",
+        False,
+        3,
+        f"{_LPIPS}, each layer averaged over its map.",
+        "reflection",
+    ),
+    Metric(
+        "removed_content",
+        "Removed content",
+        "",
+        False,
+        3,
+        "Share of the background's light that the answer lacks where the reflection is below 2 % of the photo,"
+        f" {_GAIN}.",
+        "rendered",
+    ),
+    Metric(
+        "removed_white",
+        "Removed white",
+        "",
+        False,
+        3,
+        "Share of the background's light that the answer lacks where the reflection is below 2 % of the photo and the"
+        " background is white (encoded channels above 0.75 and less than 0.12 apart),"
+        f" {_GAIN}.",
+        "rendered",
+    ),
+    Metric(
+        "kept_reflection",
+        "Kept reflection",
+        "",
+        False,
+        3,
+        "Share of the reflection's light that the answer still has above the background, where the reflection is at"
+        f" least 10 % of the photo and the photo is not clipped, {_GAIN}.",
+        "rendered",
+    ),
+)
+
+METRICS: Final = {metric.name: metric for metric in _ROWS}
+"""All scores by name, in the order of reports."""
+
+
+def find_metric(name: str) -> Metric:
+    """A metric by its name.
+
+    Raises:
+        BrewsterError: there is none of this name.
+    """
+    if name in METRICS:
+        return METRICS[name]
+    near = difflib.get_close_matches(name, METRICS, n=1)
+    cure = f"did you mean {near[0]}?" if near else "choose one of them"
+    raise BrewsterError(f"there is no metric {name!r}", f"metrics are {', '.join(METRICS)}", cure)

@@ -1,0 +1,185 @@
+"""How alike two pictures look: LPIPS 0.1 with AlexNet, from its own five convolutions.
+
+    metric = Lpips.load()
+    truth = metric.features(picture)  # once for many answers
+    print([metric.distance(metric.features(answer), truth) for answer in answers])
+
+R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018; the definition
+is that of the `lpips` package, version 0.1 of the weights. torch is woken by `Lpips.load` only.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, NamedTuple, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brewster.errors import MissingExtra
+from brewster.metrics.weights import load_backbone, read_heads
+from brewster.metrics.windows import Picture, Region, check_pictures, check_region
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch import Tensor
+
+    Map = Float[Tensor, "c h w"]
+
+LEAST_SIDE: Final = 31
+"""AlexNet halves a picture until a smaller one has nothing left."""
+
+_SHIFT: Final = np.array([-0.030, -0.088, -0.188])
+_SCALE: Final = np.array([0.458, 0.448, 0.450])
+"""ImageNet's mean and spread of values in -1..1, as LPIPS 0.1 rounds them."""
+
+
+class _Step(NamedTuple):
+    """A convolution of AlexNet; before some, each 3x3 pixels are pooled in steps of two."""
+
+    stride: int
+    padding: int
+    pooled: bool
+
+
+_STEPS: Final = (
+    _Step(4, 2, pooled=False),
+    _Step(1, 2, pooled=True),
+    _Step(1, 1, pooled=True),
+    _Step(1, 1, pooled=False),
+    _Step(1, 1, pooled=False),
+)
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Features:
+    """What AlexNet sees in a picture: five maps (C, h, w) float32 of unit length in C, and the picture's (H, W)."""
+
+    maps: tuple[Map, ...]
+    size: tuple[int, int]
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Lpips:
+    """The metric with its weights; on the CPU, reusable and thread-safe."""
+
+    convolutions: tuple[tuple[Tensor, Tensor], ...]
+    """Weights (out, in, k, k) and biases (out,) of AlexNet's five convolutions."""
+    heads: tuple[Tensor, ...]
+    """How much each channel of the five maps counts, (C,)."""
+
+    @classmethod
+    def load(cls) -> Lpips:
+        """The metric with its published weights, which are read once.
+
+        Raises:
+            MissingExtra: torch is not installed.
+            ModelError: the file of the convolutions is damaged or another one.
+            DownloadError: there is no such file yet, and the server does not give it.
+            TargetError: there is none, and the cache folder cannot be written.
+        """
+        return _load()
+
+    def features(self, picture: Picture) -> Features:
+        """What AlexNet sees in a picture.
+
+        Raises:
+            ValueError: the picture is not uint8 (H, W, 3), or has less than 31 pixels on a side.
+        """
+        import torch  # noqa: PLC0415 - an extra
+        from torch.nn import functional  # noqa: PLC0415
+
+        check_pictures(picture)
+        size = picture.shape[:2]
+        if min(size) < LEAST_SIDE:
+            raise ValueError(
+                f"LPIPS needs at least {LEAST_SIDE}x{LEAST_SIDE} pixels, not {size[0]}x{size[1]}"
+            )
+        maps = []
+        with torch.inference_mode():
+            seen = torch.from_numpy(_scaled(picture)).permute(2, 0, 1)[None]
+            for (weight, bias), step in zip(self.convolutions, _STEPS, strict=True):
+                if step.pooled:
+                    seen = functional.max_pool2d(seen, 3, 2)
+                seen = functional.relu(functional.conv2d(seen, weight, bias, step.stride, step.padding))
+                maps.append(seen[0] / (torch.linalg.vector_norm(seen[0], dim=0) + 1e-10))
+        return Features(tuple(maps), size)
+
+    def distance(self, one: Features, other: Features, *, region: Region | None = None) -> float:
+        """How differently two pictures look, 0 for equal ones, lower is better.
+
+        The squared differences of the maps, weighted by channel, are averaged over each map and summed over the
+        five. With a `region`, bool (H, W), each is first enlarged to the picture's size (bilinear, corners not
+        aligned: what `lpips` calls spatial), and their sum is averaged over the region's pixels. A region that is
+        the whole picture differs slightly from none, because enlarging counts the rims of the maps differently.
+
+        Raises:
+            ValueError: the pictures differ in size, or the region is empty or of another shape.
+        """
+        import torch  # noqa: PLC0415 - an extra
+
+        if one.size != other.size:
+            raise ValueError(f"the pictures differ in size: {one.size} and {other.size}")
+        with torch.inference_mode():
+            maps = [
+                torch.einsum("c,chw->hw", head, (a - b).square_())
+                for head, a, b in zip(self.heads, one.maps, other.maps, strict=True)
+            ]
+            if region is None:
+                return float(sum(_mean(map_.numpy()) for map_ in maps))
+            check_region(region, one.size)
+            return _mean(_enlarged(maps, one.size).numpy()[region])
+
+
+def lpips(picture: Picture, truth: Picture, *, region: Region | None = None) -> float:
+    """LPIPS 0.1 (AlexNet) of two pictures, 0 for equal ones, lower is better; see `Lpips.distance`.
+
+    Raises:
+        ValueError: the pictures are not uint8 (H, W, 3), differ in shape, or are smaller than 31x31 pixels; the
+            region is empty or of another shape.
+        BrewsterError: what `Lpips.load` raises.
+    """
+    check_pictures(picture, truth)
+    metric = Lpips.load()
+    return metric.distance(metric.features(picture), metric.features(truth), region=region)
+
+
+@functools.cache
+def _load() -> Lpips:
+    try:
+        import torch  # noqa: PLC0415 - an extra
+    except ImportError as error:
+        raise MissingExtra(
+            "torch is not installed", "LPIPS is a neural network", "pip install 'brewster[evaluate]'"
+        ) from error
+    tensors = [*load_backbone().values()]
+    weights = [weight.to(memory_format=torch.channels_last) for weight in tensors[::2]]  # faster on the CPU
+    heads = tuple(torch.from_numpy(head) for head in read_heads())
+    return Lpips(tuple(zip(weights, tensors[1::2], strict=True)), heads)
+
+
+def _scaled(picture: Picture) -> NDArray[np.float32]:
+    """(value / 127.5 - 1 - shift) / scale, (H, W, 3); in this order of memory AlexNet's convolutions are fastest.
+
+    Whole rows at once: numpy is slow along an axis of three.
+    """
+    height, width, _ = picture.shape
+    values = picture.reshape(height, -1).astype(np.float32, order="C")
+    values *= np.tile(1 / (127.5 * _SCALE), width).astype(np.float32)
+    values -= np.tile((1 + _SHIFT) / _SCALE, width).astype(np.float32)
+    return values.reshape(picture.shape)
+
+
+def _mean(values: NDArray[np.float32]) -> float:
+    """In numpy, in double: the order of its sums does not depend on the number of threads."""
+    return float(values.mean(dtype=np.float64))
+
+
+def _enlarged(maps: list[Tensor], size: tuple[int, int]) -> Tensor:
+    from torch.nn.functional import interpolate  # noqa: PLC0415 - an extra
+
+    full = [interpolate(map_[None, None], size, mode="bilinear", align_corners=False)[0, 0] for map_ in maps]
+    return sum(full[1:], start=full[0])

@@ -1,0 +1,31 @@
+"""Where the reflection is: the pixels of a photo that the glass has visibly changed."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from brewster.metrics.windows import BOX, Picture, Region, box_sums, check_pictures
+
+DEFAULT_THRESHOLD: Final = 0.08
+"""Of the range of 8-bit values. Chosen by eye on 20 real pairs, of which it marks 0.1 to 87 %, in the middle a third:
+at 0.04 most of a picture is marked, half of it for mere haze or tint; at 0.15 often highlights only."""
+
+
+def reflection_region(photo: Picture, truth: Picture, *, threshold: float = DEFAULT_THRESHOLD) -> Region:
+    """Where a photo differs from the picture without the reflection by more than a threshold, bool (H, W).
+
+    The difference is |photo - truth| / 255 in the channel where it is largest, averaged over 7x7 pixels, for which
+    the picture's edges are repeated outwards.
+
+    Raises:
+        ValueError: the pictures are not uint8 (H, W, 3) or differ in shape, or the threshold is not in 0..1.
+    """
+    check_pictures(photo, truth)
+    if not 0 <= threshold <= 1:
+        raise ValueError(f"the threshold must be in 0..1, not {threshold}")
+    largest = np.abs(photo.astype(np.int16) - truth).max(axis=2)
+    sums = box_sums(np.pad(largest, BOX // 2, mode="edge"))  # at most 49 * 255: int16 holds them exactly
+    region: Region = sums > threshold * 255 * BOX**2
+    return region

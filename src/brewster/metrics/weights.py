@@ -1,0 +1,134 @@
+"""The weights of LPIPS: its five linear heads are shipped, the five convolutions are found or fetched once.
+
+The convolutions are those of torchvision's AlexNet (`features.0`, 3, 6, 8 and 10 of alexnet-owt-7be5be79.pth,
+BSD-3-Clause). `lpips_alexnet_features.pth`, a state dict of these ten tensors, is looked for in brewster/weights of the
+user's cache folder, then in `weights` of the folder that `BREWSTER_DATA` names. Wherever they come from, a digest
+over their values must be right: a number that depends on other weights is not LPIPS.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import pickle
+import struct
+import zipfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brewster.download import Line, Promise
+from brewster.errors import ModelError
+from brewster.files import cache_folder, write_atomically
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+NAMES: Final = tuple(f"features.{i}.{kind}" for i in (0, 3, 6, 8, 10) for kind in ("weight", "bias"))
+
+FILE: Final = "lpips_alexnet_features.pth"
+
+DIGEST: Final = "b58cb12516261361a1ed14f3b70c0abad70c1ca4c1c75e1aa576654d3759aa06"
+"""See `digest_of`."""
+
+TORCHVISION: Final = Promise(
+    "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
+    size=244_408_911,
+    algorithm="sha256",
+    digest="7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02",
+)
+
+_BROKEN: Final = (
+    pickle.UnpicklingError,
+    zipfile.BadZipFile,
+    struct.error,
+    RuntimeError,
+    ValueError,
+    TypeError,
+    LookupError,
+    AttributeError,
+    AssertionError,
+    EOFError,
+    ImportError,
+    MemoryError,
+    OSError,
+)
+"""All that torch says about a file that is not a state dict, or is no longer one."""
+
+
+def load_backbone(
+    promise: Promise = TORCHVISION, digest: str = DIGEST, *, line: Line | None = None
+) -> dict[str, Tensor]:
+    """The ten tensors by name, float32, from the first place that has them; else downloaded into the cache.
+
+    Raises:
+        ModelError: a file is there, and is damaged or another one.
+        DownloadError: there is none, and the server does not give it.
+        TargetError: the cache folder cannot be written.
+    """
+    cached = cache_folder() / "weights" / FILE
+    data = os.environ.get("BREWSTER_DATA")
+    for path in (cached, *([Path(data) / "weights" / FILE] if data else [])):
+        if path.is_file():
+            return read_backbone(path, digest)
+    return _fetch(promise, digest, cached, line or Line())
+
+
+def read_backbone(path: Path, digest: str = DIGEST) -> dict[str, Tensor]:
+    """The ten tensors of a state dict, which may have others beside them; checked.
+
+    Raises:
+        ModelError: the file is damaged or another one.
+    """
+    import torch  # noqa: PLC0415 - an extra
+
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        tensors = {name: state[name].float().contiguous() for name in NAMES}
+    except _BROKEN as error:
+        raise _not_alexnet(path, f"it cannot be read: {type(error).__name__}") from error
+    if (found := digest_of(tensors)) != digest:
+        raise _not_alexnet(path, f"its digest is {found:.12}...")
+    return tensors
+
+
+def read_heads() -> list[NDArray[np.float32]]:
+    """The weights of the five layers' channels, (64,), (192,), (384,), (256,), (256,); none is negative."""
+    with np.load(Path(__file__).with_name("lpips_alex_v0.1.npz")) as file:
+        return [file[f"layer{i}"] for i in range(5)]
+
+
+def digest_of(tensors: dict[str, Tensor]) -> str:
+    """SHA-256 over name, shape and little-endian float32 values of each tensor, in the order of `NAMES`."""
+    digest = hashlib.sha256()
+    for name in NAMES:
+        values: NDArray[Any] = tensors[name].numpy().astype("<f4", order="C")
+        digest.update(f"{name} {values.shape}\n".encode() + values.tobytes())
+    return digest.hexdigest()
+
+
+def _fetch(promise: Promise, digest: str, cached: Path, line: Line) -> dict[str, Tensor]:
+    """Keeps the ten tensors of the whole network's file, and drops the file: 96 % of it are of no use here."""
+    import torch  # noqa: PLC0415 - an extra
+
+    whole = cached.with_name(promise.url.rsplit("/", 1)[-1])
+    line.fetch(promise, whole)
+    try:
+        tensors = read_backbone(whole, digest)
+        buffer = io.BytesIO()
+        torch.save(tensors, buffer)
+        write_atomically(cached, buffer.getvalue(), overwrite=True)
+    finally:
+        whole.unlink(missing_ok=True)
+    return tensors
+
+
+def _not_alexnet(path: Path, why: str) -> ModelError:
+    return ModelError(
+        f"{path} is not the AlexNet of LPIPS ({why})",
+        "the first convolutions of torchvision's alexnet-owt-7be5be79.pth",
+        "delete the file, or put the right one in its place: without it, brewster downloads 233 MiB once",
+    )

@@ -1,0 +1,77 @@
+"""What the metrics share: which pictures and regions they take, and sums over windows that slide over a picture."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from jaxtyping import Bool, UInt8
+
+    Picture = UInt8[NDArray[np.uint8], "h w 3"]
+    Region = Bool[NDArray[np.bool_], "h w"]
+else:
+    Picture = Region = NDArray
+
+_Values = TypeVar("_Values", bound=NDArray[Any])
+
+BOX: Final = 7
+"""The side of the uniform window, in pixels."""
+
+GAUSSIAN_RADIUS: Final = 5
+GAUSSIAN_SIGMA: Final = 1.5
+"""The Gaussian window of Wang et al. 2004: 11x11 pixels, that is cut off after 3.5 sigma."""
+
+_TAPS: Final = np.exp(-0.5 * (np.arange(-GAUSSIAN_RADIUS, 1) / GAUSSIAN_SIGMA) ** 2)
+_GAUSSIAN: Final = _TAPS / (
+    2 * _TAPS.sum() - _TAPS[-1]
+)  # up to the middle: the other half is its mirror image
+
+
+def check_pictures(*pictures: Picture) -> None:
+    """Refuses what is no 8-bit RGB picture, and pictures that differ in shape.
+
+    Raises:
+        ValueError: one of them is not uint8 (H, W, 3) or has no pixels, or they differ in shape.
+    """
+    for picture in pictures:
+        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or not picture.size:
+            raise ValueError(f"a picture must be uint8 (H, W, 3), not {picture.dtype} {picture.shape}")
+        if picture.shape != pictures[0].shape:
+            raise ValueError(f"the pictures differ in shape: {pictures[0].shape} and {picture.shape}")
+
+
+def check_region(region: Region, size: tuple[int, int]) -> None:
+    """Refuses what is no mask of a picture of this height and width, and a mask without any pixel.
+
+    Raises:
+        ValueError: the region is not bool (H, W), or is empty.
+    """
+    if region.dtype != np.bool_ or region.shape != size:
+        raise ValueError(f"the region must be bool {size}, not {region.dtype} {region.shape}")
+    if not region.any():
+        raise ValueError("the region is empty: there is nothing to measure in it")
+
+
+def box_sums(values: _Values) -> _Values:
+    """Sums over all whole 7x7 windows, (H - 6, W - 6, ...), of integers exactly; their type must hold the sums."""
+    for axis in (0, 1):
+        line = np.moveaxis(values, axis, 0)
+        two = line[:-1] + line[1:]
+        four = two[:-2] + two[2:]
+        values = np.moveaxis(four[:-3] + two[4:-1] + line[6:], 0, axis)
+    return values
+
+
+def gaussian_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Means under the Gaussian window at all places where it is whole, (H - 10, W - 10, ...)."""
+    for axis in (0, 1):
+        line = np.moveaxis(values, axis, 0)
+        count, last = len(line) - 2 * GAUSSIAN_RADIUS, 2 * GAUSSIAN_RADIUS
+        mean = line[GAUSSIAN_RADIUS : GAUSSIAN_RADIUS + count] * _GAUSSIAN[GAUSSIAN_RADIUS]
+        for i in range(GAUSSIAN_RADIUS):
+            mean += (line[i : i + count] + line[last - i : last - i + count]) * _GAUSSIAN[i]
+        values = np.moveaxis(mean, 0, axis)
+    return values

@@ -1,0 +1,132 @@
+"""The two ways to fail: taking content away, leaving reflections. On a pane that is made here in linear light."""
+
+import contextlib
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from brewster.light import to_encoded, to_linear
+from brewster.metrics import kept_reflection, removed_content, removed_white
+
+SIDE = 48
+TRANSMITTANCE = 0.8
+WHITE = (slice(4, 20), slice(4, 20))  # a white sheet behind the left half, where nothing is mirrored
+SCORES = (removed_content, removed_white, kept_reflection)
+
+pictures = arrays(np.uint8, (16, 16, 3))
+
+
+def encode(light):
+    return (to_encoded(light.clip(0, 1)) * 255).round().astype(np.uint8)
+
+
+def brighten(picture, gain):
+    return encode(to_linear(picture / 255) * gain)
+
+
+@pytest.fixture
+def scene():
+    """Background, photo and reflection: the right half of the pane mirrors something."""
+    random = np.random.default_rng(7)
+    behind = random.uniform(0.05, 0.4, (SIDE, SIDE, 3))
+    behind[WHITE] = 0.8
+    mirrored = np.zeros_like(behind)
+    mirrored[:, SIDE // 2 :] = random.uniform(0.1, 0.3, (SIDE, SIDE // 2, 3))
+    return encode(behind), encode(TRANSMITTANCE * behind + mirrored), encode(mirrored)
+
+
+def test_the_background_itself_fails_nowhere(scene):
+    background, photo, reflection = scene
+    assert [score(background, background, photo, reflection) for score in SCORES] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("gain", [TRANSMITTANCE, 0.64, 0.5])
+def test_an_answer_that_leaves_what_the_glass_absorbs_fails_nowhere_either(scene, gain):
+    background, photo, reflection = scene
+    scores = [score(brighten(background, gain), background, photo, reflection) for score in SCORES]
+    assert scores == pytest.approx([0, 0, 0], abs=0.01)
+
+
+def test_the_photo_itself_keeps_all_of_the_reflection_and_removes_nothing(scene):
+    background, photo, reflection = scene
+    content, white, kept = (score(photo, background, photo, reflection) for score in SCORES)
+    assert (content, white) == pytest.approx((0, 0), abs=0.01)
+    assert kept == pytest.approx(1, abs=0.01)
+
+
+def test_half_of_the_reflection_counts_half(scene):
+    background, photo, reflection = scene
+    light = [to_linear(picture / 255) for picture in (background, reflection)]
+    answer = encode(light[0] + light[1] / 2)
+    assert kept_reflection(answer, background, photo, reflection) == pytest.approx(0.5, abs=0.01)
+
+
+def test_a_white_sheet_taken_for_a_highlight_is_removed_white(scene):
+    background, photo, reflection = scene
+    answer = background.copy()
+    answer[WHITE] = 0
+    left = np.s_[:, : SIDE // 2]
+    sheet = to_linear(background[WHITE] / 255).sum() / to_linear(background[left] / 255).sum()
+    assert removed_white(answer, background, photo, reflection) == 1
+    assert removed_content(answer, background, photo, reflection) == pytest.approx(sheet, abs=0.01)
+    assert kept_reflection(answer, background, photo, reflection) == 0
+
+
+def test_a_black_answer_removes_everything_and_keeps_nothing(scene):
+    background, photo, reflection = scene
+    assert [score(np.zeros_like(photo), background, photo, reflection) for score in SCORES] == [1, 1, 0]
+
+
+@pytest.mark.parametrize("gain", [0.8, 1.1])
+def test_scores_hardly_depend_on_the_brightness_of_an_answer(scene, gain):
+    background, photo, reflection = scene
+    answer = encode(to_linear(background / 255) * 0.7 + to_linear(reflection / 255) * 0.4)
+    answer[WHITE] //= 2
+    for score in SCORES:
+        told = score(answer, background, photo, reflection)
+        assert score(brighten(answer, gain), background, photo, reflection) == pytest.approx(told, abs=0.02)
+
+
+def test_clipped_values_do_not_mislead_the_gain(scene):
+    background, photo, reflection = scene
+    background = background.copy()
+    background[:, :20] = (
+        255  # most of where nothing is mirrored; the answer is darker there than the glass explains
+    )
+    answer = brighten(background, 0.5)
+    answer[:, :20] = 255
+    assert kept_reflection(answer, background, photo, reflection) == pytest.approx(0, abs=0.01)
+
+
+@pytest.mark.parametrize("score", SCORES)
+def test_a_scene_without_such_pixels_is_refused(score):
+    grey = np.full((8, 8, 3), 100, np.uint8)
+    with pytest.raises(ValueError, match="0 pixels have R"):
+        score(grey, grey, grey, np.zeros_like(grey) if score is kept_reflection else grey)
+
+
+def test_sixty_four_pixels_are_enough():
+    white, none = np.full((8, 8, 3), 220, np.uint8), np.zeros((8, 8, 3), np.uint8)
+    assert removed_white(white, white, white, none) == 0
+    with pytest.raises(ValueError, match="63 pixels"):
+        removed_white(*(picture.reshape(1, 64, 3)[:, 1:] for picture in (white, white, white, none)))
+
+
+@pytest.mark.parametrize("score", SCORES)
+def test_pictures_of_different_shapes_are_refused(scene, score):
+    background, photo, reflection = scene
+    with pytest.raises(ValueError, match="shape"):
+        score(background[1:], background, photo, reflection)
+
+
+@given(pictures, pictures, pictures, pictures, st.integers(0, 16), st.sampled_from(SCORES))
+def test_scores_are_shares_whatever_the_pictures(answer, background, photo, reflection, calm, score):
+    reflection = reflection.copy()
+    reflection[:calm] = 0
+    if score is removed_white:
+        background = background // 16 + np.uint8(220)
+    with contextlib.suppress(ValueError):  # too few such pixels
+        assert 0 <= score(answer, background, photo, reflection) <= 1

@@ -1,0 +1,65 @@
+"""Where the reflection is."""
+
+import numpy as np
+import pytest
+
+from brewster.metrics import DEFAULT_THRESHOLD, reflection_region
+
+
+def pair(side=20):
+    return np.full((2, side, side, 3), 100, np.uint8)
+
+
+def test_equal_pictures_have_no_reflection():
+    photo, truth = pair()
+    assert not reflection_region(photo, truth).any()
+    assert not reflection_region(photo, truth, threshold=0).any()
+
+
+def test_what_the_glass_changed_is_marked_whether_it_became_brighter_or_darker():
+    photo, truth = pair()
+    photo[:, :10, 1] += np.uint8(40)
+    region = reflection_region(photo, truth)
+    assert region.dtype == np.bool_
+    assert region[:, :9].all()
+    assert not region[:, 13:].any()
+    assert (reflection_region(truth, photo) == region).all()
+
+
+def test_the_difference_is_the_mean_over_seven_by_seven_pixels_of_the_largest_channel():
+    photo, truth = pair()
+    photo[10, 10] += np.array([49, 7, 0], np.uint8)  # one unit each in the mean of 49 pixels
+    marked = reflection_region(photo, truth, threshold=0.99 / 255)
+    assert marked[7:14, 7:14].all()
+    assert marked.sum() == 49
+    assert not reflection_region(photo, truth, threshold=1 / 255).any()
+
+
+def test_edges_are_repeated_outwards():
+    photo, truth = pair()
+    photo[0, 0] += np.uint8(49)  # stands for 16 pixels of the corner's window
+    marked = reflection_region(photo, truth, threshold=15.9 / 255)
+    assert np.argwhere(marked).tolist() == [[0, 0]]
+    assert not reflection_region(photo, truth, threshold=16.1 / 255).any()
+
+
+def test_a_higher_threshold_marks_less(random):
+    photo, truth = random.integers(0, 256, (2, 30, 30, 3), np.uint8)
+    shares = [reflection_region(photo, truth, threshold=t).mean() for t in (0, DEFAULT_THRESHOLD, 0.5, 1)]
+    assert shares == sorted(shares, reverse=True)
+    assert (shares[0], shares[-1]) == (1, 0)
+
+
+def test_a_picture_may_be_smaller_than_the_window():
+    assert reflection_region(np.full((1, 2, 3), 255, np.uint8), np.zeros((1, 2, 3), np.uint8)).all()
+
+
+@pytest.mark.parametrize("threshold", [-0.1, 1.1, float("nan")])
+def test_a_threshold_that_is_no_share_of_the_range_is_refused(threshold):
+    with pytest.raises(ValueError, match="threshold"):
+        reflection_region(*pair(), threshold=threshold)
+
+
+def test_pictures_of_different_shapes_are_refused():
+    with pytest.raises(ValueError, match="shape"):
+        reflection_region(np.zeros((8, 8, 3), np.uint8), np.zeros((8, 9, 3), np.uint8))
