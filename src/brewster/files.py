@@ -10,6 +10,7 @@ import contextlib
 import errno
 import os
 import secrets
+import shutil
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -37,6 +38,9 @@ SUFFIXES = {
 
 DEFAULT_MAX_PIXELS = 200_000_000
 """Larger pictures are refused before they are decoded: a small file can hold an enormous one."""
+
+HIDDEN = ".brewster-"
+"""What the names of files begin with that are not whole yet."""
 
 LAYERS = ("transmission", "reflection", "confidence")
 _ALWAYS_PNG = ("confidence",)  # a grey map, not a photograph: no container of the source would suit it better
@@ -94,7 +98,7 @@ def write_atomically(path: Path, data: bytes, *, overwrite: bool = False, source
     `overwrite` is off, is the `source`, or cannot be written.
     """
     _refuse_source(path, source)
-    part = path.parent / f".brewster-{secrets.token_hex(8)}.part"
+    part = hidden_beside(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _refuse_taken(path, overwrite)
@@ -105,6 +109,62 @@ def write_atomically(path: Path, data: bytes, *, overwrite: bool = False, source
     finally:
         with contextlib.suppress(OSError):
             part.unlink()
+
+
+@contextlib.contextmanager
+def arriving(place: Path) -> Iterator[Path]:
+    """A hidden path beside a file or folder that takes its name once it is whole and on the disk.
+
+    It replaces a file; a folder that another process has put there meanwhile stays.
+
+    Raises:
+        TargetError: it cannot be written; the disk may be full.
+    """
+    part = hidden_beside(place)
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        yield part
+        _sync(part)
+        _replace(place, part)
+        _sync(place.parent)
+    except OSError as error:
+        raise TargetError(
+            f"{place} was not written ({error.strerror or error})",
+            "it needs its place on the disk",
+            "mend that (free some space, or name another folder) and run again: what is finished is kept",
+        ) from error
+    finally:
+        discard(part)
+
+
+def hidden_beside(place: Path) -> Path:
+    """A new hidden name in the folder of a place, for what is not whole yet or not wanted any more."""
+    return place.parent / f"{HIDDEN}{secrets.token_hex(8)}.part"
+
+
+def discard(path: Path) -> None:
+    """Removes a file, or a folder with all in it, as far as that can be done."""
+    with contextlib.suppress(OSError):
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink()
+
+
+def _replace(place: Path, part: Path) -> None:
+    try:
+        part.replace(place)
+    except OSError as error:
+        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+            raise
+
+
+def _sync(path: Path) -> None:
+    file = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(file)
+    finally:
+        os.close(file)
 
 
 def _pictures(source: Path) -> Iterator[Path]:

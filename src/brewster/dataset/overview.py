@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
-from brewster.dataset.sets import SCENE, STATISTICS, Entry, arriving, read_set
-from brewster.files import write_atomically
+from brewster.dataset.sets import SCENE, STATISTICS, Entry, read_set
+from brewster.files import arriving, write_atomically
 from brewster.photo import Photo
 from brewster.render.sample import LAYERS
 

@@ -9,15 +9,11 @@ Everything arrives whole or not at all: it is written under a hidden name, reach
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import re
-import secrets
-import shutil
 import tarfile
 import tomllib
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -28,8 +24,8 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 import brewster
-from brewster.errors import RecipeError, TargetError
-from brewster.files import write_atomically
+from brewster.errors import RecipeError
+from brewster.files import HIDDEN, arriving, discard, hidden_beside, write_atomically
 from brewster.photo import read_layers, write_layers
 from brewster.render.develop import Developed, develop, jpeg, luminance
 from brewster.render.pane import ghost_distance_px
@@ -44,7 +40,6 @@ LIGHT, SCENE = "layers.exr", "scene.toml"
 FILES: Final = (*(f"{layer}.jpg" for layer in LAYERS), LIGHT, SCENE)
 """The files of a sample: five photographs, their linear light, and their cause."""
 
-_HIDDEN: Final = ".brewster-"
 _TRUTH_QUALITY: Final = 95
 _AGAIN: Final = "delete that sample and render the set again"
 
@@ -112,55 +107,8 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
 
 def remove_leftovers(out: Path) -> None:
     """Removes what killed runs have left half; nobody else may be writing there."""
-    for part in out.glob(f"{_HIDDEN}*"):
-        _discard(part)
-
-
-@contextmanager
-def arriving(place: Path) -> Iterator[Path]:
-    """A hidden path beside a file or folder that takes its name once it is whole and on the disk.
-
-    Raises:
-        TargetError: it cannot be written; the disk may be full.
-    """
-    part = place.parent / f"{_HIDDEN}{secrets.token_hex(8)}.part"
-    try:
-        yield part
-        _sync(part)
-        _take_name(part, place)
-        _sync(place.parent)
-    except OSError as error:
-        raise TargetError(
-            f"{place} was not written ({error.strerror or error})",
-            "a set needs its place on the disk",
-            "mend that (free some space, or name another folder) and run again: what is finished is kept",
-        ) from error
-    finally:
-        _discard(part)
-
-
-def _take_name(part: Path, place: Path) -> None:
-    try:
-        part.replace(place)
-    except OSError as error:
-        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
-            raise
-
-
-def _sync(path: Path) -> None:
-    file = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(file)
-    finally:
-        os.close(file)
-
-
-def _discard(path: Path) -> None:
-    with contextlib.suppress(OSError):
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink()
+    for part in out.glob(f"{HIDDEN}*"):
+        discard(part)
 
 
 # --- shards
@@ -205,10 +153,10 @@ def _add(tar: tarfile.TarFile, entry: Entry) -> None:
 
 def _remove(folder: Path) -> None:
     """Removes a sample's folder, which must not be seen half: it loses its name first."""
-    doomed = folder.parent / f"{_HIDDEN}{secrets.token_hex(8)}.part"
+    doomed = hidden_beside(folder)
     with contextlib.suppress(OSError):  # another process was faster
         folder.replace(doomed)
-        _discard(doomed)
+        discard(doomed)
 
 
 # --- reading
@@ -253,10 +201,15 @@ def open_sample(entry: Entry) -> tuple[dict[str, Float32], Scene]:
         PhotoError, RecipeError: its files are damaged.
     """
     light = read_layers(entry.read(LIGHT))
-    return {name: light[name] for name in LAYERS}, _scene(entry)
+    return {name: light[name] for name in LAYERS}, read_cause(entry)
 
 
-def _scene(entry: Entry) -> Scene:
+def read_cause(entry: Entry) -> Scene:
+    """The scene of a sample.
+
+    Raises:
+        RecipeError: its file is damaged.
+    """
     try:
         table = tomllib.loads(entry.read(SCENE).decode())
         return Scene.model_validate({name: table[name] for name in table if name != "outcome"})

@@ -10,7 +10,6 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import tomli_w
 from pydantic import Field, model_validator
 
 from brewster.scene.camera import Camera, axes, dot
@@ -109,6 +108,8 @@ class Scene(Values):
 
     def to_toml(self, **more: dict[str, Any]) -> str:
         """The scene as TOML, with more tables after it; reading it gives an equal scene."""
+        import tomli_w  # noqa: PLC0415  (reading a scene does without it)
+
         return tomli_w.dumps({**self.model_dump(mode="json", exclude_none=True), **more})
 
 
