@@ -1,3 +1,5 @@
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 import torch
 
@@ -52,3 +54,18 @@ def test_both_kinds_of_data_show_the_same_background(assets):
     light, mixed = (stream(assets, mixing=mixing).sample(3) for mixing in ("light", "8-bit"))
     assert (light.background_encoded - mixed.transmission_encoded).abs().max() <= 0.5 / 255 + 1e-6
     assert not torch.equal(light.photo_encoded, mixed.photo_encoded)
+
+
+def test_layers_are_photo_target_and_reflection_of_the_batch(assets):
+    live = stream(assets)
+    batch, layers = live(0, 2, 32), live.layers(1, 32)
+    pictures = batch.photo_encoded[1], batch.transmission_encoded[1], batch.reflection_encoded[1]
+    assert torch.equal(layers, torch.cat(pictures))
+
+
+def test_threads_that_share_a_stream_get_what_one_would_get(assets):
+    alone = [stream(assets)(step, 1, 32) for step in range(4)]
+    shared = stream(Assets())
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda step: shared(step, 1, 32), range(4)))
+    assert all(map(same, alone, together))

@@ -84,3 +84,19 @@ def test_a_blend_takes_its_share_of_each_stream(photos):
     batch = Blend(pairs, mixtures, 0.25)(0, 8, 32)
     assert (batch.reflection_weight < 1).sum() == 2
     assert batch.photo_encoded.shape == (8, 3, 32, 32)
+
+
+def test_a_blend_asks_for_nothing_where_a_stream_gets_no_sample(photos):
+    def never(step, count, size):
+        raise AssertionError
+
+    batch = Blend(never, Mixtures(photos, [], QUIET, seed=1), 0.25)(0, 1, 32)
+    assert batch.photo_encoded.shape == (1, 3, 32, 32)
+
+
+def test_a_batch_of_layers_trusts_every_truth():
+    layers = torch.rand(2, 9, 8, 8)
+    batch = Batch.of(layers)
+    pictures = [batch.photo_encoded, batch.transmission_encoded, batch.reflection_encoded]
+    assert torch.equal(torch.cat(pictures, dim=1), layers)
+    assert (batch.reflection_weight == 1).all()

@@ -13,6 +13,7 @@ from typing import Final
 from torch import Tensor
 
 from brewster.render.develop import Developed
+from brewster.scene.scene import Scene
 
 ALPHA: Final = (0.8, 1.0)
 BETA: Final = (0.4, 1.0)
@@ -25,19 +26,26 @@ def blend(transmission_encoded: Tensor, reflection_encoded: Tensor, alpha: float
 
 
 def blended(developed: Developed) -> Developed:
-    """The same content mixed in 8 bits: background for T, beta times the mirrored scene for R, and their blend.
+    """The same content mixed in 8 bits: background for T, beta times the mirrored scene for R, and their blend."""
+    photo, transmission, reflection = blended_layers(
+        developed.background_encoded, developed.mirror_encoded, developed.scene
+    )
+    return replace(
+        developed, photo_encoded=photo, transmission_encoded=transmission, reflection_encoded=reflection
+    )
+
+
+def blended_layers(
+    background_encoded: Tensor, mirror_encoded: Tensor, scene: Scene
+) -> tuple[Tensor, Tensor, Tensor]:
+    """I, T and R of a scene's mixture in 8 bits, (3, H, W) each in 0..1, from its encoded B and MR.
 
     alpha and beta are drawn by the scene's seed and index, uniform in 0.8..1 and 0.4..1.
     """
-    dice = Random(f"blend/{developed.scene.seed}/{developed.scene.index}")  # noqa: S311  (data, not secrets)
+    dice = Random(f"blend/{scene.seed}/{scene.index}")  # noqa: S311  (data, not secrets)
     alpha, beta = dice.uniform(*ALPHA), dice.uniform(*BETA)
-    background, mirror = _eight_bits(developed.background_encoded), _eight_bits(developed.mirror_encoded)
-    return replace(
-        developed,
-        photo_encoded=blend(background, mirror, alpha, beta),
-        transmission_encoded=background,
-        reflection_encoded=_eight_bits(beta * mirror),
-    )
+    background, mirror = _eight_bits(background_encoded), _eight_bits(mirror_encoded)
+    return blend(background, mirror, alpha, beta), background, _eight_bits(beta * mirror)
 
 
 def _eight_bits(encoded: Tensor) -> Tensor:

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import count as numbers
+from threading import Lock
 from typing import Literal
 
 import torch
+from torch import Tensor
 
 from brewster.dataset.blend import blended
 from brewster.dataset.mix import Batch
@@ -21,12 +23,18 @@ from brewster.scene.recipe import SceneRecipe
 from brewster.scene.sampler import Catalog, draw
 from brewster.worlds.assets import Assets
 
+Target = Literal["background", "transmission"]
+"""What a network is to find behind the glass: the background B, as benchmarks photograph it with the glass taken
+away, or T, which adds up with R."""
+
+Mixing = Literal["light", "8-bit"]
+"""How a photo came about: light that met at the glass, or a blend of the same content in 8 bits, as RDNet's."""
+
 
 class Rendered:
-    """A `Stream` of the pane renderer's samples, also an iterable of them.
+    """A `Stream` of the pane renderer's samples, also an iterable of them; threads may share it.
 
-    `target` says what a network is to find behind the glass: the background B, as benchmarks photograph it with
-    the glass taken away, or T, which adds up with R. `mixing` "8-bit" blends the same content as RDNet does.
+    They render one at a time, as `Assets` serves one at a time; the rest of their work runs side by side.
     """
 
     def __init__(
@@ -37,11 +45,12 @@ class Rendered:
         *,
         seed: int,
         device: torch.device | str = "cpu",
-        target: Literal["background", "transmission"] = "background",
-        mixing: Literal["light", "8-bit"] = "light",
+        target: Target = "background",
+        mixing: Mixing = "light",
     ) -> None:
         self._recipe, self._catalog, self._assets = recipe, catalog, assets
         self._seed, self._device, self._target, self._mixing = seed, device, target, mixing
+        self._renders = Lock()
 
     def __iter__(self) -> Iterator[Developed]:
         return (self.sample(index) for index in numbers())
@@ -56,18 +65,23 @@ class Rendered:
         return self._developed(self._recipe, index)
 
     def __call__(self, step: int, count: int, size: int) -> Batch:
-        """The batch of this step: `count` samples of `size` px a side."""
+        """The batch of this step: `count` samples of `size` px a side, none of them ever seen before."""
+        return Batch.of(torch.stack([self.layers(step * count + slot, size) for slot in range(count)]))
+
+    def layers(self, index: int, size: int) -> Tensor:
+        """Photo, target and reflection of this number, square and as channels: (9, size, size), encoded, in 0..1.
+
+        Raises:
+            RecipeError: the recipe gives no possible scene, or a file is missing.
+            PhotoError: a file cannot be read.
+        """
         camera = self._recipe.camera.model_copy(update={"width": size, "height": size})
-        square = self._recipe.model_copy(update={"camera": camera})
-        made = [self._developed(square, step * count + slot) for slot in range(count)]
-        behind = "background_encoded" if self._target == "background" else "transmission_encoded"
-        photo, transmission, reflection = (
-            torch.stack([getattr(developed, name) for developed in made])
-            for name in ("photo_encoded", behind, "reflection_encoded")
-        )
-        return Batch(photo, transmission, reflection, torch.ones(count, device=self._device))
+        developed = self._developed(self._recipe.model_copy(update={"camera": camera}), index).layers()
+        return torch.cat([developed[name] for name in ("photo", self._target, "reflection")])
 
     def _developed(self, recipe: SceneRecipe, index: int) -> Developed:
         scene = draw(recipe, self._catalog, self._seed, index)
-        developed = develop(render(scene, self._assets, self._device))
+        with self._renders:
+            sample = render(scene, self._assets, self._device)
+        developed = develop(sample)
         return with_jpeg(developed if self._mixing == "light" else blended(developed))

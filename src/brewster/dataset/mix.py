@@ -40,6 +40,12 @@ class Batch:
     reflection_encoded: Tensor
     reflection_weight: Tensor
 
+    @classmethod
+    def of(cls, layers: Tensor) -> Batch:
+        """Samples whose truths are certain, from (N, 9, S, S): photo, transmission and reflection as channels."""
+        photo, transmission, reflection = layers.chunk(3, dim=1)
+        return cls(photo, transmission, reflection, torch.ones(len(layers), device=layers.device))
+
     def to(self, device: torch.device) -> Batch:
         """The same batch on another device."""
         return Batch(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
@@ -87,26 +93,31 @@ class MixRecipe(Values):
     noise: Range = (0.0, 0.012)
 
 
-class _Dice:
+class Dice:
     """Random numbers that depend on (seed, step, slot) and nothing else."""
 
     def __init__(self, seed: int, step: int, slot: int) -> None:
         self.generator = Generator().manual_seed((seed * 1_000_003 + step) * 1_009 + slot)
 
     def uniform(self, bounds: Range) -> float:
+        """A number between the bounds."""
         low, high = bounds
         return low + (high - low) * torch.rand((), generator=self.generator).item()
 
     def log_uniform(self, bounds: Range) -> float:
+        """A number between the bounds whose logarithm is uniform."""
         return math.exp(self.uniform((math.log(bounds[0]), math.log(bounds[1]))))
 
     def chance(self, probability: float) -> bool:
+        """True as often as `probability` says."""
         return self.uniform((0, 1)) < probability
 
     def choose(self, count: int) -> int:
+        """A number from 0 up to, not including, `count`."""
         return int(torch.randint(count, (), generator=self.generator).item())
 
     def normal(self, *shape: int) -> Tensor:
+        """A tensor of standard normal numbers."""
         return torch.randn(shape, generator=self.generator)
 
 
@@ -120,11 +131,11 @@ class Mixtures:
 
     def __call__(self, step: int, count: int, size: int) -> Batch:
         """The batch of this step: `count` samples of `size` px a side."""
-        samples = [self._sample(_Dice(self._seed, step, slot), size) for slot in range(count)]
+        samples = [self._sample(Dice(self._seed, step, slot), size) for slot in range(count)]
         photo, transmission, reflection = (torch.stack(layer) for layer in zip(*samples, strict=True))
         return Batch(photo, transmission, reflection, torch.ones(count))
 
-    def _sample(self, dice: _Dice, size: int) -> tuple[Tensor, Tensor, Tensor]:
+    def _sample(self, dice: Dice, size: int) -> tuple[Tensor, Tensor, Tensor]:
         recipe = self._recipe
         background = self._background(dice, size)
         reflection = self._reflection(dice, size) * background.mean()
@@ -136,12 +147,12 @@ class Mixtures:
             photo = photo + dice.uniform(recipe.veil) * photo.mean(dim=(1, 2), keepdim=True)
         return _photograph(dice, recipe, photo, background, reflection)
 
-    def _background(self, dice: _Dice, size: int) -> Picture:
+    def _background(self, dice: Dice, size: int) -> Picture:
         view = self._view(dice, size, self._recipe.map_probability / 3)
         level = dice.log_uniform(self._recipe.background_level_log)
         return view * _temperature(dice, self._recipe.temperature) * (level / _mean_without_lamps(view))
 
-    def _reflection(self, dice: _Dice, size: int) -> Picture:
+    def _reflection(self, dice: Dice, size: int) -> Picture:
         """A reflection for a background of mean 1: blurred, doubled, fading and cut off, in linear light."""
         recipe, scale = self._recipe, size / _REFERENCE_SIZE
         view = self._view(dice, size, recipe.map_probability)
@@ -156,10 +167,10 @@ class Mixtures:
             view = view * _edge(dice, size)
         return view * dice.log_uniform(recipe.reflection_ratio_log)
 
-    def _view(self, dice: _Dice, size: int, map_probability: float) -> Picture:
+    def _view(self, dice: Dice, size: int, map_probability: float) -> Picture:
         if self._maps and dice.chance(map_probability):
             return _look_into(dice, self._maps[dice.choose(len(self._maps))], size)
-        crop = _crop(dice, self._photos[dice.choose(len(self._photos))], self._recipe.crop, size)
+        crop = random_crop(dice, self._photos[dice.choose(len(self._photos))], self._recipe.crop, size)
         bright = ((crop.amax(dim=0, keepdim=True) - 0.8) / 0.2).clamp(0, 1)
         return crop * (1 + dice.uniform(self._recipe.highlight_boost) * bright**2)
 
@@ -174,20 +185,23 @@ class Pairs:
 
     def __call__(self, step: int, count: int, size: int) -> Batch:
         """The batch of this step: `count` samples of `size` px a side."""
-        samples = [self._sample(_Dice(self._seed, step, slot), size) for slot in range(count)]
+        samples = [self._sample(Dice(self._seed, step, slot), size) for slot in range(count)]
         photo, transmission = (torch.stack(layer) for layer in zip(*samples, strict=True))
         reflection = (photo - transmission).clamp(min=0)
         weight = torch.full((count,), self.reflection_weight)
         return Batch(to_encoded(photo), to_encoded(transmission), to_encoded(reflection), weight)
 
-    def _sample(self, dice: _Dice, size: int) -> tuple[Tensor, Tensor]:
+    def _sample(self, dice: Dice, size: int) -> tuple[Tensor, Tensor]:
         both = torch.cat(self._pairs[dice.choose(len(self._pairs))], dim=2)
-        crop = _crop(dice, both, self._crop, size)
+        crop = random_crop(dice, both, self._crop, size)
         return crop[:3], crop[3:]
 
 
 class Blend:
-    """A `Stream` that takes a share of each batch from one stream and the rest from another."""
+    """A `Stream` that takes a share of each batch from one stream and the rest from another; blends may nest.
+
+    A batch comes on the accelerator if any part does, as what was rendered there should not travel twice.
+    """
 
     def __init__(self, first: Stream, second: Stream, first_share: float) -> None:
         self._first, self._second, self._share = first, second, first_share
@@ -195,12 +209,14 @@ class Blend:
     def __call__(self, step: int, count: int, size: int) -> Batch:
         """The batch of this step: `count` samples of `size` px a side."""
         first_count = round(count * self._share)
-        parts = self._first(step, first_count, size), self._second(step, count - first_count, size)
+        counts = (self._first, first_count), (self._second, count - first_count)
+        parts = [stream(step, some, size) for stream, some in counts if some]
+        device = max((part.photo_encoded.device for part in parts), key=lambda device: device.type != "cpu")
         names = Batch.__dataclass_fields__
-        return Batch(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+        return Batch(*(torch.cat([getattr(part.to(device), name) for part in parts]) for name in names))
 
 
-def _photograph(dice: _Dice, recipe: MixRecipe, *layers: Picture) -> tuple[Picture, Picture, Picture]:
+def _photograph(dice: Dice, recipe: MixRecipe, *layers: Picture) -> tuple[Picture, Picture, Picture]:
     """One exposure and one tone curve for photo, background and reflection; noise and 8 bits for the photo."""
     exposure = min(1.0, dice.uniform(recipe.exposure) / layers[0].clamp(max=1).mean().item())
     gamma, contrast = dice.log_uniform(recipe.gamma_log), dice.uniform(recipe.contrast)
@@ -214,15 +230,18 @@ def _photograph(dice: _Dice, recipe: MixRecipe, *layers: Picture) -> tuple[Pictu
     return ((photo + noise).clamp(0, 1) * 255).round() / 255, background, reflection
 
 
-def _crop(dice: _Dice, picture: Tensor, fraction: Range, size: int) -> Tensor:
-    """A random window, maybe mirrored, in linear light: (H, W, C) uint8 to (C, size, size)."""
+def random_crop(dice: Dice, picture: Tensor, fraction: Range, size: int) -> Tensor:
+    """A random window, maybe mirrored, in linear light: (H, W, C) sRGB uint8 to (C, size, size).
+
+    `fraction` is the range of the window's side over the picture's shorter one.
+    """
     height, width, _ = picture.shape
     side = min(height, width) * dice.uniform(fraction)
     stretch = math.sqrt(dice.log_uniform((0.85, 1.18)))
     rows, columns = (max(8, min(limit, round(length))) for limit, length in (
         (height, side * stretch), (width, side / stretch)))  # fmt: skip
     top, left = dice.choose(height - rows + 1), dice.choose(width - columns + 1)
-    window = _LINEAR_OF_BYTE[picture[top : top + rows, left : left + columns].int()].permute(2, 0, 1)
+    window = _light_of(picture[top : top + rows, left : left + columns]).permute(2, 0, 1)
     if dice.chance(0.5):
         window = window.flip(2)
     return functional.interpolate(window[None], (size, size), mode="bilinear", antialias=True)[0].clamp(min=0)
@@ -231,7 +250,12 @@ def _crop(dice: _Dice, picture: Tensor, fraction: Range, size: int) -> Tensor:
 _LINEAR_OF_BYTE: Final = to_linear(torch.arange(256) / 255)
 
 
-def _look_into(dice: _Dice, lat_long: Tensor, size: int) -> Picture:
+def _light_of(encoded: Tensor) -> Tensor:
+    """Linear light of sRGB bytes, by a table; in one row, as torch looks up a row much faster than a picture."""
+    return _LINEAR_OF_BYTE.index_select(0, encoded.reshape(-1).int()).view(encoded.shape)
+
+
+def _look_into(dice: Dice, lat_long: Tensor, size: int) -> Picture:
     """A perspective view into a lat-long map (3, H, 2 H): any heading, level within 20 degrees."""
     half = math.tan(math.radians(dice.uniform((50, 100))) / 2)
     heading, pitch = dice.uniform((-math.pi, math.pi)), math.radians(dice.uniform((-20, 20)))
@@ -250,7 +274,7 @@ def _mean_without_lamps(picture: Picture) -> Tensor:
     return picture.clamp(max=picture.flatten()[::7].quantile(0.95).item()).mean() + 1e-4
 
 
-def _temperature(dice: _Dice, bounds: Range) -> Tensor:
+def _temperature(dice: Dice, bounds: Range) -> Tensor:
     """Gains of a warmer or colder light, (3, 1, 1)."""
     warmth = dice.uniform(bounds)
     gains = torch.tensor([warmth, 0, -warmth]) + 0.05 * dice.normal(3)
@@ -280,7 +304,7 @@ def _filter(picture: Picture, kernel: Tensor) -> Picture:
     return functional.conv2d(padded.transpose(0, 1), kernel[None, None]).transpose(0, 1)[0]
 
 
-def _ghost(dice: _Dice, picture: Picture, weight: float, reach_px: float) -> Picture:
+def _ghost(dice: Dice, picture: Picture, weight: float, reach_px: float) -> Picture:
     """The second surface's copy, displaced by whole pixels."""
     reach = max(1, round(reach_px))
     down, right = dice.choose(2 * reach + 1), dice.choose(2 * reach + 1)
@@ -289,14 +313,14 @@ def _ghost(dice: _Dice, picture: Picture, weight: float, reach_px: float) -> Pic
     return (picture + weight * copy) / (1 + weight)
 
 
-def _falloff(dice: _Dice, size: int) -> Tensor:
+def _falloff(dice: Dice, size: int) -> Tensor:
     """A smooth field in 0..1, (1, size, size): where the mirrored side is lit, and where it is dark."""
     cells = 2 + dice.choose(4)
     field = functional.interpolate(dice.normal(1, 1, cells, cells), (size, size), mode="bicubic")[0]
     return torch.sigmoid(dice.uniform((1, 6)) * (field + dice.uniform((-0.5, 0.5))))
 
 
-def _edge(dice: _Dice, size: int) -> Tensor:
+def _edge(dice: Dice, size: int) -> Tensor:
     """The reflection ends at a line, such as a frame or a dark body in front of the glass: (1, size, size)."""
     angle, offset = dice.uniform((0, 2 * math.pi)), dice.uniform((-0.5, 0.5))
     y, x = torch.meshgrid(*[torch.linspace(-1, 1, size)] * 2, indexing="ij")

@@ -11,13 +11,14 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
 import torch
+from pydantic import ValidationError
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -29,15 +30,23 @@ from brewster.light import to_linear
 from brewster.models.compact import STRIDE, CompactNetwork, with_imagenet_features
 from brewster.photo import Photo
 from brewster.train.checkpoint import AFRESH, Checkpoint
+from brewster.train.data import open_stream
 from brewster.train.losses import separation_loss
-from brewster.train.recipe import TrainRecipe, data_folder, open_stream
+from brewster.train.recipe import TrainRecipe, data_folder
 
 Report = Callable[[int, int, Mapping[str, float], bool], None]
 """Called with (step, steps, numbers, logged) after every step; `logged` says that the numbers went into the log."""
 
 _VALIDATION_SIDE_PX: Final = 384
+_ROUNDING: Final = 1 / (12 * 255**2)
+"""The mean squared error of rounding to 8 bits; pictures that differ by less are the same, at 58.9 dB."""
 _MAX_GRADIENT_NORM: Final = 1.0
 _TRAIN_IT_FIRST: Final = "train the recipe that makes it first, or mend start_from in this one"
+
+
+def best_device() -> torch.device:
+    """The GPU where torch sees one, else the CPU."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 class Trainer:
@@ -46,7 +55,7 @@ class Trainer:
     def __init__(self, recipe: TrainRecipe, stream: Stream) -> None:
         torch.manual_seed(recipe.seed)
         self.recipe, self.stream, self.step = recipe, stream, 0
-        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.device = best_device()
         self._workers = 1 if self.device.type == "cpu" else os.cpu_count() or 1
         self._pool = ThreadPoolExecutor(self._workers)
         self._ahead: dict[int, Future[Batch]] = {}
@@ -143,6 +152,8 @@ class Trainer:
 def train(recipe: TrainRecipe, out: Path, report: Report) -> CompactNetwork:
     """Runs the recipe to its end in folder `out`, from its checkpoint if there is one.
 
+    A recipe whose data are none (a count of 0) takes no step: the network is returned as it starts.
+
     `out` receives `checkpoint.pt`, `log.jsonl` and, at every report, `samples.png` (photo, transmission,
     reflection of the first validation pairs or training samples).
 
@@ -153,13 +164,13 @@ def train(recipe: TrainRecipe, out: Path, report: Report) -> CompactNetwork:
         TargetError: `out` cannot be written to.
     """
     out.mkdir(parents=True, exist_ok=True)
-    trainer = Trainer(recipe, open_stream(recipe))
+    trainer = Trainer(recipe, open_stream(recipe, best_device()))
     saved, log = out / "checkpoint.pt", out / "log.jsonl"
     _take_up(trainer, saved)
     _forget_after(trainer.step, log)
     pairs = _validation_pairs(recipe)
     started = time.monotonic()
-    while trainer.step < recipe.steps:
+    while trainer.step < recipe.steps and not recipe.data.is_none:
         numbers = trainer.advance()
         logged = trainer.step % recipe.report_every == 0 or trainer.step == recipe.steps
         if logged:
@@ -182,7 +193,8 @@ def validate(network: CompactNetwork, pairs: Mapping[str, list[tuple[Tensor, Ten
         for photo, truth in folder:
             answer = network(photo)[:, :3].clamp(0, 1)
             errors = [functional.mse_loss(picture, truth) for picture in (photo, answer)]
-            scores.append(10 * math.log10(errors[0] / errors[1]))
+            before, after = (max(error.item(), _ROUNDING) for error in errors)
+            scores.append(10 * math.log10(before / after))
         gains[f"gain_db_{name}"] = sum(scores) / len(scores)
     return gains
 
@@ -221,16 +233,32 @@ def _of_this_recipe(checkpoint: Checkpoint, recipe: TrainRecipe, path: Path) -> 
 
 
 def _identity(recipe: str) -> dict[str, object]:
-    """What a run must keep to be resumed: all but the place of the file that it started from."""
-    return {name: value for name, value in json.loads(recipe).items() if name != "start_from"}
+    """What a run must keep to be resumed: all but the place of the file that it started from.
+
+    What a recipe does not name, such as a value that is newer than the run, counts as its default.
+    """
+    try:
+        return TrainRecipe.model_validate_json(recipe).model_dump(exclude={"start_from"})
+    except ValidationError:
+        return {}
 
 
 def _validation_pairs(recipe: TrainRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]:
-    root = data_folder() if recipe.data.validate_on else Path()
+    folders = tuple(dict.fromkeys(recipe.data.validate_on))
+    root = data_folder() if folders else Path()
     return {
-        folder.name: [(_fit(photo), _fit(truth)) for photo, truth in read_pairs([root / folder])]
-        for folder in recipe.data.validate_on
+        name: [(_fit(photo), _fit(truth)) for photo, truth in read_pairs([root / folder])]
+        for name, folder in zip(_short(folders), folders, strict=True)
     }
+
+
+def _short(folders: Sequence[Path]) -> list[str]:
+    """Names for different folders: as much of the end of their paths as tells them apart."""
+    for length in range(1, max((len(folder.parts) for folder in folders), default=0)):
+        names = ["/".join(folder.parts[-length:]) for folder in folders]
+        if len(set(names)) == len(names):
+            return names
+    return list(map(str, folders))
 
 
 def _fit(picture: Tensor) -> Tensor:
@@ -243,7 +271,7 @@ def _fit(picture: Tensor) -> Tensor:
 
 
 def _some(trainer: Trainer) -> dict[str, list[tuple[Tensor, Tensor]]]:
-    batch = trainer.stream(0, trainer.recipe.batch, trainer.recipe.size_at(0))
+    batch = trainer.stream(0, trainer.recipe.batch, trainer.recipe.size_at(0)).to(torch.device("cpu"))
     pairs = zip(batch.photo_encoded[:, None], batch.transmission_encoded[:, None], strict=True)
     return {"training": list(pairs)}
 

@@ -6,16 +6,20 @@ Paths in a recipe are relative to the folder that `BREWSTER_DATA` names.
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
-from brewster.dataset.mix import Blend, MixRecipe, Mixtures, Pairs, Stream
-from brewster.dataset.sources import read_maps, read_pairs, read_photos
+from brewster.dataset.live import Mixing, Target
+from brewster.dataset.mix import MixRecipe
 from brewster.errors import RecipeError
 from brewster.models.compact import STRIDE
-from brewster.scene.values import Above0, Positive, Seed, Share, Values, read_toml
+from brewster.scene.values import Above0, Positive, Seed, Share, Values, read_toml, wrong_value
+
+_COMPARE = "the recipes in recipes/train/"
 
 Side = Annotated[int, Field(gt=0, multiple_of=STRIDE)]
 
@@ -30,15 +34,82 @@ def _rising_from_0(sizes: list[tuple[float, int]]) -> list[tuple[float, int]]:
 Sizes = Annotated[list[tuple[Share, Side]], Field(min_length=1), AfterValidator(_rising_from_0)]
 
 
-class DataRecipe(Values):
-    """Which folders, relative to BREWSTER_DATA, and which file names in them to leave out."""
+class RenderedRecipe(Values):
+    """Rendered samples: `sets` that `brewster render` made, or a scene `recipe` to render while the network learns."""
 
-    photos: Annotated[list[Path], Field(min_length=1)]
+    sets: tuple[Path, ...] = ()
+    recipe: str | None = None
+    """A packaged scene recipe by its name, or a TOML file, relative to this recipe."""
+    count: Annotated[int, Field(ge=0)] | None = None
+    """How many different samples; by default all of the sets, and of live ones no end. 0: none at all."""
+    share: Share = 1.0
+    """Of what pairs leave of each batch; mixtures of photos are the rest."""
+    mixing: Mixing = "light"
+    target: Target = "background"
+    orders: Literal["all", "paper"] | None = None
+    """Instead of the scene recipe's own."""
+    seed: Seed | None = None
+    """Of the scenes; by default this recipe's."""
+    maps: tuple[Path, ...] = ()
+    photos: tuple[Path, ...] = ()
+    """Worlds of live scenes; the builtin ones where there is no folder."""
+
+    @model_validator(mode="after")
+    def _comes_from_one_place(self) -> Self:
+        if bool(self.sets) == bool(self.recipe):
+            raise ValueError(
+                "rendered samples come either from sets, on disk, or from a recipe, live: name one of the two"
+            )
+        told = [
+            name for name in ("orders", "seed", "maps", "photos") if getattr(self, name) not in (None, ())
+        ]
+        if self.sets and told:
+            raise ValueError(
+                f"sets are rendered already, so that {', '.join(told)} can change nothing in them"
+            )
+        return self
+
+
+class DataRecipe(Values):
+    """What a network learns from: folders relative to BREWSTER_DATA, and file names in them to leave out.
+
+    Of each batch `pairs_share` are real pairs, `rendered.share` of the others are rendered, and the rest are
+    mixtures of photos and maps. What has a share of 0 is listed but neither read nor used.
+    """
+
+    photos: tuple[Path, ...] = ()
     maps: tuple[Path, ...] = ()
     pairs: tuple[Path, ...] = ()
     pairs_share: Share = 0.0
+    rendered: RenderedRecipe | None = None
     exclude: tuple[str, ...] = ()
     validate_on: tuple[Path, ...] = ()
+
+    @property
+    def rendered_share(self) -> float:
+        """How much of what pairs leave is rendered: 0 if there is no sample."""
+        return self.rendered.share if self.rendered and self.rendered.count != 0 else 0.0
+
+    @property
+    def is_none(self) -> bool:
+        """Whether everything that is listed has a share, or a count, of 0."""
+        return not (self.photos or self.pairs_share or self.rendered_share)
+
+    @model_validator(mode="after")
+    def _has_sources(self) -> Self:
+        if not (self.photos or self.pairs or self.rendered):
+            raise ValueError("a network learns from photos, pairs or rendered, and here is none of them")
+        if self.pairs_share and not self.pairs:
+            raise ValueError(f"pairs_share is {self.pairs_share:g}, and there are no pairs")
+        if self.pairs and "pairs_share" not in self.model_fields_set:
+            raise ValueError("with pairs, pairs_share says how much of each batch they are; it may be 0")
+        if self.photos and self.rendered and "share" not in self.rendered.model_fields_set:
+            raise ValueError("with photos, rendered.share says how much is rendered; it may be 0 or 1")
+        if not (self.photos or self.is_none or self.pairs_share == 1 or self.rendered_share == 1):
+            raise ValueError(
+                "pairs and rendered samples leave a part of each batch, and there are no photos for it"
+            )
+        return self
 
 
 class TrainRecipe(Values):
@@ -61,17 +132,22 @@ class TrainRecipe(Values):
     mix: MixRecipe = MixRecipe()
 
     @model_validator(mode="after")
-    def _blends(self) -> Self:
-        real = round(self.batch * self.data.pairs_share)
-        if real == self.batch or bool(real) != bool(self.data.pairs):
-            raise ValueError(
-                f"pairs_share gives {real} of {self.batch} samples, where pairs need some but not all, and no pairs 0"
-            )
+    def _divides(self) -> Self:
+        real = _divide(self.batch, "pairs_share", self.data.pairs_share)
+        _divide(self.batch - real, "rendered.share", self.data.rendered_share)
         return self
 
     def size_at(self, step: int) -> int:
         """Side of the training pictures in px at this step, a multiple of 32."""
         return [size for start, size in self.sizes if step >= start * self.steps][-1]
+
+
+def _divide(samples: int, name: str, share: float) -> int:
+    """The share's number of samples; a share between 0 and 1 must leave some on both sides."""
+    part = round(samples * share)
+    if samples and 0 < share < 1 and part in (0, samples):
+        raise ValueError(f"{name} = {share:g} gives {part} of {samples} samples, not some of them")
+    return part
 
 
 def read_recipe(path: Path) -> TrainRecipe:
@@ -80,10 +156,48 @@ def read_recipe(path: Path) -> TrainRecipe:
     Raises:
         RecipeError: missing, not TOML, or with values that are missing, unknown or impossible.
     """
-    recipe = read_toml(TrainRecipe, path, compare="the recipes in recipes/train/")
+    recipe = read_toml(TrainRecipe, path, compare=_COMPARE)
+    changes: dict[str, Any] = {}
     if recipe.start_from:
-        return recipe.model_copy(update={"start_from": path.parent / recipe.start_from})
-    return recipe
+        changes["start_from"] = path.parent / recipe.start_from
+    rendered = recipe.data.rendered
+    if rendered and rendered.recipe and rendered.recipe.endswith(".toml"):
+        found = rendered.model_copy(update={"recipe": str(path.parent.resolve() / rendered.recipe)})
+        changes["data"] = recipe.data.model_copy(update={"rendered": found})
+    return recipe.model_copy(update=changes)
+
+
+def with_value(recipe: TrainRecipe, dotted: str, value: object) -> TrainRecipe:
+    """The recipe with one value changed, named as in `data.rendered.mixing`, and checked again as a whole.
+
+    Raises:
+        RecipeError: the recipe has no place of this name, or the value is impossible there.
+    """
+    known = list(_names(recipe))
+    if dotted not in known:
+        close = get_close_matches(dotted, known, n=1)
+        raise RecipeError(
+            f"the recipe has no {dotted}",
+            "the name of a value, with the names of its tables and dots before it, such as data.pairs_share",
+            f"did you mean {close[0]}?" if close else "look for it in the recipe",
+        )
+    table = place = recipe.model_dump(exclude_unset=True)
+    *way, last = dotted.split(".")
+    for name in way:
+        place = place.setdefault(name, {})
+    place[last] = value
+    try:
+        return TrainRecipe.model_validate(table)
+    except ValidationError as error:
+        raise wrong_value(f"the recipe with {dotted} = {value!r}", error, _COMPARE) from error
+
+
+def _names(values: Values, before: str = "") -> Iterator[str]:
+    for name in type(values).model_fields:
+        yield before + name
+        inside = getattr(values, name)
+        if isinstance(inside, Values):
+            yield from _names(inside, f"{before}{name}.")
 
 
 def data_folder() -> Path:
@@ -100,20 +214,3 @@ def data_folder() -> Path:
             "export BREWSTER_DATA=/path/to/data",
         )
     return Path(folder)
-
-
-def open_stream(recipe: TrainRecipe) -> Stream:
-    """The recipe's training data, read into memory: mixtures, joined by real pairs where it asks for them.
-
-    Raises:
-        RecipeError: a folder is missing or empty, or pairs do not fit together.
-        PhotoError: a picture cannot be read.
-    """
-    root, data = data_folder(), recipe.data
-    photos = read_photos([root / folder for folder in data.photos], data.exclude)
-    maps = read_maps([root / folder for folder in data.maps], data.exclude)
-    mixtures = Mixtures(photos, maps, recipe.mix, seed=recipe.seed)
-    if not data.pairs:
-        return mixtures
-    pairs = Pairs(read_pairs([root / folder for folder in data.pairs]), recipe.mix.crop, seed=recipe.seed + 1)
-    return Blend(pairs, mixtures, data.pairs_share)

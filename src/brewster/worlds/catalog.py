@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 from collections.abc import Iterator, Sequence
+from fnmatch import fnmatch
 from pathlib import Path
 
 from brewster.errors import BrewsterError, RecipeError
@@ -38,28 +39,34 @@ BUILTIN_CATALOG = Catalog(
 """Worlds that need no file: streets, rooms, nights, and paintings."""
 
 
-def read_catalog(maps: Sequence[Path], pictures: Sequence[Path]) -> tuple[Catalog, list[BrewsterError]]:
+def read_catalog(
+    maps: Sequence[Path], pictures: Sequence[Path], exclude: Sequence[str] = ()
+) -> tuple[Catalog, list[BrewsterError]]:
     """The maps and pictures of some folders, and what was wrong with those left out.
 
     Maps are read whole; of a picture only the header, so one that is damaged further on is refused when drawn.
     A `manifest.csv` with the columns file and category tells what a map is. Where no folder is given for maps
-    or for pictures, the builtin ones take their place.
+    or for pictures, the builtin ones take their place. Files whose names match a pattern of `exclude` are passed over.
 
     Raises:
         RecipeError: a folder or its manifest cannot be read, or none of its files can be used.
     """
     refused: list[BrewsterError] = []
-    found_maps = _read(maps, refused, are_maps=True) if maps else BUILTIN_CATALOG.maps
-    found_pictures = _read(pictures, refused, are_maps=False) if pictures else BUILTIN_CATALOG.pictures
+    found_maps = _read(maps, exclude, refused, are_maps=True) if maps else BUILTIN_CATALOG.maps
+    found_pictures = (
+        _read(pictures, exclude, refused, are_maps=False) if pictures else BUILTIN_CATALOG.pictures
+    )
     return Catalog(maps=found_maps, pictures=found_pictures), refused
 
 
-def _read(folders: Sequence[Path], refused: list[BrewsterError], *, are_maps: bool) -> tuple[Asset, ...]:
+def _read(
+    folders: Sequence[Path], exclude: Sequence[str], refused: list[BrewsterError], *, are_maps: bool
+) -> tuple[Asset, ...]:
     found: dict[str, Asset] = {}
     for folder in folders:
         categories = _categories(folder)
         for path in _files(folder, are_maps):
-            if path.name in found:
+            if path.name in found or any(fnmatch(path.name, pattern) for pattern in exclude):
                 continue
             try:
                 found[path.name] = _asset(path, categories.get(path.name, ""), are_maps)

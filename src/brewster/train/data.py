@@ -1,0 +1,110 @@
+"""Opens what a recipe learns from: photos, maps and pairs are read into memory, rendered samples are not.
+
+stream = open_stream(read_recipe(Path("recipes/train/tiny.toml")))
+batch = stream(step=0, count=2, size=64)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from brewster.dataset.kept import InMemory, OnDisk
+from brewster.dataset.live import Rendered
+from brewster.dataset.mix import Batch, Blend, Mixtures, Pairs, Stream
+from brewster.dataset.sources import read_maps, read_pairs, read_photos
+from brewster.errors import RecipeError
+from brewster.scene.recipe import SceneRecipe, read_scene_recipe
+from brewster.train.recipe import RenderedRecipe, TrainRecipe, data_folder
+from brewster.worlds.assets import Assets
+from brewster.worlds.catalog import read_catalog
+
+
+def open_stream(recipe: TrainRecipe, device: torch.device | str = "cpu") -> Stream:
+    """The recipe's training data: photos, maps and pairs in memory; what is rendered live is so on the device.
+
+    Raises:
+        RecipeError: a folder is missing or empty, pairs do not fit together, or too few samples are rendered.
+        PhotoError: a picture cannot be read, or a map cannot light a scene.
+    """
+    return _shared(
+        recipe.data.pairs_share, partial(_open_pairs, recipe), partial(_open_others, recipe, device)
+    )
+
+
+def _open_others(recipe: TrainRecipe, device: torch.device | str) -> Stream:
+    return _shared(
+        recipe.data.rendered_share, partial(_open_rendered, recipe, device), partial(_open_mixtures, recipe)
+    )
+
+
+def _shared(share: float, first: Callable[[], Stream], second: Callable[[], Stream]) -> Stream:
+    """Opens only what has a share."""
+    if share in (0, 1):
+        return first() if share else second()
+    return Blend(first(), second(), share)
+
+
+def _open_mixtures(recipe: TrainRecipe) -> Stream:
+    data = recipe.data
+    if data.is_none:
+        return _refuse
+    photos = read_photos(_folders(data.photos), data.exclude)
+    return Mixtures(photos, read_maps(_folders(data.maps), data.exclude), recipe.mix, seed=recipe.seed)
+
+
+def _open_pairs(recipe: TrainRecipe) -> Stream:
+    return Pairs(read_pairs(_folders(recipe.data.pairs)), recipe.mix.crop, seed=recipe.seed + 1)
+
+
+def _open_rendered(recipe: TrainRecipe, device: torch.device | str) -> Stream:
+    wanted, choices = recipe.data.rendered, recipe.seed + 2
+    assert wanted
+    if wanted.sets:
+        return OnDisk(
+            _folders(wanted.sets),
+            seed=choices,
+            count=wanted.count,
+            crop=recipe.mix.crop,
+            target=wanted.target,
+            mixing=wanted.mixing,
+        )
+    live = _open_live(recipe, wanted, device)
+    return live if wanted.count is None else InMemory(live, wanted.count, seed=choices)
+
+
+def _open_live(recipe: TrainRecipe, wanted: RenderedRecipe, device: torch.device | str) -> Rendered:
+    maps, photos = _folders(wanted.maps), _folders(wanted.photos)
+    catalog, refused = read_catalog(maps, photos, recipe.data.exclude)
+    if refused:  # a run of hours has nobody to tell that it learns from less than was asked
+        raise refused[0]
+    return Rendered(
+        _scenes(wanted),
+        catalog,
+        Assets([*maps, *photos]),
+        seed=recipe.seed if wanted.seed is None else wanted.seed,
+        device=device,
+        target=wanted.target,
+        mixing=wanted.mixing,
+    )
+
+
+def _scenes(wanted: RenderedRecipe) -> SceneRecipe:
+    scenes = read_scene_recipe(wanted.recipe or "")
+    return scenes.model_copy(update={"orders": wanted.orders}) if wanted.orders else scenes
+
+
+def _refuse(step: int, count: int, size: int) -> Batch:  # noqa: ARG001  (a Stream)
+    raise RecipeError(
+        "the recipe has nothing to learn from",
+        "a share above 0, and a count of rendered samples above 0",
+        "raise data.rendered.count, data.rendered.share or data.pairs_share",
+    )
+
+
+def _folders(named: Sequence[Path]) -> list[Path]:
+    """Where they lie; BREWSTER_DATA is not asked for where no path starts from it."""
+    return [folder if folder.is_absolute() else data_folder() / folder for folder in named]

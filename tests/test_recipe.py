@@ -1,0 +1,152 @@
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from brewster.dataset.mix import MixRecipe
+from brewster.errors import RecipeError
+from brewster.train.recipe import read_recipe, with_value
+
+FOLDER = Path(__file__).parents[1] / "recipes"
+RECIPES = sorted(FOLDER.glob("train/*.toml"))
+TINY = FOLDER / "train/tiny.toml"
+BASES = [FOLDER / "ablations/base.toml", FOLDER / "ablations/tiny.toml"]
+STUDIES = [path for path in sorted(FOLDER.glob("ablations/*.toml")) if path not in BASES]
+
+
+def learning_from(tmp_path, data):
+    """The tiny recipe with other data."""
+    head = TINY.read_text().split("[data]")[0]
+    (tmp_path / "recipe.toml").write_text(f"{head}[data]\n{data}")
+    return read_recipe(tmp_path / "recipe.toml")
+
+
+def test_there_are_recipes_and_all_of_them_can_be_read():
+    assert len(RECIPES) >= 2
+    for path in [*RECIPES, *BASES]:
+        assert read_recipe(path).steps > 0
+
+
+def test_a_recipe_that_says_nothing_of_mixtures_gets_those_of_the_shipped_model():
+    assert read_recipe(TINY.with_stem("compact")).mix == MixRecipe()
+    assert read_recipe(TINY).mix == MixRecipe(map_probability=0)
+
+
+@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
+def test_a_study_changes_one_value_of_either_base_to_others_that_are_possible(path):
+    study = tomllib.loads(path.read_text())
+    assert study.keys() == {"base", "value", "choices", "benchmarks"}
+    assert path.with_name(study["base"]) in BASES
+    for base in BASES:
+        before = read_recipe(base)
+        recipes = [with_value(before, study["value"], choice) for choice in study["choices"]]
+        assert len({recipe.model_dump_json() for recipe in recipes}) == len(recipes) > 1
+        assert before in recipes or study["value"] == "data.rendered.count"
+
+
+def test_a_changed_value_leaves_the_rest_of_a_recipe_as_it_was():
+    before = read_recipe(BASES[0])
+    after = with_value(before, "data.rendered.mixing", "8-bit")
+    assert after.data.rendered.mixing == "8-bit"
+    assert with_value(after, "data.rendered.mixing", "light") == before
+    assert with_value(before, "mix.noise", [0, 0.5]).mix == MixRecipe(noise=(0, 0.5))
+
+
+@pytest.mark.parametrize(
+    ("dotted", "value", "complaint"),
+    [
+        ("data.rendered.mixng", "light", "no data.rendered.mixng; .*; did you mean data.rendered.mixing"),
+        ("data.rendered.mixing.more", 1, "no data.rendered.mixing.more; .*did you mean"),
+        ("", 1, "no ; .*; look for it in the recipe"),
+        ("sparkle", 1, "no sparkle; .*; look for it in the recipe"),
+        ("data.rendered.mixing", "dark", "with data.rendered.mixing = 'dark' has a wrong value for data"),
+        ("data.rendered.sets", ["a"], r"sets = \['a'\] has .* name one of the two; compare"),
+        ("data.pairs_share", 0.01, "pairs_share = 0.01 contradicts itself; .* gives 0 of 8"),
+        ("steps", 0, "steps = 0 has a wrong value for steps; .*; compare"),
+    ],
+)
+def test_a_value_that_cannot_be_changed_so_is_refused_by_name(dotted, value, complaint):
+    with pytest.raises(RecipeError, match=complaint):
+        with_value(read_recipe(BASES[0]), dotted, value)
+
+
+def test_what_has_no_share_may_be_listed(tmp_path):
+    no_pairs = 'pairs = ["real"]\npairs_share = 0.0\n'
+    rendered = '[data.rendered]\nrecipe = "tiny"\n'
+    assert not learning_from(tmp_path, f"{no_pairs}{rendered}").data.is_none
+    assert not learning_from(tmp_path, f'photos = ["a"]\n{no_pairs}').data.is_none
+    assert not learning_from(tmp_path, f'photos = ["a"]\n{rendered}share = 0.0\n').data.is_none
+    assert not learning_from(tmp_path, 'pairs = ["real"]\npairs_share = 1.0\n').data.is_none
+    assert learning_from(tmp_path, f"{no_pairs}{rendered}count = 0\n").data.is_none
+
+
+def test_a_scene_recipe_of_ones_own_lies_beside_the_recipe(tmp_path):
+    data = learning_from(tmp_path, '[data.rendered]\nrecipe = "mine.toml"').data
+    assert data.rendered.recipe == str(tmp_path / "mine.toml")
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (("seed = 1", "seed ="), "not TOML"),
+        (("# A run of seconds", "# Une durée de secondes"), "not TOML .*utf-8"),
+        (("seed = 1", ""), "seed; Field required"),
+        (("seed = 1", "seed = -1"), "seed"),
+        (("steps = 6", "steps = 0"), "steps"),
+        (("weight_decay = 1e-4", "weight_decay = inf"), "weight_decay"),
+        (("[[0.0, 64], [0.5, 96]]", "[]"), "sizes"),
+        (("[[0.0, 64], [0.5, 96]]", "[[0.1, 64]]"), "sizes; .* start at 0"),
+        (("[[0.0, 64], [0.5, 96]]", "[[0.0, 64], [0.0, 96]]"), "sizes; .* rise"),
+        (("[[0.0, 64], [0.5, 96]]", "[[0.0, 96], [0.5, 64]]"), "sizes; .* rise"),
+        (("[[0.0, 64], [0.5, 96]]", "[[0.0, 50]]"), r"sizes\.0\.1; .* multiple of 32"),
+        (('["photos/permissive"]', "[]"), "data; a network learns from photos, pairs or rendered"),
+        (("[data]", '[data]\npairs = ["real"]'), "data; with pairs, pairs_share says"),
+        (("[data]", '[data]\npairs = ["real"]\npairs_share = 0.1'), "itself; pairs_share = 0.1 gives 0 of 2"),
+        (("[data]", '[data]\npairs = ["real"]\npairs_share = 0.9'), "itself; pairs_share = 0.9 gives 2 of 2"),
+        (("[data]", "[data]\npairs_share = 0.5"), "data; pairs_share is 0.5, and there are no pairs"),
+        (
+            ('photos = ["photos/permissive"]', 'pairs = ["real"]\npairs_share = 0.5'),
+            "data; .* no photos for it",
+        ),
+        (("[mix]", "[data.rendered]\n[mix]"), r"data\.rendered; .* name one of the two"),
+        (
+            ("[mix]", '[data.rendered]\nrecipe = "tiny"\nsets = ["a"]\n[mix]'),
+            r"data\.rendered; .* name one of the two",
+        ),
+        (
+            ("[mix]", '[data.rendered]\nsets = ["a"]\norders = "paper"\nseed = 0\n[mix]'),
+            r"data\.rendered; sets are rendered already, so that orders, seed can",
+        ),
+        (
+            ("[mix]", '[data.rendered]\nsets = ["a"]\nmaps = ["hdri"]\nphotos = ["p"]\n[mix]'),
+            r"data\.rendered; sets are rendered already, so that maps, photos can",
+        ),
+        (("[mix]", '[data.rendered]\nrecipe = "tiny"\n[mix]'), "data; with photos, rendered.share says"),
+        (
+            ("[mix]", '[data.rendered]\nrecipe = "tiny"\nshare = 0.2\n[mix]'),
+            "itself; rendered.share = 0.2 gives 0 of 2",
+        ),
+        (
+            ('photos = ["photos/permissive"]', '[data.rendered]\nrecipe = "tiny"\nshare = 0.5'),
+            "data; .* no photos for it",
+        ),
+        (("[mix]", '[data.rendered]\nrecipe = "tiny"\ncount = -1\n[mix]'), r"data\.rendered\.count"),
+        (("[mix]", '[data.rendered]\nrecipe = "tiny"\nmixing = "dark"\n[mix]'), r"data\.rendered\.mixing"),
+        (("[mix]", "[mix]\nsparkle = 1"), r"mix\.sparkle"),
+        (("[mix]", "[mix]\ncrop = [1, 0.45]"), r"mix\.crop; a range goes up"),
+        (
+            ("[mix]", "[mix]\nreflection_ratio_log = [0, 2]"),
+            r"mix\.reflection_ratio_log\.0; .* greater than 0",
+        ),
+        (("[mix]", "[mix]\ngamma_log = [1.2, 0.8]"), r"mix\.gamma_log; a range goes up"),
+        (("[mix]", "[mix]\nnoise = [0, nan]"), r"mix\.noise"),
+        (("[mix]", "[mix]\nabsent_probability = 1.5"), r"mix\.absent_probability"),
+        (("[mix]", "[mix]\nveil_probability = -0.1"), r"mix\.veil_probability"),
+    ],
+)
+def test_a_wrong_recipe_is_refused_by_the_name_of_what_is_wrong(tmp_path, change, complaint):
+    text = TINY.read_text()
+    assert change[0] in text
+    (tmp_path / "wrong.toml").write_bytes(text.replace(*change).encode("latin-1"))
+    with pytest.raises(RecipeError, match=f"wrong.toml .*{complaint}.*; .*"):
+        read_recipe(tmp_path / "wrong.toml")
