@@ -7,6 +7,9 @@ from functools import cache
 from itertools import product
 from pathlib import Path
 
+import numpy as np
+
+from brewster import Photo
 from picture_files import file_of, smooth
 
 POSTCARD_SCENES = tuple(f"{first}{second}" for first, second in product("abcd", "bcdef"))
@@ -68,3 +71,12 @@ def sir2(root: Path):
     solidobject(root / "SolidObjectDataset")
     wildscene(root / "Wildscene")
     return root
+
+
+def paint(path, seed, size=(24, 16), *, noise=0):
+    """Writes a picture that the seed decides, with noise of so many levels."""
+    dice = np.random.default_rng(seed)
+    pixels = dice.integers(0, 200, (size[1] // 4, size[0] // 4, 3)).repeat(4, 0).repeat(4, 1)
+    pixels = np.clip(pixels + dice.normal(0, noise, pixels.shape), 0, 255).astype(np.uint8)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(Photo.from_array(pixels, encoding="srgb").encode("png"))

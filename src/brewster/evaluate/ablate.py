@@ -1,0 +1,138 @@
+"""Ablations: one value of a training recipe changed at a time, each choice trained and measured alike.
+
+    ablate(read_study(Path("recipes/ablations/mixing.toml")), Path("out/ablations/mixing"))
+
+A study is a TOML file that names a base recipe, the value, its choices and the benchmarks; the first choice is what
+the others are compared with. Both training and measuring go on where they were stopped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Final, final
+
+from pydantic import Field
+
+from brewster.dataset.benchmarks import Benchmark, read_benchmark
+from brewster.evaluate.evaluation import evaluate
+from brewster.evaluate.methods import Model, Nothing
+from brewster.evaluate.protocol import Protocol
+from brewster.evaluate.results import AVERAGE, Results
+from brewster.files import write_atomically
+from brewster.scene.values import Values, read_toml
+from brewster.train.export import export_onnx
+from brewster.train.loop import train
+from brewster.train.recipe import data_folder, read_recipe, with_value
+
+Choice = str | int | float | bool
+Report = Callable[[str, int, int, Mapping[str, float], bool], None]
+"""Called with (choice, step, steps, numbers, logged) after every step of training."""
+
+PLOT: Final = "plot.png"
+
+
+@final
+class Study(Values):
+    """One question: what does this value do?"""
+
+    base: Path
+    """A training recipe; in the file, relative to it."""
+    value: str
+    """The value that changes, dotted: "data.rendered.mixing"."""
+    choices: Annotated[list[Choice], Field(min_length=2)]
+    """The first is what the others are compared with."""
+    benchmarks: Annotated[dict[str, Path], Field(min_length=1)]
+    """name -> folder below BREWSTER_DATA."""
+
+    def label(self, choice: Choice) -> str:
+        """What tables call a choice: "mixing 8-bit"."""
+        return f"{self.value.rpartition('.')[2]} {choice}"
+
+
+def read_study(path: Path) -> Study:
+    """Reads and checks a study.
+
+    Raises:
+        RecipeError: missing, not TOML, or with values that are missing, unknown or impossible.
+    """
+    study = read_toml(Study, path, compare="the studies in recipes/ablations/")
+    return study.model_copy(update={"base": path.parent / study.base})
+
+
+def ablate(
+    study: Study,
+    out: Path,
+    *,
+    benchmarks: Sequence[Benchmark] | None = None,
+    workers: int = 1,
+    report: Report = lambda _choice, _step, _steps, _numbers, _logged: None,
+) -> Results:
+    """Trains and measures every choice; `out` receives a folder for each, and what `evaluate` writes.
+
+    Where the choices are numbers, plot.png shows the metrics over them.
+
+    Args:
+        study: the question.
+        out: a folder of this study's own.
+        benchmarks: what to measure on instead of the study's own.
+        workers: processes that score at once.
+        report: called after every step of training.
+
+    Raises:
+        RecipeError: the base recipe or the value is wrong, or data is missing.
+        BrewsterError: what training and `evaluate` raise.
+    """
+    base = read_recipe(study.base)
+    recipes = {study.label(choice): with_value(base, study.value, choice) for choice in study.choices}
+    parts = benchmarks or [
+        part
+        for name, folder in study.benchmarks.items()
+        for part in read_benchmark(name, data_folder() / folder)
+    ]
+    models = []
+    for label, recipe in recipes.items():
+        folder = out / label.replace(" ", "-")
+
+        def tell(*told: Any, label: str = label) -> None:  # noqa: ANN401  (what train tells)
+            report(label, *told)
+
+        export_onnx(train(recipe, folder, tell), folder / "model.onnx")
+        models.append(Model(label, str(folder / "model.onnx"), out / "predictions" / folder.name))
+    results = evaluate(parts, [Nothing(), *models], Protocol(), out, workers=workers)
+    numbers = [
+        choice for choice in study.choices if isinstance(choice, int | float) and not isinstance(choice, bool)
+    ]
+    if len(numbers) == len(study.choices):
+        write_atomically(out / PLOT, _plot(study, numbers, results), overwrite=True)
+    return results
+
+
+def _plot(study: Study, numbers: Sequence[float], results: Results) -> bytes:
+    """PSNR, SSIM and LPIPS over the numbers, a line a set, intervals as bands: a PNG."""
+    import io  # noqa: PLC0415
+
+    from matplotlib.figure import Figure  # noqa: PLC0415  (only those who ablate numbers need it)
+
+    metrics = [name for name in ("psnr", "ssim", "lpips") if name in results["metrics"]]
+    figure = Figure(figsize=(4 * len(metrics), 3.4), layout="constrained")
+    for panel, metric in zip(figure.subplots(1, len(metrics), squeeze=False)[0], metrics, strict=True):
+        for key, selection in results["selections"].items():
+            rows = [results["tables"][key][study.label(number)][metric] for number in numbers]
+            style = {"linewidth": 2.4, "color": "black"} if key == AVERAGE else {"linewidth": 1.2}
+            (line,) = panel.plot(
+                numbers, [row["mean"] for row in rows], marker="o", label=selection["title"], **style
+            )
+            if all(row["low"] is not None for row in rows):
+                ends = ([row[end] for row in rows] for end in ("low", "high"))
+                panel.fill_between(numbers, *ends, color=line.get_color(), alpha=0.12, linewidth=0)
+        entry = results["metrics"][metric]
+        panel.set_title(f"{entry['title']}{', ' + entry['unit'] if entry['unit'] else ''}")
+        panel.set_xlabel(study.value)
+        if len(numbers) > 2 and max(numbers) > 20 * max(1, sorted(numbers)[1]):
+            panel.set_xscale("symlog", linthresh=max(1, sorted(numbers)[1]))
+            panel.set_xticks(numbers, [f"{number:g}" for number in numbers])
+    figure.axes[0].legend(fontsize="small")
+    data = io.BytesIO()
+    figure.savefig(data, format="png", dpi=160, metadata={"Software": None})
+    return data.getvalue()

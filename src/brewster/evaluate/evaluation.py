@@ -1,0 +1,150 @@
+"""A whole evaluation: score every method on every benchmark, and write results, tables and a page.
+
+benchmarks = read_benchmark("nature20", Path("nature20"))
+evaluate(benchmarks, [Nothing(), Predictions("RDNet", Path("rdnet"))], Protocol(), Path("out/evaluate"))
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+from brewster.dataset.benchmarks import Benchmark, Case
+from brewster.errors import BrewsterError, PhotoError
+from brewster.evaluate.judge import Truth
+from brewster.evaluate.methods import NOTHING, Answer, Method, Predictions
+from brewster.evaluate.protocol import Protocol
+from brewster.evaluate.report.page import Shown, write_report
+from brewster.evaluate.report.published import read_published
+from brewster.evaluate.report.published import to_markdown as published_to_markdown
+from brewster.evaluate.report.tables import to_csv, to_latex, to_markdown
+from brewster.evaluate.results import Results, summarise
+from brewster.evaluate.runner import Report, Row, score
+from brewster.files import write_atomically
+
+RESULTS, PAGE = "results.json", "report.html"
+PICTURES_SHOWN: Final = 50
+
+
+def evaluate(
+    benchmarks: Sequence[Benchmark],
+    methods: Sequence[Method],
+    protocol: Protocol,
+    out: Path,
+    *,
+    workers: int = 1,
+    shown: int = PICTURES_SHOWN,
+    report: Report = lambda _done, _of, _row: None,
+) -> Results:
+    """Scores and writes results.json, tables.md, table.tex, table.csv and report.html into `out`.
+
+    Args:
+        benchmarks: as `read_benchmark` gives them.
+        methods: in the order of the tables; "doing nothing" belongs first.
+        protocol: the choices of the run.
+        out: a folder of this evaluation's own; a run that was stopped goes on from what lies there.
+        workers: processes that score at once.
+        shown: how many pictures of each benchmark the page shows, the worst of the first model first.
+        report: called after every answer.
+
+    Raises:
+        BrewsterError: there is nothing to compare, names are shared, predictions could be paired wrongly, the paper's
+            draw is impossible, or a part of brewster is missing.
+        TargetError: `out` cannot be written.
+    """
+    _refuse_nothing(benchmarks)
+    cases = [case for part in benchmarks for case in part.cases]
+    for method in methods:
+        if isinstance(method, Predictions):
+            method.refuse_wrong_pairing(cases)
+    rows = score(benchmarks, methods, protocol, out, workers=workers, report=report)
+    results = summarise(benchmarks, methods, protocol, rows)
+    for method in methods:
+        if isinstance(method, Predictions) and (unused := method.unused(cases)):
+            results["methods"][method.name]["remark"] = f"{unused} pictures of its folder answer no case"
+    _write(results, out)
+    write_report(results, _shown(cases, methods, protocol, rows, shown), out / PAGE)
+    return results
+
+
+def _refuse_nothing(benchmarks: Sequence[Benchmark]) -> None:
+    names = [part.name for part in benchmarks]
+    for name in names:
+        if names.count(name) > 1:
+            raise BrewsterError(
+                f"{names.count(name)} benchmarks are called {name!r}",
+                "each once",
+                "rename one of the folders",
+            )
+    if not any(part.cases for part in benchmarks):
+        refused = [reason for part in benchmarks for reason in part.refused]
+        raise PhotoError(
+            f"there is no pair in {', '.join(names) or 'no benchmark'}",
+            "a photo and its truth",
+            "; ".join(refused[:5]) or "name a folder that has some",
+        )
+
+
+def _write(results: Results, out: Path) -> None:
+    tables = {
+        RESULTS: json.dumps(results, indent=1, ensure_ascii=False, allow_nan=False) + "\n",
+        "tables.md": f"{to_markdown(results)}\n{published_to_markdown(read_published())}",
+        "table.tex": to_latex(results),
+        "table.csv": to_csv(results),
+    }
+    for name, text in tables.items():
+        write_atomically(out / name, text.encode(), overwrite=True)
+
+
+# --- what the page shows
+
+
+def _shown(
+    cases: Sequence[Case], methods: Sequence[Method], protocol: Protocol, rows: Sequence[Row], most: int
+) -> Iterator[Shown]:
+    """The pictures, read again one case at a time."""
+    good = {row.place for row in rows if not row.error}
+    for case in _worst(cases, methods, rows, most):
+        shown = [
+            method
+            for method in methods
+            if method.name != NOTHING and (case.benchmark, case.name, method.name) in good
+        ]
+        try:
+            truth = Truth.open(case, protocol)
+        except PhotoError:
+            continue  # named in the table already
+        answers = {method.name: answer for method in shown if (answer := method.kept(case))}
+        yield _show(truth, answers, protocol)
+
+
+def _show(truth: Truth, answers: dict[str, Answer], protocol: Protocol) -> Shown:
+    return Shown(
+        benchmark=truth.case.benchmark,
+        name=truth.case.name,
+        photo=truth.pictures["photo"],
+        truth=truth.pictures["transmission"],
+        region=truth.region(protocol.thresholds[0]),
+        answers={name: answer.transmission.srgb_8bit() for name, answer in answers.items()},
+        reflections={
+            name: answer.reflection.srgb_8bit() for name, answer in answers.items() if answer.reflection
+        },
+        reflection_truth=truth.pictures.get("reflection"),
+    )
+
+
+def _worst(cases: Sequence[Case], methods: Sequence[Method], rows: Sequence[Row], most: int) -> list[Case]:
+    """So many cases of each benchmark, those with the least gain in PSNR by the first method that does something."""
+    scores = {row.place: row.scores.get("psnr") for row in rows}
+    first = next((method.name for method in methods if method.name != NOTHING), NOTHING)
+
+    def gain(case: Case) -> float:
+        ours, nothing = (scores.get((case.benchmark, case.name, method)) for method in (first, NOTHING))
+        return (ours or 0.0) - (nothing or 0.0)
+
+    chosen = []
+    for name in dict.fromkeys(case.benchmark for case in cases):
+        chosen += sorted((case for case in cases if case.benchmark == name), key=gain)[:most]
+    return chosen

@@ -1,0 +1,304 @@
+"""What is measured: doing nothing, our models, and folders of pictures that any other method has left.
+
+Every method answers a case with a transmission and perhaps a reflection. `key` says all that the answer depends on
+beside the photo, so that an answer made once need not be made again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+import unicodedata
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Final, Protocol, final
+
+import numpy as np
+
+import brewster
+from brewster.dataset.benchmarks import Case
+from brewster.errors import BrewsterError, PhotoError
+from brewster.files import SUFFIXES, write_atomically
+from brewster.options import Device, Quality
+from brewster.photo import Photo
+from brewster.separate import Separator
+
+NOTHING: Final = "doing nothing"
+_ENDINGS: Final = {"transmission": ("_t", "_l"), "reflection": ("_r",)}
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """The layers that a method gives for a photo, and the wall time that this took it, if it was seen."""
+
+    transmission: Photo
+    reflection: Photo | None = None
+    seconds: float | None = None
+
+    @classmethod
+    def read(cls, files: Mapping[str, Path]) -> Answer:
+        """The answer in these files, by layer.
+
+        Raises:
+            PhotoError: one cannot be read.
+        """
+        photos = {layer: Photo.open(path) for layer, path in files.items()}
+        return cls(photos["transmission"], photos.get("reflection"))
+
+
+class Method(Protocol):
+    """Anything that answers cases. It is sent to other processes, so it is data; a failure is an exception."""
+
+    @property
+    def name(self) -> str:
+        """What tables call it."""
+        ...
+
+    def about(self) -> dict[str, str]:
+        """What it is, in plain values for results.json; the first is its kind."""
+        ...
+
+    def key(self, case: Case) -> str:
+        """All that its answer depends on, beside the photo."""
+        ...
+
+    def answer(self, case: Case, photo: Photo) -> Answer:
+        """Its layers for the photo of this case."""
+        ...
+
+    def kept(self, case: Case) -> Answer | None:
+        """The answer as it lies on the disk, if it does."""
+        ...
+
+
+@final
+@dataclass(frozen=True)
+class Nothing:
+    """The photo itself as transmission and black as reflection: what every method must beat."""
+
+    name: str = NOTHING
+
+    def about(self) -> dict[str, str]:
+        """Its kind."""
+        return {"kind": "baseline"}
+
+    def key(self, case: Case) -> str:  # noqa: ARG002  (it is the same for all)
+        """Nothing."""
+        return "nothing"
+
+    def answer(self, case: Case, photo: Photo) -> Answer:  # noqa: ARG002
+        """The photo and black."""
+        return Answer(photo, photo.with_pixels(np.zeros_like(photo.pixels)))
+
+    def kept(self, case: Case) -> Answer | None:  # noqa: ARG002
+        """Nothing is kept: it costs nothing."""
+        return None
+
+
+@final
+@dataclass(frozen=True)
+class Model:
+    """A model, run through the `Separator` that users use; its answers are kept as PNG in `folder`.
+
+    `folder` takes the form of a folder of predictions, and can be measured as one later.
+    """
+
+    name: str
+    model: str
+    folder: Path
+    quality: Quality = "standard"
+    device: Device = "auto"
+
+    def about(self) -> dict[str, str]:
+        """Its kind, the digest of its file, and how closely it looks."""
+        return {"kind": "model", "sha256": self._sha256, "quality": self.quality}
+
+    def key(self, case: Case) -> str:  # noqa: ARG002  (it is the same for all)
+        """The model's digest, its quality and the version of brewster around it."""
+        return f"{self._sha256} {self.quality} {brewster.__version__}"
+
+    def answer(self, case: Case, photo: Photo) -> Answer:
+        """Separates the photo and keeps both layers.
+
+        Raises:
+            BrewsterError: the model or the photo cannot be used, or the layers cannot be written.
+        """
+        separator = _separator(self.model, self.device)
+        started = time.perf_counter()
+        separation = separator(photo, quality=self.quality)
+        seconds = time.perf_counter() - started
+        for layer, path in self._files(case).items():
+            write_atomically(path, getattr(separation, layer).encode("png", depth=8), overwrite=True)
+        return Answer(separation.transmission, separation.reflection, seconds)
+
+    def kept(self, case: Case) -> Answer | None:
+        """The layers that were kept.
+
+        Raises:
+            PhotoError: they cannot be read.
+        """
+        files = self._files(case)
+        return Answer.read(files) if all(path.is_file() for path in files.values()) else None
+
+    @cached_property
+    def _sha256(self) -> str:
+        return _separator(self.model, self.device).sha256 or ""
+
+    def _files(self, case: Case) -> dict[str, Path]:
+        folder = self.folder / case.benchmark
+        return {layer: folder / f"{case.name}.{layer}.png" for layer in ("transmission", "reflection")}
+
+
+@lru_cache(maxsize=1)
+def _separator(model: str, device: Device) -> Separator:
+    """The model in use; one at a time, since some are large."""
+    return Separator.load(model, device=device)
+
+
+@final
+@dataclass(frozen=True)
+class Predictions:
+    """A folder with another method's pictures, found by name; README and docs say how they may be called."""
+
+    name: str
+    folder: Path
+
+    def about(self) -> dict[str, str]:
+        """Its kind."""
+        return {"kind": "predictions"}
+
+    def key(self, case: Case) -> str:
+        """The digest of the files, or what is wrong with them."""
+        try:
+            files = self.files(case)
+            return hashlib.sha256(b"".join(_digest(path) for path in files.values())).hexdigest()
+        except BrewsterError as error:
+            return str(error)
+
+    def answer(self, case: Case, photo: Photo) -> Answer:  # noqa: ARG002  (it is answered already)
+        """Reads its pictures for this case.
+
+        Raises:
+            PhotoError: there is none, there are several, or they cannot be read.
+        """
+        return Answer.read(self.files(case))
+
+    def kept(self, case: Case) -> Answer | None:
+        """What `answer` gives, and raises."""
+        return Answer.read(self.files(case))
+
+    def files(self, case: Case) -> dict[str, Path]:
+        """layer -> file for this case, transmission and perhaps reflection.
+
+        Raises:
+            PhotoError: there is no transmission, or more than one file for a layer.
+        """
+        found = {layer: self._candidates(case, layer) for layer in ("transmission", "reflection")}
+        for layer, paths in found.items():
+            if len(paths) > 1:
+                raise PhotoError(
+                    f"{self.name} has {len(paths)} pictures for the {layer} of {case.benchmark}/{case.name}"
+                    f" ({', '.join(sorted(path.name for path in paths))})",
+                    "one is needed",
+                    "remove the others",
+                )
+        if not found["transmission"]:
+            raise PhotoError(
+                f"{self.name} has no picture for {case.benchmark}/{case.name}",
+                f"such as {self.folder / case.benchmark / case.name}.png",
+                "add it, or rename it",
+            )
+        return {layer: path for layer, paths in found.items() for path in paths}
+
+    def unused(self, cases: Iterable[Case]) -> int:
+        """How many of the folder's pictures answer none of these cases: a hint that names differ."""
+        layers = ("transmission", "reflection")
+        used = {path for case in cases for layer in layers for path in self._candidates(case, layer)}
+        return sum(map(len, self._pictures.values())) - len(used)
+
+    def refuse_wrong_pairing(self, cases: Sequence[Case]) -> None:
+        """Refuses a folder in which one picture would answer two cases, or none any.
+
+        Raises:
+            PhotoError: so it is.
+        """
+        if not self.folder.is_dir():
+            raise PhotoError(
+                f"{self.folder} is no folder", f"{self.name} needs one with its pictures", "name another"
+            )
+        owners: defaultdict[Path, list[Case]] = defaultdict(list)
+        for case in cases:
+            for path in self._candidates(case, "transmission"):
+                owners[path].append(case)
+        for path, claimed in owners.items():
+            if len(claimed) > 1:
+                first, second, *_ = (f"{case.benchmark}/{case.name}" for case in claimed)
+                raise PhotoError(
+                    f"{path} could be {self.name}'s answer to {first} and to {second}",
+                    "a picture answers one case",
+                    f"sort the pictures into {', '.join(sorted({str(self.folder / case.benchmark) for case in claimed}))}",
+                )
+        if not owners:
+            example = f"{cases[0].benchmark}/{cases[0].name}" if cases else "a case"
+            raise PhotoError(
+                f"no picture in {self.folder} is called like a case",
+                f"{self.name} needs pictures such as {example}.png",
+                "rename them, or name another folder",
+            )
+
+    def _candidates(self, case: Case, layer: str) -> set[Path]:
+        """The files that could be this layer, under any of the names that are understood."""
+        root = self.folder / case.benchmark
+        root = root if root.is_dir() else self.folder
+        places = [root / f"{stem}.{layer}" for stem in (case.name, case.place)]
+        places += [root / folder / case.name for folder in (layer, f"{layer}_layer")]
+        places += [root / case.name / name for name in self._own_names(root / case.name, layer)]
+        if layer == "transmission":
+            places += [root / case.name, root / case.place]
+        return {path for place in places for path in self._pictures.get(_plain(place), ())}
+
+    def _own_names(self, folder: Path, layer: str) -> list[str]:
+        """Stems such as rdnet_t or dsrnet_l, where a method has left a folder for each picture."""
+        return [stem for stem in self._stems.get(folder, ()) if stem.endswith(_ENDINGS[layer])]
+
+    @cached_property
+    def _pictures(self) -> dict[Path, list[Path]]:
+        """The folder's pictures by their paths without suffix."""
+        found: defaultdict[Path, list[Path]] = defaultdict(list)
+        for path in sorted(self.folder.rglob("*")):
+            if path.suffix.lower() in SUFFIXES and not path.name.startswith("."):
+                found[_plain(path.with_suffix(""))].append(path)
+        return dict(found)
+
+    @cached_property
+    def _stems(self) -> dict[Path, list[str]]:
+        stems: defaultdict[Path, list[str]] = defaultdict(list)
+        for place in self._pictures:
+            stems[place.parent].append(place.name)
+        return dict(stems)
+
+
+def _plain(path: Path) -> Path:
+    """A path in one spelling: some systems write an accented letter as two characters."""
+    return Path(unicodedata.normalize("NFC", str(path)))
+
+
+def _digest(path: Path) -> bytes:
+    return hashlib.sha256(path.read_bytes()).digest()
+
+
+def refuse_shared_names(methods: Sequence[Method]) -> None:
+    """Refuses two methods of one name, since tables could not tell them apart.
+
+    Raises:
+        BrewsterError: so it is.
+    """
+    (name, count), *_ = Counter(method.name for method in methods).most_common(1)
+    if count > 1:
+        raise BrewsterError(
+            f"{count} methods are called {name!r}", "each needs a name of its own", "write NAME=... for one"
+        )

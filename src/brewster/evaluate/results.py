@@ -1,0 +1,157 @@
+"""From rows to results: means and differences with their intervals, in plain values that JSON keeps for good."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final, final
+
+import numpy as np
+
+import brewster
+from brewster.dataset.benchmarks import PAPER_SEED, Benchmark, Case, paper_draw
+from brewster.evaluate.methods import Method
+from brewster.evaluate.protocol import Protocol
+from brewster.evaluate.runner import Row
+from brewster.evaluate.statistics import Stratum, differences, estimate
+
+AVERAGE: Final = "average"
+_DIGITS: Final = 6
+
+Results = dict[str, Any]
+"""What results.json holds: see docs/evaluation.md."""
+
+
+@final
+@dataclass(frozen=True)
+class Selection:
+    """Pictures that a table is about: a whole benchmark, or the paper's draw from it."""
+
+    key: str
+    title: str
+    cases: tuple[Case, ...]
+
+
+def summarise(
+    benchmarks: Sequence[Benchmark], methods: Sequence[Method], protocol: Protocol, rows: Sequence[Row]
+) -> Results:
+    """The results of a run; the same for any order of rows.
+
+    Raises:
+        BrewsterError: the paper's draw was asked for, and a benchmark does not tell its scenes.
+    """
+    by_place = {row.place: row for row in rows}
+    named = [method.name for method in methods]
+    measured = {column for row in rows for column, score in row.scores.items() if score is not None}
+    columns = {name: metric for name, metric in protocol.columns().items() if name in measured}
+    full = [Selection(part.name, part.title, part.cases) for part in benchmarks if part.cases]
+    drawn = _drawn(benchmarks) if protocol.paper else []
+    tables = [[selection] for selection in (*full, *drawn)]
+    together = _together(full, drawn)
+    selections = {group[0].key: group for group in tables} | ({AVERAGE: together} if together else {})
+    series = [(method, column) for method in named for column in columns]
+    directions = {name: metric.higher_is_better for name, metric in columns.items()}
+    strata = {key: [_stratum(part, series, by_place) for part in group] for key, group in selections.items()}
+    return {
+        "brewster": brewster.__version__,
+        "protocol": {
+            "size": protocol.size or "native",
+            "quality": protocol.quality,
+            "region_thresholds": list(protocol.thresholds),
+            "choices": protocol.choices(),
+        },
+        "metrics": {
+            name: {key: value for key, value in asdict(metric).items() if key != "name"}
+            for name, metric in columns.items()
+        },
+        "benchmarks": {part.name: _described(part) for part in benchmarks},
+        "selections": {key: _titled(key, group) for key, group in selections.items()},
+        "methods": {method.name: method.about() for method in methods},
+        "draw": {"seed": PAPER_SEED} | {part.key: [case.name for case in part.cases] for part in drawn},
+        "pictures": [_picture(case, named, by_place) for part in benchmarks for case in part.cases],
+        "tables": {key: _table(strata[key], series) for key in selections},
+        "differences": {
+            key: [_flat(difference) for difference in differences(strata[key], series, directions)]
+            for key in selections
+        },
+    }
+
+
+def _drawn(benchmarks: Sequence[Benchmark]) -> list[Selection]:
+    """The paper's draws that are not the whole benchmark."""
+    draws = [(part, paper_draw(part)) for part in benchmarks if part.cases]
+    return [
+        Selection(f"{part.name}:paper", f"{part.title}, the paper's draw", cases)
+        for part, cases in draws
+        if len(cases) < len(part.cases)
+    ]
+
+
+def _together(full: Sequence[Selection], drawn: Sequence[Selection]) -> list[Selection]:
+    """What the average is over: of each benchmark the draw, if there is one; nothing if there is only one."""
+    draws = {part.key.partition(":")[0]: part for part in drawn}
+    return [draws.get(part.key, part) for part in full] if len(full) > 1 else []
+
+
+def _titled(key: str, group: Sequence[Selection]) -> dict[str, Any]:
+    pictures = sum(len(part.cases) for part in group)
+    return {"title": "Average" if key == AVERAGE else group[0].title, "pictures": pictures}
+
+
+def _stratum(
+    selection: Selection, series: Sequence[tuple[str, str]], rows: Mapping[tuple[str, str, str], Row]
+) -> Stratum:
+    values = [
+        [_score(rows[case.benchmark, case.name, method], column) for method, column in series]
+        for case in selection.cases
+    ]
+    shape = len(selection.cases), len(series)
+    scenes = [case.scene for case in selection.cases]
+    return Stratum(selection.key, scenes, np.array(values, float).reshape(shape))
+
+
+def _score(row: Row, column: str) -> float:
+    score = row.scores.get(column)
+    return float("nan") if score is None else score
+
+
+def _table(strata: Sequence[Stratum], series: Sequence[tuple[str, str]]) -> dict[str, dict[str, Any]]:
+    table: dict[str, dict[str, Any]] = {method: {} for method, _ in series}
+    for (method, column), answer in zip(series, estimate(strata), strict=True):
+        if answer:
+            table[method][column] = _rounded(asdict(answer))
+    return table
+
+
+def _flat(difference: Any) -> dict[str, Any]:  # noqa: ANN401  (a Difference)
+    row = asdict(difference)
+    return _rounded(row.pop("estimate") | row)
+
+
+def _rounded(row: dict[str, Any]) -> dict[str, Any]:
+    return {name: round(value, _DIGITS) if isinstance(value, float) else value for name, value in row.items()}
+
+
+def _described(part: Benchmark) -> dict[str, Any]:
+    return {
+        "title": part.title,
+        "pictures": len(part.cases),
+        "expected": list(part.expected),
+        "remarks": list(part.remarks),
+        "refused": list(part.refused),
+    }
+
+
+def _picture(case: Case, methods: Sequence[str], rows: Mapping[tuple[str, str, str], Row]) -> dict[str, Any]:
+    own = {method: rows[case.benchmark, case.name, method] for method in methods}
+    seen = next((row for row in own.values() if not row.error), None)
+    return {
+        "benchmark": case.benchmark,
+        "name": case.name,
+        "scene": case.scene,
+        "width": seen.width if seen else None,
+        "height": seen.height if seen else None,
+        "region_share": seen.region_share if seen else None,
+        "scores": {method: row.scores for method, row in own.items() if not row.error},
+        "errors": {method: row.error for method, row in own.items() if row.error},
+    }

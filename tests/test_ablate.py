@@ -1,0 +1,117 @@
+"""Studies: one value, several choices, trained and measured alike."""
+
+import io
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmark_folders import paint
+from brewster.dataset.benchmarks import read_benchmark
+from brewster.errors import RecipeError
+from brewster.evaluate import ablate as module
+from brewster.evaluate.ablate import ablate, read_study
+from brewster.train.recipe import read_recipe, with_value
+from front_door import as_user
+
+RECIPES = Path(__file__).parents[1] / "recipes" / "ablations"
+STUDIES = [path for path in sorted(RECIPES.glob("*.toml")) if "base" in path.read_text().split("\n", 2)[1]]
+
+
+def names(paths):
+    return [path.stem for path in paths]
+
+
+def test_every_ablation_of_the_paper_that_the_compact_model_can_do_is_ready():
+    assert names(STUDIES) == ["mixing", "orders", "pairs", "size"]
+
+
+@pytest.mark.parametrize("path", STUDIES, ids=names(STUDIES))
+def test_a_study_changes_one_value_of_both_the_full_and_the_tiny_recipe(path):
+    study = read_study(path)
+    for base in (read_recipe(study.base), read_recipe(RECIPES / "tiny.toml")):
+        recipes = [with_value(base, study.value, choice) for choice in study.choices]
+        assert base in recipes
+        assert len({recipe.model_dump_json() for recipe in recipes}) == len(study.choices)
+
+
+def test_the_training_sizes_are_the_papers():
+    assert read_study(RECIPES / "size.toml").choices == [0, 10, 50, 100, 300, 1000]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("value = 'seed'\nchoices = [1, 2]\nbenchmarks = { real20 = 'x' }", "base"),
+        ("base = 'b'\nvalue = 'seed'\nchoices = [1]\nbenchmarks = { real20 = 'x' }", "choices"),
+        ("base = 'b'\nvalue = 'seed'\nchoices = [1, 2]\nbenchmarks = {}", "benchmarks"),
+        ("base = 'b'\nvalue = 'seed'\nchoice = 3", "choice"),
+        ("base =", "TOML"),
+    ],
+)
+def test_a_study_that_does_not_say_what_it_must_is_refused(text, said, tmp_path):
+    (tmp_path / "study.toml").write_text(text)
+    with pytest.raises(RecipeError, match=said):
+        read_study(tmp_path / "study.toml")
+
+
+@pytest.fixture
+def quick(monkeypatch, model):
+    """Training that takes no time: every network is a pane."""
+    monkeypatch.setattr(module, "train", lambda recipe, out, report: report(1, 1, {"loss": 0.5}, True))
+    monkeypatch.setattr(module, "export_onnx", lambda _network, path: write_model(path, model))
+
+
+def write_model(path, model):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(model.read_bytes())
+
+
+@pytest.fixture
+def pairs(tmp_path):
+    for name in ("1", "2"):
+        paint(tmp_path / "real20" / "blended" / f"{name}.png", int(name), size=(96, 80), noise=20)
+        paint(tmp_path / "real20" / "transmission" / f"{name}.png", int(name), size=(96, 80))
+    return read_benchmark("real20", tmp_path / "real20")
+
+
+def test_choices_are_compared_with_the_first_and_numbers_are_drawn(quick, pairs, data, tmp_path, monkeypatch):
+    monkeypatch.setenv("BREWSTER_DATA", str(data))
+    told = []
+    results = ablate(
+        read_study(RECIPES / "size.toml"),
+        tmp_path / "out",
+        benchmarks=pairs,
+        report=lambda *now: told.append(now),
+    )
+    labels = [f"count {count}" for count in (0, 10, 50, 100, 300, 1000)]
+    assert list(results["methods"]) == ["doing nothing", *labels]
+    assert [now[0] for now in told] == labels
+    compared = {(row["method"], row["than"]) for row in results["differences"]["real20"]}
+    assert ("count 300", "count 0") in compared
+    plot = np.asarray(Image.open(io.BytesIO((tmp_path / "out" / "plot.png").read_bytes())).convert("L"))
+    assert plot.shape[1] > plot.shape[0] > 300
+    assert 0.005 < (plot < 128).mean() < 0.5
+
+
+def test_words_are_not_drawn(quick, pairs, data, tmp_path, monkeypatch):
+    monkeypatch.setenv("BREWSTER_DATA", str(data))
+    ablate(read_study(RECIPES / "mixing.toml"), tmp_path / "out", benchmarks=pairs)
+    assert not (tmp_path / "out" / "plot.png").exists()
+    assert (tmp_path / "out" / "mixing-8-bit" / "model.onnx").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", STUDIES, ids=names(STUDIES))
+def test_every_study_runs_end_to_end_at_tiny_size(path, data, tmp_path):
+    """Real rendering, real training, real measuring, on the twenty dev pairs."""
+    environment = {**os.environ, "BREWSTER_DATA": str(data)}
+    done = as_user("ablate", path, "--base", RECIPES / "tiny.toml", "-o", tmp_path / "out", env=environment)
+    assert done.returncode == 0, done.stderr.decode()
+    text = done.stdout.decode()
+    for choice in read_study(path).choices:
+        assert f" {choice} " in text
+    assert (tmp_path / "out" / "report.html").is_file()
+    assert (tmp_path / "out" / "plot.png").is_file() == (path.stem in {"size", "pairs"})

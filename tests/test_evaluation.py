@@ -1,0 +1,84 @@
+"""A whole evaluation, from folders to files."""
+
+import json
+
+import pytest
+
+from benchmark_folders import paint
+from brewster.dataset.benchmarks import Benchmark, read_benchmark
+from brewster.errors import BrewsterError, PhotoError
+from brewster.evaluate.evaluation import evaluate
+from brewster.evaluate.methods import Model, Nothing, Predictions
+from brewster.evaluate.protocol import Protocol
+
+QUICK = Protocol(metrics=("psnr", "ssim", "psnr_region"))
+
+
+@pytest.fixture
+def real20(tmp_path):
+    for name in ("1", "2"):
+        paint(tmp_path / "real20" / "blended" / f"{name}.png", int(name), noise=20)
+        paint(tmp_path / "real20" / "transmission_layer" / f"{name}.png", int(name))
+        paint(tmp_path / "theirs" / f"{name}.png", int(name), noise=5)
+    return read_benchmark("real20", tmp_path / "real20")
+
+
+@pytest.fixture
+def methods(model, tmp_path):
+    return [
+        Nothing(),
+        Model("pane", str(model), tmp_path / "kept"),
+        Predictions("theirs", tmp_path / "theirs"),
+    ]
+
+
+def test_an_evaluation_leaves_results_tables_and_a_page(real20, methods, tmp_path):
+    results = evaluate(real20, methods, QUICK, tmp_path / "out")
+    written = json.loads((tmp_path / "out" / "results.json").read_text())
+    assert written == results
+    assert results["tables"]["real20"]["theirs"]["psnr"]["mean"] > 30
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {"results.json", "tables.md", "table.tex", "table.csv", "report.html", "scores.jsonl"}
+    text = (tmp_path / "out" / "tables.md").read_text()
+    assert text.index("theirs") < text.index("not measured here")
+    assert (tmp_path / "out" / "report.html").read_text().count("<article") == 2
+
+
+def test_two_runs_and_two_workers_write_the_same_bytes(real20, methods, tmp_path):
+    for place, workers in (("a", 1), ("b", 2)):
+        evaluate(real20, methods, QUICK, tmp_path / place, workers=workers)
+    for name in ("results.json", "tables.md", "table.tex", "table.csv", "report.html"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
+
+
+def test_the_page_shows_the_worst_of_the_first_model(real20, methods, tmp_path):
+    results = evaluate(real20, methods, QUICK, tmp_path / "out", shown=1)
+    gains = {
+        picture["name"]: picture["scores"]["pane"]["psnr"] - picture["scores"]["doing nothing"]["psnr"]
+        for picture in results["pictures"]
+    }
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert page.count("<article") == 1
+    assert f'data-name="{min(gains, key=gains.get)}"' in page
+
+
+def test_pictures_without_a_case_are_said_aloud(real20, methods, tmp_path):
+    paint(tmp_path / "theirs" / "other.png", 3)
+    results = evaluate(real20, methods, QUICK, tmp_path / "out")
+    assert results["methods"]["theirs"]["remark"].startswith("1 pictures")
+
+
+def test_benchmarks_that_share_a_name_or_hold_no_pair_are_refused(real20, methods, tmp_path):
+    with pytest.raises(BrewsterError, match="2 benchmarks are called 'real20'"):
+        evaluate([*real20, *real20], methods, QUICK, tmp_path / "out")
+    empty = Benchmark("real20", "Real20", (), refused=("a.png has no partner",))
+    with pytest.raises(PhotoError, match=r"no pair in real20.*a\.png has no partner"):
+        evaluate([empty], methods, QUICK, tmp_path / "out")
+
+
+def test_a_failed_prediction_is_missing_on_the_page_and_named_in_the_tables(real20, methods, tmp_path):
+    (tmp_path / "theirs" / "2.png").unlink()
+    results = evaluate(real20, methods, QUICK, tmp_path / "out")
+    assert "no picture for real20/2" in results["pictures"][1]["errors"]["theirs"]
+    assert "no picture for real20/2" in (tmp_path / "out" / "tables.md").read_text()
+    assert "no picture for real20/2" in (tmp_path / "out" / "report.html").read_text()

@@ -1,0 +1,137 @@
+"""Whose answer belongs to which case: by name, once, or not at all."""
+
+import pickle
+import unicodedata
+
+import numpy as np
+import pytest
+
+from benchmark_folders import picture, repacked, write
+from brewster import Photo
+from brewster.dataset.benchmarks import read_benchmark
+from brewster.errors import BrewsterError, PhotoError
+from brewster.evaluate.methods import Model, Nothing, Predictions, refuse_shared_names
+
+
+@pytest.fixture
+def cases(tmp_path):
+    repacked(tmp_path / "real20", ["1", "2", "ä"])
+    (benchmark,) = read_benchmark("real20", tmp_path / "real20")
+    return benchmark.cases
+
+
+@pytest.fixture
+def case(cases):
+    return cases[0]
+
+
+def method(tmp_path, *places):
+    write(tmp_path / "theirs", *places)
+    return Predictions("theirs", tmp_path / "theirs")
+
+
+NAMES = [
+    "1.png",
+    "1.jpg",
+    "1.transmission.png",
+    "real20/1.png",
+    "transmission/1.png",
+    "transmission_layer/1.JPG",
+    "blended/1.png",
+    "blended/1.transmission.png",
+    "real20/blended/1.transmission.jpg",
+    "1/theirs_t.png",
+    "real20/1/dsrnet_l.png",
+]
+
+
+@pytest.mark.parametrize("place", NAMES)
+def test_a_prediction_is_found_under_every_name_that_is_documented(place, case, tmp_path):
+    (found,) = method(tmp_path, place).files(case).values()
+    assert found == tmp_path / "theirs" / place
+
+
+def test_a_reflection_is_found_beside_it(case, tmp_path):
+    both = method(tmp_path, "1/x_t.png", "1/x_r.png", "1/m_input.png", "1/t_label.png").files(case)
+    assert {layer: path.name for layer, path in both.items()} == {
+        "transmission": "x_t.png",
+        "reflection": "x_r.png",
+    }
+    both = method(tmp_path / "more", "1.transmission.png", "1.reflection.png").files(case)
+    assert both["reflection"].name == "1.reflection.png"
+
+
+@pytest.mark.parametrize("place", ["10.png", "01.png", "1_.png", "1.txt", ".1.png", "x1.png"])
+def test_a_name_that_is_merely_similar_is_no_prediction(place, case, tmp_path):
+    with pytest.raises(PhotoError, match="no picture for real20/1"):
+        method(tmp_path, place).files(case)
+
+
+def test_two_pictures_for_one_case_are_refused_and_named(case, tmp_path):
+    with pytest.raises(PhotoError, match=r"2 pictures for the transmission.*1\.jpg, 1\.png"):
+        method(tmp_path, "1.png", "1.jpg").files(case)
+
+
+def test_an_accent_written_as_two_characters_is_the_same_name(cases, tmp_path):
+    apart = unicodedata.normalize("NFD", "ä")
+    assert method(tmp_path, f"{apart}.png").files(cases[2])
+
+
+def test_one_picture_cannot_answer_two_cases(cases, tmp_path):
+    repacked(tmp_path / "nature20", ["1"])
+    (other,) = read_benchmark("nature20", tmp_path / "nature20")
+    theirs = method(tmp_path, "1.png", "2.png")
+    theirs.refuse_wrong_pairing(cases)
+    with pytest.raises(PhotoError, match="to real20/1 and to nature20/1"):
+        theirs.refuse_wrong_pairing([*cases, *other.cases])
+    sorted_out = method(tmp_path / "sorted", "real20/1.png", "nature20/1.png")
+    sorted_out.refuse_wrong_pairing([*cases, *other.cases])
+
+
+def test_a_folder_in_which_no_name_fits_is_refused_at_once(cases, tmp_path):
+    with pytest.raises(PhotoError, match="called like a case"):
+        method(tmp_path, "a.png", "b.png").refuse_wrong_pairing(cases)
+    with pytest.raises(PhotoError, match="no folder"):
+        Predictions("theirs", tmp_path / "nowhere").refuse_wrong_pairing(cases)
+
+
+def test_pictures_that_answer_no_case_are_counted(cases, tmp_path):
+    assert method(tmp_path, "1.png", "other.png", "another.png").unused(cases) == 2
+
+
+def test_doing_nothing_is_the_photo_and_black(case):
+    photo = Photo.open(case.photo.read())
+    answer = Nothing().answer(case, photo)
+    assert answer.transmission is photo
+    assert not answer.reflection.pixels.any()
+
+
+def test_a_model_answers_as_the_separator_does_and_keeps_its_answer(case, model, tmp_path):
+    ours = Model("pane", str(model), tmp_path / "kept")
+    assert ours.kept(case) is None
+    photo = Photo.open(case.photo.read())
+    answer = ours.answer(case, photo)
+    assert answer.seconds > 0
+    kept = ours.kept(case)
+    assert np.array_equal(kept.transmission.srgb_8bit(), answer.transmission.srgb_8bit())
+    assert np.array_equal(kept.reflection.srgb_8bit(), answer.reflection.srgb_8bit())
+    assert Predictions("again", tmp_path / "kept").files(case).keys() == {"transmission", "reflection"}
+
+
+def test_a_key_changes_with_all_that_the_answer_depends_on(case, model, tmp_path):
+    draft = Model("pane", str(model), tmp_path, quality="draft")
+    assert draft.key(case) != Model("pane", str(model), tmp_path).key(case)
+    theirs = method(tmp_path, "1.png")
+    before = theirs.key(case)
+    write(tmp_path / "theirs", "1.png", data=picture((8, 7), "png"))
+    assert Predictions("theirs", tmp_path / "theirs").key(case) != before
+
+
+def test_methods_are_data_that_other_processes_can_take(model, tmp_path):
+    for one in (Nothing(), Model("pane", str(model), tmp_path), method(tmp_path, "1.png")):
+        assert pickle.loads(pickle.dumps(one)) == one
+
+
+def test_two_methods_of_one_name_are_refused(tmp_path):
+    with pytest.raises(BrewsterError, match="2 methods are called 'doing nothing'"):
+        refuse_shared_names([Nothing(), Predictions("doing nothing", tmp_path)])

@@ -1,0 +1,127 @@
+"""What results.json says, from rows whose numbers are known."""
+
+import json
+
+import pytest
+
+from benchmark_folders import repacked, sir2
+from brewster.dataset.benchmarks import Benchmark, Case, File, read_benchmark
+from brewster.errors import BrewsterError
+from brewster.evaluate.methods import Nothing, Predictions
+from brewster.evaluate.protocol import Protocol
+from brewster.evaluate.results import summarise
+from brewster.evaluate.runner import Row
+
+PSNR = Protocol(metrics=("psnr",))
+
+
+def benchmark(name, count, refused=()):
+    file = File("nowhere")
+    cases = tuple(Case(name, str(i), str(i), str(i), file, file) for i in range(count))
+    return Benchmark(name, name.title(), cases, refused=refused)
+
+
+def rows(benchmarks, methods, score):
+    return [
+        Row(case.benchmark, case.name, method.name, "", "", {"psnr": score(case, method)})
+        for part in benchmarks
+        for case in part.cases
+        for method in methods
+    ]
+
+
+@pytest.fixture
+def methods(tmp_path):
+    return [Nothing(), Predictions("theirs", tmp_path)]
+
+
+def test_the_average_is_over_all_pictures(methods):
+    parts = [benchmark("a", 20), benchmark("b", 80)]
+    results = summarise(
+        parts, methods, PSNR, rows(parts, methods, lambda case, _: 20.0 if case.benchmark == "a" else 30.0)
+    )
+    assert results["tables"]["a"]["theirs"]["psnr"]["mean"] == 20
+    assert results["tables"]["average"]["theirs"]["psnr"]["mean"] == 28
+    assert results["selections"]["average"] == {"title": "Average", "pictures": 100}
+
+
+def test_one_benchmark_alone_has_no_average(methods):
+    parts = [benchmark("a", 3)]
+    assert list(summarise(parts, methods, PSNR, rows(parts, methods, lambda *_: 1.0))["tables"]) == ["a"]
+
+
+def test_the_order_of_rows_does_not_matter(methods):
+    parts = [benchmark("a", 9)]
+    told = rows(parts, methods, lambda case, method: int(case.name) ** 2 + (method.name == "theirs"))
+    assert summarise(parts, methods, PSNR, told) == summarise(parts, methods, PSNR, told[::-1])
+
+
+def test_differences_are_to_every_method_named_before(methods):
+    parts = [benchmark("a", 4)]
+    told = rows(parts, methods, lambda case, method: int(case.name) + 0.5 * (method.name == "theirs"))
+    (row,) = summarise(parts, methods, PSNR, told)["differences"]["a"]
+    assert (row["method"], row["than"], row["mean"], row["better"]) == ("theirs", "doing nothing", 0.5, 4)
+    assert (row["low"], row["high"]) == (0.5, 0.5)
+
+
+def test_a_failed_picture_is_counted_out_and_named(methods):
+    parts = [benchmark("a", 3, refused=("x.png has no partner",))]
+    told = rows(parts, methods, lambda case, method: float(case.name))
+    told[1] = Row("a", "0", "theirs", "", "", error="theirs failed")
+    results = summarise(parts, methods, PSNR, told)
+    assert results["tables"]["a"]["theirs"]["psnr"] | {"low": 0, "high": 0} == {
+        "mean": 1.5,
+        "low": 0,
+        "high": 0,
+        "count": 2,
+    }
+    assert results["pictures"][0]["errors"] == {"theirs": "theirs failed"}
+    assert results["benchmarks"]["a"]["refused"] == ["x.png has no partner"]
+
+
+def test_metrics_that_nothing_was_measured_in_are_left_out(methods):
+    parts = [benchmark("a", 2)]
+    protocol = Protocol(metrics=("psnr", "kept_reflection"))
+    results = summarise(parts, methods, protocol, rows(parts, methods, lambda *_: 1.0))
+    assert list(results["metrics"]) == ["psnr"]
+    assert results["metrics"]["psnr"]["unit"] == "dB"
+
+
+def test_a_benchmark_without_pairs_is_told_and_makes_no_table(methods):
+    parts = [benchmark("a", 2), benchmark("b", 0, refused=("all of it",))]
+    results = summarise(parts, methods, PSNR, rows(parts, methods, lambda *_: 1.0))
+    assert list(results["tables"]) == ["a"]
+    assert results["benchmarks"]["b"]["pictures"] == 0
+
+
+def test_the_papers_protocol_averages_over_181_pictures_and_reports_all_too(tmp_path, methods):
+    for name in ("real20", "nature20"):
+        repacked(tmp_path / name, map(str, range(20)))
+    sir2(tmp_path / "sir2")
+    parts = [
+        part for name in ("real20", "nature20", "sir2") for part in read_benchmark(name, tmp_path / name)
+    ]
+    protocol = Protocol(metrics=("psnr",), paper=True)
+    results = summarise(parts, methods, protocol, rows(parts, methods, lambda *_: 1.0))
+    pictures = {key: selection["pictures"] for key, selection in results["selections"].items()}
+    assert pictures == {
+        "real20": 20,
+        "nature20": 20,
+        "postcard": 199,
+        "solidobject": 200,
+        "wildscene": 101,
+        "postcard:paper": 20,
+        "solidobject:paper": 20,
+        "average": 181,
+    }
+    assert len(results["draw"]["postcard:paper"]) == 20
+    json.dumps(results, allow_nan=False)
+
+
+def test_the_papers_draw_is_refused_where_scenes_cannot_be_told(tmp_path, methods):
+    repacked(tmp_path / "postcard", ["001", "002"])
+    parts = read_benchmark("postcard", tmp_path / "postcard")
+    with pytest.raises(BrewsterError, match="scene"):
+        summarise(
+            parts, methods, Protocol(metrics=("psnr",), paper=True), rows(parts, methods, lambda *_: 1.0)
+        )

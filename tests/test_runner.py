@@ -1,0 +1,215 @@
+"""Resume, workers and failures: the same numbers whatever happens on the way."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmark_folders import paint, repacked, write
+from brewster import Photo
+from brewster.dataset.benchmarks import read_benchmark
+from brewster.errors import PhotoError, TargetError
+from brewster.evaluate.methods import Answer, Model, Nothing, Predictions
+from brewster.evaluate.protocol import Protocol
+from brewster.evaluate.runner import SCORES, score
+
+QUICK = Protocol(metrics=("psnr", "ssim"))
+NAMES = ["1", "2", "3"]
+
+
+class Fake:
+    """A method that fails or answers as it is told, and counts how often it was asked."""
+
+    def __init__(self, name="fake", answers=None):
+        self.name, self.answers, self.asked = name, answers or {}, []
+
+    def about(self):
+        return {"kind": "fake"}
+
+    def key(self, case):
+        return f"{self.name}"
+
+    def answer(self, case, photo):
+        self.asked.append(case.name)
+        answer = self.answers.get(case.name, Answer(photo))
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    def kept(self, case):
+        return None
+
+
+@pytest.fixture
+def real20(tmp_path):
+    for i, name in enumerate(NAMES):
+        paint(tmp_path / "real20" / "blended" / f"{name}.png", i, noise=20)
+        paint(tmp_path / "real20" / "transmission_layer" / f"{name}.png", i)
+    return read_benchmark("real20", tmp_path / "real20")
+
+
+def numbers(rows):
+    return [(row.place, row.scores, row.error) for row in rows]
+
+
+def test_every_method_is_scored_on_every_case_in_order(real20, tmp_path):
+    rows = score(real20, [Nothing(), Fake()], QUICK, tmp_path / "out")
+    assert [row.place[1:] for row in rows] == [
+        (case, method) for case in NAMES for method in ("doing nothing", "fake")
+    ]
+    assert rows[0].scores == rows[1].scores
+    assert (rows[0].width, rows[0].height) == (24, 16)
+    assert len((tmp_path / "out" / SCORES).read_text().splitlines()) == 6
+
+
+def test_what_is_scored_is_not_scored_again(real20, tmp_path):
+    first = score(real20, [Fake()], QUICK, tmp_path / "out")
+    again = Fake()
+    assert numbers(score(real20, [again], QUICK, tmp_path / "out")) == numbers(first)
+    assert again.asked == []
+
+
+def test_a_run_that_was_killed_in_the_middle_of_a_line_goes_on(real20, tmp_path):
+    whole = score(real20, [Fake()], QUICK, tmp_path / "whole")
+    log = tmp_path / "out" / SCORES
+    log.parent.mkdir()
+    lines = (tmp_path / "whole" / SCORES).read_text().splitlines()
+    log.write_text(lines[0] + "\n" + lines[1][:40])
+    fake = Fake()
+    assert numbers(score(real20, [fake], QUICK, tmp_path / "out")) == numbers(whole)
+    assert fake.asked == ["2", "3"]
+    fake = Fake()
+    score(real20, [fake], QUICK, tmp_path / "out")
+    assert fake.asked == []
+
+
+def test_a_changed_photo_truth_or_protocol_is_measured_anew(real20, tmp_path):
+    score(real20, [Fake()], QUICK, tmp_path / "out")
+    paint(tmp_path / "real20" / "transmission_layer" / "2.png", 77)
+    fake = Fake()
+    score(real20, [fake], QUICK, tmp_path / "out")
+    assert fake.asked == ["2"]
+    fake = Fake()
+    score(real20, [fake], replace(QUICK, metrics=("psnr",)), tmp_path / "out")
+    assert fake.asked == NAMES
+
+
+def test_other_metrics_do_not_make_a_model_answer_again(real20, model, tmp_path, monkeypatch):
+    ours = Model("pane", str(model), tmp_path / "out" / "predictions" / "pane")
+    first = score(real20, [ours], QUICK, tmp_path / "out")
+    monkeypatch.setattr(Model, "answer", lambda *_: pytest.fail("it was asked again"))
+    more = score(real20, [ours], Protocol(metrics=("psnr", "psnr_region")), tmp_path / "out")
+    assert [row.scores["psnr"] for row in more] == [row.scores["psnr"] for row in first]
+
+
+def test_kept_layers_score_exactly_as_fresh_ones(real20, model, tmp_path):
+    ours = Model("pane", str(model), tmp_path / "kept")
+    fresh = score(real20, [ours], QUICK, tmp_path / "out")
+    kept = score(real20, [Predictions("pane", tmp_path / "kept")], QUICK, tmp_path / "out")
+    assert [row.scores for row in fresh] == [row.scores for row in kept]
+
+
+def test_two_workers_give_the_same_rows_as_one(real20, model, tmp_path):
+    methods = [Nothing(), Model("pane", str(model), tmp_path / "kept")]
+    protocol = Protocol(metrics=("psnr", "ssim", "psnr_region"))
+    one = score(real20, methods, protocol, tmp_path / "one")
+    two = score(real20, methods, protocol, tmp_path / "two", workers=2)
+    assert numbers(one) == numbers(two)
+
+
+def test_a_method_that_fails_on_one_picture_is_named_and_the_rest_is_scored(real20, tmp_path):
+    fake = Fake(answers={"2": PhotoError("the picture is odd", "an even one", "paint another")})
+    rows = score(real20, [Nothing(), fake], QUICK, tmp_path / "out")
+    assert [bool(row.error) for row in rows] == [False, False, False, True, False, False]
+    assert rows[3].error.startswith("the picture is odd")
+
+
+def test_a_crash_is_named_with_its_picture_and_is_tried_again_next_time(real20, tmp_path):
+    rows = score(real20, [Fake(answers={"2": RuntimeError("boom")})], QUICK, tmp_path / "out")
+    assert rows[1].error == "fake failed on real20/2: RuntimeError: boom"
+    better = Fake()
+    assert not any(row.error for row in score(real20, [better], QUICK, tmp_path / "out"))
+    assert better.asked == ["2"]
+
+
+def test_an_answer_of_another_size_is_refused_never_resized(real20, tmp_path):
+    small = Photo.from_array(np.zeros((8, 8, 3), np.uint8), encoding="srgb")
+    rows = score(real20, [Fake(answers={"1": Answer(small)})], QUICK, tmp_path / "out")
+    assert rows[0].error.startswith("fake's transmission of real20/1 is 8x8; 24x16")
+
+
+def test_a_picture_that_cannot_be_decoded_fails_for_all_methods(real20, tmp_path):
+    path = tmp_path / "real20" / "blended" / "2.png"
+    path.write_bytes(path.read_bytes()[:200])
+    rows = score(real20, [Nothing(), Fake()], QUICK, tmp_path / "out")
+    assert [row.case for row in rows if row.error] == ["2", "2"]
+
+
+def test_grey_alpha_and_sixteen_bits_are_measured_as_what_they_show(tmp_path):
+    dice = np.random.default_rng(3)
+    grey = dice.integers(0, 256, (16, 24, 1), np.uint8)
+    alpha = np.concatenate([grey.repeat(3, 2), np.full_like(grey, 9)], axis=2)
+    deep = grey.repeat(3, 2).astype(np.uint16) * 257
+    for role, pixels in (("blended", grey), ("transmission_layer", alpha), ("reflection_layer", deep)):
+        path = tmp_path / "real20" / role / "1.png"
+        path.parent.mkdir(parents=True)
+        path.write_bytes(Photo.from_array(pixels, encoding="srgb").encode("png"))
+    (row,) = score(read_benchmark("real20", tmp_path / "real20"), [Nothing()], QUICK, tmp_path / "out")
+    assert row.scores == {"psnr": 100.0, "ssim": 1.0}
+
+
+def test_a_permuted_folder_gives_the_same_rows(tmp_path):
+    for order, place in ((NAMES, "a"), (NAMES[::-1], "b")):
+        for name in order:
+            paint(tmp_path / place / "transmission_layer" / f"{name}.png", int(name))
+            paint(tmp_path / place / "blended" / f"{name}.png", int(name), noise=9)
+    rows = [
+        score(read_benchmark("real20", tmp_path / place), [Nothing()], QUICK, tmp_path / f"out-{place}")
+        for place in "ab"
+    ]
+    assert numbers(rows[0]) == numbers(rows[1])
+
+
+def test_pictures_are_reduced_before_any_method_sees_them(tmp_path):
+    repacked(tmp_path / "real20", ["1"], size=(80, 40))
+    fake = Fake()
+    seen = []
+    fake.answer = lambda case, photo: seen.append(photo.size) or Answer(photo)
+    (row,) = score(
+        read_benchmark("real20", tmp_path / "real20"), [fake], replace(QUICK, size=20), tmp_path / "out"
+    )
+    assert seen == [(40, 20)]
+    assert (row.width, row.height) == (40, 20)
+
+
+def test_a_folder_that_cannot_be_written_is_an_error(real20, tmp_path):
+    write(tmp_path, "out", data=b"a file")
+    with pytest.raises(TargetError, match="was not written"):
+        score(real20, [Fake()], QUICK, tmp_path / "out")
+
+
+def test_progress_is_told_after_every_answer(real20, tmp_path):
+    told = []
+    score(real20, [Nothing(), Fake()], QUICK, tmp_path / "out", report=lambda *now: told.append(now[:2]))
+    assert told == [(i, 6) for i in range(1, 7)]
+
+
+def test_lines_of_another_version_are_passed_over(real20, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / SCORES).write_text(json.dumps({"benchmark": "real20", "odd": 1}) + "\n[]\n7\n")
+    assert len(score(real20, [Fake()], QUICK, tmp_path / "out")) == 3
+
+
+def test_an_interrupt_leaves_what_was_scored(real20, tmp_path, monkeypatch):
+    fake = Fake()
+
+    def answer(case, photo):
+        if case.name == "3":
+            raise KeyboardInterrupt
+        return Answer(photo)
+
+    monkeypatch.setattr(fake, "answer", answer)
+    with pytest.raises(KeyboardInterrupt):
+        score(real20, [fake], QUICK, tmp_path / "out")
+    assert len((tmp_path / "out" / SCORES).read_text().splitlines()) == 2
