@@ -1,5 +1,6 @@
 """What `make bench` plays: quality on the development pairs beside doing nothing and beside a peer, what happens
-to photographs without any reflection, the cost of a 12-megapixel photograph, and the renderer beside Mitsuba.
+to photographs without any reflection, the cost of a 12-megapixel photograph, metrics beside their peers, a large
+evaluation, and the renderer beside Mitsuba.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/run.py
 """
@@ -8,6 +9,8 @@ import os
 import sys
 from pathlib import Path
 
+import evaluate
+import metrics
 import plain
 import quality
 import render
@@ -20,4 +23,6 @@ if __name__ == "__main__":
     quality.main(data)
     plain.main(data)
     speed.main(data)
+    metrics.main(data)
+    evaluate.main(data)
     render.main(data)

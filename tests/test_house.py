@@ -115,7 +115,7 @@ def test_files_and_signatures_stay_small():
 
 def test_the_tree_in_the_readme_equals_the_tree_on_disk():
     block = re.search(r"```\n(src/brewster/.*?)```", README, re.S)[1]
-    rows = [line.split()[0] for line in block.splitlines()[1:]]
+    rows = re.findall(r"^  (\S+)", block, re.M)
     drawn = {row.rstrip("/") for row in rows}
     on_disk = {
         path.relative_to(SOURCE).with_suffix("").as_posix().split("/")[0]

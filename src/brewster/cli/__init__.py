@@ -12,7 +12,7 @@ from pathlib import Path
 import click
 
 import brewster
-from brewster.cli import assets, doctor, models, render, separate, train
+from brewster.cli import ablate, assets, doctor, evaluate, models, render, separate, train
 from brewster.cli.terminal import complain, interrupts, say
 from brewster.errors import BrewsterError
 
@@ -58,7 +58,16 @@ def cli() -> None:
     """
 
 
-for _command in (separate.separate, models.models, doctor.doctor, train.train, assets.assets, render.render):
+for _command in (
+    separate.separate,
+    models.models,
+    doctor.doctor,
+    train.train,
+    assets.assets,
+    render.render,
+    evaluate.evaluate,
+    ablate.ablate,
+):
     cli.add_command(_command)
 
 

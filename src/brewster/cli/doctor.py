@@ -47,6 +47,7 @@ EXTRAS: Final = {
         "onnxscript": "onnxscript",
         "torch": "torch",
     },
+    "evaluate": {"matplotlib": "matplotlib", "torch": "torch"},
 }
 """The packages behind each extra, and the module that each brings."""
 

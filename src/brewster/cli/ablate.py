@@ -1,0 +1,69 @@
+"""`brewster ablate`: a study in; a trained model for each choice, and tables that compare them, out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import click
+
+from brewster.cli.doctor import require_extra
+from brewster.cli.terminal import complain, interrupts, say, write_out
+
+
+@click.command
+@click.argument("study", type=click.Path(path_type=Path))
+@click.option(
+    "-o",
+    "--output",
+    "out",
+    metavar="FOLDER",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Where models, tables and the page go. By default out/ablations/NAME for NAME.toml.",
+)
+@click.option(
+    "--base",
+    metavar="RECIPE",
+    type=click.Path(path_type=Path),
+    help="Another training recipe than the study's own, such as a tiny one to try it.",
+)
+@click.option(
+    "--workers",
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    help="How many processes score at once.",
+)
+@click.option("--quiet", is_flag=True, help="Say nothing but errors, and print no tables.")
+@click.pass_context
+def ablate(
+    context: click.Context, /, *, study: Path, out: Path | None, base: Path | None, workers: int, quiet: bool
+) -> None:
+    """Train and measure a model for each choice of the one value that STUDY, a TOML file, changes.
+
+    The folder BREWSTER_DATA holds the data. What was stopped goes on when the same command is given again. The tables
+    go to standard output; they and report.html also into the folder named with -o.
+    """
+    require_extra("train", "training")
+    require_extra("evaluate", "evaluating")
+    from brewster.evaluate.ablate import ablate as run  # noqa: PLC0415  (wakes torch, in two seconds)
+    from brewster.evaluate.ablate import read_study  # noqa: PLC0415
+    from brewster.evaluate.report.tables import overview  # noqa: PLC0415
+
+    read, out = read_study(study), out or Path("out") / "ablations" / study.stem
+    if base:
+        read = read.model_copy(update={"base": base})
+
+    def report(choice: str, step: int, steps: int, numbers: Mapping[str, float], logged: bool) -> None:
+        interrupts.heed()
+        if logged and not quiet:
+            say(f"{choice}, step {step} of {steps}: loss {numbers['loss']:.4f}")
+
+    results = run(read, out, workers=workers, report=report)
+    if not quiet:
+        write_out(overview(results).encode())
+        say(f"all of it is in {out}")
+    errors = [error for picture in results["pictures"] for error in picture["errors"].values()]
+    for error in errors:
+        complain(error)
+    context.exit(1 if errors else 0)

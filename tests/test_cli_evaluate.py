@@ -1,0 +1,138 @@
+"""`brewster evaluate`, as a user calls it."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from benchmark_folders import paint, picture, write
+from front_door import errors
+
+
+@pytest.fixture
+def pairs(tmp_path):
+    for name in ("1", "2", "3"):
+        paint(tmp_path / "pairs" / "blended" / f"{name}.png", int(name), noise=20)
+        paint(tmp_path / "pairs" / "transmission" / f"{name}.png", int(name))
+        paint(tmp_path / "theirs" / f"{name}.png", int(name), noise=5)
+    return "real20=pairs"
+
+
+QUICK = ("--metrics", "psnr,ssim", "-o", "out")
+
+
+def test_tables_go_to_standard_output_and_all_else_into_a_folder(bare, pairs, model, tmp_path):
+    code, out, err = bare(
+        "evaluate", "--benchmark", pairs, "--model", f"pane={model}", "--predictions", "theirs=theirs", *QUICK
+    )
+    assert code == 0, err
+    text = out.decode()
+    assert text.count("| doing nothing") == 2
+    assert "theirs \N{MINUS SIGN} doing nothing" in text
+    assert "3 pictures, where Real20 has 20" in err
+    assert (tmp_path / "out" / "report.html").is_file()
+    assert (tmp_path / "out" / "predictions" / "pane" / "real20" / "3.reflection.png").is_file()
+
+
+def test_json_is_the_results(bare, pairs, tmp_path):
+    code, out, _ = bare("evaluate", "--benchmark", pairs, "--json", *QUICK)
+    assert code == 0
+    assert json.loads(out) == json.loads((tmp_path / "out" / "results.json").read_text())
+
+
+def test_quiet_says_nothing(bare, pairs):
+    assert bare("evaluate", "--benchmark", pairs, "--quiet", *QUICK) == (0, b"", "")
+
+
+def test_a_dry_run_measures_nothing(bare, pairs, tmp_path):
+    code, out, err = bare("evaluate", "--benchmark", pairs, "--dry-run", *QUICK)
+    assert (code, out) == (0, b"")
+    assert "Real20: 3 pictures" in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_has_no_partner_is_named_and_the_rest_is_measured(bare, pairs, tmp_path):
+    paint(tmp_path / "pairs" / "blended" / "4.png", 4)
+    paint(tmp_path / "pairs" / "blended" / "5.png", 5, size=(48, 32))
+    paint(tmp_path / "pairs" / "transmission" / "5.png", 5)
+    code, out, err = bare("evaluate", "--benchmark", pairs, "--json", *QUICK)
+    assert code == 1
+    assert len(json.loads(out)["pictures"]) == 3
+    told = errors(err)
+    assert any("4.png" in line for line in told)
+    assert any("blended/5:" in line and "half the scale" in line for line in told)
+
+
+def test_a_method_that_fails_on_a_picture_is_named_and_the_exit_code_is_one(bare, pairs, tmp_path):
+    (tmp_path / "theirs" / "2.png").write_bytes(b"no picture")
+    code, out, err = bare("evaluate", "--benchmark", pairs, "--predictions", "theirs=theirs", *QUICK)
+    assert code == 1
+    assert "(2 of 3)" in out.decode()
+    assert any("1 answers could not be scored" in line for line in errors(err))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (("--benchmark", "real2=pairs"), "real20"),
+        (("--benchmark", "real20=nowhere"), "nowhere"),
+        (("--benchmark", "real20=empty"), "empty"),
+        (("--benchmark", "real20=pairs", "--metrics", "pnsr"), "did you mean psnr"),
+        (("--benchmark", "real20=pairs", "--model", "compac"), "did you mean compact"),
+        (("--benchmark", "real20=pairs", "--predictions", "theirs=nowhere"), "nowhere"),
+        (("--benchmark", "real20=pairs", "--predictions", "theirs=others"), "called like a case"),
+    ],
+)
+def test_what_cannot_be_measured_is_said_in_a_sentence(wrong, said, bare, pairs, tmp_path):
+    (tmp_path / "empty").mkdir()
+    write(tmp_path / "others", "a.png", data=picture())
+    code, out, err = bare("evaluate", "--metrics", "psnr", *wrong)
+    assert (code, out) == (1, b"")
+    assert said in errors(err)[-1]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        (),
+        ("--benchmark", "pairs"),
+        ("--benchmark", "real20="),
+        ("--benchmark", "real20=pairs", "--size", "big"),
+        ("--benchmark", "real20=pairs", "--region-threshold", "a,b"),
+        ("--benchmark", "real20=pairs", "--predictions", "theirs"),
+        ("--benchmark", "real20=pairs", "--workers", "0"),
+    ],
+)
+def test_a_wrong_usage_has_exit_code_two(wrong, bare, pairs):
+    assert bare("evaluate", *wrong)[0] == 2
+
+
+def test_thresholds_are_swept_and_sizes_reduced(bare, pairs):
+    asked = ("--metrics", "psnr,psnr_region", "--region-threshold", "0.01,0.03", "--size", "12")
+    code, out, _ = bare("evaluate", "--benchmark", pairs, "--json", "-o", "out", *asked)
+    results = json.loads(out)
+    assert code == 0
+    assert list(results["metrics"]) == ["psnr", "psnr_region@0.01", "psnr_region@0.03"]
+    assert {(row["width"], row["height"]) for row in results["pictures"]} == {(18, 12)}
+
+
+def test_the_dev_pairs_score_what_scikit_image_says(bare, data, tmp_path):
+    """Doing nothing on the ten Nature pairs; computed here with scikit-image and PIL, and stated as measured."""
+    folder = data / "real/dev/nature"
+    code, out, _ = bare("evaluate", "--benchmark", f"nature20={folder}", "--json", *QUICK)
+    assert code == 0
+    table = json.loads(out)["tables"]["nature20"]["doing nothing"]
+    pairs = [
+        [
+            np.asarray(Image.open(folder / role / path.name).convert("RGB"))
+            for role in ("blended", "transmission")
+        ]
+        for path in (folder / "blended").iterdir()
+    ]
+    psnr = np.mean([peak_signal_noise_ratio(truth, photo) for photo, truth in pairs])
+    ssim = np.mean([structural_similarity(truth, photo, channel_axis=2) for photo, truth in pairs])
+    assert table["psnr"]["mean"] == pytest.approx(psnr, abs=1e-5)
+    assert table["ssim"]["mean"] == pytest.approx(ssim, abs=1e-5)
+    assert psnr == pytest.approx(22.09, abs=0.005)
