@@ -112,7 +112,8 @@ def _told(results: Results) -> str:
 
 
 def _choices(results: Results) -> str:
-    lines = [*results["protocol"]["choices"], *(entry["about"] for entry in results["metrics"].values())]
+    metrics = (f"{entry['title']}: {entry['about']}" for entry in results["metrics"].values())
+    lines = [*results["protocol"]["choices"], *metrics]
     return "\n".join(["### How it was measured", "", *(f"- {line}" for line in lines)])
 
 
@@ -178,7 +179,7 @@ def _of_the_paper(results: Results) -> list[str]:
     keys = [
         key for key in results["selections"] if f"{key}:paper" not in results["selections"] and key != AVERAGE
     ]
-    keys.sort(key=lambda key: key.partition(":")[0] in _SIR2)
+    keys.sort(key=lambda key: _SIR2.index(name) if (name := key.partition(":")[0]) in _SIR2 else -1)
     return [*keys, *([AVERAGE] if AVERAGE in results["selections"] else [])]
 
 
@@ -188,7 +189,7 @@ def _latex_heads(results: Results, keys: list[str], width: int) -> list[str]:
 
     def head(key: str, rows: int) -> str:
         selection = results["selections"][key]
-        text = f"{_escaped(selection['title'].partition(',')[0])} ({selection['pictures']})"
+        text = f"{_escaped(selection['title'].partition(',')[0].removeprefix('SIR2 '))} ({selection['pictures']})"
         return _spanning(width, f"\\multirow{{{rows}}}{{*}}{{{text}}}" if rows > 1 else text)
 
     if len(sir2) < 2:
@@ -231,7 +232,9 @@ def _latex_cells(results: Results, key: str, method: str, metrics: Iterable[str]
             if metric in row
         }
         best = (max if results["metrics"][metric]["higher_is_better"] else min)(texts.values(), key=float)
-        cells.append(f"\\textbf{{{texts[method]}}}" if texts[method] == best else texts[method])
+        cells.append(
+            f"\\textbf{{{texts[method]}}}" if texts[method] == best and len(texts) > 1 else texts[method]
+        )
     return cells
 
 
