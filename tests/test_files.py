@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from brewster import files
 from brewster.errors import TargetError
 from brewster.files import SUFFIXES, Job, cache_folder, find, write_atomically
 
@@ -246,3 +247,19 @@ def test_what_was_fetched_is_kept_in_the_users_cache_folder(monkeypatch: pytest.
     for nowhere in ("relative", ""):
         monkeypatch.setenv("XDG_CACHE_HOME", nowhere)
         assert cache_folder() == Path("/home/ann/.cache/brewster")
+
+
+def test_ctrl_c_just_after_a_file_took_its_name_leaves_nothing_else(tmp_path, monkeypatch):
+    """Where the interrupt comes before the hidden file is removed; it happened on a busy machine."""
+    discard, calls = files.discard, []
+
+    def interrupted(path):
+        calls.append(path)
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        discard(path)
+
+    monkeypatch.setattr(files, "discard", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_atomically(tmp_path / "a", b"whole")
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]

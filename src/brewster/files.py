@@ -98,17 +98,14 @@ def write_atomically(path: Path, data: bytes, *, overwrite: bool = False, source
     `overwrite` is off, is the `source`, or cannot be written.
     """
     _refuse_source(path, source)
-    part = hidden_beside(path)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        _refuse_taken(path, overwrite)
-        _write_through(part, data)
-        _take_name(part, path, overwrite)
+        with _part_of(path) as part:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _refuse_taken(path, overwrite)
+            _write_through(part, data)
+            _take_name(part, path, overwrite)
     except OSError as error:
         raise _target_error(path, error) from error
-    finally:
-        with contextlib.suppress(OSError):
-            part.unlink()
 
 
 @contextlib.contextmanager
@@ -120,21 +117,33 @@ def arriving(place: Path) -> Iterator[Path]:
     Raises:
         TargetError: it cannot be written; the disk may be full.
     """
-    part = hidden_beside(place)
     try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        yield part
-        _sync(part)
-        _replace(place, part)
-        _sync(place.parent)
+        with _part_of(place) as part:
+            place.parent.mkdir(parents=True, exist_ok=True)
+            yield part
+            _sync(part)
+            _replace(place, part)
+            _sync(place.parent)
     except OSError as error:
         raise TargetError(
             f"{place} was not written ({error.strerror or error})",
             "it needs its place on the disk",
             "mend that (free some space, or name another folder) and run again: what is finished is kept",
         ) from error
-    finally:
+
+
+@contextlib.contextmanager
+def _part_of(place: Path) -> Iterator[Path]:
+    """A hidden path beside a place, where nothing is left afterwards."""
+    part = hidden_beside(place)
+    try:
+        try:
+            yield part
+        finally:
+            discard(part)
+    except KeyboardInterrupt:  # it may have come between the name's taking and the part's removal
         discard(part)
+        raise
 
 
 def hidden_beside(place: Path) -> Path:
