@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Final, final
 
 import numpy as np
@@ -56,8 +57,8 @@ class Separation:
     photo: Photo
     transmission: Photo
     reflection: Photo
-    confidence: Photo
-    """Grey, 8 bit: 255 where the separation is sure of the transmission."""
+    sureness: Floats = field(repr=False, compare=False)
+    """How sure the looks were, (h, w, 1) in 0..1, as small as the network saw the photo."""
     remainder: float
     """Mean of |photo - transmission - reflection| in linear light: what neither layer explains."""
     model: str
@@ -65,6 +66,11 @@ class Separation:
     device: str
     seconds: dict[str, float] = field(compare=False)
     """Wall time of decode, network and detail transfer."""
+
+    @cached_property
+    def confidence(self) -> Photo:
+        """Grey, 8 bit: 255 where the separation is sure of the transmission. Enlarged when it is first asked for."""
+        return _enlarged(self.sureness, self.photo)
 
 
 @final
@@ -127,9 +133,8 @@ class Separator:
             share = np.float32(strength) * white
             transfer = Transfer.learn(white * copies[-1], share * change, share * reflection)
             whole, mirrored, remainder = _at_full_size(photo, transfer, additive=additive)
-            confidence = _enlarged(sure, photo)
         made_by = self.name, self.sha256, self.device
-        return Separation(photo, whole, mirrored, confidence, remainder, *made_by, seconds)
+        return Separation(photo, whole, mirrored, sure, remainder, *made_by, seconds)
 
     def _look(self, copies: list[Floats]) -> tuple[Floats, Floats, Floats]:
         """Change (transmission - photo), reflection and confidence (h, w, 1), all of the largest copy's size."""
