@@ -82,8 +82,8 @@ def test_choices_are_compared_with_the_first_and_numbers_are_drawn(quick, pairs,
     told = []
     results = ablate(
         read_study(RECIPES / "size.toml"),
+        pairs,
         tmp_path / "out",
-        benchmarks=pairs,
         report=lambda *now: told.append(now),
     )
     labels = [f"count {count}" for count in (0, 10, 50, 100, 300, 1000)]
@@ -98,7 +98,7 @@ def test_choices_are_compared_with_the_first_and_numbers_are_drawn(quick, pairs,
 
 def test_words_are_not_drawn(quick, pairs, data, tmp_path, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
-    ablate(read_study(RECIPES / "mixing.toml"), tmp_path / "out", benchmarks=pairs)
+    ablate(read_study(RECIPES / "mixing.toml"), pairs, tmp_path / "out")
     assert not (tmp_path / "out" / "plot.png").exists()
     assert (tmp_path / "out" / "mixing-8-bit" / "model.onnx").is_file()
 

@@ -137,6 +137,7 @@ def test_one_split_below_an_openrr_folder_is_taken(tmp_path):
         ("写真", "pairs"),
         ("v1.0_b", "v1.0_b"),
         ("real20", "pairs-real20"),
+        ("average", "pairs-average"),
         ("pairs", "pairs"),
     ],
 )

@@ -1,6 +1,10 @@
 """`brewster evaluate`, as a user calls it."""
 
 import json
+import signal
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -48,7 +52,7 @@ def test_quiet_says_nothing(bare, pairs):
 
 def test_a_dry_run_measures_nothing(bare, pairs, tmp_path):
     code, out, err = bare("evaluate", "--benchmark", pairs, "--dry-run", *QUICK)
-    assert (code, out) == (0, b"")
+    assert (code, out.decode().split()) == (0, ["real20/1", "real20/2", "real20/3"])
     assert "Real20: 3 pictures" in err
     assert not (tmp_path / "out").exists()
 
@@ -70,7 +74,7 @@ def test_a_method_that_fails_on_a_picture_is_named_and_the_exit_code_is_one(bare
     code, out, err = bare("evaluate", "--benchmark", pairs, "--predictions", "theirs=theirs", *QUICK)
     assert code == 1
     assert "(2 of 3)" in out.decode()
-    assert any("1 answers could not be scored" in line for line in errors(err))
+    assert any("1 answer could not be scored" in line for line in errors(err))
 
 
 @pytest.mark.parametrize(
@@ -88,9 +92,10 @@ def test_a_method_that_fails_on_a_picture_is_named_and_the_exit_code_is_one(bare
 def test_what_cannot_be_measured_is_said_in_a_sentence(wrong, said, bare, pairs, tmp_path):
     (tmp_path / "empty").mkdir()
     write(tmp_path / "others", "a.png", data=picture())
-    code, out, err = bare("evaluate", "--metrics", "psnr", *wrong)
-    assert (code, out) == (1, b"")
-    assert said in errors(err)[-1]
+    for dry in ((), ("--dry-run",)):
+        code, out, err = bare("evaluate", "--metrics", "psnr", *wrong, *dry)
+        assert (code, out) == (1, b"")
+        assert said in errors(err)[-1]
 
 
 @pytest.mark.parametrize(
@@ -136,3 +141,24 @@ def test_the_dev_pairs_score_what_scikit_image_says(bare, data, tmp_path):
     assert table["psnr"]["mean"] == pytest.approx(psnr, abs=1e-5)
     assert table["ssim"]["mean"] == pytest.approx(ssim, abs=1e-5)
     assert psnr == pytest.approx(22.09, abs=0.005)
+
+
+@pytest.mark.slow
+def test_ctrl_c_with_two_workers_stops_soon_and_keeps_what_was_scored(tmp_path, model):
+    for i in range(60):
+        paint(tmp_path / "real20" / "blended" / f"{i}.png", i, size=(400, 300), noise=20)
+        paint(tmp_path / "real20" / "transmission" / f"{i}.png", i, size=(400, 300))
+    asked = ["evaluate", "--benchmark", "real20=real20", "--model", f"pane={model}", "--workers", "2", *QUICK]
+    command = [sys.executable, "-m", "brewster", *asked]
+    run = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.PIPE)
+    log = tmp_path / "out" / "scores.jsonl"
+    while not log.exists():
+        time.sleep(0.05)
+    run.send_signal(signal.SIGINT)
+    _, err = run.communicate(timeout=120)
+    assert run.returncode == 130, err
+    assert b"Traceback" not in err
+    scored = len(log.read_text().splitlines())
+    answered = len(list((tmp_path / "out" / "predictions").rglob("*.transmission.png")))
+    assert answered <= scored / 2 + 1
+    assert scored < 120

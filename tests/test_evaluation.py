@@ -53,13 +53,26 @@ def test_two_runs_and_two_workers_write_the_same_bytes(real20, methods, tmp_path
 
 def test_the_page_shows_the_worst_of_the_first_model(real20, methods, tmp_path):
     results = evaluate(real20, methods, QUICK, tmp_path / "out", shown=1)
-    gains = {
-        picture["name"]: picture["scores"]["pane"]["psnr"] - picture["scores"]["doing nothing"]["psnr"]
-        for picture in results["pictures"]
-    }
+    scores = {picture["name"]: picture["scores"]["pane"]["psnr"] for picture in results["pictures"]}
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("<article") == 1
-    assert f'data-name="{min(gains, key=gains.get)}"' in page
+    assert f'data-name="{min(scores, key=scores.get)}"' in page
+
+
+def test_without_a_model_the_page_shows_the_worst_photos(real20, tmp_path):
+    results = evaluate(real20, [Nothing()], QUICK, tmp_path / "out", shown=1)
+    scores = {picture["name"]: picture["scores"]["doing nothing"]["psnr"] for picture in results["pictures"]}
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert f'data-name="{min(scores, key=scores.get)}"' in page
+
+
+def test_the_page_never_shows_another_models_answer(real20, methods, tmp_path):
+    first = evaluate(real20, methods, QUICK, tmp_path / "out")
+    page = (tmp_path / "out" / "report.html").read_bytes()
+    for kept in (tmp_path / "kept").rglob("1.*.png"):
+        kept.unlink()
+    assert evaluate(real20, methods, QUICK, tmp_path / "out") == first
+    assert (tmp_path / "out" / "report.html").read_bytes() == page
 
 
 def test_pictures_without_a_case_are_said_aloud(real20, methods, tmp_path):

@@ -10,7 +10,7 @@ from benchmark_folders import picture, repacked, write
 from brewster import Photo
 from brewster.dataset.benchmarks import read_benchmark
 from brewster.errors import BrewsterError, PhotoError
-from brewster.evaluate.methods import Model, Nothing, Predictions, refuse_shared_names
+from brewster.evaluate.methods import Model, Nothing, Predictions, refuse_names
 
 
 @pytest.fixture
@@ -37,7 +37,6 @@ NAMES = [
     "real20/1.png",
     "transmission/1.png",
     "transmission_layer/1.JPG",
-    "blended/1.png",
     "blended/1.transmission.png",
     "real20/blended/1.transmission.jpg",
     "1/theirs_t.png",
@@ -65,6 +64,11 @@ def test_a_reflection_is_found_beside_it(case, tmp_path):
 def test_a_name_that_is_merely_similar_is_no_prediction(place, case, tmp_path):
     with pytest.raises(PhotoError, match="no picture for real20/1"):
         method(tmp_path, place).files(case)
+
+
+def test_a_copy_of_the_photos_is_no_answer(case, tmp_path):
+    with pytest.raises(PhotoError, match="no picture"):
+        method(tmp_path, "blended/1.png").files(case)
 
 
 def test_two_pictures_for_one_case_are_refused_and_named(case, tmp_path):
@@ -134,4 +138,18 @@ def test_methods_are_data_that_other_processes_can_take(model, tmp_path):
 
 def test_two_methods_of_one_name_are_refused(tmp_path):
     with pytest.raises(BrewsterError, match="2 methods are called 'doing nothing'"):
-        refuse_shared_names([Nothing(), Predictions("doing nothing", tmp_path)])
+        refuse_names([Nothing(), Predictions("doing nothing", tmp_path)])
+
+
+@pytest.mark.parametrize("name", ["../out", "a/b", "a\\b", "..", ".", "", "two\nlines", "\udcff"])
+def test_names_that_are_no_names_of_folders_are_refused(name, tmp_path):
+    with pytest.raises(BrewsterError, match="names become folders"):
+        refuse_names([Predictions(name, tmp_path)])
+
+
+def test_folders_and_dangling_links_called_like_pictures_are_passed_over(cases, tmp_path):
+    theirs = method(tmp_path, "2.png")
+    (tmp_path / "theirs" / "1.png").mkdir()
+    (tmp_path / "theirs" / "3.png").symlink_to("nowhere")
+    assert theirs.unused(cases) == 0
+    assert "no picture" in theirs.key(cases[0])

@@ -118,6 +118,24 @@ def test_the_papers_protocol_averages_over_181_pictures_and_reports_all_too(tmp_
     json.dumps(results, allow_nan=False)
 
 
+def test_the_papers_average_is_over_the_papers_sets_only_and_says_what_it_lacks(tmp_path, methods):
+    parts = [benchmark("real20", 20), benchmark("nature20", 10), benchmark("mine", 7)]
+    protocol = Protocol(metrics=("psnr",), paper=True)
+    results = summarise(parts, methods, protocol, rows(parts, methods, lambda *_: 1.0))
+    assert results["selections"]["average"]["pictures"] == 30
+    assert (
+        "over 181 pictures; this one is over 20 of real20, 10 of nature20"
+        in results["protocol"]["choices"][-1]
+    )
+
+
+def test_a_metric_that_was_asked_for_in_vain_is_told(methods):
+    parts = [benchmark("a", 2)]
+    protocol = Protocol(metrics=("psnr", "kept_reflection"))
+    results = summarise(parts, methods, protocol, rows(parts, methods, lambda *_: 1.0))
+    assert results["unmeasured"] == ["kept_reflection"]
+
+
 def test_the_papers_draw_is_refused_where_scenes_cannot_be_told(tmp_path, methods):
     repacked(tmp_path / "postcard", ["001", "002"])
     parts = read_benchmark("postcard", tmp_path / "postcard")

@@ -1,15 +1,18 @@
 """Resume, workers and failures: the same numbers whatever happens on the way."""
 
 import json
-from dataclasses import replace
+import os
+from dataclasses import dataclass, replace
+from typing import final
 
 import numpy as np
 import pytest
 
+import brewster
 from benchmark_folders import paint, repacked, write
 from brewster import Photo
 from brewster.dataset.benchmarks import read_benchmark
-from brewster.errors import PhotoError, TargetError
+from brewster.errors import BrewsterError, PhotoError, TargetError
 from brewster.evaluate.methods import Answer, Model, Nothing, Predictions
 from brewster.evaluate.protocol import Protocol
 from brewster.evaluate.runner import SCORES, score
@@ -103,6 +106,45 @@ def test_other_metrics_do_not_make_a_model_answer_again(real20, model, tmp_path,
     assert [row.scores["psnr"] for row in more] == [row.scores["psnr"] for row in first]
 
 
+def test_an_answer_that_was_changed_on_the_disk_is_made_again(real20, model, tmp_path):
+    ours = Model("pane", str(model), tmp_path / "kept")
+    first = score(real20, [ours], QUICK, tmp_path / "out")
+    kept = tmp_path / "kept" / "real20" / "2.transmission.png"
+    kept.write_bytes((tmp_path / "real20" / "blended" / "2.png").read_bytes())
+    again = score(real20, [ours], Protocol(metrics=("psnr",)), tmp_path / "out")
+    assert [row.scores["psnr"] for row in again] == [row.scores["psnr"] for row in first]
+
+
+def test_another_version_of_brewster_scores_anew(real20, tmp_path, monkeypatch):
+    score(real20, [Fake()], QUICK, tmp_path / "out")
+    monkeypatch.setattr(brewster, "__version__", "99")
+    fake = Fake()
+    score(real20, [fake], QUICK, tmp_path / "out")
+    assert fake.asked == NAMES
+
+
+def test_a_worker_that_dies_is_told_and_scores_are_kept(real20, model, tmp_path):
+    with pytest.raises(BrewsterError, match="a worker process died"):
+        score(real20, [Nothing(), Deadly()], QUICK, tmp_path / "out", workers=2)
+
+
+@final
+@dataclass(frozen=True)
+class Deadly:
+    """A method that kills its process."""
+
+    name: str = "deadly"
+
+    def key(self, case):
+        return self.name
+
+    def answer(self, case, photo):
+        os._exit(1)
+
+    def kept(self, case):
+        return None
+
+
 def test_kept_layers_score_exactly_as_fresh_ones(real20, model, tmp_path):
     ours = Model("pane", str(model), tmp_path / "kept")
     fresh = score(real20, [ours], QUICK, tmp_path / "out")
@@ -122,7 +164,7 @@ def test_a_method_that_fails_on_one_picture_is_named_and_the_rest_is_scored(real
     fake = Fake(answers={"2": PhotoError("the picture is odd", "an even one", "paint another")})
     rows = score(real20, [Nothing(), fake], QUICK, tmp_path / "out")
     assert [bool(row.error) for row in rows] == [False, False, False, True, False, False]
-    assert rows[3].error.startswith("the picture is odd")
+    assert rows[3].error.startswith("fake failed on real20/2: the picture is odd")
 
 
 def test_a_crash_is_named_with_its_picture_and_is_tried_again_next_time(real20, tmp_path):
@@ -136,7 +178,7 @@ def test_a_crash_is_named_with_its_picture_and_is_tried_again_next_time(real20, 
 def test_an_answer_of_another_size_is_refused_never_resized(real20, tmp_path):
     small = Photo.from_array(np.zeros((8, 8, 3), np.uint8), encoding="srgb")
     rows = score(real20, [Fake(answers={"1": Answer(small)})], QUICK, tmp_path / "out")
-    assert rows[0].error.startswith("fake's transmission of real20/1 is 8x8; 24x16")
+    assert "fake's transmission of real20/1 is 8x8; 24x16" in rows[0].error
 
 
 def test_a_picture_that_cannot_be_decoded_fails_for_all_methods(real20, tmp_path):

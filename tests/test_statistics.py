@@ -33,6 +33,12 @@ def test_one_scene_has_no_interval():
     assert only([stratum([1.0, 2.0, 3.0], scenes=["x"] * 3)]).low is None
 
 
+def test_a_region_that_one_picture_alone_has_has_no_interval():
+    assert only([stratum([1.0, np.nan, np.nan])]).low is None
+    assert only([stratum([1.0], name="a"), stratum([2.0], name="b")]).low is None
+    assert only([stratum([1.0], name="a"), stratum([2.0, 3.0], name="b")]).low is not None
+
+
 def test_missing_values_are_not_counted():
     answer = only([stratum([1.0, np.nan, 3.0])])
     assert (answer.mean, answer.count) == (2.0, 2)

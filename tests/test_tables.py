@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from brewster.evaluate.report.tables import overview, to_csv, to_latex, to_markdown
+from brewster.evaluate.report.tables import best_mean, overview, to_csv, to_latex, to_markdown
 
 METRICS = {
     "psnr": {"title": "PSNR", "unit": "dB", "higher_is_better": True, "digits": 2, "about": "PSNR is so."},
@@ -40,6 +40,7 @@ def results():
             "real20": {"title": "Real20", "remarks": ["20 of 20"], "refused": ["x.png has no partner"]}
         },
         "methods": {"doing nothing": {}, "A_b|c": {"remark": "2 pictures answer no case"}},
+        "unmeasured": ["removed_white"],
         "pictures": [{"errors": {"A_b|c": "A_b|c failed on real20/3"}}],
         "tables": dict.fromkeys(selections, table),
         "differences": dict.fromkeys(selections, rows),
@@ -59,7 +60,7 @@ def test_markdown_says_aloud_what_was_left_out_what_failed_and_every_choice(resu
     text = to_markdown(results)
     for said in (
         "left out: x.png has no partner",
-        "failed: A_b|c failed on real20/3",
+        "- A_b|c failed on real20/3",
         "2 pictures answer no case",
         "Everything is stated.",
         "LPIPS is so.",
@@ -77,7 +78,8 @@ def test_a_method_that_failed_somewhere_shows_how_many_pictures_it_is_judged_on(
         "doing nothing": {"psnr": entry(20.0)},
         "A_b|c": {"psnr": entry(21.5, count=19)},
     }
-    assert "21.50 / - (19 of 20)" in to_markdown(results)
+    assert "21.50 / - (0 to 19 of 20)" in to_markdown(results)
+    assert "| 21.50, 19 of 20 " in to_markdown(results)
 
 
 def test_latex_has_the_papers_layout_and_the_best_in_bold(results):
@@ -120,3 +122,15 @@ def test_csv_has_a_line_for_every_mean_and_every_difference(results):
         "20.0",
     )
     assert [row["than"] for row in rows if row["set"] == "average"].count("doing nothing") == 2
+
+
+def test_a_method_that_failed_somewhere_is_never_the_best(results):
+    results["tables"]["real20"] = {
+        "doing nothing": {"psnr": entry(20.0), "lpips": entry(0.2)},
+        "A_b|c": {"psnr": entry(21.5, count=10), "lpips": entry(0.1, count=10)},
+    }
+    text = to_latex(results)
+    assert r"21.50$^\dagger$" in text
+    assert best_mean(results["tables"]["real20"], "psnr", METRICS["psnr"]) is None
+    results["tables"]["real20"]["third"] = {"psnr": entry(19.0)}
+    assert best_mean(results["tables"]["real20"], "psnr", METRICS["psnr"]) == "20.00"

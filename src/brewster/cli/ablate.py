@@ -8,7 +8,8 @@ from pathlib import Path
 import click
 
 from brewster.cli.doctor import require_extra
-from brewster.cli.terminal import complain, interrupts, say, write_out
+from brewster.cli.evaluate import print_tables, tell_failures, tell_of
+from brewster.cli.terminal import interrupts, say
 
 
 @click.command
@@ -48,22 +49,20 @@ def ablate(
     require_extra("evaluate", "evaluating")
     from brewster.evaluate.ablate import ablate as run  # noqa: PLC0415  (wakes torch, in two seconds)
     from brewster.evaluate.ablate import read_study  # noqa: PLC0415
-    from brewster.evaluate.report.tables import overview  # noqa: PLC0415
 
     read, out = read_study(study), out or Path("out") / "ablations" / study.stem
     if base:
         read = read.model_copy(update={"base": base})
+    parts = read.open_benchmarks()
+    is_whole = tell_of(parts, quiet=quiet)
 
     def report(choice: str, step: int, steps: int, numbers: Mapping[str, float], logged: bool) -> None:
         interrupts.heed()
         if logged and not quiet:
             say(f"{choice}, step {step} of {steps}: loss {numbers['loss']:.4f}")
 
-    results = run(read, out, workers=workers, report=report)
+    results = run(read, parts, out, workers=workers, report=report)
     if not quiet:
-        write_out(overview(results).encode())
+        print_tables(results)
         say(f"all of it is in {out}")
-    errors = [error for picture in results["pictures"] for error in picture["errors"].values()]
-    for error in errors:
-        complain(error)
-    context.exit(1 if errors else 0)
+    context.exit(0 if tell_failures(results) and is_whole else 1)

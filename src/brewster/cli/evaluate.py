@@ -6,7 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final, get_args
+from typing import TYPE_CHECKING, Any, Final, final, get_args
 
 import click
 
@@ -165,11 +165,15 @@ class _Size(click.ParamType[int]):
     default=50,
     show_default=True,
     metavar="NUMBER",
-    help="How many pictures of each benchmark the page shows, the worst first.",
+    help="How many pictures of each benchmark the page shows, the worst of the first method first.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the results as JSON instead of the tables.")
 @click.option("--quiet", is_flag=True, help="Say nothing but errors, and print no tables.")
-@click.option("--dry-run", is_flag=True, help="Say what would be measured, and measure nothing.")
+@click.option(
+    "--dry-run",
+    is_flag=True,
+    help="Check all that was named, print the names of the cases, and measure nothing.",
+)
 @click.pass_context
 def evaluate(context: click.Context, /, *, dry_run: bool, **asked: Any) -> None:  # noqa: ANN401  (the fields of _Order)
     """Measure models and other methods' pictures on benchmarks, doing nothing beside them.
@@ -207,20 +211,25 @@ class _Order:
 
     def tell(self) -> bool:
         """Says what there is; whether all of it can be measured."""
-        found = self._found()
+        from brewster.evaluate.evaluation import check  # noqa: PLC0415
+
+        found, methods = self._found(), self._methods()
+        is_whole = tell_of(found, quiet=self.quiet)
+        check(found, methods, self._protocol())
         for part in found:
             say(f"{part.title}: {len(part.cases)} pictures")
-        for method in self._methods():
+            write_out("".join(f"{part.name}/{case.name}\n" for case in part.cases).encode(errors=_ODD))
+        for method in methods:
             say(f"method: {method.name}")
-        return self._speak(found)
+        return is_whole
 
     def run(self) -> bool:
         """Measures and prints; whether nothing was left out and nothing failed."""
+        from brewster.evaluate.evaluation import PAGE  # noqa: PLC0415
         from brewster.evaluate.evaluation import evaluate as measure  # noqa: PLC0415
-        from brewster.evaluate.report.tables import overview  # noqa: PLC0415
 
         protocol, found, methods = self._protocol(), self._found(), self._methods()
-        is_whole = self._speak(found)
+        is_whole = tell_of(found, quiet=self.quiet)
         total = len(methods) * sum(len(part.cases) for part in found)
         with progress(total, shown=not self.quiet) as advance:
 
@@ -240,25 +249,9 @@ class _Order:
         if self.as_json:
             write_out(f"{json.dumps(results)}\n".encode())
         elif not self.quiet:
-            write_out(overview(results).encode())
-            say(f"all of it is in {self.out}; {self.out / 'report.html'} shows the pictures")
-        return self._complain(results) and is_whole
-
-    def _speak(self, found: Sequence[Benchmark]) -> bool:
-        for part in found:
-            for remark in () if self.quiet else part.remarks:
-                say(f"{part.title}: {remark}")
-            for reason in part.refused:
-                complain(f"{part.title}: {reason}")
-        return not any(part.refused for part in found)
-
-    def _complain(self, results: Results) -> bool:
-        errors = [error for picture in results["pictures"] for error in picture["errors"].values()]
-        for error in errors:
-            complain(error)
-        if errors:
-            complain(f"{len(errors)} answers could not be scored")
-        return not errors
+            print_tables(results)
+            say(f"all of it is in {self.out}; {self.out / PAGE} shows the pictures")
+        return tell_failures(results) and is_whole
 
     def _found(self) -> list[Benchmark]:
         from brewster.dataset.benchmarks import read_benchmark  # noqa: PLC0415
@@ -270,7 +263,7 @@ class _Order:
 
         chosen: dict[str, Any] = {"size": self.size, "quality": self.quality, "paper": self.paper}
         if self.metrics is not None:
-            chosen["metrics"] = tuple(self.metrics.split(","))
+            chosen["metrics"] = tuple(name.strip() for name in self.metrics.split(","))
         if self.thresholds is not None:
             chosen["thresholds"] = self.thresholds
         return Protocol(**chosen)
@@ -286,3 +279,38 @@ class _Order:
             *(Model(name, model, answers / name, self.quality, self.device) for name, model in models),
             *(Predictions(name, Path(folder)) for name, folder in self.predictions),
         ]
+
+
+_ODD: Final = "backslashreplace"
+"""How names are printed that are no text."""
+
+
+def tell_of(parts: Sequence[Benchmark], *, quiet: bool) -> bool:
+    """Says what is odd about benchmarks; whether nothing was left out."""
+    for part in parts:
+        for remark in () if quiet else part.remarks:
+            say(f"{part.title}: {remark}")
+        for reason in part.refused:
+            complain(f"{part.title}: {reason}")
+    return not any(part.refused for part in parts)
+
+
+def print_tables(results: Results) -> None:
+    """The tables, on standard output."""
+    from brewster.evaluate.report.tables import overview  # noqa: PLC0415
+
+    write_out(overview(results).encode(errors=_ODD))
+
+
+def tell_failures(results: Results) -> bool:
+    """Names what could not be scored; whether there was nothing."""
+    from brewster.evaluate.report.tables import failures  # noqa: PLC0415
+
+    for name in results["unmeasured"]:
+        say(f"{name} was not measured: no picture has the truth that it needs")
+    for error in failures(results):
+        complain(error)
+    count = sum(len(picture["errors"]) for picture in results["pictures"])
+    if count:
+        complain(f"{count} {'answer' if count == 1 else 'answers'} could not be scored")
+    return not count

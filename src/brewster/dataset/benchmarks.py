@@ -320,11 +320,12 @@ def _unmirrored(cases: Sequence[Case]) -> list[str]:
 
 
 def _called(name: str, folder: Path) -> str:
-    """A known set's own name; else the folder's, which never passes for a known set."""
+    """A known set's own name; else the folder's, which never passes for a known set or the average of all."""
     if BENCHMARKS[name].title:
         return name
     safe = re.sub(r"[^A-Za-z0-9_.-]+", "-", _own_name(folder)).strip("-.") or name
-    return f"{name}-{safe}" if safe in BENCHMARKS and BENCHMARKS[safe].title else safe
+    is_taken = safe == "average" or (safe in BENCHMARKS and BENCHMARKS[safe].title)
+    return f"{name}-{safe}" if is_taken else safe
 
 
 def _own_name(folder: Path) -> str:

@@ -1,6 +1,7 @@
 """Ablations: one value of a training recipe changed at a time, each choice trained and measured alike.
 
-    ablate(read_study(Path("recipes/ablations/mixing.toml")), Path("out/ablations/mixing"))
+    study = read_study(Path("recipes/ablations/mixing.toml"))
+    ablate(study, study.open_benchmarks(), Path("out/ablations/mixing"))
 
 A study is a TOML file that names a base recipe, the value, its choices and the benchmarks; the first choice is what
 the others are compared with. Both training and measuring go on where they were stopped.
@@ -12,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, final
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from brewster.dataset.benchmarks import Benchmark, read_benchmark
 from brewster.evaluate.evaluation import evaluate
@@ -32,6 +33,12 @@ Report = Callable[[str, int, int, Mapping[str, float], bool], None]
 PLOT: Final = "plot.png"
 
 
+def _all_different(choices: list[Choice]) -> list[Choice]:
+    if len({str(choice) for choice in choices}) < len(choices):
+        raise ValueError("a choice stands there twice")
+    return choices
+
+
 @final
 class Study(Values):
     """One question: what does this value do?"""
@@ -40,14 +47,26 @@ class Study(Values):
     """A training recipe; in the file, relative to it."""
     value: str
     """The value that changes, dotted: "data.rendered.mixing"."""
-    choices: Annotated[list[Choice], Field(min_length=2)]
+    choices: Annotated[list[Choice], Field(min_length=2), AfterValidator(_all_different)]
     """The first is what the others are compared with."""
     benchmarks: Annotated[dict[str, Path], Field(min_length=1)]
     """name -> folder below BREWSTER_DATA."""
 
     def label(self, choice: Choice) -> str:
         """What tables call a choice: "mixing 8-bit"."""
-        return f"{self.value.rpartition('.')[2]} {choice}"
+        return f"{self.value.rpartition('.')[2]} {str(choice).replace('/', ' ')}"
+
+    def open_benchmarks(self) -> list[Benchmark]:
+        """Its benchmarks.
+
+        Raises:
+            RecipeError: BREWSTER_DATA names no folder.
+            PhotoError: a benchmark cannot be read.
+        """
+        root = data_folder()
+        return [
+            part for name, folder in self.benchmarks.items() for part in read_benchmark(name, root / folder)
+        ]
 
 
 def read_study(path: Path) -> Study:
@@ -62,9 +81,9 @@ def read_study(path: Path) -> Study:
 
 def ablate(
     study: Study,
+    benchmarks: Sequence[Benchmark],
     out: Path,
     *,
-    benchmarks: Sequence[Benchmark] | None = None,
     workers: int = 1,
     report: Report = lambda _choice, _step, _steps, _numbers, _logged: None,
 ) -> Results:
@@ -74,8 +93,8 @@ def ablate(
 
     Args:
         study: the question.
+        benchmarks: what to measure on, such as `study.open_benchmarks()`.
         out: a folder of this study's own.
-        benchmarks: what to measure on instead of the study's own.
         workers: processes that score at once.
         report: called after every step of training.
 
@@ -85,11 +104,6 @@ def ablate(
     """
     base = read_recipe(study.base)
     recipes = {study.label(choice): with_value(base, study.value, choice) for choice in study.choices}
-    parts = benchmarks or [
-        part
-        for name, folder in study.benchmarks.items()
-        for part in read_benchmark(name, data_folder() / folder)
-    ]
     models = []
     for label, recipe in recipes.items():
         folder = out / label.replace(" ", "-")
@@ -99,7 +113,7 @@ def ablate(
 
         export_onnx(train(recipe, folder, tell), folder / "model.onnx")
         models.append(Model(label, str(folder / "model.onnx"), out / "predictions" / folder.name))
-    results = evaluate(parts, [Nothing(), *models], Protocol(), out, workers=workers)
+    results = evaluate(benchmarks, [Nothing(), *models], Protocol(), out, workers=workers)
     numbers = [
         choice for choice in study.choices if isinstance(choice, int | float) and not isinstance(choice, bool)
     ]

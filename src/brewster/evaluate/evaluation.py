@@ -7,21 +7,22 @@ evaluate(benchmarks, [Nothing(), Predictions("RDNet", Path("rdnet"))], Protocol(
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
 from brewster.dataset.benchmarks import Benchmark, Case
 from brewster.errors import BrewsterError, PhotoError
 from brewster.evaluate.judge import Truth
-from brewster.evaluate.methods import NOTHING, Answer, Method, Predictions
+from brewster.evaluate.methods import NOTHING, Answer, Method, Predictions, refuse_names
 from brewster.evaluate.protocol import Protocol
 from brewster.evaluate.report.page import Shown, write_report
 from brewster.evaluate.report.published import read_published
 from brewster.evaluate.report.published import to_markdown as published_to_markdown
 from brewster.evaluate.report.tables import to_csv, to_latex, to_markdown
-from brewster.evaluate.results import Results, summarise
-from brewster.evaluate.runner import Report, Row, score
+from brewster.evaluate.results import Results, draw, summarise
+from brewster.evaluate.runner import Place, Report, Row, find_answer, score
 from brewster.files import write_atomically
 
 RESULTS, PAGE = "results.json", "report.html"
@@ -46,7 +47,7 @@ def evaluate(
         protocol: the choices of the run.
         out: a folder of this evaluation's own; a run that was stopped goes on from what lies there.
         workers: processes that score at once.
-        shown: how many pictures of each benchmark the page shows, the worst of the first model first.
+        shown: how many pictures of each benchmark the page shows, the worst of the first method that does something.
         report: called after every answer.
 
     Raises:
@@ -54,11 +55,8 @@ def evaluate(
             draw is impossible, or a part of brewster is missing.
         TargetError: `out` cannot be written.
     """
-    _refuse_nothing(benchmarks)
+    check(benchmarks, methods, protocol)
     cases = [case for part in benchmarks for case in part.cases]
-    for method in methods:
-        if isinstance(method, Predictions):
-            method.refuse_wrong_pairing(cases)
     rows = score(benchmarks, methods, protocol, out, workers=workers, report=report)
     results = summarise(benchmarks, methods, protocol, rows)
     for method in methods:
@@ -69,7 +67,13 @@ def evaluate(
     return results
 
 
-def _refuse_nothing(benchmarks: Sequence[Benchmark]) -> None:
+def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], protocol: Protocol) -> None:
+    """Refuses what cannot be measured as asked, before anything is.
+
+    Raises:
+        BrewsterError: see `evaluate`.
+    """
+    refuse_names(methods)
     names = [part.name for part in benchmarks]
     for name in names:
         if names.count(name) > 1:
@@ -85,17 +89,23 @@ def _refuse_nothing(benchmarks: Sequence[Benchmark]) -> None:
             "a photo and its truth",
             "; ".join(refused[:5]) or "name a folder that has some",
         )
+    if protocol.paper:
+        draw(benchmarks)
+    cases = [case for part in benchmarks for case in part.cases]
+    for method in methods:
+        if isinstance(method, Predictions):
+            method.refuse_wrong_pairing(cases)
 
 
 def _write(results: Results, out: Path) -> None:
     tables = {
-        RESULTS: json.dumps(results, indent=1, ensure_ascii=False, allow_nan=False) + "\n",
+        RESULTS: json.dumps(results, indent=1, allow_nan=False) + "\n",
         "tables.md": f"{to_markdown(results)}\n{published_to_markdown(read_published())}",
         "table.tex": to_latex(results),
         "table.csv": to_csv(results),
     }
     for name, text in tables.items():
-        write_atomically(out / name, text.encode(), overwrite=True)
+        write_atomically(out / name, text.encode(errors="backslashreplace"), overwrite=True)
 
 
 # --- what the page shows
@@ -105,18 +115,17 @@ def _shown(
     cases: Sequence[Case], methods: Sequence[Method], protocol: Protocol, rows: Sequence[Row], most: int
 ) -> Iterator[Shown]:
     """The pictures, read again one case at a time."""
-    good = {row.place for row in rows if not row.error}
-    for case in _worst(cases, methods, rows, most):
-        shown = [
-            method
-            for method in methods
-            if method.name != NOTHING and (case.benchmark, case.name, method.name) in good
-        ]
+    good = {row.place: row for row in rows if not row.error}
+    for case in _worst(cases, methods, protocol, good, most):
         try:
             truth = Truth.open(case, protocol)
         except PhotoError:
-            continue  # named in the table already
-        answers = {method.name: answer for method in shown if (answer := method.kept(case))}
+            continue  # named in the tables already
+        answers = {
+            method.name: find_answer(truth, method, row)
+            for method in methods
+            if method.name != NOTHING and (row := good.get((case.benchmark, case.name, method.name)))
+        }
         yield _show(truth, answers, protocol)
 
 
@@ -135,16 +144,23 @@ def _show(truth: Truth, answers: dict[str, Answer], protocol: Protocol) -> Shown
     )
 
 
-def _worst(cases: Sequence[Case], methods: Sequence[Method], rows: Sequence[Row], most: int) -> list[Case]:
-    """So many cases of each benchmark, those with the least gain in PSNR by the first method that does something."""
-    scores = {row.place: row.scores.get("psnr") for row in rows}
-    first = next((method.name for method in methods if method.name != NOTHING), NOTHING)
+def _worst(
+    cases: Sequence[Case],
+    methods: Sequence[Method],
+    protocol: Protocol,
+    rows: Mapping[Place, Row],
+    most: int,
+) -> list[Case]:
+    """So many cases of each benchmark: the worst of the first method that does something, in the first metric."""
+    method = next((method.name for method in methods if method.name != NOTHING), NOTHING)
+    column, metric = next(iter(protocol.columns().items()))
 
-    def gain(case: Case) -> float:
-        ours, nothing = (scores.get((case.benchmark, case.name, method)) for method in (first, NOTHING))
-        return (ours or 0.0) - (nothing or 0.0)
+    def merit(case: Case) -> float:
+        row = rows.get((case.benchmark, case.name, method))
+        score = row.scores.get(column) if row else None
+        return math.inf if score is None else score if metric.higher_is_better else -score
 
     chosen = []
     for name in dict.fromkeys(case.benchmark for case in cases):
-        chosen += sorted((case for case in cases if case.benchmark == name), key=gain)[:most]
+        chosen += sorted((case for case in cases if case.benchmark == name), key=merit)[:most]
     return chosen

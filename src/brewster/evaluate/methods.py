@@ -12,7 +12,7 @@ import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Final, Protocol, final
 
@@ -33,11 +33,15 @@ _ENDINGS: Final = {"transmission": ("_t", "_l"), "reflection": ("_r",)}
 @final
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The layers that a method gives for a photo, and the wall time that this took it, if it was seen."""
+    """The layers that a method gives for a photo.
+
+    `seconds` is the wall time that this took it, if it was seen; `kept` the digest of the files that keep the answer.
+    """
 
     transmission: Photo
     reflection: Photo | None = None
     seconds: float | None = None
+    kept: str | None = None
 
     @classmethod
     def read(cls, files: Mapping[str, Path]) -> Answer:
@@ -46,8 +50,9 @@ class Answer:
         Raises:
             PhotoError: one cannot be read.
         """
-        photos = {layer: Photo.open(path) for layer, path in files.items()}
-        return cls(photos["transmission"], photos.get("reflection"))
+        data = {layer: _read(path) for layer, path in files.items()}
+        photos = {layer: Photo.open(picture) for layer, picture in data.items()}
+        return cls(photos["transmission"], photos.get("reflection"), kept=_digest(data.values()))
 
 
 class Method(Protocol):
@@ -131,9 +136,11 @@ class Model:
         started = time.perf_counter()
         separation = separator(photo, quality=self.quality)
         seconds = time.perf_counter() - started
-        for layer, path in self._files(case).items():
-            write_atomically(path, getattr(separation, layer).encode("png", depth=8), overwrite=True)
-        return Answer(separation.transmission, separation.reflection, seconds)
+        files = self._files(case)
+        data = {layer: getattr(separation, layer).encode("png", depth=8) for layer in files}
+        for layer, path in files.items():
+            write_atomically(path, data[layer], overwrite=True)
+        return Answer(separation.transmission, separation.reflection, seconds, _digest(data.values()))
 
     def kept(self, case: Case) -> Answer | None:
         """The layers that were kept.
@@ -153,9 +160,9 @@ class Model:
         return {layer: folder / f"{case.name}.{layer}.png" for layer in ("transmission", "reflection")}
 
 
-@lru_cache(maxsize=1)
+@cache
 def _separator(model: str, device: Device) -> Separator:
-    """The model in use; one at a time, since some are large."""
+    """A model, loaded once a process."""
     return Separator.load(model, device=device)
 
 
@@ -174,8 +181,7 @@ class Predictions:
     def key(self, case: Case) -> str:
         """The digest of the files, or what is wrong with them."""
         try:
-            files = self.files(case)
-            return hashlib.sha256(b"".join(_digest(path) for path in files.values())).hexdigest()
+            return _digest(_read(path) for path in self.files(case).values())
         except BrewsterError as error:
             return str(error)
 
@@ -258,7 +264,7 @@ class Predictions:
         places += [root / folder / case.name for folder in (layer, f"{layer}_layer")]
         places += [root / case.name / name for name in self._own_names(root / case.name, layer)]
         if layer == "transmission":
-            places += [root / case.name, root / case.place]
+            places += [root / case.name]
         return {path for place in places for path in self._pictures.get(_plain(place), ())}
 
     def _own_names(self, folder: Path, layer: str) -> list[str]:
@@ -270,7 +276,7 @@ class Predictions:
         """The folder's pictures by their paths without suffix."""
         found: defaultdict[Path, list[Path]] = defaultdict(list)
         for path in sorted(self.folder.rglob("*")):
-            if path.suffix.lower() in SUFFIXES and not path.name.startswith("."):
+            if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file():
                 found[_plain(path.with_suffix(""))].append(path)
         return dict(found)
 
@@ -287,12 +293,24 @@ def _plain(path: Path) -> Path:
     return Path(unicodedata.normalize("NFC", str(path)))
 
 
-def _digest(path: Path) -> bytes:
-    return hashlib.sha256(path.read_bytes()).digest()
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise PhotoError(
+            f"{path} cannot be read ({error.strerror or error})",
+            "an answer's file",
+            "mend that and run again",
+        ) from error
 
 
-def refuse_shared_names(methods: Sequence[Method]) -> None:
-    """Refuses two methods of one name, since tables could not tell them apart.
+def _digest(data: Iterable[bytes]) -> str:
+    """One digest of several files."""
+    return hashlib.sha256(b"".join(hashlib.sha256(one).digest() for one in data)).hexdigest()
+
+
+def refuse_names(methods: Sequence[Method]) -> None:
+    """Refuses two methods of one name, since tables could not tell them apart, and names that are no names of folders.
 
     Raises:
         BrewsterError: so it is.
@@ -302,3 +320,10 @@ def refuse_shared_names(methods: Sequence[Method]) -> None:
         raise BrewsterError(
             f"{count} methods are called {name!r}", "each needs a name of its own", "write NAME=... for one"
         )
+    for method in methods:
+        if method.name in ("", ".", "..") or set("/\\") & set(method.name) or not method.name.isprintable():
+            raise BrewsterError(
+                f"a method is called {method.name!r}",
+                "names become folders: no slashes, no control letters, not . or ..",
+                "choose another with NAME=...",
+            )

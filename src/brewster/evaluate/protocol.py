@@ -40,10 +40,12 @@ class Protocol:
                 "each once",
                 f"choose from {', '.join(METRICS)}",
             )
-        if not self.thresholds or not all(0 < threshold < 1 for threshold in self.thresholds):
+        columns = {f"{threshold:g}" for threshold in self.thresholds}
+        is_possible = all(0 < threshold < 1 for threshold in self.thresholds)
+        if not is_possible or not 0 < len(self.thresholds) == len(columns):
             raise BrewsterError(
                 f"the region's thresholds are {self.thresholds}",
-                "numbers between 0 and 1",
+                "numbers between 0 and 1 that differ in their first six digits",
                 "choose such ones",
             )
         if self.size is not None and self.size < 1:
@@ -109,5 +111,5 @@ _INTERVALS: Final = (
 )
 _DRAW: Final = (
     "The paper's draw of one picture a scene of Postcard and SolidObject is unpublished; ours has the seed "
-    f"{PAPER_SEED} and is listed in results.json. The average is over all pictures of the paper's sets."
+    f"{PAPER_SEED} and is listed in results.json. The average is over the paper's five sets, and what was drawn of them."
 )

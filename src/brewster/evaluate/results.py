@@ -11,11 +11,13 @@ import numpy as np
 import brewster
 from brewster.dataset.benchmarks import PAPER_SEED, Benchmark, Case, paper_draw
 from brewster.evaluate.methods import Method
-from brewster.evaluate.protocol import Protocol
+from brewster.evaluate.protocol import DEFAULT_METRICS, Protocol
 from brewster.evaluate.runner import Row
 from brewster.evaluate.statistics import Stratum, differences, estimate
 
 AVERAGE: Final = "average"
+PAPER: Final = {"real20": 20, "nature20": 20, "postcard": 20, "solidobject": 20, "wildscene": 101}
+"""The paper's sets, and of how many pictures its average takes of each."""
 _DIGITS: Final = 6
 
 Results = dict[str, Any]
@@ -45,9 +47,9 @@ def summarise(
     measured = {column for row in rows for column, score in row.scores.items() if score is not None}
     columns = {name: metric for name, metric in protocol.columns().items() if name in measured}
     full = [Selection(part.name, part.title, part.cases) for part in benchmarks if part.cases]
-    drawn = _drawn(benchmarks) if protocol.paper else []
+    drawn = draw(benchmarks) if protocol.paper else []
     tables = [[selection] for selection in (*full, *drawn)]
-    together = _together(full, drawn)
+    together = _together([part for part in full if part.key in PAPER] if protocol.paper else full, drawn)
     selections = {group[0].key: group for group in tables} | ({AVERAGE: together} if together else {})
     series = [(method, column) for method in named for column in columns]
     directions = {name: metric.higher_is_better for name, metric in columns.items()}
@@ -58,7 +60,7 @@ def summarise(
             "size": protocol.size or "native",
             "quality": protocol.quality,
             "region_thresholds": list(protocol.thresholds),
-            "choices": protocol.choices(),
+            "choices": _choices(protocol, together),
         },
         "metrics": {
             name: {key: value for key, value in asdict(metric).items() if key != "name"}
@@ -67,6 +69,7 @@ def summarise(
         "benchmarks": {part.name: _described(part) for part in benchmarks},
         "selections": {key: _titled(key, group) for key, group in selections.items()},
         "methods": {method.name: method.about() for method in methods},
+        "unmeasured": [] if protocol.metrics == DEFAULT_METRICS else _missing(protocol, measured),
         "draw": {"seed": PAPER_SEED} | {part.key: [case.name for case in part.cases] for part in drawn},
         "pictures": [_picture(case, named, by_place) for part in benchmarks for case in part.cases],
         "tables": {key: _table(strata[key], series) for key in selections},
@@ -77,8 +80,17 @@ def summarise(
     }
 
 
-def _drawn(benchmarks: Sequence[Benchmark]) -> list[Selection]:
-    """The paper's draws that are not the whole benchmark."""
+def _missing(protocol: Protocol, measured: set[str]) -> list[str]:
+    """Metrics that were asked for, and that no picture has the truth for."""
+    return [name for name in protocol.columns() if name not in measured]
+
+
+def draw(benchmarks: Sequence[Benchmark]) -> list[Selection]:
+    """The paper's draws, of the benchmarks that it does not take whole.
+
+    Raises:
+        BrewsterError: a benchmark does not tell its scenes.
+    """
     draws = [(part, paper_draw(part)) for part in benchmarks if part.cases]
     return [
         Selection(f"{part.name}:paper", f"{part.title}, the paper's draw", cases)
@@ -96,6 +108,18 @@ def _together(full: Sequence[Selection], drawn: Sequence[Selection]) -> list[Sel
 def _titled(key: str, group: Sequence[Selection]) -> dict[str, Any]:
     pictures = sum(len(part.cases) for part in group)
     return {"title": "Average" if key == AVERAGE else group[0].title, "pictures": pictures}
+
+
+def _choices(protocol: Protocol, together: Sequence[Selection]) -> list[str]:
+    """The protocol's, and what the paper's average lacks."""
+    there = {part.key.partition(":")[0]: len(part.cases) for part in together}
+    if not protocol.paper or there == PAPER:
+        return protocol.choices()
+    found = ", ".join(f"{count} of {name}" for name, count in there.items()) or "too few sets for one"
+    return [
+        *protocol.choices(),
+        f"The paper's average is over {sum(PAPER.values())} pictures; this one is over {found}.",
+    ]
 
 
 def _stratum(

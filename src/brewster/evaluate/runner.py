@@ -1,29 +1,30 @@
-"""Benchmarks times methods: every case answered and scored, in one process or several, resumable.
+"""Every method answers every case and is scored, in one process or several, resumable.
 
-    results = evaluate(read_benchmark("nature20", folder), [Nothing(), model], Protocol(), Path("out/evaluate"))
+    rows = score(read_benchmark("nature20", folder), [Nothing(), model], Protocol(), Path("out/evaluate"))
 
 `scores.jsonl` in the folder gains a line for each answer as it is scored; a run that was stopped reads them and goes on.
-`results.json` is made from them at the end: the same for any number of workers and any order of work.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
+import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import groupby
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Final, final
 
+import brewster
 from brewster.dataset.benchmarks import Benchmark, Case
 from brewster.errors import BrewsterError, TargetError
 from brewster.evaluate.judge import Judge, Truth
-from brewster.evaluate.methods import Answer, Method, refuse_shared_names
+from brewster.evaluate.methods import Answer, Method, refuse_names
 from brewster.evaluate.protocol import Protocol
 from brewster.metrics import Lpips
 
@@ -32,6 +33,8 @@ SCORES: Final = "scores.jsonl"
 Report = Callable[[int, int, "Row"], None]
 """Called with (done, of how many, the row) after every answer that was scored."""
 
+Place = tuple[str, str, str]
+
 
 @final
 @dataclass(frozen=True)
@@ -39,7 +42,7 @@ class Row:
     """What became of one method's answer to one case.
 
     `key` is a digest of all that the scores depend on, `answer_key` of all that the answer does: where it is equal,
-    nothing need be done again.
+    nothing need be done again. `kept` is the digest of the answer's files, where it lies on the disk.
     """
 
     benchmark: str
@@ -50,12 +53,13 @@ class Row:
     scores: dict[str, float | None] = field(default_factory=dict)
     error: str | None = None
     seconds: float | None = None
+    kept: str | None = None
     width: int = 0
     height: int = 0
     region_share: float = 0.0
 
     @property
-    def place(self) -> tuple[str, str, str]:
+    def place(self) -> Place:
         """Benchmark, case and method: where it stands in the results."""
         return self.benchmark, self.case, self.method
 
@@ -63,12 +67,10 @@ class Row:
 @final
 @dataclass(frozen=True)
 class _Task:
-    """A case, and the methods whose answers to it are to be scored."""
+    """A case, and the rows that are to be filled; `kept` of a row says which answer on the disk is the right one."""
 
     case: Case
     rows: tuple[Row, ...]
-    answered: frozenset[str]
-    """The methods whose answers are kept on the disk, from an earlier run that asked for other metrics."""
 
 
 def score(
@@ -83,138 +85,157 @@ def score(
     """Has every method answer every case and scores the answers; those that `out` knows already are not made again.
 
     A method that fails on a case gives a row with an `error`; the others are scored. Rows come in the order of
-    benchmarks, cases and methods.
+    benchmarks, cases and methods, the same for any number of workers.
 
     Raises:
-        BrewsterError: two methods or benchmarks share a name, or a part of brewster is missing.
+        BrewsterError: methods' names are shared or unfit, a part of brewster is missing, or a worker died.
         TargetError: `out` cannot be written.
     """
-    refuse_shared_names(methods)
-    cases = {(case.benchmark, case.name): case for part in benchmarks for case in part.cases}
-    wanted = [_row(case, method, protocol) for case in cases.values() for method in methods]
+    refuse_names(methods)
     known = _read(out / SCORES)
-    rows = {
-        row.place: known[row.place]
-        for row in wanted
-        if row.place in known and known[row.place].key == row.key
-    }
+    cases = {(case.benchmark, case.name): case for part in benchmarks for case in part.cases}
+    wanted = [row for case in cases.values() for row in _rows(case, methods, protocol, known)]
+    rows = {row.place: known[row.place] for row in wanted if _is_scored(row, known)}
     tasks = [
-        _Task(cases[place], todo, frozenset(row.method for row in todo if _is_answered(row, known)))
+        _Task(cases[place], todo)
         for place, group in groupby(wanted, lambda row: row.place[:2])
         if (todo := tuple(row for row in group if row.place not in rows))
     ]
     if tasks and any(name.startswith("lpips") for name in protocol.metrics):
         Lpips.load()  # here, once: its weights may have to be fetched, or be missing
-    with _log(out) as log, _workers(workers, methods, protocol) as run:
-        for made in run(tasks):
-            for row in made:
-                log(row)
-                rows[row.place] = row
-                report(len(rows), len(wanted), row)
+    log = _Log(out / SCORES)
+
+    def take(made: Sequence[Row]) -> None:
+        for row in made:
+            log.write(row)
+            rows[row.place] = row
+            report(len(rows), len(wanted), row)
+
+    _run(tasks, methods, protocol, take, workers)
     return [rows[row.place] for row in wanted]
 
 
-def _is_answered(row: Row, known: Mapping[tuple[str, str, str], Row]) -> bool:
-    return row.place in known and known[row.place].answer_key == row.answer_key
-
-
-def _row(case: Case, method: Method, protocol: Protocol) -> Row:
-    """A row without scores; its keys are digests of all that they depend on."""
+def _rows(
+    case: Case, methods: Sequence[Method], protocol: Protocol, known: Mapping[Place, Row]
+) -> Iterator[Row]:
+    """Rows without scores; their keys are digests of all that they depend on."""
     photo, *truths = (
         hashlib.sha256(file.read()).hexdigest() if file else ""
         for file in (case.photo, case.transmission, case.reflection)
     )
-    answer_key = _digest(photo, protocol.size, method.key(case))
     asked = asdict(protocol) | {"paper": None, "quality": None}
-    return Row(
-        benchmark=case.benchmark,
-        case=case.name,
-        method=method.name,
-        answer_key=answer_key,
-        key=_digest(answer_key, truths, asked, case.rendered),
-    )
+    for method in methods:
+        answer_key = _digest(photo, protocol.size, method.key(case))
+        key = _digest(answer_key, truths, asked, case.rendered, brewster.__version__)
+        row = Row(case.benchmark, case.name, method.name, answer_key, key)
+        before = known.get(row.place)
+        is_answered = before and before.answer_key == answer_key
+        yield replace(row, kept=before.kept) if before and is_answered else row
+
+
+def _is_scored(row: Row, known: Mapping[Place, Row]) -> bool:
+    return row.place in known and known[row.place].key == row.key
 
 
 def _digest(*parts: object) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
 
 
-# --- the work
+# --- one case
 
 
-def _do(task: _Task, methods: dict[str, Method], protocol: Protocol) -> list[Row]:
-    """Scores one case."""
+def _do(task: _Task, methods: Mapping[str, Method], protocol: Protocol) -> list[Row]:
+    """Scores all answers to a case."""
     try:
         truth = Truth.open(task.case, protocol)
-        judge = Judge(truth, protocol)
     except BrewsterError as error:
-        return [_failed(row, error) for row in task.rows]
-    return [_scored(row, truth, judge, methods[row.method], row.method in task.answered) for row in task.rows]
+        return [replace(row, error=f"{row.benchmark}/{row.case}: {error}") for row in task.rows]
+    judge = Judge(truth, protocol)
+    return [_scored(row, truth, judge, methods[row.method]) for row in task.rows]
 
 
-def _scored(row: Row, truth: Truth, judge: Judge, method: Method, is_kept: bool) -> Row:
+def _scored(row: Row, truth: Truth, judge: Judge, method: Method) -> Row:
     try:
-        answer = _answer(truth, method, is_kept)
+        answer = find_answer(truth, method, row)
         truth.check(answer, method.name)
     except BrewsterError as error:
-        return _failed(row, error)
+        return _failed(row, str(error))
     except Exception as error:  # noqa: BLE001  (a model that stumbles over one picture must not stop the others)
-        return _failed(
-            row, f"{method.name} failed on {row.benchmark}/{row.case}: {type(error).__name__}: {error}"
-        )
+        return _failed(row, f"{type(error).__name__}: {error}")
     width, height = truth.photo.size
-    return _with(
+    return replace(
         row,
         scores=judge.score(answer),
         seconds=answer.seconds,
+        kept=answer.kept,
         width=width,
         height=height,
         region_share=judge.region_share,
     )
 
 
-def _answer(truth: Truth, method: Method, is_kept: bool) -> Answer:
-    kept = method.kept(truth.case) if is_kept else None
-    return kept or method.answer(truth.case, truth.photo)
+def find_answer(truth: Truth, method: Method, row: Row) -> Answer:
+    """The answer that lies on the disk, if it is the one that the row knows; else a new one.
+
+    Raises:
+        BrewsterError: what the method raises.
+    """
+    kept = method.kept(truth.case) if row.kept else None
+    return kept if kept and kept.kept == row.kept else method.answer(truth.case, truth.photo)
 
 
-def _failed(row: Row, error: object) -> Row:
-    return _with(row, error=str(error))
+def _failed(row: Row, error: str) -> Row:
+    return replace(row, error=f"{row.method} failed on {row.benchmark}/{row.case}: {error}")
 
 
-def _with(row: Row, **changes: Any) -> Row:  # noqa: ANN401  (fields of Row)
-    return Row(**{**asdict(row), **changes})
+# --- all cases
+
+Take = Callable[[Sequence[Row]], None]
 
 
-# --- processes
+def _run(
+    tasks: Sequence[_Task], methods: Sequence[Method], protocol: Protocol, take: Take, workers: int
+) -> None:
+    """Does the tasks here, or in so many processes, and hands their rows over as they come.
 
-Run = Callable[[Sequence[_Task]], Iterator[list[Row]]]
-
-
-@contextmanager
-def _workers(count: int, methods: Sequence[Method], protocol: Protocol) -> Iterator[Run]:
-    """Runs tasks here, or in so many processes; each uses one thread for metrics, so that all give equal numbers."""
+    Each process uses one thread for metrics, so that all give equal numbers.
+    """
     named = {method.name: method for method in methods}
-    if count == 1:
+    if workers == 1:
         with _one_thread():
-            yield lambda tasks: (_do(task, named, protocol) for task in tasks)
+            for task in tasks:
+                take(_do(task, named, protocol))
         return
-    with ProcessPoolExecutor(count, get_context("spawn"), _begin, (named, protocol)) as pool:
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (named, protocol))
+    waiting = {pool.submit(_do_here, task) for task in tasks}
+    try:
+        for future in as_completed(set(waiting)):
+            waiting.remove(future)
+            take(future.result())
+    except BrokenProcessPool as error:
+        raise BrewsterError(
+            "a worker process died",
+            "it was killed, or out of memory",
+            "run again with fewer workers: scores are kept",
+        ) from error
+    except KeyboardInterrupt:
+        pool.shutdown(cancel_futures=True)
+        for rows in _finished(waiting):
+            take(rows)
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
 
-        def run(tasks: Sequence[_Task]) -> Iterator[list[Row]]:
-            futures = [pool.submit(_do_here, task) for task in tasks]
-            try:
-                yield from (future.result() for future in as_completed(futures))
-            finally:
-                pool.shutdown(wait=False, cancel_futures=True)
 
-        yield run
+def _finished(futures: set[Future[list[Row]]]) -> Iterator[list[Row]]:
+    return (future.result() for future in futures if not future.cancelled() and not future.exception())
 
 
 _process: dict[str, Any] = {}
 
 
 def _begin(methods: dict[str, Method], protocol: Protocol) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which lets a case be finished
     _process.update(methods=methods, protocol=protocol)
 
 
@@ -226,11 +247,8 @@ def _do_here(task: _Task) -> list[Row]:
 @contextmanager
 def _one_thread() -> Iterator[None]:
     """Torch sums in another order with more threads."""
-    try:
-        import torch  # noqa: PLC0415  (PSNR and SSIM do without it)
-    except ImportError:
-        yield
-        return
+    import torch  # noqa: PLC0415  (only here)
+
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -242,33 +260,42 @@ def _one_thread() -> Iterator[None]:
 # --- the log
 
 
-@contextmanager
-def _log(out: Path) -> Iterator[Callable[[Row], None]]:
-    """Adds rows to the log; each is on its way to the disk before the next."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        with (out / SCORES).open("a") as file:
-            if file.tell() and not (out / SCORES).read_bytes().endswith(b"\n"):
-                file.write("\n")  # a killed run may have left half a line
+@final
+class _Log:
+    """The file that a stopped run goes on from; it is made with the first row."""
 
-            def log(row: Row) -> None:
-                file.write(json.dumps(asdict(row)) + "\n")
-                file.flush()
+    def __init__(self, path: Path) -> None:
+        self._path = path
 
-            yield log
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise TargetError(
-            f"{out / SCORES} was not written ({error.strerror or error})",
-            "a run needs a folder of its own",
-            "free some space or name another folder with -o, and run again: what is scored is kept",
-        ) from error
+    def write(self, row: Row) -> None:
+        """Adds a line.
+
+        Raises:
+            TargetError: it cannot be written.
+        """
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            with self._path.open("ab+") as file:
+                file.write(self._separator(file) + json.dumps(asdict(row)).encode() + b"\n")
+        except OSError as error:
+            raise TargetError(
+                f"{self._path} was not written ({error.strerror or error})",
+                "a run needs a folder of its own",
+                "free some space or name another folder with -o, and run again: what is scored is kept",
+            ) from error
+
+    def _separator(self, file: Any) -> bytes:  # noqa: ANN401  (what open gives)
+        """A killed run may have left half a line."""
+        if not file.seek(0, 2):
+            return b""
+        file.seek(-1, 2)
+        return b"" if file.read(1) == b"\n" else b"\n"
 
 
-def _read(path: Path) -> dict[tuple[str, str, str], Row]:
+def _read(path: Path) -> dict[Place, Row]:
     """The last row of earlier runs at each place; failures, half lines and lines of other versions are passed over."""
     rows = {}
-    for line in path.read_text().splitlines() if path.is_file() else ():
+    for line in path.read_text(errors="replace").splitlines() if path.is_file() else ():
         try:
             row = Row(**json.loads(line))
         except (ValueError, TypeError):

@@ -25,7 +25,7 @@ _PERCENTILES: Final = (2.5, 97.5)
 @final
 @dataclass(frozen=True)
 class Estimate:
-    """A mean and its 95 % interval, which is None where fewer than two scenes were counted."""
+    """A mean and its 95 % interval, which is None where no benchmark has two scenes with a value."""
 
     mean: float
     low: float | None
@@ -53,13 +53,19 @@ def estimate(strata: Sequence[Stratum]) -> list[Estimate | None]:
     each stratum as many scenes are drawn, with replacement, as it has, and each brings all its pictures.
     """
     drawn = [_draw(stratum) for stratum in strata]
-    sums, counts = (sum(part[i] for part in drawn) for i in range(2))
+    sums, counts = (np.sum([part[i] for part in drawn], axis=0) for i in range(2))
     values = np.concatenate([stratum.values for stratum in strata])
-    scenes = sum(len(set(stratum.scenes)) for stratum in strata)
+    is_varied = np.any([_scenes(stratum) > 1 for stratum in strata], axis=0)
     return [
-        _estimate(values[:, i], sums[:, i], counts[:, i], scenes)  # type: ignore[index]
+        _estimate(values[:, i], sums[:, i], counts[:, i], is_varied=bool(is_varied[i]))
         for i in range(values.shape[1])
     ]
+
+
+def _scenes(stratum: Stratum) -> NDArray[np.int64]:
+    """How many scenes have a value, for each series."""
+    names = np.array(stratum.scenes)
+    return np.array([len(set(names[has])) for has in np.isfinite(stratum.values).T])
 
 
 def _draw(stratum: Stratum) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -75,13 +81,13 @@ def _draw(stratum: Stratum) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _estimate(
-    values: NDArray[np.float64], sums: NDArray[np.float64], counts: NDArray[np.float64], scenes: int
+    values: NDArray[np.float64], sums: NDArray[np.float64], counts: NDArray[np.float64], *, is_varied: bool
 ) -> Estimate | None:
     valid = values[np.isfinite(values)]
     if not valid.size:
         return None
     mean = math.fsum(valid) / valid.size
-    if scenes < 2:
+    if not is_varied:
         return Estimate(mean, None, None, valid.size)
     low, high = np.percentile(sums[counts > 0] / counts[counts > 0], _PERCENTILES)
     return Estimate(mean, float(low), float(high), valid.size)

@@ -18,6 +18,7 @@ from typing import Any, Final
 
 from brewster.evaluate.methods import NOTHING
 from brewster.evaluate.report.figures import BRIGHTEST_ERROR, LONGEST, RAMP, Shown, answer_tiles, photo_tiles
+from brewster.evaluate.report.tables import best_mean, is_complete
 from brewster.files import arriving
 
 __all__ = ["Shown", "write_report"]
@@ -161,10 +162,21 @@ def _means(results: Results) -> str:
     metrics = _used(results)
     bodies = []
     for name, table in results["tables"].items():
-        best = {metric: _best(table, metric, about) for metric, about in metrics.items()}
+        best = {metric: best_mean(table, metric, about) for metric, about in metrics.items()}
         pictures = results["selections"][name]["pictures"]
         rows = (
-            (method, [_mean(row.get(metric), metrics[metric], best[metric], pictures) for metric in metrics])
+            (
+                method,
+                [
+                    _mean(
+                        row.get(metric),
+                        metrics[metric],
+                        best[metric] if is_complete(table, method, metric) else None,
+                        pictures,
+                    )
+                    for metric in metrics
+                ],
+            )
             for method, row in table.items()
         )
         counted = f" <small>{_count(pictures, 'picture')}</small>"
@@ -172,18 +184,12 @@ def _means(results: Results) -> str:
     return _table("Means and their 95 % intervals; a star marks the best of a column", metrics, bodies)
 
 
-def _best(table: Results, metric: str, about: Results) -> str | None:
-    """The best mean as it is printed, so that what prints alike is marked alike."""
-    means = [row[metric]["mean"] for row in table.values() if row.get(metric)]
-    return _number((max if about["higher_is_better"] else min)(means), about) if len(means) > 1 else None
-
-
 def _mean(estimate: Results | None, about: Results, best: str | None, pictures: int) -> str:
     if not estimate:
         return f"<td>{_DASH}</td>"
-    mean = _number(estimate["mean"], about)
-    is_best = " class=best" if mean == best else ""
-    star = "<span class=star>&starf;<span class=hidden> best </span></span>" if mean == best else ""
+    mean, wins = _number(estimate["mean"], about), f"{estimate['mean']:.{about['digits']}f}" == best
+    is_best = " class=best" if wins else ""
+    star = "<span class=star>&starf;<span class=hidden> best </span></span>" if wins else ""
     some = f"<small>of {estimate['count']}</small>" if estimate["count"] != pictures else ""
     return f"<td{is_best}>{star}<b>{mean}</b>{_interval(estimate, about)}{some}</td>"
 

@@ -53,8 +53,8 @@ def _overview(results: Results) -> str:
 def _cell(results: Results, key: str, method: str, metrics: Iterable[str]) -> str:
     row, pictures = results["tables"][key][method], results["selections"][key]["pictures"]
     text = " / ".join(_number(results, name, row[name]["mean"]) if name in row else "-" for name in metrics)
-    counted = max((entry["count"] for entry in row.values()), default=0)
-    return text if counted == pictures else f"{text} ({counted} of {pictures})"
+    counts = sorted({row[name]["count"] if name in row else 0 for name in metrics})
+    return text if counts == [pictures] else f"{text} ({' to '.join(map(str, counts))} of {pictures})"
 
 
 def _details(results: Results, key: str) -> str:
@@ -67,17 +67,20 @@ def _details(results: Results, key: str) -> str:
         if not any(metric in table[method] for method in methods):
             continue
         found = {(row["method"], row["than"]): row for row in apart if row["metric"] == metric}
-        means = [_mean(results, metric, table[method].get(metric)) for method in methods]
+        means = [
+            _mean(results, metric, table[method].get(metric), selection["pictures"]) for method in methods
+        ]
         rows.append(
             [_heading(results, metric), *means, *(_apart(results, metric, found.get(pair)) for pair in pairs)]
         )
     return f"### {selection['title']} ({selection['pictures']} pictures)\n\n{_grid(rows)}"
 
 
-def _mean(results: Results, metric: str, entry: Mapping[str, Any] | None) -> str:
+def _mean(results: Results, metric: str, entry: Mapping[str, Any] | None, pictures: int) -> str:
     if entry is None:
         return "-"
-    return f"{_number(results, metric, entry['mean'])}{_interval(results, metric, entry)}"
+    some = f", {entry['count']} of {pictures}" if entry["count"] != pictures else ""
+    return f"{_number(results, metric, entry['mean'])}{_interval(results, metric, entry)}{some}"
 
 
 def _apart(results: Results, metric: str, row: Mapping[str, Any] | None) -> str:
@@ -107,8 +110,15 @@ def _told(results: Results) -> str:
     lines += [
         f"- {method}: {text}" for method, about in results["methods"].items() if (text := about.get("remark"))
     ]
-    lines += [f"- failed: {error}" for picture in results["pictures"] for error in picture["errors"].values()]
+    lines += [f"- {name}: no picture has the truth that it needs" for name in results["unmeasured"]]
+    lines += [f"- {error}" for error in failures(results)]
     return "\n".join(["### Said aloud", "", *lines]) if lines else ""
+
+
+def failures(results: Results) -> list[str]:
+    """What methods failed on, each said once."""
+    errors = (error for picture in results["pictures"] for error in picture["errors"].values())
+    return list(dict.fromkeys(errors))
 
 
 def _choices(results: Results) -> str:
@@ -143,7 +153,7 @@ def _number(results: Results, metric: str, value: float, *, sign: str = "") -> s
 def to_latex(results: Results) -> str:
     """The layout of the paper's Table 1: a row a method, three metrics a set, SIR2 under one head, the best in bold.
 
-    Needs the packages booktabs and multirow.
+    A dagger marks means over fewer pictures than others have. Needs the packages booktabs and multirow.
     """
     metrics = [name for name in _MAIN if name in results["metrics"]]
     keys = _of_the_paper(results)
@@ -221,21 +231,36 @@ def _latex_heading(results: Results, metric: str) -> str:
 
 
 def _latex_cells(results: Results, key: str, method: str, metrics: Iterable[str]) -> list[str]:
+    """Means, the best in bold; a dagger where a method is judged on fewer pictures than others."""
     table, cells = results["tables"][key], []
     for metric in metrics:
         if metric not in table[method]:
             cells.append("--")
             continue
-        texts = {
-            name: _number(results, metric, row[metric]["mean"])
-            for name, row in table.items()
-            if metric in row
-        }
-        best = (max if results["metrics"][metric]["higher_is_better"] else min)(texts.values(), key=float)
-        cells.append(
-            f"\\textbf{{{texts[method]}}}" if texts[method] == best and len(texts) > 1 else texts[method]
-        )
+        text = _number(results, metric, table[method][metric]["mean"])
+        if not is_complete(table, method, metric):
+            cells.append(f"{text}$^\\dagger$")
+        else:
+            is_best = text == best_mean(table, metric, results["metrics"][metric])
+            cells.append(f"\\textbf{{{text}}}" if is_best else text)
     return cells
+
+
+def best_mean(table: Mapping[str, Any], metric: str, about: Mapping[str, Any]) -> str | None:
+    """The best mean as it is printed, so that what prints alike is marked alike; None where nothing is compared.
+
+    A method that was judged on fewer pictures than others, since it failed on some, is not in the running.
+    """
+    means = [row[metric]["mean"] for method, row in table.items() if is_complete(table, method, metric)]
+    if len(means) < 2:
+        return None
+    return f"{(max if about['higher_is_better'] else min)(means):.{about['digits']}f}"
+
+
+def is_complete(table: Mapping[str, Any], method: str, metric: str) -> bool:
+    """Whether a method is judged on as many pictures in this metric as any other."""
+    counts = {name: row[metric]["count"] for name, row in table.items() if row.get(metric)}
+    return counts.get(method) == max(counts.values(), default=0)
 
 
 _SPECIAL: Final = str.maketrans(
