@@ -48,6 +48,16 @@ EXTRAS: Final = {
         "torch": "torch",
     },
     "evaluate": {"matplotlib": "matplotlib", "torch": "torch"},
+    "large": {
+        "accelerate": "accelerate",
+        "diffusers": "diffusers",
+        "huggingface_hub": "huggingface_hub",
+        "peft": "peft",
+        "safetensors": "safetensors",
+        "torch": "torch",
+        "torchao": "torchao",
+        "transformers": "transformers",
+    },
 }
 """The packages behind each extra, and the module that each brings."""
 

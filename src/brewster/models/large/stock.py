@@ -1,0 +1,160 @@
+"""The door to diffusers, transformers, peft and the hub: opened late, and their errors told plainly."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import logging
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from brewster.errors import DeviceError, DownloadError, MissingExtra, ModelError
+
+_CPU_MEMORY_ERROR = re.compile(r"out of memory|not enough memory|can't allocate memory", re.IGNORECASE)
+
+
+def library(name: str) -> Any:  # noqa: ANN401 - a module of a library that may be missing
+    """A module of an outside library, imported at its first use.
+
+    Raises:
+        MissingExtra: it is not installed.
+    """
+    try:
+        with quiet():
+            return importlib.import_module(name)
+    except ImportError as error:
+        raise MissingExtra(
+            f"{error.name or name} cannot be imported ({error})",
+            "the large models need it",
+            "pip install 'brewster[large]'",
+        ) from error
+
+
+def stock_class(name: str) -> Any:  # noqa: ANN401 - diffusers has no types that mypy reads
+    """A class of diffusers, which imports its parts one by one when they are asked for.
+
+    Raises:
+        MissingExtra: diffusers, or what this class needs, is not installed.
+    """
+    diffusers = library("diffusers")
+    with quiet():
+        return getattr(diffusers, name)
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """The stock libraries greet every import with notes about what else could be installed; errors still show."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(before)
+
+
+def bars_on_terminals_only() -> None:
+    """The stock libraries draw progress bars into any pipe; ours stay on terminals."""
+    if sys.stderr.isatty():
+        return
+    library("huggingface_hub.utils").disable_progress_bars()
+    library("diffusers.utils.logging").disable_progress_bar()
+    library("transformers.utils.logging").disable_progress_bar()
+
+
+def fetch(source: str, patterns: list[str]) -> Path:
+    """A model's folder: `source` itself where it is one, else the hub's files that match, from the cache or net.
+
+    The token is the one of `hf auth login` or HF_TOKEN.
+
+    Raises:
+        DownloadError: no access (says how to ask for it), no such model, no network.
+        ModelError: neither a folder nor a hub id.
+        MissingExtra: huggingface_hub is not installed.
+    """
+    if Path(source).is_dir():
+        return Path(source)
+    hub, errors = library("huggingface_hub"), library("huggingface_hub.errors")
+    page = f"https://huggingface.co/{source}"
+    try:
+        return Path(hub.snapshot_download(source, allow_patterns=patterns))
+    except errors.GatedRepoError as error:
+        raise _no_access(error, source, page) from error
+    except errors.RepositoryNotFoundError as error:
+        raise DownloadError(
+            f"the hub shows no model {source}",
+            "a public model, or a private one that your token may read",
+            f"check {page}, then `hf auth login` or set HF_TOKEN",
+        ) from error
+    except errors.HfHubHTTPError as error:
+        raise _refused(error, source) from error
+    except errors.HFValidationError as error:
+        raise ModelError(
+            f"there is no folder {source}, and it is no hub id",
+            "a model's folder or OWNER/NAME",
+            "check the path",
+        ) from error
+    except (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled) as error:
+        # Where nothing is in the cache, the client hides the hub's answer behind the missing file.
+        if isinstance(error.__cause__, errors.HfHubHTTPError):
+            raise _refused(error.__cause__, source) from error
+        raise DownloadError(
+            f"{source} is not in the cache and the hub cannot be reached",
+            "a network, or a folder with the model's files",
+            f"connect, or copy the model from {page} and give the folder",
+        ) from error
+    except OSError as error:
+        raise DownloadError(
+            f"{source} could not be downloaded: {error}",
+            "room in the cache (HF_HOME)",
+            "make room and try again",
+        ) from error
+
+
+def _no_access(error: Exception, source: str, page: str) -> DownloadError:
+    """A gated model: 401 without a token, 403 with a token whose owner has not been let in."""
+    known = _status(error) == 403
+    return DownloadError(
+        f"{source} is gated and {'your account has no access' if known else 'no valid token was sent'}",
+        f"its licence accepted at {page} by the owner of the token",
+        "open that page, agree to the licence, then `hf auth login` or set HF_TOKEN to a token with read access",
+    )
+
+
+def _refused(error: Exception, source: str) -> DownloadError:
+    status = _status(error)
+    if status in {401, 403}:
+        return DownloadError(
+            f"the hub refused the token for {source} (HTTP {status})",
+            "a valid token with read access",
+            "make one at https://huggingface.co/settings/tokens, then `hf auth login` or set HF_TOKEN",
+        )
+    return DownloadError(
+        f"the hub answered HTTP {status} for {source}", "the model's files", "try again later"
+    )
+
+
+def _status(error: Exception) -> int | None:
+    return getattr(getattr(error, "response", None), "status_code", None)
+
+
+@contextlib.contextmanager
+def within_memory(cure: str) -> Iterator[None]:
+    """Tells an out-of-memory plainly, on any device; `cure` says what to lower.
+
+    Raises:
+        DeviceError: out of memory.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, MemoryError | torch.OutOfMemoryError) or _CPU_MEMORY_ERROR.search(str(error)):
+            first = str(error).splitlines()[0] if str(error) else "out of memory"
+            raise DeviceError(
+                f"the device ran out of memory ({first})", "room for the model", cure
+            ) from error
+        raise

@@ -1,0 +1,65 @@
+"""Safetensors files with the same bytes for the same tensors, and plain words for damaged ones."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from brewster.errors import ModelError
+from brewster.files import write_atomically
+from brewster.models.large.stock import library
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, str]) -> None:
+    """Writes the tensors and what is said about them, whole or not at all, replacing an older file.
+
+    Raises:
+        TargetError: the file cannot be written.
+        MissingExtra: safetensors is not installed.
+    """
+    alone = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    data = library("safetensors.torch").save(alone, {"format": "pt", **about})
+    write_atomically(path, _with_sorted_header(data), overwrite=True)
+
+
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """The tensors of a file by name, on the CPU, and what is said about them.
+
+    Raises:
+        ModelError: the file is missing or damaged.
+        MissingExtra: safetensors is not installed.
+    """
+    safetensors = library("safetensors")
+    try:
+        # Not mapped but read: whoever writes the file anew would pull a mapped tensor from under our feet.
+        data = path.read_bytes()
+        tensors = library("safetensors.torch").load(data)
+        return dict(sorted(tensors.items())), _header(data).get("__metadata__", {})
+    except FileNotFoundError as error:
+        raise ModelError(f"{path} is missing", "a safetensors file", "copy the whole folder") from error
+    except (OSError, ValueError, safetensors.SafetensorError) as error:
+        raise ModelError(
+            f"{path} cannot be read: {error}", "a whole safetensors file", "copy or write it again"
+        ) from error
+
+
+def _header(data: bytes) -> dict[str, Any]:
+    return json.loads(data[8 : _end(data)])  # type: ignore[no-any-return]
+
+
+def _end(data: bytes) -> int:
+    """Where the header ends: its length stands in the first eight bytes."""
+    return 8 + int.from_bytes(data[:8], "little")
+
+
+def _with_sorted_header(data: bytes) -> bytes:
+    """safetensors writes its metadata in an order that changes from run to run; offsets count from its end."""
+    header = _header(data)
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text + data[_end(data) :]

@@ -1,0 +1,287 @@
+"""The table of large backbones: real loading code on tiny folders, and every way in which a model can be amiss."""
+
+import json
+import shutil
+
+import huggingface_hub
+import pytest
+import torch
+import transformers
+from tokenizers.pre_tokenizers import ByteLevel
+
+from brewster.errors import DeviceError, DownloadError, ModelError
+from brewster.models.large import backbones, stock
+from brewster.models.large.backbones import BACKBONES, build, encode_prompt, load_backbone, tiny
+from brewster.models.large.lora import add_lora
+from brewster.models.large.prompt import PROMPT
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """Folders of tiny twins, to be read only."""
+    folder = tmp_path_factory.mktemp("twins")
+    for name in BACKBONES:
+        tiny(name, seed=1)[0].save(folder / name)
+    return folder
+
+
+@pytest.fixture
+def folder(saved, tmp_path):
+    """A folder of a tiny Kontext that may be broken."""
+    return shutil.copytree(saved / "kontext", tmp_path / "kontext")
+
+
+def velocity(backbone, prompt):
+    generator = torch.Generator().manual_seed(0)
+    latents, condition = torch.randn(2, 1, backbone.channels, 2, 6, generator=generator)
+    return backbone.predict(latents, condition, torch.tensor([0.7]), prompt, 1.0)
+
+
+@pytest.mark.parametrize("name", list(BACKBONES))
+def test_a_twin_survives_its_folder(saved, name):
+    twin, prompt = tiny(name, seed=1)
+    back = load_backbone(str(saved / name))
+    assert type(back) is BACKBONES[name]
+    weights = back.transformer.state_dict()
+    assert all(torch.equal(weights[key], value) for key, value in twin.transformer.state_dict().items())
+    torch.testing.assert_close(velocity(back, prompt), velocity(twin, prompt), atol=1e-6, rtol=0)
+    assert not any(parameter.requires_grad for parameter in back.transformer.parameters())
+
+
+@pytest.mark.parametrize("name", list(BACKBONES))
+def test_twins_have_the_classes_of_the_real_ones_and_differ_by_seed_only(name):
+    twin, prompt = tiny(name, seed=1)
+    same, same_prompt = tiny(name, seed=1)
+    other, other_prompt = tiny(name, seed=2)
+    parts = {"transformer": twin.transformer, "vae": twin.vae, "scheduler": twin.scheduler}
+    assert {part: type(value).__name__ for part, value in parts.items()}.items() <= twin.classes.items()
+    assert torch.equal(velocity(twin, prompt), velocity(same, same_prompt))
+    assert not torch.equal(velocity(twin, prompt), velocity(other, prompt))
+    assert prompt.sha256 == same_prompt.sha256 != other_prompt.sha256
+    assert prompt.text == PROMPT
+
+
+@pytest.mark.parametrize(
+    ("name", "billions", "targets"), [("kontext", 11.90, 494), ("klein", 3.88, 100), ("qwen", 20.43, 840)]
+)
+def test_full_size_architectures_cost_nothing_on_meta(name, billions, targets):
+    backbone = build(name, device="meta", dtype=torch.bfloat16)
+    parameters = sum(parameter.numel() for parameter in backbone.transformer.parameters())
+    assert parameters / 1e9 == pytest.approx(billions, abs=0.005)
+    assert len(backbone.lora_targets()) == targets
+    assert backbone.dtype == torch.bfloat16
+
+
+@pytest.mark.parametrize("name", list(BACKBONES))
+def test_a_picture_becomes_one_token_for_16_by_16_pixels(name):
+    backbone, _ = tiny(name, seed=1)
+    latents = backbone.encode(torch.rand(2, 3, 32, 96) * 2 - 1)
+    assert latents.shape == (2, backbone.channels, 2, 6)
+    assert backbone.noise((96, 32), 0).shape == latents[:1].shape
+    assert backbone.decode(latents).shape == (2, 3, 32, 96)
+
+
+@pytest.mark.parametrize("name", list(BACKBONES))
+def test_latent_statistics_are_applied_and_undone(name, monkeypatch):
+    backbone, _ = tiny(name, seed=1)
+    mean, deviation = backbone.statistics()
+    assert mean.abs().max() > 0.05
+    assert (deviation - 1).abs().max() > 0.05
+    grid = torch.randn(1, backbone.channels // 4, 4, 4)
+    monkeypatch.setattr(backbone, "_see", lambda picture: grid)
+    monkeypatch.setattr(backbone, "_show", lambda latent: latent)
+    torch.testing.assert_close(backbone.decode(backbone.encode(torch.zeros(1, 3, 32, 32))), grid)
+
+
+def test_a_panel_encoded_apart_is_not_the_panel_of_the_composite():
+    backbone, _ = tiny("kontext", seed=1)
+    composite = torch.rand(1, 3, 32, 96) * 2 - 1
+    assert not torch.allclose(
+        backbone.encode(composite)[..., :2], backbone.encode(composite[..., :32]), atol=1e-3
+    )
+
+
+@pytest.mark.parametrize("quantise", ["int8", "float8"])
+def test_a_quantised_base_predicts_nearly_the_same_and_trains_a_lora(saved, quantise):
+    plain, prompt = tiny("kontext", seed=1)
+    small = load_backbone(str(saved / "kontext"), quantise=quantise, dtype=torch.bfloat16)
+    weight = small.transformer.transformer_blocks[0].attn.to_q.weight
+    assert type(weight) not in {torch.Tensor, torch.nn.Parameter}
+    expected = velocity(plain, prompt)
+    assert (velocity(small, prompt) - expected).std() < 0.2 * expected.std()
+    parameters = add_lora(small, rank=2)
+    velocity(small, prompt).square().mean().backward()
+    assert any(parameter.grad.abs().max() > 0 for parameter in parameters)
+    assert {parameter.dtype for parameter in parameters} == {torch.float32}
+
+
+def test_a_base_that_was_silently_left_unquantised_is_refused(saved, monkeypatch):
+    monkeypatch.setattr(backbones, "_placed", lambda device: {"device_map": {"": device}})
+    with pytest.raises(ModelError, match=r"loaded as torch\.bfloat16; stored as int8"):
+        load_backbone(str(saved / "kontext"), quantise="int8", dtype=torch.bfloat16)
+
+
+def test_nf4_wants_an_nvidia_gpu():
+    with pytest.raises(DeviceError, match='nf4 does not run on cpu; an NVIDIA GPU; use quantise="int8"'):
+        load_backbone("kontext", quantise="nf4")
+
+
+def test_unknown_names_are_answered_with_known_ones():
+    with pytest.raises(ModelError, match="did you mean kontext"):
+        tiny("kontxt")
+    with pytest.raises(ModelError, match="there is no quantisation 'int2'; one of int8, float8, nf4"):
+        load_backbone("kontext", quantise="int2")
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is one")
+def test_an_absent_gpu_is_told_before_anything_is_loaded():
+    with pytest.raises(DeviceError, match="there is no CUDA device"):
+        load_backbone("/nowhere", device="cuda")
+
+
+@pytest.fixture(scope="module")
+def with_words(tmp_path_factory):
+    """Folders of tiny twins with text encoders and tokenizers: every byte is a word."""
+    folder = tmp_path_factory.mktemp("words")
+    letters = sorted(ByteLevel.alphabet())
+    torch.manual_seed(0)
+    clip_words = [*letters, *(letter + "</w>" for letter in letters), "<|startoftext|>", "<|endoftext|>"]
+    clip_words = {word: index for index, word in enumerate(clip_words)}
+    clip = transformers.CLIPTokenizer(vocab=clip_words, merges=[], model_max_length=77)
+    t5_words = ["<pad>", "</s>", "<unk>", "\u2581", *map(chr, range(33, 127))]
+    t5 = transformers.T5TokenizerFast(vocab=[(word, -1.0) for word in t5_words], extra_ids=0)
+    words = {
+        word: index for index, word in enumerate([*letters, "<|endoftext|>", "<|im_start|>", "<|im_end|>"])
+    }
+    qwen = transformers.Qwen2TokenizerFast(vocab=words, merges=[])
+    qwen.chat_template = "{% for m in messages %}<|im_start|>{{ m.content }}<|im_end|>{% endfor %}"
+    small = {"intermediate_size": 16, "num_attention_heads": 2, "hidden_size": 16}
+    summary = transformers.CLIPTextConfig(vocab_size=len(clip), num_hidden_layers=1, **small)
+    tokens = transformers.T5Config(vocab_size=len(t5), d_model=32, d_kv=8, d_ff=16, num_layers=1, num_heads=2)
+    layers = transformers.Qwen3Config(
+        vocab_size=300, num_hidden_layers=28, num_key_value_heads=1, head_dim=8, **small
+    )
+    readers = {
+        "kontext": {
+            "tokenizer": clip,
+            "text_encoder": transformers.CLIPTextModel(summary),
+            "tokenizer_2": t5,
+            "text_encoder_2": transformers.T5EncoderModel(tokens),
+        },
+        "klein": {"tokenizer": qwen, "text_encoder": transformers.Qwen3ForCausalLM(layers)},
+    }
+    stock.bars_on_terminals_only()
+    for name, reader in readers.items():
+        pipeline = tiny(name)[0].pipeline()
+        pipeline.register_modules(**reader)
+        pipeline.save_pretrained(folder / name)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("name", "shapes"),
+    [
+        ("kontext", {"embeds": (1, 512, 32), "pooled": (1, 16)}),
+        ("klein", {"embeds": (1, 512, 48), "negative": (1, 512, 48)}),
+    ],
+)
+def test_a_prompt_is_encoded_by_the_text_encoders_of_the_folder(with_words, name, shapes):
+    prompt = encode_prompt(str(with_words / name))
+    assert (prompt.backbone, prompt.text) == (name, PROMPT)
+    assert {key: tuple(tensor.shape) for key, tensor in prompt.tensors.items()} == shapes
+    assert encode_prompt(str(with_words / name)).sha256 == prompt.sha256
+    assert not torch.equal(encode_prompt(str(with_words / name), "a cat").embeds, prompt.embeds)
+
+
+def test_without_a_network_the_hub_client_itself_ends_in_plain_words(tmp_path, monkeypatch):
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
+    with pytest.raises(DownloadError, match="cannot be reached"):
+        load_backbone("klein")
+
+
+def test_only_the_parts_that_see_pictures_are_downloaded(saved, monkeypatch):
+    asked = []
+
+    def give(source, *, allow_patterns):
+        asked.append((source, allow_patterns))
+        return str(saved / "klein")
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", give)
+    load_backbone("klein")
+    source, patterns = asked[0]
+    assert source == "black-forest-labs/FLUX.2-klein-base-4B"
+    assert patterns == ["model_index.json", "transformer/*", "vae/*", "scheduler/*"]
+
+
+def test_a_path_that_is_nowhere_is_no_hub_id_either():
+    with pytest.raises(ModelError, match=r"there is no folder ./nowhere/at/all"):
+        load_backbone("./nowhere/at/all")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "model_index.json",
+        "transformer/config.json",
+        "transformer/diffusion_pytorch_model.safetensors",
+        "vae/diffusion_pytorch_model.safetensors",
+        "scheduler/scheduler_config.json",
+    ],
+)
+def test_a_missing_file_is_named(folder, name):
+    (folder / name).unlink()
+    with pytest.raises(ModelError, match=name.rsplit("/", 1)[-1]):
+        load_backbone(str(folder))
+
+
+@pytest.mark.parametrize("size", [0, 100, -7])
+def test_truncated_weights_are_told_plainly(folder, size):
+    path = folder / "transformer" / "diffusion_pytorch_model.safetensors"
+    path.write_bytes(path.read_bytes()[:size])
+    with pytest.raises(ModelError, match=r"transformer cannot be loaded.*download the model again"):
+        load_backbone(str(folder))
+
+
+def change(path, **values):
+    path.write_text(json.dumps(json.loads(path.read_text()) | values))
+
+
+def test_another_pipeline_is_not_one_of_ours(folder):
+    change(folder / "model_index.json", _class_name="StableDiffusionPipeline")
+    with pytest.raises(ModelError, match="holds a StableDiffusionPipeline; one of FluxKontextPipeline"):
+        load_backbone(str(folder))
+
+
+def test_a_transformer_of_another_architecture_is_refused(folder, saved):
+    shutil.rmtree(folder / "transformer")
+    shutil.copytree(saved / "qwen" / "transformer", folder / "transformer")
+    with pytest.raises(ModelError, match="holds a QwenImageTransformer2DModel; a FluxTransformer2DModel"):
+        load_backbone(str(folder))
+
+
+def test_settings_that_do_not_fit_the_weights_are_refused(folder):
+    change(folder / "transformer" / "config.json", num_layers=3)
+    with pytest.raises(ModelError, match="transformer"):
+        load_backbone(str(folder))
+    change(folder / "transformer" / "config.json", num_layers=2, num_attention_heads=3)
+    with pytest.raises(ModelError, match="transformer cannot be loaded"):
+        load_backbone(str(folder))
+
+
+def test_a_broken_index_is_told_plainly(folder):
+    (folder / "model_index.json").write_text("{")
+    with pytest.raises(ModelError, match=r"model_index.json is not JSON"):
+        load_backbone(str(folder))
+    (folder / "model_index.json").write_text("[]")
+    with pytest.raises(ModelError, match="holds no settings"):
+        load_backbone(str(folder))
+
+
+def test_running_out_of_memory_while_loading_says_what_to_lower(folder, monkeypatch):
+    def full(*_, **__):
+        raise torch.OutOfMemoryError("CUDA out of memory.")
+
+    monkeypatch.setattr(backbones, "_part", full)
+    with pytest.raises(DeviceError, match='use quantise="int8", a smaller backbone'):
+        load_backbone(str(folder))

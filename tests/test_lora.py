@@ -1,0 +1,230 @@
+"""LoRAs on tiny twins: what is trained, saved and loaded, by us and by stock diffusers."""
+
+import copy
+
+import pytest
+import torch
+from torch import nn
+
+from brewster.errors import ModelError
+from brewster.models.large.backbones import BACKBONES, tiny
+from brewster.models.large.lora import (
+    LORA_FILE,
+    LoraCard,
+    add_lora,
+    has_lora,
+    load_lora,
+    load_lora_state,
+    lora_parameters,
+    lora_state,
+    read_card,
+    remove_lora,
+    save_lora,
+)
+from brewster.models.large.panels import Layout
+from brewster.models.large.tensors import read_tensors, write_tensors
+
+
+@pytest.fixture(params=list(BACKBONES))
+def twin(request):
+    return tiny(request.param, seed=1)
+
+
+@pytest.fixture
+def kontext():
+    return tiny("kontext", seed=1)
+
+
+def velocity(backbone, prompt):
+    generator = torch.Generator().manual_seed(0)
+    latents, condition = torch.randn(2, 1, backbone.channels, 2, 6, generator=generator)
+    return backbone.predict(latents, condition, torch.tensor([0.7]), prompt, 4.0)
+
+
+def trained(backbone, *, alpha=16, rank=4):
+    """A LoRA as if training had moved it: B is no longer zero."""
+    add_lora(backbone, rank=rank, alpha=alpha, seed=2)
+    generator = torch.Generator().manual_seed(4)
+    with torch.no_grad():
+        for parameter in lora_parameters(backbone):
+            parameter.add_(0.05 * torch.randn(parameter.shape, generator=generator))
+    return backbone
+
+
+def test_every_linear_layer_of_the_blocks_is_changed_and_nothing_else(twin):
+    backbone, _ = twin
+    targets = backbone.lora_targets()
+    linear = {name for name, module in backbone.transformer.named_modules() if isinstance(module, nn.Linear)}
+    outside = linear - set(targets)
+    assert outside
+    assert all("blocks." in name for name in targets)
+    assert not any("blocks." in name for name in outside)
+    assert "proj_out" in outside
+    add_lora(backbone)
+    changed = {name.rsplit(".lora_", 1)[0] for name in lora_state(backbone)}
+    assert changed == set(targets)
+    assert backbone.lora_targets() == targets
+
+
+def test_a_fresh_lora_changes_nothing_and_is_all_that_is_trained(twin):
+    backbone, prompt = twin
+    before = velocity(backbone, prompt)
+    parameters = add_lora(backbone, rank=4)
+    assert torch.equal(velocity(backbone, prompt), before)
+    assert sum(map(torch.numel, parameters)) == sum(map(torch.numel, lora_state(backbone).values()))
+    velocity(backbone, prompt).square().mean().backward()
+    idle = {
+        name
+        for name, parameter in backbone.transformer.named_parameters()
+        if "lora_" in name and parameter.grad is None
+    }
+    # Qwen's last block computes words that nobody reads: those layers never learn (DDP must be told).
+    last = "transformer_blocks.1.attn.to_add_out", "transformer_blocks.1.txt_mlp."
+    assert all(name.startswith(last) for name in idle)
+    assert bool(idle) == (backbone.name == "qwen")
+
+
+def test_the_seed_decides_the_lora_and_leaves_torchs_own_dice_alone(kontext):
+    backbone, _ = kontext
+    states = []
+    for seed in (7, 7, 8):
+        dice = torch.get_rng_state()
+        add_lora(backbone, rank=4, seed=seed)
+        assert torch.equal(torch.get_rng_state(), dice)
+        states.append(lora_state(backbone))
+        remove_lora(backbone)
+    name = next(name for name in states[0] if "lora_A" in name)
+    assert torch.equal(states[0][name], states[1][name])
+    assert not torch.equal(states[0][name], states[2][name])
+
+
+def test_on_a_bf16_base_the_lora_is_float32(kontext):
+    backbone, prompt = kontext
+    backbone.transformer.to(torch.bfloat16)
+    parameters = add_lora(backbone, rank=4)
+    assert {parameter.dtype for parameter in parameters} == {torch.float32}
+    assert backbone.dtype == torch.bfloat16
+    assert velocity(backbone, prompt).isfinite().all()
+
+
+@pytest.mark.parametrize("alpha", [4, 16])
+def test_a_saved_lora_gives_the_same_picture_reloaded_and_in_stock_diffusers(twin, tmp_path, alpha):
+    backbone, prompt = twin
+    plain = copy.deepcopy(backbone.transformer)
+    untouched = velocity(backbone, prompt)
+    with_lora = velocity(trained(backbone, alpha=alpha), prompt)
+    assert (with_lora - untouched).abs().max() > 1e-3
+    card = save_lora(tmp_path, backbone, Layout(), prompt)
+
+    backbone.transformer = copy.deepcopy(plain)
+    assert load_lora(tmp_path, backbone)[0] == card == read_card(tmp_path)
+    assert (card.rank, card.alpha, card.prompt_sha256) == (4, alpha, prompt.sha256)
+    torch.testing.assert_close(velocity(backbone, prompt), with_lora, atol=1e-6, rtol=0)
+
+    backbone.transformer = plain
+    backbone.pipeline().load_lora_weights(tmp_path)
+    torch.testing.assert_close(velocity(backbone, prompt), with_lora, atol=1e-5, rtol=0)
+
+
+def test_the_same_lora_gives_the_same_bytes(kontext, tmp_path):
+    backbone, prompt = kontext
+    trained(backbone)
+    for name in "ab":
+        save_lora(tmp_path / name, backbone, Layout(), prompt)
+    assert (tmp_path / "a" / LORA_FILE).read_bytes() == (tmp_path / "b" / LORA_FILE).read_bytes()
+
+
+def test_a_checkpoint_of_the_weights_alone_goes_back_in(kontext):
+    backbone, prompt = kontext
+    state = {name: tensor.clone() for name, tensor in lora_state(trained(backbone)).items()}
+    expected = velocity(backbone, prompt)
+    with torch.no_grad():
+        for parameter in lora_parameters(backbone):
+            parameter.zero_()
+    load_lora_state(backbone, state)
+    assert torch.equal(velocity(backbone, prompt), expected)
+
+
+def test_removing_a_lora_gives_the_plain_backbone_back(twin):
+    backbone, prompt = twin
+    before = velocity(backbone, prompt)
+    remove_lora(trained(backbone))
+    assert not has_lora(backbone)
+    assert lora_state(backbone) == {}
+    assert torch.equal(velocity(backbone, prompt), before)
+
+
+def test_a_lora_of_another_backbone_is_refused(kontext, tmp_path):
+    backbone, prompt = kontext
+    save_lora(tmp_path, trained(backbone), Layout(), prompt)
+    with pytest.raises(ModelError, match="is a LoRA of kontext; one of klein; load the backbone kontext"):
+        load_lora(tmp_path, tiny("klein")[0])
+
+
+def changed_card(folder, **changes):
+    tensors, about = read_tensors(folder / LORA_FILE)
+    card = vars(LoraCard.from_json(about["brewster"])) | changes
+    write_tensors(folder / LORA_FILE, tensors, about | {"brewster": LoraCard(**card).to_json()})
+
+
+def test_a_card_that_does_not_fit_its_weights_is_refused_and_leaves_no_trace(kontext, tmp_path):
+    backbone, prompt = kontext
+    save_lora(tmp_path, trained(backbone), Layout(), prompt)
+    changed_card(tmp_path, rank=8)
+    fresh, _ = tiny("kontext", seed=1)
+    with pytest.raises(ModelError, match=r"has the shape \(4, 32\); \(8, 32\); use the rank"):
+        load_lora(tmp_path, fresh)
+    assert not has_lora(fresh)
+
+
+def test_a_smaller_backbone_of_the_same_family_is_refused(kontext, tmp_path):
+    backbone, prompt = kontext
+    save_lora(tmp_path, trained(backbone), Layout(), prompt)
+    fresh, _ = tiny("kontext", seed=1)
+    fresh.transformer.single_transformer_blocks = fresh.transformer.single_transformer_blocks[:1]
+    with pytest.raises(ModelError, match=r"too few or too many, single_transformer_blocks\.1"):
+        load_lora(tmp_path, fresh)
+
+
+def test_another_prompt_in_the_folder_is_refused(kontext, tmp_path):
+    backbone, prompt = kontext
+    save_lora(tmp_path, trained(backbone), Layout(), prompt)
+    changed_card(tmp_path, prompt_sha256="0" * 64)
+    with pytest.raises(ModelError, match="is not the prompt that the LoRA was trained with"):
+        load_lora(tmp_path, tiny("kontext")[0])
+
+
+def test_a_corrupt_or_foreign_or_missing_file_is_refused(kontext, tmp_path):
+    backbone, prompt = kontext
+    with pytest.raises(ModelError, match="is missing"):
+        load_lora(tmp_path, backbone)
+    save_lora(tmp_path, trained(backbone), Layout(), prompt)
+    path = tmp_path / LORA_FILE
+    tensors, _ = read_tensors(path)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(ModelError, match="cannot be read"):
+        load_lora(tmp_path, backbone)
+    write_tensors(path, tensors, {})
+    with pytest.raises(ModelError, match="was not written by brewster"):
+        read_card(tmp_path)
+    write_tensors(path, tensors, {"brewster": '{"rank": 4}'})
+    with pytest.raises(ModelError, match="the card of the LoRA cannot be read"):
+        read_card(tmp_path)
+
+
+def test_one_lora_at_a_time_and_only_what_is_there(kontext, tmp_path):
+    backbone, prompt = kontext
+    with pytest.raises(ModelError, match="has no LoRA"):
+        save_lora(tmp_path, backbone, Layout(), prompt)
+    with pytest.raises(ModelError, match="the rank is 0"):
+        add_lora(backbone, rank=0)
+    add_lora(backbone, rank=2)
+    with pytest.raises(ModelError, match="has a LoRA already"):
+        add_lora(backbone)
+    with pytest.raises(ModelError, match="encoded for klein"):
+        save_lora(tmp_path, backbone, Layout(), tiny("klein")[1])
+
+
+def test_a_card_comes_back_from_its_line():
+    card = LoraCard("qwen", 16, 8, Layout(("T", "R"), "stacked"), "abc")
+    assert LoraCard.from_json(card.to_json()) == card

@@ -1,0 +1,132 @@
+import contextlib
+
+import pytest
+import torch
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from brewster.errors import PhotoError, RecipeError
+from brewster.models.large.panels import Layout, compose, condition, fit_panel, split
+
+LAYOUTS = [
+    Layout(panels, direction)
+    for panels in [("I", "T", "R"), ("T", "R"), ("R", "I", "T"), ("T",)]
+    for direction in ["side by side", "stacked"]
+]
+layouts = st.sampled_from(LAYOUTS)
+sides = st.integers(1, 9)
+
+
+@given(layouts, sides, sides, st.integers(0, 2**31))
+def test_splitting_undoes_composing_to_the_bit(layout, height, width, seed):
+    generator = torch.Generator().manual_seed(seed)
+    panels = {name: torch.randn(2, 3, height, width, generator=generator) for name in layout.panels}
+    composite = compose(panels, layout)
+    assert tuple(composite.shape[:-3:-1]) == layout.composite_size((width, height))
+    back = split(composite, layout)
+    assert list(back) == list(layout.panels)
+    assert all(torch.equal(back[name], panels[name]) for name in panels)
+    assert torch.equal(compose(back, layout), composite)
+
+
+def test_the_model_is_shown_the_photo_and_white_space():
+    photo = torch.rand(1, 3, 4, 5) - 1
+    shown = split(condition(photo, Layout()), Layout())
+    assert torch.equal(shown["I"], photo)
+    assert shown["T"].eq(1).all()
+    assert shown["R"].eq(1).all()
+
+
+def test_without_a_generated_photo_the_photo_is_shown_alone():
+    photo = torch.rand(1, 3, 4, 5)
+    assert torch.equal(condition(photo, Layout(("T", "R"))), photo)
+
+
+def test_the_papers_composite_is_three_squares_of_512_pixels():
+    assert fit_panel((2000, 2000), Layout(), budget_px=1536 * 512, multiple=16).panel == (512, 512)
+
+
+@given(
+    st.integers(1, 9000),
+    st.integers(1, 9000),
+    layouts,
+    st.integers(1000, 2_000_000),
+    st.sampled_from([8, 16, 32]),
+)
+def test_any_photo_fits_without_a_stretch_or_is_refused(width, height, layout, budget_px, multiple):
+    try:
+        fit = fit_panel((width, height), layout, budget_px=budget_px, multiple=multiple)
+    except PhotoError:
+        assume(False)
+    composite = layout.composite_size(fit.panel)
+    assert composite[0] * composite[1] <= budget_px
+    padding = [panel - content for panel, content in zip(fit.panel, fit.content, strict=True)]
+    assert min(padding) == 0
+    assert 0 <= max(padding) <= multiple / 2 + 0.5
+    assert all(side % multiple == 0 for side in fit.panel)
+    scales = [content / own for content, own in zip(fit.content, (width, height), strict=True)]
+    assert max(scales) <= 1
+    # One side decides the scale, the other follows it to the nearest pixel.
+    assert any(
+        all(abs(got - scale * own) <= 0.501 for got, own in zip(fit.content, (width, height), strict=True))
+        for scale in scales
+    )
+    picture = torch.rand(1, 1, fit.content[1], 1).expand(1, 1, fit.content[1], fit.content[0])
+    if fit.panel[0] * fit.panel[1] < 200_000:
+        assert torch.equal(fit.cut(fit.pad(picture)), picture)
+
+
+@given(st.integers(16, 4000), st.integers(16, 4000), layouts, st.integers(10_000, 2_000_000))
+def test_the_next_larger_panel_would_break_the_budget(width, height, layout, budget_px):
+    try:
+        fit = fit_panel((width, height), layout, budget_px=budget_px, multiple=16)
+    except PhotoError:
+        assume(False)
+    short = min(fit.panel) + 16
+    long = round(short * max(width, height) / min(width, height) / 16) * 16
+    assert short * long * len(layout.panels) > budget_px
+
+
+@given(st.integers(16, 500), st.integers(16, 500), layouts)
+def test_a_photo_smaller_than_its_panel_is_told_a_budget_that_works(width, height, layout):
+    with pytest.raises(PhotoError, match="lower budget_px to") as refused:
+        fit_panel((width, height), layout, budget_px=10**7, multiple=16)
+    budget_px = int(str(refused.value).rstrip(".").rsplit(maxsplit=1)[1])
+    with contextlib.suppress(PhotoError):  # so thin that no panel of its shape is left below it
+        fit = fit_panel((width, height), layout, budget_px=budget_px, multiple=16)
+        assert max(fit.content) <= max(width, height)
+
+
+def test_a_thread_of_a_photo_is_refused_plainly():
+    with pytest.raises(PhotoError, match=r"no panel with the shape of 9000 x 2 pixels fits"):
+        fit_panel((9000, 2), Layout(), budget_px=30_000, multiple=16)
+
+
+def test_padding_continues_the_picture_by_its_reflection():
+    fit = fit_panel((100, 61), Layout(("T",)), budget_px=48 * 80, multiple=16)
+    assert (fit.content, fit.panel) == ((79, 48), (80, 48))
+    picture = torch.rand(1, 3, 48, 79)
+    assert torch.equal(fit.pad(picture)[..., 79], picture[..., 77])
+
+
+@pytest.mark.parametrize("panels", [(), ("I", "I"), ("I", "B")])
+def test_panels_are_some_of_three_letters_each_once(panels):
+    with pytest.raises(RecipeError, match="some of I, T and R, each once"):
+        Layout(panels)
+
+
+def test_an_unknown_direction_is_refused():
+    with pytest.raises(RecipeError, match="side by side"):
+        Layout(direction="diagonal")
+
+
+def test_panels_that_do_not_belong_together_are_refused():
+    one = torch.zeros(1, 3, 4, 4)
+    with pytest.raises(PhotoError, match="there is no panel R"):
+        compose({"I": one, "T": one}, Layout())
+    with pytest.raises(PhotoError, match="they must be alike"):
+        compose({"T": one, "R": one[..., :2]}, Layout(("T", "R")))
+    with pytest.raises(PhotoError, match="does not divide by 3"):
+        split(one, Layout())
+    with pytest.raises(PhotoError, match="resize it first"):
+        fit_panel((64, 64), Layout(("T",)), budget_px=64 * 64, multiple=16).pad(one)

@@ -1,0 +1,76 @@
+import re
+from pathlib import Path
+
+import pytest
+import torch
+
+from brewster.errors import ModelError
+from brewster.models.large.prompt import PROMPT, PromptEmbedding, load_prompt
+
+PAPER = Path(__file__).parents[2] / "shared" / "paper.tex"
+
+
+@pytest.fixture
+def prompt():
+    torch.manual_seed(0)
+    return PromptEmbedding("kontext", PROMPT, torch.randn(1, 6, 8).bfloat16(), torch.randn(1, 4))
+
+
+@pytest.mark.skipif(not PAPER.is_file(), reason="the paper's source is not here")
+def test_the_prompt_is_the_papers_word_for_word():
+    box = re.search(r"title=PROMPT\]\n(.*?)\\end\{tcolorbox\}", PAPER.read_text(), re.S)[1]
+    assert PROMPT.split() == box.split()
+
+
+def test_the_prompt_names_three_images():
+    assert len(PROMPT.split("; ")) == 5
+    assert {f"[IMAGE{n}]" for n in (1, 2, 3)} == set(re.findall(r"\[IMAGE.\]", PROMPT))
+
+
+def test_a_saved_prompt_comes_back_to_the_bit(prompt, tmp_path):
+    prompt.save(tmp_path / "prompt.safetensors")
+    back = load_prompt(tmp_path / "prompt.safetensors", "kontext")
+    assert (back.text, back.sha256, back.negative) == (PROMPT, prompt.sha256, None)
+    assert torch.equal(back.embeds, prompt.embeds)
+    assert back.embeds.dtype == torch.bfloat16
+    assert torch.equal(back.pooled, prompt.pooled)
+
+
+def test_the_same_prompt_gives_the_same_bytes(prompt, tmp_path):
+    for name in "ab":
+        prompt.save(tmp_path / name)
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
+    header = (tmp_path / "a").read_bytes()[8:].split(b"}")[0]
+    assert header.index(b'"backbone"') < header.index(b'"kind"') < header.index(b'"sha256"')
+
+
+def test_another_text_or_backbone_or_number_is_another_digest(prompt):
+    digests = {
+        prompt.sha256,
+        PromptEmbedding("qwen", PROMPT, prompt.embeds, prompt.pooled).sha256,
+        PromptEmbedding("kontext", "a cat", prompt.embeds, prompt.pooled).sha256,
+        PromptEmbedding("kontext", PROMPT, prompt.embeds + 1, prompt.pooled).sha256,
+        PromptEmbedding("kontext", PROMPT, prompt.embeds).sha256,
+    }
+    assert len(digests) == 5
+
+
+def test_moving_a_prompt_keeps_what_it_says(prompt):
+    moved = prompt.to("cpu", torch.float32)
+    assert moved.embeds.dtype == moved.pooled.dtype == torch.float32
+    assert moved.text == prompt.text
+
+
+def test_a_prompt_of_another_backbone_is_refused(prompt, tmp_path):
+    prompt.save(tmp_path / "p")
+    with pytest.raises(ModelError, match="was encoded for kontext; a prompt for klein"):
+        load_prompt(tmp_path / "p", "klein")
+
+
+def test_a_prompt_that_was_changed_is_refused(prompt, tmp_path):
+    prompt.save(tmp_path / "p")
+    data = bytearray((tmp_path / "p").read_bytes())
+    data[-1] ^= 1
+    (tmp_path / "p").write_bytes(data)
+    with pytest.raises(ModelError, match="does not have the digest that it names"):
+        load_prompt(tmp_path / "p", "kontext")

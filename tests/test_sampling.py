@@ -1,0 +1,178 @@
+"""Our loop against the stock pipelines, on tiny twins of the same classes."""
+
+import pytest
+import torch
+from diffusers.pipelines.qwenimage import pipeline_qwenimage_edit
+from PIL import Image
+
+from brewster.errors import DeviceError, ModelError
+from brewster.models.large.backbones import BACKBONES, tiny
+from brewster.models.large.prompt import PromptEmbedding
+from brewster.models.large.sampling import sample
+
+SIZE = (192, 64)
+STEPS = 4
+
+
+@pytest.fixture(params=list(BACKBONES), scope="module")
+def twin(request):
+    return tiny(request.param, seed=1)
+
+
+def eight_bit_picture(width, height):
+    """In steps of 1/255, so that the pipelines that insist on PIL see the same numbers."""
+    generator = torch.Generator().manual_seed(5)
+    return torch.randint(0, 256, (1, 3, height, width), generator=generator) / 127.5 - 1
+
+
+def as_pil(picture):
+    return Image.fromarray(((picture[0] + 1) * 127.5).round().byte().permute(1, 2, 0).numpy())
+
+
+def stock_picture(twin, condition, monkeypatch, *, guidance=4.0, seed=3):
+    """The stock pipeline's picture in [0, 1], its rescaling switched off, with its own noise for the seed."""
+    backbone, prompt = twin
+    width, height = SIZE
+    options = {"prompt_embeds": prompt.embeds, "height": height, "width": width, "output_type": "pt"}
+    options |= {"num_inference_steps": STEPS, "generator": torch.Generator().manual_seed(seed)}
+    if backbone.name == "kontext":
+        options |= {"image": (condition + 1) / 2, "pooled_prompt_embeds": prompt.pooled}
+        options |= {"max_area": width * height, "_auto_resize": False, "guidance_scale": guidance}
+    elif backbone.name == "klein":
+        options |= {"image": as_pil(condition), "negative_prompt_embeds": prompt.negative}
+        options |= {"guidance_scale": guidance}
+    else:
+        as_it_is = (condition.shape[3], condition.shape[2], None)
+        monkeypatch.setattr(pipeline_qwenimage_edit, "calculate_dimensions", lambda area, ratio: as_it_is)
+        options |= {"image": as_pil(condition), "negative_prompt_embeds": prompt.negative}
+        options |= {"true_cfg_scale": guidance}
+    pipe = backbone.pipeline()
+    pipe.set_progress_bar_config(disable=True)
+    return pipe(**options).images
+
+
+def ours(twin, condition, **options):
+    backbone, prompt = twin
+    return sample(backbone, condition, prompt, **({"size": SIZE, "steps": STEPS, "seeds": [3]} | options))
+
+
+@pytest.mark.parametrize("condition_size", [SIZE, (64, 96)])
+@pytest.mark.parametrize("guidance", [1.0, 4.0])
+def test_our_loop_gives_the_stock_pipelines_picture(twin, monkeypatch, guidance, condition_size):
+    condition = eight_bit_picture(*condition_size)
+    stock = stock_picture(twin, condition, monkeypatch, guidance=guidance)
+    mine = (ours(twin, condition, guidance=guidance) + 1) / 2
+    torch.testing.assert_close(mine, stock, atol=1e-5, rtol=0)
+    assert stock.std() > 0.01
+
+
+def test_the_transformer_is_asked_exactly_what_the_stock_pipeline_asks(twin, monkeypatch):
+    """Tokens and their order, ids, times and guidance, at every step."""
+    asked = []
+    backbone, _ = twin
+    hook = backbone.transformer.register_forward_pre_hook(
+        lambda module, args, kwargs: asked.append(kwargs), with_kwargs=True
+    )
+    condition = eight_bit_picture(64, 96)
+    stock_picture(twin, condition, monkeypatch)
+    ours(twin, condition)
+    hook.remove()
+    half = len(asked) // 2
+    assert half == STEPS * (1 if backbone.guided_by_embedding else 2)
+    names = ("hidden_states", "img_ids", "txt_ids", "timestep", "guidance", "encoder_hidden_states")
+    for theirs, mine in zip(asked[:half], asked[half:], strict=True):
+        for name in names:
+            if theirs.get(name) is not None:
+                same_shape = mine[name].reshape(theirs[name].shape)
+                torch.testing.assert_close(same_shape, theirs[name], atol=2e-5, rtol=0, check_dtype=False)
+        assert mine.get("img_shapes") == theirs.get("img_shapes")
+
+
+def test_everything_that_is_given_matters(twin):
+    backbone, _ = twin
+    condition = eight_bit_picture(*SIZE)
+    usual = ours(twin, condition)
+    others = {
+        "condition": ours(twin, -condition),
+        "guidance": ours(twin, condition, guidance=2.0),
+        "seed": ours(twin, condition, seeds=[4]),
+        "prompt": ours((backbone, backbone.random_prompt(backbone.transformer, 9)), condition),
+    }
+    assert not [name for name, other in others.items() if (other - usual).abs().max() < 1e-4]
+
+
+def test_a_seed_means_the_same_alone_and_in_a_batch(twin):
+    condition = eight_bit_picture(*SIZE)
+    alone = ours(twin, condition, seeds=[3, 4, 5])
+    together = ours(twin, condition, seeds=[3, 4, 5], batch=2)
+    torch.testing.assert_close(alone, together, atol=5e-5, rtol=0)
+    assert torch.equal(ours(twin, condition, seeds=[4]), alone[1:2])
+    assert (alone[0] - alone[1]).abs().max() > 0.01
+
+
+def test_the_schedule_counts_generated_tokens_and_ends_at_the_picture(twin):
+    backbone, _ = twin
+    few, many = backbone.schedule(256, 20), backbone.schedule(3072, 20)
+    assert len(few) == 21
+    assert (few[0], few[-1]) == (1, 0)
+    assert (few.diff() < 0).all()
+    assert (many[1:-2] > few[1:-2]).all()  # larger pictures stay longer in the noise
+
+
+def test_training_times_are_moved_as_the_schedule_moves_them(twin):
+    backbone, _ = twin
+    moved = backbone.shifted(torch.linspace(1, 1 / 8, 8), 3072, steps=8)
+    if backbone.scheduler.config.shift_terminal:  # the sampler stretches its end afterwards
+        kept = (1 - moved[-1]) / (1 - backbone.scheduler.config.shift_terminal)
+        moved = 1 - (1 - moved) / kept
+    torch.testing.assert_close(moved, backbone.schedule(3072, 8)[:-1], atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+def test_few_steps_are_allowed_and_every_step_is_told(twin, steps):
+    told = []
+    ours(twin, eight_bit_picture(*SIZE), steps=steps, seeds=[1, 2], tell=lambda *step: told.append(step))
+    assert told == [(done, 2 * steps) for done in range(1, 2 * steps + 1)]
+
+
+def test_guidance_without_an_empty_prompt_says_what_to_do(twin):
+    backbone, prompt = twin
+    if backbone.guided_by_embedding:
+        pytest.skip("guidance is distilled into this one")
+    bare = PromptEmbedding(prompt.backbone, prompt.text, prompt.embeds)
+    with pytest.raises(ModelError, match=r"no empty counterpart.*set the guidance to 1"):
+        ours((backbone, bare), eight_bit_picture(*SIZE))
+    assert ours((backbone, bare), eight_bit_picture(*SIZE), guidance=1.0).isfinite().all()
+
+
+def test_a_picture_off_the_grid_is_refused(twin):
+    with pytest.raises(ModelError, match="has 100 x 64 pixels; sides that are multiples of 16"):
+        ours(twin, torch.zeros(1, 3, 64, 100))
+    with pytest.raises(ModelError, match="has 100 x 64 pixels"):
+        ours(twin, torch.zeros(1, 3, 64, 64), size=(100, 64))
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB.\nmore"),
+        RuntimeError("[enforce fail at alloc_cpu.cpp:114] DefaultCPUAllocator: can't allocate memory"),
+        MemoryError(),
+    ],
+)
+def test_running_out_of_memory_says_what_to_lower(twin, monkeypatch, error):
+    def full(*_, **__):
+        raise error
+
+    monkeypatch.setattr(twin[0], "predict", full)
+    with pytest.raises(DeviceError, match="lower budget_px"):
+        ours(twin, eight_bit_picture(*SIZE))
+
+
+def test_other_errors_are_not_taken_for_memory(twin, monkeypatch):
+    def broken(*_, **__):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(twin[0], "predict", broken)
+    with pytest.raises(RuntimeError, match="a bug"):
+        ours(twin, eight_bit_picture(*SIZE))
