@@ -5,11 +5,12 @@ import pytest
 
 from brewster.dataset.mix import MixRecipe
 from brewster.errors import RecipeError
-from brewster.train.recipe import read_recipe, with_value
+from brewster.train.recipe import CompactRecipe, LargeRecipe, read_recipe, with_value
 
 FOLDER = Path(__file__).parents[1] / "recipes"
 RECIPES = sorted(FOLDER.glob("train/*.toml"))
 TINY = FOLDER / "train/tiny.toml"
+KONTEXT = TINY.with_stem("kontext")
 BASES = [FOLDER / "ablations/base.toml", FOLDER / "ablations/tiny.toml"]
 STUDIES = [path for path in sorted(FOLDER.glob("ablations/*.toml")) if path not in BASES]
 
@@ -148,5 +149,66 @@ def test_a_wrong_recipe_is_refused_by_the_name_of_what_is_wrong(tmp_path, change
     text = TINY.read_text()
     assert change[0] in text
     (tmp_path / "wrong.toml").write_bytes(text.replace(*change).encode("latin-1"))
+    with pytest.raises(RecipeError, match=f"wrong.toml .*{complaint}.*; .*"):
+        read_recipe(tmp_path / "wrong.toml")
+
+
+def test_a_recipe_that_names_a_backbone_is_a_large_ones():
+    large = {path.stem for path in RECIPES if isinstance(read_recipe(path), LargeRecipe)}
+    assert large == {"kontext", "klein", "qwen", "large-tiny"}
+    assert isinstance(read_recipe(TINY), CompactRecipe)
+
+
+def test_the_kontext_recipe_is_the_papers():
+    recipe = read_recipe(KONTEXT)
+    assert (recipe.backbone, recipe.rank, recipe.steps, recipe.batch) == ("kontext", 16, 4000, 1)
+    assert recipe.layout.panels == ("I", "T", "R")
+    assert recipe.layout.composite_size((512, 512))[0] * 512 == recipe.budget_px
+    assert recipe.data.rendered.target == "transmission"
+
+
+def test_a_value_of_a_large_recipe_can_be_changed_too():
+    before = read_recipe(KONTEXT)
+    after = with_value(before, "panels", ["T", "R"])
+    assert after.panels == ("T", "R")
+    assert with_value(after, "panels", ["I", "T", "R"]) == before
+    with pytest.raises(RecipeError, match=r"no rnk; .*; did you mean rank"):
+        with_value(before, "rnk", 8)
+
+
+def test_a_prompt_lies_beside_its_recipe(tmp_path):
+    text = KONTEXT.read_text().replace("rank = 16", 'rank = 16\nprompt = "mine.safetensors"')
+    (tmp_path / "large.toml").write_text(text)
+    assert read_recipe(tmp_path / "large.toml").prompt == tmp_path / "mine.safetensors"
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (("rank = 16", "rank = 0"), "value for rank"),
+        (("rank = 16", "rnk = 16"), "value for rnk"),
+        (("rank = 16", "sizes = [[0.0, 64]]"), "value for sizes"),
+        (('"int8"', '"int3"'), "value for quantise"),
+        (('"kontext"', '"tiny:kontext"'), "contradicts itself; a toy twin is never quantised"),
+        (('["I", "T", "R"]', '["I", "T", "Q"]'), r"panels\.2"),
+        (('["I", "T", "R"]', '["I", "R"]'), "itself; the panels are .*T among them"),
+        (('["I", "T", "R"]', '["T", "T"]'), "itself; the panels are .*each once"),
+        (("rank = 16", "panel_weights = { X = 1 }"), "panel_weights"),
+        (("rank = 16", "panel_weights = { I = 0, T = 0, R = 0 }"), "itself; panel_weights leaves nothing"),
+        (
+            ('sets = ["sets/window"]', 'recipe = "window"'),
+            "itself; a large backbone learns from rendered sets",
+        ),
+        (
+            ("[data.rendered]", 'photos = ["p"]\n[data.rendered]\nshare = 0.5'),
+            "itself; a large backbone learns from rendered sets",
+        ),
+        (('objective = "flow"', 'objective = "two_step"'), "value for objective"),
+    ],
+)
+def test_a_wrong_large_recipe_is_refused_by_the_name_of_what_is_wrong(tmp_path, change, complaint):
+    text = KONTEXT.read_text()
+    assert change[0] in text
+    (tmp_path / "wrong.toml").write_text(text.replace(*change, 1))
     with pytest.raises(RecipeError, match=f"wrong.toml .*{complaint}.*; .*"):
         read_recipe(tmp_path / "wrong.toml")

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from brewster.cli.doctor import require_extra
 from brewster.cli.terminal import interrupts, progress, say
-from brewster.errors import TargetError
+from brewster.errors import RecipeError, TargetError
+
+if TYPE_CHECKING:
+    from brewster.train.recipe import CompactRecipe, LargeRecipe
 
 
 @click.command
@@ -20,23 +24,39 @@ from brewster.errors import TargetError
     "out",
     metavar="FOLDER",
     type=click.Path(path_type=Path),
-    help="The folder of the run: its checkpoint, log, samples and, at the end, model.onnx. By default out/NAME for NAME.toml.",
+    help="The folder of the run: its checkpoint, log, samples and, at the end, model.onnx or the folder lora. By default out/NAME for NAME.toml.",
+)
+@click.option(
+    "--plan",
+    is_flag=True,
+    help="Estimate memory and time of a large backbone's recipe, say whether they fit, and train nothing.",
+)
+@click.option(
+    "--card", metavar="NAME", help="With --plan: for this graphics card, such as RTX 4090, not the one here."
 )
 @click.option("--quiet", is_flag=True, help="Say nothing but errors.")
-def train(*, recipe: Path, out: Path | None, quiet: bool) -> None:
+def train(*, recipe: Path, out: Path | None, plan: bool, card: str | None, quiet: bool) -> None:
     """Train a model as RECIPE, a TOML file, says.
 
     The folder BREWSTER_DATA holds the data. A run that was stopped goes on from its last checkpoint when the same
-    command is given again, and ends with the same weights.
+    command is given again, and ends with the same weights. Under torchrun several GPUs learn a large backbone together.
     """
     require_extra("train", "training")
-    from brewster.train.recipe import read_recipe  # noqa: PLC0415  (wakes torch, in two seconds)
+    from brewster.train.recipe import LargeRecipe, read_recipe  # noqa: PLC0415  (wakes torch, in two seconds)
 
     read, out = read_recipe(recipe), out or Path("out") / recipe.stem
+    if isinstance(read, LargeRecipe):
+        require_extra("large", "a large backbone")
+    if plan or card:
+        _print_plan(read, card)
+        return
     _make(out)
-    from brewster.train.export import export_onnx  # noqa: PLC0415
-    from brewster.train.loop import train as run  # noqa: PLC0415
+    from brewster.train.crew import leads  # noqa: PLC0415
+    from brewster.train.learners import open_learner  # noqa: PLC0415
+    from brewster.train.loop import run  # noqa: PLC0415
 
+    learner = open_learner(read)
+    quiet = quiet or not leads()
     with progress(read.steps, shown=not quiet) as advance:
 
         def report(step: int, steps: int, numbers: Mapping[str, float], logged: bool) -> None:
@@ -46,11 +66,24 @@ def train(*, recipe: Path, out: Path | None, quiet: bool) -> None:
                 told = ", ".join(f"{name} {value:.4g}" for name, value in numbers.items())
                 say(f"step {step} of {steps}: {told}")
 
-        network = run(read, out, report)
-    model = out / "model.onnx"
-    export_onnx(network, model)
-    if not quiet:
-        say(f"the model is {model}")
+        run(learner, out, report)
+    if leads():
+        model = learner.export(out)
+        if not quiet:
+            say(f"the model is {model}")
+
+
+def _print_plan(recipe: CompactRecipe | LargeRecipe, card: str | None) -> None:
+    from brewster.train.plan import find_card, plan_for  # noqa: PLC0415
+    from brewster.train.recipe import LargeRecipe  # noqa: PLC0415
+
+    if not isinstance(recipe, LargeRecipe):
+        raise RecipeError(
+            "the recipe trains the compact network", "a large backbone's recipe", "train it without --plan"
+        )
+    estimate = plan_for(recipe, find_card(card))
+    click.echo(estimate.table())
+    estimate.refuse_misfit()
 
 
 def _make(folder: Path) -> None:

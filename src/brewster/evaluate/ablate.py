@@ -16,15 +16,16 @@ from typing import Annotated, Any, Final, final
 from pydantic import AfterValidator, Field
 
 from brewster.dataset.benchmarks import Benchmark, read_benchmark
+from brewster.errors import RecipeError
 from brewster.evaluate.evaluation import evaluate
 from brewster.evaluate.methods import Model, Nothing
 from brewster.evaluate.protocol import Protocol
 from brewster.evaluate.results import AVERAGE, Results
 from brewster.files import write_atomically
 from brewster.scene.values import Values, read_toml
+from brewster.train.compact_learner import train
 from brewster.train.export import export_onnx
-from brewster.train.loop import train
-from brewster.train.recipe import data_folder, read_recipe, with_value
+from brewster.train.recipe import CompactRecipe, data_folder, read_recipe, with_value
 
 Choice = str | int | float | bool
 Report = Callable[[str, int, int, Mapping[str, float], bool], None]
@@ -102,7 +103,7 @@ def ablate(
         RecipeError: the base recipe or the value is wrong, or data is missing.
         BrewsterError: what training and `evaluate` raise.
     """
-    base = read_recipe(study.base)
+    base = _compact(study.base)
     recipes = {study.label(choice): with_value(base, study.value, choice) for choice in study.choices}
     models = []
     for label, recipe in recipes.items():
@@ -120,6 +121,17 @@ def ablate(
     if len(numbers) == len(study.choices):
         write_atomically(out / PLOT, _plot(study, numbers, results), overwrite=True)
     return results
+
+
+def _compact(path: Path) -> CompactRecipe:
+    recipe = read_recipe(path)
+    if isinstance(recipe, CompactRecipe):
+        return recipe
+    raise RecipeError(
+        f"{path} trains a large backbone",
+        "a study trains compact networks",
+        "name another recipe with --base",
+    )
 
 
 def _plot(study: Study, numbers: Sequence[float], results: Results) -> bytes:

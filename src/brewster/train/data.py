@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from brewster.dataset.kept import InMemory, OnDisk
 from brewster.dataset.live import Rendered
@@ -18,12 +19,12 @@ from brewster.dataset.mix import Batch, Blend, Mixtures, Pairs, Stream
 from brewster.dataset.sources import read_maps, read_pairs, read_photos
 from brewster.errors import RecipeError
 from brewster.scene.recipe import SceneRecipe, read_scene_recipe
-from brewster.train.recipe import RenderedRecipe, TrainRecipe, data_folder
+from brewster.train.recipe import CompactRecipe, DataRecipe, RenderedRecipe, data_folder
 from brewster.worlds.assets import Assets
 from brewster.worlds.catalog import read_catalog
 
 
-def open_stream(recipe: TrainRecipe, device: torch.device | str = "cpu") -> Stream:
+def open_stream(recipe: CompactRecipe, device: torch.device | str = "cpu") -> Stream:
     """The recipe's training data: photos, maps and pairs in memory; what is rendered live is so on the device.
 
     Raises:
@@ -35,7 +36,28 @@ def open_stream(recipe: TrainRecipe, device: torch.device | str = "cpu") -> Stre
     )
 
 
-def _open_others(recipe: TrainRecipe, device: torch.device | str) -> Stream:
+def validation_pairs(data: DataRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]:
+    """Aligned (photo, transmission) pairs, uint8 sRGB (H, W, 3), by names that tell their folders apart.
+
+    Raises:
+        RecipeError: a folder is missing or empty, or pairs do not fit together.
+        PhotoError: a picture cannot be read.
+    """
+    folders = tuple(dict.fromkeys(data.validate_on))
+    root = data_folder() if folders else Path()
+    return {name: read_pairs([root / folder]) for name, folder in zip(_short(folders), folders, strict=True)}
+
+
+def _short(folders: Sequence[Path]) -> list[str]:
+    """Names for different folders: as much of the end of their paths as tells them apart."""
+    for length in range(1, max((len(folder.parts) for folder in folders), default=0)):
+        names = ["/".join(folder.parts[-length:]) for folder in folders]
+        if len(set(names)) == len(names):
+            return names
+    return list(map(str, folders))
+
+
+def _open_others(recipe: CompactRecipe, device: torch.device | str) -> Stream:
     return _shared(
         recipe.data.rendered_share, partial(_open_rendered, recipe, device), partial(_open_mixtures, recipe)
     )
@@ -48,24 +70,24 @@ def _shared(share: float, first: Callable[[], Stream], second: Callable[[], Stre
     return Blend(first(), second(), share)
 
 
-def _open_mixtures(recipe: TrainRecipe) -> Stream:
+def _open_mixtures(recipe: CompactRecipe) -> Stream:
     data = recipe.data
     if data.is_none:
         return _refuse
-    photos = read_photos(_folders(data.photos), data.exclude)
-    return Mixtures(photos, read_maps(_folders(data.maps), data.exclude), recipe.mix, seed=recipe.seed)
+    photos = read_photos(found(data.photos), data.exclude)
+    return Mixtures(photos, read_maps(found(data.maps), data.exclude), recipe.mix, seed=recipe.seed)
 
 
-def _open_pairs(recipe: TrainRecipe) -> Stream:
-    return Pairs(read_pairs(_folders(recipe.data.pairs)), recipe.mix.crop, seed=recipe.seed + 1)
+def _open_pairs(recipe: CompactRecipe) -> Stream:
+    return Pairs(read_pairs(found(recipe.data.pairs)), recipe.mix.crop, seed=recipe.seed + 1)
 
 
-def _open_rendered(recipe: TrainRecipe, device: torch.device | str) -> Stream:
+def _open_rendered(recipe: CompactRecipe, device: torch.device | str) -> Stream:
     wanted, choices = recipe.data.rendered, recipe.seed + 2
     assert wanted
     if wanted.sets:
         return OnDisk(
-            _folders(wanted.sets),
+            found(wanted.sets),
             seed=choices,
             count=wanted.count,
             crop=recipe.mix.crop,
@@ -76,8 +98,8 @@ def _open_rendered(recipe: TrainRecipe, device: torch.device | str) -> Stream:
     return live if wanted.count is None else InMemory(live, wanted.count, seed=choices)
 
 
-def _open_live(recipe: TrainRecipe, wanted: RenderedRecipe, device: torch.device | str) -> Rendered:
-    maps, photos = _folders(wanted.maps), _folders(wanted.photos)
+def _open_live(recipe: CompactRecipe, wanted: RenderedRecipe, device: torch.device | str) -> Rendered:
+    maps, photos = found(wanted.maps), found(wanted.photos)
     catalog, refused = read_catalog(maps, photos, recipe.data.exclude)
     if refused:  # a run of hours has nobody to tell that it learns from less than was asked
         raise refused[0]
@@ -105,6 +127,10 @@ def _refuse(step: int, count: int, size: int) -> Batch:  # noqa: ARG001  (a Stre
     )
 
 
-def _folders(named: Sequence[Path]) -> list[Path]:
-    """Where they lie; BREWSTER_DATA is not asked for where no path starts from it."""
+def found(named: Sequence[Path]) -> list[Path]:
+    """Where a recipe's folders lie; BREWSTER_DATA is not asked for where no path starts from it.
+
+    Raises:
+        RecipeError: it is asked for and names no folder.
+    """
     return [folder if folder.is_absolute() else data_folder() / folder for folder in named]

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
+from typing import TYPE_CHECKING, Final
 
 from torch import Tensor
 from torch.nn import functional
 
 from brewster.dataset.mix import Batch
+from brewster.errors import ModelError
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
+_ROUNDING: Final = 1 / (12 * 255**2)
+"""The mean squared error of rounding to 8 bits; pictures that differ by less are the same, at 58.9 dB."""
 _SCALES = (1, 4, 16)
 _GOOD_ENOUGH = 1e-3
 """Mean squared error, 30 dB, past which a picture no longer pulls."""
@@ -42,4 +46,26 @@ def separation_loss(layers: Float[Tensor, "n 6 h w"], batch: Batch) -> dict[str,
 def _at_all_scales(error: Tensor) -> Float[Tensor, " n"]:
     return sum(  # type: ignore[return-value]
         functional.avg_pool2d(error, scale).abs().mean(dim=(1, 2, 3)) for scale in _SCALES
+    )
+
+
+def gain_db(answer: Tensor, photo: Tensor, truth: Tensor) -> float:
+    """How much nearer to the truth the answer is than the photo, in dB of PSNR; encoded pictures in 0..1."""
+    errors = [functional.mse_loss(picture, truth).item() for picture in (photo, answer)]
+    before, after = (max(error, _ROUNDING) for error in errors)
+    return 10 * math.log10(before / after)
+
+
+def finite(value: Tensor, step: int, name: str = "loss") -> Tensor:
+    """The loss, or what is named, if it is a number.
+
+    Raises:
+        ModelError: it is not; the last checkpoint is still good.
+    """
+    if value.isfinite():
+        return value
+    raise ModelError(
+        f"the {name} is {value.item()} at step {step}",
+        f"a finite {name}",
+        "resume from the last checkpoint with a lower learning rate",
     )

@@ -6,10 +6,12 @@ Paths in a recipe are relative to the folder that `BREWSTER_DATA` names.
 from __future__ import annotations
 
 import os
+import tomllib
 from collections.abc import Iterator
+from contextlib import suppress
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
@@ -17,9 +19,14 @@ from brewster.dataset.live import Mixing, Target
 from brewster.dataset.mix import MixRecipe
 from brewster.errors import RecipeError
 from brewster.models.compact import STRIDE
-from brewster.scene.values import Above0, Positive, Seed, Share, Values, read_toml, wrong_value
+from brewster.models.large.backbones import Quantisation
+from brewster.models.large.panels import Direction, Layout, Panel
+from brewster.scene.values import Above0, From0, Positive, Seed, Share, Values, read_toml, wrong_value
 
 _COMPARE = "the recipes in recipes/train/"
+
+TINY: Final = "tiny:"
+"""What a backbone's toy twin is called, before the backbone's name."""
 
 Side = Annotated[int, Field(gt=0, multiple_of=STRIDE)]
 
@@ -112,23 +119,28 @@ class DataRecipe(Values):
         return self
 
 
-class TrainRecipe(Values):
-    """One run. `sizes` lists (share of the run, side in px): small pictures first, large ones last."""
+class Recipe(Values):
+    """One run, whatever learns in it."""
 
     seed: Seed
     steps: Positive
     batch: Positive
-    sizes: Sizes
     learning_rate: Above0
-    encoder_learning_rate: Above0
     warmup_steps: Positive
-    weight_decay: Annotated[float, Field(ge=0)]
-    average_decay: Share
-    start_from: Path | None = None
-    """A checkpoint whose averaged weights this run starts from, relative to the recipe."""
+    weight_decay: From0
     report_every: Positive
     checkpoint_every: Positive
     data: DataRecipe
+
+
+class CompactRecipe(Recipe):
+    """A run of the compact network. `sizes` lists (share of the run, side in px): small pictures first."""
+
+    sizes: Sizes
+    encoder_learning_rate: Above0
+    average_decay: Share
+    start_from: Path | None = None
+    """A checkpoint whose averaged weights this run starts from, relative to the recipe."""
     mix: MixRecipe = MixRecipe()
 
     @model_validator(mode="after")
@@ -142,6 +154,62 @@ class TrainRecipe(Values):
         return [size for start, size in self.sizes if step >= start * self.steps][-1]
 
 
+class LargeRecipe(Recipe):
+    """A run of a LoRA on a large backbone; the defaults are the paper's, or the usual ones where it is silent.
+
+    Each sample of a batch is a real pair with the chance `data.pairs_share`, else a rendered one, whole and in its
+    own aspect ratio: neither mixtures nor live scenes, which are square.
+    """
+
+    backbone: str
+    """A name in the table, a hub id, a folder, or "tiny:" and a name: that backbone's toy twin, random weights."""
+    rank: Positive = 16
+    alpha: Positive = 16
+    quantise: Quantisation | None = None
+    panels: tuple[Panel, ...] = ("I", "T", "R")
+    direction: Direction = "side by side"
+    budget_px: Positive = 1536 * 512
+    """The most pixels that all panels have together."""
+    panel_weights: dict[Panel, From0] = Field(default_factory=dict)
+    """How much each panel counts in the loss, 1 if not named."""
+    objective: Literal["flow", "one_step"] = "flow"
+    """From noise to panels in many steps, or from the photo, in every panel, to what it lacks in one."""
+    guidance: From0 = 1.0
+    """While learning; 1 is none where it takes a second prediction."""
+    logit_mean: float = 0.0
+    logit_deviation: Above0 = 1.0
+    """Of the times that it learns at, logit-normal (Esser et al. 2024), before the shift for the resolution."""
+    flip: bool = True
+    """Whether every sample is also seen mirrored."""
+    reflections: Literal["given", "difference"] = "given"
+    """Pairs without a reflection are refused where R is a panel, or R is what photo - transmission leaves in light."""
+    prompt: Path | None = None
+    """An encoded prompt, relative to the recipe; else the backbone's own text encoder encodes the paper's."""
+
+    @property
+    def layout(self) -> Layout:
+        """How the panels stand."""
+        return Layout(self.panels, self.direction)
+
+    @model_validator(mode="after")
+    def _can_be_learnt(self) -> Self:
+        rendered = self.data.rendered
+        if self.data.photos or self.data.maps or (rendered and rendered.recipe):
+            raise ValueError(
+                "a large backbone learns from rendered sets and pairs; photos, maps and live scenes give squares"
+            )
+        if "T" not in self.panels or len(set(self.panels)) < len(self.panels):
+            raise ValueError(f"the panels are {list(self.panels)}: each once, and T among them")
+        if self.quantise and self.backbone.startswith(TINY):
+            raise ValueError("a toy twin is never quantised")
+        if not any(self.panel_weights.get(panel, 1) for panel in self.panels):
+            raise ValueError("panel_weights leaves nothing to learn: every panel counts 0")
+        return self
+
+
+AnyRecipe = TypeVar("AnyRecipe", bound=Recipe)
+
+
 def _divide(samples: int, name: str, share: float) -> int:
     """The share's number of samples; a share between 0 and 1 must leave some on both sides."""
     part = round(samples * share)
@@ -150,16 +218,18 @@ def _divide(samples: int, name: str, share: float) -> int:
     return part
 
 
-def read_recipe(path: Path) -> TrainRecipe:
-    """Reads and checks a recipe.
+def read_recipe(path: Path) -> CompactRecipe | LargeRecipe:
+    """Reads and checks a recipe; one that names a backbone is a large one's.
 
     Raises:
         RecipeError: missing, not TOML, or with values that are missing, unknown or impossible.
     """
-    recipe = read_toml(TrainRecipe, path, compare=_COMPARE)
-    changes: dict[str, Any] = {}
-    if recipe.start_from:
-        changes["start_from"] = path.parent / recipe.start_from
+    recipe = read_toml(_kind(path), path, compare=_COMPARE)
+    changes: dict[str, Any] = {
+        name: path.parent / getattr(recipe, name)
+        for name in ("start_from", "prompt")
+        if getattr(recipe, name, None)
+    }
     rendered = recipe.data.rendered
     if rendered and rendered.recipe and rendered.recipe.endswith(".toml"):
         found = rendered.model_copy(update={"recipe": str(path.parent.resolve() / rendered.recipe)})
@@ -167,7 +237,14 @@ def read_recipe(path: Path) -> TrainRecipe:
     return recipe.model_copy(update=changes)
 
 
-def with_value(recipe: TrainRecipe, dotted: str, value: object) -> TrainRecipe:
+def _kind(path: Path) -> type[CompactRecipe] | type[LargeRecipe]:
+    with suppress(OSError, ValueError):  # which read_toml tells
+        if "backbone" in tomllib.loads(path.read_text("utf-8")):
+            return LargeRecipe
+    return CompactRecipe
+
+
+def with_value(recipe: AnyRecipe, dotted: str, value: object) -> AnyRecipe:
     """The recipe with one value changed, named as in `data.rendered.mixing`, and checked again as a whole.
 
     Raises:
@@ -187,7 +264,7 @@ def with_value(recipe: TrainRecipe, dotted: str, value: object) -> TrainRecipe:
         place = place.setdefault(name, {})
     place[last] = value
     try:
-        return TrainRecipe.model_validate(table)
+        return type(recipe).model_validate(table)
     except ValidationError as error:
         raise wrong_value(f"the recipe with {dotted} = {value!r}", error, _COMPARE) from error
 

@@ -1,0 +1,210 @@
+"""The compact network as a learner: its losses, optimiser and running average, on the GPU where there is one.
+
+network = train(read_recipe(Path("recipes/train/compact.toml")), Path("out/compact"), report)
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from brewster.dataset.mix import Batch, Stream
+from brewster.models.compact import STRIDE, CompactNetwork, with_imagenet_features
+from brewster.train.checkpoint import Checkpoint, fitting
+from brewster.train.crew import best_device
+from brewster.train.data import open_stream, validation_pairs
+from brewster.train.export import export_onnx
+from brewster.train.loop import Report, run
+from brewster.train.losses import finite, gain_db, separation_loss
+from brewster.train.recipe import CompactRecipe
+
+Pairs = Mapping[str, list[tuple[Tensor, Tensor]]]
+"""Encoded (photo, truth), float (1, 3, h, w) each, by the name of their folder."""
+
+MODEL: Final = "model.onnx"
+_VALIDATION_SIDE_PX: Final = 384
+_MAX_GRADIENT_NORM: Final = 1.0
+_TRAIN_IT_FIRST: Final = "train the recipe that makes it first, or mend start_from in this one"
+
+
+def train(recipe: CompactRecipe, out: Path, report: Report) -> CompactNetwork:
+    """Runs or resumes the recipe in folder `out`, as `loop.run` does; the network that users get.
+
+    Raises:
+        RecipeError: data missing, or `out` holds a run of another recipe.
+        PhotoError: a picture cannot be read.
+        ModelError, TargetError: as `loop.run`.
+    """
+    learner = CompactLearner(recipe)
+    run(learner, out, report)
+    return learner.averaged_network()
+
+
+class CompactLearner:
+    """A `Learner`: the network, the running average of its weights, and AdamW.
+
+    `stream` stands in for the recipe's data.
+
+    Raises:
+        RecipeError, PhotoError: the data are missing or damaged.
+    """
+
+    def __init__(self, recipe: CompactRecipe, stream: Stream | None = None) -> None:
+        self.recipe, self.device = recipe, best_device()
+        self.stream = stream or open_stream(recipe, self.device)
+        self._pairs = _fitted(validation_pairs(recipe.data))
+        self._workers = 1 if self.device.type == "cpu" else os.cpu_count() or 1
+        self._pool = ThreadPoolExecutor(self._workers)
+        self._ahead: dict[int, Future[Batch]] = {}
+        torch.manual_seed(recipe.seed)
+        network = with_imagenet_features()
+        self.network = network.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._begin_average()
+        encoder = list(self.network.encoder.parameters())
+        known = set(map(id, encoder))
+        rest = [parameter for parameter in self.network.parameters() if id(parameter) not in known]
+        self.optimizer = torch.optim.AdamW(
+            [
+                {"params": encoder, "peak": recipe.encoder_learning_rate},
+                {"params": rest, "peak": recipe.learning_rate},
+            ],
+            weight_decay=recipe.weight_decay,
+        )
+
+    def begin(self) -> None:
+        """Begins with the averaged weights of another run, if the recipe names one.
+
+        Raises:
+            ModelError: its checkpoint is missing, damaged or of another network.
+        """
+        path = self.recipe.start_from
+        if path:
+            average = Checkpoint.read(path, _TRAIN_IT_FIRST).state.get("average", {})
+            with fitting(path, _TRAIN_IT_FIRST):
+                self.network.load_state_dict(average)
+            self._begin_average()
+
+    def state(self) -> dict[str, Any]:
+        """Weights, their average, and the optimiser's moments."""
+        return {
+            "network": self.network.state_dict(),
+            "average": self.average,
+            "optimizer": self.optimizer.state_dict(),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Goes on from such a state."""
+        self.network.load_state_dict(state["network"])
+        self.average = {name: value.to(self.device) for name, value in state["average"].items()}
+        self.optimizer.load_state_dict(state["optimizer"])
+
+    def advance(self, step: int) -> dict[str, float]:
+        """One step of AdamW on one batch; returns the parts of the loss.
+
+        Raises:
+            ModelError: the loss is not a number; the last checkpoint is still good.
+        """
+        batch = self._batch(step).to(self.device)
+        parts = separation_loss(self.network(_channels_last(batch.photo_encoded)), batch)
+        loss = finite(torch.stack(list(parts.values())).sum(), step)
+        self._set_learning_rates(step)
+        self.optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
+        self.optimizer.step()
+        self._update_average(step + 1)
+        return {"loss": loss.item(), **{name: part.item() for name, part in parts.items()}}
+
+    def validate(self) -> tuple[dict[str, float], Tensor]:
+        """What the averaged network gains on the recipe's pairs, and what it makes of four of each folder."""
+        network = self.averaged_network()
+        return validate(network, self._pairs), _sheet(network, self._pairs or self._some())
+
+    def export(self, folder: Path) -> Path:
+        """Writes model.onnx, which needs no torch.
+
+        Raises:
+            TargetError: it cannot be written.
+        """
+        export_onnx(self.averaged_network(), folder / MODEL)
+        return folder / MODEL
+
+    def averaged_network(self) -> CompactNetwork:
+        """The network with the running average of its weights, ready to be used."""
+        network = CompactNetwork().eval()
+        network.load_state_dict(self.average)
+        return network
+
+    def _begin_average(self) -> None:
+        self.average = {name: value.clone() for name, value in self.network.state_dict().items()}
+
+    def _batch(self, wanted: int) -> Batch:
+        """The batch of this step; those of the next steps are made in the background meanwhile."""
+        for step in range(wanted, wanted + 1 + self._workers):
+            if step not in self._ahead:
+                size = self.recipe.size_at(step)
+                self._ahead[step] = self._pool.submit(self.stream, step, self.recipe.batch, size)
+        return self._ahead.pop(wanted).result()
+
+    def _set_learning_rates(self, step: int) -> None:
+        warm = min(1.0, (step + 1) / self.recipe.warmup_steps)
+        cosine = 0.5 + 0.5 * math.cos(math.pi * step / self.recipe.steps)
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["peak"] * warm * cosine
+
+    @torch.no_grad()
+    def _update_average(self, steps: int) -> None:
+        decay = min(self.recipe.average_decay, (steps + 1) / (steps + 10))
+        for name, value in self.network.state_dict().items():
+            self.average[name].lerp_(value, 1 - decay)
+
+    def _some(self) -> Pairs:
+        batch = self.stream(0, self.recipe.batch, self.recipe.size_at(0)).to(torch.device("cpu"))
+        pairs = zip(batch.photo_encoded[:, None], batch.transmission_encoded[:, None], strict=True)
+        return {"training": list(pairs)}
+
+
+@torch.no_grad()
+def validate(network: Callable[[Tensor], Tensor], pairs: Pairs) -> dict[str, float]:
+    """Mean PSNR gain in dB over doing nothing, per folder, at the (small) size of the given pairs."""
+    gains = {}
+    for name, folder in pairs.items():
+        scores = [gain_db(network(photo)[:, :3].clamp(0, 1), photo, truth) for photo, truth in folder]
+        gains[f"gain_db_{name}"] = sum(scores) / len(scores)
+    return gains
+
+
+@torch.no_grad()
+def _sheet(network: CompactNetwork, pairs: Pairs) -> Tensor:
+    """Rows of photo, truth, transmission and reflection, four of each folder: (H, 960, 3)."""
+    rows = []
+    for photo, truth in (pair for folder in pairs.values() for pair in folder[:4]):
+        layers = network(photo)
+        row = torch.cat([photo, truth, layers[:, :3], layers[:, 3:]], dim=3)
+        rows.append(functional.interpolate(row, (160, 960), mode="bilinear", antialias=True)[0])
+    return torch.cat(rows, dim=1).permute(1, 2, 0)
+
+
+def _fitted(folders: Pairs) -> Pairs:
+    return {name: [(_fit(photo), _fit(truth)) for photo, truth in pairs] for name, pairs in folders.items()}
+
+
+def _fit(picture: Tensor) -> Tensor:
+    """uint8 (H, W, 3) to float (1, 3, h, w) that the network takes, longest side 384 px."""
+    height, width, _ = picture.shape
+    scale = _VALIDATION_SIDE_PX / max(height, width)
+    size = [max(1, round(side * scale / STRIDE)) * STRIDE for side in (height, width)]
+    planes = picture.permute(2, 0, 1)[None] / 255
+    return functional.interpolate(planes, size, mode="bilinear", antialias=True)
+
+
+def _channels_last(pictures: Tensor) -> Tensor:
+    return pictures.contiguous(memory_format=torch.channels_last)

@@ -1,0 +1,220 @@
+"""Samples as a large backbone sees them: whole, in their own aspect ratio, composed of panels, and encoded once.
+
+    samples = open_samples(recipe)
+    encoded = Latents(samples, backbone, recipe)(Dice(seed, step, slot))
+
+Latents are a function of sample and mirroring alone, as size, panels and VAE stay the same in a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from brewster.dataset.kept import OnDisk
+from brewster.dataset.layouts import Trio, read_folders
+from brewster.dataset.mix import Dice, Pairs
+from brewster.dataset.sources import read_pairs
+from brewster.errors import RecipeError
+from brewster.light import to_encoded, to_linear
+from brewster.models.large.family import Backbone
+from brewster.models.large.panels import Fit, compose, condition, fit_panel
+from brewster.photo import Photo
+from brewster.train.data import found
+from brewster.train.recipe import LargeRecipe
+
+if TYPE_CHECKING:
+    from jaxtyping import Float, UInt8
+
+KEPT: Final = 2048
+"""How many samples' latents stay in memory: 3 GiB at the paper's size (a thousand sets, also mirrored). Beyond, those
+that were not used for longest are encoded again when their turn comes: slower, but the same."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Photo, transmission and reflection, sRGB uint8 (H, W, 9), and how far the reflection is to be trusted."""
+
+    layers: UInt8[Tensor, "h w 9"]
+    trust: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Encoded:
+    """Latent grids (1, C, h, w), float32, on the CPU: the composite, what the model is shown, and where it starts.
+
+    `start` is the photo in every panel, where there is one step only; else noise takes its place.
+    """
+
+    composite: Float[Tensor, "1 c h w"]
+    condition: Float[Tensor, "1 c p q"]
+    start: Float[Tensor, "1 c h w"] | None
+    trust: float
+
+
+class Samples:
+    """Rendered sets and real pairs as one sequence: first the sets, then the pairs."""
+
+    def __init__(self, rendered: OnDisk | None, pairs: Sequence[Sample], pairs_share: float) -> None:
+        self._rendered, self._pairs, self._share = rendered, pairs, pairs_share
+        self._first_pair = len(rendered) if rendered else 0
+
+    def __len__(self) -> int:
+        return self._first_pair + len(self._pairs)
+
+    def __getitem__(self, number: int) -> Sample:
+        if self._rendered and number < self._first_pair:
+            return Sample(self._rendered.sample(number))
+        return self._pairs[number - self._first_pair]
+
+    def at_hand(self) -> Iterator[UInt8[Tensor, "h w 9"]]:
+        """Layers that need no reading: the first rendered ones, and every pair's."""
+        if self._rendered:
+            yield self._rendered.sample(0)
+        yield from (pair.layers for pair in self._pairs)
+
+    def choose(self, dice: Dice) -> int:
+        """The number of a sample: a pair as often as their share says."""
+        if dice.chance(self._share):
+            return self._first_pair + dice.choose(len(self._pairs))
+        return dice.choose(self._first_pair)
+
+
+class Latents:
+    """Encodes what the dice choose.
+
+    Raises:
+        PhotoError: a pair, or the first of the rendered samples, is smaller than a panel.
+    """
+
+    def __init__(self, samples: Samples, backbone: Backbone, recipe: LargeRecipe) -> None:
+        self._samples, self._backbone, self._recipe = samples, backbone, recipe
+        for layers in samples.at_hand():  # better now than after an hour
+            panel_for(layers, backbone, recipe)
+        self._encoded = lru_cache(KEPT)(self._encode)
+
+    def __call__(self, dice: Dice) -> Encoded:
+        """A sample, maybe mirrored.
+
+        Raises:
+            RecipeError, PhotoError: its files are missing or damaged, or it is smaller than a panel.
+        """
+        number = self._samples.choose(dice)
+        return self._encoded(number, self._recipe.flip and dice.chance(0.5))
+
+    def _encode(self, number: int, mirrored: bool) -> Encoded:
+        sample = self._samples[number]
+        panels, _ = panels_of(
+            sample.layers.flip(1) if mirrored else sample.layers, self._backbone, self._recipe
+        )
+        layout, see = self._recipe.layout, self._backbone.encode
+        return Encoded(
+            see(compose(panels, layout)).cpu(),
+            see(condition(panels["I"], layout)).cpu(),
+            start_of(panels["I"], self._backbone, self._recipe),
+            sample.trust,
+        )
+
+
+def start_of(photo: Tensor, backbone: Backbone, recipe: LargeRecipe) -> Tensor | None:
+    """Where the one step starts, encoded: the photo in every panel; nothing where there are many steps, from noise."""
+    if recipe.objective == "flow":
+        return None
+    return backbone.encode(compose(dict.fromkeys(recipe.panels, photo), recipe.layout)).cpu()
+
+
+def panels_of(layers: Tensor, backbone: Backbone, recipe: LargeRecipe) -> tuple[dict[str, Tensor], Fit]:
+    """I, T and R as panels, (1, 3, h, w) in [-1, 1], shrunk in linear light; and how they stand in them.
+
+    Raises:
+        PhotoError: the sample is smaller than a panel.
+    """
+    fit = panel_for(layers, backbone, recipe)
+    light = to_linear(layers.permute(2, 0, 1)[None] / 255)
+    small = functional.interpolate(light, fit.content[::-1], mode="bilinear", antialias=True)
+    padded = fit.pad(2 * to_encoded(small.clamp(0, 1)) - 1)
+    return dict(zip("ITR", padded.chunk(3, dim=1), strict=True)), fit
+
+
+def panel_for(layers: Tensor, backbone: Backbone, recipe: LargeRecipe) -> Fit:
+    """How a sample stands in a panel.
+
+    Raises:
+        PhotoError: it is smaller than that.
+    """
+    height, width, _ = layers.shape
+    return fit_panel((width, height), recipe.layout, budget_px=recipe.budget_px, multiple=backbone.multiple)
+
+
+def open_samples(recipe: LargeRecipe) -> Samples:
+    """The recipe's rendered sets and pairs; what has a share of 0 is not read.
+
+    Raises:
+        RecipeError: a folder is missing, empty or without reflections, or too few samples are rendered.
+        PhotoError: a picture cannot be read.
+    """
+    data, wanted = recipe.data, recipe.data.rendered
+    rendered = None
+    if wanted and data.pairs_share < 1 and data.rendered_share:
+        rendered = OnDisk(
+            found(wanted.sets),
+            seed=recipe.seed,
+            count=wanted.count,
+            target=wanted.target,
+            mixing=wanted.mixing,
+        )
+    folders = found(data.pairs) if data.pairs_share else []
+    pairs = [sample for folder in folders for sample in _pairs(folder, recipe)]
+    return Samples(rendered, pairs, data.pairs_share)
+
+
+def _pairs(folder: Path, recipe: LargeRecipe) -> list[Sample]:
+    pictures = read_pairs([folder])
+    trios = sorted(read_folders(folder).trios, key=lambda trio: trio.photo)
+    if "R" in recipe.panels and recipe.reflections == "given":
+        _refuse_without_reflections(folder, trios)
+    return [_whole(trio, *pair) for trio, pair in zip(trios, pictures, strict=True)]
+
+
+def _refuse_without_reflections(folder: Path, trios: Sequence[Trio]) -> None:
+    lacking = [trio.name for trio in trios if trio.reflection is None]
+    if lacking:
+        raise RecipeError(
+            f"{folder} has no reflection for {lacking[0]} ({len(lacking)} such)",
+            "one for each photo, as R is a panel",
+            'add a folder reflection_layer, set reflections = "difference", or leave R out of panels',
+        )
+
+
+def _whole(trio: Trio, photo: Tensor, transmission: Tensor) -> Sample:
+    if trio.reflection is None:
+        return Sample(with_difference(photo, transmission), Pairs.reflection_weight)
+    reflection = _read(trio.reflection)
+    if reflection.shape != photo.shape:
+        raise RecipeError(
+            f"{trio.photo} and {trio.reflection} differ in size",
+            "layers are aligned",
+            "crop one to the other",
+        )
+    return Sample(torch.cat([photo, transmission, reflection], dim=2))
+
+
+def with_difference(photo: Tensor, transmission: Tensor) -> Tensor:
+    """A pair as (H, W, 9), with the light that the transmission lacks for its reflection."""
+    light = to_linear(photo / 255) - to_linear(transmission / 255)
+    reflection = (to_encoded(light.clamp(0, 1)) * 255).round().to(torch.uint8)
+    return torch.cat([photo, transmission, reflection], dim=2)
+
+
+def _read(path: Path) -> Tensor:
+    photo = Photo.open(path)
+    encoded = to_encoded(np.clip(photo.small(*photo.size), 0, 1))
+    return torch.from_numpy(np.rint(encoded * 255).astype(np.uint8))

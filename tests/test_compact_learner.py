@@ -1,0 +1,89 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from brewster.errors import ModelError
+from brewster.photo import Photo
+from brewster.train.checkpoint import Checkpoint
+from brewster.train.compact_learner import CompactLearner, train, validate
+from brewster.train.data import open_stream
+from brewster.train.recipe import read_recipe, with_value
+from brewster.worlds.assets import Assets
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+
+
+@pytest.fixture
+def recipe(tmp_path, monkeypatch, random):
+    folder = tmp_path / "data" / "photos" / "permissive"
+    folder.mkdir(parents=True)
+    for index in range(3):
+        picture = np.kron(random.integers(0, 256, (5, 7, 3)), np.ones((20, 20, 1))).astype(np.uint8)
+        Photo.from_array(picture, encoding="srgb").save(folder / f"{index}.png")
+    monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "data"))
+    return read_recipe(RECIPES / "train/tiny.toml")
+
+
+@pytest.fixture
+def rendered(monkeypatch):
+    """A recipe that renders; its worlds are computed once, as that takes longer than all the rest."""
+    assets = Assets()
+    monkeypatch.setattr("brewster.train.data.Assets", lambda folders: assets)
+    monkeypatch.delenv("BREWSTER_DATA", raising=False)
+    return read_recipe(RECIPES / "ablations/tiny.toml")
+
+
+def silent(step, steps, numbers, logged):
+    pass
+
+
+def checkpoint(recipe):
+    """The state that a run begins with."""
+    return Checkpoint(0, recipe.model_dump_json(), CompactLearner(recipe).state())
+
+
+def test_nothing_to_learn_from_leaves_the_network_as_it_starts(rendered, tmp_path):
+    network = train(with_value(rendered, "data.rendered.count", 0), tmp_path, silent)
+    photo = torch.rand(1, 3, 64, 64)
+    torch.testing.assert_close(network(photo)[:, :3], photo, atol=1e-5, rtol=0)
+
+
+def test_a_photo_that_equals_its_truth_has_no_infinite_score():
+    photo = torch.rand(1, 3, 32, 32)
+    better, worse = (
+        validate(lambda _, given=given: given, {"plain": [(photo, photo)]})["gain_db_plain"]
+        for given in (photo, 1 - photo)
+    )
+    assert better == 0
+    assert -60 < worse < 0
+
+
+def test_training_lowers_the_loss_on_a_batch_seen_again_and_again(recipe):
+    stream = open_stream(recipe)
+    longer = recipe.model_copy(update={"steps": 40})
+    learner = CompactLearner(longer, lambda step, count, size: stream(0, 2, 64))
+    losses = [learner.advance(step)["loss"] for step in range(15)]
+    assert losses[-1] < 0.8 * losses[0]
+
+
+def test_a_loss_that_is_not_a_number_stops_the_run_and_keeps_the_weights(recipe):
+    batch = open_stream(recipe)(0, 2, 64)
+    batch.transmission_encoded.fill_(float("nan"))
+    learner = CompactLearner(recipe, lambda step, count, size: batch)
+    before = {name: value.clone() for name, value in learner.network.state_dict().items()}
+    with pytest.raises(ModelError, match="finite"):
+        learner.advance(0)
+    assert all(torch.equal(value, before[name]) for name, value in learner.network.state_dict().items())
+
+
+def test_a_run_starts_from_the_averaged_weights_of_another(recipe, tmp_path):
+    given = checkpoint(recipe)
+    ones = {name: torch.ones_like(value) for name, value in given.state["average"].items()}
+    replace(given, state=given.state | {"average": ones}).write(tmp_path / "start.pt")
+    learner = CompactLearner(recipe.model_copy(update={"start_from": tmp_path / "start.pt"}))
+    learner.begin()
+    assert all((value == 1).all() for value in learner.network.state_dict().values())
+    assert all((value == 1).all() for value in learner.average.values())

@@ -1,0 +1,129 @@
+"""What a large backbone learns from: whole samples, composed and encoded once."""
+
+import pytest
+import torch
+
+from brewster.dataset.mix import Dice, Pairs
+from brewster.dataset.sets import read_set
+from brewster.errors import PhotoError, RecipeError
+from brewster.models.large.backbones import tiny
+from brewster.models.large.panels import split
+from brewster.photo import Photo
+from brewster.train.latents import Latents, open_samples, panels_of, with_difference
+from brewster.train.recipe import LargeRecipe
+from set_folders import make
+
+RECIPE = {
+    "backbone": "tiny:kontext", "budget_px": 3 * 32 * 16, "seed": 1, "steps": 6, "batch": 1,
+    "learning_rate": 1e-2, "warmup_steps": 2, "weight_decay": 1e-4, "report_every": 6, "checkpoint_every": 2,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def backbone():
+    return tiny("kontext")[0]
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """A data folder with a set, pairs, and pairs with reflections."""
+    root = tmp_path_factory.mktemp("data")
+    make(root / "set", count=3)
+    for folder, roles in (
+        ("pairs", ["blended", "transmission"]),
+        ("trios", ["blended", "transmission", "reflection"]),
+    ):
+        for number, role in enumerate(roles):
+            pixels = torch.full((40, 60, 3), 200 - 70 * number, dtype=torch.uint8)
+            (root / folder / role).mkdir(parents=True)
+            Photo.from_array(pixels.numpy(), encoding="srgb").save(root / folder / role / "a.png")
+    return root
+
+
+@pytest.fixture
+def recipe(root, monkeypatch):
+    monkeypatch.setenv("BREWSTER_DATA", str(root))
+    return lambda data, **changes: LargeRecipe.model_validate(RECIPE | {"data": data} | changes)
+
+
+RENDERED = {"rendered": {"sets": ["set"], "target": "transmission"}}
+
+
+def test_panels_are_the_whole_sample_in_its_own_aspect_ratio(recipe, root, backbone):
+    wanted = recipe(RENDERED)
+    samples = open_samples(wanted)
+    assert len(samples) == 3
+    for number, entry in enumerate(read_set(root / "set")):
+        panels, fit = panels_of(samples[number].layers, backbone, wanted)
+        assert (fit.content, fit.panel) == ((24, 16), (32, 16))
+        for letter, name in zip("ITR", ("photo", "transmission", "reflection"), strict=True):
+            picture = torch.from_numpy(Photo.open(entry.read(f"{name}.jpg")).pixels.copy())
+            whole = (fit.cut(panels[letter])[0].permute(1, 2, 0) + 1) * 127.5
+            torch.testing.assert_close(whole, picture.float(), atol=0.01, rtol=0)
+
+
+def test_an_encoded_sample_depends_on_the_dice_alone_and_is_encoded_once(recipe, backbone, monkeypatch):
+    wanted = recipe(RENDERED)
+    one, other = (Latents(open_samples(wanted), backbone, wanted) for _ in range(2))
+    for slot in range(4):
+        other(Dice(1, 0, slot))
+    assert torch.equal(one(Dice(1, 7, 0)).composite, other(Dice(1, 7, 0)).composite)
+    assert one(Dice(1, 7, 0)) is one(Dice(1, 7, 0))
+    grid = one(Dice(1, 7, 0)).composite
+    assert grid.shape[2:] == (1, 6)
+    assert {tuple(panel.shape[2:]) for panel in split(grid, wanted.layout).values()} == {(1, 2)}
+
+
+def test_mirrored_samples_are_seen_unless_the_recipe_forbids_it(recipe, backbone):
+    counts = []
+    for flip in (True, False):
+        wanted = recipe(RENDERED, flip=flip)
+        latents = Latents(open_samples(wanted), backbone, wanted)
+        counts.append(len({id(latents(Dice(1, step, 0))) for step in range(60)}))
+    assert counts == [6, 3]
+
+
+def test_real_pairs_come_as_often_as_their_share(recipe, root):
+    samples = open_samples(recipe({**RENDERED, "pairs": ["trios"], "pairs_share": 0.25}))
+    assert len(samples) == 4
+    chosen = [samples.choose(Dice(1, step, 0)) for step in range(200)]
+    assert set(chosen) == {0, 1, 2, 3}
+    assert 30 < chosen.count(3) < 70
+
+
+def test_what_has_no_share_is_not_read(recipe):
+    gone = {"sets": ["gone"]}
+    assert len(open_samples(recipe({**RENDERED, "pairs": ["gone"], "pairs_share": 0.0}))) == 3
+    assert len(open_samples(recipe({"rendered": gone, "pairs": ["trios"], "pairs_share": 1.0}))) == 1
+
+
+def test_pairs_without_reflections_are_refused_where_r_is_a_panel(recipe):
+    pairs = {"pairs": ["pairs"], "pairs_share": 1.0}
+    with pytest.raises(RecipeError, match=r"pairs has no reflection for a \(1 such\); .*difference"):
+        open_samples(recipe(pairs))
+    assert len(open_samples(recipe(pairs, panels=["I", "T"]))) == 1
+    (sample,) = open_samples(recipe(pairs, reflections="difference"))
+    assert sample.trust == Pairs.reflection_weight < 1
+
+
+def test_a_reflection_that_is_given_is_trusted_and_one_that_is_not_is_the_light_that_is_left(recipe):
+    (given,) = open_samples(recipe({"pairs": ["trios"], "pairs_share": 1.0}))
+    assert given.trust == 1
+    assert [given.layers[0, 0, channel].item() for channel in (0, 3, 6)] == [200, 130, 60]
+    both = (torch.full((2, 2, 3), value, dtype=torch.uint8) for value in (188, 137))
+    left = with_difference(*both)[0, 0, 6].item()
+    assert left == 138  # of half the light, 188, a quarter, 137, is taken away
+
+
+def test_a_sample_that_is_smaller_than_a_panel_is_refused_with_the_budget_that_fits(recipe, backbone):
+    wanted = recipe(RENDERED, budget_px=10**6)
+    with pytest.raises(PhotoError, match="lower budget_px to 768"):
+        Latents(open_samples(wanted), backbone, wanted)
+    pair = recipe({"pairs": ["trios"], "pairs_share": 1.0}, budget_px=10**6)
+    with pytest.raises(PhotoError, match="lower budget_px to"):
+        Latents(open_samples(pair), backbone, pair)
+
+
+def test_more_samples_than_there_are_are_refused(recipe):
+    with pytest.raises(RecipeError, match="3 rendered samples; the recipe learns from 9"):
+        open_samples(recipe({"rendered": {"sets": ["set"], "count": 9}}))
