@@ -64,7 +64,7 @@ MODELS: Final = {
         Model(
             "compact",
             _WEIGHTS / "compact.onnx",
-            "7adbca68093de4e874becce062b3758af61fc1a9474c30a67275bafdd2bfd4ee",
+            "284215df47a9149197b6c80b19c17bd0bb9f65bdca7c6fd0b0e15dde35a2f102",
             "Apache-2.0",
         ),
     )

@@ -31,9 +31,9 @@ from brewster.separate.runtime import OnnxBackend
 from brewster.separate.tiles import Backend, in_tiles
 
 QUALITIES: Final[dict[Quality, tuple[int, ...]]] = {
-    "draft": (50_000,),
-    "standard": (30_000, 100_000),
-    "best": (20_000, 50_000, 100_000, 180_000),
+    "draft": (100_000,),
+    "standard": (100_000, 200_000),
+    "best": (30_000, 100_000, 200_000, 350_000),
 }
 """Pixels of the small copies that the network sees, the largest last."""
 
