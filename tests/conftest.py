@@ -13,8 +13,11 @@ import hypothesis
 import numpy as np
 import pytest
 
+from brewster import Photo
 from brewster.cli import main
 from front_door import write_pane
+
+RECIPES = Path(__file__).parents[1] / "recipes"
 
 hypothesis.settings.register_profile("shared machine", deadline=None)
 hypothesis.settings.load_profile("shared machine")
@@ -67,3 +70,29 @@ def run(model, monkeypatch, tmp_path, capfdbinary):
 def bare(run):
     """The same for commands that take no model."""
     return lambda *args: run(*args, with_model=False)
+
+
+@pytest.fixture
+def recipe(tmp_path, monkeypatch, random):
+    """The tiny training recipe, with three photos to learn from."""
+    from brewster.train.recipe import read_recipe  # noqa: PLC0415  (wakes torch)
+
+    folder = tmp_path / "data" / "photos" / "permissive"
+    folder.mkdir(parents=True)
+    for index in range(3):
+        picture = np.kron(random.integers(0, 256, (5, 7, 3)), np.ones((20, 20, 1))).astype(np.uint8)
+        Photo.from_array(picture, encoding="srgb").save(folder / f"{index}.png")
+    monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "data"))
+    return read_recipe(RECIPES / "train/tiny.toml")
+
+
+@pytest.fixture
+def rendered(monkeypatch):
+    """A recipe that renders; its worlds are computed once, as that takes longer than all the rest."""
+    from brewster.train.recipe import read_recipe  # noqa: PLC0415
+    from brewster.worlds.assets import Assets  # noqa: PLC0415
+
+    assets = Assets()
+    monkeypatch.setattr("brewster.train.data.Assets", lambda folders: assets)
+    monkeypatch.delenv("BREWSTER_DATA", raising=False)
+    return read_recipe(RECIPES / "ablations/tiny.toml")

@@ -52,7 +52,9 @@ def test_a_light_start_wakes_no_heavy_library(command):
 
 def test_large_image_models_have_one_door():
     """Their libraries are imported by name when they are needed, which no import contract can see."""
-    callers = {path.parent.name for path in FILES if re.search(r"\b(library|stock_class)\(", path.read_text())}
+    callers = {
+        path.parent.name for path in FILES if re.search(r"\b(library|stock_class)\(", path.read_text())
+    }
     assert callers == {"large"}
 
 

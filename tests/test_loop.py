@@ -2,7 +2,6 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -12,31 +11,10 @@ from brewster.photo import Photo
 from brewster.train.checkpoint import Checkpoint
 from brewster.train.compact_learner import CompactLearner, train
 from brewster.train.loop import run
-from brewster.train.recipe import read_recipe, with_value
-from brewster.worlds.assets import Assets
+from brewster.train.recipe import with_value
 from front_door import picture
 
 RECIPES = Path(__file__).parents[1] / "recipes"
-
-
-@pytest.fixture
-def recipe(tmp_path, monkeypatch, random):
-    folder = tmp_path / "data" / "photos" / "permissive"
-    folder.mkdir(parents=True)
-    for index in range(3):
-        picture = np.kron(random.integers(0, 256, (5, 7, 3)), np.ones((20, 20, 1))).astype(np.uint8)
-        Photo.from_array(picture, encoding="srgb").save(folder / f"{index}.png")
-    monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "data"))
-    return read_recipe(RECIPES / "train/tiny.toml")
-
-
-@pytest.fixture
-def rendered(monkeypatch):
-    """A recipe that renders; its worlds are computed once, as that takes longer than all the rest."""
-    assets = Assets()
-    monkeypatch.setattr("brewster.train.data.Assets", lambda folders: assets)
-    monkeypatch.delenv("BREWSTER_DATA", raising=False)
-    return read_recipe(RECIPES / "ablations/tiny.toml")
 
 
 def silent(step, steps, numbers, logged):
