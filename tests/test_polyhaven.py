@@ -18,6 +18,7 @@ from brewster.cli import cli
 from brewster.dataset import polyhaven
 from brewster.dataset.polyhaven import Order, maps_folder, pull
 from brewster.errors import DownloadError, TargetError
+from file_server import loopback_only
 from front_door import errors, lines, tree
 
 IN, OUT = {"categories": ["indoor", "urban"]}, {"categories": ["outdoor", "night"]}
@@ -29,13 +30,7 @@ SIZE = 100_000
 @pytest.fixture(autouse=True)
 def _network_off(monkeypatch):
     """Loopback only, where the other tests have no network at all."""
-    connect = socket.socket.connect
-
-    def loopback(self, address):
-        assert address[0] == "127.0.0.1", address
-        return connect(self, address)
-
-    monkeypatch.setattr(socket.socket, "connect", loopback)
+    loopback_only(monkeypatch)
 
 
 @pytest.fixture(autouse=True)
