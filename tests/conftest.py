@@ -41,7 +41,8 @@ def random() -> np.random.Generator:
 @pytest.fixture(scope="session")
 def data() -> Path:
     """The shared data; BREWSTER_DATA or ../shared/data, else the test is skipped."""
-    folder = Path(os.environ.get("BREWSTER_DATA") or Path(__file__).parents[2] / "shared" / "data")
+    named = os.environ.get("BREWSTER_DATA") or Path(__file__).parents[2] / "shared" / "data"
+    folder = Path(named).resolve()
     if not folder.is_dir():
         pytest.skip(f"no data: {folder} does not exist, and BREWSTER_DATA names no other folder")
     return folder
