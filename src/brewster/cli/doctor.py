@@ -54,9 +54,16 @@ EXTRAS: Final = {
         "huggingface_hub": "huggingface_hub",
         "peft": "peft",
         "safetensors": "safetensors",
+        "tensorboard": "tensorboard",
         "torch": "torch",
         "torchao": "torchao",
         "transformers": "transformers",
+    },
+    "web": {
+        "fastapi": "fastapi",
+        "matplotlib": "matplotlib",
+        "python-multipart": "python_multipart",
+        "uvicorn": "uvicorn",
     },
 }
 """The packages behind each extra, and the module that each brings."""
