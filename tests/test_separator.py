@@ -135,7 +135,7 @@ def test_a_mixture_comes_closer_to_what_is_behind_the_glass(separator):
 def test_tiled_and_untiled_agree(separator, monkeypatch):
     photo = Photo.open(PICTURES[0])
     whole = separator(photo, quality="best").transmission.pixels
-    monkeypatch.setattr("brewster.separate.separator._TILE_PX", 416)
+    monkeypatch.setattr("brewster.separate.look._TILE_PX", 416)
     assert psnr(separator(photo, quality="best").transmission.pixels, whole) > 40
 
 
@@ -199,3 +199,31 @@ def test_the_shipped_model_hardly_changes_photographs_without_glass(separator, d
     photos = [Photo.open(data / "photos/permissive" / f"kodak24__{number:02}.jpg") for number in range(1, 11)]
     scores = [psnr(separator(photo).transmission.pixels, photo.pixels) for photo in photos]
     assert np.mean(scores) >= 32
+
+
+@pytest.mark.parametrize("quality", QUALITIES)
+def test_the_share_that_is_done_rises_to_one(quality):
+    told = []
+    Separator(glass)(Photo.from_array(picture(600, 900), encoding="srgb"), quality=quality, tell=told.append)
+    assert told == sorted(told)
+    assert (told[0], told[-1]) == (0, 1)
+    assert len(told) > 4
+
+
+@pytest.mark.parametrize("patience", [1, 3, 6])
+def test_what_tell_raises_stops_the_work(patience):
+    told, tiles = [], []
+
+    def give_up(share):
+        told.append(share)
+        if len(told) == patience:
+            raise TimeoutError
+
+    def counting(tile):
+        tiles.append(tile)
+        return glass(tile)
+
+    with pytest.raises(TimeoutError):
+        Separator(counting)(Photo.from_array(picture(600, 900), encoding="srgb"), tell=give_up)
+    assert len(told) == patience
+    assert len(tiles) <= patience

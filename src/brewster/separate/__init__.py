@@ -8,7 +8,8 @@ import sys
 from types import ModuleType
 
 from brewster.options import Quality
-from brewster.separate.separator import QUALITIES, Separation, Separator, separate
+from brewster.separate.look import QUALITIES
+from brewster.separate.separator import Separation, Separator, separate
 
 __all__ = ["QUALITIES", "Quality", "Separation", "Separator", "separate"]
 

@@ -4,8 +4,8 @@
     separation = separator("window.jpg")
     separation.transmission.save("clear.jpg")
 
-The network sees small linear copies of the photo (tiles.py cuts them where they are large), each as it is and
-mirrored. The mean is the answer, the disagreement tells how sure it is. detail.py brings it to full size.
+The model looks at small linear copies of the photo (look.py; generate.py for large image models; tiles.py cuts what
+is too large for it), and detail.py brings its answer to full size.
 """
 
 from __future__ import annotations
@@ -22,31 +22,19 @@ from typing import Final, final
 import numpy as np
 
 from brewster.errors import BrewsterError
-from brewster.light import to_encoded
 from brewster.models.zoo import find_model
 from brewster.options import Quality
 from brewster.photo import DEFAULT_MAX_PIXELS, Encoding, Photo, Source
 from brewster.separate.detail import Floats, Transfer, enlarge_rows
+from brewster.separate.look import QUALITIES, Look, Tell, Views
 from brewster.separate.runtime import OnnxBackend
-from brewster.separate.tiles import Backend, in_tiles
+from brewster.separate.tiles import Backend
 
-QUALITIES: Final[dict[Quality, tuple[int, ...]]] = {
-    "draft": (100_000,),
-    "standard": (100_000, 200_000),
-    "best": (30_000, 100_000, 200_000, 350_000),
-}
-"""Pixels of the small copies that the network sees, the largest last."""
-
-_SHORTEST_SIDE_PX: Final = 160
-_LONG_PHOTO: Final = 3.0
-"""How much larger than the dial says the small copy of a long thin photo may be, a side."""
-_TILE_PX: Final = 1024
-_OVERLAP_PX: Final = 192
 _WORKERS: Final = 2
 _WHITE_PERCENTILE: Final = 99.0
 """Of a photo brighter than white, such as an EXR, this percentile is shown to the network as white."""
-_UNSURE: Final = 0.05
-"""Disagreement of the views, in sRGB-encoded units, at which confidence has fallen to 1/e."""
+_LOOKING: Final = 0.6
+"""The share of the work that is told as done when the network has answered: an estimate for those who wait."""
 
 
 @final
@@ -61,6 +49,8 @@ class Separation:
     """How sure the looks were, (h, w, 1) in 0..1, as small as the network saw the photo."""
     remainder: float
     """Mean of |photo - transmission - reflection| in linear light: what neither layer explains."""
+    drift: float | None
+    """How far the model redraws the photo itself: mean difference, sRGB-encoded; None where it draws no photo."""
     model: str
     sha256: str | None
     device: str
@@ -75,12 +65,12 @@ class Separation:
 
 @final
 class Separator:
-    """A reusable, thread-safe callable around one `Backend`."""
+    """A reusable, thread-safe callable around one `Backend`, or any other way to `Look`."""
 
     def __init__(
-        self, backend: Backend, *, name: str = "custom", sha256: str | None = None, device: str = "cpu"
+        self, model: Backend | Look, *, name: str = "custom", sha256: str | None = None, device: str = "cpu"
     ) -> None:
-        self._backend = backend
+        self._look = model if isinstance(model, Look) else Views(model)
         self.name, self.sha256, self.device = name, sha256, device
 
     @classmethod
@@ -105,6 +95,7 @@ class Separator:
         additive: bool = False,
         encoding: Encoding | None = None,
         max_pixels: int = DEFAULT_MAX_PIXELS,
+        tell: Tell = lambda _share: None,
     ) -> Separation:
         """Separates a photograph; safe to call from many threads at once.
 
@@ -115,6 +106,7 @@ class Separator:
             additive: layers of 32-bit floats that sum to the photo exactly in linear light, for compositing.
             encoding: what an array's numbers mean, "srgb" or "linear".
             max_pixels: larger pictures are refused before they are decoded.
+            tell: called with the share that is done, 0 to 1; an exception that it raises stops the work.
 
         Raises:
             PhotoError: the source cannot be read, or is too large.
@@ -124,39 +116,18 @@ class Separator:
         seconds: dict[str, float] = {}
         with _clock(seconds, "decode"):
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
-            copies = [photo.small(*size) for size in _work_sizes(photo.size, QUALITIES[quality])]
+            copies = [photo.small(*size) for size in self._look.sizes(photo.size, quality)]
             white = np.float32(max(1.0, float(np.percentile(copies[-1], _WHITE_PERCENTILE))))
             copies = [np.clip(copy / white, 0, 1) for copy in copies]
+        tell(0.0)
         with _clock(seconds, "network"):
-            change, reflection, sure = self._look(copies)
+            seen = self._look(copies, quality, lambda done: tell(_LOOKING * done))
         with _clock(seconds, "detail"):
             share = np.float32(strength) * white
-            transfer = Transfer.learn(white * copies[-1], share * change, share * reflection)
-            whole, mirrored, remainder = _at_full_size(photo, transfer, additive=additive)
+            transfer = Transfer.learn(white * copies[-1], share * seen.change, share * seen.reflection)
+            whole, mirrored, remainder = _at_full_size(photo, transfer, additive=additive, tell=tell)
         made_by = self.name, self.sha256, self.device
-        return Separation(photo, whole, mirrored, sure, remainder, *made_by, seconds)
-
-    def _look(self, copies: list[Floats]) -> tuple[Floats, Floats, Floats]:
-        """Change (transmission - photo), reflection and confidence (h, w, 1), all of the largest copy's size."""
-        size = copies[-1].shape[:2]
-        views = [
-            [enlarge_rows(map_, 0, size[0], size) for map_ in (transmission - copy, reflection)]
-            for copy in copies
-            for transmission, reflection in self._both_ways(copy)
-        ]
-        changes, reflections = (np.stack(maps) for maps in zip(*views, strict=True))
-        seen = to_encoded(np.maximum(copies[-1] + changes, 0))
-        apart = np.ptp(seen, axis=0).max(axis=2, keepdims=True)
-        return changes.mean(axis=0), reflections.mean(axis=0), np.exp(-apart / np.float32(_UNSURE))
-
-    def _both_ways(self, copy: Floats) -> Iterator[tuple[Floats, Floats]]:
-        """Both layers of a copy as it is, and as seen in a mirror."""
-        yield self._separate(copy)
-        transmission, reflection = self._separate(np.ascontiguousarray(copy[:, ::-1]))
-        yield transmission[:, ::-1], reflection[:, ::-1]
-
-    def _separate(self, small: Floats) -> tuple[Floats, Floats]:
-        return in_tiles(self._backend, small, tile_px=_TILE_PX, overlap_px=_OVERLAP_PX)
+        return Separation(photo, whole, mirrored, seen.sureness, remainder, seen.drift, *made_by, seconds)
 
 
 def separate(
@@ -189,18 +160,9 @@ def _check(strength: float, quality: str) -> None:
         raise BrewsterError(f"quality is {quality!r}", f"one of {', '.join(QUALITIES)}", "choose one of them")
 
 
-def _work_sizes(size: tuple[int, int], budgets: tuple[int, ...]) -> list[tuple[int, int]]:
-    """Width and height of each small copy, smallest first, each once; more pixels for long thin photos."""
-    width, height = size
-    sizes = []
-    for pixels in budgets:
-        scale = math.sqrt(pixels / (width * height))
-        scale = min(1.0, max(scale, min(_LONG_PHOTO * scale, _SHORTEST_SIDE_PX / min(size))))
-        sizes.append((max(1, round(width * scale)), max(1, round(height * scale))))
-    return list(dict.fromkeys(sizes))
-
-
-def _at_full_size(photo: Photo, transfer: Transfer, *, additive: bool) -> tuple[Photo, Photo, float]:
+def _at_full_size(
+    photo: Photo, transfer: Transfer, *, additive: bool, tell: Tell
+) -> tuple[Photo, Photo, float]:
     """Both layers, stored as the photo is or as exact floats, and the mean unexplained remainder."""
     store = _as_floats(photo) if additive else photo
     canvases = [np.empty(store.pixels.shape, store.pixels.dtype) for _ in range(2)]
@@ -215,8 +177,11 @@ def _at_full_size(photo: Photo, transfer: Transfer, *, additive: bool) -> tuple[
             canvas[rows] = layer
         return 0.0 if additive else float(np.abs(linear - layers[0] - layers[1]).sum(dtype=np.float64))
 
+    strips, unexplained = list(photo.strips()), 0.0
     with ThreadPoolExecutor(_WORKERS) as pool:
-        unexplained = sum(pool.map(fill, photo.strips()))
+        for done, part in enumerate(pool.map(fill, strips), 1):
+            unexplained += part
+            tell(_LOOKING + (1 - _LOOKING) * done / len(strips))
     transmission, reflection = (store.with_pixels(canvas) for canvas in canvases)
     return transmission, reflection, unexplained / (math.prod(photo.size) * 3)
 

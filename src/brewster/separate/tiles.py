@@ -21,8 +21,10 @@ Backend = Callable[[Picture], tuple[Picture, Picture]]
 reflection, both of the same shape and kind."""
 
 
-def in_tiles(backend: Backend, picture: Picture, *, tile_px: int, overlap_px: int) -> tuple[Picture, Picture]:
-    """Both layers of a picture (H, W, 3) of any size; a picture no larger than a tile goes in whole.
+def in_tiles(
+    backend: Callable[[Picture], tuple[Picture, ...]], picture: Picture, *, tile_px: int, overlap_px: int
+) -> tuple[Picture, ...]:
+    """The backend's answers, (H, W, 3) each, for a picture of any size; one no larger than a tile goes in whole.
 
     Neighbouring tiles share at least `overlap_px` pixels, over which their answers are cross-faded.
     """
@@ -30,7 +32,7 @@ def in_tiles(backend: Backend, picture: Picture, *, tile_px: int, overlap_px: in
     rows, columns = (_spans(side, tile_px, overlap_px) for side in (height, width))
     if len(rows) == len(columns) == 1:
         return backend(picture)
-    layers = np.zeros((2, height, width, 3), np.float32)
+    layers: list[Picture] = []
     total = np.zeros((height, width, 1), np.float32)
     for vertical, horizontal in product(rows, columns):
         window = np.s_[vertical, horizontal]
@@ -38,9 +40,11 @@ def in_tiles(backend: Backend, picture: Picture, *, tile_px: int, overlap_px: in
             ..., None
         ]
         total[window] += weight
-        for layer, answer in zip(layers, backend(picture[window]), strict=True):
+        answers = backend(picture[window])
+        layers = layers or [np.zeros((height, width, 3), np.float32) for _ in answers]
+        for layer, answer in zip(layers, answers, strict=True):
             layer[window] += weight * answer
-    return layers[0] / total, layers[1] / total
+    return tuple(layer / total for layer in layers)
 
 
 def _spans(side: int, tile: int, overlap: int) -> list[slice]:
