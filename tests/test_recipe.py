@@ -179,7 +179,7 @@ def test_a_value_of_a_large_recipe_can_be_changed_too():
 def test_a_prompt_lies_beside_its_recipe(tmp_path):
     text = KONTEXT.read_text().replace("rank = 16", 'rank = 16\nprompt = "mine.safetensors"')
     (tmp_path / "large.toml").write_text(text)
-    assert read_recipe(tmp_path / "large.toml").prompt == tmp_path / "mine.safetensors"
+    assert read_recipe(tmp_path / "large.toml").prompt == str(tmp_path / "mine.safetensors")
 
 
 @pytest.mark.parametrize(

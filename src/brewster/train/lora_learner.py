@@ -23,12 +23,13 @@ from torch.nn import functional
 from brewster.dataset.mix import Dice
 from brewster.errors import PhotoError, RecipeError
 from brewster.files import write_atomically
-from brewster.models.large.backbones import encode_prompt, load_backbone, tiny
+from brewster.models.large.backbones import encode_prompt, load_backbone
+from brewster.models.large.decompose import Decomposer
 from brewster.models.large.family import Backbone
 from brewster.models.large.lora import add_lora, load_lora_state, lora_state, save_lora
-from brewster.models.large.panels import Fit, condition, split
-from brewster.models.large.prompt import PromptEmbedding, load_prompt
-from brewster.models.large.sampling import GUIDANCE, STEPS, euler
+from brewster.models.large.panels import Fit, split
+from brewster.models.large.prompt import PROMPTS, PromptEmbedding, load_prompt
+from brewster.models.large.sampling import STEPS
 from brewster.models.large.stock import within_memory
 from brewster.train import crew
 from brewster.train.data import validation_pairs
@@ -38,11 +39,10 @@ from brewster.train.latents import (
     Samples,
     open_samples,
     panels_of,
-    start_of,
     with_difference,
 )
 from brewster.train.losses import finite, gain_db
-from brewster.train.recipe import TINY, LargeRecipe
+from brewster.train.recipe import ENCODED, LargeRecipe
 
 FOLDER: Final = "lora"
 RECIPE: Final = "recipe.json"
@@ -66,7 +66,8 @@ class LoraLearner:
         self.recipe = recipe
         samples = open_samples(recipe)
         self._shown = _shown(recipe, samples)
-        self.backbone = _open(recipe)
+        device = str(crew.best_device())
+        self.backbone = load_backbone(recipe.backbone, device=device, quantise=recipe.quantise)
         self._data = Latents(samples, self.backbone, recipe)
         self._parameters = add_lora(self.backbone, rank=recipe.rank, alpha=recipe.alpha, seed=recipe.seed)
         self.backbone.transformer.enable_gradient_checkpointing()
@@ -137,35 +138,19 @@ class LoraLearner:
             TargetError: it cannot be written.
         """
         place = folder / FOLDER
-        save_lora(place, self.backbone, self.recipe.layout, self.prompt)
+        base, quantise = self.recipe.backbone, self.recipe.quantise
+        save_lora(place, self.backbone, self.prompt, self.recipe.task, base=base, quantise=quantise)
         text = json.dumps(self.recipe.model_dump(mode="json"), indent=2)
         write_atomically(place / RECIPE, f"{text}\n".encode(), overwrite=True)
         return place
 
-    @torch.no_grad()
-    def separate(self, photo: Tensor, *, steps: int = STEPS, seed: int = 0) -> dict[str, Tensor]:
+    def separate(self, photo: Tensor, *, steps: int = STEPS, seed: int = 0) -> Mapping[str, Tensor]:
         """The panels that it makes of a photo in a panel, (1, 3, h, w) in [-1, 1]; one_step takes one step.
 
         Raises:
             DeviceError: out of memory (says what to lower).
         """
-        backbone, recipe = self.backbone, self.recipe
-        height, width = photo.shape[-2:]
-        start = start_of(photo, backbone, recipe)
-        many = start is None
-        begun = (
-            backbone.noise(recipe.layout.composite_size((width, height)), seed) if start is None else start
-        )
-        with within_memory(_LOWER):
-            latents = euler(
-                backbone,
-                begun,
-                backbone.encode(condition(photo, recipe.layout)),
-                self.prompt,
-                steps=steps if many else 1,
-                guidance=GUIDANCE if many else recipe.guidance,
-            )
-            return split(backbone.decode(latents).clamp(-1, 1).cpu(), recipe.layout)
+        return Decomposer(self.backbone, self.prompt, self.recipe.task)(photo, steps=steps, seeds=[seed])
 
     def _learn(self, step: int) -> dict[str, Tensor]:
         """The gradients, and the parts of the loss, of this process's slots of the batch."""
@@ -242,22 +227,10 @@ def _refuse_idle(recipe: LargeRecipe) -> None:
         )
 
 
-def _open(recipe: LargeRecipe) -> Backbone:
-    device = crew.best_device()
-    if not recipe.backbone.startswith(TINY):
-        return load_backbone(recipe.backbone, device=str(device), quantise=recipe.quantise)
-    backbone, _ = tiny(recipe.backbone.removeprefix(TINY))
-    backbone.transformer.to(device)
-    backbone.vae.to(device)
-    return backbone
-
-
 def _find_prompt(recipe: LargeRecipe, backbone: Backbone) -> PromptEmbedding:
-    if recipe.prompt:
-        return load_prompt(recipe.prompt, backbone.name)
-    if recipe.backbone.startswith(TINY):
-        return tiny(recipe.backbone.removeprefix(TINY))[1]
-    return encode_prompt(recipe.backbone)
+    if recipe.prompt.endswith(ENCODED):
+        return load_prompt(Path(recipe.prompt), backbone.name)
+    return encode_prompt(recipe.backbone, PROMPTS[recipe.prompt])
 
 
 def _adamw(parameters: Sequence[nn.Parameter], recipe: LargeRecipe) -> torch.optim.Optimizer:

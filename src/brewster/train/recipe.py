@@ -19,14 +19,17 @@ from brewster.dataset.live import Mixing, Target
 from brewster.dataset.mix import MixRecipe
 from brewster.errors import RecipeError
 from brewster.models.compact import STRIDE
-from brewster.models.large.backbones import Quantisation
+from brewster.models.large.backbones import TINY
 from brewster.models.large.panels import Direction, Layout, Panel
+from brewster.models.large.prompt import PROMPTS
+from brewster.models.large.sampling import GUIDANCE
+from brewster.models.large.task import PAPER_PX, Objective, Quantisation, Task
 from brewster.scene.values import Above0, From0, Positive, Seed, Share, Values, read_toml, wrong_value
 
 _COMPARE = "the recipes in recipes/train/"
 
-TINY: Final = "tiny:"
-"""What a backbone's toy twin is called, before the backbone's name."""
+ENCODED: Final = ".safetensors"
+"""The ending of an encoded prompt's file."""
 
 Side = Annotated[int, Field(gt=0, multiple_of=STRIDE)]
 
@@ -168,11 +171,11 @@ class LargeRecipe(Recipe):
     quantise: Quantisation | None = None
     panels: tuple[Panel, ...] = ("I", "T", "R")
     direction: Direction = "side by side"
-    budget_px: Positive = 1536 * 512
+    budget_px: Positive = PAPER_PX
     """The most pixels that all panels have together."""
     panel_weights: dict[Panel, From0] = Field(default_factory=dict)
     """How much each panel counts in the loss, 1 if not named."""
-    objective: Literal["flow", "one_step"] = "flow"
+    objective: Objective = "flow"
     """From noise to panels in many steps, or from the photo, in every panel, to what it lacks in one."""
     guidance: From0 = 1.0
     """While learning; 1 is none where it takes a second prediction."""
@@ -183,13 +186,20 @@ class LargeRecipe(Recipe):
     """Whether every sample is also seen mirrored."""
     reflections: Literal["given", "difference"] = "given"
     """Pairs without a reflection are refused where R is a panel, or R is what photo - transmission leaves in light."""
-    prompt: Path | None = None
-    """An encoded prompt, relative to the recipe; else the backbone's own text encoder encodes the paper's."""
+    prompt: str = "paper"
+    """A prompt by name, which the backbone's own text encoder encodes, or an encoded one: a .safetensors file,
+    relative to the recipe."""
 
     @property
     def layout(self) -> Layout:
         """How the panels stand."""
         return Layout(self.panels, self.direction)
+
+    @property
+    def task(self) -> Task:
+        """What is learnt, as those need it who use it: they are guided as in the paper, or as it was learnt in one step."""
+        guidance = GUIDANCE if self.objective == "flow" else self.guidance
+        return Task(self.layout, self.budget_px, self.objective, guidance)
 
     @model_validator(mode="after")
     def _can_be_learnt(self) -> Self:
@@ -202,6 +212,8 @@ class LargeRecipe(Recipe):
             raise ValueError(f"the panels are {list(self.panels)}: each once, and T among them")
         if self.quantise and self.backbone.startswith(TINY):
             raise ValueError("a toy twin is never quantised")
+        if self.prompt not in PROMPTS and not self.prompt.endswith(ENCODED):
+            raise ValueError(f"prompt is {self.prompt!r}: one of {', '.join(PROMPTS)}, or a {ENCODED} file")
         if not any(self.panel_weights.get(panel, 1) for panel in self.panels):
             raise ValueError("panel_weights leaves nothing to learn: every panel counts 0")
         return self
@@ -225,11 +237,11 @@ def read_recipe(path: Path) -> CompactRecipe | LargeRecipe:
         RecipeError: missing, not TOML, or with values that are missing, unknown or impossible.
     """
     recipe = read_toml(_kind(path), path, compare=_COMPARE)
-    changes: dict[str, Any] = {
-        name: path.parent / getattr(recipe, name)
-        for name in ("start_from", "prompt")
-        if getattr(recipe, name, None)
-    }
+    changes: dict[str, Any] = {}
+    if isinstance(recipe, CompactRecipe) and recipe.start_from:
+        changes["start_from"] = path.parent / recipe.start_from
+    if isinstance(recipe, LargeRecipe) and recipe.prompt.endswith(ENCODED):
+        changes["prompt"] = str(path.parent / recipe.prompt)
     rendered = recipe.data.rendered
     if rendered and rendered.recipe and rendered.recipe.endswith(".toml"):
         found = rendered.model_copy(update={"recipe": str(path.parent.resolve() / rendered.recipe)})

@@ -11,9 +11,11 @@ from __future__ import annotations
 import contextlib
 import difflib
 import json
+import zlib
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, get_args
 
 import torch
 from torch import Tensor, nn
@@ -25,11 +27,13 @@ from brewster.models.large.kontext import Kontext
 from brewster.models.large.prompt import PROMPT, PromptEmbedding
 from brewster.models.large.qwen import Qwen
 from brewster.models.large.stock import bars_on_terminals_only, fetch, library, stock_class, within_memory
-
-Quantisation = Literal["int8", "float8", "nf4"]
+from brewster.models.large.task import Quantisation
 
 BACKBONES: Final[dict[str, type[Backbone]]] = {family.name: family for family in (Kontext, Klein, Qwen)}
 """name -> adapter; each knows its hub id, licence, classes and full-size settings."""
+
+TINY: Final = "tiny:"
+"""What a backbone's toy twin is called, before the backbone's name."""
 
 _INDEX: Final = "model_index.json"
 _CONFIGS: Final = {"transformer": "config.json", "vae": "config.json", "scheduler": "scheduler_config.json"}
@@ -48,6 +52,8 @@ def load_backbone(
 ) -> Backbone:
     """A backbone by its name in the table, a hub id or a folder in diffusers' layout, without text encoders.
 
+    "tiny:" and a name is that backbone's toy twin.
+
     `dtype` is bfloat16 on an accelerator and float32 on the CPU. `quantise` stores the transformer's weights in
     8 bits (torchao) or 4 (bitsandbytes, CUDA only).
 
@@ -58,6 +64,8 @@ def load_backbone(
         MissingExtra: diffusers, torchao or bitsandbytes is not installed.
     """
     _refuse_absent(device)
+    if source.startswith(TINY):
+        return _toy(source, device, quantise)
     options = _quantised(quantise, device) if quantise else {}
     dtype = dtype or (torch.float32 if device == "cpu" else torch.bfloat16)
     bars_on_terminals_only()
@@ -77,10 +85,15 @@ def load_backbone(
 def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> PromptEmbedding:
     """Loads a backbone's text encoders, encodes the prompt, and forgets them; see `load_backbone` for `source`.
 
+    A toy twin has none: its prompt is random numbers, others for other words.
+
     Raises:
         DownloadError, ModelError, DeviceError, MissingExtra: as `load_backbone`.
     """
     _refuse_absent(device)
+    if source.startswith(TINY):
+        seed = 0 if text == PROMPT else zlib.crc32(text.encode())
+        return replace(tiny(source.removeprefix(TINY), seed)[1], text=text)
     bars_on_terminals_only()
     folder = _folder(source, _TEXT_PARTS)
     family, _ = _family(folder)
@@ -149,6 +162,17 @@ def find_family(name: str) -> type[Backbone]:
         f"one of {', '.join(BACKBONES)}",
         f"did you mean {close[0]}?" if close else "choose one of them",
     )
+
+
+def _toy(source: str, device: str, quantise: str | None) -> Backbone:
+    if quantise:
+        raise ModelError(
+            f"{source} was asked for as {quantise}", "a toy twin is never quantised", "leave quantise out"
+        )
+    backbone, _ = tiny(source.removeprefix(TINY))
+    backbone.transformer.to(device)
+    backbone.vae.to(device)
+    return backbone
 
 
 def _folder(source: str, patterns: list[str]) -> Path:

@@ -1,8 +1,8 @@
 """What training adds to a backbone: low-rank changes to its blocks (Hu et al. 2021), in a file of their own.
 
     add_lora(backbone, rank=16, alpha=16, seed=0)
-    save_lora(folder, backbone, layout, prompt)     # stock diffusers: pipe.load_lora_weights(folder)
-    about, prompt = load_lora(folder, backbone)
+    save_lora(folder, backbone, prompt, task)     # stock diffusers: pipe.load_lora_weights(folder)
+    card, prompt = load_lora(folder, backbone)
 
 The paper names the rank, 16 (Experimental Setup); alpha 16 and every linear layer of the blocks are the common
 recipe behind it. A LoRA is float32 on a base of any precision: bf16 would round most of Adam's steps away.
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, final
 
@@ -21,9 +21,9 @@ from torch import Tensor, nn
 
 from brewster.errors import ModelError, RecipeError
 from brewster.models.large.family import Backbone
-from brewster.models.large.panels import Layout
 from brewster.models.large.prompt import PROMPT_FILE, PromptEmbedding, load_prompt
 from brewster.models.large.stock import library
+from brewster.models.large.task import Quantisation, Task
 from brewster.models.large.tensors import read_tensors, write_tensors
 
 LORA_FILE: Final = "pytorch_lora_weights.safetensors"
@@ -37,18 +37,22 @@ _ADAPTER: Final = "default"
 @final
 @dataclass(frozen=True)
 class LoraCard:
-    """What a LoRA was made for: the backbone's name, its size, the layout of panels, and the prompt's digest."""
+    """What a LoRA was made for: the backbone and how it was stored, the LoRA's size, its task, and the prompt's digest.
+
+    `base` is a hub id, a folder, or a name in the table of backbones.
+    """
 
     backbone: str
+    base: str
+    quantise: Quantisation | None
     rank: int
     alpha: int
-    layout: Layout
+    task: Task
     prompt_sha256: str
 
     def to_json(self) -> str:
         """One line of JSON."""
-        layout = {"panels": self.layout.panels, "direction": self.layout.direction}
-        return json.dumps(vars(self) | {"layout": layout}, sort_keys=True)
+        return json.dumps(asdict(self), sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> LoraCard:
@@ -59,8 +63,7 @@ class LoraCard:
         """
         try:
             value = json.loads(text)
-            layout = Layout(tuple(value["layout"]["panels"]), value["layout"]["direction"])
-            return cls(**(value | {"layout": layout}))
+            return cls(**(value | {"task": Task.from_values(value["task"])}))
         except (ValueError, TypeError, KeyError, RecipeError) as error:
             raise ModelError(
                 f"the card of the LoRA cannot be read: {error}",
@@ -124,8 +127,18 @@ def load_lora_state(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
     library("peft").set_peft_model_state_dict(backbone.transformer, dict(state), adapter_name=_ADAPTER)
 
 
-def save_lora(folder: Path, backbone: Backbone, layout: Layout, prompt: PromptEmbedding) -> LoraCard:
+def save_lora(
+    folder: Path,
+    backbone: Backbone,
+    prompt: PromptEmbedding,
+    task: Task,
+    *,
+    base: str = "",
+    quantise: Quantisation | None = None,
+) -> LoraCard:
     """Writes the LoRA in the file that stock diffusers loads, and the prompt beside it; same LoRA, same bytes.
+
+    `base` is the backbone's own hub id unless it is named.
 
     Raises:
         ModelError: no LoRA, or a prompt of another backbone.
@@ -138,7 +151,15 @@ def save_lora(folder: Path, backbone: Backbone, layout: Layout, prompt: PromptEm
             f"the prompt was encoded for {prompt.backbone}", f"{backbone.name}", "encode it for this backbone"
         )
     config = backbone.transformer.peft_config[_ADAPTER]
-    card = LoraCard(backbone.name, config.r, config.lora_alpha, layout, prompt.sha256)
+    card = LoraCard(
+        backbone.name,
+        base or backbone.hub_id,
+        quantise,
+        config.r,
+        config.lora_alpha,
+        task,
+        prompt.sha256,
+    )
     tensors = {_PREFIX + name: tensor for name, tensor in lora_state(backbone).items()}
     prompt.save(folder / PROMPT_FILE)
     write_tensors(folder / LORA_FILE, tensors, {_OURS: card.to_json(), _STOCK: _stock_settings(config)})

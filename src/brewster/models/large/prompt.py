@@ -29,11 +29,19 @@ PROMPT: Final = (
     "[IMAGE3] shows only the reflection of glass without transmission; "
     "[IMAGE1] could be decomposed to [IMAGE2] and [IMAGE3]."
 )
-"""The paper's prompt, word for word (Experimental Setup, box PROMPT); its paragraphs are joined by a space.
+"""The paper's prompt, word for word (Experimental Setup, box PROMPT); its paragraphs are joined by a space."""
 
-The ablation's "generic" and "detailed" prompts (figure flux_compare) are shown there as results only: the paper
-does not print their words.
-"""
+PROMPTS: Final[dict[str, str]] = {
+    "paper": PROMPT,
+    "generic": "Remove the reflection.",
+    "detailed": (
+        "This photograph was taken through a pane of glass. Remove everything that is mirrored in the glass: lamps,"
+        " windows, people and bright haze in front of it. Show only the scene behind the glass, as if the pane were"
+        " not there, with the same framing, sharpness, colours and brightness, and change nothing else."
+    ),
+}
+"""Prompts by name. "generic" and "detailed" are for a backbone without a LoRA (paper, Comparing to original Flux
+model): the paper shows their results and not their words, so that these are ours."""
 
 PROMPT_FILE: Final = "prompt.safetensors"
 _FORMAT: Final = "brewster prompt 1"
