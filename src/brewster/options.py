@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, final
+from typing import Any, Literal, TypedDict, final
 
 from brewster.errors import BrewsterError
 from brewster.files import DEFAULT_MAX_PIXELS, SUFFIXES
@@ -17,6 +17,18 @@ Layer = Literal["transmission", "reflection", "confidence"]
 Quality = Literal["draft", "standard", "best"]
 Container = Literal["jpeg", "png", "tiff", "webp", "avif", "heic", "exr", "hdr"]
 Device = Literal["auto", "cuda", "rocm", "directml", "coreml", "cpu"]
+
+Quantise = Literal["int8", "float8", "nf4"]
+
+
+class Large(TypedDict, total=False):
+    """What can be asked of large image models alone; see `Options` for what each is."""
+
+    base: str | None
+    quantise: Quantise | None
+    steps: int | None
+    average: int
+
 
 _FLOAT_CONTAINERS = ("tiff", "exr")
 _SUFFIXES = {"jpeg": ".jpg"}  # the others are the container's name
@@ -58,12 +70,32 @@ class Options:
     model: str = field(
         default="compact",
         metadata=_about(
-            "The model to use: a name from `brewster models list`, or the path of an .onnx file."
+            "The model to use: a name from `brewster models list`, an .onnx file, or a LoRA's folder or hub id."
         ),
     )
     device: Device = field(
         default="auto",
         metadata=_about("Where the network runs; auto takes the fastest device that is there."),
+    )
+    base: str | None = field(
+        default=None,
+        metadata=_about(
+            "Of a LoRA: the folder or hub id of its base, if that lies not where it was trained."
+        ),
+    )
+    quantise: Quantise | None = field(
+        default=None,
+        metadata=_about("Of large models: store the weights in 8 or 4 bits, as small cards need it."),
+    )
+    steps: int | None = field(
+        default=None,
+        metadata=_about(
+            "Of large models: steps for each look, 20 if not said otherwise, and 4 for a draft.", ge=1
+        ),
+    )
+    average: int = field(
+        default=1,
+        metadata=_about("Of large models: how many answers are averaged.", ge=1),
     )
     max_pixels: int = field(
         default=DEFAULT_MAX_PIXELS,
@@ -78,6 +110,12 @@ class Options:
                 "their 32-bit floats fit only into TIFF and EXR",
                 "choose format tiff or exr, or leave additive out",
             )
+
+    def load(self) -> dict[str, Any]:
+        """The keywords for loading a `Separator`."""
+        large = {name: getattr(self, name) for name in Large.__annotations__}
+        asked = {name: value for name, value in large.items() if value != getattr(Options, name)}
+        return {"model": self.model, "device": self.device, **asked}
 
     def call(self) -> dict[str, Any]:
         """The keywords for calling a `Separator`."""

@@ -53,6 +53,8 @@ class Entry:
     device: str | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     remainder: float | None = None
+    drift: float | None = None
+    doubtful: bool = False
     error: str | None = None
 
 
@@ -167,7 +169,7 @@ class Batch:
     def _separator(self) -> Separator:
         from brewster.separate import Separator  # noqa: PLC0415  (wakes ONNX Runtime and pyvips)
 
-        return Separator.load(self.options.model, device=self.options.device)
+        return Separator.load(**self.options.load())
 
     def _do(self, task: Task, bugs: list[Exception]) -> Entry:
         entry = Entry(task.name)
@@ -223,6 +225,7 @@ class Batch:
     def _separate(self, source: Path | None, targets: dict[str, Path | None], entry: Entry) -> None:
         separation = self._separator(source or sys.stdin.buffer.read(), **self.options.call())
         entry.seconds, entry.remainder = dict(separation.seconds), separation.remainder
+        entry.drift, entry.doubtful = separation.drift, separation.doubtful
         started = time.perf_counter()
         for layer, target in targets.items():
             own = separation.photo.origin.container
@@ -248,6 +251,10 @@ class Batch:
             say(f"{entry.source}: skipped, its layers are there (--overwrite makes them again)")
         elif entry.status == "separated":
             say(f"{entry.source} -> {outputs} ({sum(entry.seconds.values()):.1f} s)")
+            if entry.doubtful:
+                say(
+                    f"{entry.source}: doubtful, the model redrew the photo (drift {entry.drift:.2f}): look at it"
+                )
 
     def _sum_up(self, entries: Sequence[Entry]) -> None:
         counts = dict.fromkeys(("separated", "planned", "skipped", "failed"), 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import hashlib
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, final
@@ -71,6 +72,20 @@ MODELS: Final = {
 }
 
 
+LARGE: Final = ("kontext", "klein", "qwen")
+"""Large image models by name; they and what is trained on them lie elsewhere, and need the extra `large`."""
+
+
+def is_large(name: str) -> bool:
+    """Whether this names a large image model or a LoRA: by name, folder, toy twin ("tiny:kontext") or hub id."""
+    return name in LARGE or name.startswith("tiny:") or Path(name).is_dir() or _is_hub_id(name)
+
+
+def _is_hub_id(name: str) -> bool:
+    """OWNER/NAME, and no file or folder of this name."""
+    return re.fullmatch(r"[\w-][\w.-]*/[\w-][\w.-]*", name) is not None and not name.endswith(".onnx")
+
+
 def find_model(name: str) -> Model:
     """A model by its name in the zoo, or by the path of an .onnx file.
 
@@ -82,9 +97,9 @@ def find_model(name: str) -> Model:
     path = Path(name)
     if path.is_file():
         return Model(path.stem, path, None, "unknown")
-    close = difflib.get_close_matches(name, MODELS, n=1)
+    close = difflib.get_close_matches(name, (*MODELS, *LARGE), n=1)
     raise ModelError(
         f"there is no model {name!r}",
-        f"one of {', '.join(MODELS)}, or the path of an .onnx file",
+        f"one of {', '.join((*MODELS, *LARGE))}, an .onnx file, or the folder or hub id of a LoRA",
         f"did you mean {close[0]}?" if close else "brewster models list shows them",
     )

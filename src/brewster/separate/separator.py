@@ -17,19 +17,21 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Final, final
+from typing import Final, Unpack, final
 
 import numpy as np
 
-from brewster.errors import BrewsterError
-from brewster.models.zoo import find_model
-from brewster.options import Quality
+from brewster.errors import BrewsterError, MissingExtra, ModelError
+from brewster.models.zoo import find_model, is_large
+from brewster.options import Large, Quality
 from brewster.photo import DEFAULT_MAX_PIXELS, Encoding, Photo, Source
 from brewster.separate.detail import Floats, Transfer, enlarge_rows
 from brewster.separate.look import QUALITIES, Look, Tell, Views
 from brewster.separate.runtime import OnnxBackend
 from brewster.separate.tiles import Backend
 
+DRIFT_LIMIT: Final = 0.06
+"""Beyond this drift a separation is doubtful: three times what the VAEs of large models lose by themselves."""
 _WORKERS: Final = 2
 _WHITE_PERCENTILE: Final = 99.0
 """Of a photo brighter than white, such as an EXR, this percentile is shown to the network as white."""
@@ -57,6 +59,11 @@ class Separation:
     seconds: dict[str, float] = field(compare=False)
     """Wall time of decode, network and detail transfer."""
 
+    @property
+    def doubtful(self) -> bool:
+        """Whether the model redrew the photo so freely that its layers may be of another scene: look at them."""
+        return self.drift is not None and self.drift > DRIFT_LIMIT
+
     @cached_property
     def confidence(self) -> Photo:
         """Grey, 8 bit: 255 where the separation is sure of the transmission. Enlarged when it is first asked for."""
@@ -74,17 +81,50 @@ class Separator:
         self.name, self.sha256, self.device = name, sha256, device
 
     @classmethod
-    def load(cls, model: str = "compact", *, device: str = "auto") -> Separator:
-        """A separator by the name of a model in the zoo or the path of an .onnx file.
+    def load(cls, model: str = "compact", *, device: str = "auto", **large: Unpack[Large]) -> Separator:
+        """A separator by the name of a model in the zoo, the path of an .onnx file, or a large image model.
+
+        Args:
+            model: "compact", an .onnx file, a LoRA's folder or hub id, or a backbone's ("kontext", "klein", "qwen").
+            device: where it runs; "auto" takes the fastest device that is there.
+            large: of large models only: `base`, where a LoRA's base lies, if not where it was trained; `quantise`,
+                "int8", "float8" or "nf4", by default as for the LoRA's training; `steps` for each look, by default
+                the paper's 20, and 4 for quality "draft"; `average`, how many answers are averaged.
 
         Raises:
-            ModelError: no such model, or a damaged one.
-            DeviceError: the asked device is not available.
+            ModelError: no such model, a damaged one, or options of large models for a small one.
+            DeviceError: the asked device is not available, or a large model does not fit into its memory.
+            DownloadError: a large model cannot be downloaded; says how to ask for access.
+            MissingExtra: a large model needs the extra `large`.
         """
+        if is_large(model):
+            return cls._load_large(model, device, large)
+        if large:
+            raise ModelError(
+                f"{', '.join(large)} was asked of {model}",
+                "a large image model or a LoRA",
+                "leave it out, or name such a model",
+            )
         found = find_model(model)
         digest = found.verify()
         backend = OnnxBackend(found.path, device)
         return cls(backend, name=found.name, sha256=digest, device=backend.device)
+
+    @classmethod
+    def _load_large(cls, model: str, device: str, asked: Large) -> Separator:
+        try:
+            from brewster.models.large.decompose import open_decomposer  # noqa: PLC0415  (wakes torch)
+            from brewster.separate.generate import Panels  # noqa: PLC0415
+        except ImportError as error:
+            raise MissingExtra(
+                f"{error.name} is not installed", f"{model} needs it", "pip install 'brewster[large]'"
+            ) from error
+        decomposer = open_decomposer(
+            model, device=device, base=asked.get("base"), quantise=asked.get("quantise")
+        )
+        look = Panels(decomposer, steps=asked.get("steps"), average=asked.get("average", 1))
+        where = str(decomposer.backbone.device)
+        return cls(look, name=decomposer.name, sha256=decomposer.sha256, device=where)
 
     def __call__(
         self,
@@ -140,9 +180,10 @@ def separate(
     additive: bool = False,
     encoding: Encoding | None = None,
     max_pixels: int = DEFAULT_MAX_PIXELS,
+    **large: Unpack[Large],
 ) -> Separation:
     """Separates one photograph; for many, `Separator.load` once and call it. Options and errors are theirs."""
-    separator = Separator.load(model, device=device)
+    separator = Separator.load(model, device=device, **large)
     return separator(
         source,
         strength=strength,

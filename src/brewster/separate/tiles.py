@@ -29,12 +29,12 @@ def in_tiles(
     Neighbouring tiles share at least `overlap_px` pixels, over which their answers are cross-faded.
     """
     height, width, _ = picture.shape
-    rows, columns = (_spans(side, tile_px, overlap_px) for side in (height, width))
-    if len(rows) == len(columns) == 1:
+    windows = tiles_of((height, width), tile_px=tile_px, overlap_px=overlap_px)
+    if len(windows) == 1:
         return backend(picture)
     layers: list[Picture] = []
     total = np.zeros((height, width, 1), np.float32)
-    for vertical, horizontal in product(rows, columns):
+    for vertical, horizontal in windows:
         window = np.s_[vertical, horizontal]
         weight = np.outer(_fade(vertical, height, overlap_px), _fade(horizontal, width, overlap_px))[
             ..., None
@@ -45,6 +45,12 @@ def in_tiles(
         for layer, answer in zip(layers, answers, strict=True):
             layer[window] += weight * answer
     return tuple(layer / total for layer in layers)
+
+
+def tiles_of(size: tuple[int, int], *, tile_px: int, overlap_px: int) -> list[tuple[slice, slice]]:
+    """The rows and columns of each tile of a picture of this (height, width)."""
+    rows, columns = (_spans(side, tile_px, overlap_px) for side in size)
+    return list(product(rows, columns))
 
 
 def _spans(side: int, tile: int, overlap: int) -> list[slice]:

@@ -1,0 +1,153 @@
+"""How a large image model looks at a photo: it draws the panels anew, and only what it changes is believed.
+
+A generated picture drifts from the photo in its colours and in its detail. Where the model draws the photo, too (the
+panel I), it drifts there alike, so that the change is taken between its own panels, T - I, and detail.py lays it over
+the real photo. How far its photo is from the real one is the drift, of which nobody should be unaware.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from threading import Lock
+from typing import Final, final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from brewster.errors import ModelError
+from brewster.light import to_encoded, to_linear
+from brewster.models.large.decompose import Decomposer
+from brewster.models.large.panels import Fit
+from brewster.models.large.sampling import STEPS
+from brewster.options import Quality
+from brewster.separate.detail import Floats, enlarge_rows
+from brewster.separate.look import Look, Seen, Tell, agreement
+from brewster.separate.tiles import in_tiles, tiles_of
+
+_DRAFT_STEPS: Final = 4
+_CLOSER: Final = 2
+"""How much larger a side of the second copy of a close look is; it is seen in tiles of a panel each."""
+_WORTH_IT: Final = 1.25
+"""A copy that is less than so much larger shows nothing new."""
+
+
+@final
+class Panels(Look):
+    """Looks through a `Decomposer`: at the whole photo in one panel, and for "best" also closer, panel by panel.
+
+    Args:
+        decomposer: the model.
+        steps: how many steps each look takes; by default the paper's 20, and 4 for "draft".
+        average: how many answers, from as many seeds, are averaged: what the model merely made up averages out.
+
+    Raises:
+        ModelError: no step, or nothing to average.
+    """
+
+    def __init__(self, decomposer: Decomposer, *, steps: int | None = None, average: int = 1) -> None:
+        if (steps is not None and steps < 1) or average < 1:
+            raise ModelError(f"steps = {steps}, average = {average}", "at least 1 of each", "raise them")
+        self._decomposer, self._steps, self._seeds = decomposer, steps, range(average)
+        self._one_at_a_time = Lock()
+
+    def sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
+        """As large as a panel, and for "best" twice that, as far as the photo is.
+
+        Raises:
+            PhotoError: the photo has fewer than 16 pixels a side, or is too long and thin.
+        """
+        task, multiple = self._decomposer.task, self._decomposer.backbone.multiple
+        whole = task.fit(size, multiple).content
+        scale = min(_CLOSER, size[0] / whole[0])
+        if quality != "best" or scale < _WORTH_IT:
+            return [whole]
+        return [whole, (round(scale * whole[0]), round(scale * whole[1]))]
+
+    def __call__(self, copies: Sequence[Floats], quality: Quality, tell: Tell) -> Seen:
+        """The mean of the looks; the drift is that of the look at the whole."""
+        size = copies[-1].shape[:2]
+        sides = [max(copies[0].shape), *(self._tile_px for _ in copies[1:])]
+        tiles = [
+            len(tiles_of(copy.shape[:2], **_cut(side))) for copy, side in zip(copies, sides, strict=True)
+        ]
+        steps = self._steps or (_DRAFT_STEPS if quality == "draft" else STEPS)
+        count = _Count(tell, sum(tiles))
+        looks = []
+        with self._one_at_a_time:  # two at once would need twice the memory of the card
+            for copy, side in zip(copies, sides, strict=True):
+                looks.append(in_tiles(lambda tile: self._answer(tile, steps, count), copy, **_cut(side)))
+        change, reflection, apart, drift = (
+            np.mean([enlarge_rows(map_, 0, size[0], size) for map_ in maps], axis=0)
+            for maps in zip(*looks, strict=True)
+        )
+        whole = float(looks[0][3].mean()) if self._redraws else None
+        return Seen(change, reflection, agreement(apart + drift), whole)
+
+    @property
+    def _redraws(self) -> bool:
+        return bool({"I", "R"} & set(self._decomposer.task.layout.panels))
+
+    @property
+    def _tile_px(self) -> int:
+        """The side of a square panel."""
+        task, multiple = self._decomposer.task, self._decomposer.backbone.multiple
+        return max(1, math.isqrt(task.budget_px // len(task.layout.panels)) // multiple) * multiple
+
+    def _answer(self, tile: Floats, steps: int, count: _Count) -> tuple[Floats, Floats, Floats, Floats]:
+        """Change and reflection, linear; how far the answers are apart, and how far their photo is from it, encoded."""
+        height, width, _ = tile.shape
+        fit = Fit((width, height), _up((width, height), self._decomposer.backbone.multiple))
+        shown = torch.from_numpy(2 * to_encoded(tile) - 1).permute(2, 0, 1)[None]
+        panels = self._decomposer(fit.pad(shown), steps=steps, seeds=self._seeds, tell=count.within_tile)
+        count.tile_done()
+        light = {name: _light(fit.cut(panel)) for name, panel in panels.items()}
+        photo = light.get("I", tile)
+        change = light["T"] - photo
+        reflection = light.get("R", np.maximum(-change, 0))
+        drawn = to_encoded(_drawn(light, tile))
+        return (
+            change.mean(axis=0),
+            reflection.mean(axis=0),
+            np.ptp(to_encoded(light["T"]), axis=0),
+            np.abs(drawn - to_encoded(tile)).mean(axis=0),
+        )
+
+
+@dataclass
+class _Count:
+    """Tells how far a look is, tile by tile and step by step."""
+
+    tell: Tell
+    tiles: int
+    done: int = 0
+
+    def within_tile(self, step: int, steps: int) -> None:
+        self.tell((self.done + step / steps) / self.tiles)
+
+    def tile_done(self) -> None:
+        self.done += 1
+
+
+def _drawn(light: Mapping[str, Floats], tile: Floats) -> Floats:
+    """The photo as the model draws it: its own panel, or T and R together, or not at all."""
+    if "I" in light:
+        return light["I"]
+    return light["T"] + light["R"] if "R" in light else tile[None]
+
+
+def _light(panels: torch.Tensor) -> NDArray[np.float32]:
+    """Panels (n, 3, h, w) in [-1, 1] as linear light (n, h, w, 3)."""
+    light: NDArray[np.float32] = to_linear(((panels + 1) / 2).clamp(0, 1).permute(0, 2, 3, 1).numpy())
+    return light
+
+
+def _cut(side: int) -> dict[str, int]:
+    return {"tile_px": side, "overlap_px": side // 4}
+
+
+def _up(size: tuple[int, int], multiple: int) -> tuple[int, int]:
+    width, height = (-(-side // multiple) * multiple for side in size)
+    return width, height
