@@ -353,7 +353,8 @@ def test_json_says_what_became_of_every_photo(run, tmp_path, model):
     done, failed = lines(out)
     assert code == 1
     assert len(err.splitlines()) == 1
-    keys = {"source", "status", "outputs", "model", "sha256", "device", "seconds", "remainder", "error"}
+    made_by = {"model", "sha256", "device", "seconds", "remainder", "drift", "doubtful"}
+    keys = {"source", "status", "outputs", "error"} | made_by
     assert keys == set(done) == set(failed)
     assert done["outputs"] == {layer: f"a.{layer}.jpg" for layer in LAYERS}
     assert (done["source"], done["status"], done["model"], done["error"]) == (

@@ -28,6 +28,7 @@ class Large(TypedDict, total=False):
     quantise: Quantise | None
     steps: int | None
     average: int
+    plain: bool
 
 
 _FLOAT_CONTAINERS = ("tiff", "exr")
@@ -96,6 +97,12 @@ class Options:
     average: int = field(
         default=1,
         metadata=_about("Of large models: how many answers are averaged.", ge=1),
+    )
+    plain: bool = field(
+        default=False,
+        metadata=_about(
+            "Of large models: the transmission as it is drawn, enlarged, without the photo's own detail."
+        ),
     )
     max_pixels: int = field(
         default=DEFAULT_MAX_PIXELS,

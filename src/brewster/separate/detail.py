@@ -22,6 +22,8 @@ Floats = NDArray[np.float32]
 
 _RADIUS: Final = 2
 _VARIANCE_FLOOR: Final = 4e-3
+_FAINT_DETAIL: Final = 1e-6
+"""Energy of detail, linear light squared, below which it is nobody's."""
 
 
 @final
@@ -43,14 +45,43 @@ class _Lines:
 
 @final
 @dataclass(frozen=True)
+class Redrawn:
+    """A transmission that a model drew at work resolution, and where it is to be taken as it is, merely enlarged.
+
+    Where sharp detail is mirrored and little lies behind it, the photo's detail is the mirror's: the drawn picture,
+    though softer, is nearer to the truth there.
+    """
+
+    transmission: Float32[Floats, "h w 3"]
+    share: Float32[Floats, "h w 1"]
+    """0: the photo's own detail; 1: the drawn picture."""
+    strength: float = 1.0
+    """How much of the way from the photo to the drawn picture is gone."""
+
+    @classmethod
+    def where_mirrored(cls, transmission: Floats, reflection: Floats) -> Redrawn:
+        """Taken as far as the fine detail is the reflection's: its share of the energy above the windows' means."""
+        mirrored, behind = (
+            _box(np.square(layer - _box(layer)).mean(axis=2, keepdims=True))
+            for layer in (reflection, transmission)
+        )
+        share: Floats = mirrored / (mirrored + behind + np.float32(_FAINT_DETAIL))
+        return cls(transmission, share)
+
+
+@final
+@dataclass(frozen=True)
 class Transfer:
     """A separation at work resolution, ready to be read at the photo's, row by row."""
 
     change: _Lines
     reflection: _Lines
+    redrawn: Redrawn | None = None
 
     @classmethod
-    def learn(cls, photo: Floats, change: Floats, reflection: Floats) -> Transfer:
+    def learn(
+        cls, photo: Floats, change: Floats, reflection: Floats, redrawn: Redrawn | None = None
+    ) -> Transfer:
         """From a photo, transmission - photo, and the reflection at work resolution, (h, w, 3), linear light."""
         mean = _box(photo)
         spread = _box(photo * photo) - mean**2 + _VARIANCE_FLOOR
@@ -60,7 +91,7 @@ class Transfer:
             slope = _box((_box(photo * picture) - mean * _box(picture)) / spread)
             return _Lines(slope, picture - slope * photo)
 
-        return cls(fit(change), fit(reflection))
+        return cls(fit(change), fit(reflection), redrawn)
 
     def apply(self, photo: Floats, top: int, height: int) -> tuple[Floats, Floats]:
         """Transmission and reflection of rows top..top+n of a photo `height` rows high, each (n, W, 3).
@@ -69,6 +100,13 @@ class Transfer:
         than the photo it is part of.
         """
         transmission = self.change.read(photo, top, height)
+        if self.redrawn:
+            size = height, photo.shape[1]
+            drawn, share = (
+                enlarge_rows(map_, top, len(photo), size)
+                for map_ in (self.redrawn.transmission, self.redrawn.share)
+            )
+            transmission += share * (np.float32(self.redrawn.strength) * (drawn - photo) - transmission)
         transmission += photo
         np.maximum(transmission, np.minimum(photo, 0), out=transmission)
         reflection = self.reflection.read(photo, top, height)

@@ -23,7 +23,7 @@ from brewster.models.large.decompose import Decomposer
 from brewster.models.large.panels import Fit
 from brewster.models.large.sampling import STEPS
 from brewster.options import Quality
-from brewster.separate.detail import Floats, enlarge_rows
+from brewster.separate.detail import Floats, Redrawn, enlarge_rows
 from brewster.separate.look import Look, Seen, Tell, agreement
 from brewster.separate.tiles import in_tiles, tiles_of
 
@@ -42,15 +42,24 @@ class Panels(Look):
         decomposer: the model.
         steps: how many steps each look takes; by default the paper's 20, and 4 for "draft".
         average: how many answers, from as many seeds, are averaged: what the model merely made up averages out.
+        plain: gives the transmission as the model draws it, enlarged, without the photo's own detail.
 
     Raises:
         ModelError: no step, or nothing to average.
     """
 
-    def __init__(self, decomposer: Decomposer, *, steps: int | None = None, average: int = 1) -> None:
+    def __init__(
+        self,
+        decomposer: Decomposer,
+        *,
+        steps: int | None = None,
+        average: int = 1,
+        plain: bool = False,
+    ) -> None:
         if (steps is not None and steps < 1) or average < 1:
             raise ModelError(f"steps = {steps}, average = {average}", "at least 1 of each", "raise them")
-        self._decomposer, self._steps, self._seeds = decomposer, steps, range(average)
+        self._decomposer, self._plain = decomposer, plain
+        self._steps, self._seeds = steps, range(average)
         self._one_at_a_time = Lock()
 
     def sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
@@ -79,12 +88,14 @@ class Panels(Look):
         with self._one_at_a_time:  # two at once would need twice the memory of the card
             for copy, side in zip(copies, sides, strict=True):
                 looks.append(in_tiles(lambda tile: self._answer(tile, steps, count), copy, **_cut(side)))
-        change, reflection, apart, drift = (
+        change, reflection, drawn, apart, drift = (
             np.mean([enlarge_rows(map_, 0, size[0], size) for map_ in maps], axis=0)
             for maps in zip(*looks, strict=True)
         )
-        whole = float(looks[0][3].mean()) if self._redraws else None
-        return Seen(change, reflection, agreement(apart + drift), whole)
+        whole = Redrawn(drawn, np.ones_like(drawn[..., :1]))
+        redrawn = whole if self._plain else Redrawn.where_mirrored(drawn, reflection)
+        strayed = float(looks[0][-1].mean()) if self._redraws else None
+        return Seen(change, reflection, agreement(apart + drift), redrawn, strayed)
 
     @property
     def _redraws(self) -> bool:
@@ -96,8 +107,8 @@ class Panels(Look):
         task, multiple = self._decomposer.task, self._decomposer.backbone.multiple
         return max(1, math.isqrt(task.budget_px // len(task.layout.panels)) // multiple) * multiple
 
-    def _answer(self, tile: Floats, steps: int, count: _Count) -> tuple[Floats, Floats, Floats, Floats]:
-        """Change and reflection, linear; how far the answers are apart, and how far their photo is from it, encoded."""
+    def _answer(self, tile: Floats, steps: int, count: _Count) -> tuple[Floats, ...]:
+        """Change, reflection and transmission, linear; how far the answers are apart and their photo strays, encoded."""
         height, width, _ = tile.shape
         fit = Fit((width, height), _up((width, height), self._decomposer.backbone.multiple))
         shown = torch.from_numpy(2 * to_encoded(tile) - 1).permute(2, 0, 1)[None]
@@ -111,6 +122,7 @@ class Panels(Look):
         return (
             change.mean(axis=0),
             reflection.mean(axis=0),
+            light["T"].mean(axis=0),
             np.ptp(to_encoded(light["T"]), axis=0),
             np.abs(drawn - to_encoded(tile)).mean(axis=0),
         )

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from brewster.light import to_encoded
 from brewster.options import Quality
-from brewster.separate.detail import Floats, enlarge_rows
+from brewster.separate.detail import Floats, Redrawn, enlarge_rows
 from brewster.separate.tiles import Backend, in_tiles
 
 if TYPE_CHECKING:
@@ -52,6 +52,8 @@ class Seen:
     reflection: Float32[NDArray[np.float32], "h w 3"]
     sureness: Float32[NDArray[np.float32], "h w 1"]
     """1 where it is sure, towards 0 where it is not."""
+    redrawn: Redrawn | None = None
+    """Where the transmission is to be taken as the model drew it."""
     drift: float | None = None
     """Mean of |the photo as the model redraws it - the photo|, sRGB-encoded; None where it redraws nothing."""
 

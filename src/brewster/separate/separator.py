@@ -26,7 +26,7 @@ from brewster.models.zoo import find_model, is_large
 from brewster.options import Large, Quality
 from brewster.photo import DEFAULT_MAX_PIXELS, Encoding, Photo, Source
 from brewster.separate.detail import Floats, Transfer, enlarge_rows
-from brewster.separate.look import QUALITIES, Look, Tell, Views
+from brewster.separate.look import QUALITIES, Look, Seen, Tell, Views
 from brewster.separate.runtime import OnnxBackend
 from brewster.separate.tiles import Backend
 
@@ -89,7 +89,8 @@ class Separator:
             device: where it runs; "auto" takes the fastest device that is there.
             large: of large models only: `base`, where a LoRA's base lies, if not where it was trained; `quantise`,
                 "int8", "float8" or "nf4", by default as for the LoRA's training; `steps` for each look, by default
-                the paper's 20, and 4 for quality "draft"; `average`, how many answers are averaged.
+                the paper's 20, and 4 for quality "draft"; `average`, how many answers are averaged; `plain`, the
+                transmission as the model draws it, without the photo's own detail.
 
         Raises:
             ModelError: no such model, a damaged one, or options of large models for a small one.
@@ -122,7 +123,12 @@ class Separator:
         decomposer = open_decomposer(
             model, device=device, base=asked.get("base"), quantise=asked.get("quantise")
         )
-        look = Panels(decomposer, steps=asked.get("steps"), average=asked.get("average", 1))
+        look = Panels(
+            decomposer,
+            steps=asked.get("steps"),
+            average=asked.get("average", 1),
+            plain=asked.get("plain", False),
+        )
         where = str(decomposer.backbone.device)
         return cls(look, name=decomposer.name, sha256=decomposer.sha256, device=where)
 
@@ -163,8 +169,7 @@ class Separator:
         with _clock(seconds, "network"):
             seen = self._look(copies, quality, lambda done: tell(_LOOKING * done))
         with _clock(seconds, "detail"):
-            share = np.float32(strength) * white
-            transfer = Transfer.learn(white * copies[-1], share * seen.change, share * seen.reflection)
+            transfer = _transfer(copies[-1], seen, strength, white)
             whole, mirrored, remainder = _at_full_size(photo, transfer, additive=additive, tell=tell)
         made_by = self.name, self.sha256, self.device
         return Separation(photo, whole, mirrored, seen.sureness, remainder, seen.drift, *made_by, seconds)
@@ -199,6 +204,14 @@ def _check(strength: float, quality: str) -> None:
         raise BrewsterError(f"strength is {strength}", "a number from 0 to 1", "choose one in that range")
     if quality not in QUALITIES:
         raise BrewsterError(f"quality is {quality!r}", f"one of {', '.join(QUALITIES)}", "choose one of them")
+
+
+def _transfer(copy: Floats, seen: Seen, strength: float, white: np.float32) -> Transfer:
+    """What was seen, as strong and as bright as it is asked for."""
+    share, redrawn = np.float32(strength) * white, seen.redrawn
+    if redrawn:
+        redrawn = replace(redrawn, transmission=white * redrawn.transmission, strength=strength)
+    return Transfer.learn(white * copy, share * seen.change, share * seen.reflection, redrawn)
 
 
 def _at_full_size(

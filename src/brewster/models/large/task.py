@@ -40,6 +40,12 @@ class Task:
         try:
             return fit_panel(size, self.layout, budget_px=self.budget_px, multiple=multiple)
         except PhotoError:
+            if min(size) < multiple:
+                raise PhotoError(
+                    f"the photo has {size[0]} x {size[1]} pixels",
+                    f"at least {multiple} a side",
+                    "large models see nothing smaller: use another photo, or the compact model",
+                ) from None
             cells = math.prod(max(1, side // multiple) for side in size)
             small = min(self.budget_px, cells * len(self.layout.panels) * multiple**2)
             return fit_panel(size, self.layout, budget_px=small, multiple=multiple)
