@@ -2,6 +2,8 @@
 
 import io
 import os
+import shutil
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -17,21 +19,25 @@ from brewster.train.recipe import read_recipe, with_value
 from front_door import as_user
 
 RECIPES = Path(__file__).parents[1] / "recipes" / "ablations"
-STUDIES = [path for path in sorted(RECIPES.glob("*.toml")) if "base" in path.read_text().split("\n", 2)[1]]
+STUDIES = [path for path in sorted(RECIPES.glob("*.toml")) if "base" in tomllib.loads(path.read_text())]
 
 
 def names(paths):
     return [path.stem for path in paths]
 
 
-def test_every_ablation_of_the_paper_that_the_compact_model_can_do_is_ready():
-    assert names(STUDIES) == ["mixing", "orders", "pairs", "size"]
+TINY = {"prompt": "backbone-tiny.toml"}
+"""Another tiny base than tiny.toml, by study."""
+
+
+def test_every_ablation_of_the_paper_is_ready():
+    assert names(STUDIES) == ["mixing", "orders", "pairs", "prompt", "size"]
 
 
 @pytest.mark.parametrize("path", STUDIES, ids=names(STUDIES))
 def test_a_study_changes_one_value_of_both_the_full_and_the_tiny_recipe(path):
     study = read_study(path)
-    for base in (read_recipe(study.base), read_recipe(RECIPES / "tiny.toml")):
+    for base in (read_recipe(study.base), read_recipe(RECIPES / TINY.get(path.stem, "tiny.toml"))):
         recipes = [with_value(base, study.value, choice) for choice in study.choices]
         assert base in recipes
         assert len({recipe.model_dump_json() for recipe in recipes}) == len(study.choices)
@@ -60,13 +66,13 @@ def test_a_study_that_does_not_say_what_it_must_is_refused(text, said, tmp_path)
 @pytest.fixture
 def quick(monkeypatch, model):
     """Training that takes no time: every network is a pane."""
-    monkeypatch.setattr(module, "train", lambda recipe, out, report: report(1, 1, {"loss": 0.5}, True))
-    monkeypatch.setattr(module, "export_onnx", lambda _network, path: write_model(path, model))
 
+    def trained(recipe, folder, tell):
+        tell(1, 1, {"loss": 0.5}, True)
+        folder.mkdir(parents=True, exist_ok=True)
+        return Path(shutil.copy(model, folder / "model.onnx"))
 
-def write_model(path, model):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(model.read_bytes())
+    monkeypatch.setattr(module, "_trained", trained)
 
 
 @pytest.fixture
@@ -103,6 +109,16 @@ def test_words_are_not_drawn(quick, pairs, data, tmp_path, monkeypatch):
     assert (tmp_path / "out" / "mixing-8-bit" / "model.onnx").is_file()
 
 
+def test_prompts_are_compared_on_a_backbone_that_nobody_has_trained(pairs, tmp_path, monkeypatch):
+    monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
+    study = read_study(RECIPES / "prompt.toml").model_copy(update={"base": RECIPES / "backbone-tiny.toml"})
+    results = ablate(study, pairs, tmp_path / "out")
+    assert list(results["methods"]) == ["doing nothing", "prompt generic", "prompt detailed"]
+    assert not (tmp_path / "out" / "prompt-generic" / "checkpoint.pt").exists()
+    means = [row["psnr"]["mean"] for row in results["tables"]["real20"].values()]
+    assert len(set(means)) == 3
+
+
 @pytest.fixture
 def little_data(data, tmp_path):
     """A few of the pairs that studies learn from and are measured on."""
@@ -121,7 +137,8 @@ def little_data(data, tmp_path):
 def test_every_study_runs_end_to_end_at_tiny_size(path, little_data, tmp_path):
     """Real rendering, real training, real measuring, on four real pairs."""
     environment = {**os.environ, "BREWSTER_DATA": str(little_data)}
-    done = as_user("ablate", path, "--base", RECIPES / "tiny.toml", "-o", tmp_path / "out", env=environment)
+    base = RECIPES / TINY.get(path.stem, "tiny.toml")
+    done = as_user("ablate", path, "--base", base, "-o", tmp_path / "out", env=environment)
     assert done.returncode == 0, done.stderr.decode()
     text = done.stdout.decode()
     for choice in read_study(path).choices:

@@ -1,4 +1,3 @@
-import tomllib
 from pathlib import Path
 
 import pytest
@@ -12,7 +11,6 @@ RECIPES = sorted(FOLDER.glob("train/*.toml"))
 TINY = FOLDER / "train/tiny.toml"
 KONTEXT = TINY.with_stem("kontext")
 BASES = [FOLDER / "ablations/base.toml", FOLDER / "ablations/tiny.toml"]
-STUDIES = [path for path in sorted(FOLDER.glob("ablations/*.toml")) if path not in BASES]
 
 
 def learning_from(tmp_path, data):
@@ -31,18 +29,6 @@ def test_there_are_recipes_and_all_of_them_can_be_read():
 def test_a_recipe_that_says_nothing_of_mixtures_gets_those_of_the_shipped_model():
     assert read_recipe(TINY.with_stem("compact")).mix == MixRecipe()
     assert read_recipe(TINY).mix == MixRecipe(map_probability=0)
-
-
-@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
-def test_a_study_changes_one_value_of_either_base_to_others_that_are_possible(path):
-    study = tomllib.loads(path.read_text())
-    assert study.keys() == {"base", "value", "choices", "benchmarks"}
-    assert path.with_name(study["base"]) in BASES
-    for base in BASES:
-        before = read_recipe(base)
-        recipes = [with_value(before, study["value"], choice) for choice in study["choices"]]
-        assert len({recipe.model_dump_json() for recipe in recipes}) == len(recipes) > 1
-        assert before in recipes or study["value"] == "data.rendered.count"
 
 
 def test_a_changed_value_leaves_the_rest_of_a_recipe_as_it_was():

@@ -24,6 +24,8 @@ NAMES = ["1", "2", "3"]
 class Fake:
     """A method that fails or answers as it is told, and counts how often it was asked."""
 
+    alone = False
+
     def __init__(self, name="fake", answers=None):
         self.name, self.answers, self.asked = name, answers or {}, []
 
@@ -134,6 +136,7 @@ class Deadly:
     """A method that kills its process."""
 
     name: str = "deadly"
+    alone: bool = False
 
     def key(self, case):
         return self.name
@@ -255,3 +258,19 @@ def test_an_interrupt_leaves_what_was_scored(real20, tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         score(real20, [fake], QUICK, tmp_path / "out")
     assert len((tmp_path / "out" / SCORES).read_text().splitlines()) == 2
+
+
+def test_methods_that_need_the_memory_for_themselves_go_through_all_cases_one_after_another(real20, tmp_path):
+    asked = []
+
+    class Large(Fake):
+        alone = True
+
+        def answer(self, case, photo):
+            asked.append((self.name, case.name))
+            return super().answer(case, photo)
+
+    methods = [Large("one"), Fake("small"), Large("two")]
+    rows = score(real20, methods, QUICK, tmp_path / "out")
+    assert [name for name, _ in asked] == sorted(name for name, _ in asked)
+    assert [row.method for row in rows[:3]] == ["one", "small", "two"]

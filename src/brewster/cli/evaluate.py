@@ -270,9 +270,9 @@ class _Order:
 
     def _methods(self) -> list[Method]:
         from brewster.evaluate.methods import Model, Nothing, Predictions  # noqa: PLC0415
-        from brewster.models.zoo import find_model  # noqa: PLC0415
+        from brewster.models.zoo import model_name  # noqa: PLC0415
 
-        models = [(name or find_model(model).name, model) for name, model in self.models]
+        models = [(name or model_name(model), model) for name, model in self.models]
         answers = self.out / "predictions"
         return [
             Nothing(),

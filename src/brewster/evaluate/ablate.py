@@ -16,16 +16,15 @@ from typing import Annotated, Any, Final, final
 from pydantic import AfterValidator, Field
 
 from brewster.dataset.benchmarks import Benchmark, read_benchmark
-from brewster.errors import RecipeError
 from brewster.evaluate.evaluation import evaluate
 from brewster.evaluate.methods import Model, Nothing
 from brewster.evaluate.protocol import Protocol
 from brewster.evaluate.results import AVERAGE, Results
 from brewster.files import write_atomically
 from brewster.scene.values import Values, read_toml
-from brewster.train.compact_learner import train
-from brewster.train.export import export_onnx
-from brewster.train.recipe import CompactRecipe, data_folder, read_recipe, with_value
+from brewster.train import loop
+from brewster.train.learners import open_learner
+from brewster.train.recipe import CompactRecipe, LargeRecipe, data_folder, read_recipe, with_value
 
 Choice = str | int | float | bool
 Report = Callable[[str, int, int, Mapping[str, float], bool], None]
@@ -103,7 +102,7 @@ def ablate(
         RecipeError: the base recipe or the value is wrong, or data is missing.
         BrewsterError: what training and `evaluate` raise.
     """
-    base = _compact(study.base)
+    base = read_recipe(study.base)
     recipes = {study.label(choice): with_value(base, study.value, choice) for choice in study.choices}
     models = []
     for label, recipe in recipes.items():
@@ -112,8 +111,7 @@ def ablate(
         def tell(*told: Any, label: str = label) -> None:  # noqa: ANN401  (what train tells)
             report(label, *told)
 
-        export_onnx(train(recipe, folder, tell), folder / "model.onnx")
-        models.append(Model(label, str(folder / "model.onnx"), out / "predictions" / folder.name))
+        models.append(Model(label, str(_trained(recipe, folder, tell)), out / "predictions" / folder.name))
     results = evaluate(benchmarks, [Nothing(), *models], Protocol(), out, workers=workers)
     numbers = [
         choice for choice in study.choices if isinstance(choice, int | float) and not isinstance(choice, bool)
@@ -123,15 +121,11 @@ def ablate(
     return results
 
 
-def _compact(path: Path) -> CompactRecipe:
-    recipe = read_recipe(path)
-    if isinstance(recipe, CompactRecipe):
-        return recipe
-    raise RecipeError(
-        f"{path} trains a large backbone",
-        "a study trains compact networks",
-        "name another recipe with --base",
-    )
+def _trained(recipe: CompactRecipe | LargeRecipe, folder: Path, tell: loop.Report) -> Path:
+    """The model of this recipe, in memory no longer than it learns."""
+    learner = open_learner(recipe)
+    loop.run(learner, folder, tell)
+    return learner.export(folder)
 
 
 def _plot(study: Study, numbers: Sequence[float], results: Results) -> bytes:

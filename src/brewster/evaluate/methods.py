@@ -12,7 +12,7 @@ import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import Final, Protocol, final
 
@@ -22,6 +22,7 @@ import brewster
 from brewster.dataset.benchmarks import Case
 from brewster.errors import BrewsterError, PhotoError
 from brewster.files import SUFFIXES, write_atomically
+from brewster.models.zoo import find_model, is_large
 from brewster.options import Device, Quality
 from brewster.photo import Photo
 from brewster.separate import Separator
@@ -63,6 +64,11 @@ class Method(Protocol):
         """What tables call it."""
         ...
 
+    @property
+    def alone(self) -> bool:
+        """Whether it needs the memory for itself, and so answers after the others."""
+        ...
+
     def about(self) -> dict[str, str]:
         """What it is, in plain values for results.json; the first is its kind."""
         ...
@@ -86,6 +92,7 @@ class Nothing:
     """The photo itself as transmission and black as reflection: what every method must beat."""
 
     name: str = NOTHING
+    alone: Final = False
 
     def about(self) -> dict[str, str]:
         """Its kind."""
@@ -118,6 +125,11 @@ class Model:
     quality: Quality = "standard"
     device: Device = "auto"
 
+    @property
+    def alone(self) -> bool:
+        """Large image models: two of them fill any card."""
+        return is_large(self.model)
+
     def about(self) -> dict[str, str]:
         """Its kind, the digest of its file, and how closely it looks."""
         return {"kind": "model", "sha256": self._sha256, "quality": self.quality}
@@ -132,7 +144,7 @@ class Model:
         Raises:
             BrewsterError: the model or the photo cannot be used, or the layers cannot be written.
         """
-        separator = _separator(self.model, self.device)
+        separator = (_large if self.alone else _small)(self.model, self.device)
         started = time.perf_counter()
         separation = separator(photo, quality=self.quality)
         seconds = time.perf_counter() - started
@@ -153,7 +165,11 @@ class Model:
 
     @cached_property
     def _sha256(self) -> str:
-        return _separator(self.model, self.device).sha256 or ""
+        if not self.alone:
+            return find_model(self.model).verify()
+        from brewster.models.large.decompose import fingerprint  # noqa: PLC0415  (wakes torch)
+
+        return fingerprint(self.model)
 
     def _files(self, case: Case) -> dict[str, Path]:
         folder = self.folder / case.benchmark
@@ -161,8 +177,14 @@ class Model:
 
 
 @cache
-def _separator(model: str, device: Device) -> Separator:
+def _small(model: str, device: Device) -> Separator:
     """A model, loaded once a process."""
+    return Separator.load(model, device=device)
+
+
+@lru_cache(maxsize=1)
+def _large(model: str, device: Device) -> Separator:
+    """A model that makes room for the next one."""
     return Separator.load(model, device=device)
 
 
@@ -173,6 +195,7 @@ class Predictions:
 
     name: str
     folder: Path
+    alone: Final = False
 
     def about(self) -> dict[str, str]:
         """Its kind."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -96,11 +96,8 @@ def score(
     cases = {(case.benchmark, case.name): case for part in benchmarks for case in part.cases}
     wanted = [row for case in cases.values() for row in _rows(case, methods, protocol, known)]
     rows = {row.place: known[row.place] for row in wanted if _is_scored(row, known)}
-    tasks = [
-        _Task(cases[place], todo)
-        for place, group in groupby(wanted, lambda row: row.place[:2])
-        if (todo := tuple(row for row in group if row.place not in rows))
-    ]
+    todo = [row for row in wanted if row.place not in rows]
+    tasks = list(_tasks(cases, todo, {method.name for method in methods if method.alone}))
     if tasks and any(name.startswith("lpips") for name in protocol.metrics):
         Lpips.load()  # here, once: its weights may have to be fetched, or be missing
     log = _Log(out / SCORES)
@@ -131,6 +128,19 @@ def _rows(
         before = known.get(row.place)
         is_answered = before and before.answer_key == answer_key
         yield replace(row, kept=before.kept) if before and is_answered else row
+
+
+def _tasks(
+    cases: Mapping[tuple[str, str], Case], todo: Sequence[Row], alone: Collection[str]
+) -> Iterator[_Task]:
+    """Case by case; methods that need the memory for themselves then go through all cases, one after another."""
+
+    def turn(row: Row) -> str:
+        return row.method if row.method in alone else ""
+
+    for _, rows in groupby(sorted(todo, key=turn), turn):
+        for place, group in groupby(rows, lambda row: row.place[:2]):
+            yield _Task(cases[place], tuple(group))
 
 
 def _is_scored(row: Row, known: Mapping[Place, Row]) -> bool:

@@ -81,6 +81,17 @@ def is_large(name: str) -> bool:
     return name in LARGE or name.startswith("tiny:") or Path(name).is_dir() or _is_hub_id(name)
 
 
+def model_name(model: str) -> str:
+    """What a model is called, by whatever it is named: "compact", a file's stem, a folder's name.
+
+    Raises:
+        ModelError: a small model that is not there.
+    """
+    if is_large(model):
+        return Path(model).resolve().name.replace(":", "-")
+    return find_model(model).name
+
+
 def _is_hub_id(name: str) -> bool:
     """OWNER/NAME, and no file or folder of this name."""
     return re.fullmatch(r"[\w-][\w.-]*/[\w-][\w.-]*", name) is not None and not name.endswith(".onnx")

@@ -27,6 +27,7 @@ from brewster.models.large.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding
 from brewster.models.large.sampling import STEPS, euler, sample
 from brewster.models.large.stock import fetch, within_memory
 from brewster.models.large.task import Quantisation, Task
+from brewster.models.zoo import model_name
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -137,8 +138,22 @@ def open_decomposer(
         )
     backbone = load_backbone(model, device=place, quantise=quantise)
     words = encode_prompt(model, PROMPTS.get(prompt, prompt), device=place)
-    named = hashlib.sha256(f"{model} {quantise} {words.sha256}".encode()).hexdigest()
-    return Decomposer(backbone, words, Task(Layout(("T",))), Path(model).name, named)
+    return Decomposer(
+        backbone, words, Task(Layout(("T",))), model_name(model), fingerprint(model, quantise, prompt)
+    )
+
+
+def fingerprint(model: str, quantise: Quantisation | None = None, prompt: str = "detailed") -> str:
+    """SHA-256 of a LoRA's weights and prompt; of a backbone, which is not read for it, of name, storage and words.
+
+    Raises:
+        ModelError, DownloadError: there is no such LoRA, or a damaged one.
+    """
+    folder = _lora_folder(model)
+    if folder is None:
+        return hashlib.sha256(f"{model} {quantise} {PROMPTS.get(prompt, prompt)}".encode()).hexdigest()
+    prompt_sha256 = read_card(folder).prompt_sha256
+    return hashlib.sha256((folder / LORA_FILE).read_bytes() + prompt_sha256.encode()).hexdigest()
 
 
 def torch_device(device: str) -> str:
@@ -182,5 +197,4 @@ def _with_lora(folder: Path, device: str, base: str | None, quantise: Quantisati
     kept = quantise or (card.quantise if device != "cpu" else None)
     backbone = load_backbone(found, device=device, quantise=kept)
     card, prompt = load_lora(folder, backbone)
-    digest = hashlib.sha256((folder / LORA_FILE).read_bytes() + card.prompt_sha256.encode()).hexdigest()
-    return Decomposer(backbone, prompt, card.task, folder.resolve().name, digest)
+    return Decomposer(backbone, prompt, card.task, model_name(str(folder)), fingerprint(str(folder)))
