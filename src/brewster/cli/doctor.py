@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 import platform
 import shutil
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Final, Literal, final
 
 import click
@@ -139,6 +141,7 @@ def examine() -> Iterator[Check]:
     yield from _devices()
     yield from _formats()
     yield from _models()
+    yield from _large()
 
 
 def _packages() -> Iterator[Check]:
@@ -232,6 +235,21 @@ def _models() -> Iterator[Check]:
             yield Check("models", row["name"], "broken", row["error"], cure)
         else:
             yield Check("models", row["name"], "ok", f"sha256 {row['sha256']}")
+
+
+def _large() -> Iterator[Check]:
+    """What large image models may want beyond their extra."""
+    if _version("diffusers") is None:
+        return
+    version = _version("bitsandbytes")
+    about = version or "not installed; for nf4 and 8-bit AdamW on NVIDIA cards"
+    cure = None if version else "pip install bitsandbytes"
+    yield Check("large", "bitsandbytes", "ok" if version else "missing", about, cure, needed=False)
+    kept = Path(os.environ.get("HF_HOME", "~/.cache/huggingface")).expanduser() / "token"
+    found = "HF_TOKEN" if os.environ.get("HF_TOKEN") else str(kept) if kept.is_file() else None
+    about = f"from {found}" if found else "none; gated models such as FLUX.1 Kontext want one"
+    cure = None if found else "hf auth login"
+    yield Check("large", "hub token", "ok" if found else "missing", about, cure, needed=False)
 
 
 def _print(checks: list[Check]) -> None:
