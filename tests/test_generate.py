@@ -1,13 +1,15 @@
 """A large model behind the Separator: twins where the machinery matters, and a model that is known where the answer does."""
 
+import shutil
 from types import SimpleNamespace
 
+import huggingface_hub
 import numpy as np
 import pytest
 import torch
 
 from brewster import Photo, Separator
-from brewster.errors import DeviceError, ModelError, PhotoError
+from brewster.errors import DeviceError, DownloadError, ModelError, PhotoError
 from brewster.light import to_encoded, to_linear
 from brewster.models.large.backbones import TINY, tiny
 from brewster.models.large.decompose import open_decomposer
@@ -205,3 +207,17 @@ def test_a_base_that_has_moved_can_be_named(tmp_path):
 def test_options_of_large_models_are_not_forgotten_by_small_ones():
     with pytest.raises(ModelError, match="steps, plain was asked of compact"):
         Separator.load("compact", steps=3, plain=True)
+
+
+def test_a_lora_is_opened_by_its_name_on_the_hub_from_the_cache(lora, tmp_path, monkeypatch):
+    repository = tmp_path / "models--me--glass"
+    shutil.copytree(lora, repository / "snapshots" / ("1" * 40))
+    (repository / "refs").mkdir()
+    (repository / "refs" / "main").write_text("1" * 40)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
+    separator = Separator.load("me/glass", steps=1)
+    assert separator.name == "glass"
+    assert separator.sha256 == Separator.load(str(lora)).sha256
+    with pytest.raises(DownloadError, match="me/other is not in the cache"):
+        Separator.load("me/other")

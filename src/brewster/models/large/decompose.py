@@ -129,7 +129,7 @@ def open_decomposer(
     place = torch_device(device)
     folder = _lora_folder(model)
     if folder:
-        return _with_lora(folder, place, base, quantise)
+        return _with_lora(model, folder, place, base, quantise)
     if base:
         raise ModelError(
             f"{model} is a base itself, and {base} was named as its base",
@@ -185,7 +185,9 @@ def _lora_folder(model: str) -> Path | None:
     return None
 
 
-def _with_lora(folder: Path, device: str, base: str | None, quantise: Quantisation | None) -> Decomposer:
+def _with_lora(
+    model: str, folder: Path, device: str, base: str | None, quantise: Quantisation | None
+) -> Decomposer:
     card = read_card(folder)
     found = base or card.base
     if base is None and Path(found).is_absolute() and not Path(found).is_dir():
@@ -197,4 +199,4 @@ def _with_lora(folder: Path, device: str, base: str | None, quantise: Quantisati
     kept = quantise or (card.quantise if device != "cpu" else None)
     backbone = load_backbone(found, device=device, quantise=kept)
     card, prompt = load_lora(folder, backbone)
-    return Decomposer(backbone, prompt, card.task, model_name(str(folder)), fingerprint(str(folder)))
+    return Decomposer(backbone, prompt, card.task, model_name(model), fingerprint(model))
