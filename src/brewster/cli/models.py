@@ -1,18 +1,21 @@
-"""`brewster models`: which there are, what their cards say, and whether their files are whole."""
+"""`brewster models`: which there are, what their cards say, whether their files are whole; and sending a LoRA to the hub."""
 
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import click
 
-from brewster.cli.terminal import complain
-from brewster.errors import BrewsterError
+from brewster.cli.terminal import complain, say
+from brewster.errors import BrewsterError, ModelError
+from brewster.files import write_atomically
 from brewster.models import zoo
 
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 _NAME = click.argument("name", default="compact")
+_CARD = "README.md"
 
 
 @click.group
@@ -35,9 +38,18 @@ def list_models(*, as_json: bool) -> None:
 
 @models.command
 @_NAME
-def card(*, name: str) -> None:
-    """Print the card of a model: licence, training data, scores, where it fails."""
-    click.echo(zoo.find_model(name).card())
+@click.option(
+    "--scores",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Put the tables of this results.json, which brewster evaluate wrote, into the card of a LoRA's folder first.",
+)
+def card(*, name: str, scores: Path | None) -> None:
+    """Print the card of a model, or of a LoRA's folder: licence, training data, scores, where it fails."""
+    if scores:
+        _put_scores(Path(name), scores)
+    is_folder = name not in zoo.MODELS and Path(name).is_dir()
+    click.echo(_read_card(Path(name)) if is_folder else zoo.find_model(name).card())
 
 
 @models.command
@@ -66,6 +78,35 @@ def verify(context: click.Context, *, names: tuple[str, ...], as_json: bool) -> 
     context.exit(1 if any(row["error"] for row in rows) else 0)
 
 
+@models.command
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.argument("repo_id", metavar="OWNER/NAME")
+@click.option("--public", is_flag=True, help="For everybody to see; without it, only you and your team.")
+@click.option("--message", metavar="TEXT", default="", help="Of the commit, if not the base and rank.")
+@click.option("--dry-run", is_flag=True, help="Check the folder, print what would be sent, and send nothing.")
+@_JSON
+def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: bool, as_json: bool) -> None:
+    """Send the LoRA in FOLDER to the Hugging Face hub as OWNER/NAME, in one commit.
+
+    Sent are its weights, its prompt, its recipe and its card, nothing else; places of this machine are not named. The
+    token is HF_TOKEN, or the one of `hf auth login`.
+    """
+    from brewster.cli.doctor import require_extra  # noqa: PLC0415  (which imports this module)
+
+    require_extra("large", "pushing")
+    from brewster.models.large import hub  # noqa: PLC0415  (wakes torch)
+
+    plan = hub.plan_push(folder, repo_id, message=message, public=public)
+    for remark in plan.remarks:
+        say(remark)
+    address = None if dry_run else hub.push(plan)
+    if as_json:
+        click.echo(json.dumps(plan.about() | {"address": address}))
+    else:
+        click.echo(plan.table())
+        click.echo(f"sent: {address}" if address else "nothing was sent")
+
+
 def describe(model: zoo.Model) -> dict[str, Any]:
     """A model in plain values; `error` says what is wrong with its file, or is None."""
     row = {"name": model.name, "path": str(model.path), "licence": model.licence, "sha256": model.sha256}
@@ -73,3 +114,36 @@ def describe(model: zoo.Model) -> dict[str, Any]:
         return row | {"sha256": model.verify(), "bytes": model.path.stat().st_size, "error": None}
     except BrewsterError as error:
         return row | {"bytes": None, "error": str(error)}
+
+
+def _read_card(folder: Path) -> str:
+    path = folder / _CARD
+    try:
+        return path.read_text("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ModelError(
+            f"{path} cannot be read ({error})",
+            "the card of a LoRA, as brewster train writes it",
+            "name its folder lora",
+        ) from error
+
+
+def _put_scores(folder: Path, scores: Path) -> None:
+    """Replaces what the card in this folder says was measured."""
+    from brewster.cli.doctor import require_extra  # noqa: PLC0415  (which imports this module)
+
+    require_extra("train", "writing a card")
+    from brewster.evaluate.report.tables import overview  # noqa: PLC0415  (wakes torch)
+    from brewster.train.card import with_measured  # noqa: PLC0415
+
+    try:
+        results = json.loads(scores.read_text("utf-8"))
+        told = [overview(results), *(f"- {choice}" for choice in results["protocol"]["choices"])]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ModelError(
+            f"{scores} cannot be read ({error!r})",
+            "the results.json that brewster evaluate wrote",
+            "name that file",
+        ) from error
+    text = with_measured(_read_card(folder), "\n".join(told))
+    write_atomically(folder / _CARD, text.encode(), overwrite=True)

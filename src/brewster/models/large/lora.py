@@ -175,6 +175,22 @@ def read_card(folder: Path) -> LoraCard:
     return _read(folder)[1]
 
 
+def read_prompt(folder: Path, card: LoraCard) -> PromptEmbedding:
+    """The prompt of the LoRA in this folder.
+
+    Raises:
+        ModelError: missing, damaged, or not the one that the LoRA was trained with.
+    """
+    prompt = load_prompt(folder / PROMPT_FILE, card.backbone)
+    if prompt.sha256 != card.prompt_sha256:
+        raise ModelError(
+            f"{folder / PROMPT_FILE} is not the prompt that the LoRA was trained with",
+            f"SHA-256 {card.prompt_sha256[:12]}...",
+            "copy the whole folder again",
+        )
+    return prompt
+
+
 def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraCard, PromptEmbedding]:
     """Adds the LoRA of a folder to its backbone, and gives its card and its prompt.
 
@@ -189,13 +205,7 @@ def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraCard, PromptEmbeddi
             f"one of {backbone.name}",
             f"load the backbone {card.backbone} for it",
         )
-    prompt = load_prompt(folder / PROMPT_FILE, backbone.name)
-    if prompt.sha256 != card.prompt_sha256:
-        raise ModelError(
-            f"{folder / PROMPT_FILE} is not the prompt that the LoRA was trained with",
-            f"SHA-256 {card.prompt_sha256[:12]}...",
-            "copy the whole folder again",
-        )
+    prompt = read_prompt(folder, card)
     add_lora(backbone, rank=card.rank, alpha=card.alpha)
     try:
         load_lora_state(backbone, state)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final, Literal, Self, final
 
 from brewster.errors import PhotoError
@@ -26,7 +26,7 @@ class Task:
     `guidance` is that of separating, which need not be that of learning.
     """
 
-    layout: Layout = Layout()
+    layout: Layout = field(default_factory=Layout)
     budget_px: int = PAPER_PX
     objective: Objective = "flow"
     guidance: float = GUIDANCE

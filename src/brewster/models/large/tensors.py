@@ -22,8 +22,10 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str,
         MissingExtra: safetensors is not installed.
     """
     alone = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    data = library("safetensors.torch").save(alone, {"format": "pt", **about})
-    write_atomically(path, _with_sorted_header(data), overwrite=True)
+    said = {"format": "pt", **about}
+    # safetensors writes its metadata in an order that changes from run to run; offsets count from its end.
+    data = retold(library("safetensors.torch").save(alone, said), said)
+    write_atomically(path, data, overwrite=True)
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -38,7 +40,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         # Not mapped but read: whoever writes the file anew would pull a mapped tensor from under our feet.
         data = path.read_bytes()
         tensors = library("safetensors.torch").load(data)
-        return dict(sorted(tensors.items())), _header(data).get("__metadata__", {})
+        return dict(sorted(tensors.items())), said_of(data)
     except FileNotFoundError as error:
         raise ModelError(f"{path} is missing", "a safetensors file", "copy the whole folder") from error
     except (OSError, ValueError, safetensors.SafetensorError) as error:
@@ -56,10 +58,16 @@ def _end(data: bytes) -> int:
     return 8 + int.from_bytes(data[:8], "little")
 
 
-def _with_sorted_header(data: bytes) -> bytes:
-    """safetensors writes its metadata in an order that changes from run to run; offsets count from its end."""
+def said_of(data: bytes) -> dict[str, str]:
+    """What is said about the tensors in a whole file's bytes."""
+    said: dict[str, str] = _header(data).get("__metadata__", {})
+    return said
+
+
+def retold(data: bytes, about: Mapping[str, str]) -> bytes:
+    """The same tensors in a whole file's bytes, with something else said about them."""
     header = _header(data)
-    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    header["__metadata__"] = dict(sorted(about.items()))
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
     text += b" " * (-len(text) % 8)
     return len(text).to_bytes(8, "little") + text + data[_end(data) :]

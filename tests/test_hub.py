@@ -1,0 +1,271 @@
+"""What leaves for the hub: which files, without whose home, and what is said where the hub refuses."""
+
+import hashlib
+import json
+import shutil
+
+import huggingface_hub
+import pytest
+from huggingface_hub import ModelCard
+
+import fake_hub
+from brewster.errors import DownloadError, ModelError
+from brewster.models.large.backbones import BACKBONES, tiny
+from brewster.models.large.hub import FILES, plan_push, push
+from brewster.models.large.lora import LORA_FILE, add_lora, load_lora, save_lora
+from brewster.models.large.task import Task
+from brewster.models.large.tensors import read_tensors, said_of
+from brewster.train.card import write_card
+from brewster.train.recipe import LargeRecipe
+from file_server import loopback_only, unheard
+
+REPO = "somebody/sees-through-glass"
+VALUES = {
+    "seed": 1, "steps": 6, "batch": 2, "learning_rate": 1e-2, "warmup_steps": 2, "weight_decay": 1e-4,
+    "report_every": 6, "checkpoint_every": 2,
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _network_off(monkeypatch):
+    loopback_only(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def twin():
+    backbone, prompt = tiny("kontext")
+    add_lora(backbone, rank=2, alpha=2)
+    return backbone, prompt
+
+
+@pytest.fixture
+def write(twin, tmp_path):
+    """Writes a LoRA's folder as training does."""
+
+    def write(base="kontext", sets="sets/window"):
+        folder = tmp_path / "lora"
+        hub_id = BACKBONES["kontext"].hub_id if base == "kontext" else base
+        save_lora(folder, *twin, Task(), base=hub_id)
+        recipe = LargeRecipe.model_validate(
+            VALUES | {"backbone": base, "data": {"rendered": {"sets": [sets]}}}
+        )
+        (folder / "recipe.json").write_text(json.dumps(recipe.model_dump(mode="json"), indent=2))
+        write_card(folder, recipe, {"loss": 1.0}, BACKBONES["kontext"])
+        return folder
+
+    return write
+
+
+@pytest.fixture
+def hub(monkeypatch, tmp_path):
+    with fake_hub.served() as hub:
+        monkeypatch.setattr(huggingface_hub.constants, "ENDPOINT", hub.url)
+        monkeypatch.setattr(huggingface_hub.constants, "HF_TOKEN_PATH", str(tmp_path / "nobody-logged-in"))
+        monkeypatch.setenv("HF_TOKEN", hub.token)
+        yield hub
+
+
+def contents(plan):
+    return {file.name: file.data for file in plan.files}
+
+
+def test_four_files_would_be_sent_as_they_are(write):
+    folder = write()
+    (folder / "notes.txt").write_text("mine")
+    plan = plan_push(folder, REPO)
+    assert [file.name for file in plan.files] == sorted(FILES, key=FILES.index)
+    assert contents(plan) == {name: (folder / name).read_bytes() for name in FILES}
+    assert plan.is_private
+    assert plan.message == "LoRA of black-forest-labs/FLUX.1-Kontext-dev, rank 2"
+    assert plan.remarks[1:] == ("not sent: notes.txt",)
+    for file in plan.about()["files"]:
+        assert file["sha256"] == hashlib.sha256((folder / file["name"]).read_bytes()).hexdigest()
+    assert all(name in plan.table() for name in FILES)
+
+
+def test_a_base_that_forbids_commerce_and_a_toy_are_said(write):
+    assert "not for commercial use" in plan_push(write(), REPO).remarks[0]
+    assert "a toy: nobody can separate" in plan_push(write("tiny:kontext"), REPO).remarks[0]
+
+
+def test_places_of_this_machine_are_renamed_in_what_is_sent_and_the_lora_still_loads(write, tmp_path, twin):
+    base, sets = tmp_path / "models" / "flux", tmp_path / "secret" / "window"
+    folder = write(str(base), str(sets))
+    before = {name: (folder / name).read_bytes() for name in FILES}
+    plan = plan_push(folder, REPO)
+    sent = contents(plan)
+    assert all(str(tmp_path).encode() not in data for data in sent.values())
+    recipe = json.loads(sent["recipe.json"])
+    assert recipe["data"]["rendered"]["sets"] == ["window"]
+    assert recipe["backbone"] == BACKBONES["kontext"].hub_id
+    assert json.loads(said_of(sent[LORA_FILE])["brewster"])["base"] == BACKBONES["kontext"].hub_id
+    assert f"{sets} is called window in what is sent" in plan.remarks
+    assert before == {name: (folder / name).read_bytes() for name in FILES}
+    for name, data in sent.items():
+        (folder / name).write_bytes(data)
+    card, _ = load_lora(folder, tiny("kontext")[0])
+    assert card.base == BACKBONES["kontext"].hub_id
+    whole, _ = read_tensors(folder / LORA_FILE)
+    folder.joinpath(LORA_FILE).write_bytes(before[LORA_FILE])
+    assert all((tensor == whole[name]).all() for name, tensor in read_tensors(folder / LORA_FILE)[0].items())
+
+
+@pytest.mark.parametrize("home", ["/home/ann/photos", "/Users/ann/x.jpg", r"C:\Users\ann\x.jpg"])
+def test_a_card_that_names_somebodys_home_is_refused(write, home):
+    folder = write()
+    with (folder / "README.md").open("a") as card:
+        card.write(f"Trained on {home}, at night.\n")
+    with pytest.raises(ModelError, match=r"README\.md names .*ann.*; nothing of this machine"):
+        plan_push(folder, REPO)
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_missing_file_is_named(write, name):
+    folder = write()
+    (folder / name).unlink()
+    with pytest.raises(ModelError, match=f"{name} cannot be read .*; a LoRA's folder, with"):
+        plan_push(folder, REPO)
+
+
+@pytest.mark.parametrize(
+    ("card", "words"),
+    [
+        ("# No front matter\n", "says nothing of base_model, library_name, license"),
+        ("---\nlicense: mit\nlibrary_name: diffusers\n---\n", "says nothing of base_model"),
+        ("---\nlicense: [mit\n---\n", "is not YAML"),
+        ("---\n- mit\n---\n", "is not YAML"),
+    ],
+)
+def test_a_card_that_the_hub_could_not_read_is_refused(write, card, words):
+    folder = write()
+    (folder / "README.md").write_text(card)
+    with pytest.raises(ModelError, match=words):
+        plan_push(folder, REPO)
+
+
+def test_damaged_files_and_another_prompt_are_refused(write):
+    folder = write()
+    (folder / "recipe.json").write_text("{")
+    with pytest.raises(ModelError, match="is not JSON"):
+        plan_push(folder, REPO)
+    folder = write()
+    tiny("kontext", seed=8)[1].save(folder / "prompt.safetensors")
+    with pytest.raises(ModelError, match="not the prompt that the LoRA was trained with"):
+        plan_push(folder, REPO)
+    whole = (folder / LORA_FILE).read_bytes()
+    (folder / LORA_FILE).write_bytes(whole[:1000])
+    with pytest.raises(ModelError, match="cannot be read"):
+        plan_push(folder, REPO)
+
+
+@pytest.mark.parametrize("name", ["name", "a/b/c", "a b/c", "", "-a/b"])
+def test_a_name_that_the_hub_does_not_take_is_refused(write, name):
+    with pytest.raises(ModelError, match=r"is no name on the hub .*; OWNER/NAME"):
+        plan_push(write(), name)
+
+
+# --- sending
+
+
+def test_a_push_makes_a_private_repository_with_the_four_files_in_one_commit(write, hub):
+    plan = plan_push(write(), REPO, message="First try")
+    assert push(plan) == f"{hub.url}/{REPO}/commit/1"
+    assert hub.repos == {REPO: contents(plan)}
+    assert hub.private == {REPO: True}
+    assert hub.messages == ["First try"]
+    assert ModelCard(hub.repos[REPO]["README.md"].decode()).data.license == "other"
+    push(plan_push(write(), REPO, message="Again"))
+    assert hub.messages == ["First try", "Again"]
+
+
+def test_what_shall_be_private_does_not_go_into_a_public_repository(write, hub):
+    push(plan_push(write(), REPO, public=True))
+    assert hub.private == {REPO: False}
+    with pytest.raises(DownloadError, match=r"is there already and public; .*; pass --public"):
+        push(plan_push(write(), REPO))
+    assert len(hub.messages) == 1
+
+
+def test_without_a_token_nothing_is_asked(write, hub, monkeypatch):
+    monkeypatch.delenv("HF_TOKEN")
+    with pytest.raises(DownloadError, match=r"there is no token to write to .*; .*; make one at https"):
+        push(plan_push(write(), REPO))
+    assert hub.asked == []
+
+
+@pytest.mark.parametrize(
+    ("place", "status", "words"),
+    [
+        ("repos/create", 403, "the token may not write to somebody/.* whose owner is somebody"),
+        ("/commit/", 403, "the token may not write"),
+        ("/commit/", 401, "the hub refused the token"),
+        ("/commit/", 500, "the hub answered HTTP 500 .*; try again later"),
+        ("validate-yaml", 400, r"the hub refused README\.md"),
+    ],
+)
+def test_what_the_hub_refuses_is_told_plainly(write, hub, place, status, words):
+    hub.refusals[place] = status
+    with pytest.raises(DownloadError, match=words):
+        push(plan_push(write(), REPO))
+    assert hub.messages == []
+
+
+def test_a_wrong_token_is_told_plainly(write, hub):
+    with pytest.raises(DownloadError, match="the hub refused the token"):
+        push(plan_push(write(), REPO), token="hf_wrong")
+
+
+def test_what_is_no_hub_is_told_plainly(write, hub):
+    hub.speaks_html = True
+    with pytest.raises(DownloadError, match=r"what answered is no hub .*; JSON; look at HF_ENDPOINT"):
+        push(plan_push(write(), REPO))
+
+
+def test_no_network_is_told_plainly(write, monkeypatch):
+    monkeypatch.setattr(huggingface_hub.constants, "ENDPOINT", unheard())
+    with pytest.raises(DownloadError, match=r"the hub cannot be reached .*; a network"):
+        push(plan_push(write(), REPO), token="hf_right")
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    with pytest.raises(DownloadError, match="the hub cannot be reached"):
+        push(plan_push(write(), REPO), token="hf_right")
+
+
+# --- the command
+
+
+def test_the_command_shows_what_it_would_send_and_sends_nothing(bare, write, hub):
+    folder = write()
+    code, out, err = bare("models", "push", folder, REPO, "--dry-run")
+    assert (code, hub.asked) == (0, [])
+    assert out.decode().splitlines()[-1] == "nothing was sent"
+    assert "not for commercial use" in err
+    code, out, _ = bare(
+        "models", "push", folder, REPO, "--dry-run", "--json", "--public", "--message", "Hello"
+    )
+    told = json.loads(out)
+    assert (told["address"], told["private"], told["message"]) == (None, False, "Hello")
+    assert [file["name"] for file in told["files"]] == list(FILES)
+
+
+def test_the_command_sends_and_says_where(bare, write, hub):
+    code, out, _ = bare("models", "push", write(), REPO)
+    assert code == 0
+    assert out.decode().splitlines()[-1] == f"sent: {hub.url}/{REPO}/commit/1"
+    assert set(hub.repos[REPO]) == set(FILES)
+    hub.token = "hf_changed"
+    code, _, err = bare("models", "push", write(), REPO)
+    assert code == 1
+    assert "error: the hub refused the token" in err
+
+
+def test_the_card_of_a_folder_is_printed_and_takes_scores(bare, write, tmp_path):
+    folder = write()
+    code, out, _ = bare("models", "card", folder)
+    assert (code, out.decode()) == (0, (folder / "README.md").read_text() + "\n")
+    (tmp_path / "half.json").write_text('{"metrics": {}}')
+    assert bare("models", "card", folder, "--scores", tmp_path / "half.json")[0] == 1
+    shutil.rmtree(folder)
+    folder.mkdir()
+    code, _, err = bare("models", "card", folder)
+    assert code == 1
+    assert "README.md cannot be read" in err
