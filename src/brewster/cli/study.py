@@ -1,0 +1,273 @@
+"""`brewster study`: which of two results do people prefer? Make a study, plan it, serve it, and report what it says."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import secrets
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Final
+
+import click
+
+from brewster.cli.doctor import require_extra
+from brewster.cli.evaluate import _Named as Named
+from brewster.cli.serve import _read_token as read_token
+from brewster.cli.terminal import progress, say, write_out
+from brewster.errors import BrewsterError
+
+_AUTO: Final = "auto"
+_MAX_BYTES: Final = 10_000  # an answer has eighty
+_FOLDER: Final = click.Path(path_type=Path, file_okay=False)
+_WARNING: Final = (
+    "warning: whoever reaches {host} can take part, and nothing they send is encrypted; "
+    "behind a proxy that encrypts, keep 127.0.0.1 and give its name with --called"
+)
+
+
+@click.group
+def study() -> None:
+    """Ask people which of two results they prefer: blind pairs, drawn at random, with catch trials.
+
+    `create` freezes a study from folders of outputs, `plan` says how many participants it needs, `serve` is the page
+    for them, and `report` what they said. docs/study.md has the definitions.
+    """
+
+
+@study.command
+@click.argument("out", type=_FOLDER)
+@click.option(
+    "--inputs",
+    type=_FOLDER,
+    required=True,
+    metavar="DIR",
+    help="The photos, or a folder of them for each dataset.",
+)
+@click.option(
+    "--method",
+    "methods",
+    type=Named("RDNet=out/rdnet"),
+    multiple=True,
+    required=True,
+    metavar="NAME=DIR",
+    help="A method's outputs, called like the inputs; two or more. The first is compared with each other one.",
+)
+@click.option(
+    "--dataset", "datasets", multiple=True, metavar="NAME", help="Take these datasets only, in this order."
+)
+@click.option("--all-pairs", is_flag=True, help="Compare every method with every other.")
+@click.option(
+    "--pairs",
+    type=click.IntRange(1),
+    metavar="NUMBER",
+    help="Pairs a participant; by default 40, or all where there are fewer.",
+)
+@click.option(
+    "--catches",
+    type=click.IntRange(0),
+    metavar="NUMBER",
+    help="Catch trials a participant, in turn two equal pictures and a spoilt one; by default 4.",
+)
+@click.option(
+    "--seed", type=click.IntRange(0), metavar="NUMBER", help="Of the draw; by default drawn, and kept."
+)
+@click.option(
+    "--consent",
+    type=click.Path(path_type=Path, dir_okay=False, exists=True),
+    metavar="FILE",
+    help="What participants agree to, as plain text with empty lines between paragraphs, instead of our own.",
+)
+def create(
+    out: Path,
+    *,
+    inputs: Path,
+    methods: tuple[tuple[str, str], ...],
+    datasets: tuple[str, ...],
+    all_pairs: bool,
+    pairs: int | None,
+    catches: int | None,
+    seed: int | None,
+    consent: Path | None,
+) -> None:
+    """Freeze a study in the folder OUT from folders of outputs.
+
+    Pictures are paired by name, whatever their format: DIR/real/12.png and DIR/nature/3.jpg belong to the datasets real
+    and nature, DIR/12.png to the only one. What is missing, double, unreadable or of another size is named, and nothing
+    is written. The study holds copies of all pictures, and can be moved.
+    """
+    from brewster.study.create import CATCH_POOL, CONSENT, Choices  # noqa: PLC0415  (wakes pyvips)
+    from brewster.study.create import create as freeze  # noqa: PLC0415
+    from brewster.study.folders import find_pictures  # noqa: PLC0415
+
+    folders = {name: Path(folder) for name, folder in methods}
+    if len(folders) < len(methods):
+        raise BrewsterError(
+            f"two methods share a name of {', '.join(name for name, _ in methods)}",
+            "tables tell methods apart by name",
+            "give each its own",
+        )
+    text = CONSENT if consent is None else _text(consent)
+    chosen = Choices(
+        datasets=datasets, pairs=pairs, catches=catches, all_pairs=all_pairs, seed=seed, consent=text
+    )
+    total = len(find_pictures(inputs, datasets)) * (1 + len(folders)) + CATCH_POOL
+    with progress(total, shown=True) as advance:
+        made = freeze(out, inputs, folders, chosen, lambda done: advance(done, "copying")).description
+    say(
+        f"{out}: {len(made.comparisons)} comparisons of {len(made.methods)} methods; a participant sees "
+        f"{made.pairs} of them and {made.catches} catch trials (seed {made.seed})"
+    )
+    say(f"next: brewster study serve {out}")
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text("utf-8").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        raise BrewsterError(
+            f"{path} cannot be read ({error})", "plain text in UTF-8", "save it so"
+        ) from error
+
+
+@study.command
+@click.argument("folder", metavar="STUDY", type=_FOLDER)
+@click.option(
+    "--host", default="127.0.0.1", show_default=True, metavar="ADDRESS", help="The address to bind to."
+)
+@click.option("--port", type=click.IntRange(0, 65535), default=8420, show_default=True, metavar="NUMBER", help="The port; 0 takes a free one.")  # fmt: skip
+@click.option(
+    "--called",
+    multiple=True,
+    metavar="NAME",
+    help="Another name that browsers call this server by, such as that of a proxy before it.",
+)
+@click.option("--token", callback=read_token, metavar="TOKEN|auto", help="Let in only who brings this token; auto makes one.")  # fmt: skip
+@click.option(
+    "--most", type=click.IntRange(1), metavar="NUMBER", help="Admit no more participants than this."
+)
+def serve(
+    folder: Path, *, host: str, port: int, called: tuple[str, ...], token: str | None, most: int | None
+) -> None:
+    """Serve the page for participants until Ctrl-C.
+
+    Every answer is on the disk before it is acknowledged. A server that was stopped or killed goes on where it was.
+    """
+    require_extra("web", "serving", without=frozenset({"matplotlib"}))
+    from brewster.study.store import Store  # noqa: PLC0415
+    from brewster.study.study import read_study  # noqa: PLC0415
+    from brewster.web import application as web  # noqa: PLC0415  (wakes FastAPI)
+    from brewster.web.guard import Guard, is_loopback  # noqa: PLC0415
+    from brewster.web.study import participants  # noqa: PLC0415
+
+    made = read_study(folder)
+    made.refuse_changed()
+    if not is_loopback(host):
+        say(_WARNING.format(host=host))
+    token = secrets.token_urlsafe(16) if token == _AUTO else token
+    guard = Guard.at(host, token=token, max_bytes=_MAX_BYTES)
+    guard = replace(guard, hosts=guard.hosts | {name.lower() for name in called})
+    store = Store(made)
+    app = web.application(participants(made, store, most=most, token=token), guard=guard, home="study.html")
+    with contextlib.closing(store), contextlib.suppress(KeyboardInterrupt):  # the usual end
+        web.serve(app, host=host, port=port, tell=lambda url: _invite(url, token))
+    say("stopped; all answers are kept")
+
+
+def _invite(url: str, token: str | None) -> None:
+    click.echo(f"{url}?token={token}" if token else url)
+    say("Ctrl-C stops the server")
+
+
+@study.command
+@click.argument("folder", metavar="STUDY", type=_FOLDER)
+@click.option(
+    "-o", "--output", "out", type=_FOLDER, metavar="DIR", help="Where the files go; by default STUDY/report."
+)
+@click.option(
+    "--most-failed",
+    type=click.FloatRange(0, 1),
+    default=0.5,
+    show_default=True,
+    metavar="SHARE",
+    help="Leave out who fails more of the catch trials.",
+)
+@click.option(
+    "--least-seconds",
+    type=click.FloatRange(0),
+    default=1.5,
+    show_default=True,
+    metavar="SECONDS",
+    help="Leave out who takes less for half of all trials.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print the results as JSON instead of the tables.")
+def report(
+    folder: Path, *, out: Path | None, most_failed: float, least_seconds: float, as_json: bool
+) -> None:
+    """Say what the answers say, with and without the rule that leaves people out.
+
+    The tables go to standard output; report.md, report.json, table.tex (the layout of the paper's Table 3), table.csv,
+    answers.csv and plot.png into a folder. The server may be running meanwhile.
+    """
+    require_extra("web", "reporting", without=frozenset({"fastapi", "python-multipart", "uvicorn"}))
+    from brewster.study.report.people import Rule, people  # noqa: PLC0415
+    from brewster.study.report.results import summarise, write  # noqa: PLC0415
+    from brewster.study.report.tables import overview  # noqa: PLC0415
+    from brewster.study.store import Store  # noqa: PLC0415
+    from brewster.study.study import read_study  # noqa: PLC0415
+
+    made = read_study(folder)
+    with contextlib.closing(Store(made)) as store:
+        answered = people(store.everything())
+    results = summarise(made, answered, Rule(most_failed, least_seconds))
+    out = folder / "report" if out is None else out
+    write(results, made, answered, out)
+    write_out((json.dumps(results) + "\n" if as_json else overview(results)).encode())
+    say(f"all of it is in {out}")
+
+
+@study.command
+@click.option(
+    "--difference",
+    type=click.FloatRange(0, 1, min_open=True),
+    required=True,
+    metavar="SHARE",
+    help="The win rate less the lose rate that is to be shown, such as 0.1.",
+)
+@click.option("--tie", type=click.FloatRange(0, 1, max_open=True), default=0.25, show_default=True, metavar="SHARE", help='The rate of "similar".')  # fmt: skip
+@click.option(
+    "--pairs",
+    type=click.IntRange(1),
+    default=40,
+    show_default=True,
+    metavar="NUMBER",
+    help="How many pairs of these two methods a participant sees.",
+)
+@click.option(
+    "--correlation",
+    type=click.FloatRange(0, 1),
+    default=0.05,
+    show_default=True,
+    metavar="NUMBER",
+    help="How alike the answers of one participant are; reports estimate it.",
+)
+@click.option("--power", type=click.FloatRange(0.5, 1, max_open=True), default=0.8, show_default=True, metavar="SHARE", help="How surely it is shown if it is there.")  # fmt: skip
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def plan(
+    *, difference: float, tie: float, pairs: int, correlation: float, power: float, as_json: bool
+) -> None:
+    """Say how many participants a difference needs, at the 5 % level."""
+    from brewster.study.plan import plan as planned  # noqa: PLC0415
+
+    answer = planned(difference=difference, tie=tie, pairs=pairs, correlation=correlation, power=power)
+    if as_json:
+        click.echo(json.dumps(asdict(answer)))
+        return
+    click.echo(
+        f"{answer.participants} participants ({answer.answers} answers) show {answer.win:.1%} wins to {answer.lose:.1%} "
+        f"losses with {power:.0%} power at the 5 % level."
+    )
+    click.echo(
+        f"{pairs} pairs each, correlation {correlation:g}: {answer.design_effect:.2f} answers do what an independent one "
+        f"would, and participants' own differences scatter by {answer.deviation:.0%} about the mean."
+    )

@@ -1,0 +1,175 @@
+"""Results as tables: Markdown to read, LaTeX in the layout of the paper's Table 3, CSV to go on with."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Mapping
+from typing import Any, Final
+
+_GROUPS: Final = {"kept": "After the rule", "everyone": "Everyone"}
+_CHOICES: Final = """\
+Rates are shares of the answers about a pair of methods. Average weights each dataset by its number of pictures, as the \
+paper's Table 3 does; the plain mean of the datasets and the rates of all answers together stand below.
+Intervals are 95 % expanded percentile intervals of 10,000 bootstrap resamples of whole participants. They speak of \
+other people who see these pictures, not of other pictures.
+Difference is win less lose. Alike is the intra-participant correlation of scores 1, 0, -1, for `brewster study plan`.
+Strength: Bradley and Terry's model over all answers, a tie being half a win for each; 0 is the mean of all methods.
+Agreement: Krippendorff's alpha of win, tie and lose over comparisons; 1 is perfect, 0 is chance."""
+
+Results = Mapping[str, Any]
+
+
+# --- Markdown
+
+
+def to_markdown(results: Results) -> str:
+    """All there is to read: who took part, the tables with and without the rule, strengths, agreement, definitions."""
+    parts = [
+        f"# {' · '.join(results['study']['methods'])}",
+        *(_group(results, key, heading) for key, heading in _GROUPS.items()),
+        "\n".join(
+            [
+                "## How it was measured",
+                "",
+                *(f"- {line}" for line in (_rule(results), *_CHOICES.splitlines())),
+            ]
+        ),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def overview(results: Results) -> str:
+    """What a terminal shows: the group that the rule keeps."""
+    return f"{_group(results, 'kept', _GROUPS['kept'])}\n\n{_rule(results)}\n"
+
+
+def _rule(results: Results) -> str:
+    gone = results["excluded"]
+    rule = results["rule"]
+    return (
+        f"{rule[0].upper()}{rule[1:]}: {gone['failed']} for wrong answers, {gone['fast']} for haste. "
+        "Who stopped early counts with what they answered."
+    )
+
+
+def _group(results: Results, key: str, heading: str) -> str:
+    group = results[key]
+    parts = [f"## {heading}", _counted(group)]
+    parts += [_table(table) for table in group["tables"]]
+    if group["strengths"]:
+        rows = [["Method", "Strength"], *([name, _signed(row)] for name, row in group["strengths"].items())]
+        agreement = "has no value" if group["agreement"] is None else f"is {group['agreement']:.3f}"
+        parts += [_grid(rows), f"Krippendorff's alpha {agreement}."]
+    return "\n\n".join(parts)
+
+
+def _counted(group: Mapping[str, Any]) -> str:
+    return (
+        f"{group['participants']} participants ({group['complete']} to the end), {group['answers']} answers; "
+        f"{group['failed']} of {group['catches']} catch trials failed."
+    )
+
+
+def _table(table: Mapping[str, Any]) -> str:
+    rows = [["", table["first"], "Tie", table["second"], "Difference", "Answers"]]
+    rows += [
+        [row["title"], *(_percent(row[name]) for name in ("win", "tie", "lose")), _percent(row["difference"], "+"), str(row["answers"])]
+        for row in table["rows"]
+    ]  # fmt: skip
+    alike = "" if table["correlation"] is None else f"\n\nAlike: {table['correlation']:.3f}"
+    return f"### {table['first']} and {table['second']}\n\n{_grid(rows)}{alike}"
+
+
+def _percent(entry: Mapping[str, Any], sign: str = "") -> str:
+    if entry["mean"] is None:
+        return "-"
+    mean = f"{100 * entry['mean']:{sign}.2f} %"
+    return mean if entry["low"] is None else f"{mean} ({_ends(entry, sign)})"
+
+
+def _ends(entry: Mapping[str, Any], sign: str = "", join: str = " to ") -> str:
+    return join.join(f"{100 * entry[end]:{sign}.1f}" for end in ("low", "high"))
+
+
+def _signed(entry: Mapping[str, Any]) -> str:
+    if entry["mean"] is None:
+        return "without bound: a method has only won, or only lost"
+    mean = f"{entry['mean']:+.3f}"
+    return mean if entry["low"] is None else f"{mean} ({entry['low']:+.3f} to {entry['high']:+.3f})"
+
+
+def _grid(rows: Iterable[Iterable[str]]) -> str:
+    head, *body = [[cell.replace("|", "\\|") for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(head, *body, strict=True)]
+    lines = [head, [":" + "-" * max(2, width - 1) for width in widths], *body]
+    return "\n".join(
+        f"| {' | '.join(cell.ljust(width) for cell, width in zip(line, widths, strict=True))} |"
+        for line in lines
+    )
+
+
+# --- LaTeX
+
+
+def to_latex(results: Results) -> str:
+    """The layout of the paper's Table 3, of the group that the rule keeps, with the intervals below the rates.
+
+    A row a dataset and the average; for each pair of methods win, tie and lose. Needs the package booktabs.
+    """
+    tables = results["kept"]["tables"]
+    if not tables:
+        return "% the rule leaves nobody\n"
+    heads = [cell for table in tables for cell in (table["first"], "Tie", table["second"])]
+    keys = [key for key in results["study"]["datasets"] if len(results["study"]["datasets"]) > 1]
+    lines = [_latex_row(tables, key) for key in keys]
+    return "\n".join([
+        "% brewster study report; needs \\usepackage{booktabs}; below each rate its 95\\% interval",
+        f"\\begin{{tabular}}{{c|{'|'.join('ccc' for _ in tables)}}}",
+        "\\toprule",
+        " & ".join(map(_escaped, ["Dataset", *heads])) + r" \\",
+        "\\midrule",
+        *lines,
+        *(["\\midrule"] if lines else []),
+        _latex_row(tables, "/average"),
+        "\\bottomrule",
+        "\\end{tabular}",
+        "",
+    ])  # fmt: skip
+
+
+def _latex_row(tables: Iterable[Mapping[str, Any]], key: str) -> str:
+    rows = [next(row for row in table["rows"] if row["key"] == key) for table in tables]
+    entries = [row[name] for row in rows for name in ("win", "tie", "lose")]
+    above = ["--" if entry["mean"] is None else f"{100 * entry['mean']:.2f}\\%" for entry in entries]
+    below = ["" if entry["low"] is None else f"\\scriptsize {_ends(entry, join='--')}" for entry in entries]
+    return " & ".join([_escaped(rows[0]["title"]), *above]) + " \\\\\n" + " & ".join(["", *below]) + r" \\"
+
+
+_SPECIAL: Final = str.maketrans(
+    {letter: f"\\{letter}" for letter in "&%$#_{}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\^{}"}
+)
+
+
+def _escaped(text: str) -> str:
+    return text.translate(_SPECIAL)
+
+
+# --- CSV
+
+
+def to_csv(results: Results) -> str:
+    """A line for each group, pair of methods, dataset or average, and rate; shares, not percent."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["group", "first", "second", "dataset", "rate", "mean", "low", "high", "answers"])
+    for key in _GROUPS:
+        for pair in results[key]["tables"]:
+            for row in pair["rows"]:
+                for name in ("win", "tie", "lose", "difference"):
+                    ends = row[name].values()
+                    table.writerow(
+                        [key, pair["first"], pair["second"], row["title"], name, *ends, row["answers"]]
+                    )
+    return text.getvalue()

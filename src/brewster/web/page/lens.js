@@ -1,0 +1,123 @@
+// A lens over several frames that show pictures of one size: zoom and pan move all of them in step.
+// Frames have the shape of their pictures; what is moved is told in shares of the frame, so that all show the same part.
+
+const CLOSEST = 8; // screen pixels for a pixel of the picture, at most
+const STEP = 1.5;
+const PAN = 0.12;
+
+export class Lens {
+  #scale = 1;
+  #x = 0; // where the left and upper edge lie, in shares of the frame: 0 or less
+  #y = 0;
+  #size = [1, 1];
+  #pointers = new Map();
+
+  constructor(box, frames) {
+    [this.box, this.frames] = [box, frames];
+    for (const frame of frames) {
+      frame.addEventListener("wheel", (event) => this.#wheel(event, frame), { passive: false });
+      frame.addEventListener("dblclick", (event) => this.#toggle(...this.#point(event, frame)));
+      frame.addEventListener("pointerdown", (event) => this.#down(event, frame));
+      frame.addEventListener("pointermove", (event) => this.#move(event, frame));
+      for (const end of ["pointerup", "pointercancel"]) {
+        frame.addEventListener(end, (event) => this.#pointers.delete(event.pointerId));
+      }
+    }
+    new ResizeObserver(() => this.#paint()).observe(box);
+  }
+
+  // New pictures of this size in pixels, shown whole.
+  reset(width, height) {
+    this.#size = [width, height];
+    this.zoom("fit");
+  }
+
+  // What a button or a key asks for: in, out, fit or full.
+  zoom(kind) {
+    if (kind === "in") this.#to(this.#scale * STEP);
+    else if (kind === "out") this.#to(this.#scale / STEP);
+    else this.#to(kind === "fit" || this.isFull ? 1 : this.#full());
+  }
+
+  // Whether a pixel of the picture is a pixel of the screen.
+  get isFull() {
+    return this.#scale > 1 && Math.abs(this.#scale / this.#full() - 1) < 1e-3;
+  }
+
+  // Whether a key was for the lens.
+  press(key) {
+    const zooms = { "+": "in", "=": "in", "-": "out", _: "out", 0: "fit", f: "full", F: "full" };
+    const pans = { "Shift+ArrowLeft": [PAN, 0], "Shift+ArrowRight": [-PAN, 0], "Shift+ArrowUp": [0, PAN], "Shift+ArrowDown": [0, -PAN] };
+    if (key in zooms) this.zoom(zooms[key]);
+    else if (key in pans) this.#pan(...pans[key]);
+    else return false;
+    return true;
+  }
+
+  // The scale at which a pixel of the picture is one of the screen, in the largest frame.
+  #full() {
+    const fits = this.frames.map(({ clientWidth, clientHeight }) =>
+      Math.min(clientWidth / this.#size[0], clientHeight / this.#size[1]));
+    return Math.max(1, 1 / (Math.max(...fits, 1e-6) * devicePixelRatio));
+  }
+
+  #to(scale, x = 0.5, y = 0.5) {
+    const next = Math.min(Math.max(1, scale), CLOSEST * this.#full());
+    this.#x = x - ((x - this.#x) * next) / this.#scale;
+    this.#y = y - ((y - this.#y) * next) / this.#scale;
+    this.#scale = next;
+    this.#paint();
+  }
+
+  #pan(right, down) {
+    this.#x += right;
+    this.#y += down;
+    this.#paint();
+  }
+
+  #paint() {
+    const inside = (at) => Math.min(0, Math.max(1 - this.#scale, at));
+    [this.#x, this.#y] = [inside(this.#x), inside(this.#y)];
+    const place = `translate(${100 * this.#x}%, ${100 * this.#y}%) scale(${this.#scale})`;
+    for (const frame of this.frames) frame.firstElementChild.style.transform = place;
+    this.box.classList.toggle("zoomed", this.#scale > 1);
+    this.box.classList.toggle("close", this.#scale > 3 * this.#full());
+    this.box.dispatchEvent(new Event("zoomed"));
+  }
+
+  #point(event, frame) {
+    const box = frame.getBoundingClientRect();
+    return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
+  }
+
+  #toggle(x, y) {
+    this.#to(this.#scale > 1 ? 1 : Math.max(2, this.#full()), x, y);
+  }
+
+  #wheel(event, frame) {
+    event.preventDefault();
+    this.#to(this.#scale * 1.002 ** -event.deltaY, ...this.#point(event, frame));
+  }
+
+  #down(event, frame) {
+    if (event.button) return;
+    frame.setPointerCapture(event.pointerId);
+    this.#pointers.set(event.pointerId, this.#point(event, frame));
+  }
+
+  #move(event, frame) {
+    const before = this.#pointers.get(event.pointerId);
+    if (!before) return;
+    const now = this.#point(event, frame);
+    this.#pointers.set(event.pointerId, now);
+    const others = [...this.#pointers].filter(([id]) => id !== event.pointerId).map(([, point]) => point);
+    if (others.length === 1) this.#pinch(before, now, others[0]);
+    else if (this.#scale > 1) this.#pan(now[0] - before[0], now[1] - before[1]);
+  }
+
+  #pinch(before, now, other) {
+    const reach = ([x, y]) => Math.hypot(x - other[0], y - other[1]) || 1;
+    this.#to((this.#scale * reach(now)) / reach(before), (now[0] + other[0]) / 2, (now[1] + other[1]) / 2);
+    this.#pan((now[0] - before[0]) / 2, (now[1] - before[1]) / 2);
+  }
+}

@@ -1,0 +1,173 @@
+"""What a participant's browser talks to: consent, the pictures of a trial, answers.
+
+    application(participants(study, Store(study)), guard=guard, home="study.html")
+
+Nothing here names a method, a file or a dataset: a picture is a trial's left, right or photo, and only who holds the
+personal link of that trial gets it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Final, Literal, final
+
+from fastapi import APIRouter, Body
+from fastapi import Path as FromPath
+from fastapi.responses import Response
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.exceptions import HTTPException
+
+from brewster.study import draw
+from brewster.study.draw import Choice
+from brewster.study.store import Participant, Store
+from brewster.study.study import Study
+from brewster.web.application import page
+
+_KEEP: Final = {"Cache-Control": "private, max-age=86400, immutable"}
+_FORGET: Final = {"Cache-Control": "no-store"}
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class Invitation(_Strict):
+    """What somebody is told before they take part: the text, and how many trials there are."""
+
+    consent: str
+    trials: int
+    is_open: bool
+
+
+class Agreement(_Strict):
+    """That somebody takes part."""
+
+    agreed: Literal[True]
+
+
+class Link(_Strict):
+    """The personal link, from the server's root."""
+
+    link: str
+
+
+class Trial(_Strict):
+    """The first trial without an answer, from 0, and the size of its pictures in px; no trial where all are answered."""
+
+    trial: int | None
+    trials: int
+    width: int | None = None
+    height: int | None = None
+
+
+class Given(_Strict):
+    """An answer, and for how many seconds the pictures were seen."""
+
+    trial: Annotated[int, Field(ge=0)]
+    choice: Choice
+    seconds: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class Kept(_Strict):
+    """What is on the disk now, which is the first answer that came, and what is next."""
+
+    kept: Choice
+    next: Trial
+
+
+Token = Annotated[str, FromPath(max_length=64)]
+Side = Literal["photo", "left", "right"]
+
+
+def participants(
+    study: Study, store: Store, *, most: int | None = None, token: str | None = None
+) -> APIRouter:
+    """The routes of a study that admits at most so many; personal links carry the guard's token, if there is one."""
+    door, router = _Door(study, store, most, token), APIRouter(tags=["study"])
+    router.get("/invitation")(door.invitation)
+    router.post("/participants", status_code=201)(door.admit)
+    router.get("/s/{person}", include_in_schema=False)(door.begin)
+    router.get("/s/{person}/link")(door.link)
+    router.get("/s/{person}/trial")(door.next_trial)
+    router.get("/s/{person}/pictures/{trial}/{side}", response_class=Response)(door.picture)
+    router.post("/s/{person}/answers")(door.answer)
+    return router
+
+
+@final
+@dataclass(frozen=True)
+class _Door:
+    """What the routes do, each in a thread, as the disk is waited for."""
+
+    study: Study
+    store: Store
+    most: int | None
+    token: str | None
+
+    def invitation(self) -> Invitation:
+        """What the study is about."""
+        description = self.study.description
+        is_open = self.most is None or self.store.count() < self.most
+        return Invitation(
+            consent=description.consent, trials=description.pairs + description.catches, is_open=is_open
+        )
+
+    def admit(self, _agreement: Annotated[Agreement, Body()]) -> Link:
+        """Admits somebody who agrees to take part, and gives them a link of their own."""
+        person = self.store.admit(most=self.most)
+        if person is None:
+            raise HTTPException(403, "the study has all the participants that it needs; thank you for coming")
+        return self._link(person)
+
+    def begin(self, person: Token) -> Response:
+        """The page behind a personal link; where nobody has it, the same page says so."""
+        answer = page("study.html")
+        answer.status_code = 404 if self.store.participant(person) is None else 200
+        return answer
+
+    def link(self, person: Token) -> Link:
+        """The personal link, whole: the page's own address has lost the guard's token."""
+        self._participant(person)
+        return self._link(person)
+
+    def next_trial(self, person: Token, response: Response) -> Trial:
+        """The first trial without an answer."""
+        response.headers.update(_FORGET)
+        return self._next(self._participant(person))
+
+    def picture(self, person: Token, trial: int, side: Side) -> Response:
+        """A picture of a trial."""
+        shown = _shown(self._participant(person), trial)
+        data = self.study.file(getattr(shown, side)).read_bytes()
+        return Response(data, media_type="image/png", headers=_KEEP)
+
+    def answer(self, person: Token, given: Annotated[Given, Body()]) -> Kept:
+        """Keeps an answer on the disk. The first one to a trial stays: sent again, it changes nothing."""
+        participant = self._participant(person)
+        _shown(participant, given.trial)
+        kept = self.store.answer(participant, given.trial, given.choice, seconds=given.seconds)
+        return Kept(kept=kept, next=self._next(participant))
+
+    def _link(self, person: str) -> Link:
+        return Link(link=f"/s/{person}" + (f"?token={self.token}" if self.token else ""))
+
+    def _participant(self, person: str) -> Participant:
+        participant = self.store.participant(person)
+        if participant is None:
+            raise HTTPException(
+                404, "nobody has this link; check that it is whole, or begin at the first page"
+            )
+        return participant
+
+    def _next(self, participant: Participant) -> Trial:
+        trial, count = self.store.next_trial(participant), len(participant.trials)
+        if trial is None:
+            return Trial(trial=None, trials=count)
+        photo = self.study.picture(participant.trials[trial].photo)
+        return Trial(trial=trial, trials=count, width=photo.width, height=photo.height)
+
+
+def _shown(participant: Participant, trial: int) -> draw.Trial:
+    if not 0 <= trial < len(participant.trials):
+        raise HTTPException(404, f"there is no trial {trial}; load the page again")
+    return participant.trials[trial]

@@ -1,0 +1,88 @@
+"""Studies to test with: one described but not drawn, one of real little pictures, and people who answer at random."""
+
+import numpy as np
+
+from brewster import Photo
+from brewster.study.create import Choices, create
+from brewster.study.study import PICTURES, Catch, Comparison, Description, Picture, Study
+
+
+def described(
+    pictures=20, *, methods=("ours", "RDNet"), datasets=("real", "nature"), pairs=8, catches=2, seed=7
+):
+    """A description without pictures: `pictures` of each dataset, the first method against each other one."""
+    photos = [(dataset, str(i)) for dataset in datasets for i in range(pictures)]
+    comparisons = [
+        Comparison(
+            dataset,
+            name,
+            (methods[0], other),
+            f"{dataset}-{name}",
+            (f"{dataset}-{name}-a", f"{dataset}-{name}-{other}"),
+        )
+        for dataset, name in photos
+        for other in methods[1:]
+    ]
+    catches_there = [Catch(*photo, "-".join(photo), "good", "spoilt") for photo in photos]
+    names = {name for row in comparisons for name in (row.photo, *row.outputs)}
+    return Description(
+        brewster="0",
+        seed=seed,
+        pairs=pairs,
+        catches=catches,
+        consent="Yes?",
+        methods=tuple(methods),
+        datasets=tuple(datasets),
+        pictures=tuple(Picture(name, 3, 2, "", "") for name in sorted(names)),
+        comparisons=tuple(comparisons),
+        catch_pool=tuple(catches_there),
+    )
+
+
+def empty(folder, **asked):
+    """The same as a study in a folder, without its files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return Study(folder, described(**asked))
+
+
+def write_pictures(
+    folder, names=("real/1", "real/2", "real/10", "nature/1"), *, size=(24, 18), suffix=".png", seed=0
+):
+    dice = np.random.default_rng(seed)
+    for name in names:
+        path = folder / f"{name}{suffix}"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        picture = np.kron(dice.integers(0, 256, (3, 4, 3)), np.ones((size[1] // 3, size[0] // 4, 1)))
+        Photo.from_array(picture.astype(np.uint8), encoding="srgb").save(path, overwrite=True)
+    return folder
+
+
+def made(
+    folder,
+    *,
+    methods=("Secretlus", "Rivalino"),
+    names=("real/1", "real/2", "real/10", "nature/1"),
+    size=(24, 18),
+    **choices,
+):
+    """A study of little pictures, with its files."""
+    inputs = write_pictures(folder / "inputs", names, size=size)
+    outputs = {
+        method: write_pictures(folder / method, names, size=size, seed=i + 1)
+        for i, method in enumerate(methods)
+    }
+    return create(folder / "study", inputs, outputs, Choices(**{"seed": 3} | choices))
+
+
+def choice_for(trial, outcome):
+    """What somebody presses who wants this outcome (0, 1, 2) for the comparison's first method."""
+    if outcome == 1:
+        return "similar"
+    return "left" if (outcome == 0) != trial.flipped else "right"
+
+
+def beside(study, folder):
+    """The same study without answers in another folder, which shares its pictures."""
+    folder.mkdir()
+    (folder / PICTURES).symlink_to(study.folder / PICTURES)
+    return Study(folder, study.description)

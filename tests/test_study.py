@@ -1,0 +1,207 @@
+"""Making a study: what is paired, what is refused, and that nothing tells which method made what."""
+
+import hashlib
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from brewster import Photo
+from brewster.errors import BrewsterError, TargetError
+from brewster.study.create import Choices, create
+from brewster.study.spoil import spoil
+from brewster.study.study import read_study
+from small_studies import made, write_pictures
+
+NAMES = ("real/1", "real/2", "real/10", "nature/1")
+
+
+@pytest.fixture
+def folders(tmp_path):
+    inputs = write_pictures(tmp_path / "inputs", NAMES)
+    return inputs, {
+        name: write_pictures(tmp_path / name, NAMES, seed=i + 1) for i, name in enumerate(("ours", "RDNet"))
+    }
+
+
+def test_a_study_is_read_as_it_was_made(tmp_path):
+    study = made(tmp_path)
+    assert read_study(study.folder) == study
+    assert study.description.datasets == ("nature", "real")
+    assert [row.name for row in study.description.comparisons] == ["1", "1", "2", "10"]
+    assert study.description.pairs == 4  # fewer than 40, as there are no more
+    assert not list(study.changed())
+
+
+def test_the_first_method_is_compared_with_each_other_or_all_with_all(tmp_path):
+    names = ("ours", "RDNet", "DSIT")
+    assert made(tmp_path / "a", methods=names).pairs_of_methods == (("ours", "RDNet"), ("ours", "DSIT"))
+    assert len(made(tmp_path / "b", methods=names, all_pairs=True).pairs_of_methods) == 3
+
+
+def test_pictures_without_folders_are_one_dataset(tmp_path):
+    study = made(tmp_path, names=("a", "b"))
+    assert study.description.datasets == ("",)
+
+
+def test_named_datasets_are_taken_in_their_order_and_no_others(tmp_path):
+    study = made(tmp_path, datasets=("real",))
+    assert study.description.datasets == ("real",)
+    assert {row.dataset for row in study.description.comparisons} == {"real"}
+
+
+def test_the_outputs_of_brewster_itself_are_found(tmp_path, folders):
+    inputs, methods = folders
+    for path in sorted(methods["ours"].rglob("*.png")):
+        path.rename(path.with_suffix(".transmission.png"))
+        Photo.from_array(np.zeros((2, 2, 3), np.uint8), encoding="srgb").save(
+            path.with_suffix(".reflection.png")
+        )
+    assert len(create(tmp_path / "study", inputs, methods).description.comparisons) == 4
+
+
+def test_a_picture_is_kept_to_the_last_value_whatever_its_format(tmp_path, folders):
+    inputs, methods = folders
+    (inputs / "real/1.png").unlink()
+    write_pictures(inputs, ["real/1"], suffix=".tif", seed=5)
+    study = create(tmp_path / "study", inputs, methods)
+    row = next(row for row in study.description.comparisons if (row.dataset, row.name) == ("real", "1"))
+    kept = Photo.open(study.file(row.photo))
+    assert np.array_equal(kept.pixels, Photo.open(inputs / "real/1.tif").pixels)
+    about = study.picture(row.photo)
+    assert about.source_sha256 == hashlib.sha256((inputs / "real/1.tif").read_bytes()).hexdigest()
+    assert (about.width, about.height) == kept.size
+
+
+def test_file_names_and_bytes_tell_no_method_and_no_picture(tmp_path):
+    study = made(tmp_path)
+    files = list((study.folder / "pictures").iterdir())
+    assert len(files) == 4 * 3 + 4  # and the spoilt ones
+    for path in files:
+        assert re.fullmatch(r"[0-9a-f]{16}\.png", path.name)
+        assert not re.search(rb"Secretlus|Rivalino|brewster|tEXt|eXIf|tIME", path.read_bytes())
+
+
+def test_the_same_seed_makes_the_same_study_and_another_another(tmp_path, folders):
+    inputs, methods = folders
+    first, second, third = (
+        create(tmp_path / name, inputs, methods, Choices(seed=seed)).description
+        for name, seed in (("a", 5), ("b", 5), ("c", 6))
+    )
+    assert first == second
+    assert not {picture.name for picture in first.pictures} & {picture.name for picture in third.pictures}
+
+
+def test_a_study_that_was_not_seeded_has_a_seed_of_its_own(tmp_path, folders):
+    seeds = {create(tmp_path / name, *folders).description.seed for name in "ab"}
+    assert len(seeds) == 2
+
+
+def test_everything_that_does_not_fit_is_named_at_once_and_nothing_is_written(tmp_path, folders):
+    inputs, methods = folders
+    (methods["ours"] / "real/2.png").unlink()
+    (inputs / "nature/1.png").unlink()
+    write_pictures(inputs, ["nature/other"])
+    write_pictures(methods["RDNet"], ["real/1.png"], size=(12, 18), suffix="")
+    (methods["RDNet"] / "real/10.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    with pytest.raises(BrewsterError) as caught:
+        create(tmp_path / "study", inputs, methods)
+    for told in (
+        f"ours has no {methods['ours'] / 'real/2'}.*",
+        f"{methods['ours'] / 'nature/1.png'} has no input",
+        f"{methods['RDNet'] / 'real/1.png'} is 12x18, its input 24x18",
+        f"{methods['RDNet'] / 'real/10.png'}: ",
+        f"RDNet has no {methods['RDNet'] / 'nature/other'}.*",
+    ):
+        assert told in str(caught.value)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["RDNet", "inputs", "ours"]
+
+
+def test_one_name_in_two_formats_is_refused(tmp_path, folders):
+    inputs, methods = folders
+    write_pictures(methods["ours"], ["real/2"], suffix=".jpg")
+    with pytest.raises(BrewsterError, match=r"2\.jpg and .*2\.png share a name"):
+        create(tmp_path / "study", inputs, methods)
+
+
+@pytest.mark.parametrize(
+    ("choices", "told"),
+    [
+        (Choices(datasets=("wild",)), "no dataset 'wild'"),
+        (Choices(pairs=5), "5 pairs .* there are 4"),
+        (Choices(catches=5), "5 catch trials .* there are 4"),
+    ],
+)
+def test_more_than_there_is_is_refused(tmp_path, folders, choices, told):
+    with pytest.raises(BrewsterError, match=told):
+        create(tmp_path / "study", *folders, choices)
+
+
+def test_one_method_is_no_study_and_an_empty_folder_none_either(tmp_path, folders):
+    inputs, methods = folders
+    with pytest.raises(BrewsterError, match="two or more"):
+        create(tmp_path / "study", inputs, {"ours": methods["ours"]})
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(BrewsterError, match="holds no picture"):
+        create(tmp_path / "study", tmp_path / "empty", methods)
+    with pytest.raises(BrewsterError, match="is no folder"):
+        create(tmp_path / "study", tmp_path / "nowhere", methods)
+
+
+def test_a_study_is_never_written_over(tmp_path, folders):
+    create(tmp_path / "study", *folders)
+    with pytest.raises(TargetError, match="is not empty"):
+        create(tmp_path / "study", *folders)
+
+
+def test_a_changed_picture_is_noticed(tmp_path):
+    study = made(tmp_path)
+    study.file(study.description.comparisons[0].outputs[0]).write_bytes(b"other")
+    with pytest.raises(BrewsterError, match="missing or changed"):
+        study.refuse_changed()
+
+
+def test_a_description_that_is_none_is_refused_with_its_place(tmp_path):
+    with pytest.raises(BrewsterError, match="cannot be read"):
+        read_study(tmp_path)
+    study = made(tmp_path)
+    text = json.loads((study.folder / "study.json").read_text())
+    for change, told in (
+        ({"pairs": "many"}, "pairs: "),
+        ({"surprise": 1}, "surprise: "),
+        ({"format": 2}, "format 2"),
+    ):
+        (study.folder / "study.json").write_text(json.dumps(text | change))
+        with pytest.raises(BrewsterError, match=told):
+            read_study(study.folder)
+
+
+def test_catch_pictures_are_the_output_spoilt_beyond_doubt(tmp_path):
+    study = made(tmp_path, size=(96, 72))
+    for catch in study.description.catch_pool:
+        good, spoilt = (
+            Photo.open(study.file(name)).pixels.astype(float) for name in (catch.good, catch.spoilt)
+        )
+        assert good.shape == spoilt.shape
+        assert 10 * np.log10(255**2 / np.mean((good - spoilt) ** 2)) < 22
+        outputs = {name for row in study.description.comparisons for name in row.outputs}
+        assert catch.good in outputs
+        assert catch.spoilt not in outputs
+
+
+def test_spoiling_is_worse_in_light_and_dark_and_keeps_the_mean(random):
+    for level in (20, 128, 235):
+        flat = np.full((60, 80, 3), level, np.uint8)
+        spoilt = spoil(flat, 1)
+        assert spoilt.astype(float).std() > 10
+        assert abs(spoilt.mean() - level) < 12
+    assert np.array_equal(spoil(flat, 1), spoilt)
+
+
+def test_a_study_that_was_moved_is_the_same_study(tmp_path):
+    study = made(tmp_path)
+    moved = study.folder.rename(tmp_path / "elsewhere")
+    assert read_study(moved) == replace(study, folder=moved)
+    read_study(moved).refuse_changed()

@@ -1,0 +1,220 @@
+"""The study in a real browser: with the keyboard alone, on a phone, interrupted, and against a failing server."""
+
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import expect, sync_playwright
+
+from brewster import Photo
+from brewster.study.store import Store
+from brewster.web.application import application
+from brewster.web.guard import Guard
+from brewster.web.study import participants
+from file_server import loopback_only
+from glass_server import on_a_thread
+from small_studies import beside, made
+
+CHROMIUM = Path("/usr/bin/chromium")
+pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason=f"no browser: {CHROMIUM} is not installed")
+READY = "#trial:not(.waiting):not([hidden])"
+
+NAMED = {
+    "img": ["Result A", "Photo, with the reflection", "Result B"],
+    "button": ["Zoom in", "Zoom out", "Show all", "Full size", "Copy your personal link"],
+    "progressbar": ["Pair 1 of 4"],
+}
+"""What a screen reader finds, by role."""
+
+
+@pytest.fixture(autouse=True)
+def _network_off(monkeypatch):
+    loopback_only(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory):
+    return made(tmp_path_factory.mktemp("original"), size=(240, 180), catches=0)
+
+
+@pytest.fixture
+def store(original, tmp_path):
+    with closing(Store(beside(original, tmp_path / "study"))) as store:
+        yield store
+
+
+@pytest.fixture
+def url(store):
+    app = application(participants(store.study, store), guard=Guard(), home="study.html")
+    with on_a_thread(app) as port:
+        yield f"http://127.0.0.1:{port}/"
+
+
+@pytest.fixture
+def open_page(browser):
+    """A page of a participant; whatever goes wrong in its scripts fails the test."""
+    contexts, errors = [], []
+
+    def open_page(url, **how):
+        context = browser.new_context(**how)
+        contexts.append(context)
+        page = context.new_page()
+        page.on("pageerror", lambda error: errors.append(error))  # noqa: PLW0108  (playwright marks its handlers)
+        page.goto(url)
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert not errors
+
+
+def press(page, key):
+    """A key, once the pictures have been there for long enough to be meant."""
+    page.wait_for_selector(READY)
+    page.wait_for_timeout(320)
+    page.keyboard.press(key)
+
+
+def begin(page):
+    page.get_by_role("checkbox").check()
+    page.get_by_role("button", name="Begin").click()
+    page.wait_for_selector(READY)
+
+
+def test_the_keyboard_alone_leads_from_consent_to_thanks(open_page, url, store):
+    page = open_page(url)
+    page.wait_for_selector("#invitation:not([hidden])")
+    for key in ("Tab", "Space", "Tab", "Enter"):
+        page.keyboard.press(key)
+    for trial, key in enumerate(["1", "ArrowDown", "3", "ArrowLeft"]):
+        expect(page.get_by_text(f"Pair {trial + 1} of 4", exact=True).first).to_be_visible()
+        press(page, key)
+    expect(page.get_by_role("heading", name="Thank you.")).to_be_focused()
+    expect(page.get_by_text("All 4 answers are saved.")).to_be_visible()
+    ((_, answers),) = store.everything()
+    given = [answer.choice for answer in answers.values()]
+    assert given == ["left", "similar", "right", "left"]
+    assert all(0.3 < answer.seconds < 60 for answer in answers.values())
+
+
+def test_who_stops_goes_on_with_the_same_link_elsewhere_and_with_no_other(open_page, url):
+    page = open_page(url)
+    begin(page)
+    press(page, "1")
+    press(page, "2")
+    expect(page.get_by_text("Pair 3 of 4").first).to_be_visible()
+    link = page.url
+    page.context.close()
+    again = open_page(link)
+    expect(again.get_by_text("Pair 3 of 4").first).to_be_visible()
+    again.goto(link[:-1])
+    expect(again.get_by_role("alert")).to_contain_text("nobody has this link; check that it is whole")
+
+
+def test_what_is_seen_are_the_pictures_of_the_trial_on_their_sides_and_all_has_a_name(open_page, url, store):
+    page = open_page(url, viewport={"width": 1280, "height": 800})
+    begin(page)
+    ((person, _),) = store.everything()
+    page.wait_for_timeout(300)  # until they have faded in
+    for side in ("left", "photo", "right"):
+        seen = Photo.open(page.locator(f".{side} .frame").screenshot()).linear()
+        truth = Photo.open(store.study.file(getattr(person.trials[0], side)))
+        assert (
+            np.median(np.abs(seen - truth.small(*seen.shape[1::-1]))) < 0.002
+        )  # not the mean: edges are smoothed
+    places = [page.locator(f".{side} .frame").bounding_box()["x"] for side in ("left", "photo", "right")]
+    assert places == sorted(places)
+    for role, names in NAMED.items():
+        for name in names:
+            expect(page.get_by_role(role, name=name)).to_be_visible()
+    assert page.get_by_role("heading", level=1).all_inner_texts() == ["Which result looks better?"]
+
+
+def test_zoom_and_pan_move_all_three_in_step_and_new_pictures_are_shown_whole(open_page, url):
+    page = open_page(url)
+    begin(page)
+
+    def transforms():
+        return page.eval_on_selector_all(".frame img", "all => all.map(one => one.style.transform)")
+
+    whole = transforms()
+    page.keyboard.press("+")
+    page.keyboard.press("+")
+    page.keyboard.press("Shift+ArrowRight")
+    closer = transforms()
+    assert len(set(closer)) == 1
+    assert closer != whole
+    box = page.locator(".left .frame").bounding_box()
+    page.mouse.move(box["x"] + 50, box["y"] + 50)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 80, box["y"] + 70)
+    page.mouse.up()
+    dragged = transforms()
+    assert len(set(dragged)) == 1
+    assert dragged != closer
+    page.mouse.wheel(0, -400)
+    page.wait_for_function(
+        "before => document.querySelector('.frame img').style.transform !== before", arg=dragged[0]
+    )
+    page.keyboard.press("0")
+    assert transforms() == whole
+    page.get_by_role("button", name="Zoom in").click()
+    press(page, "3")
+    expect(page.get_by_text("Pair 2 of 4").first).to_be_visible()
+    page.wait_for_selector(READY)
+    assert transforms() == whole
+
+
+def test_an_answer_that_the_network_swallows_is_sent_until_it_is_kept(open_page, url, store):
+    page = open_page(url)
+    begin(page)
+    posts = []
+
+    def fail(route):
+        posts.append(route)
+        if len(posts) > 1:
+            route.continue_()
+        else:  # kept by the server, but the acknowledgement never comes
+            route.fetch()
+            route.abort()
+
+    page.route("**/answers", fail)
+    press(page, "1")
+    expect(page.get_by_text("Not saved yet")).to_be_visible()
+    page.keyboard.press("3")  # does nothing meanwhile
+    expect(page.get_by_text("Pair 2 of 4").first).to_be_visible(timeout=15_000)
+    ((_, answers),) = store.everything()
+    assert [answer.choice for answer in answers.values()] == ["left"]
+    assert len(posts) == 2
+
+
+def test_a_phone_shows_all_without_scrolling_sideways_and_takes_fingers(open_page, url, store):
+    page = open_page(
+        url, viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True, color_scheme="dark"
+    )
+    begin(page)
+    assert page.evaluate("document.documentElement.scrollWidth") == 390
+    buttons = [
+        page.get_by_role("button", name=name, exact=True)
+        for name in ("A is better", "Similar", "B is better")
+    ]
+    boxes = [button.bounding_box() for button in buttons]
+    assert all(box["height"] >= 44 and box["y"] + box["height"] <= 844 for box in boxes)
+    shapes = [page.locator(f".{side} .frame").bounding_box() for side in ("left", "photo", "right")]
+    assert all(box["width"] > 180 and box["x"] + box["width"] <= 390 for box in shapes)
+    assert [box["width"] / box["height"] for box in shapes] == pytest.approx([240 / 180] * 3, rel=0.02)
+    page.wait_for_timeout(320)
+    buttons[2].tap()
+    expect(page.get_by_text("Pair 2 of 4").first).to_be_visible()
+    ((_, answers),) = store.everything()
+    assert answers[0].choice == "right"

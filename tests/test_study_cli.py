@@ -1,0 +1,138 @@
+"""`brewster study`, as a user types it."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+
+import httpx
+import pytest
+
+from brewster.study.store import Store
+from brewster.study.study import read_study
+from file_server import loopback_only
+from small_studies import choice_for, write_pictures
+
+
+@pytest.fixture(autouse=True)
+def _network_off(monkeypatch):
+    loopback_only(monkeypatch)
+
+
+@pytest.fixture
+def folders(tmp_path):
+    for seed, name in enumerate(("inputs", "ours", "rdnet")):
+        write_pictures(tmp_path / name, seed=seed)
+    return ["--inputs", "inputs", "--method", "ours=ours", "--method", "RDNet=rdnet"]
+
+
+@pytest.fixture
+def created(bare, folders, tmp_path):
+    assert bare("study", "create", "study", *folders, "--seed", 4)[0] == 0
+    return read_study(tmp_path / "study")
+
+
+def answer_all(study, people, dice):
+    store = Store(study)
+    for _ in range(people):
+        person = store.participant(store.admit())
+        for number, trial in enumerate(person.trials):
+            choice = trial.expected or choice_for(trial, dice.choice(3, p=[0.6, 0.2, 0.2]))
+            store.answer(person, number, choice, seconds=4)
+    store.close()
+
+
+def test_create_says_what_was_made_and_what_comes_next(bare, folders):
+    code, out, err = bare("study", "create", "study", *folders, "--seed", 4, "--pairs", 3, "--catches", 2)
+    assert (code, out) == (0, b"")
+    assert "4 comparisons of 2 methods; a participant sees 3 of them and 2 catch trials (seed 4)" in err
+    assert "next: brewster study serve study" in err
+
+
+def test_create_takes_a_consent_text_of_one_s_own(bare, folders, tmp_path):
+    (tmp_path / "consent.txt").write_text("Our own words.\n")
+    bare("study", "create", "study", *folders, "--consent", "consent.txt")
+    assert read_study(tmp_path / "study").description.consent == "Our own words."
+
+
+def test_create_refuses_what_does_not_fit_with_exit_code_1_and_a_wrong_use_with_2(bare, folders, tmp_path):
+    assert bare("study", "create", "study", *folders[:4])[0] == 1
+    code, _, err = bare("study", "create", "study", *folders, "--method", "ours=rdnet")
+    assert (code, "share a name" in err) == (1, True)
+    assert bare("study", "create", "study", *folders, "--method", "nameless")[0] == 2
+    assert not (tmp_path / "study").exists()
+
+
+def test_report_prints_tables_and_writes_all_files(bare, created, random):
+    answer_all(created, 12, random)
+    code, out, err = bare("study", "report", "study")
+    assert code == 0
+    assert "### ours and RDNet" in out.decode()
+    assert "12 participants (12 to the end), 48 answers; 0 of 48 catch trials failed." in out.decode()
+    assert "all of it is in study/report" in err
+    names = {path.name for path in (created.folder / "report").iterdir()}
+    assert names == {"report.json", "report.md", "table.tex", "table.csv", "answers.csv", "plot.png"}
+    code, out, _ = bare("study", "report", "study", "--json", "--least-seconds", 99)  # over the first
+    assert json.loads(out)["excluded"] == {"failed": 0, "fast": 12}
+
+
+def test_report_without_answers_or_without_a_study_says_so(bare, created):
+    code, _, err = bare("study", "report", "study")
+    assert (code, "has no answers yet" in err) == (1, True)
+    code, _, err = bare("study", "report", "nowhere")
+    assert (code, "cannot be read" in err) == (1, True)
+
+
+def test_plan_answers_in_words_and_in_json(bare):
+    code, out, _ = bare("study", "plan", "--difference", 0.1)
+    assert (code, out.decode().startswith("45 participants (1800 answers)")) == (0, True)
+    assert json.loads(bare("study", "plan", "--difference", 0.1, "--json")[1])["participants"] == 45
+    assert bare("study", "plan")[0] == 2
+    assert bare("study", "plan", "--difference", 0.9)[0] == 1
+
+
+def serve(folder, *args):
+    command = [sys.executable, "-m", "brewster", "study", "serve", str(folder), "--port", "0", *args]
+    return subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )
+
+
+def test_a_server_goes_on_where_a_killed_one_was_and_ends_with_ctrl_c(created):
+    first = serve(created.folder)
+    url = first.stdout.readline().strip()
+    assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", url)
+    link = httpx.post(f"{url}participants", json={"agreed": True}).json()["link"]
+    given = {"trial": 0, "choice": "right", "seconds": 3}
+    assert httpx.post(f"{url}{link[1:]}/answers", json=given).json()["kept"] == "right"
+    first.send_signal(signal.SIGKILL)
+    first.communicate()
+    second = serve(created.folder, "--called", "study.example")
+    url = second.stdout.readline().strip()
+    state = httpx.get(f"{url}{link[1:]}/trial", headers={"Host": "study.example"}).json()
+    assert state["trial"] == 1
+    second.send_signal(signal.SIGINT)
+    _, said = second.communicate(timeout=30)
+    assert second.returncode == 0
+    assert "all answers are kept" in said
+
+
+def test_serving_a_study_whose_pictures_changed_is_refused(bare, created):
+    next((created.folder / "pictures").iterdir()).unlink()
+    code, _, err = bare("study", "serve", "study")
+    assert (code, "missing or changed" in err) == (1, True)
+
+
+def test_another_address_is_served_with_a_warning(created):
+    server = serve(created.folder, "--host", "0.0.0.0", "--token", "auto")
+    link = server.stdout.readline().strip()
+    server.send_signal(signal.SIGINT)
+    _, said = server.communicate(timeout=30)
+    assert "nothing they send is encrypted" in said
+    assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{22}", link)

@@ -1,0 +1,330 @@
+"""What the answers say: on simulated people whose preferences are known, and on numbers that others have computed."""
+
+import csv
+import io
+import json
+
+import choix
+import numpy as np
+import pytest
+
+from brewster import Photo
+from brewster.errors import BrewsterError
+from brewster.study.draw import Trial, draw
+from brewster.study.report.agreement import alpha
+from brewster.study.report.figure import plot
+from brewster.study.report.people import Person, Rule, outcome, people
+from brewster.study.report.results import summarise, write
+from brewster.study.report.statistics import averages, correlation, interval, rates, resampled, summed
+from brewster.study.report.strengths import strengths
+from brewster.study.report.tables import to_csv, to_latex, to_markdown
+from brewster.study.store import Answer, Participant
+from brewster.study.study import Study
+from small_studies import choice_for, described
+
+TRUTH = np.array([0.45, 0.28, 0.27])
+TABLE_3 = {  # the paper's: Real, Nature, Postcard, SolidObject, Wildscene, Average
+    "RDNet": [
+        (49.38, 21.25, 29.37),
+        (35.00, 42.08, 22.92),
+        (55.37, 18.66, 25.97),
+        (41.43, 26.96, 31.61),
+        (43.68, 29.57, 26.75),
+        (45.15, 27.78, 27.07),
+    ],
+    "DSIT": [
+        (57.32, 21.50, 21.18),
+        (35.00, 53.75, 11.25),
+        (67.03, 12.26, 20.71),
+        (40.37, 26.06, 33.57),
+        (48.57, 15.71, 35.71),
+        (49.17, 21.32, 29.51),
+    ],
+}
+PICTURES = np.array([20.0, 20, 20, 20, 101])
+
+
+def simulated(dice, people, studies, *, pairs=40, correlation=0.05):
+    """Counts (people, studies, 1, 3): everybody has chances of their own about the TRUTH, alike by this correlation.
+
+    Of Dirichlet chances with concentration a, every score's intraclass correlation is 1 / (1 + a).
+    """
+    chances = dice.dirichlet(TRUTH * (1 / correlation - 1), (people, studies))
+    return dice.multinomial(pairs, chances)[:, :, None].astype(float)
+
+
+# --- the paper's Table 3
+
+
+def test_the_average_of_the_paper_weights_datasets_by_their_pictures():
+    """Of DSIT all three are reproduced; of RDNet the loss rate, and win and tie together: 0.76 moved between these."""
+    by_pictures, by_datasets = averages(np.array(TABLE_3["DSIT"][:5]), PICTURES)
+    assert np.abs(by_pictures - TABLE_3["DSIT"][5]).max() < 0.006
+    assert np.abs(by_datasets - TABLE_3["DSIT"][5]).max() > 4
+    win, tie, lose = averages(np.array(TABLE_3["RDNet"][:5]), PICTURES)[0]
+    printed = TABLE_3["RDNet"][5]
+    assert lose == pytest.approx(printed[2], abs=0.006)
+    assert win + tie == pytest.approx(printed[0] + printed[1], abs=0.006)
+    assert win == pytest.approx(printed[0] - 0.76, abs=0.006)
+
+
+def test_rates_are_told_of_each_dataset_and_in_three_averages():
+    counts, pictures = np.array([[6.0, 2, 2], [0, 10, 30]]), np.array([30.0, 10])
+    rows = rates(counts, pictures)
+    assert rows[:2, :3] == pytest.approx(np.array([[0.6, 0.2, 0.2], [0, 0.25, 0.75]]))
+    assert rows[2] == pytest.approx([0.45, 0.2125, 0.3375, 0.1125])
+    assert rows[3] == pytest.approx([0.3, 0.225, 0.475, -0.175])
+    assert rows[4] == pytest.approx([6 / 50, 12 / 50, 32 / 50, -26 / 50])
+
+
+# --- intervals
+
+
+def intervals(counts):
+    """Of studies that nobody shares: (2, studies, 4)."""
+    people, studies = counts.shape[:2]
+    return interval(rates(summed(resampled(people, 1000), counts), np.ones((studies, 1))), people)[:, :, 0]
+
+
+@pytest.mark.parametrize("people", [100, 12])
+def test_intervals_cover_the_truth_at_their_stated_rate(people):
+    """400 studies, 40 pairs a participant: 95 % within three standard errors, of many participants and of few."""
+    studies = 400
+    lows, highs = intervals(simulated(np.random.default_rng(1), people, studies))
+    truth = np.append(TRUTH, TRUTH[0] - TRUTH[2])
+    covered = ((lows <= truth) & (truth <= highs)).mean(axis=0)
+    assert np.all(np.abs(covered - 0.95) < 3 * np.sqrt(0.95 * 0.05 / studies)), covered
+
+
+def test_intervals_that_forgot_the_participants_would_be_too_narrow():
+    counts = simulated(np.random.default_rng(2), 100, 50, correlation=0.1)
+    lows, highs = intervals(counts)
+    naive = 2 * 1.96 * np.sqrt(TRUTH * (1 - TRUTH) / 4000)
+    assert (highs - lows)[:, :3].mean(axis=0) / naive == pytest.approx(np.sqrt(1 + 39 * 0.1), rel=0.05)
+
+
+def test_a_dataset_that_nobody_answered_has_no_rate_and_hurts_no_other():
+    counts = np.zeros((10, 1, 2, 3))
+    counts[:, 0, 0] = [3, 1, 1]
+    low, high = interval(rates(summed(resampled(10, 200), counts), np.array([[5.0, 5]])), 10)
+    assert low[0, 0, :3] == pytest.approx([0.6, 0.2, 0.2])
+    assert high[0, 0, :3] == pytest.approx([0.6, 0.2, 0.2])
+    assert np.isnan(low[0, 1]).all()
+
+
+def test_the_correlation_within_participants_is_found_again():
+    counts = simulated(np.random.default_rng(3), 4000, 1, correlation=0.08)[:, 0, 0]
+    assert correlation(counts) == pytest.approx(0.08, abs=0.01)
+    assert correlation(counts[:1]) is None
+    assert correlation(np.tile([0.0, 3, 0], (5, 1))) is None
+
+
+# --- strengths
+
+
+@pytest.mark.parametrize("methods", [2, 3, 5])
+def test_strengths_equal_those_of_choix(random, methods):
+    wins = random.integers(1, 30, (methods, methods)) + random.integers(0, 2, (methods, methods)) / 2
+    games = [
+        (a, b) for a in range(methods) for b in range(methods) if a != b for _ in range(int(2 * wins[a, b]))
+    ]
+    ours = strengths(wins)
+    assert ours == pytest.approx(choix.opt_pairwise(methods, games, alpha=0, tol=1e-12), abs=1e-5)
+    assert ours.sum() == pytest.approx(0)
+
+
+def test_strengths_of_two_are_the_logit_of_their_share():
+    assert np.diff(strengths(np.array([[0, 30.0], [10, 0]]))) == pytest.approx([-np.log(3)])
+
+
+def test_strengths_of_many_tables_are_those_of_each(random):
+    tables = random.integers(1, 20, (6, 4, 4)).astype(float)
+    tables[2, 0] = 0  # the first method never wins
+    together = strengths(tables)
+    assert np.isnan(together[2]).all()
+    for table, worth in zip(np.delete(tables, 2, 0), np.delete(together, 2, 0), strict=True):
+        assert worth == pytest.approx(strengths(table))
+
+
+def test_strengths_are_found_however_lopsided_the_games():
+    wins = np.array([[0, 5000.0, 0], [0.5, 0, 5000], [0, 0.5, 0]])
+    worth = strengths(wins)
+    assert np.diff(worth) == pytest.approx([-np.log(10_000)] * 2)
+
+
+# --- agreement
+
+
+def test_alpha_is_that_of_krippendorff_s_own_example():
+    """Krippendorff 2011, part C: four observers, twelve units, missing values; nominal alpha is 0.743."""
+    observers = "123321412...", "1233224125.3", ".3332342251.", "12332441251."
+    ratings = np.array(
+        [[sum(row[unit] == value for row in observers) for value in "12345"] for unit in range(12)], float
+    )
+    assert alpha(ratings) == pytest.approx(0.743, abs=5e-4)
+
+
+def test_alpha_is_1_in_full_agreement_0_by_chance_and_nothing_where_nothing_can_be_said(random):
+    assert alpha(np.array([[4.0, 0, 0], [0, 3, 0]])) == 1
+    assert alpha(random.multinomial(20, TRUTH, 2000).astype(float)) == pytest.approx(0, abs=0.01)
+    assert alpha(np.array([[4.0, 0, 0], [5, 0, 0]])) is None
+    assert alpha(np.array([[1.0, 0, 0], [0, 1, 0]])) is None
+
+
+# --- who counts
+
+
+@pytest.mark.parametrize(
+    ("flipped", "choice", "means"),
+    [(False, "left", 0), (False, "right", 2), (True, "left", 2), (True, "right", 0), (True, "similar", 1)],
+)
+def test_a_choice_is_the_first_method_s_win_on_whichever_side_it_stood(flipped, choice, means):
+    assert outcome(Trial("", "", "", 0, flipped), choice) == means
+
+
+def person(**about):
+    return Person(
+        **{"number": 0, "votes": {0: 1}, "catches": 4, "failed": 0, "seconds": 5.0, "is_complete": True}
+        | about
+    )
+
+
+@pytest.mark.parametrize(
+    ("about", "reason"),
+    [
+        ({}, None),
+        ({"failed": 2}, None),
+        ({"failed": 3}, "failed"),
+        ({"failed": 3, "seconds": 0.1}, "failed"),
+        ({"seconds": 1.49}, "fast"),
+        ({"seconds": 1.5}, None),
+        ({"catches": 0}, None),
+        ({"catches": 1, "failed": 1}, "failed"),
+    ],
+)
+def test_the_rule_leaves_out_who_does_not_look_and_nobody_else(about, reason):
+    assert Rule().reason(person(**about)) == reason
+
+
+def answered(description, number, dice, chances, *, catches=1.0, seconds=6.0, trials=None):
+    """A participant whose wishes have these chances, who passes this share of the catch trials."""
+    row = draw(description, number)
+    answers = {}
+    for i, trial in enumerate(row[:trials]):
+        if trial.expected is None:
+            choice = choice_for(trial, dice.choice(3, p=chances))
+        else:
+            wrong = "left" if trial.expected != "left" else "right"
+            choice = trial.expected if dice.random() < catches else wrong
+        answers[i] = Answer(choice, seconds * dice.uniform(0.5, 2))
+    return Participant(number, row), answers
+
+
+@pytest.fixture(scope="module")
+def hundred(tmp_path_factory):
+    """100 participants x 40 pairs of three methods; five of them never look, and five are in haste."""
+    description = described(pictures=50, methods=("ours", "R&D_Net", "DSIT"), pairs=40, catches=4)
+    dice = np.random.default_rng(4)
+    everybody = [
+        answered(
+            description,
+            number,
+            dice,
+            TRUTH if number >= 10 else [0, 0, 1],
+            catches=0.95 if number >= 5 else 0.0,
+            seconds=0.6 if 5 <= number < 10 else 6.0,
+            trials=20 if number == 99 else None,
+        )
+        for number in range(100)
+    ]
+    study = Study(tmp_path_factory.mktemp("hundred"), description)
+    who = people(everybody)
+    return study, who, summarise(study, who, Rule())
+
+
+def test_a_hundred_simulated_people_are_understood(hundred):
+    _, _, results = hundred
+    kept, everyone = results["kept"], results["everyone"]
+    assert results["excluded"] == {"failed": 5, "fast": 5}
+    assert (kept["participants"], everyone["participants"], kept["complete"]) == (90, 100, 89)
+    assert everyone["answers"] == kept["answers"] + 400
+    for table in kept["tables"]:
+        row = next(row for row in table["rows"] if row["key"] == "/average")
+        found = [row[name]["mean"] for name in ("win", "tie", "lose")]
+        assert found == pytest.approx(TRUTH, abs=0.05)
+        assert all(
+            row[name]["low"] < row[name]["mean"] < row[name]["high"] for name in ("win", "tie", "lose")
+        )
+        spoilt = next(row for row in everyone["tables"][0]["rows"] if row["key"] == "/average")
+        assert spoilt["lose"]["mean"] > row["lose"]["mean"] + 0.03
+    worth = {name: entry["mean"] for name, entry in kept["strengths"].items()}
+    assert worth["ours"] - worth["DSIT"] == pytest.approx(np.log(0.59 / 0.41), abs=0.15)
+    assert abs(kept["agreement"]) < 0.05
+
+
+def test_results_are_plain_json_and_the_same_in_any_order(hundred):
+    study, who, results = hundred
+    assert json.loads(json.dumps(results, allow_nan=False)) == results
+    assert (
+        summarise(study, who[::-1], Rule())["kept"]["tables"][0]["rows"][0]["win"]["mean"]
+        == (results["kept"]["tables"][0]["rows"][0]["win"]["mean"])
+    )
+
+
+def test_the_files_of_a_report_agree_with_each_other(hundred, tmp_path):
+    study, who, results = hundred
+    write(results, study, who, tmp_path)
+    assert json.loads((tmp_path / "report.json").read_text()) == results
+    assert Photo.open(tmp_path / "plot.png").size[0] > 800
+    lines = list(csv.DictReader(io.StringIO((tmp_path / "answers.csv").read_text())))
+    wins = [
+        line["outcome"] for line in lines if line["second"] == "DSIT" and line["dataset"] == "real"
+    ].count("win")
+    row = next(row for row in results["everyone"]["tables"][1]["rows"] if row["key"] == "real")
+    assert wins / row["answers"] == pytest.approx(row["win"]["mean"], abs=1e-6)
+
+
+def test_latex_has_the_layout_of_the_paper_and_no_bare_specials(hundred):
+    _, _, results = hundred
+    text = to_latex(results)
+    rows = [line for line in text.splitlines() if line.endswith(r"\\")]
+    assert all(line.count(" & ") + line.startswith(" & ") >= 6 for line in rows)
+    assert rows[0] == r"Dataset & ours & Tie & R\&D\_Net & ours & Tie & DSIT \\"
+    assert [line.split(" & ")[0] for line in rows[1::2]] == ["real", "nature", "Average"]
+
+
+def test_markdown_says_all_and_csv_has_a_line_for_each_number(hundred):
+    _, _, results = hundred
+    text = to_markdown(results)
+    for told in (
+        "5 for wrong answers, 5 for haste",
+        "## Everyone",
+        "Mean of the datasets",
+        "Krippendorff's alpha is",
+    ):
+        assert told in text
+    lines = list(csv.DictReader(io.StringIO(to_csv(results))))
+    assert len(lines) == 2 * 2 * 5 * 4
+    assert {line["group"] for line in lines} == {"kept", "everyone"}
+
+
+def test_without_answers_there_is_no_report(hundred):
+    study, *_ = hundred
+    with pytest.raises(BrewsterError, match="no answers yet"):
+        summarise(study, [], Rule())
+
+
+def test_one_person_gives_rates_without_intervals(hundred):
+    study, who, _ = hundred
+    row = summarise(study, who[20:21], Rule())["kept"]["tables"][0]["rows"][-1]
+    assert row["win"]["mean"] is not None
+    assert row["win"]["low"] is None
+
+
+def test_a_rule_that_leaves_nobody_still_tells_of_everyone(hundred):
+    study, who, _ = hundred
+    results = summarise(study, who[:5], Rule())
+    assert results["kept"]["participants"] == 0
+    assert to_latex(results).startswith("% the rule leaves nobody")
+    assert plot(results)[1:4] == b"PNG"
+    assert "## Everyone" in to_markdown(results)

@@ -1,0 +1,143 @@
+"""Answers: on the disk before they are acknowledged, once, whoever writes beside and whatever is killed."""
+
+import os
+import re
+import signal
+import sqlite3
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from brewster.errors import BrewsterError
+from brewster.study.draw import draw
+from brewster.study.store import Store
+from brewster.study.study import read_study, write_study
+from small_studies import described, empty
+
+
+@pytest.fixture
+def store(tmp_path):
+    store = Store(empty(tmp_path / "study"))
+    yield store
+    store.close()
+
+
+def all_answers(store):
+    return {participant.number: answers for participant, answers in store.everything()}
+
+
+def test_a_participant_is_shown_what_the_draw_says_and_goes_on_where_they_stopped(store):
+    tokens = [store.admit() for _ in range(3)]
+    person = store.participant(tokens[2])
+    assert person.trials == draw(store.study.description, 2)
+    assert store.next_trial(person) == 0
+    for trial in range(len(person.trials)):
+        assert store.next_trial(person) == trial
+        store.answer(person, trial, "similar", seconds=2)
+    assert store.next_trial(person) is None
+
+
+def test_the_first_answer_stays(store):
+    person = store.participant(store.admit())
+    assert store.answer(person, 0, "left", seconds=2) == "left"
+    assert store.answer(person, 0, "right", seconds=9) == "left"
+    assert [(answer.choice, answer.seconds) for answer in all_answers(store)[0].values()] == [("left", 2)]
+
+
+def test_links_cannot_be_guessed_and_nobody_else_s_are_known(store):
+    tokens = {store.admit() for _ in range(20)}
+    assert len(tokens) == 20
+    assert all(re.fullmatch(r"[\w-]{32}", token) for token in tokens)
+    assert store.participant("0") is None
+
+
+def test_nothing_is_kept_of_a_person_but_the_day(store):
+    store.admit()
+    with sqlite3.connect(store.study.answers) as database:
+        columns = [row[1] for row in database.execute("PRAGMA table_info(participants)")]
+        ((day,),) = database.execute("SELECT consented_on FROM participants").fetchall()
+    database.close()
+    assert columns == ["number", "token", "consented_on", "trials"]
+    assert re.fullmatch(r"\d{4}-\d\d-\d\d", day)
+
+
+def test_no_more_are_admitted_than_there_may_be(store):
+    assert [store.admit(most=2) is not None for _ in range(4)] == [True, True, False, False]
+    assert store.count() == 2
+
+
+@pytest.mark.parametrize(("trial", "choice"), [(-1, "left"), (10, "left"), (0, "both")])
+def test_an_answer_to_nothing_is_refused(store, trial, choice):
+    person = store.participant(store.admit())
+    with pytest.raises(BrewsterError, match="was answered with"):
+        store.answer(person, trial, choice, seconds=1)
+
+
+def test_absurd_times_are_cut(store):
+    person = store.participant(store.admit())
+    store.answer(person, 0, "left", seconds=-5)
+    store.answer(person, 1, "left", seconds=1e9)
+    assert [answer.seconds for answer in all_answers(store)[0].values()] == [0, 3600]
+
+
+def test_two_servers_and_many_threads_lose_nothing_and_number_nobody_twice(store):
+    other = Store(store.study)
+
+    def take_part(number):
+        own = (store, other)[number % 2]
+        person = own.participant(own.admit())
+        for trial in range(len(person.trials)):
+            own.answer(person, trial, ("left", "right")[number % 2], seconds=number)
+        return person.number
+
+    with ThreadPoolExecutor(8) as pool:
+        numbers = list(pool.map(take_part, range(16)))
+    assert sorted(numbers) == list(range(16))
+    assert [len(answers) for answers in all_answers(other).values()] == [10] * 16
+    other.close()
+
+
+def test_a_file_that_is_no_database_is_told_in_one_sentence(tmp_path):
+    study = empty(tmp_path / "study")
+    study.answers.write_bytes(b"no database at all, but long enough to be read as a header" * 20)
+    with pytest.raises(BrewsterError, match=r"answers\.sqlite cannot be used"):
+        Store(study)
+
+
+WRITER = """
+import sys
+from pathlib import Path
+from brewster.study.store import Store
+from brewster.study.study import read_study
+
+store = Store(read_study(Path(sys.argv[1])))
+while True:
+    token = store.admit()
+    person = store.participant(token)
+    for trial in range(len(person.trials)):
+        store.answer(person, trial, "left", seconds=1)
+        print(person.number, trial, flush=True)
+"""
+
+
+def test_what_was_acknowledged_before_kill_9_is_there_once(tmp_path):
+    write_study(tmp_path, described())
+    acknowledged = []
+    for _ in range(2):
+        writer = subprocess.Popen(
+            [sys.executable, "-c", WRITER, str(tmp_path)], stdout=subprocess.PIPE, text=True
+        )
+        acknowledged += [tuple(map(int, writer.stdout.readline().split())) for _ in range(15)]
+        os.kill(writer.pid, signal.SIGKILL)
+        rest = writer.communicate()[0].splitlines()
+        acknowledged += [tuple(map(int, line.split())) for line in rest if re.fullmatch(r"\d+ \d+", line)]
+    store = Store(read_study(tmp_path))
+    kept = all_answers(store)
+    store.close()
+    assert len(set(acknowledged)) == len(acknowledged) >= 30
+    assert all(trial in kept[number] for number, trial in acknowledged)
+    assert (
+        sum(map(len, kept.values())) <= len(acknowledged) + 2
+    )  # one of each writer may not have been told of
