@@ -1,6 +1,6 @@
 """What `make bench` plays: quality on the development pairs beside doing nothing and beside a peer, what happens
 to photographs without any reflection, the cost of a 12-megapixel photograph, metrics beside their peers, a large
-evaluation, and the renderer beside Mitsuba.
+evaluation, the renderer beside Mitsuba, and both servers under load.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/run.py
 """
@@ -14,7 +14,9 @@ import metrics
 import plain
 import quality
 import render
+import serve
 import speed
+import study
 
 if __name__ == "__main__":
     if not os.environ.get("BREWSTER_DATA"):
@@ -26,3 +28,5 @@ if __name__ == "__main__":
     metrics.main(data)
     evaluate.main(data)
     render.main(data)
+    serve.main(data)
+    study.main()

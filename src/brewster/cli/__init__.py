@@ -12,7 +12,7 @@ from pathlib import Path
 import click
 
 import brewster
-from brewster.cli import ablate, assets, doctor, evaluate, models, render, separate, train
+from brewster.cli import ablate, assets, doctor, evaluate, models, render, separate, serve, study, train
 from brewster.cli.terminal import complain, interrupts, say
 from brewster.errors import BrewsterError
 
@@ -67,6 +67,8 @@ for _command in (
     render.render,
     evaluate.evaluate,
     ablate.ablate,
+    serve.serve,
+    study.study,
 ):
     cli.add_command(_command)
 

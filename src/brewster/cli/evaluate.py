@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @final
-class _Named(click.ParamType[tuple[str, str]]):
+class Named(click.ParamType[tuple[str, str]]):
     """NAME=VALUE, as two strings; without a name that is empty, where this is allowed."""
 
     name = "named"
@@ -83,7 +83,7 @@ class _Size(click.ParamType[int]):
     "--benchmark",
     "benchmarks",
     metavar="NAME=DIR",
-    type=_Named("real20=data/real20"),
+    type=Named("real20=data/real20"),
     multiple=True,
     required=True,
     help="A benchmark and where your copy lies; may be given again. NAME is real20, nature20, sir2, postcard, "
@@ -93,14 +93,14 @@ class _Size(click.ParamType[int]):
     "--model",
     "models",
     metavar="[NAME=]MODEL",
-    type=_Named("ours=model.onnx", needs_name=False),
+    type=Named("ours=model.onnx", needs_name=False),
     multiple=True,
     help="A model to run, as `brewster --model` takes it; may be given again.",
 )
 @click.option(
     "--predictions",
     metavar="NAME=DIR",
-    type=_Named("RDNet=out/rdnet"),
+    type=Named("RDNet=out/rdnet"),
     multiple=True,
     help="A folder of another method's pictures, called like the cases; may be given again.",
 )

@@ -12,8 +12,8 @@ from typing import Final
 import click
 
 from brewster.cli.doctor import require_extra
-from brewster.cli.evaluate import _Named as Named
-from brewster.cli.serve import _read_token as read_token
+from brewster.cli.evaluate import Named
+from brewster.cli.serve import read_token
 from brewster.cli.terminal import progress, say, write_out
 from brewster.errors import BrewsterError
 

@@ -1,0 +1,123 @@
+"""50 photos queued by 8 clients at `brewster serve`, beside the command line on the same folder in the same run.
+
+    BREWSTER_DATA=../shared/data .venv/bin/python bench/serve.py
+
+Throughput as a ratio, the server's memory at the start, half way and at the end, and whether every answer is its own
+photo's: the bytes must be those that the command line has written.
+"""
+
+import json
+import os
+import queue
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from pathlib import Path
+from threading import Thread
+
+PHOTOS, CLIENTS = 50, 8
+HOW = {"layers": "transmission", "quality": "draft"}
+BREWSTER = [sys.executable, "-m", "brewster"]
+
+
+def main(data: Path) -> None:
+    photos = sorted((data / "photos/permissive").glob("*.jpg"))[:PHOTOS]
+    with tempfile.TemporaryDirectory() as folder:
+        from_command, seconds = by_command(photos, Path(folder))
+    with server() as (url, process):
+        post(url, photos[0])  # the model is warm, as the command line's is after its first photo
+        memory, served = [resident_mb(process)], []
+        for _ in range(2):
+            started = time.perf_counter()
+            answers = by_clients(url, photos)
+            served.append(time.perf_counter() - started)
+            memory.append(resident_mb(process))
+            refuse_wrong(answers, from_command)
+    print(f"{PHOTOS} photos by {CLIENTS} clients, twice: {2 * PHOTOS / sum(served):.2f} a second")
+    ratio = 2 * seconds / sum(served)
+    print(f"  the command line on the same photos: {PHOTOS / seconds:.2f} a second; ratio {ratio:.2f}")
+    print(f"  server's memory after 1, {PHOTOS + 1} and {2 * PHOTOS + 1} photos: ", end="")
+    print(", ".join(f"{amount:.0f} MB" for amount in memory))
+    print("  none lost; the bytes of each are those that the command line wrote")
+
+
+def refuse_wrong(answers: dict[str, bytes], expected: dict[str, bytes]) -> None:
+    """Ends the run if an answer is missing, or is not that of its own photo."""
+    wrong = [name for name, data in expected.items() if answers.get(name) != data]
+    if wrong or len(expected) != PHOTOS:
+        sys.exit(f"of {len(expected)} answers these are lost or wrong: {', '.join(wrong)}")
+
+
+def by_command(photos: list[Path], folder: Path) -> tuple[dict[str, bytes], float]:
+    """What one run of the command writes, by photo, and its seconds from the first photo on."""
+    options = [part for name, value in HOW.items() for part in (f"--{name}", value)]
+    started = time.perf_counter()
+    command = [*BREWSTER, *map(str, photos), "-o", str(folder), *options, "--json", "--device", "cpu"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    seconds = time.perf_counter() - started
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    written = {Path(row["source"]).name: Path(row["outputs"]["transmission"]).read_bytes() for row in rows}
+    return written, seconds
+
+
+class server:
+    """`brewster serve` while it is entered: its address and its process."""
+
+    def __enter__(self) -> tuple[str, subprocess.Popen]:
+        command = [*BREWSTER, "serve", "--port", "0", "--device", "cpu"]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        return self.process.stdout.readline().strip(), self.process
+
+    def __exit__(self, *_: object) -> None:
+        self.process.send_signal(signal.SIGINT)
+        self.process.wait()
+        self.process.stdout.close()
+
+
+def by_clients(url: str, photos: list[Path]) -> dict[str, bytes]:
+    """The answers to all photos, asked for by clients that take the next one as soon as they are answered."""
+    waiting, answers = queue.SimpleQueue(), {}
+    for photo in photos:
+        waiting.put(photo)
+
+    def client() -> None:
+        while True:
+            try:
+                photo = waiting.get_nowait()
+            except queue.Empty:
+                return
+            answers[photo.name] = post(url, photo)
+
+    threads = [Thread(target=client) for _ in range(CLIENTS)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    return answers
+
+
+def post(url: str, photo: Path) -> bytes:
+    fields = [
+        f'--x\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n{value}\r\n'
+        for name, value in HOW.items()
+    ]
+    head = f'--x\r\nContent-Disposition: form-data; name="photo"; filename="{photo.name}"\r\n\r\n'
+    body = "".join([*fields, head]).encode() + photo.read_bytes() + b"\r\n--x--\r\n"
+    request = urllib.request.Request(
+        f"{url}separate", body, {"Content-Type": "multipart/form-data; boundary=x"}
+    )
+    with urllib.request.urlopen(request) as answer:
+        return answer.read()
+
+
+def resident_mb(process: subprocess.Popen) -> float:
+    status = Path(f"/proc/{process.pid}/status").read_text()
+    return int(re.search(r"VmRSS:\s+(\d+)", status)[1]) / 1024
+
+
+if __name__ == "__main__":
+    main(Path(os.environ["BREWSTER_DATA"]))

@@ -1,0 +1,145 @@
+"""The application behind both front doors: routers, a guard, the files of the page, and errors as sentences.
+
+    serve(application(router, guard=Guard.at("127.0.0.1")), host="127.0.0.1", port=8417)
+
+Everything comes from this package: no remote asset, so that it works offline.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+from http import HTTPStatus
+from pathlib import Path
+from typing import Final
+
+import uvicorn
+from fastapi import APIRouter, FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import FileResponse, JSONResponse, Response
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
+
+import brewster
+from brewster.errors import (
+    BrewsterError,
+    DeviceError,
+    DownloadError,
+    MissingExtra,
+    ModelError,
+    PhotoTooLarge,
+    TargetError,
+    UnreadablePhoto,
+    UnsupportedPhoto,
+)
+from brewster.web.asked import explain
+from brewster.web.guard import Guard, Guarded
+
+PAGE: Final = Path(__file__).parent / "page"
+_STATUSES: Final[dict[type[BrewsterError], int]] = {
+    PhotoTooLarge: 413,
+    UnreadablePhoto: 422,
+    UnsupportedPhoto: 415,
+    MissingExtra: 501,
+    DeviceError: 503,
+    ModelError: 500,
+    TargetError: 500,
+    DownloadError: 502,
+}
+"""Of errors that are not named here, the asker is to blame: 422."""
+
+
+def application(*routers: APIRouter, guard: Guard, home: str = "index.html") -> FastAPI:
+    """An application of these routers whose first page is the file `home` in web/page/, behind the guard."""
+    app = FastAPI(title="brewster", version=brewster.__version__, docs_url=None, redoc_url=None)
+    app.add_middleware(Guarded, guard=guard)
+    for kind in (ClientDisconnect, HTTPException, RequestValidationError, BrewsterError, Exception):
+        app.add_exception_handler(kind, _explain)
+    for router in routers:
+        app.include_router(router)
+    _show(app, "/", home)
+    for file in sorted(PAGE.iterdir()):
+        _show(app, f"/page/{file.name}", file.name)
+    return app
+
+
+def page(name: str) -> Response:
+    """A file of web/page/, to be asked for again each time."""
+    return FileResponse(PAGE / name, headers={"Cache-Control": "no-cache"})
+
+
+def _show(app: FastAPI, path: str, name: str) -> None:
+    app.get(path, include_in_schema=False)(lambda: page(name))
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A socket that listens; port 0 takes a free one.
+
+    Raises:
+        TargetError: the address cannot be had.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family, backlog=128)
+    except OSError as error:
+        raise TargetError(
+            f"{host} port {port} cannot be listened on ({error.strerror})",
+            "an address of this machine and a free port",
+            "choose others with --host and --port",
+        ) from error
+
+
+def address(listening: socket.socket) -> str:
+    """The URL of a listening socket, as a browser takes it."""
+    host, port = listening.getsockname()[:2]
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104  (read, not bound)
+    return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
+
+
+def serve(
+    app: FastAPI,
+    *,
+    host: str,
+    port: int,
+    tell: Callable[[str], None] = print,
+) -> None:
+    """Serves until it is interrupted; `tell` is told the URL when browsers may come.
+
+    Raises:
+        TargetError: the address cannot be had.
+    """
+    with listen(host, port) as listening:
+        tell(address(listening))
+        server(app).run(sockets=[listening])
+
+
+def server(app: FastAPI) -> uvicorn.Server:
+    """A server that says little; when it ends, it waits two seconds for what is under way."""
+    config = uvicorn.Config(
+        app,
+        log_config=None,
+        log_level="error",
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=2,
+    )
+    return uvicorn.Server(config)
+
+
+async def _explain(request: Request, error: Exception) -> Response:
+    """Every error as JSON, `{"error": sentence}`."""
+    if isinstance(error, ClientDisconnect):
+        return Response(status_code=499)  # nobody reads it
+    if isinstance(error, HTTPException):
+        return JSONResponse({"error": _sentence(request, error)}, error.status_code, error.headers)
+    if isinstance(error, RequestValidationError):
+        return JSONResponse({"error": explain(error.errors())}, 422)
+    if isinstance(error, BrewsterError):
+        return JSONResponse({"error": str(error)}, _STATUSES.get(type(error), 422))
+    return JSONResponse({"error": f"brewster stumbled ({type(error).__name__}); please report it"}, 500)
+
+
+def _sentence(request: Request, error: HTTPException) -> str:
+    if error.detail != HTTPStatus(error.status_code).phrase:
+        return error.detail
+    return f"there is no {request.method} {request.url.path} here; GET /openapi.json tells what there is"

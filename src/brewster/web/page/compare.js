@@ -1,0 +1,193 @@
+// <glass-compare>: two pictures of one size on either side of a line that can be moved; zoom and pan move both.
+// Draw on its canvases `left` and `right`, call `show(...)`, and `paint()` after each change.
+
+const CLOSEST = 8; // screen pixels for a pixel of the picture, at most
+const GRIP = 28; // how near to the line, in CSS pixels, a pointer takes hold of it when the picture is zoomed
+
+class GlassCompare extends HTMLElement {
+  left = document.createElement("canvas");
+  right = document.createElement("canvas");
+  #split = 0.5; // where the line is, as a share of the visible width of the picture
+  #zoom = 1; // 1 shows it all
+  #centre = { x: 0.5, y: 0.5 }; // the point of the picture in the middle of the view, as shares
+  #pointers = new Map();
+  #hold = null; // what a pointer has taken hold of: "line" or "picture"
+
+  connectedCallback() {
+    this.tabIndex = 0;
+    this.setAttribute("role", "group");
+    this.innerHTML = `<canvas aria-hidden="true"></canvas>
+      <div class="line" role="slider" tabindex="0" aria-label="Line between the two"
+        aria-valuemin="0" aria-valuemax="100"></div>
+      <span class="tag left" aria-hidden="true">Photo</span><span class="tag right" aria-hidden="true"></span>
+      <div class="zoom" role="group" aria-label="Zoom">
+        <button type="button" data-by="0.5" aria-label="Zoom out">−</button>
+        <button type="button" data-by="0" aria-label="Show all">Fit</button>
+        <button type="button" data-by="2" aria-label="Zoom in">+</button></div>`;
+    this.canvas = this.querySelector("canvas");
+    this.line = this.querySelector(".line");
+    for (const kind of ["pointerdown", "pointermove", "pointerup", "pointercancel", "wheel", "dblclick", "keydown"]) {
+      this.addEventListener(kind, (event) => this[`_${kind}`](event), { passive: false });
+    }
+    for (const button of this.querySelectorAll("button")) {
+      button.addEventListener("click", () => this.zoomBy(Number(button.dataset.by)));
+    }
+    new ResizeObserver(() => this.paint()).observe(this);
+  }
+
+  // Names both sides, for eyes and for a screen reader.
+  show(photo, layer) {
+    this.setAttribute("aria-label", `${photo}: the photo on the left, its ${layer} on the right. `
+      + "Plus and minus zoom, 0 shows all, arrow keys move the picture.");
+    this.querySelector(".right").textContent = layer[0].toUpperCase() + layer.slice(1);
+    this.paint();
+  }
+
+  // Another photo: shown whole, the line in the middle.
+  reset() {
+    [this.#split, this.#zoom, this.#centre] = [0.5, 1, { x: 0.5, y: 0.5 }];
+  }
+
+  // Zooms by a factor around a point of the view, its middle if none is given; 0 shows all.
+  zoomBy(factor, x = this.clientWidth / 2, y = this.clientHeight / 2) {
+    const before = this.#place();
+    const closest = Math.max(1, (CLOSEST * this.left.width) / this.#fit().width / (window.devicePixelRatio || 1));
+    this.#zoom = factor === 0 ? 1 : Math.min(closest, Math.max(1, this.#zoom * factor));
+    const at = { x: (x - before.left) / before.width, y: (y - before.top) / before.height };
+    const { width, height } = this.#place();
+    this.#centre = { x: at.x - (x - this.clientWidth / 2) / width, y: at.y - (y - this.clientHeight / 2) / height };
+    this.paint();
+  }
+
+  // The size of the whole picture in the view, in CSS pixels; small ones are enlarged to twice their size.
+  #fit() {
+    const { width, height } = this.left;
+    const scale = Math.min(this.clientWidth / width, this.clientHeight / height, 2);
+    return { width: width * scale, height: height * scale };
+  }
+
+  // Where the picture lies in the view; an edge is never drawn further in than it must be.
+  #place() {
+    const fit = this.#fit();
+    const [width, height] = [fit.width * this.#zoom, fit.height * this.#zoom];
+    const start = (view, length, centre) =>
+      length <= view ? (view - length) / 2 : Math.min(0, Math.max(view - length, view / 2 - centre * length));
+    const left = start(this.clientWidth, width, this.#centre.x);
+    const top = start(this.clientHeight, height, this.#centre.y);
+    this.#centre = { x: (this.clientWidth / 2 - left) / width, y: (this.clientHeight / 2 - top) / height };
+    return { left, top, width, height };
+  }
+
+  // The ends of what is visible of the picture, and the line between them.
+  #visible(place = this.#place()) {
+    const [from, to] = [Math.max(0, place.left), Math.min(this.clientWidth, place.left + place.width)];
+    return { from, to, line: from + this.#split * (to - from) };
+  }
+
+  paint() {
+    if (!this.canvas || !this.clientWidth || !this.clientHeight) return;
+    const density = window.devicePixelRatio || 1;
+    const place = this.#place();
+    const { line } = this.#visible(place);
+    this.canvas.width = Math.round(this.clientWidth * density);
+    this.canvas.height = Math.round(this.clientHeight * density);
+    const context = this.canvas.getContext("2d");
+    context.scale(density, density);
+    context.imageSmoothingEnabled = place.width < 4 * this.left.width;
+    context.imageSmoothingQuality = "high";
+    for (const [side, start, end] of [[this.left, 0, line], [this.right, line, this.clientWidth]]) {
+      context.save();
+      context.beginPath();
+      context.rect(start, 0, end - start, this.clientHeight);
+      context.clip();
+      if (side.width) context.drawImage(side, place.left, place.top, place.width, place.height);
+      context.restore();
+    }
+    this.line.style.left = `${line}px`;
+    this.line.setAttribute("aria-valuenow", Math.round(100 * this.#split));
+    this.line.setAttribute("aria-valuetext", `${Math.round(100 * this.#split)} % photo`);
+    this.classList.toggle("zoomed", this.#zoom > 1);
+  }
+
+  #moveLine(x) {
+    const { from, to } = this.#visible();
+    this.#split = Math.min(1, Math.max(0, (x - from) / (to - from)));
+    this.paint();
+  }
+
+  #pan(right, down) {
+    const { width, height } = this.#place();
+    this.#centre = { x: this.#centre.x - right / width, y: this.#centre.y - down / height };
+    this.paint();
+  }
+
+  #point(event) {
+    const box = this.getBoundingClientRect();
+    return { x: event.clientX - box.left, y: event.clientY - box.top };
+  }
+
+  _pointerdown(event) {
+    if (event.button || event.target.closest(".zoom")) return;
+    const point = this.#point(event);
+    this.setPointerCapture(event.pointerId);
+    this.#pointers.set(event.pointerId, point);
+    const isNear = Math.abs(point.x - this.#visible().line) < GRIP;
+    this.#hold = this.#zoom === 1 || isNear ? "line" : "picture";
+    if (this.#hold === "line" && this.#pointers.size === 1 && event.pointerType === "mouse") this.#moveLine(point.x);
+  }
+
+  _pointermove(event) {
+    const before = this.#pointers.get(event.pointerId);
+    if (!before) return;
+    const now = this.#point(event);
+    this.#pointers.set(event.pointerId, now);
+    if (this.#pointers.size === 2) this.#pinch(event.pointerId, before, now);
+    else if (this.#hold === "line") this.#moveLine(now.x);
+    else this.#pan(now.x - before.x, now.y - before.y);
+  }
+
+  #pinch(id, before, now) {
+    const [other] = [...this.#pointers].filter(([key]) => key !== id).map(([, point]) => point);
+    const reach = (point) => Math.hypot(point.x - other.x, point.y - other.y) || 1;
+    this.zoomBy(reach(now) / reach(before), (now.x + other.x) / 2, (now.y + other.y) / 2);
+    this.#pan((now.x - before.x) / 2, (now.y - before.y) / 2);
+    this.#hold = "picture";
+  }
+
+  _pointerup(event) {
+    this.#pointers.delete(event.pointerId);
+  }
+
+  _pointercancel(event) {
+    this.#pointers.delete(event.pointerId);
+  }
+
+  _wheel(event) {
+    event.preventDefault();
+    const point = this.#point(event);
+    this.zoomBy(1.0015 ** -event.deltaY, point.x, point.y);
+  }
+
+  _dblclick(event) {
+    if (event.target.closest(".zoom")) return;
+    const point = this.#point(event);
+    this.zoomBy(this.#zoom > 1 ? 0 : 3, point.x, point.y);
+  }
+
+  _keydown(event) {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const { from, to, line } = this.#visible();
+    const step = (to - from) / 100;
+    const onLine = { ArrowLeft: line - step, ArrowDown: line - step, ArrowRight: line + step, ArrowUp: line + step,
+      PageDown: line - 10 * step, PageUp: line + 10 * step, Home: from, End: to };
+    const onPicture = { ArrowLeft: [60, 0], ArrowRight: [-60, 0], ArrowUp: [0, 60], ArrowDown: [0, -60] };
+    const zooms = { "+": 1.5, "=": 1.5, "-": 1 / 1.5, 0: 0 };
+    if (event.key in zooms) this.zoomBy(zooms[event.key]);
+    else if (event.target === this.line && event.key in onLine) this.#moveLine(onLine[event.key]);
+    else if (event.target === this && event.key in onPicture) this.#pan(...onPicture[event.key]);
+    else return;
+    event.preventDefault();
+  }
+}
+
+customElements.define("glass-compare", GlassCompare);

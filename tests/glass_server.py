@@ -1,0 +1,117 @@
+"""The web server of the tests: applications asked without a network, on a thread, or as a user starts them."""
+
+import asyncio
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+from threading import Event, Thread
+
+import httpx
+
+from brewster.separate import Separator
+from brewster.web.application import application, listen, server
+from brewster.web.desk import Desk
+from brewster.web.guard import Guard
+from brewster.web.separation import separation
+from brewster.web.shelf import ModelRow
+
+
+def pane(tile):
+    return tile * 0.8, tile * 0.2
+
+
+class OneModel:
+    """What a shelf is, with one backend on it."""
+
+    names = ("pane",)
+
+    def __init__(self, backend=pane):
+        self._separator = Separator(backend, name="pane", sha256="0" * 64)
+
+    def rows(self):
+        return [ModelRow(name="pane", licence="none", sha256=None, card=None)]
+
+    def separator(self, name):
+        assert name == "pane"
+        return self._separator
+
+
+class Stubborn:
+    """A pane that is busy with its first tile until it is told to go on."""
+
+    def __init__(self):
+        self.tiles, self.started, self.go = 0, Event(), Event()
+
+    def __call__(self, tile):
+        self.tiles += 1
+        self.started.set()
+        assert self.go.wait(30)
+        return pane(tile)
+
+
+def app_of(backend=pane, *, desk=None, max_pixels=10**8, guard=None):
+    return application(
+        separation(OneModel(backend), desk or Desk(), max_pixels=max_pixels), guard=guard or Guard()
+    )
+
+
+def client(app, **how):
+    """An HTTP client of an application, without a network."""
+    return httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://localhost:8417", **how)
+
+
+def ask(app, method, path, **what):
+    """One request, one answer."""
+
+    async def once():
+        async with client(app) as asking:
+            return await asking.request(method, path, **what)
+
+    return asyncio.run(once())
+
+
+def form(photo, name="window.png", **fields):
+    return {"files": {"photo": (name, photo)}, "data": fields}
+
+
+@contextlib.contextmanager
+def on_a_thread(app):
+    """An application on a port of this machine, which is given."""
+    with listen("127.0.0.1", 0) as listening:
+        running = server(app)
+        thread = Thread(target=running.run, kwargs={"sockets": [listening]})
+        thread.start()
+        try:
+            yield listening.getsockname()[1]
+        finally:
+            running.should_exit = True
+            thread.join()
+
+
+def spoken(port, *pieces):
+    """What a server answers to these bytes, sent one after another; connected until it closes."""
+    with socket.create_connection(("127.0.0.1", port), timeout=30) as connection:
+        for piece in pieces:
+            connection.sendall(piece)
+        answer = b""
+        while more := connection.recv(1 << 16):
+            answer += more
+    return answer
+
+
+@contextlib.contextmanager
+def as_a_user(*args):
+    """`brewster serve` in a process of its own: its first line, a link; its exit code is checked at the end."""
+    command = [sys.executable, "-m", "brewster", "serve", "--port", "0", "--device", "cpu", *map(str, args)]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"}
+    ) as process:
+        try:
+            yield process.stdout.readline().strip()
+        finally:
+            process.send_signal(signal.SIGINT)
+            process.wait(30)
+    assert process.returncode == 0

@@ -1,0 +1,106 @@
+"""The application behind a real socket: what only bytes on a wire can show."""
+
+import socket
+
+import pytest
+
+from brewster.errors import TargetError
+from brewster.web.application import address, listen
+from brewster.web.desk import Desk
+from brewster.web.guard import Guard
+from file_server import loopback_only
+from front_door import picture
+from glass_server import Stubborn, app_of, on_a_thread, spoken
+
+HEAD = "POST /separate HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Type: multipart/form-data; boundary=x\r\n"
+PHOTO = picture(40, 30, "png")
+FORM = b'--x\r\nContent-Disposition: form-data; name="photo"; filename="a.png"\r\n\r\n%b\r\n--x--\r\n' % PHOTO
+
+
+@pytest.fixture(autouse=True)
+def _network_off(monkeypatch):
+    loopback_only(monkeypatch)
+
+
+def head(*more):
+    return "".join([HEAD, *(f"{line}\r\n" for line in more), "\r\n"]).encode()
+
+
+def whole(body=FORM):
+    return head(f"Content-Length: {len(body)}"), body
+
+
+def status(answer):
+    return int(answer.split(b" ", 2)[1]) if answer else None
+
+
+def chunk(data):
+    return b"%x\r\n%b\r\n" % (len(data), data)
+
+
+def test_a_photo_is_separated_over_a_socket():
+    with on_a_thread(app_of()) as port:
+        answer = spoken(port, *whole())
+    assert status(answer) == 200
+    assert b"server:" not in answer.lower().partition(b"\r\n\r\n")[0]
+
+
+def test_an_upload_too_long_is_answered_although_nobody_reads_it_whole():
+    """A client that sends all before it reads must find an answer, and no broken connection."""
+    with on_a_thread(app_of(guard=Guard(max_bytes=10_000))) as port:
+        long = bytes(3_000_000)
+        assert status(spoken(port, head(f"Content-Length: {len(long)}"), long)) == 413
+        chunked = [chunk(bytes(100_000)) for _ in range(30)]
+        assert status(spoken(port, head("Transfer-Encoding: chunked"), *chunked, chunk(b""))) == 413
+        assert status(spoken(port, *whole())) == 200
+
+
+def test_a_slow_upload_is_given_up():
+    with on_a_thread(app_of(guard=Guard(body_seconds=0.1))) as port:
+        answer = spoken(port, head(f"Content-Length: {len(FORM)}"), FORM[:50])
+        assert status(answer) == 408
+        assert b"send it again" in answer
+        assert status(spoken(port, *whole())) == 200
+
+
+def test_an_upload_that_is_cut_off_harms_nobody():
+    desk = Desk(queue=0)
+    with on_a_thread(app_of(desk=desk)) as port:
+        for end in (0, 30, 90, len(FORM) - 3):
+            with socket.create_connection(("127.0.0.1", port)) as connection:
+                connection.sendall(head(f"Content-Length: {len(FORM)}") + FORM[:end])
+        while status(answer := spoken(port, *whole())) == 503:  # the last one's place is not free yet
+            assert b"Retry-After" in answer or b"retry-after" in answer
+        assert status(answer) == 200
+    assert desk.jobs == 0
+
+
+def test_a_connection_that_breaks_stops_the_work():
+    backend, desk = Stubborn(), Desk()
+    with on_a_thread(app_of(backend, desk=desk)) as port:
+        with socket.create_connection(("127.0.0.1", port)) as connection:
+            connection.sendall(b"".join(whole()))
+            backend.started.wait()
+            (job,) = desk._jobs.values()
+        job.stopped.wait()
+        backend.go.set()
+    assert backend.tiles == 1
+
+
+@pytest.mark.parametrize(
+    "rubbish", [b"\x16\x03\x01\x02\x00", b"GET / HTTP/9\r\n\r\n", b"\r\n\r\nnonsense\r\n\r\n"]
+)
+def test_what_is_no_http_is_answered_and_forgotten(rubbish):
+    with on_a_thread(app_of()) as port:
+        assert status(spoken(port, rubbish + b"\r\n\r\n")) in (400, None)
+        assert status(spoken(port, *whole())) == 200
+
+
+def test_a_port_that_is_taken_is_named():
+    with listen("127.0.0.1", 0) as taken:
+        port = taken.getsockname()[1]
+        assert address(taken) == f"http://127.0.0.1:{port}/"
+        with pytest.raises(
+            TargetError, match=f"port {port} cannot be listened on .*; choose others with --host"
+        ):
+            listen("127.0.0.1", port)

@@ -1,0 +1,357 @@
+"""The page in a real browser, before a real server, as its users have them."""
+
+import base64
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from brewster import Photo
+from brewster.light import to_encoded, to_linear
+from brewster.photo.origin import Origin
+from front_door import picture
+from glass_server import as_a_user
+from picture_files import exif_block, file_of, smooth
+
+CHROMIUM = Path("/usr/bin/chromium")
+MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
+
+
+@pytest.fixture(scope="module")
+def link(model):
+    with as_a_user("--model", model, "--token", "auto") as link:
+        yield link
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    if not CHROMIUM.exists():
+        pytest.skip(f"no browser: {CHROMIUM} does not exist")
+    from playwright.sync_api import sync_playwright  # noqa: PLC0415
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def visit(chromium, link):
+    """Opens the page; in the end nothing must have gone wrong in it, and nothing been fetched from elsewhere."""
+    contexts, wrong, asked = [], [], []
+
+    def visit(**how):
+        context = chromium.new_context(
+            **{"viewport": {"width": 1100, "height": 760}, "accept_downloads": True, **how}
+        )
+        contexts.append(context)
+        page = context.new_page()
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on("console", lambda said: wrong.append(said.text) if "Content Security" in said.text else None)
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto(link)
+        page.wait_for_selector("#model option", state="attached")  # its scripts have run
+        assert "token" not in page.url
+        return page
+
+    yield visit
+    for context in contexts:
+        context.close()
+    assert not wrong
+    here = link.partition("?")[0]
+    assert [url for url in asked if not url.startswith((here, "blob:"))] == []
+
+
+def upload(page, *files):
+    """Adds (name, bytes), and waits until the last of them is shown or has failed."""
+    page.set_input_files("#files", [{"name": name, "mimeType": "", "buffer": data} for name, data in files])
+    page.wait_for_selector("#photos:not(:has(.waiting, .working)) li")
+    page.wait_for_selector("glass-compare:not([hidden]), #trouble:not([hidden])")
+    settle(page)
+
+
+def settle(page):
+    page.evaluate("() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+
+
+def canvas(page, side):
+    """The pixels of one of the two pictures that are compared."""
+    told = page.evaluate("side => document.querySelector('glass-compare')[side].toDataURL()", side)
+    return Photo.open(base64.b64decode(told.partition(",")[2])).pixels
+
+
+def downloaded(page, press):
+    with page.expect_download() as waiting:
+        press()
+    return waiting.value.suggested_filename, Path(waiting.value.path()).read_bytes()
+
+
+def apart(one, other):
+    assert one.shape == other.shape
+    return np.abs(one.astype(int) - other.astype(int))
+
+
+def share(page):
+    return int(page.get_by_role("slider", name="Line").get_attribute("aria-valuenow"))
+
+
+def test_a_photo_is_uploaded_compared_weakened_and_downloaded_as_the_command_line_makes_it(
+    visit, bare, tmp_path
+):
+    whole = Photo.open(MIXTURE)
+    photo = tmp_path / "window.jpg"
+    photo.write_bytes(Photo(whole.pixels[:150, :200].copy(), None, whole.origin).encode())
+    page = visit()
+    upload(page, (photo.name, photo.read_bytes()))
+    page.get_by_label("Model").select_option("compact")
+    page.wait_for_selector("li.done")
+    assert (canvas(page, "left") == Photo.open(photo).pixels).all()
+
+    stage = page.locator("glass-compare").bounding_box()
+    page.mouse.move(stage["x"] + stage["width"] / 2, stage["y"] + 100)
+    page.mouse.down()
+    page.mouse.move(stage["x"] + stage["width"] / 4, stage["y"] + 120)
+    page.mouse.up()
+    assert share(page) < 40
+
+    page.get_by_label("Strength").fill("0.6")
+    settle(page)
+    assert page.locator("#amount").inner_text() == "60 %"
+    bare(photo, "--strength", "0.6", "--device", "cpu", "--layers", "transmission,confidence")
+    for layer in ("transmission", "confidence"):
+        page.get_by_label(layer.capitalize(), exact=True).check()
+        settle(page)
+        (made,) = tmp_path.glob(f"*.{layer}.*")
+        shown = Photo.open(made).srgb_8bit()
+        assert np.median(apart(canvas(page, "right"), shown)) <= 1  # JPEG is further off at its edges
+        name, data = downloaded(page, page.get_by_role("button", name=f"Download {layer}").click)
+        assert (name, data) == (made.name, made.read_bytes())
+
+
+def test_the_layers_on_the_page_are_those_of_the_server_to_two_code_values(visit, run):
+    data = picture(90, 60, "png")
+    page = visit()
+    upload(page, ("window.png", data))
+    for strength in (0.3, 1):
+        page.get_by_label("Strength").fill(str(strength))
+        for layer in ("transmission", "reflection"):
+            page.get_by_label(layer.capitalize(), exact=True).check()
+            settle(page)
+            _, made, _ = run("-", "--strength", strength, "--layers", layer, stdin=data)
+            assert apart(canvas(page, "right"), Photo.open(made).pixels).max() <= 2
+
+
+def test_a_wide_gamut_photo_and_a_rotated_one_look_right(visit):
+    import pyvips  # noqa: PLC0415
+
+    colours = np.kron(np.array([[[230, 60, 60], [60, 200, 60]]], np.uint8), np.ones((30, 30, 1), np.uint8))
+    wide = Photo(colours, None, Origin(icc=pyvips.Image.profile_load("p3")))
+    page = visit()
+    upload(page, ("p3.png", wide.encode("png")))
+    assert apart(canvas(page, "left"), wide.srgb_8bit()).max() <= 1
+    assert canvas(page, "left")[0, 0, 0] > 240
+    expected = 255 * to_encoded(to_linear(wide.srgb_8bit() / 255) * 0.8)
+    inside = np.s_[
+        5:25, 5:25
+    ]  # the photo's own light goes beyond sRGB, so only what sRGB holds can be compared
+    assert np.abs(canvas(page, "right")[inside] - expected[inside])[..., 1:].max() <= 2
+    page.get_by_role("button", name="Remove p3.png").click()
+    upload(page, ("turned.png", file_of(smooth(), "png", exif=exif_block(6))))
+    assert (canvas(page, "left") == np.rot90(smooth(), -1)).all()
+
+
+def test_everything_can_be_done_by_keyboard_alone(visit, run):
+    data = picture(90, 60, "png")
+    file = {"name": "window.png", "mimeType": "image/png", "buffer": data}
+    page = visit()
+    page.on("filechooser", lambda choosing: choosing.set_files(file))
+    page.get_by_role("button", name="Choose photos").wait_for()  # and the browser has heard of the line above
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    page.wait_for_selector("li.done")
+    page.wait_for_selector("glass-compare:not([hidden])")
+    focus = "(document.activeElement.getAttribute('aria-label') ?? document.activeElement.textContent).trim()"
+    reached = []
+
+    def tab_to(name):
+        while name not in (now := page.evaluate(focus)):
+            reached.append(now)
+            assert len(reached) < 40, reached
+            page.keyboard.press("Tab")
+
+    assert "window.png" in page.evaluate(
+        focus
+    )  # the button that was pressed is gone: focus is on the new photo
+    page.evaluate("document.activeElement.blur()")
+    tab_to("the photo on the left")
+    page.keyboard.press("+")
+    page.keyboard.press("ArrowRight")
+    assert "zoomed" in page.locator("glass-compare").get_attribute("class")
+    page.keyboard.press("0")
+    tab_to("Line between")
+    page.keyboard.press("PageUp")
+    page.keyboard.press("ArrowLeft")
+    assert share(page) == 59
+    tab_to("Remove window.png")
+    page.keyboard.press("Tab")
+    page.keyboard.press("ArrowRight")  # the next of the views
+    assert page.get_by_label("Reflection", exact=True).is_checked()
+    page.keyboard.press("Tab")
+    for _ in range(50):
+        page.keyboard.press("ArrowLeft")
+    assert page.locator("#amount").inner_text() == "50 %"
+    tab_to("Download reflection")
+    _, made = downloaded(page, lambda: page.keyboard.press("Enter"))
+    assert made == run("-", "--strength", "0.5", "--layers", "reflection", stdin=data)[1]
+
+
+def test_a_phone_shows_it_all_without_scrolling_sideways(visit):
+    page = visit(viewport={"width": 390, "height": 844}, has_touch=True)
+    assert page.evaluate("document.documentElement.scrollWidth") == 390
+    long = "a very long name of a photo taken through a window " * 3
+    upload(page, *((f"{number} {long}.png", picture(300, 200, "png", number)) for number in range(4)))
+    assert page.evaluate("document.documentElement.scrollWidth") == 390
+    for control in page.locator("button:visible, select:visible").all():
+        box = control.bounding_box()
+        assert box["height"] >= 36 or box["width"] >= 36, control.inner_text()
+    before = share(page)
+    stage = page.locator("glass-compare").bounding_box()
+    finger = page.context.new_cdp_session(page)
+    for kind, at in (("touchStart", 0.5), ("touchMove", 0.6), ("touchMove", 0.8), ("touchEnd", None)):
+        points = [] if at is None else [{"x": stage["x"] + at * stage["width"], "y": stage["y"] + 50}]
+        finger.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+    assert share(page) > before + 20
+
+
+def test_zoom_and_pan_move_both_sides_together(visit):
+    """A ramp, at strength 0 on both sides: a step between them would show."""
+    page = visit()
+    ramp = np.repeat(np.linspace(20, 220, 240).astype(np.uint8)[None, :, None], 120, axis=0)
+    upload(page, ("a.png", file_of(ramp, "png")))
+    page.get_by_label("Strength").fill("0")
+    page.get_by_role("button", name="Zoom in").click()
+    before = row(page)
+    stage = page.locator("glass-compare").bounding_box()
+    page.mouse.move(stage["x"] + 200, stage["y"] + 200)
+    page.mouse.down()
+    page.mouse.move(stage["x"] + 100, stage["y"] + 150)
+    page.mouse.up()
+    after = row(page)
+    for line in (before, after):
+        assert line.all()  # the picture is larger than the view
+        assert set(np.diff(line)) <= {0, 1}
+    assert after[0] > before[0]
+    page.mouse.wheel(0, -200)
+    settle(page)
+    assert np.ptp(row(page)) < np.ptp(after)  # closer: less of the ramp is seen
+
+
+def row(page):
+    """What is painted across the middle of the view, line, grip and all apart."""
+    settle(page)
+    told = page.evaluate("""() => {
+        const canvas = document.querySelector("glass-compare canvas");
+        const y = Math.round(canvas.height / 2);
+        return Array.from(canvas.getContext("2d").getImageData(0, y, canvas.width, 1).data);
+    }""")
+    return np.array(told).reshape(-1, 4)[:, 0]
+
+
+def test_what_is_no_photo_is_told_in_place_and_can_be_tried_again_or_removed(visit):
+    page = visit()
+    upload(page, ("holiday.jpg", b"not a picture"), ("window.png", picture(90, 60, "png")))
+    assert page.get_by_role("heading", name="holiday.jpg could not be separated").is_visible()
+    assert "no picture brewster knows" in page.get_by_role("alert").inner_text()
+    assert page.get_by_role("button", name="Download transmission").is_disabled()
+    assert page.get_by_role("button", name="Download all").is_enabled()
+    page.get_by_role("button", name="Try again").click()
+    page.wait_for_selector("#trouble:not([hidden])")
+    page.get_by_role("button", name="Remove", exact=True).click()
+    page.wait_for_selector("glass-compare:not([hidden])")
+    assert page.get_by_role("listitem").count() == 1
+    page.get_by_role("button", name="Remove window.png").click()
+    assert page.evaluate("document.activeElement.id") == "choose"
+
+
+def test_many_photos_come_as_one_zip_with_names_of_their_own(visit, run):
+    photos = [
+        ("a.png", picture(90, 60, "png", 1)),
+        ("a.png", picture(90, 60, "png", 2)),
+        ("ä.jpg", picture(60, 50)),
+    ]
+    page = visit()
+    upload(page, *photos)
+    name, data = downloaded(page, page.get_by_role("button", name="Download all").click)
+    assert name == "brewster.zip"
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        assert archive.testzip() is None
+        made = {name: archive.read(name) for name in archive.namelist()}
+    assert list(made) == [
+        *(f"{name}.{layer}.png" for name in ("a", "2-a") for layer in ("transmission", "reflection")),
+        "ä.transmission.jpg",
+        "ä.reflection.jpg",
+    ]
+    for (_, photo), name in zip(
+        photos, ("a.transmission.png", "2-a.transmission.png", "ä.transmission.jpg"), strict=True
+    ):
+        assert made[name] == run("-", stdin=photo)[1]
+
+
+def test_photos_can_be_pasted_and_dropped(visit):
+    page = visit()
+    give = """([kind, bytes]) => {
+        const carried = new DataTransfer();
+        carried.items.add(new File([new Uint8Array(bytes)], `${kind}.png`, { type: "image/png" }));
+        const event = kind === "paste" ? new ClipboardEvent(kind, { clipboardData: carried, bubbles: true })
+            : new DragEvent(kind, { dataTransfer: carried, bubbles: true, cancelable: true });
+        document.body.dispatchEvent(event);
+    }"""
+    for kind in ("paste", "drop"):
+        page.evaluate(give, [kind, list(picture(60, 40, "png"))])
+        page.get_by_role("button", name=f"{kind}.png").first.wait_for()
+    page.wait_for_selector("li.done >> nth=1")
+    assert "2 of 2 are done" in page.locator("#news").inner_text()
+
+
+def test_another_quality_makes_the_preview_anew(visit):
+    page = visit()
+    upload(page, ("a.png", picture(90, 60, "png")))
+    with page.expect_request("**/preview?*") as asked:
+        page.get_by_label("Draft", exact=True).check()
+    assert asked.value.method == "POST"
+    for quality in ("Best", "Standard", "Draft"):  # each before the one before it can be done
+        page.get_by_label(quality, exact=True).check()
+    page.wait_for_selector("li.done")
+    page.wait_for_selector("glass-compare:not([hidden])")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_words_can_be_read_in_light_and_dark_and_every_control_has_a_name(visit, scheme):
+    page = visit(color_scheme=scheme, reduced_motion="reduce")
+    upload(page, ("a.png", picture(90, 60, "png")), ("b.png", b"none"))
+    contrast = page.evaluate("""() => {
+        const canvas = document.createElement("canvas").getContext("2d", { willReadFrequently: true });
+        const light = (colours) => {
+            for (const colour of colours) { canvas.fillStyle = colour; canvas.fillRect(0, 0, 1, 1); }
+            const part = [...canvas.getImageData(0, 0, 1, 1).data].map((code) => code / 255)
+                .map((code) => (code <= 0.04045 ? code / 12.92 : ((code + 0.055) / 1.055) ** 2.4));
+            return 0.2126 * part[0] + 0.7152 * part[1] + 0.0722 * part[2];
+        };
+        const behind = (element) => element ? [...behind(element.parentElement), getComputedStyle(element).backgroundColor] : [];
+        return [...document.querySelectorAll("h1, p, label, legend, span, button, output, select")]
+            .filter((element) => element.checkVisibility() && element.textContent.trim() && !element.disabled
+                && !element.closest("glass-compare"))
+            .map((element) => {
+                const back = behind(element);
+                const [one, other] = [light(back), light([...back, getComputedStyle(element).color])].sort((a, b) => b - a);
+                return [element.textContent.trim(), (one + 0.05) / (other + 0.05)];
+            });
+    }""")
+    assert len(contrast) > 15
+    assert [row for row in contrast if row[1] < 4.5] == []
+    nameless = page.evaluate("""() => [...document.querySelectorAll("button, input, select, [tabindex]")]
+        .filter((one) => one.checkVisibility() && !(one.getAttribute("aria-label") || one.textContent.trim() || one.labels?.length))
+        .map((one) => one.outerHTML)""")
+    assert nameless == []
