@@ -11,11 +11,13 @@
 # "est." marks numbers that nobody has measured: from `brewster train recipes/train/kontext.toml --plan`, or arithmetic.
 # runs/full_size_check.sh measures memory and the time of a step on the card that you have.
 set -euo pipefail
-cd "$(dirname "$0")/.."
+root="$(realpath "$(dirname "$0")/..")"
+out=$(realpath -m "${1:-$root/out/kontext}")
 command -v brewster > /dev/null || export PATH="$PWD/.venv/bin:$PATH"
 : "${BREWSTER_DATA:?names no folder: it holds the data, and needs 10 GB}"
+BREWSTER_DATA="$(realpath "$BREWSTER_DATA")"
 export BREWSTER_DATA
-out=${1:-out/kontext}
+cd "$root"
 real20=${REAL20:-$BREWSTER_DATA/real20} nature20=${NATURE20:-$BREWSTER_DATA/nature20} sir2=${SIR2:-$BREWSTER_DATA/SIR2}
 
 # 1. Worlds: 170 HDR maps of Poly Haven, CC0, 4k.   est. 4 GB

@@ -4,8 +4,9 @@
 # The toy twin has random weights and learns for six steps: every part is real, and what it draws is noise.
 # runs/paper.sh is the same play at the paper's size.
 set -euo pipefail
-cd "$(dirname "$0")/.."
-out=${1:-out/tiny}
+root="$(realpath "$(dirname "$0")/..")"
+out=$(realpath -m "${1:-$root/out/tiny}")
+cd "$root"
 command -v brewster > /dev/null || export PATH="$PWD/.venv/bin:$PATH"
 export BREWSTER_DATA="$out" OMP_NUM_THREADS=1 HF_HUB_OFFLINE=1
 

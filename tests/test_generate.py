@@ -1,5 +1,6 @@
 """A large model behind the Separator: twins where the machinery matters, and a model that is known where the answer does."""
 
+import json
 import shutil
 from types import SimpleNamespace
 
@@ -12,10 +13,11 @@ from brewster import Photo, Separator
 from brewster.errors import DeviceError, DownloadError, ModelError, PhotoError
 from brewster.light import to_encoded, to_linear
 from brewster.models.large.backbones import TINY, tiny
-from brewster.models.large.decompose import open_decomposer
+from brewster.models.large.decompose import fingerprint, open_decomposer
 from brewster.models.large.lora import LORA_FILE, add_lora, lora_parameters, save_lora
 from brewster.models.large.panels import Layout
 from brewster.models.large.task import Task
+from brewster.models.large.tensors import read_tensors, write_tensors
 from brewster.separate.generate import Panels
 from brewster.separate.separator import DRIFT_LIMIT
 
@@ -126,7 +128,7 @@ def test_drafts_take_few_steps_and_close_looks_see_tiles():
     assert len(calls["best"]) == 1 + 6
 
 
-@pytest.mark.parametrize(("width", "height"), [(16, 16), (17, 40), (90, 21), (1000, 60)])
+@pytest.mark.parametrize(("width", "height"), [(16, 16), (17, 40), (30, 20), (90, 21), (171, 16), (1000, 60)])
 def test_photos_of_any_shape_come_back_in_their_size(width, height):
     result = Separator(Panels(Oracle(budget_px=3 * 128 * 128)))(smooth(width, height))
     assert result.transmission.size == result.reflection.size == (width, height)
@@ -134,7 +136,7 @@ def test_photos_of_any_shape_come_back_in_their_size(width, height):
 
 
 def test_a_photo_that_is_smaller_than_a_token_is_refused_with_the_size_it_takes():
-    with pytest.raises(PhotoError, match="15 x 40 pixels; at least 16 a side"):
+    with pytest.raises(PhotoError, match=r"15 x 40 pixels; at least 16 a side, .* or use the compact model"):
         Separator(Panels(Oracle()))(smooth(15, 40))
 
 
@@ -144,6 +146,26 @@ def test_a_model_that_draws_no_reflection_leaves_what_it_took_away():
     np.testing.assert_allclose(result.reflection.linear(), 0.3 * photo.linear(), atol=0.02)
     assert result.drift is None
     assert not result.doubtful
+    assert not result.confidence.pixels.any()  # nothing tells how sure it is
+
+
+def test_a_model_that_draws_numbers_that_are_none_is_refused():
+    class Broken(Oracle):
+        def draw(self, light, count):
+            return super().draw(light * float("nan"), count)
+
+    with pytest.raises(ModelError, match="numbers that are none; finite ones"):
+        Separator(Panels(Broken()))(smooth(60, 40))
+
+
+def test_light_that_the_photo_could_not_hold_is_no_drift():
+    photo = Photo.from_array(np.full((64, 64, 3), 1.0, np.float32), encoding="linear")
+
+    class Bright(Oracle):
+        def draw(self, light, count):
+            return super().draw(light + 0.4, count)
+
+    assert Separator(Panels(Bright(panels=("T", "R"))))(photo).drift < 0.004
 
 
 def test_the_share_that_is_done_rises_tile_by_tile_and_step_by_step():
@@ -182,7 +204,7 @@ def test_a_backbone_without_a_lora_is_asked_for_the_transmission_alone():
 
 
 def test_what_a_lora_is_opened_with_is_checked(lora, tmp_path):
-    with pytest.raises(ModelError, match="is a LoRA of kontext; one of klein"):
+    with pytest.raises(ModelError, match="is a LoRA of kontext; its base, not a klein"):
         open_decomposer(str(lora), base="tiny:klein")
     with pytest.raises(ModelError, match="is a base itself"):
         open_decomposer("tiny:klein", base="tiny:kontext")
@@ -195,6 +217,48 @@ def test_what_a_lora_is_opened_with_is_checked(lora, tmp_path):
         open_decomposer(str(tmp_path))
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"rank": "4"}, "card of the LoRA cannot be read"),
+        ({"alpha": 0}, "card of the LoRA cannot be read"),
+        ({"base": None}, "card of the LoRA cannot be read"),
+        ({"quantise": "int3"}, "card of the LoRA cannot be read"),
+        ({"prompt_sha256": None}, "card of the LoRA cannot be read"),
+        ({"more": 1}, "card of the LoRA cannot be read"),
+        ({"task": {"objective": "two"}}, "card of the LoRA cannot be read"),
+        ({"task": {"budget_px": "18432"}}, "card of the LoRA cannot be read"),
+        ({"task": {"layout": {"panels": ["I", "R"], "direction": "stacked"}}}, "T among them"),
+        ({"task": {"layout": {"panels": ["T", "T"], "direction": "stacked"}}}, "each once"),
+    ],
+)
+def test_a_damaged_card_ends_in_a_sentence(lora, tmp_path, change, words):
+    tensors, about = read_tensors(lora / LORA_FILE)
+    card = json.loads(about["brewster"])
+    card |= change | {"task": card["task"] | change.get("task", {})}
+    write_tensors(tmp_path / LORA_FILE, tensors, about | {"brewster": json.dumps(card)})
+    with pytest.raises(ModelError, match=words):
+        Separator.load(str(tmp_path))
+
+
+def test_another_base_has_another_digest(lora, tmp_path):
+    for seed in (0, 1):
+        tiny("kontext", seed)[0].save(tmp_path / str(seed))
+    digests = [fingerprint(str(lora)), *(fingerprint(str(lora), base=str(tmp_path / name)) for name in "01")]
+    assert len(set(digests)) == 3
+    assert fingerprint(str(tmp_path / "0")) != fingerprint(str(tmp_path / "1"))
+    assert Separator.load(str(lora), base=str(tmp_path / "1")).sha256 == digests[2]
+
+
+@pytest.mark.parametrize("folder", ["compact", "kontext", "models"])
+def test_folders_here_do_not_stand_in_for_models(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / folder).mkdir()
+    assert Separator.load("compact").name == "compact"
+    with pytest.raises(ModelError, match="there is no model 'models/mine'" if folder == "models" else "."):
+        Separator.load(f"{folder}/mine")
+
+
 def test_a_base_that_has_moved_can_be_named(tmp_path):
     backbone, prompt = tiny("kontext")
     add_lora(backbone, rank=1, alpha=1)
@@ -202,6 +266,15 @@ def test_a_base_that_has_moved_can_be_named(tmp_path):
     with pytest.raises(ModelError, match=r"the base of .* was /gone/kontext, which is not there.*--base"):
         Separator.load(str(tmp_path / "lora"))
     assert Separator.load(str(tmp_path / "lora"), base="tiny:kontext").name == "lora"
+
+
+def test_one_step_takes_neither_steps_nor_averages():
+    one_step = Oracle()
+    one_step.task = Task(Layout(), SMALL, "one_step", 1.0)
+    with pytest.raises(ModelError, match="answers in one step"):
+        Panels(one_step, steps=4)
+    with pytest.raises(ModelError, match="answers in one step"):
+        Panels(one_step, average=2)
 
 
 def test_options_of_large_models_are_not_forgotten_by_small_ones():

@@ -260,17 +260,29 @@ def test_an_interrupt_leaves_what_was_scored(real20, tmp_path, monkeypatch):
     assert len((tmp_path / "out" / SCORES).read_text().splitlines()) == 2
 
 
-def test_methods_that_need_the_memory_for_themselves_go_through_all_cases_one_after_another(real20, tmp_path):
-    asked = []
+class Large(Fake):
+    """Writes down who asked it, and in which process."""
 
-    class Large(Fake):
-        alone = True
+    alone = True
 
-        def answer(self, case, photo):
-            asked.append((self.name, case.name))
-            return super().answer(case, photo)
+    def __init__(self, name, log):
+        super().__init__(name)
+        self.log = log
 
-    methods = [Large("one"), Fake("small"), Large("two")]
-    rows = score(real20, methods, QUICK, tmp_path / "out")
-    assert [name for name, _ in asked] == sorted(name for name, _ in asked)
+    def answer(self, case, photo):
+        with self.log.open("a") as file:
+            file.write(f"{os.getpid()} {self.name} {case.name}\n")
+        return super().answer(case, photo)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_methods_that_need_the_memory_for_themselves_go_through_all_cases_one_after_another(
+    real20, tmp_path, workers
+):
+    log = tmp_path / "log"
+    methods = [Large("one", log), Fake("small"), Large("two", log)]
+    rows = score(real20, methods, QUICK, tmp_path / "out", workers=workers)
+    asked = [line.split() for line in log.read_text().splitlines()]
+    assert [name for _, name, _ in asked] == ["one"] * 3 + ["two"] * 3
+    assert {int(process) for process, _, _ in asked} == {os.getpid()}
     assert [row.method for row in rows[:3]] == ["one", "small", "two"]

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
 import platform
 import shutil
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Final, Literal, final
 
 import click
@@ -245,9 +243,10 @@ def _large() -> Iterator[Check]:
     about = version or "not installed; for nf4 and 8-bit AdamW on NVIDIA cards"
     cure = None if version else "pip install bitsandbytes"
     yield Check("large", "bitsandbytes", "ok" if version else "missing", about, cure, needed=False)
-    kept = Path(os.environ.get("HF_HOME", "~/.cache/huggingface")).expanduser() / "token"
-    found = "HF_TOKEN" if os.environ.get("HF_TOKEN") else str(kept) if kept.is_file() else None
-    about = f"from {found}" if found else "none; gated models such as FLUX.1 Kontext want one"
+    from huggingface_hub import get_token  # noqa: PLC0415
+
+    found = get_token() is not None
+    about = "found" if found else "none; gated models such as FLUX.1 Kontext want one"
     cure = None if found else "hf auth login"
     yield Check("large", "hub token", "ok" if found else "missing", about, cure, needed=False)
 

@@ -6,13 +6,14 @@ beside the photo, so that an answer made once need not be made again.
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import time
 import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Final, Protocol, final
 
@@ -169,7 +170,7 @@ class Model:
             return find_model(self.model).verify()
         from brewster.models.large.decompose import fingerprint  # noqa: PLC0415  (wakes torch)
 
-        return fingerprint(self.model)
+        return fingerprint(self.model, device=self.device)
 
     def _files(self, case: Case) -> dict[str, Path]:
         folder = self.folder / case.benchmark
@@ -182,10 +183,16 @@ def _small(model: str, device: Device) -> Separator:
     return Separator.load(model, device=device)
 
 
-@lru_cache(maxsize=1)
+_held: dict[tuple[str, Device], Separator] = {}
+
+
 def _large(model: str, device: Device) -> Separator:
-    """A model that makes room for the next one."""
-    return Separator.load(model, device=device)
+    """A model that makes room for the next one before that is loaded."""
+    if (model, device) not in _held:
+        _held.clear()
+        gc.collect()
+        _held[model, device] = Separator.load(model, device=device)
+    return _held[model, device]
 
 
 @final

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import signal
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -84,6 +84,7 @@ def score(
 ) -> list[Row]:
     """Has every method answer every case and scores the answers; those that `out` knows already are not made again.
 
+    Methods that need the memory for themselves go through all cases one after another, when the others are done.
     A method that fails on a case gives a row with an `error`; the others are scored. Rows come in the order of
     benchmarks, cases and methods, the same for any number of workers.
 
@@ -97,8 +98,10 @@ def score(
     wanted = [row for case in cases.values() for row in _rows(case, methods, protocol, known)]
     rows = {row.place: known[row.place] for row in wanted if _is_scored(row, known)}
     todo = [row for row in wanted if row.place not in rows]
-    tasks = list(_tasks(cases, todo, {method.name for method in methods if method.alone}))
-    if tasks and any(name.startswith("lpips") for name in protocol.metrics):
+    alone = [method.name for method in methods if method.alone]
+    tasks = list(_tasks(cases, [row for row in todo if row.method not in alone]))
+    later = [task for name in alone for task in _tasks(cases, [row for row in todo if row.method == name])]
+    if todo and any(name.startswith("lpips") for name in protocol.metrics):
         Lpips.load()  # here, once: its weights may have to be fetched, or be missing
     log = _Log(out / SCORES)
 
@@ -109,6 +112,7 @@ def score(
             report(len(rows), len(wanted), row)
 
     _run(tasks, methods, protocol, take, workers)
+    _run(later, methods, protocol, take, 1)
     return [rows[row.place] for row in wanted]
 
 
@@ -130,17 +134,10 @@ def _rows(
         yield replace(row, kept=before.kept) if before and is_answered else row
 
 
-def _tasks(
-    cases: Mapping[tuple[str, str], Case], todo: Sequence[Row], alone: Collection[str]
-) -> Iterator[_Task]:
-    """Case by case; methods that need the memory for themselves then go through all cases, one after another."""
-
-    def turn(row: Row) -> str:
-        return row.method if row.method in alone else ""
-
-    for _, rows in groupby(sorted(todo, key=turn), turn):
-        for place, group in groupby(rows, lambda row: row.place[:2]):
-            yield _Task(cases[place], tuple(group))
+def _tasks(cases: Mapping[tuple[str, str], Case], todo: Sequence[Row]) -> Iterator[_Task]:
+    """Case by case."""
+    for place, rows in groupby(todo, lambda row: row.place[:2]):
+        yield _Task(cases[place], tuple(rows))
 
 
 def _is_scored(row: Row, known: Mapping[Place, Row]) -> bool:

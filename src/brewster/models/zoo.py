@@ -78,6 +78,8 @@ LARGE: Final = ("kontext", "klein", "qwen")
 
 def is_large(name: str) -> bool:
     """Whether this names a large image model or a LoRA: by name, folder, toy twin ("tiny:kontext") or hub id."""
+    if name in MODELS or Path(name).is_file():
+        return False
     return name in LARGE or name.startswith("tiny:") or Path(name).is_dir() or _is_hub_id(name)
 
 
@@ -93,8 +95,9 @@ def model_name(model: str) -> str:
 
 
 def _is_hub_id(name: str) -> bool:
-    """OWNER/NAME, and no file or folder of this name."""
-    return re.fullmatch(r"[\w-][\w.-]*/[\w-][\w.-]*", name) is not None and not name.endswith(".onnx")
+    """OWNER/NAME; where there is a folder OWNER, a file in it was meant, and nobody out there shall be asked for it."""
+    is_one = re.fullmatch(r"[\w-][\w.-]*/[\w-][\w.-]*", name) is not None
+    return is_one and not name.endswith(".onnx") and not Path(name).parent.is_dir()
 
 
 def find_model(name: str) -> Model:
@@ -105,6 +108,12 @@ def find_model(name: str) -> Model:
     """
     if name in MODELS:
         return MODELS[name]
+    if is_large(name):
+        raise ModelError(
+            f"{name} is a large model, which has no file here",
+            f"one of {', '.join(MODELS)}, or the path of an .onnx file",
+            "brewster models card FOLDER prints the card of a LoRA",
+        )
     path = Path(name)
     if path.is_file():
         return Model(path.stem, path, None, "unknown")

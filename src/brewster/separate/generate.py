@@ -58,6 +58,12 @@ class Panels(Look):
     ) -> None:
         if (steps is not None and steps < 1) or average < 1:
             raise ModelError(f"steps = {steps}, average = {average}", "at least 1 of each", "raise them")
+        if decomposer.task.objective == "one_step" and (steps not in (None, 1) or average > 1):
+            raise ModelError(
+                f"steps = {steps}, average = {average} were asked of a model that answers in one step",
+                "there is one step and one answer",
+                "leave them out",
+            )
         self._decomposer, self._plain = decomposer, plain
         self._steps, self._seeds = steps, range(average)
         self._one_at_a_time = Lock()
@@ -92,14 +98,24 @@ class Panels(Look):
             np.mean([enlarge_rows(map_, 0, size[0], size) for map_ in maps], axis=0)
             for maps in zip(*looks, strict=True)
         )
-        whole = Redrawn(drawn, np.ones_like(drawn[..., :1]))
-        redrawn = whole if self._plain else Redrawn.where_mirrored(drawn, reflection)
-        strayed = float(looks[0][-1].mean()) if self._redraws else None
-        return Seen(change, reflection, agreement(apart + drift), redrawn, strayed)
+        redrawn, strayed = None, None
+        if self._plain:
+            redrawn = Redrawn(drawn, np.ones_like(drawn[..., :1]))
+        elif self._redraws:
+            redrawn = Redrawn.where_mirrored(drawn, reflection)
+        if self._redraws:
+            strayed = float(looks[0][-1].mean())
+        sure = agreement(apart + drift)
+        return Seen(change, reflection, sure if self._can_tell else np.zeros_like(sure), redrawn, strayed)
 
     @property
     def _redraws(self) -> bool:
         return bool({"I", "R"} & set(self._decomposer.task.layout.panels))
+
+    @property
+    def _can_tell(self) -> bool:
+        """Whether anything shows how sure the model is: a photo that it draws, or other answers."""
+        return self._redraws or (len(self._seeds) > 1 and self._decomposer.task.objective == "flow")
 
     @property
     def _tile_px(self) -> int:
@@ -114,6 +130,7 @@ class Panels(Look):
         shown = torch.from_numpy(2 * to_encoded(tile) - 1).permute(2, 0, 1)[None]
         panels = self._decomposer(fit.pad(shown), steps=steps, seeds=self._seeds, tell=count.within_tile)
         count.tile_done()
+        _refuse_broken(panels)
         light = {name: _light(fit.cut(panel)) for name, panel in panels.items()}
         photo = light.get("I", tile)
         change = light["T"] - photo
@@ -147,7 +164,17 @@ def _drawn(light: Mapping[str, Floats], tile: Floats) -> Floats:
     """The photo as the model draws it: its own panel, or T and R together, or not at all."""
     if "I" in light:
         return light["I"]
-    return light["T"] + light["R"] if "R" in light else tile[None]
+    return np.minimum(light["T"] + light["R"], 1) if "R" in light else tile[None]
+
+
+def _refuse_broken(panels: Mapping[str, torch.Tensor]) -> None:
+    for name, panel in panels.items():
+        if not panel.isfinite().all():
+            raise ModelError(
+                f"the model drew a panel {name} with numbers that are none",
+                "finite ones",
+                "store the base otherwise (quantise), or train the LoRA again: its weights may be broken",
+            )
 
 
 def _light(panels: torch.Tensor) -> NDArray[np.float32]:

@@ -164,6 +164,17 @@ def find_family(name: str) -> type[Backbone]:
     )
 
 
+def family_of(source: str) -> type[Backbone]:
+    """Which adapter `load_backbone` would take for this source; no weights are fetched for it.
+
+    Raises:
+        DownloadError, ModelError, MissingExtra: as `load_backbone`.
+    """
+    if source in BACKBONES or source.startswith(TINY):
+        return find_family(source.removeprefix(TINY))
+    return _family(fetch(source, [_INDEX]))[0]
+
+
 def _toy(source: str, device: str, quantise: str | None) -> Backbone:
     if quantise:
         raise ModelError(

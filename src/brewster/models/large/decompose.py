@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 
 from brewster.errors import DeviceError, ModelError
-from brewster.models.large.backbones import BACKBONES, TINY, encode_prompt, load_backbone
+from brewster.models.large.backbones import BACKBONES, TINY, encode_prompt, family_of, load_backbone
 from brewster.models.large.family import Backbone
-from brewster.models.large.lora import LORA_FILE, load_lora, read_card
+from brewster.models.large.lora import LORA_FILE, LoraCard, load_lora, read_card
 from brewster.models.large.panels import Layout, compose, condition, split
 from brewster.models.large.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding
 from brewster.models.large.sampling import STEPS, euler, sample
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 _LOWER: Final = "use a quantised or a smaller backbone"
+_END: Final = 1 << 20
+"""So many bytes of each end of a file are read to tell it from others."""
 _DEVICES: Final = {"auto": "", "cuda": "cuda", "rocm": "cuda", "cpu": "cpu"}
 
 
@@ -138,22 +140,54 @@ def open_decomposer(
         )
     backbone = load_backbone(model, device=place, quantise=quantise)
     words = encode_prompt(model, PROMPTS.get(prompt, prompt), device=place)
-    return Decomposer(
-        backbone, words, Task(Layout(("T",))), model_name(model), fingerprint(model, quantise, prompt)
-    )
+    named = fingerprint(model, device=device, quantise=quantise, prompt=prompt)
+    return Decomposer(backbone, words, Task(Layout(("T",))), model_name(model), named)
 
 
-def fingerprint(model: str, quantise: Quantisation | None = None, prompt: str = "detailed") -> str:
-    """SHA-256 of a LoRA's weights and prompt; of a backbone, which is not read for it, of name, storage and words.
+def fingerprint(
+    model: str,
+    *,
+    device: str = "auto",
+    base: str | None = None,
+    quantise: Quantisation | None = None,
+    prompt: str = "detailed",
+) -> str:
+    """SHA-256 of what `open_decomposer` would open: LoRA, prompt, base, and how the base is stored.
+
+    A base on the hub counts by its name; one in a folder by the names, sizes and ends of its files, since reading
+    all of them takes a minute.
 
     Raises:
-        ModelError, DownloadError: there is no such LoRA, or a damaged one.
+        ModelError, DownloadError, DeviceError: there is no such LoRA or device, or the LoRA is damaged.
     """
     folder = _lora_folder(model)
     if folder is None:
-        return hashlib.sha256(f"{model} {quantise} {PROMPTS.get(prompt, prompt)}".encode()).hexdigest()
-    prompt_sha256 = read_card(folder).prompt_sha256
-    return hashlib.sha256((folder / LORA_FILE).read_bytes() + prompt_sha256.encode()).hexdigest()
+        parts = [_identity(model), str(quantise), PROMPTS.get(prompt, prompt)]
+    else:
+        card = read_card(folder)
+        weights = hashlib.sha256((folder / LORA_FILE).read_bytes()).hexdigest()
+        stored = _stored(card, torch_device(device), quantise)
+        parts = [weights, card.prompt_sha256, _identity(base or card.base), str(stored)]
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+
+
+def _identity(source: str) -> str:
+    """A folder by its files, anything else by its name."""
+    folder, digest = Path(source), hashlib.sha256()
+    if source in BACKBONES or not folder.is_dir():
+        return source
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        digest.update(f"{path.relative_to(folder)} {path.stat().st_size}\0".encode())
+        with path.open("rb") as file:
+            digest.update(file.read(_END))
+            file.seek(max(0, path.stat().st_size - _END))
+            digest.update(file.read())
+    return digest.hexdigest()
+
+
+def _stored(card: LoraCard, device: str, quantise: Quantisation | None) -> Quantisation | None:
+    """As it is asked for, or as the LoRA has learnt on it; on the CPU nothing is gained by it."""
+    return quantise or (card.quantise if device != "cpu" else None)
 
 
 def torch_device(device: str) -> str:
@@ -190,13 +224,23 @@ def _with_lora(
 ) -> Decomposer:
     card = read_card(folder)
     found = base or card.base
-    if base is None and Path(found).is_absolute() and not Path(found).is_dir():
+    if base is None and _is_local(found) and not Path(found).is_dir():
         raise ModelError(
-            f"the base of {folder} was {found}, which is not there",
+            f"the base of {model} was {found}, which is not there",
             f"a {card.backbone} in diffusers' layout",
             "name its folder or hub id with --base",
         )
-    kept = quantise or (card.quantise if device != "cpu" else None)
-    backbone = load_backbone(found, device=device, quantise=kept)
+    family = family_of(found)  # before it is loaded, which may take an hour
+    if family.name != card.backbone:
+        raise ModelError(
+            f"{model} is a LoRA of {card.backbone}", f"its base, not a {family.name}", "name another base"
+        )
+    backbone = load_backbone(found, device=device, quantise=_stored(card, device, quantise))
     card, prompt = load_lora(folder, backbone)
-    return Decomposer(backbone, prompt, card.task, model_name(model), fingerprint(model))
+    where = "cpu" if device == "cpu" else "cuda"
+    named = fingerprint(model, device=where, base=base, quantise=quantise)
+    return Decomposer(backbone, prompt, card.task, model_name(model), named)
+
+
+def _is_local(source: str) -> bool:
+    return Path(source).is_absolute() or source.startswith((".", "~"))

@@ -32,7 +32,7 @@ RECIPE_FILE: Final = "recipe.json"
 FILES: Final = (CARD_FILE, LORA_FILE, PROMPT_FILE, RECIPE_FILE)
 """The layout on the hub. Stock diffusers reads the LoRA by its name, and the hub the card by its own."""
 
-_HOMES: Final = re.compile(r"(?:/home/|/Users/|/root/|[A-Za-z]:\\+Users\\+)[^\s\"'`,;)\]]*")
+_HOMES: Final = re.compile(r"(?:(?<![\w.])/home/|/Users/|/root/|[A-Za-z]:\\+Users\\+)[^\s\"'`,;)\]]*")
 _LOGIN: Final = "make one at https://huggingface.co/settings/tokens, then `hf auth login` or set HF_TOKEN"
 _AGAIN: Final = "train again to write the card anew, or mend it"
 
@@ -95,7 +95,7 @@ def plan_push(folder: Path, repo_id: str, *, message: str = "", public: bool = F
     if renamed:
         data[RECIPE_FILE] = f"{json.dumps(_with(recipe, renamed), indent=2)}\n".encode()
         data[LORA_FILE] = _retold(data[LORA_FILE], card, renamed)
-    for name, sent in data.items():
+    for name, sent in [*data.items(), ("the message", message.encode())]:
         _refuse_homes(folder / name, sent)
     return Push(
         repo_id,
@@ -127,11 +127,12 @@ def push(plan: Push, token: str | None = None) -> str:
     added = [hub.CommitOperationAdd(file.name, file.data) for file in plan.files]
     with _plainly(plan.repo_id):
         api.create_repo(plan.repo_id, private=plan.is_private, exist_ok=True)
-        if plan.is_private and not api.model_info(plan.repo_id).private:
+        is_private = bool(api.model_info(plan.repo_id).private)
+        if plan.is_private != is_private:
             raise DownloadError(
-                f"{plan.repo_id} is there already and public",
-                "a private repository, unless a public one is asked for",
-                "pass --public, choose another name, or make it private in its settings",
+                f"{plan.repo_id} is there already and {'private' if is_private else 'public'}",
+                "private without --public, and public with it",
+                f"{'leave out' if is_private else 'pass'} --public, choose another name, or change its settings",
             )
         commit = api.create_commit(plan.repo_id, added, commit_message=plan.message)
     return str(commit.commit_url)

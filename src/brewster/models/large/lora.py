@@ -13,10 +13,12 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, Final, final
+from typing import Annotated, Any, Final, final
 
 import torch
+from pydantic import Field, TypeAdapter
 from torch import Tensor, nn
 
 from brewster.errors import ModelError, RecipeError
@@ -45,8 +47,8 @@ class LoraCard:
     backbone: str
     base: str
     quantise: Quantisation | None
-    rank: int
-    alpha: int
+    rank: Annotated[int, Field(ge=1)]
+    alpha: Annotated[int, Field(ge=1)]
     task: Task
     prompt_sha256: str
 
@@ -62,14 +64,18 @@ class LoraCard:
             ModelError: not such a line.
         """
         try:
-            value = json.loads(text)
-            return cls(**(value | {"task": Task.from_values(value["task"])}))
-        except (ValueError, TypeError, KeyError, RecipeError) as error:
+            return _cards().validate_json(text, strict=True, extra="forbid")
+        except (ValueError, RecipeError) as error:
             raise ModelError(
                 f"the card of the LoRA cannot be read: {error}",
                 "one that brewster wrote",
                 "save the LoRA again",
             ) from error
+
+
+@cache
+def _cards() -> TypeAdapter[LoraCard]:
+    return TypeAdapter(LoraCard)
 
 
 def add_lora(backbone: Backbone, *, rank: int = 16, alpha: int = 16, seed: int = 0) -> list[nn.Parameter]:

@@ -95,7 +95,8 @@ def load_prompt(path: Path, backbone: str) -> PromptEmbedding:
         ModelError: missing, damaged, not a prompt, or another backbone's.
     """
     tensors, about = read_tensors(path)
-    if about.get("kind") != _FORMAT or not {"embeds"} <= set(tensors) <= {"embeds", "pooled", "negative"}:
+    is_one = about.get("kind") == _FORMAT and {"backbone", "text", "sha256"} <= about.keys()
+    if not (is_one and {"embeds"} <= set(tensors) <= {"embeds", "pooled", "negative"}):
         raise ModelError(f"{path} is not an encoded prompt", f"a file of kind {_FORMAT!r}", "encode it again")
     if about["backbone"] != backbone:
         raise ModelError(

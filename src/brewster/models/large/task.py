@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal, Self, final
+from typing import Final, Literal, final
 
-from brewster.errors import PhotoError
+from brewster.errors import PhotoError, RecipeError
 from brewster.models.large.panels import Fit, Layout, fit_panel
 from brewster.models.large.sampling import GUIDANCE
 
@@ -31,32 +32,27 @@ class Task:
     objective: Objective = "flow"
     guidance: float = GUIDANCE
 
+    def __post_init__(self) -> None:
+        """Refuses a task without T, which every user wants."""
+        if "T" not in self.layout.panels:
+            raise RecipeError(
+                f"the panels are {list(self.layout.panels)}", "T among them", "add T to the panels"
+            )
+
     def fit(self, size: tuple[int, int], multiple: int) -> Fit:
         """The largest panel for a photo of this (width, height); a small photo gets a smaller panel.
 
         Raises:
-            PhotoError: the photo has fewer than `multiple` pixels a side, or is long and thin beyond the budget.
+            PhotoError: the photo has fewer than `multiple` pixels a side, or is too long and thin.
         """
-        try:
-            return fit_panel(size, self.layout, budget_px=self.budget_px, multiple=multiple)
-        except PhotoError:
-            if min(size) < multiple:
-                raise PhotoError(
-                    f"the photo has {size[0]} x {size[1]} pixels",
-                    f"at least {multiple} a side",
-                    "large models see nothing smaller: use another photo, or the compact model",
-                ) from None
-            cells = math.prod(max(1, side // multiple) for side in size)
-            small = min(self.budget_px, cells * len(self.layout.panels) * multiple**2)
-            return fit_panel(size, self.layout, budget_px=small, multiple=multiple)
-
-    @classmethod
-    def from_values(cls, values: dict[str, Any]) -> Self:
-        """Reads what `dataclasses.asdict` gives.
-
-        Raises:
-            TypeError, KeyError: values are missing or unknown.
-            RecipeError: there is no such layout.
-        """
-        layout = Layout(tuple(values["layout"]["panels"]), values["layout"]["direction"])
-        return cls(**(values | {"layout": layout}))
+        most = self.budget_px // (len(self.layout.panels) * multiple**2)
+        cells = min(most, math.prod(-(-side // multiple) for side in size))
+        for count in range(cells, 0, -1):
+            budget = count * len(self.layout.panels) * multiple**2
+            with suppress(PhotoError):
+                return fit_panel(size, self.layout, budget_px=budget, multiple=multiple)
+        raise PhotoError(
+            f"the photo has {size[0]} x {size[1]} pixels",
+            f"at least {multiple} a side, and not so long and thin",
+            "crop it, or use the compact model",
+        )
