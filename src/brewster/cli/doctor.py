@@ -243,9 +243,9 @@ def _large() -> Iterator[Check]:
     about = version or "not installed; for nf4 and 8-bit AdamW on NVIDIA cards"
     cure = None if version else "pip install bitsandbytes"
     yield Check("large", "bitsandbytes", "ok" if version else "missing", about, cure, needed=False)
-    from huggingface_hub import get_token  # noqa: PLC0415
+    from brewster.models.large.stock import has_token  # noqa: PLC0415  (wakes torch)
 
-    found = get_token() is not None
+    found = has_token()
     about = "found" if found else "none; gated models such as FLUX.1 Kontext want one"
     cure = None if found else "hf auth login"
     yield Check("large", "hub token", "ok" if found else "missing", about, cure, needed=False)

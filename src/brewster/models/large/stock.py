@@ -115,6 +115,15 @@ def fetch(source: str, patterns: list[str]) -> Path:
         ) from error
 
 
+def has_token() -> bool:
+    """Whether the hub's client finds a token, wherever it looks for one.
+
+    Raises:
+        MissingExtra: huggingface_hub is not installed.
+    """
+    return library("huggingface_hub").get_token() is not None
+
+
 def _no_access(error: Exception, source: str, page: str) -> DownloadError:
     """A gated model: 401 without a token, 403 with a token whose owner has not been let in."""
     known = _status(error) == 403
