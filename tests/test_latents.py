@@ -1,15 +1,18 @@
 """What a large backbone learns from: whole samples, composed and encoded once."""
 
+import numpy as np
 import pytest
 import torch
+from hypothesis import given, reject
+from hypothesis import strategies as st
 
 from brewster.dataset.mix import Dice, Pairs
 from brewster.dataset.sets import read_set
 from brewster.errors import PhotoError, RecipeError
 from brewster.models.large.backbones import tiny
-from brewster.models.large.panels import split
+from brewster.models.large.panels import Layout, fit_panel, split
 from brewster.photo import Photo
-from brewster.train.latents import Latents, open_samples, panels_of, with_difference
+from brewster.train.latents import Latents, cropped, open_samples, panels_of, with_difference
 from brewster.train.recipe import LargeRecipe
 from set_folders import make
 
@@ -37,6 +40,12 @@ def root(tmp_path_factory):
             pixels = torch.full((40, 60, 3), 200 - 70 * number, dtype=torch.uint8)
             (root / folder / role).mkdir(parents=True)
             Photo.from_array(pixels.numpy(), encoding="srgb").save(root / folder / role / "a.png")
+    noise = np.random.default_rng(1)
+    for role in ("blended", "transmission", "reflection"):
+        (root / "large" / role).mkdir(parents=True)
+        for name in "abc":
+            pixels = noise.integers(0, 256, (32, 48, 3), dtype=np.uint8)
+            Photo.from_array(pixels, encoding="srgb").save(root / "large" / role / f"{name}.png")
     return root
 
 
@@ -47,6 +56,8 @@ def recipe(root, monkeypatch):
 
 
 RENDERED = {"rendered": {"sets": ["set"], "target": "transmission"}}
+LARGE = {"pairs": ["large"], "pairs_share": 1.0}
+"""Three samples of twice the panel's side."""
 
 
 def test_panels_are_the_whole_sample_in_its_own_aspect_ratio(recipe, root, backbone):
@@ -81,6 +92,47 @@ def test_mirrored_samples_are_seen_unless_the_recipe_forbids_it(recipe, backbone
         latents = Latents(open_samples(wanted), backbone, wanted)
         counts.append(len({id(latents(Dice(1, step, 0))) for step in range(60)}))
     assert counts == [6, 3]
+
+
+def test_as_many_crops_of_each_sample_are_seen_as_the_recipe_says_beside_the_whole(recipe, backbone):
+    for crops, seen in ((0, 6), (2, 18)):
+        wanted = recipe(LARGE, crops=crops)
+        latents = Latents(open_samples(wanted), backbone, wanted)
+        encoded = {id(each): each for each in (latents(Dice(1, step, 0)) for step in range(200))}
+        assert len(encoded) == seen
+        different = {each.composite.numpy().tobytes() for each in encoded.values()}
+        assert len(different) == seen
+        assert {each.composite.shape for each in encoded.values()} == {(1, 64, 1, 6)}
+
+
+def test_a_crop_depends_on_seed_sample_and_its_number_alone(recipe, backbone):
+    def encoded(number, crop, **changes):
+        wanted = recipe(LARGE, crops=3, **changes)
+        return Latents(open_samples(wanted), backbone, wanted)._encode(number, False, crop).composite
+
+    assert torch.equal(encoded(1, 2), encoded(1, 2, steps=9, flip=False))
+    for other in (encoded(1, 1), encoded(0, 2), encoded(1, 2, seed=2), encoded(1, 0)):
+        assert not torch.equal(encoded(1, 2), other)
+
+
+@given(st.integers(16, 300), st.integers(16, 300), st.integers(1, 99), st.integers(0, 99))
+def test_a_crop_is_a_window_of_the_samples_shape_and_never_smaller_than_it_is_shown(
+    width, height, cells, seed
+):
+    layout = Layout()
+    cells = min(cells, (width // 16) * (height // 16))
+    try:
+        fit = fit_panel((width, height), layout, budget_px=3 * 16 * 16 * cells, multiple=16)
+    except PhotoError:
+        reject()
+    whole = torch.arange(height * width).reshape(height, width, 1)
+    crop = cropped(Dice(seed, -1, 1), whole, fit)
+    rows, columns, _ = crop.shape
+    assert max(fit.content[0], width // 2) <= columns <= width
+    assert max(fit.content[1], height // 2) <= rows <= height
+    assert abs(columns - width * rows / height) <= 1 + width / height
+    top, left = divmod(crop[0, 0, 0].item(), width)
+    assert torch.equal(crop, whole[top : top + rows, left : left + columns])
 
 
 def test_real_pairs_come_as_often_as_their_share(recipe, root):

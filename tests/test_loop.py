@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from brewster.dataset.sources import read_photos
 from brewster.errors import ModelError, RecipeError
@@ -81,6 +82,19 @@ def test_the_loop_knows_no_network(recipe, tmp_path):
     run(again, tmp_path, silent)
     assert not again.begun
     assert again.steps == learner.steps
+
+
+def test_tensorboard_is_told_what_the_log_is_told(recipe, tmp_path):
+    run(Counting(recipe), tmp_path, silent)
+    lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    events = EventAccumulator(str(tmp_path)).Reload()
+    assert set(events.Tags()["scalars"]) == lines[0].keys() - {"step"}
+    for name in ("loss", "gain"):
+        told = [(event.step, event.value) for event in events.Scalars(name)]
+        assert told == [(line["step"], pytest.approx(line[name], abs=1e-5)) for line in lines]
+    assert [event.step for event in events.Images("samples")] == [3, 6]
+    run(Counting(recipe), tmp_path, silent)
+    assert len(list(tmp_path.glob("events.out.tfevents.*"))) == 1
 
 
 def test_a_killed_run_ends_with_the_same_weights_to_the_last_bit(recipe, tmp_path):

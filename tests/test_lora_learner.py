@@ -81,11 +81,18 @@ def photo(width=48, height=32):
     return torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(3)) * 2 - 1
 
 
-def test_a_killed_run_ends_with_the_same_lora_to_the_last_bit(recipe, tmp_path):
-    undisturbed = train(recipe(), tmp_path / "one").export(tmp_path / "one")
+def test_a_killed_run_ends_with_the_same_lora_to_the_last_bit(recipe, folder, tmp_path):
+    pairs = tmp_path / "pairs"
+    for role in ("blended", "transmission", "reflection"):
+        (pairs / role).mkdir(parents=True)
+        pixels = np.random.default_rng(len(role)).integers(0, 256, (32, 48, 3), dtype=np.uint8)
+        Photo.from_array(pixels, encoding="srgb").save(pairs / role / "a.png")
+    rendered = {"sets": [folder], "target": "transmission"}
+    wanted = recipe(crops=2, data={"pairs": [pairs], "pairs_share": 0.5, "rendered": rendered})
+    undisturbed = train(wanted, tmp_path / "one").export(tmp_path / "one")
     with pytest.raises(Killed):
-        train(recipe(), tmp_path / "two", last=5)
-    resumed = train(recipe(), tmp_path / "two").export(tmp_path / "two")
+        train(wanted, tmp_path / "two", last=5)
+    resumed = train(wanted, tmp_path / "two").export(tmp_path / "two")
     assert (undisturbed / LORA_FILE).read_bytes() == (resumed / LORA_FILE).read_bytes()
     ends = [Checkpoint.read(tmp_path / name / "checkpoint.pt").state for name in ("one", "two")]
     moments = [state["optimizer"]["state"] for state in ends]
@@ -95,7 +102,9 @@ def test_a_killed_run_ends_with_the_same_lora_to_the_last_bit(recipe, tmp_path):
 
 def test_a_run_leaves_a_log_pictures_and_a_folder_for_stock_diffusers(recipe, tmp_path):
     place = train(recipe(), tmp_path).export(tmp_path)
-    assert {path.name for path in place.iterdir()} == {LORA_FILE, "prompt.safetensors", "recipe.json"}
+    assert {path.name for path in place.iterdir()} == {
+        LORA_FILE, "prompt.safetensors", "recipe.json", "README.md",
+    }  # fmt: skip
     assert json.loads((place / "recipe.json").read_text())["backbone"] == "tiny:kontext"
     (line,) = (tmp_path / "log.jsonl").read_text().splitlines()
     assert json.loads(line).keys() == {

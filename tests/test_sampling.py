@@ -153,6 +153,20 @@ def test_a_picture_off_the_grid_is_refused(twin):
 
 
 @pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"steps": 0}, "0 steps; at least 1; the usual is 20"),
+        ({"steps": -3}, "-3 steps; at least 1; the usual is 20"),
+        ({"seeds": []}, "0 seeds; at least 1; the usual is 1"),
+        ({"batch": 0}, "a batch of 0; at least 1; the usual is 1"),
+    ],
+)
+def test_nothing_cannot_be_sampled(twin, options, words):
+    with pytest.raises(ModelError, match=words):
+        ours(twin, eight_bit_picture(*SIZE), **options)
+
+
+@pytest.mark.parametrize(
     "error",
     [
         torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB.\nmore"),
@@ -165,7 +179,7 @@ def test_running_out_of_memory_says_what_to_lower(twin, monkeypatch, error):
         raise error
 
     monkeypatch.setattr(twin[0], "predict", full)
-    with pytest.raises(DeviceError, match="lower budget_px"):
+    with pytest.raises(DeviceError, match="fewer bits"):
         ours(twin, eight_bit_picture(*SIZE))
 
 

@@ -3,7 +3,9 @@
     samples = open_samples(recipe)
     encoded = Latents(samples, backbone, recipe)(Dice(seed, step, slot))
 
-Latents are a function of sample and mirroring alone, as size, panels and VAE stay the same in a run.
+Latents are a function of sample, mirroring and crop, by which they are kept, and of bucket (the size of the panels) and
+VAE, which need not stand beside them: a run has one VAE, frozen, and one budget, so that a sample's shape decides its
+bucket, the same for all crops of it.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from brewster.dataset.mix import Dice, Pairs
 from brewster.dataset.sources import read_pairs
 from brewster.errors import RecipeError
 from brewster.light import to_encoded, to_linear
+from brewster.models.large.decompose import start
 from brewster.models.large.family import Backbone
 from brewster.models.large.panels import Fit, compose, condition, fit_panel
 from brewster.photo import Photo
@@ -35,8 +38,10 @@ if TYPE_CHECKING:
     from jaxtyping import Float, UInt8
 
 KEPT: Final = 2048
-"""How many samples' latents stay in memory: 3 GiB at the paper's size (a thousand sets, also mirrored). Beyond, those
-that were not used for longest are encoded again when their turn comes: slower, but the same."""
+"""How many latents stay in memory: 3 GiB at the paper's size (a thousand sets, also mirrored, without crops). Beyond,
+those that were not used for longest are encoded again when their turn comes: slower, but the same."""
+_LEAST_SIDE: Final = 0.5
+"""Of a crop, over the whole sample's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,46 +107,60 @@ class Latents:
         self._encoded = lru_cache(KEPT)(self._encode)
 
     def __call__(self, dice: Dice) -> Encoded:
-        """A sample, maybe mirrored.
+        """A sample, maybe mirrored, whole or a crop of it.
 
         Raises:
             RecipeError, PhotoError: its files are missing or damaged, or it is smaller than a panel.
         """
         number = self._samples.choose(dice)
-        return self._encoded(number, self._recipe.flip and dice.chance(0.5))
+        mirrored = self._recipe.flip and dice.chance(0.5)
+        crops = self._recipe.crops
+        return self._encoded(number, mirrored, dice.choose(crops + 1) if crops else 0)
 
-    def _encode(self, number: int, mirrored: bool) -> Encoded:
-        sample = self._samples[number]
-        panels, _ = panels_of(
-            sample.layers.flip(1) if mirrored else sample.layers, self._backbone, self._recipe
-        )
-        layout, see = self._recipe.layout, self._backbone.encode
+    def _encode(self, number: int, mirrored: bool, crop: int) -> Encoded:
+        sample, layout, see = self._samples[number], self._recipe.layout, self._backbone.encode
+        fit = panel_for(sample.layers, self._backbone, self._recipe)
+        seen = sample.layers
+        if crop:
+            seen = cropped(Dice(self._recipe.seed, -1 - number, crop), seen, fit)  # dice that no step throws
+        panels = panels_in(seen.flip(1) if mirrored else seen, fit)
+        many = self._recipe.objective == "flow"
         return Encoded(
             see(compose(panels, layout)).cpu(),
             see(condition(panels["I"], layout)).cpu(),
-            start_of(panels["I"], self._backbone, self._recipe),
+            None if many else start(panels["I"], self._backbone, layout).cpu(),
             sample.trust,
         )
 
 
-def start_of(photo: Tensor, backbone: Backbone, recipe: LargeRecipe) -> Tensor | None:
-    """Where the one step starts, encoded: the photo in every panel; nothing where there are many steps, from noise."""
-    if recipe.objective == "flow":
-        return None
-    return backbone.encode(compose(dict.fromkeys(recipe.panels, photo), recipe.layout)).cpu()
+def cropped(dice: Dice, layers: UInt8[Tensor, "h w 9"], fit: Fit) -> UInt8[Tensor, "p q 9"]:
+    """A window of the sample's aspect ratio, anywhere, with 0.5 to 1 of its sides, yet no smaller than what `fit` shows."""
+    height, width, _ = layers.shape
+    least = max(_LEAST_SIDE, fit.content[0] / width, fit.content[1] / height)
+    side = dice.uniform((least, 1.0))
+    columns, rows = (
+        max(shown, round(side * whole)) for shown, whole in zip(fit.content, (width, height), strict=True)
+    )
+    top, left = dice.choose(height - rows + 1), dice.choose(width - columns + 1)
+    return layers[top : top + rows, left : left + columns]
 
 
 def panels_of(layers: Tensor, backbone: Backbone, recipe: LargeRecipe) -> tuple[dict[str, Tensor], Fit]:
-    """I, T and R as panels, (1, 3, h, w) in [-1, 1], shrunk in linear light; and how they stand in them.
+    """I, T and R of a whole sample as panels, as `panels_in` makes them; and how they stand in them.
 
     Raises:
         PhotoError: the sample is smaller than a panel.
     """
     fit = panel_for(layers, backbone, recipe)
+    return panels_in(layers, fit), fit
+
+
+def panels_in(layers: UInt8[Tensor, "h w 9"], fit: Fit) -> dict[str, Float[Tensor, "1 3 p q"]]:
+    """I, T and R, shrunk in linear light until they fit, in [-1, 1]."""
     light = to_linear(layers.permute(2, 0, 1)[None] / 255)
     small = functional.interpolate(light, fit.content[::-1], mode="bilinear", antialias=True)
     padded = fit.pad(2 * to_encoded(small.clamp(0, 1)) - 1)
-    return dict(zip("ITR", padded.chunk(3, dim=1), strict=True)), fit
+    return dict(zip("ITR", padded.chunk(3, dim=1), strict=True))
 
 
 def panel_for(layers: Tensor, backbone: Backbone, recipe: LargeRecipe) -> Fit:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -19,6 +20,7 @@ from brewster.errors import RecipeError
 from brewster.files import write_atomically
 from brewster.light import to_linear
 from brewster.photo import Photo
+from brewster.train.board import Board
 from brewster.train.checkpoint import AFRESH, Checkpoint, fitting
 from brewster.train.crew import leads
 from brewster.train.recipe import Recipe
@@ -71,7 +73,8 @@ def run(learner: Learner, out: Path, report: Report) -> None:
 
     A recipe whose data are none (a count of 0) takes no step: the learner stays as it starts.
 
-    `out` receives `checkpoint.pt`, `log.jsonl` and, at every report, `samples.png`.
+    `out` receives `checkpoint.pt` and, at every report, a line in `log.jsonl`, `samples.png`, and both in a file for
+    TensorBoard, where that is installed.
 
     Raises:
         RecipeError: `out` holds a run of another recipe.
@@ -83,18 +86,27 @@ def run(learner: Learner, out: Path, report: Report) -> None:
     begun = _take_up(learner, out / CHECKPOINT)
     if leads():
         _forget_after(begun, out / LOG)
-    started = time.monotonic()
-    for step in range(begun + 1, 1 + (0 if recipe.data.is_none else recipe.steps)):
-        numbers, last = learner.advance(step - 1), step == recipe.steps
-        logged = leads() and (last or step % recipe.report_every == 0)
-        if logged:
-            scores, picture = learner.validate()
-            numbers |= scores | {"seconds": time.monotonic() - started}
-            _log(out / LOG, {"step": step, **numbers})
-            _write_picture(out / SAMPLES, picture)
-        if leads() and (last or step % recipe.checkpoint_every == 0):
-            Checkpoint(step, recipe.model_dump_json(), learner.state()).write(out / CHECKPOINT)
-        report(step, recipe.steps, numbers, logged)
+    started, steps = time.monotonic(), 0 if recipe.data.is_none else recipe.steps
+    with closing(Board(out, begun)) as board:
+        for step in range(begun + 1, 1 + steps):
+            numbers, last = learner.advance(step - 1), step == recipe.steps
+            logged = leads() and (last or step % recipe.report_every == 0)
+            if logged:
+                scores, picture = learner.validate()
+                numbers |= scores | {"seconds": time.monotonic() - started}
+                _log(out / LOG, {"step": step, **numbers})
+                _write_picture(out / SAMPLES, picture)
+                board.tell(step, numbers, picture)
+            if leads() and (last or step % recipe.checkpoint_every == 0):
+                Checkpoint(step, recipe.model_dump_json(), learner.state()).write(out / CHECKPOINT)
+            report(step, recipe.steps, numbers, logged)
+
+
+def last_numbers(folder: Path) -> dict[str, float]:
+    """What a run in this folder logged last; nothing if it has not."""
+    log = folder / LOG
+    lines = log.read_text().splitlines() if log.exists() else []
+    return dict(json.loads(lines[-1])) if lines else {}
 
 
 def _take_up(learner: Learner, saved: Path) -> int:

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from brewster.dataset.mix import Dice
-from brewster.errors import PhotoError, RecipeError
+from brewster.errors import RecipeError
 from brewster.files import write_atomically
 from brewster.models.large.backbones import encode_prompt, load_backbone
 from brewster.models.large.decompose import Decomposer
@@ -32,15 +32,17 @@ from brewster.models.large.prompt import PROMPTS, PromptEmbedding, load_prompt
 from brewster.models.large.sampling import STEPS
 from brewster.models.large.stock import within_memory
 from brewster.train import crew
+from brewster.train.card import write_card
 from brewster.train.data import validation_pairs
 from brewster.train.latents import (
     Encoded,
     Latents,
     Samples,
     open_samples,
-    panels_of,
+    panels_in,
     with_difference,
 )
+from brewster.train.loop import last_numbers
 from brewster.train.losses import finite, gain_db
 from brewster.train.recipe import ENCODED, LargeRecipe
 
@@ -132,16 +134,19 @@ class LoraLearner:
         return gains, torch.cat(rows, dim=1).clamp(0, 1).permute(1, 2, 0)
 
     def export(self, folder: Path) -> Path:
-        """Writes a folder that stock diffusers loads: the LoRA with its card, the prompt, and the recipe.
+        """Writes a folder that stock diffusers loads: the LoRA, the prompt, the recipe, and the model card, README.md.
 
         Raises:
             TargetError: it cannot be written.
         """
         place = folder / FOLDER
         base, quantise = self.recipe.backbone, self.recipe.quantise
+        if Path(base).is_dir():
+            base = str(Path(base).resolve())
         save_lora(place, self.backbone, self.prompt, self.recipe.task, base=base, quantise=quantise)
         text = json.dumps(self.recipe.model_dump(mode="json"), indent=2)
         write_atomically(place / RECIPE, f"{text}\n".encode(), overwrite=True)
+        write_card(place, self.recipe, last_numbers(folder), type(self.backbone))
         return place
 
     def separate(self, photo: Tensor, *, steps: int = STEPS, seed: int = 0) -> Mapping[str, Tensor]:
@@ -198,14 +203,9 @@ class LoraLearner:
 
     def _panels(self, layers: Tensor) -> tuple[dict[str, Tensor], Fit]:
         """Of a picture that is only looked at: one that is smaller than a panel gets smaller panels."""
-        try:
-            return panels_of(layers, self.backbone, self.recipe)
-        except PhotoError:
-            height, width, _ = layers.shape
-            cells = (width // self.backbone.multiple) * (height // self.backbone.multiple)
-            least = len(self.recipe.panels) * self.backbone.multiple**2
-            smaller = self.recipe.model_copy(update={"budget_px": max(cells, 1) * least})
-            return panels_of(layers, self.backbone, smaller)
+        height, width, _ = layers.shape
+        fit = self.recipe.task.fit((width, height), self.backbone.multiple)
+        return panels_in(layers, fit), fit
 
     def _answer(self, layers: Tensor) -> tuple[float, Tensor]:
         """The gain on a sample, and its row: photo and truths, then the panels."""

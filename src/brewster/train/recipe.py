@@ -184,6 +184,8 @@ class LargeRecipe(Recipe):
     """Of the times that it learns at, logit-normal (Esser et al. 2024), before the shift for the resolution."""
     flip: bool = True
     """Whether every sample is also seen mirrored."""
+    crops: Annotated[int, Field(ge=0)] = 0
+    """How many different crops of each sample are learnt beside the whole."""
     reflections: Literal["given", "difference"] = "given"
     """Pairs without a reflection are refused where R is a panel, or R is what photo - transmission leaves in light."""
     prompt: str = "paper"

@@ -46,7 +46,7 @@ class Backbone(ABC):
     """Names in diffusers of the "pipeline", "transformer", "vae" and "scheduler"."""
     real: ClassVar[Architecture]
     tiny: ClassVar[Architecture]
-    guided_by_embedding: ClassVar[bool] = False
+    guided_by_embedding: ClassVar[bool]
     """Whether guidance is a number that the transformer reads, or a second prediction (classifier-free)."""
     multiple: ClassVar[int] = 16
     """Sides of a panel are multiples of this many pixels."""
@@ -110,7 +110,11 @@ class Backbone(ABC):
         prompt: PromptEmbedding,
         guidance: float,
     ) -> Float[Tensor, "n c h w"]:
-        """The velocity noise - picture at time sigma, float32; carries gradients where the caller wants them."""
+        """The velocity noise - picture at time sigma, float32; carries gradients where the caller wants them.
+
+        Raises:
+            ModelError: a prompt that lacks what this guidance needs.
+        """
 
     @abstractmethod
     def positions(self, latents: Tensor, condition: Tensor) -> Any:  # noqa: ANN401 - each family has its own kind
@@ -220,24 +224,32 @@ class Backbone(ABC):
         return torch.cat([grid.flatten(2).mT for grid in grids], dim=1).to(self.device, self.dtype)
 
 
-def guided(velocity: Tensor, empty: Tensor, guidance: float) -> Tensor:
-    """Classifier-free guidance (Ho & Salimans 2022): away from what the empty prompt predicts."""
-    return empty + guidance * (velocity - empty)
+class GuidedTwice(Backbone):
+    """A backbone whose guidance is classifier-free (Ho & Salimans 2022): above 1 it predicts a second time."""
 
+    guided_by_embedding = False
 
-def empty_prompt(prompt: PromptEmbedding) -> Tensor:
-    """The prompt's empty counterpart, for classifier-free guidance.
+    def predict(
+        self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float
+    ) -> Tensor:
+        """See Backbone; a distilled model takes no guidance.
 
-    Raises:
-        ModelError: it was not encoded.
-    """
-    if prompt.negative is None:
-        raise ModelError(
-            f"the prompt for {prompt.backbone} has no empty counterpart",
-            "one, for a guidance above 1",
-            "encode the prompt again or set the guidance to 1",
-        )
-    return prompt.negative
+        Raises:
+            ModelError: guidance above 1 and a prompt without its empty counterpart.
+        """
+        wanted = self._velocity(latents, condition, sigma, prompt.embeds)
+        if guidance <= 1 or self.distilled:
+            return wanted
+        empty = self._velocity(latents, condition, sigma, _empty(prompt))
+        return self._guided(wanted, empty, guidance)
+
+    @abstractmethod
+    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, words: Tensor) -> Tensor:
+        """What the transformer predicts when it is told these words, (1, tokens, width)."""
+
+    def _guided(self, wanted: Tensor, empty: Tensor, guidance: float) -> Tensor:
+        """Away from what the empty prompt predicts."""
+        return empty + guidance * (wanted - empty)
 
 
 def grid_of(tokens: Float[Tensor, "n t c"], like: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
@@ -252,6 +264,16 @@ def random_prompt(backbone: str, seed: int, **shapes: tuple[int, ...]) -> Prompt
         name: _normal(shape, seed + index) for index, (name, shape) in enumerate(sorted(shapes.items()))
     }
     return PromptEmbedding(backbone, PROMPT, **tensors)
+
+
+def _empty(prompt: PromptEmbedding) -> Tensor:
+    if prompt.negative is None:
+        raise ModelError(
+            f"the prompt for {prompt.backbone} has no empty counterpart",
+            "one, for a guidance above 1",
+            "encode the prompt again or set the guidance to 1",
+        )
+    return prompt.negative
 
 
 def _normal(shape: tuple[int, ...], seed: int) -> Tensor:

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Final, final
 import torch
 from torch import Tensor
 
-from brewster.models.large.family import Backbone, empty_prompt, grid_of, guided, random_prompt
+from brewster.models.large.family import GuidedTwice, grid_of, random_prompt
 from brewster.models.large.prompt import PromptEmbedding
 
 _SCHEDULER: Final = {
@@ -19,7 +19,7 @@ _CONDITION_TIME: Final = 10
 
 
 @final
-class Klein(Backbone):
+class Klein(GuidedTwice):
     """FLUX.2 klein (Black Forest Labs 2026), the base model: guidance is classifier-free.
 
     The distilled models of the same family load, too; they take no guidance.
@@ -78,32 +78,6 @@ class Klein(Backbone):
         """(tokens, 4): time (0 generated, 10 conditioning), row, column, place in the text (0)."""
         return torch.cat([_ids(latents, 0), _ids(condition, _CONDITION_TIME)]).to(self.device)
 
-    def predict(
-        self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float
-    ) -> Tensor:
-        """See Backbone; a guidance above 1 predicts a second time with the empty prompt.
-
-        Raises:
-            ModelError: guidance above 1 and a prompt without its empty counterpart.
-        """
-
-        def velocity(embeds: Tensor) -> Tensor:
-            words = embeds.to(self.device, self.dtype).expand(len(latents), -1, -1)
-            tokens = self.transformer(
-                hidden_states=self._tokens(latents, condition),
-                encoder_hidden_states=words,
-                timestep=sigma.to(self.device, self.dtype),
-                guidance=None,
-                txt_ids=_text_ids(words).to(self.device),
-                img_ids=self.positions(latents, condition),
-                return_dict=False,
-            )[0]
-            return grid_of(tokens, latents)
-
-        if guidance <= 1 or self.distilled:
-            return velocity(prompt.embeds)
-        return guided(velocity(prompt.embeds), velocity(empty_prompt(prompt)), guidance)
-
     @classmethod
     def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a stock pipeline
         """Three layers of Qwen3 for the prompt, and for the empty one."""
@@ -116,6 +90,19 @@ class Klein(Backbone):
         """Eight random tokens, and eight for the empty prompt."""
         shape = (1, 8, transformer.config.joint_attention_dim)
         return random_prompt(cls.name, seed, embeds=shape, negative=shape)
+
+    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, words: Tensor) -> Tensor:
+        told = words.to(self.device, self.dtype).expand(len(latents), -1, -1)
+        tokens = self.transformer(
+            hidden_states=self._tokens(latents, condition),
+            encoder_hidden_states=told,
+            timestep=sigma.to(self.device, self.dtype),
+            guidance=None,
+            txt_ids=_text_ids(told).to(self.device),
+            img_ids=self.positions(latents, condition),
+            return_dict=False,
+        )[0]
+        return grid_of(tokens, latents)
 
 
 def _ids(grid: Tensor, time: int) -> Tensor:

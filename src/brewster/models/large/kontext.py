@@ -63,7 +63,11 @@ class Kontext(Backbone):
     def predict(
         self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float
     ) -> Tensor:
-        """See Backbone; guidance is a number that the transformer reads."""
+        """See Backbone; guidance is a number that the transformer reads.
+
+        Raises:
+            ModelError: a prompt without its summary vector.
+        """
         if prompt.pooled is None:
             raise ModelError("the prompt has no pooled vector", "one, from CLIP", "encode the prompt again")
         count, words = len(latents), prompt.to(self.device, self.dtype)

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Final, final
 import torch
 from torch import Tensor
 
-from brewster.models.large.family import PATCH, Backbone, empty_prompt, grid_of, guided, random_prompt
+from brewster.models.large.family import PATCH, GuidedTwice, grid_of, random_prompt
 from brewster.models.large.prompt import PromptEmbedding
 
 _SCHEDULER: Final = {
@@ -18,7 +18,7 @@ _GREY_SIDE_PX: Final = 448
 
 
 @final
-class Qwen(Backbone):
+class Qwen(GuidedTwice):
     """Qwen-Image-Edit (Qwen team 2025); guidance is classifier-free and keeps each token's length.
 
     Its stock pipeline resizes the condition to a megapixel; here it is seen as it is. Its text encoder looks at the
@@ -57,31 +57,6 @@ class Qwen(Backbone):
         shapes = [(1, int(grid.shape[2]), int(grid.shape[3])) for grid in (latents, condition)]
         return [shapes] * len(latents)
 
-    def predict(
-        self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float
-    ) -> Tensor:
-        """See Backbone; a guidance above 1 predicts a second time with the empty prompt.
-
-        Raises:
-            ModelError: guidance above 1 and a prompt without its empty counterpart.
-        """
-
-        def velocity(embeds: Tensor) -> Tensor:
-            tokens = self.transformer(
-                hidden_states=self._tokens(latents, condition),
-                encoder_hidden_states=embeds.to(self.device, self.dtype).expand(len(latents), -1, -1),
-                timestep=sigma.to(self.device, self.dtype),
-                img_shapes=self.positions(latents, condition),
-                return_dict=False,
-            )[0]
-            return grid_of(tokens, latents)
-
-        wanted = velocity(prompt.embeds)
-        if guidance <= 1:
-            return wanted
-        combined = guided(wanted, velocity(empty_prompt(prompt)), guidance)
-        return combined * (_length(wanted) / _length(combined))
-
     @classmethod
     def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a stock pipeline
         """Qwen2.5-VL's last layer for the prompt beside a grey picture, and for an empty one."""
@@ -95,6 +70,21 @@ class Qwen(Backbone):
         """Eight random tokens, and six for the empty prompt."""
         width = transformer.config.joint_attention_dim
         return random_prompt(cls.name, seed, embeds=(1, 8, width), negative=(1, 6, width))
+
+    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, words: Tensor) -> Tensor:
+        tokens = self.transformer(
+            hidden_states=self._tokens(latents, condition),
+            encoder_hidden_states=words.to(self.device, self.dtype).expand(len(latents), -1, -1),
+            timestep=sigma.to(self.device, self.dtype),
+            img_shapes=self.positions(latents, condition),
+            return_dict=False,
+        )[0]
+        return grid_of(tokens, latents)
+
+    def _guided(self, wanted: Tensor, empty: Tensor, guidance: float) -> Tensor:
+        """The direction of the guided prediction, the length of the wanted one, token by token."""
+        combined = super()._guided(wanted, empty, guidance)
+        return combined * (_length(wanted) / _length(combined))
 
     def _see(self, picture: Tensor) -> Tensor:
         return self.vae.encode(picture[:, :, None]).latent_dist.mode()[:, :, 0]  # type: ignore[no-any-return]

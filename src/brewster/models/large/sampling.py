@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 import torch
 from torch import Tensor
 
+from brewster.errors import ModelError
 from brewster.models.large.family import Backbone
 from brewster.models.large.prompt import PromptEmbedding
 from brewster.models.large.stock import within_memory
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 STEPS: Final = 20
 GUIDANCE: Final = 4.0
-_CURE: Final = "lower budget_px, the batch, or use a quantised or smaller backbone"
+_CURE: Final = "store the base in fewer bits (quantise), or take a smaller base or a card with more memory"
 
 
 @torch.no_grad()
@@ -46,9 +47,12 @@ def sample(
     computed together; `.mean(0, keepdim=True)` averages them. `tell(done, all)` is called after each step.
 
     Raises:
-        ModelError: sides that are not multiples of 16, or a prompt that guidance cannot use.
+        ModelError: sides that are not multiples of 16, a prompt that guidance cannot use, or no steps, seeds or batch.
         DeviceError: out of memory (says what to lower).
     """
+    _refuse_fewer_than_one(f"{steps} steps", steps, usual=STEPS)
+    _refuse_fewer_than_one(f"{len(seeds)} seeds", len(seeds), usual=1)
+    _refuse_fewer_than_one(f"a batch of {batch}", batch, usual=1)
     groups = [seeds[start : start + batch] for start in range(0, len(seeds), batch)]
     done = itertools.count(1)
 
@@ -88,3 +92,8 @@ def euler(
         if tell:
             tell()
     return latents
+
+
+def _refuse_fewer_than_one(told: str, count: int, *, usual: int) -> None:
+    if count < 1:
+        raise ModelError(f"sampling was asked for {told}", "at least 1", f"the usual is {usual}")

@@ -1,0 +1,91 @@
+"""Processes that learn as one: how many there are, what they add up, and launches that went wrong."""
+
+import os
+import subprocess
+import sys
+
+import accelerate
+import pytest
+import torch
+
+from brewster.errors import DeviceError
+from brewster.train import crew
+
+LAUNCHED = {"RANK": "0", "LOCAL_RANK": "0", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29555"}
+
+
+@pytest.fixture(autouse=True)
+def _not_launched(monkeypatch):
+    for name in ("WORLD_SIZE", "ACCELERATE_MIXED_PRECISION", *LAUNCHED):
+        monkeypatch.delenv(name, raising=False)
+
+
+def python(code, *launcher, **variables):
+    """A program, maybe under a launcher: what it printed, what it said, and its exit code."""
+    here = {name: value for name, value in os.environ.items() if name not in {"WORLD_SIZE", *LAUNCHED}}
+    done = subprocess.run(
+        [sys.executable, *launcher, *([] if launcher else ["-c"]), str(code)],
+        env=here | {"OMP_NUM_THREADS": "1"} | variables,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    return done.stdout, done.stderr, done.returncode
+
+
+def test_one_process_leads_itself_adds_up_nothing_and_needs_no_accelerate():
+    code = """
+import sys, torch
+sys.modules["accelerate"] = None
+from brewster.train import crew
+crew.assemble()
+alone = torch.ones(3)
+crew.add_up([alone])
+print(crew.size(), crew.rank(), crew.leads(), alone.tolist())
+"""
+    assert python(code) == ("1 0 True [1.0, 1.0, 1.0]\n", "", 0)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(torch.cuda.is_available(), reason="two processes would want two GPUs")
+def test_two_processes_know_each_other_and_add_up_each_tensor(tmp_path):
+    (tmp_path / "two.py").write_text(
+        """
+import torch
+from brewster.train import crew
+crew.assemble()
+assert crew.size() == 2 and crew.leads() == (crew.rank() == 0) and crew.best_device() == torch.device("cpu")
+tensors = [torch.full((2,), 1.0 + crew.rank()), torch.tensor(10.0 * crew.rank())]
+crew.add_up(tensors)
+assert [tensor.tolist() for tensor in tensors] == [[3.0, 3.0], 10.0]
+print("rank", crew.rank(), flush=True)
+"""
+    )
+    torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
+    told, said, code = python(tmp_path / "two.py", *torchrun)
+    assert code == 0, said
+    assert sorted(told.split()) == ["0", "1", "rank", "rank"]
+
+
+def test_a_world_that_nobody_launched_is_told_so(monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(DeviceError, match=r"WORLD_SIZE is 2, and RANK, .* not set; .*torchrun"):
+        crew.assemble()
+
+
+def test_processes_that_did_not_come_are_missed(monkeypatch):
+    accelerate.PartialState(cpu=True)  # as a library does that was imported before the crew has met
+    for name, value in (LAUNCHED | {"WORLD_SIZE": "2"}).items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(DeviceError, match=r"1 processes have met; the 2 that WORLD_SIZE names; .*torchrun"):
+        crew.assemble()
+    accelerate.PartialState._reset_state()
+
+
+def test_a_launcher_that_quietly_started_one_of_several_processes_is_caught(tmp_path):
+    (tmp_path / "one.py").write_text("from brewster.train import crew\ncrew.assemble()\n")
+    launch = ["-m", "accelerate.commands.launch", "--cpu", "--num_processes", "2"]
+    _, said, code = python(tmp_path / "one.py", *launch)
+    assert code == 1
+    assert "accelerate launch was asked for several processes and has started one" in said

@@ -1,0 +1,116 @@
+"""Qwen's prompt through the real stock pipeline, with a toy of its text encoder that looks at pictures, too."""
+
+import importlib.util
+import json
+
+import pytest
+import torch
+import transformers
+from tokenizers.pre_tokenizers import ByteLevel
+from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
+
+from brewster.errors import MissingExtra
+from brewster.models.large import stock
+from brewster.models.large.backbones import encode_prompt, tiny
+from brewster.models.large.prompt import PROMPT
+from brewster.models.large.qwen import Qwen
+
+MARKS = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>"]
+MARKS += ["<|image_pad|>", "<|video_pad|>"]
+PICTURE_TOKENS = 16
+
+
+class WithoutVideo(transformers.Qwen2VLProcessor):
+    """The stock one insists on a video processor, which needs torchvision."""
+
+    def check_argument_for_proper_class(self, name, argument):
+        if name != "video_processor":
+            super().check_argument_for_proper_class(name, argument)
+
+
+@pytest.fixture(scope="module")
+def pipeline():
+    """The stock pipeline: every byte is a word, and the picture is shrunk to 16 tokens."""
+    words = {word: number for number, word in enumerate([*sorted(ByteLevel.alphabet()), *MARKS])}
+    tokenizer = transformers.Qwen2TokenizerFast(vocab=words, merges=[], additional_special_tokens=MARKS)
+    eyes = Qwen2VLImageProcessorPil(min_pixels=28 * 28, max_pixels=28 * 28 * PICTURE_TOKENS)
+    text = {
+        "vocab_size": len(words), "hidden_size": 32, "intermediate_size": 16, "num_hidden_layers": 2,
+        "num_attention_heads": 2, "num_key_value_heads": 1, "bos_token_id": 0, "eos_token_id": 0,
+        "rope_scaling": {"type": "mrope", "mrope_section": [2, 3, 3]},
+    }  # fmt: skip
+    vision = {"depth": 1, "hidden_size": 16, "intermediate_size": 16, "num_heads": 2, "out_hidden_size": 32}
+    config = transformers.Qwen2_5_VLConfig(
+        text_config=text,
+        vision_config=vision | {"fullatt_block_indexes": [0]},
+        image_token_id=words["<|image_pad|>"],
+        video_token_id=words["<|video_pad|>"],
+        vision_start_token_id=words["<|vision_start|>"],
+        vision_end_token_id=words["<|vision_end|>"],
+    )
+    torch.manual_seed(0)
+    made = tiny("qwen")[0].pipeline()
+    made.register_modules(
+        tokenizer=tokenizer,
+        processor=WithoutVideo(image_processor=eyes, tokenizer=tokenizer),
+        text_encoder=transformers.Qwen2_5_VLForConditionalGeneration(config).eval(),
+    )
+    return made
+
+
+def test_a_prompt_is_read_beside_a_plain_grey_picture(pipeline):
+    asked = []
+    hook = pipeline.text_encoder.register_forward_pre_hook(
+        lambda module, args, kwargs: asked.append(kwargs), with_kwargs=True
+    )
+    with torch.no_grad():
+        prompt = Qwen.embed(pipeline, PROMPT)
+    hook.remove()
+    for words, kwargs, embeds in zip((PROMPT, " "), asked, (prompt.embeds, prompt.negative), strict=True):
+        told = pipeline.tokenizer(pipeline.prompt_template_encode.format(words)).input_ids
+        left = len(told) - 1 + PICTURE_TOKENS - pipeline.prompt_template_encode_start_idx
+        assert embeds.shape == (1, left, 32)
+        eyes = pipeline.processor.image_processor
+        grey = torch.tensor(
+            [(128 / 255 - mean) / std for mean, std in zip(eyes.image_mean, eyes.image_std, strict=True)]
+        )
+        seen = kwargs["pixel_values"].unflatten(1, (3, -1))
+        torch.testing.assert_close(seen, grey[:, None].expand_as(seen).to(seen), atol=1e-5, rtol=0)
+    assert (prompt.backbone, prompt.text, prompt.pooled) == ("qwen", PROMPT, None)
+
+
+def test_another_prompt_is_another_embedding_with_the_same_empty_counterpart(pipeline):
+    with torch.no_grad():
+        one, same, other = (Qwen.embed(pipeline, words) for words in ("a cat", "a cat", "a dog"))
+    assert one.sha256 == same.sha256
+    assert not torch.equal(one.embeds, other.embeds)
+    assert torch.equal(one.negative, other.negative)
+
+
+def test_what_it_embeds_guides_the_twin(pipeline):
+    backbone, _ = tiny("qwen")
+    with torch.no_grad():
+        prompt = Qwen.embed(pipeline, "a cat")
+        latents = backbone.noise((96, 32), 0)
+        plain, guided = (
+            backbone.predict(latents, latents, torch.ones(1), prompt, guidance) for guidance in (1.0, 4.0)
+        )
+    assert guided.isfinite().all()
+    assert not torch.allclose(plain, guided, atol=1e-4)
+
+
+@pytest.mark.skipif(bool(importlib.util.find_spec("torchvision")), reason="there it is")
+def test_a_folder_whose_processor_wants_torchvision_says_so(pipeline, tmp_path):
+    stock.bars_on_terminals_only()
+    tiny("qwen")[0].save(tmp_path)
+    pipeline.text_encoder.save_pretrained(tmp_path / "text_encoder")
+    for place in ("tokenizer", "processor"):
+        pipeline.tokenizer.save_pretrained(tmp_path / place)
+    pipeline.processor.image_processor.save_pretrained(tmp_path / "processor")
+    index = json.loads((tmp_path / "model_index.json").read_text())
+    for part in ("text_encoder", "tokenizer", "processor"):
+        kind = "Qwen2VLProcessor" if part == "processor" else type(getattr(pipeline, part)).__name__
+        index[part] = ["transformers", kind]
+    (tmp_path / "model_index.json").write_text(json.dumps(index))
+    with pytest.raises(MissingExtra, match=r"requires the Torchvision library.*install it beside"):
+        encode_prompt(str(tmp_path))
