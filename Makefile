@@ -11,7 +11,7 @@ demo: .venv/core
 	$(BIN)/python runs/demo.py "$(PHOTO)"
 
 test: .venv/dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 
 test-slow: .venv/dev
 	$(BIN)/python -m pytest -m slow

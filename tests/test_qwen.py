@@ -112,5 +112,5 @@ def test_a_folder_whose_processor_wants_torchvision_says_so(pipeline, tmp_path):
         kind = "Qwen2VLProcessor" if part == "processor" else type(getattr(pipeline, part)).__name__
         index[part] = ["transformers", kind]
     (tmp_path / "model_index.json").write_text(json.dumps(index))
-    with pytest.raises(MissingExtra, match=r"requires the Torchvision library.*install it beside"):
+    with pytest.raises(MissingExtra, match=r"torchvision is not installed; .* pip install torchvision"):
         encode_prompt(str(tmp_path))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import importlib.util
 import json
 import zlib
 from collections.abc import Iterator
@@ -94,6 +95,13 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
     if source.startswith(TINY):
         seed = 0 if text == PROMPT else zlib.crc32(text.encode())
         return replace(tiny(source.removeprefix(TINY), seed)[1], text=text)
+    for name in family_of(source).words_need:  # before the download, which may take an hour
+        if importlib.util.find_spec(name) is None:
+            raise MissingExtra(
+                f"{name} is not installed",
+                f"the text encoder of {source} needs it",
+                f"pip install {name}, of the version that fits your torch",
+            )
     bars_on_terminals_only()
     folder = _folder(source, _TEXT_PARTS)
     family, _ = _family(folder)

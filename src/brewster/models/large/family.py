@@ -48,6 +48,8 @@ class Backbone(ABC):
     tiny: ClassVar[Architecture]
     guided_by_embedding: ClassVar[bool]
     """Whether guidance is a number that the transformer reads, or a second prediction (classifier-free)."""
+    words_need: ClassVar[tuple[str, ...]] = ()
+    """Libraries beyond the extra `large` that its text encoders are loaded with."""
     multiple: ClassVar[int] = 16
     """Sides of a panel are multiples of this many pixels."""
 

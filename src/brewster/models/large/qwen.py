@@ -28,6 +28,7 @@ class Qwen(GuidedTwice):
     name = "qwen"
     hub_id = "Qwen/Qwen-Image-Edit"
     licence = "Apache-2.0"
+    words_need = ("torchvision",)
     classes: ClassVar = {
         "pipeline": "QwenImageEditPipeline", "transformer": "QwenImageTransformer2DModel",
         "vae": "AutoencoderKLQwenImage", "scheduler": "FlowMatchEulerDiscreteScheduler",
