@@ -1,8 +1,8 @@
 """Qwen's prompt through the real stock pipeline, with a toy of its text encoder that looks at pictures, too."""
 
 import importlib.util
-import json
 
+import huggingface_hub
 import pytest
 import torch
 import transformers
@@ -10,7 +10,6 @@ from tokenizers.pre_tokenizers import ByteLevel
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
 from brewster.errors import MissingExtra
-from brewster.models.large import stock
 from brewster.models.large.backbones import encode_prompt, tiny
 from brewster.models.large.prompt import PROMPT
 from brewster.models.large.qwen import Qwen
@@ -100,17 +99,7 @@ def test_what_it_embeds_guides_the_twin(pipeline):
 
 
 @pytest.mark.skipif(bool(importlib.util.find_spec("torchvision")), reason="there it is")
-def test_a_folder_whose_processor_wants_torchvision_says_so(pipeline, tmp_path):
-    stock.bars_on_terminals_only()
-    tiny("qwen")[0].save(tmp_path)
-    pipeline.text_encoder.save_pretrained(tmp_path / "text_encoder")
-    for place in ("tokenizer", "processor"):
-        pipeline.tokenizer.save_pretrained(tmp_path / place)
-    pipeline.processor.image_processor.save_pretrained(tmp_path / "processor")
-    index = json.loads((tmp_path / "model_index.json").read_text())
-    for part in ("text_encoder", "tokenizer", "processor"):
-        kind = "Qwen2VLProcessor" if part == "processor" else type(getattr(pipeline, part)).__name__
-        index[part] = ["transformers", kind]
-    (tmp_path / "model_index.json").write_text(json.dumps(index))
+def test_torchvision_is_asked_for_before_anything_is_downloaded(monkeypatch):
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda *_, **__: pytest.fail("it was"))
     with pytest.raises(MissingExtra, match=r"torchvision is not installed; .* pip install torchvision"):
-        encode_prompt(str(tmp_path))
+        encode_prompt("qwen")
