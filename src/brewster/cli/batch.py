@@ -11,13 +11,13 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, final
 
 import click
 
-from brewster.cli.terminal import complain, interrupts, one_line, progress, say, write_out
+from brewster.cli.terminal import Advance, complain, interrupts, one_line, progress, say, write_out
 from brewster.errors import BrewsterError, PhotoError, TargetError
 from brewster.files import SUFFIXES, find, write_atomically
 from brewster.options import Options
@@ -154,6 +154,7 @@ class Batch:
         with progress(len(tasks), shown=not self.quiet and not talks_over_bar) as advance:
             for task in tasks:
                 advance(len(entries), task.name)
+                self._tell_share = partial(_tell_share, advance, len(entries), task.name)
                 entry = self._do(task, bugs)
                 if entry.error:
                     interrupts.heed()  # a dropped Ctrl-C may be all that was wrong
@@ -223,7 +224,8 @@ class Batch:
             return False
 
     def _separate(self, source: Path | None, targets: dict[str, Path | None], entry: Entry) -> None:
-        separation = self._separator(source or sys.stdin.buffer.read(), **self.options.call())
+        photo = source or sys.stdin.buffer.read()
+        separation = self._separator(photo, tell=self._tell_share, **self.options.call())
         entry.seconds, entry.remainder = dict(separation.seconds), separation.remainder
         entry.drift, entry.doubtful = separation.drift, separation.doubtful
         started = time.perf_counter()
@@ -266,6 +268,12 @@ class Batch:
             if entry.error:
                 is_named = entry.error.startswith(f"{entry.source} ")
                 complain(entry.error if is_named else f"{entry.source}: {entry.error}")
+
+
+def _tell_share(advance: Advance, before: int, name: str, share: float) -> None:
+    """A large model takes minutes for a photo: the bar moves between two of them, too, and Ctrl-C is heeded."""
+    interrupts.heed()
+    advance(before + share, name)
 
 
 def _failed(entry: Entry, error: object) -> Entry:

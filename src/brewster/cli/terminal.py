@@ -13,8 +13,8 @@ from brewster.errors import TargetError
 if TYPE_CHECKING:
     from sys import UnraisableHookArgs
 
-Advance = Callable[[int, str], None]
-"""Called with how many are done and what comes next, or how it goes."""
+Advance = Callable[[float, str], None]
+"""Called with how many are done, perhaps in part, and what comes next, or how it goes."""
 
 
 @final

@@ -138,8 +138,10 @@ def open_decomposer(
             f"a LoRA, a folder with {LORA_FILE}",
             "leave the base out",
         )
+    words = encode_prompt(
+        model, PROMPTS.get(prompt, prompt), device=place
+    )  # first: there is room for one of the two
     backbone = load_backbone(model, device=place, quantise=quantise)
-    words = encode_prompt(model, PROMPTS.get(prompt, prompt), device=place)
     named = fingerprint(model, device=device, quantise=quantise, prompt=prompt)
     return Decomposer(backbone, words, Task(Layout(("T",))), model_name(model), named)
 
