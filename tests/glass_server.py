@@ -12,9 +12,10 @@ from threading import Event, Thread
 import httpx
 
 from brewster.separate import Separator
-from brewster.web.application import application, listen, server
+from brewster.web.application import application, listen
 from brewster.web.desk import Desk
 from brewster.web.guard import Guard
+from brewster.web.line import server
 from brewster.web.separation import separation
 from brewster.web.shelf import ModelRow
 
@@ -80,12 +81,19 @@ def form(photo, name="window.png", **fields):
 @contextlib.contextmanager
 def on_a_thread(app):
     """An application on a port of this machine, which is given."""
+    with served(app) as (port, _):
+        yield port
+
+
+@contextlib.contextmanager
+def served(app):
+    """An application on a thread: its port, and the server."""
     with listen("127.0.0.1", 0) as listening:
         running = server(app)
         thread = Thread(target=running.run, kwargs={"sockets": [listening]})
         thread.start()
         try:
-            yield listening.getsockname()[1]
+            yield listening.getsockname()[1], running
         finally:
             running.should_exit = True
             thread.join()

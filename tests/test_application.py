@@ -1,6 +1,9 @@
 """The application behind a real socket: what only bytes on a wire can show."""
 
+import signal
 import socket
+import subprocess
+import sys
 
 import pytest
 
@@ -94,6 +97,34 @@ def test_what_is_no_http_is_answered_and_forgotten(rubbish):
     with on_a_thread(app_of()) as port:
         assert status(spoken(port, rubbish + b"\r\n\r\n")) in (400, None)
         assert status(spoken(port, *whole())) == 200
+
+
+SERVING = """
+from fastapi import APIRouter
+from brewster.web.application import application, serve
+from brewster.web.guard import Guard
+try:
+    serve(application(APIRouter(), guard=Guard()), host="127.0.0.1", port=0, tell=lambda url: print(url, flush=True))
+except KeyboardInterrupt:
+    print("interrupted")
+finally:
+    print("closed")
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+def test_a_server_that_is_ended_lets_its_caller_finish(how):
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", SERVING], **pipes) as process:
+        url = process.stdout.readline()
+        spoken(
+            int(url.split(":")[2].strip("/\n")),
+            b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n",
+        )
+        process.send_signal(how)
+        out, err = process.communicate(timeout=60)
+    assert url.startswith("http://127.0.0.1:")
+    assert (process.returncode, out.split(), err) == (0, ["interrupted", "closed"], "")
 
 
 def test_a_port_that_is_taken_is_named():

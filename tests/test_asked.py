@@ -47,6 +47,16 @@ def refused(data, **how):
     return error.value.status_code, error.value.detail
 
 
+@pytest.mark.parametrize("charset", [b"undefined", b"punycode"])
+def test_a_charset_that_is_no_text_is_a_broken_form(charset):
+    status, said = refused(
+        body(("photo", b"", "a.jpg"), ("strength", b"\xff-1")),
+        kind=b"multipart/form-data; boundary=x; charset=" + charset,
+    )
+    assert status == 400
+    assert "UTF-8" in said
+
+
 # --- values
 
 
@@ -165,7 +175,8 @@ def test_a_name_is_never_a_path_and_fits_every_disk(name):
 
 @given(stem=st.text(string.ascii_letters + string.digits + "äöü日本 -_()", min_size=1).filter(str.strip))
 def test_a_harmless_name_stays_as_it_is(stem):
-    assert safe_name(f"{stem.strip()[:30]}.jpg") == f"{stem.strip()[:30]}.jpg"
+    name = f"{stem.strip()[:30].strip()}.jpg"
+    assert safe_name(name) == name
 
 
 @pytest.mark.parametrize(

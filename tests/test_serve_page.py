@@ -327,6 +327,94 @@ def test_another_quality_makes_the_preview_anew(visit):
     page.wait_for_selector("glass-compare:not([hidden])")
 
 
+def held(page, path):
+    """What the page sends here gets no answer, until it goes on with `page.unroute(path)`."""
+    page.route(path, lambda route: None)
+
+
+def focused(page):
+    settle(page)
+    return page.evaluate("document.activeElement.id")
+
+
+def test_back_to_the_former_quality_shows_what_was_there(visit):
+    page = visit()
+    upload(page, ("a.png", picture(90, 60, "png")), ("b.png", picture(80, 60, "png")))
+    held(page, "**/preview?*")
+    page.get_by_label("Best", exact=True).check()
+    page.get_by_role("button", name="Cancel").click()
+    page.get_by_role("heading", name="Cancelled").wait_for()
+    page.get_by_label("Standard", exact=True).check()
+    page.wait_for_selector("glass-compare:not([hidden])")
+    page.wait_for_selector("li.done >> nth=1")  # what still ran for b.png is given up, too
+    assert page.get_by_role("button", name="Download transmission").is_enabled()
+    page.get_by_label("Best", exact=True).check()
+    page.get_by_role("button", name="Cancel").wait_for()
+    page.unroute("**/preview?*")
+    page.get_by_label("Draft", exact=True).check()
+    page.wait_for_selector("li.done >> nth=1")
+
+
+def test_the_focus_goes_on_when_its_button_goes_away(visit):
+    page = visit()
+    held(page, "**/preview?*")
+    page.set_input_files("#files", [{"name": "a.png", "mimeType": "", "buffer": picture(90, 60, "png")}])
+    page.get_by_role("button", name="Cancel").focus()
+    for heir in ("again", "cancel", "again"):
+        page.keyboard.press("Enter")
+        page.wait_for_selector(f"#{heir}:visible")
+        assert focused(page) == heir
+    page.unroute("**/preview?*")
+    page.keyboard.press("Enter")
+    page.wait_for_selector("glass-compare:not([hidden])")
+    assert focused(page) == "compare"
+
+    page.get_by_role("button", name="Download transmission").focus()
+    downloaded(page, lambda: page.keyboard.press("Enter"))
+    page.wait_for_selector("#making", state="hidden")
+    assert focused(page) == "download"
+    held(page, "**/separate?*")
+    with page.expect_request("**/separate?*"):
+        page.keyboard.press("Enter")
+    assert page.get_by_role("button", name="Download transmission").is_disabled()
+    page.keyboard.press("Enter")  # once is enough
+    page.get_by_role("button", name="Stop").focus()
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#making", state="hidden")
+    assert focused(page) == "download"
+
+
+def test_a_photo_that_is_not_done_shows_its_own_strength(visit):
+    page = visit()
+    upload(page, ("a.png", picture(90, 60, "png")))
+    page.get_by_label("Strength").fill("0.3")
+    held(page, "**/preview?*")
+    page.set_input_files("#files", [{"name": "b.png", "mimeType": "", "buffer": picture(90, 60, "png")}])
+    page.locator(".pick").nth(1).click()
+    assert page.locator("#amount").inner_text() == "100 %"
+
+
+def test_a_photo_that_fails_is_left_out_of_the_zip_and_named(visit):
+    page = visit()
+    upload(page, *((f"{name}.png", picture(90, 60, "png", seed)) for seed, name in enumerate("abc")))
+
+    def refuse(route):
+        if b'"b.png"' in route.request.post_data_buffer:
+            route.fulfill(status=422, json={"error": "its layers cannot be written"})
+        else:
+            route.continue_()
+
+    page.route("**/separate?*", refuse)
+    _, data = downloaded(page, page.get_by_role("button", name="Download all").click)
+    names = zipfile.ZipFile(io.BytesIO(data)).namelist()
+    assert [name[0] for name in names] == ["a", "a", "c", "c"]
+    alert = page.locator("#failed")
+    assert alert.inner_text() == "b.png is not in the zip. Its layers cannot be written."
+    page.locator(".pick").nth(1).click()
+    page.get_by_role("button", name="Download transmission").click()
+    page.get_by_text("Its layers cannot be written.", exact=True).wait_for()
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_words_can_be_read_in_light_and_dark_and_every_control_has_a_name(visit, scheme):
     page = visit(color_scheme=scheme, reduced_motion="reduce")

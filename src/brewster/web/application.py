@@ -7,13 +7,14 @@ Everything comes from this package: no remote asset, so that it works offline.
 
 from __future__ import annotations
 
+import signal
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from http import HTTPStatus
 from pathlib import Path
 from typing import Final
 
-import uvicorn
 from fastapi import APIRouter, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import FileResponse, JSONResponse, Response
@@ -33,7 +34,8 @@ from brewster.errors import (
     UnsupportedPhoto,
 )
 from brewster.web.asked import explain
-from brewster.web.guard import Guard, Guarded
+from brewster.web.guard import HEADERS, Guard, Guarded
+from brewster.web.line import server
 
 PAGE: Final = Path(__file__).parent / "page"
 _STATUSES: Final[dict[type[BrewsterError], int]] = {
@@ -103,27 +105,25 @@ def serve(
     port: int,
     tell: Callable[[str], None] = print,
 ) -> None:
-    """Serves until it is interrupted; `tell` is told the URL when browsers may come.
+    """Serves until it is interrupted; `tell` is told the URL when browsers may come. For a main thread only.
 
     Raises:
+        KeyboardInterrupt: the usual end, by Ctrl-C or SIGTERM.
         TargetError: the address cannot be had.
     """
-    with listen(host, port) as listening:
+    with _terminated_as_interrupted(), listen(host, port) as listening:
         tell(address(listening))
         server(app).run(sockets=[listening])
 
 
-def server(app: FastAPI) -> uvicorn.Server:
-    """A server that says little; when it ends, it waits two seconds for what is under way."""
-    config = uvicorn.Config(
-        app,
-        log_config=None,
-        log_level="error",
-        access_log=False,
-        server_header=False,
-        timeout_graceful_shutdown=2,
-    )
-    return uvicorn.Server(config)
+@contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """SIGTERM does what Ctrl-C does: uvicorn sends itself the signal once more when it has ended, to die of it."""
+    former = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, former)
 
 
 async def _explain(request: Request, error: Exception) -> Response:
@@ -136,7 +136,8 @@ async def _explain(request: Request, error: Exception) -> Response:
         return JSONResponse({"error": explain(error.errors())}, 422)
     if isinstance(error, BrewsterError):
         return JSONResponse({"error": str(error)}, _STATUSES.get(type(error), 422))
-    return JSONResponse({"error": f"brewster stumbled ({type(error).__name__}); please report it"}, 500)
+    told = {"error": f"brewster stumbled ({type(error).__name__}); please report it"}
+    return JSONResponse(told, 500, HEADERS)  # this answer does not pass the guard
 
 
 def _sentence(request: Request, error: HTTPException) -> str:

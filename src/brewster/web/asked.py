@@ -63,6 +63,8 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
         raise HTTPException(
             400, f"the form cannot be read ({error.message.rstrip('.')}); send it again"
         ) from error
+    except ValueError as error:  # Python knows charsets that it cannot read text by
+        raise HTTPException(400, "the form's charset cannot be read; send it in UTF-8") from error
     try:
         return await _asked(form, _options(form, models, max_pixels))
     finally:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import ipaddress
+import re
 import secrets
 import socket
 from dataclasses import dataclass
@@ -27,7 +28,7 @@ LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
 _SAFE: Final = ("GET", "HEAD", "OPTIONS")
 _DRAIN_SECONDS: Final = 10.0
 _DIGITS: Final = 18  # of a length in bytes; Python reads no endless ones
-_HEADERS: Final = {
+HEADERS: Final = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
         "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
@@ -38,6 +39,8 @@ _HEADERS: Final = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
+"""What every answer says to a browser."""
+_HOST: Final = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^\[\]:@/?#\s]+)(:[0-9]{1,5})?")
 _ENTRANCE: Final = '<!doctype html><title>brewster</title><p>The token fits. <a href="{0}">Go on</a>.</p>'
 
 
@@ -73,10 +76,8 @@ class Guard:
 
     def knows(self, host: str) -> bool:
         """Whether a Host header, port and all, is one of ours."""
-        try:
-            name = urlsplit(f"//{host}").hostname or ""
-        except ValueError:
-            return False
+        called = _HOST.fullmatch(host)
+        name = called[1].strip("[]").lower() if called else ""
         return name in self.hosts or (self.any_address and _is_address(name))
 
     def opens_to(self, token: str | None) -> bool:
@@ -109,6 +110,11 @@ class Guarded:
             await answer(scope, exchange.receive, exchange.send)
         except HTTPException as error:  # of an application that does not answer them itself
             await _no(error.status_code, error.detail)(scope, exchange.receive, exchange.send)
+        except asyncio.CancelledError:  # nobody cancels a request but a server that ends
+            if not exchange.has_begun:
+                await _no(503, "the server is being stopped; start it again, then try again")(
+                    scope, exchange.receive, exchange.pass_on
+                )
 
     def _answer(self, scope: Scope, headers: Headers) -> Response | None:
         """What is said to a request that goes no further; None lets it through."""
@@ -139,6 +145,7 @@ class _Exchange:
     def __init__(self, guard: Guard, receive: Receive, send: Send) -> None:
         self._guard, self._receive, self._send = guard, receive, send
         self._bytes, self._is_whole, self._is_drained = 0, False, False
+        self.has_begun = False
         self._deadline = asyncio.get_running_loop().time() + guard.body_seconds
 
     async def receive(self) -> Message:
@@ -165,17 +172,22 @@ class _Exchange:
 
     async def send(self, message: Message) -> None:
         """Passes the answer on. Its end waits for the rest of the body: a client that is cut off reads no answer."""
-        if message["type"] == "http.response.start":
-            headers = MutableHeaders(scope=message)
-            for name, value in _HEADERS.items():
-                headers.setdefault(name, value)
         is_end = message["type"] == "http.response.body" and not message.get("more_body", False)
         if not is_end or self._is_whole:
-            await self._send(message)
+            await self.pass_on(message)
             return
         await self._send({**message, "more_body": True})
         await self._drain()
         await self._send({"type": "http.response.body", "body": b""})
+
+    async def pass_on(self, message: Message) -> None:
+        """Passes the answer on and waits for nothing."""
+        if message["type"] == "http.response.start":
+            self.has_begun = True
+            headers = MutableHeaders(scope=message)
+            for name, value in HEADERS.items():
+                headers.setdefault(name, value)
+        await self._send(message)
 
     async def _drain(self) -> None:
         self._is_drained = True
@@ -193,9 +205,7 @@ def _no(status: int, sentence: str) -> Response:
 
 def _too_long(guard: Guard) -> HTTPException:
     limit = f"{guard.max_bytes / 1e6:g} MB"
-    return HTTPException(
-        413, f"the upload is longer than {limit}; send a smaller one, or start with --max-bytes"
-    )
+    return HTTPException(413, f"the upload is longer than {limit}; send a smaller one")
 
 
 def _entrance(path: str, guard: Guard) -> Response:
@@ -221,8 +231,15 @@ def _comes_from_here(headers: Headers) -> bool:
     """Browsers say where a post comes from. Where nothing is said there is no browser, hence no page behind it."""
     origin = headers.get("origin")
     if origin is not None:
-        return urlsplit(origin).netloc == headers["host"]
+        return _netloc(origin) == headers["host"]
     return headers.get("sec-fetch-site", "none") in ("same-origin", "none")
+
+
+def _netloc(origin: str) -> str | None:
+    try:
+        return urlsplit(origin).netloc
+    except ValueError:  # such as [ without ]
+        return None
 
 
 def _is_address(name: str) -> bool:

@@ -99,7 +99,8 @@ async function separate(photo) {
     news(`${photo.file.name} is separated`);
   } catch (error) {
     const isStopped = error.name === "AbortError";
-    const state = isStopped && photo.isAskedAgain ? "waiting" : "failed";
+    const asBefore = isFresh(photo) ? "done" : "waiting"; // the maps that it has may be wanted again
+    const state = isStopped && photo.isAskedAgain ? asBefore : "failed";
     Object.assign(photo, { state, error: isStopped ? null : error.message });
     if (photo.error) news(`${photo.file.name} failed`);
   }
@@ -117,13 +118,14 @@ function again(photo) {
   next();
 }
 
-// The settings have changed.
+// The settings have changed, perhaps back to those of the maps that a photo has.
 function redo() {
-  for (const photo of photos.filter((photo) => !isFresh(photo))) {
+  for (const photo of photos) {
     photo.stop?.abort();
-    Object.assign(photo, { state: "waiting", error: null, isAskedAgain: true });
+    Object.assign(photo, { state: isFresh(photo) ? "done" : "waiting", error: null, isAskedAgain: true });
   }
   refresh();
+  show();
   next();
 }
 
@@ -144,6 +146,7 @@ function select(photo) {
     at("strength").value = photo.strength;
     sketch(at("sketch"), photo.file);
     compare.reset();
+    paint();
   }
   refresh();
   show();
@@ -182,23 +185,30 @@ function refresh(photo = null) {
     one.row.className = one.state;
     one.row.querySelector(".state").textContent = inShort(one);
   }
-  at("all").disabled = making !== null || !photos.some((one) => one.state === "done");
+  enable("all", making === null && photos.some((one) => one.state === "done"));
   if (photo && photo !== current) return;
   const has = current !== null;
   at("welcome").hidden = has;
   for (const id of ["stage", "strip", "panel", "add"]) at(id).hidden = !has;
   if (!has) return;
   const isReady = current.state === "done" && shown !== null;
+  const hadFocus = [at("waiting"), at("trouble")].find((part) => part.contains(document.activeElement));
   compare.hidden = !isReady;
-  at("waiting").hidden = ["done", "failed"].includes(current.state);
   at("trouble").hidden = current.state !== "failed";
-  at("download").disabled = !isReady || making !== null;
+  at("waiting").hidden = isReady || current.state === "failed";
+  if (hadFocus?.hidden) (isReady ? compare : at(current.state === "failed" ? "again" : "cancel")).focus();
+  enable("download", isReady && making === null);
   at("step").textContent = inWords(current);
   if (current.state === "working") at("bar").value = current.share;
   else at("bar").removeAttribute("value");
   at("what").textContent = current.error ? `${current.file.name} could not be separated` : "Cancelled";
   at("why").textContent = current.error ?? "";
   at("facts").textContent = isReady ? facts(shown) : "";
+}
+
+// A button that is disabled in earnest would lose the focus.
+function enable(id, isEnabled) {
+  at(id).setAttribute("aria-disabled", !isEnabled);
 }
 
 function facts({ full, width, height, doubtful }) {
@@ -213,7 +223,7 @@ function inShort({ state, share, error }) {
 }
 
 function inWords({ state, share, ahead }) {
-  if (state === "working") return `Separating, ${Math.round(100 * share)} %`;
+  if (state !== "waiting") return `Separating, ${Math.round(100 * share)} %`;
   return ahead ? `Waiting, ${ahead} before it` : "Waiting";
 }
 
@@ -221,22 +231,29 @@ function inWords({ state, share, ahead }) {
 
 let making = null;
 
-async function make(work) {
+async function make(button, work) {
+  if (button.getAttribute("aria-disabled") === "true") return;
   making = new AbortController();
   at("failed").hidden = true;
   at("making").hidden = false;
   refresh();
   try {
-    const { name, blob } = await work(making.signal);
+    const { name, blob, trouble = "" } = await work(making.signal);
     save(name, blob);
     at("news").textContent = `${name} is ready`;
+    complain(trouble);
   } catch (error) {
-    at("failed").textContent = error.message;
-    at("failed").hidden = error.name === "AbortError";
+    complain(error.name === "AbortError" ? "" : error.message);
   }
   making = null;
+  if (at("making").contains(document.activeElement)) button.focus();
   at("making").hidden = true;
   refresh();
+}
+
+function complain(trouble) {
+  at("failed").textContent = trouble;
+  at("failed").hidden = !trouble;
 }
 
 const fullSize = (photo, layers, signal, onShare) =>
@@ -250,16 +267,25 @@ async function one(signal) {
   return { name: nameOf(response), blob: await response.blob() };
 }
 
+// One that fails is left out and named; if all do, there is nothing to save.
 async function all(signal) {
   const files = [];
+  const failed = [];
   const done = photos.filter((photo) => photo.state === "done");
   for (const [index, photo] of done.entries()) {
     const onShare = (share) => (at("made").value = (index + share) / done.length);
     onShare(0);
-    const response = await fullSize(photo, LAYERS, signal, onShare);
-    files.push(...filesOf(await response.arrayBuffer()));
+    try {
+      const response = await fullSize(photo, LAYERS, signal, onShare);
+      files.push(...filesOf(await response.arrayBuffer()));
+    } catch (error) {
+      if (error.name === "AbortError") throw error;
+      failed.push(`${photo.file.name} is not in the zip. ${error.message}`);
+    }
   }
-  return { name: "brewster.zip", blob: zipped(files) };
+  const trouble = failed.join(" ");
+  if (!files.length) throw new Error(trouble);
+  return { name: "brewster.zip", blob: zipped(files), trouble };
 }
 
 function save(name, blob) {
@@ -290,8 +316,8 @@ at("cancel").addEventListener("click", () => {
 });
 at("again").addEventListener("click", () => again(current));
 at("drop").addEventListener("click", () => remove(current));
-at("download").addEventListener("click", () => make(one));
-at("all").addEventListener("click", () => make(all));
+at("download").addEventListener("click", (event) => make(event.currentTarget, one));
+at("all").addEventListener("click", (event) => make(event.currentTarget, all));
 at("stop").addEventListener("click", () => making?.abort());
 at("panel").addEventListener("submit", (event) => event.preventDefault());
 
