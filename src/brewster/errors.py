@@ -22,7 +22,7 @@ class BrewsterError(Exception):
     """Anything brewster can explain; the message is one sentence in three beats."""
 
     def __init__(self, happened: str, expected: str, cure: str) -> None:
-        super().__init__(f"{happened}; {expected}; {cure}.")
+        super().__init__(f"{happened}; {expected}; {cure}{'' if cure.endswith('?') else '.'}")
 
 
 class PhotoError(BrewsterError):

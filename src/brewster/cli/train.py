@@ -74,14 +74,17 @@ def train(*, recipe: Path, out: Path | None, plan: bool, card: str | None, quiet
 
 
 def _print_plan(recipe: CompactRecipe | LargeRecipe, card: str | None) -> None:
-    from brewster.train.plan import find_card, plan_for  # noqa: PLC0415
+    from brewster.train.plan import find_card, is_here, plan_for  # noqa: PLC0415
     from brewster.train.recipe import LargeRecipe  # noqa: PLC0415
 
     if not isinstance(recipe, LargeRecipe):
         raise RecipeError(
             "the recipe trains the compact network", "a large backbone's recipe", "train it without --plan"
         )
-    estimate = plan_for(recipe, find_card(card))
+    found = find_card(card)
+    if card is None and not is_here(found):
+        say(f"there is no graphics card here: planned for {found.name}, the paper's; --card names another")
+    estimate = plan_for(recipe, found)
     click.echo(estimate.table())
     estimate.refuse_misfit()
 

@@ -162,6 +162,6 @@ def find_metric(name: str) -> Metric:
     """
     if name in METRICS:
         return METRICS[name]
-    near = difflib.get_close_matches(name, METRICS, n=1)
+    near = difflib.get_close_matches(name.lower(), METRICS, n=1)
     cure = f"did you mean {near[0]}?" if near else "choose one of them"
     raise BrewsterError(f"there is no metric {name!r}", f"metrics are {', '.join(METRICS)}", cure)

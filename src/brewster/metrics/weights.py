@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.download import Line, Promise
-from brewster.errors import ModelError
+from brewster.errors import DownloadError, ModelError
 from brewster.files import cache_folder, write_atomically
 
 if TYPE_CHECKING:
@@ -115,7 +115,14 @@ def _fetch(promise: Promise, digest: str, cached: Path, line: Line) -> dict[str,
     import torch  # noqa: PLC0415 - an extra
 
     whole = cached.with_name(promise.url.rsplit("/", 1)[-1])
-    line.fetch(promise, whole)
+    try:
+        line.fetch(promise, whole)
+    except DownloadError as error:
+        raise DownloadError(
+            f"LPIPS needs AlexNet once, 233 MiB, and it cannot be had: {str(error).rstrip('.')}",
+            f"a network, or {FILE} in the folder weights of BREWSTER_DATA",
+            "leave LPIPS out with --metrics psnr,ssim",
+        ) from error
     try:
         tensors = read_backbone(whole, digest)
         buffer = io.BytesIO()

@@ -117,9 +117,11 @@ def find_model(name: str) -> Model:
     path = Path(name)
     if path.is_file():
         return Model(path.stem, path, None, "unknown")
-    close = difflib.get_close_matches(name, (*MODELS, *LARGE), n=1)
+    close = difflib.get_close_matches(name, (*MODELS, *LARGE), n=1) if path.name == name else []
     raise ModelError(
         f"there is no model {name!r}",
         f"one of {', '.join((*MODELS, *LARGE))}, an .onnx file, or the folder or hub id of a LoRA",
-        f"did you mean {close[0]}?" if close else "brewster models list shows them",
+        f"did you mean {close[0]}?"
+        if close
+        else "check the path; brewster models list shows those that are here",
     )

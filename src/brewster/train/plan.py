@@ -143,6 +143,11 @@ def find_card(name: str | None = None) -> Card:
     )
 
 
+def is_here(card: Card) -> bool:
+    """Whether this is the card of this machine."""
+    return torch.cuda.is_available() and card == _here()
+
+
 def plan_for(recipe: LargeRecipe, card: Card) -> Plan:
     """Counts what the recipe takes; some seconds.
 
