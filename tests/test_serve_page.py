@@ -16,6 +16,7 @@ from glass_server import as_a_user
 from picture_files import exif_block, file_of, smooth
 
 CHROMIUM = Path("/usr/bin/chromium")
+PATIENCE_MS = 120_000  # a busy machine is no failure
 MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
 
 
@@ -47,6 +48,7 @@ def visit(chromium, link):
             **{"viewport": {"width": 1100, "height": 760}, "accept_downloads": True, **how}
         )
         contexts.append(context)
+        context.set_default_timeout(PATIENCE_MS)
         page = context.new_page()
         page.on("pageerror", lambda error: wrong.append(str(error)))
         page.on("console", lambda said: wrong.append(said.text) if "Content Security" in said.text else None)
