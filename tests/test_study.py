@@ -205,3 +205,20 @@ def test_a_study_that_was_moved_is_the_same_study(tmp_path):
     moved = study.folder.rename(tmp_path / "elsewhere")
     assert read_study(moved) == replace(study, folder=moved)
     read_study(moved).refuse_changed()
+
+
+def test_pictures_beside_folders_of_pictures_are_named_and_refused_unless_datasets_are_named(
+    tmp_path, folders
+):
+    inputs, methods = folders
+    write_pictures(inputs, ["stray"])
+    with pytest.raises(BrewsterError, match=r"stray\.png\) beside folders of them \(nature, real\)"):
+        create(tmp_path / "study", inputs, methods)
+    study = create(tmp_path / "study", inputs, methods, Choices(datasets=("nature", "real")))
+    assert len(study.description.comparisons) == 4
+
+
+def test_a_picture_that_is_called_like_a_layer_is_one_where_nothing_was_separated(tmp_path):
+    names = ("window.reflection", "window", "b.confidence")
+    study = made(tmp_path, names=names)
+    assert {row.name for row in study.description.comparisons} == set(names)

@@ -67,6 +67,7 @@ def open_page(browser):
     def open_page(url, **how):
         context = browser.new_context(**how)
         contexts.append(context)
+        context.set_default_timeout(120_000)  # a busy machine is no failure
         page = context.new_page()
         page.on("pageerror", lambda error: errors.append(error))  # noqa: PLW0108  (playwright marks its handlers)
         page.goto(url)
@@ -96,7 +97,7 @@ def test_the_keyboard_alone_leads_from_consent_to_thanks(open_page, url, store):
     page.wait_for_selector("#invitation:not([hidden])")
     for key in ("Tab", "Space", "Tab", "Enter"):
         page.keyboard.press(key)
-    for trial, key in enumerate(["1", "ArrowDown", "3", "ArrowLeft"]):
+    for trial, key in enumerate(["1", "2", "3", "ArrowLeft"]):
         expect(page.get_by_text(f"Pair {trial + 1} of 4", exact=True).first).to_be_visible()
         press(page, key)
     expect(page.get_by_role("heading", name="Thank you.")).to_be_focused()
@@ -218,3 +219,39 @@ def test_a_phone_shows_all_without_scrolling_sideways_and_takes_fingers(open_pag
     expect(page.get_by_text("Pair 2 of 4").first).to_be_visible()
     ((_, answers),) = store.everything()
     assert answers[0].choice == "right"
+
+
+def test_arrows_up_and_down_scroll_and_the_focus_stays_where_it_was(open_page, url, store):
+    page = open_page(url, viewport={"width": 390, "height": 500})
+    begin(page)
+    similar = page.get_by_role("button", name="Similar", exact=True)
+    press(page, "ArrowDown")
+    page.wait_for_function("() => document.querySelector('main').scrollTop + scrollY > 0")
+    similar.focus()
+    for trial in range(2, 4):
+        press(page, "Enter")
+        expect(page.get_by_text(f"Pair {trial} of 4", exact=True).first).to_be_visible()
+        page.wait_for_selector(READY)
+        expect(similar).to_be_focused()
+        expect(similar).to_be_enabled()
+    page.wait_for_timeout(320)
+    page.keyboard.down("ArrowUp")
+    page.keyboard.up("ArrowUp")
+    page.keyboard.down("Enter")
+    expect(page.get_by_text("Pair 4 of 4").first).to_be_visible()
+    page.wait_for_selector(READY)
+    page.wait_for_timeout(320)
+    page.keyboard.down("Enter")  # still: a repeat
+    page.wait_for_timeout(200)
+    ((_, answers),) = store.everything()
+    assert [answer.choice for answer in answers.values()] == ["similar"] * 3
+
+
+def test_a_picture_that_is_gone_from_the_server_is_told_when_its_turn_comes(open_page, url, store):
+    page = open_page(url)
+    gone = {"status": 410, "json": {"error": "a picture is missing on the server"}}
+    page.route("**/pictures/1/left", lambda route: route.fulfill(**gone))
+    begin(page)
+    press(page, "1")
+    expect(page.get_by_role("alert")).to_contain_text("a picture is missing on the server")
+    expect(page.locator("#notice")).to_be_hidden()

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -136,3 +137,70 @@ def test_another_address_is_served_with_a_warning(created):
     _, said = server.communicate(timeout=30)
     assert "nothing they send is encrypted" in said
     assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{22}", link)
+
+
+def test_a_token_of_its_own_is_kept_for_its_owner_and_links_survive_a_restart(created):
+    first = serve(created.folder, "--token", "auto")
+    url, _, token = first.stdout.readline().strip().partition("?token=")
+    bearer = {"Authorization": f"Bearer {token}"}
+    link = httpx.post(f"{url}participants", json={"agreed": True}, headers=bearer).json()["link"]
+    first.send_signal(signal.SIGKILL)
+    first.communicate()
+    place = created.folder / "token"
+    assert place.read_text().strip() == token
+    assert place.stat().st_mode & 0o777 == 0o600
+    second = serve(created.folder, "--token", "auto")
+    url = second.stdout.readline().strip().partition("?")[0]
+    assert httpx.get(url + link[1:]).status_code == 200
+    second.send_signal(signal.SIGINT)
+    second.communicate(timeout=30)
+
+
+def test_a_kept_token_that_is_none_is_refused(bare, created):
+    (created.folder / "token").write_text("short\n")
+    code, _, err = bare("study", "serve", "study", "--token", "auto")
+    assert (code, "holds no token" in err) == (1, True)
+
+
+@pytest.mark.parametrize(
+    "name", ["study.example.org:443", "https://study.example.org", "study.example.org/", "", "bücher.example"]
+)
+def test_a_name_that_no_browser_calls_is_wrong_use(bare, created, name):
+    code, _, err = bare("study", "serve", "study", "--called", name, "--port", 0)
+    assert (code, "no bare name of a host" in err) == (2, True)
+
+
+def test_report_without_answers_makes_no_database(bare, created):
+    bare("study", "report", "study")
+    assert sorted(path.name for path in created.folder.iterdir()) == ["pictures", "study.json"]
+
+
+@pytest.mark.skipif(
+    os.geteuid() == 0 and not shutil.which("setpriv"), reason="root writes to read-only folders"
+)
+def test_a_study_that_may_only_be_read_is_reported_elsewhere(created, random, tmp_path):
+    answer_all(created, 3, random)
+    created.folder.chmod(0o555)
+    tame = ["setpriv", "--inh-caps=-all", "--bounding-set=-all"] if os.geteuid() == 0 else []
+    command = [*tame, sys.executable, "-m", "brewster", "study", "report", str(created.folder)]
+    done = subprocess.run(
+        [*command, "-o", str(tmp_path / "out")], capture_output=True, text=True, check=False
+    )
+    refused = subprocess.run(command, capture_output=True, text=True, check=False)
+    created.folder.chmod(0o755)
+    assert done.returncode == 0, done.stderr
+    assert "3 participants" in done.stdout
+    assert refused.returncode == 1  # so it was read-only indeed
+
+
+def test_create_prints_and_refuses_the_true_number_of_catch_trials(bare, tmp_path):
+    names = [f"{i}" for i in range(26)]
+    for seed, name in enumerate(("inputs", "ours", "rdnet")):
+        write_pictures(tmp_path / name, names, size=(4, 3), seed=seed)
+    args = ["--inputs", "inputs", "--method", "ours=ours", "--method", "RDNet=rdnet", "--catches"]
+    code, _, err = bare("study", "create", "study", *args, 25)
+    assert (code, "25 catch trials a participant were asked for; there are 24 at most" in err) == (
+        1,
+        True,
+    )
+    assert "26 of them and 24 catch trials" in bare("study", "create", "study", *args, 24)[2]

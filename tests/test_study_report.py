@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import re
 
 import choix
 import numpy as np
@@ -11,11 +12,19 @@ import pytest
 from brewster import Photo
 from brewster.errors import BrewsterError
 from brewster.study.draw import Trial, draw
+from brewster.study.report import figure
 from brewster.study.report.agreement import alpha
 from brewster.study.report.figure import plot
 from brewster.study.report.people import Person, Rule, outcome, people
-from brewster.study.report.results import summarise, write
-from brewster.study.report.statistics import averages, correlation, interval, rates, resampled, summed
+from brewster.study.report.results import AVERAGES, summarise, write
+from brewster.study.report.statistics import (
+    averages,
+    correlation,
+    interval,
+    rates,
+    resampled,
+    summed,
+)
 from brewster.study.report.strengths import strengths
 from brewster.study.report.tables import to_csv, to_latex, to_markdown
 from brewster.study.store import Answer, Participant
@@ -193,8 +202,8 @@ def person(**about):
     ("about", "reason"),
     [
         ({}, None),
-        ({"failed": 2}, None),
-        ({"failed": 3}, "failed"),
+        ({"failed": 1}, None),
+        ({"failed": 2}, "failed"),
         ({"failed": 3, "seconds": 0.1}, "failed"),
         ({"seconds": 1.49}, "fast"),
         ({"seconds": 1.5}, None),
@@ -245,7 +254,7 @@ def hundred(tmp_path_factory):
 def test_a_hundred_simulated_people_are_understood(hundred):
     _, _, results = hundred
     kept, everyone = results["kept"], results["everyone"]
-    assert results["excluded"] == {"failed": 5, "fast": 5}
+    assert results["excluded"] == {"failed": 6, "fast": 4}
     assert (kept["participants"], everyone["participants"], kept["complete"]) == (90, 100, 89)
     assert everyone["answers"] == kept["answers"] + 400
     for table in kept["tables"]:
@@ -297,7 +306,7 @@ def test_markdown_says_all_and_csv_has_a_line_for_each_number(hundred):
     _, _, results = hundred
     text = to_markdown(results)
     for told in (
-        "5 for wrong answers, 5 for haste",
+        "6 for wrong answers, 4 for haste",
         "## Everyone",
         "Mean of the datasets",
         "Krippendorff's alpha is",
@@ -328,3 +337,64 @@ def test_a_rule_that_leaves_nobody_still_tells_of_everyone(hundred):
     assert to_latex(results).startswith("% the rule leaves nobody")
     assert plot(results)[1:4] == b"PNG"
     assert "## Everyone" in to_markdown(results)
+
+
+# --- names
+
+
+def named(tmp_path, datasets, methods):
+    description = described(pictures=3, datasets=datasets, methods=methods, catches=0)
+    dice, study = np.random.default_rng(5), Study(tmp_path, description)
+    return study, people([answered(description, number, dice, TRUTH) for number in range(6)])
+
+
+def test_a_dataset_that_is_called_average_is_told_from_the_average(tmp_path):
+    study, who = named(tmp_path, ("Average", "real"), ("ours", "RDNet"))
+    results = summarise(study, who, Rule())
+    lines = csv.DictReader(io.StringIO(to_csv(results)))
+    told = {line["key"]: line["dataset"] for line in lines}
+    assert told == {"Average": "Average (dataset)", "real": "real"} | AVERAGES
+    for text in (to_latex(results), to_markdown(results)):
+        assert len(re.findall(r"Average +[|&]", text)) in (1, 2)  # of each group
+        assert "Average (dataset)" in text
+
+
+def test_the_plot_has_a_bar_for_each_row_and_takes_names_as_they_are(tmp_path, monkeypatch, recwarn):
+    axes = []
+    draw_bars = figure._bars
+    monkeypatch.setattr(figure, "_bars", lambda axis, *rest: (axes.append(axis), draw_bars(axis, *rest)))
+    study, who = named(tmp_path, ("$x^$", "\u96e8"), ("$a_{b$", "RDNet"))
+    results = summarise(study, who, Rule())
+    for row in results["kept"]["tables"][0]["rows"]:
+        row["title"] = "alike" if row["key"] in ("\u96e8", "/average") else row["title"]
+    results["kept"]["tables"][0]["second"] = "\u96e8"
+    assert plot(results)[1:4] == b"PNG"
+    (axis,) = axes
+    assert [label.get_text() for label in axis.get_yticklabels()] == ["$x^$", "alike", "alike"]
+    assert len(axis.patches) == 3 * 3
+    assert len({patch.get_y() for patch in axis.patches}) == 3
+    assert not [str(warning.message) for warning in recwarn]
+
+
+def test_a_plot_of_everyone_says_so(hundred, monkeypatch):
+    study, who, _ = hundred
+    said = []
+    monkeypatch.setattr("matplotlib.figure.Figure.suptitle", lambda _self, text, **_how: said.append(text))
+    for count in (20, 5):  # of the five, nobody is kept
+        plot(summarise(study, who[:count], Rule()))
+    assert said == ["Everyone: the rule leaves nobody"]
+
+
+def test_answers_csv_says_who_is_left_out_and_why(hundred, tmp_path):
+    study, who, results = hundred
+    write(results, study, who, tmp_path)
+    lines = csv.DictReader(io.StringIO((tmp_path / "answers.csv").read_text()))
+    reasons = {int(line["participant"]): line["left_out"] for line in lines}
+    assert [reasons[i] for i in range(100)] == ["failed"] * 5 + ["fast"] * 5 + [""] * 90
+
+
+def test_strengths_that_are_alike_in_all_resamples_have_no_interval(hundred):
+    study, *_ = hundred
+    tied = [person(number=i, votes={0: 1, 1: 1}) for i in range(5)]
+    worth = summarise(study, tied, Rule())["kept"]["strengths"]["ours"]
+    assert worth == {"mean": pytest.approx(0), "low": None, "high": None}

@@ -2,11 +2,13 @@
 
 import os
 import re
+import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import pytest
 
@@ -141,3 +143,50 @@ def test_what_was_acknowledged_before_kill_9_is_there_once(tmp_path):
     assert (
         sum(map(len, kept.values())) <= len(acknowledged) + 2
     )  # one of each writer may not have been told of
+
+
+def test_a_copy_of_the_folder_after_kill_9_has_all_answers_and_once_opened_again_the_file_alone(tmp_path):
+    write_study(tmp_path / "study", described())
+    writer = subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(tmp_path / "study")], stdout=subprocess.PIPE, text=True
+    )
+    for _ in range(15):
+        writer.stdout.readline()
+    os.kill(writer.pid, signal.SIGKILL)
+    writer.communicate()
+    shutil.copytree(tmp_path / "study", tmp_path / "copy")
+    copied = all_answers(Store(read_study(tmp_path / "copy"), only_reads=True))
+    assert sum(map(len, copied.values())) >= 15
+    store = Store(read_study(tmp_path / "study"))
+    assert all_answers(alone(store.study, tmp_path / "alone")) == copied
+    store.close()
+
+
+def alone(study, folder):
+    """The answers of a copy of answers.sqlite without its log."""
+    folder.mkdir()
+    shutil.copy(study.answers, folder)
+    return Store(replace(study, folder=folder))
+
+
+def test_a_store_that_is_closed_leaves_all_in_the_file_though_others_have_it_open(store, tmp_path):
+    other = Store(store.study)
+    person = store.participant(store.admit())
+    store.answer(person, 0, "left", seconds=2)
+    store.close()
+    assert len(all_answers(alone(store.study, tmp_path / "alone"))[0]) == 1
+    other.close()
+
+
+def test_a_reader_makes_no_database_and_sees_what_a_server_writes(store):
+    person = store.participant(store.admit())
+    store.answer(person, 0, "left", seconds=2)
+    reader = Store(store.study, only_reads=True)
+    store.answer(person, 1, "right", seconds=2)
+    assert all_answers(reader) == all_answers(store)
+    with pytest.raises(BrewsterError, match="cannot be used"):
+        reader.admit()
+    reader.close()
+    nobody = empty(store.study.folder / "nobody")
+    assert all_answers(Store(nobody, only_reads=True)) == {}
+    assert not nobody.answers.exists()

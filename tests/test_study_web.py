@@ -192,3 +192,16 @@ def test_an_answer_that_the_disk_refuses_is_not_acknowledged_and_can_be_sent_aga
     assert refused.json()["error"].startswith("answers.sqlite cannot be used")
     store._database.execute("PRAGMA query_only = OFF")
     assert reply(app, link, 0, "right").json()["kept"] == "right"
+
+
+def test_a_picture_that_is_gone_is_told_so_and_not_as_a_failure_that_passes(tmp_path):
+    study = made(tmp_path)
+    with closing(Store(study)) as store:
+        app = application(participants(study, store), guard=Guard(), home="study.html")
+        link = begin(app)
+        trial = store.participant(link.removeprefix("/s/")).trials[0]
+        study.file(trial.left).unlink()
+        answer = ask(app, "GET", f"{link}/pictures/0/left")
+    assert answer.status_code == 410  # the page asks again after 500 and more
+    assert answer.json()["error"].startswith("a picture is missing on the server")
+    assert trial.left.removesuffix(".png") not in answer.text

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import json
-import secrets
+import re
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Final
@@ -18,6 +19,7 @@ from brewster.cli.terminal import progress, say, write_out
 from brewster.errors import BrewsterError
 
 _AUTO: Final = "auto"
+_NAME: Final = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)*", re.IGNORECASE)
 _MAX_BYTES: Final = 10_000  # an answer has eighty
 _FOLDER: Final = click.Path(path_type=Path, file_okay=False)
 _WARNING: Final = (
@@ -130,6 +132,20 @@ def _text(path: Path) -> str:
         ) from error
 
 
+def _read_names(_context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]) -> list[str]:
+    """Names as they stand in the Host header, lower case: the guard does not look at a port there."""
+    for name in names:
+        if not _NAME.fullmatch(name):
+            try:
+                ipaddress.ip_address(name)
+            except ValueError as error:
+                raise click.BadParameter(
+                    f"{name!r} is no bare name of a host, such as study.example.org: "
+                    "leave out https://, the port and the path; letters other than a-z as xn--."
+                ) from error
+    return [name.lower() for name in names]
+
+
 @study.command
 @click.argument("folder", metavar="STUDY", type=_FOLDER)
 @click.option(
@@ -139,15 +155,16 @@ def _text(path: Path) -> str:
 @click.option(
     "--called",
     multiple=True,
+    callback=_read_names,
     metavar="NAME",
-    help="Another name that browsers call this server by, such as that of a proxy before it.",
+    help="Another name that browsers call this server by, such as that of a proxy before it: study.example.org.",
 )
-@click.option("--token", callback=read_token, metavar="TOKEN|auto", help="Let in only who brings this token; auto makes one.")  # fmt: skip
+@click.option("--token", callback=read_token, metavar="TOKEN|auto", help="Let in only who brings this token; auto makes one and keeps it in STUDY/token.")  # fmt: skip
 @click.option(
     "--most", type=click.IntRange(1), metavar="NUMBER", help="Admit no more participants than this."
 )
 def serve(
-    folder: Path, *, host: str, port: int, called: tuple[str, ...], token: str | None, most: int | None
+    folder: Path, *, host: str, port: int, called: list[str], token: str | None, most: int | None
 ) -> None:
     """Serve the page for participants until Ctrl-C.
 
@@ -156,6 +173,7 @@ def serve(
     require_extra("web", "serving", without=frozenset({"matplotlib"}))
     from brewster.study.store import Store  # noqa: PLC0415
     from brewster.study.study import read_study  # noqa: PLC0415
+    from brewster.study.token import kept_token  # noqa: PLC0415
     from brewster.web import application as web  # noqa: PLC0415  (wakes FastAPI)
     from brewster.web.guard import Guard, is_loopback  # noqa: PLC0415
     from brewster.web.study import participants  # noqa: PLC0415
@@ -164,9 +182,9 @@ def serve(
     made.refuse_changed()
     if not is_loopback(host):
         say(_WARNING.format(host=host))
-    token = secrets.token_urlsafe(16) if token == _AUTO else token
+    token = kept_token(folder) if token == _AUTO else token
     guard = Guard.at(host, token=token, max_bytes=_MAX_BYTES)
-    guard = replace(guard, hosts=guard.hosts | {name.lower() for name in called})
+    guard = replace(guard, hosts=guard.hosts | {*called})
     store = Store(made)
     app = web.application(participants(made, store, most=most, token=token), guard=guard, home="study.html")
     with contextlib.closing(store), contextlib.suppress(KeyboardInterrupt):  # the usual end
@@ -187,7 +205,7 @@ def _invite(url: str, token: str | None) -> None:
 @click.option(
     "--most-failed",
     type=click.FloatRange(0, 1),
-    default=0.5,
+    default=0.25,
     show_default=True,
     metavar="SHARE",
     help="Leave out who fails more of the catch trials.",
@@ -217,7 +235,7 @@ def report(
     from brewster.study.study import read_study  # noqa: PLC0415
 
     made = read_study(folder)
-    with contextlib.closing(Store(made)) as store:
+    with contextlib.closing(Store(made, only_reads=True)) as store:
         answered = people(store.everything())
     results = summarise(made, answered, Rule(most_failed, least_seconds))
     out = folder / "report" if out is None else out

@@ -90,7 +90,7 @@ def create(
     pairs = every if choices.all_pairs else every[: len(methods) - 1]
     seed = secrets.randbelow(1 << 32) if choices.seed is None else choices.seed
     shown = _fitting(choices.pairs, PAIRS, len(pairs) * len(found.inputs), "pairs")
-    catches = _fitting(choices.catches, CATCHES, len(found.inputs), "catch trials")
+    catches = _fitting(choices.catches, CATCHES, min(CATCH_POOL, len(found.inputs)), "catch trials")
     with arriving(out) as part:
         copier = _Copier(part / PICTURES, Random(f"{seed}/names"), tell)  # noqa: S311  (a published seed)
         comparisons = tuple(_comparisons(found, pairs, copier))
@@ -165,8 +165,8 @@ def _fitting(asked: int | None, usual: int, most: int, what: str) -> int:
     if asked is not None and asked > most:
         raise BrewsterError(
             f"{asked} {what} a participant were asked for",
-            f"there are {most}",
-            "ask for fewer, or add pictures",
+            f"there are {most} at most",
+            "ask for fewer",
         )
     return min(usual, most) if asked is None else asked
 

@@ -17,33 +17,37 @@ Key = tuple[str, str]
 """Dataset and stem."""
 
 _SHOWN: Final = 8
+_CLEAR: Final = ".transmission"
 
 
 def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]:
     """The pictures of a folder in natural order: in its folders, or in itself where these hold none.
 
-    Of the `datasets` only and in their order, if any are given. Outputs may be called like those of `brewster -o`: name.transmission.png.
+    Of the `datasets` only and in their order, if any are given. Outputs may be called like those of `brewster -o`:
+    name.transmission.png, beside which name.reflection.png and name.confidence.png are passed over.
 
     Raises:
-        BrewsterError: there is no picture, no such dataset, or one name has several files.
+        BrewsterError: there is no picture, no such dataset, one name has several files, or pictures lie both in the
+            folder and in its folders, and no `datasets` say which.
     """
     if not folder.is_dir():
         raise BrewsterError(f"{folder} is no folder", "one with pictures is needed", "name another")
     rooms = {_plain(room.name): room for room in folder.iterdir() if room.is_dir() and room.name[0] != "."}
-    parts = {name: room for name, room in rooms.items() if any(_stem(path) for path in room.iterdir())}
+    rooms = {name: rooms[name] for name in sorted(rooms, key=_natural)}
+    parts = {name: stems for name, room in rooms.items() if (stems := _stems(room))}
     if missing := [name for name in datasets if name not in parts]:
         raise BrewsterError(
             f"{folder} has no dataset {missing[0]!r}",
             f"a folder with pictures in it; there {'is' if len(parts) == 1 else 'are'} {', '.join(parts) or 'none'}",
             "check the name",
         )
-    if not parts:
-        parts = {ONE: folder}
+    if not datasets and (own := _stems(folder)):
+        _refuse_both(folder, list(parts), list(own))
+        parts = {ONE: own}
     found: defaultdict[Key, list[Path]] = defaultdict(list)
-    for name in dict.fromkeys(datasets or sorted(parts, key=_natural)):
-        for path in sorted(parts[name].iterdir(), key=lambda path: _natural(_stem(path))):
-            if stem := _stem(path):
-                found[name, stem].append(path)
+    for name in dict.fromkeys(datasets or parts):
+        for path, stem in parts[name].items():
+            found[name, stem].append(path)
     _refuse(folder, found)
     return {key: paths[0] for key, paths in found.items()}
 
@@ -68,12 +72,26 @@ def _refuse(folder: Path, found: dict[Key, list[Path]]) -> None:
         )
 
 
-def _stem(path: Path) -> str:
-    """What a picture is called; "" for what is no picture, or another layer."""
-    if path.suffix.lower() not in SUFFIXES or path.name.startswith(".") or not path.is_file():
-        return ""
-    stem = _plain(path.stem)
-    return "" if stem.endswith((".reflection", ".confidence")) else stem.removesuffix(".transmission")
+def _refuse_both(folder: Path, rooms: Sequence[str], own: Sequence[Path]) -> None:
+    if rooms:
+        raise BrewsterError(
+            f"{folder} holds pictures ({listed([path.name for path in own])}) beside folders of them ({', '.join(rooms)})",
+            "pictures lie in a folder, or in its folders, one for each dataset",
+            "move them into one of these folders, or name those that are meant: --dataset NAME",
+        )
+
+
+def _stems(folder: Path) -> dict[Path, str]:
+    """What each picture of a folder is called, in natural order; without the other layers of one that is there."""
+    pictures = {
+        path: _plain(path.stem)
+        for path in folder.iterdir()
+        if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
+    }
+    clear = {stem.removesuffix(_CLEAR) for stem in pictures.values() if stem.endswith(_CLEAR)}
+    others = {f"{stem}{layer}" for stem in clear for layer in (".reflection", ".confidence")}
+    stems = {path: stem.removesuffix(_CLEAR) for path, stem in pictures.items() if stem not in others}
+    return dict(sorted(stems.items(), key=lambda pair: (_natural(pair[1]), pair[0])))
 
 
 def _plain(name: str) -> str:

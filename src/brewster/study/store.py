@@ -12,12 +12,14 @@ first answer to a trial stays: sent again, perhaps because the acknowledgement w
 from __future__ import annotations
 
 import json
+import os
 import secrets
 import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from pathlib import Path
 from threading import Lock
 from typing import Final, final
 
@@ -58,22 +60,40 @@ class Answer:
 
 @final
 class Store:
-    """The answers of one study. Thread-safe, and several processes may use one study at once."""
+    """The answers of one study. Thread-safe, and several processes may use one study at once.
 
-    def __init__(self, study: Study) -> None:
+    Where it `only_reads`, no answer can be written, and a study that nobody has answered stays without a database.
+    """
+
+    def __init__(self, study: Study, *, only_reads: bool = False) -> None:
         self.study = study
-        self._lock = Lock()
+        self._lock, self._only_reads = Lock(), only_reads
         with self._told():
             self._database = sqlite3.connect(
-                study.answers, timeout=_PATIENCE_SECONDS, check_same_thread=False, isolation_level=None
+                _readable(study.answers) if only_reads else study.answers,
+                timeout=_PATIENCE_SECONDS,
+                check_same_thread=False,
+                isolation_level=None,
+                uri=only_reads,
             )
-            self._database.execute("PRAGMA journal_mode = WAL")
-            self._database.execute("PRAGMA synchronous = FULL")
-            self._database.executescript(_SCHEMA)
+            if not only_reads:
+                self._database.execute("PRAGMA journal_mode = WAL")
+                self._database.execute("PRAGMA synchronous = FULL")
+                self._gather()
+            if not only_reads or not study.answers.exists():
+                self._database.executescript(_SCHEMA)
 
     def close(self) -> None:
-        """Lets the file go."""
-        self._database.close()
+        """Lets the file go, with all answers in it."""
+        with self._lock:
+            if not self._only_reads:
+                with suppress(sqlite3.Error):  # of a full disk, perhaps: then the log has them
+                    self._gather()
+            self._database.close()
+
+    def _gather(self) -> None:
+        """Moves into the file what a killed server may have left in the log beside it."""
+        self._database.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
 
     def count(self) -> int:
         """How many participants were admitted."""
@@ -173,6 +193,18 @@ class Store:
                 "a database that brewster has made, on a disk of this machine with free space",
                 "mend that and start again: what was acknowledged is kept",
             ) from error
+
+
+def _readable(file: Path) -> str:
+    """The address under which SQLite only reads a file; an empty database where there is none.
+
+    A reader keeps a little file beside it, for the log. Where it cannot, and no log is there, none is needed.
+    """
+    if not file.exists():
+        return "file::memory:"
+    log = file.with_name(f"{file.name}-wal")
+    is_still = not os.access(file.parent, os.W_OK) and not (log.exists() and log.stat().st_size)
+    return f"{file.resolve().as_uri()}?mode=ro{'&immutable=1' if is_still else ''}"
 
 
 def _trials(text: str) -> tuple[Trial, ...]:

@@ -138,7 +138,14 @@ class _Door:
     def picture(self, person: Token, trial: int, side: Side) -> Response:
         """A picture of a trial."""
         shown = _shown(self._participant(person), trial)
-        data = self.study.file(getattr(shown, side)).read_bytes()
+        try:
+            data = self.study.file(getattr(shown, side)).read_bytes()
+        except (
+            FileNotFoundError
+        ) as error:  # it does not come back by itself: the page must not ask again and again
+            raise HTTPException(
+                410, "a picture is missing on the server; please tell whoever runs the study"
+            ) from error
         return Response(data, media_type="image/png", headers=_KEEP)
 
     def answer(self, person: Token, given: Annotated[Given, Body()]) -> Kept:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
@@ -12,21 +13,28 @@ _INKS: Final = {"win": "#1f6f8b", "tie": "#666666", "lose": "#a8561b"}
 _NARROW: Final = 0.06
 """A share too narrow for its number."""
 _SHOWN: Final = ("/average",)
+_EVERYONE: Final = "Everyone: the rule leaves nobody"
 
 
 def plot(results: Mapping[str, Any]) -> bytes:
-    """A PNG of the group that the rule keeps, or of everyone where it keeps nobody."""
+    """A PNG of the group that the rule keeps, or of everyone where it keeps nobody, which it says then."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (an extra, and slow to wake)
 
-    tables = results["kept"]["tables"] or results["everyone"]["tables"]
+    kept = results["kept"]["tables"]
+    tables = kept or results["everyone"]["tables"]
     shown = [_shown(results, table) for table in tables]
     heights = [len(rows) + 0.9 for rows in shown]
-    figure = Figure(figsize=(7.2, 0.36 * sum(heights) + 0.3), layout="constrained")
+    height = 0.36 * sum(heights) + (0.3 if kept else 0.7)
+    figure = Figure(figsize=(7.2, height), layout="constrained")
     axes = figure.subplots(len(tables), 1, squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
     for table, rows, axis in zip(tables, shown, axes, strict=True):
         _bars(axis, table, rows)
+    if not kept:
+        figure.suptitle(_EVERYONE, fontsize=9, color="#a8561b")
     data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=160, metadata={"Software": None})
+    with warnings.catch_warnings():  # a letter that the font does not have is a box; the tables have the name
+        warnings.filterwarnings("ignore", message="Glyph .* missing")
+        figure.savefig(data, format="png", dpi=160, metadata={"Software": None})
     return data.getvalue()
 
 
@@ -38,11 +46,11 @@ def _shown(results: Mapping[str, Any], table: Mapping[str, Any]) -> list[Mapping
 
 
 def _bars(axis: Any, table: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> None:  # noqa: ANN401  (matplotlib)
-    labels = [row["title"] for row in rows]
+    places = range(len(rows))  # not the titles: of two that are alike, matplotlib would make one
     starts = [0.0] * len(rows)
     for name, colour in _COLOURS.items():
         widths = [row[name]["mean"] for row in rows]
-        axis.barh(labels, widths, left=starts, color=colour, height=0.72, edgecolor="white", linewidth=0.8)
+        axis.barh(places, widths, left=starts, color=colour, height=0.72, edgecolor="white", linewidth=0.8)
         for i, (start, width) in enumerate(zip(starts, widths, strict=True)):
             if width >= _NARROW:
                 axis.text(
@@ -57,6 +65,7 @@ def _bars(axis: Any, table: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]
         starts = [start + width for start, width in zip(starts, widths, strict=True)]
     axis.invert_yaxis()
     axis.set(xlim=(0, 1), xticks=[])
+    axis.set_yticks(places, [row["title"] for row in rows], parse_math=False)
     axis.tick_params(left=False, labelsize=9)
     axis.spines[:].set_visible(False)
     heads = (
@@ -66,5 +75,13 @@ def _bars(axis: Any, table: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]
     )
     for place, side, text, colour in heads:
         axis.text(
-            place, 1.02, text, transform=axis.transAxes, ha=side, color=colour, fontsize=9, weight="bold"
+            place,
+            1.02,
+            text,
+            transform=axis.transAxes,
+            ha=side,
+            color=colour,
+            fontsize=9,
+            weight="bold",
+            parse_math=False,
         )

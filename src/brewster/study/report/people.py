@@ -38,7 +38,7 @@ class Person:
 class Rule:
     """Who is left out: who fails more than this share of the catch trials, or is faster than this median time."""
 
-    most_failed: float = 0.5
+    most_failed: float = 0.25
     least_seconds: float = 1.5
 
     def __str__(self) -> str:

@@ -25,7 +25,15 @@ from brewster.files import write_atomically
 from brewster.study.report.agreement import alpha
 from brewster.study.report.figure import plot
 from brewster.study.report.people import OUTCOMES, Person, Rule
-from brewster.study.report.statistics import correlation, interval, rates, resampled, summed
+from brewster.study.report.statistics import (
+    correlation,
+    interval,
+    least,
+    rates,
+    resampled,
+    summed,
+    widened,
+)
 from brewster.study.report.strengths import strengths
 from brewster.study.report.tables import to_csv, to_latex, to_markdown
 from brewster.study.study import Study
@@ -39,6 +47,7 @@ AVERAGES: Final = {
 
 The first weights each dataset by its number of pictures, as the paper does."""
 _DIGITS: Final = 6
+_EQUAL: Final = 1e-6
 
 Results = dict[str, Any]
 """What report.json holds: see docs/study.md."""
@@ -72,12 +81,19 @@ def summarise(study: Study, people: Sequence[Person], rule: Rule) -> Results:
         },
         "rule": str(rule),
         "excluded": {reason: reasons.count(reason) for reason in ("failed", "fast")},
+        "left_out": {
+            str(person.number): reason
+            for person, reason in zip(people, reasons, strict=True)
+            if reason is not None
+        },
         "kept": _group(study, kept),
         "everyone": _group(study, people),
     }
 
 
 def _titled(dataset: str) -> str:
+    if dataset in AVERAGES.values():
+        return f"{dataset} (dataset)"
     return dataset or "All pictures"
 
 
@@ -148,7 +164,8 @@ def _ratings(study: Study, people: Sequence[Person]) -> Floats:
 def _tables(study: Study, counts: Floats, pictures: Floats, times: Floats) -> list[dict[str, Any]]:
     """A table for each pair of methods: a row for each dataset, then the averages."""
     means = rates(counts.sum(axis=0), pictures)
-    lows, highs = interval(rates(summed(times, counts), pictures), len(counts))
+    ends = interval(rates(summed(times, counts), pictures), len(counts))
+    lows, highs = widened(means, ends, least(counts, pictures))
     titles = {name: _titled(name) for name in study.description.datasets} | AVERAGES
     answers = counts.sum(axis=(0, 3))
     return [
@@ -175,12 +192,14 @@ def _tables(study: Study, counts: Floats, pictures: Floats, times: Floats) -> li
 
 
 def _strengths(study: Study, counts: Floats, times: Floats) -> dict[str, Any]:
-    """Of each method; without an interval where some resample leaves a method that has only won or only lost."""
+    """Of each method; without an interval where a resample has a method that only won or lost, or all are alike."""
     wins = _wins(study, counts)
     means = strengths(wins.sum(axis=0))
     draws = strengths(summed(times, wins))
     lows, highs = (
-        interval(draws, len(counts)) if np.isfinite(draws).all() else np.full((2, len(means)), math.nan)
+        interval(draws, len(counts))
+        if np.isfinite(draws).all() and np.ptp(draws, axis=0).min() > _EQUAL
+        else np.full((2, len(means)), math.nan)
     )
     return {
         method: _estimate(*(part[i] for part in (means, lows, highs)))
@@ -223,20 +242,21 @@ def write(results: Results, study: Study, people: Sequence[Person], out: Path) -
         "report.md": to_markdown(results).encode(),
         "table.tex": to_latex(results).encode(),
         "table.csv": to_csv(results).encode(),
-        "answers.csv": _answers_csv(study, people).encode(),
+        "answers.csv": _answers_csv(results, study, people).encode(),
         "plot.png": plot(results),
     }
     for name, data in files.items():
         write_atomically(out / name, data, overwrite=True)
 
 
-def _answers_csv(study: Study, people: Sequence[Person]) -> str:
-    """A line for each answer about a comparison, for other people's statistics."""
+def _answers_csv(results: Results, study: Study, people: Sequence[Person]) -> str:
+    """A line for each answer about a comparison, for other people's statistics; `left_out` says by what rule, if so."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(["participant", "dataset", "name", "first", "second", "outcome"])
+    table.writerow(["participant", "dataset", "name", "first", "second", "outcome", "left_out"])
     for person in people:
+        reason = results["left_out"].get(str(person.number), "")
         for number, outcome in sorted(person.votes.items()):
             row = study.description.comparisons[number]
-            table.writerow([person.number, row.dataset, row.name, *row.methods, OUTCOMES[outcome]])
+            table.writerow([person.number, row.dataset, row.name, *row.methods, OUTCOMES[outcome], reason])
     return text.getvalue()

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 RESAMPLES: Final = 10_000
 SEED: Final = 20_261_121
+_EQUAL: Final = 1e-9
 
 Floats = NDArray[np.float64]
 
@@ -74,6 +75,40 @@ def interval(draws: Float64[Floats, "r ..."], participants: int) -> Float64[Floa
     columns = [column[np.isfinite(column)] for column in draws.reshape(len(draws), -1).T]
     found = [np.percentile(column, ends) if column.size else np.full(2, np.nan) for column in columns]
     return np.array(found).T.reshape(2, *draws.shape[1:])
+
+
+def least(
+    counts: Float64[Floats, "p ... d 3"], pictures: Float64[Floats, "... d"]
+) -> Float64[Floats, "... d+3"]:
+    """The lower 95 % bound of a rate that all answers agree on, of each row of `rates`; NaN where nobody answered.
+
+    Clopper and Pearson 1934 with n of n, 0.025^(1 / n), n being the participants of a dataset: somebody who gives several
+    answers agrees in all of them no more surely than in one. Averages of the bounds bound the averages.
+    """
+    sizes = counts.sum(axis=-1)
+    with np.errstate(divide="ignore"):
+        bounds = 0.025 ** (1 / (sizes > 0).sum(axis=0))
+        pooled = 0.025 ** (1 / (sizes.sum(axis=-1) > 0).sum(axis=0))
+    bounds = np.where((sizes > 0).any(axis=0), bounds, np.nan)
+    return np.concatenate([bounds, averages(bounds[..., None], pictures)[..., 0], pooled[..., None]], axis=-1)
+
+
+def widened(
+    rows: Float64[Floats, "... 4"], ends: Float64[Floats, "2 ... 4"], bounds: Floats
+) -> Float64[Floats, "2 ... 4"]:
+    """The intervals of `rates`, where those without width, of resamples that are all alike, are those of `least`.
+
+    NaN where there is no width though answers differ, as when a single participant has answered about a dataset.
+    """
+    bound, shares = bounds[..., None], rows[..., :3]
+    is_all, is_none = shares > 1 - _EQUAL, shares < _EQUAL
+    lows = np.where(is_all, bound, np.where(is_none, 0.0, np.nan))
+    highs = np.where(is_all, 1.0, np.where(is_none, 1 - bound, np.nan))
+    lows, highs = (
+        np.concatenate([own, own[..., :1] - other[..., 2:]], axis=-1)
+        for own, other in ((lows, highs), (highs, lows))
+    )
+    return np.where(ends[1] - ends[0] < _EQUAL, np.stack([lows, highs]), ends)
 
 
 def _percentiles(participants: int) -> tuple[float, float]:

@@ -11,8 +11,9 @@ _GROUPS: Final = {"kept": "After the rule", "everyone": "Everyone"}
 _CHOICES: Final = """\
 Rates are shares of the answers about a pair of methods. Average weights each dataset by its number of pictures, as the \
 paper's Table 3 does; the plain mean of the datasets and the rates of all answers together stand below.
-Intervals are 95 % expanded percentile intervals of 10,000 bootstrap resamples of whole participants. They speak of \
-other people who see these pictures, not of other pictures.
+Intervals are 95 % expanded percentile intervals of 10,000 bootstrap resamples of whole participants; where all answers \
+agree, Clopper and Pearson's with one answer a participant. They speak of other people who see these pictures, not of \
+other pictures.
 Difference is win less lose. Alike is the intra-participant correlation of scores 1, 0, -1, for `brewster study plan`.
 Strength: Bradley and Terry's model over all answers, a tie being half a win for each; 0 is the mean of all methods.
 Agreement: Krippendorff's alpha of win, tie and lose over comparisons; 1 is perfect, 0 is chance."""
@@ -160,16 +161,18 @@ def _escaped(text: str) -> str:
 
 
 def to_csv(results: Results) -> str:
-    """A line for each group, pair of methods, dataset or average, and rate; shares, not percent."""
+    """A line for each group, pair of methods, dataset or average, and rate; shares, not percent.
+
+    The key is the dataset's own name, or begins with a slash for an average.
+    """
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(["group", "first", "second", "dataset", "rate", "mean", "low", "high", "answers"])
+    table.writerow(["group", "first", "second", "key", "dataset", "rate", "mean", "low", "high", "answers"])
     for key in _GROUPS:
         for pair in results[key]["tables"]:
             for row in pair["rows"]:
                 for name in ("win", "tie", "lose", "difference"):
                     ends = row[name].values()
-                    table.writerow(
-                        [key, pair["first"], pair["second"], row["title"], name, *ends, row["answers"]]
-                    )
+                    place = [key, pair["first"], pair["second"], row["key"], row["title"]]
+                    table.writerow([*place, name, *ends, row["answers"]])
     return text.getvalue()

@@ -5,7 +5,7 @@ import { Lens } from "./lens.js";
 
 const PERSON = location.pathname.match(/^\/s\/([^/]+)/)?.[1];
 const TOO_SOON = 300; // ms after new pictures in which no answer is taken: a second click was meant for the last ones
-const KEYS = { 1: "left", 2: "similar", 3: "right", ArrowLeft: "left", ArrowDown: "similar", ArrowUp: "similar", ArrowRight: "right" };
+const KEYS = { 1: "left", 2: "similar", 3: "right", ArrowLeft: "left", ArrowRight: "right" }; // up and down scroll
 
 const get = (id) => document.getElementById(id);
 const sections = ["invitation", "trial", "finish", "trouble"];
@@ -32,7 +32,7 @@ async function ask(path, body) {
     try {
       const options = body && { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) };
       const answer = await fetch(path, options);
-      if (answer.ok || (answer.status < 500 && answer.status !== 408)) return await read(answer);
+      if (answer.ok || isRefused(answer)) return await read(answer);
     } catch (error) {
       if (error instanceof Refused) throw error;
     }
@@ -42,6 +42,8 @@ async function ask(path, body) {
 }
 
 class Refused extends Error {}
+
+const isRefused = (answer) => answer.status >= 400 && answer.status < 500 && answer.status !== 408;
 
 async function read(answer) {
   notice("");
@@ -97,6 +99,8 @@ async function load(source) {
       notice("");
       return picture;
     } catch {
+      const answer = await fetch(source).catch(() => null); // a picture does not say why it did not come
+      if (answer && isRefused(answer)) await read(answer);
       notice("A picture has not arrived. Trying again…");
       await new Promise((resolve) => setTimeout(resolve, 1000 * wait));
     }
@@ -119,21 +123,27 @@ async function present(next) {
   await Promise.all(sides.map((side) => frames[side].firstElementChild.decode()));
   lens.reset(next.width, next.height);
   get("trial").classList.remove("waiting");
-  for (const button of get("choices").children) [button.disabled, button.className] = [false, ""];
+  mark(null, false);
   get("news").textContent = number;
   shownAt = performance.now();
   preloaded.length = 0;
-  if (next.trial + 1 < next.trials) preloaded.push(...sides.map((side) => load(address(next.trial + 1, side))));
+  const ahead = next.trial + 1 < next.trials ? sides.map((side) => load(address(next.trial + 1, side))) : [];
+  preloaded.push(...ahead.map((loading) => loading.catch(() => {}))); // what fails is told when its turn comes
+}
+
+// Says what was chosen, and whether it is too early or too late to choose. A button that is `disabled` would lose the focus.
+function mark(choice, closed) {
+  for (const button of get("choices").children) {
+    button.setAttribute("aria-disabled", closed);
+    button.classList.toggle("chosen", button.dataset.choice === choice);
+  }
 }
 
 async function choose(choice) {
   if (shownAt === null || performance.now() - shownAt < TOO_SOON) return;
   const seconds = (performance.now() - shownAt) / 1000;
   shownAt = null;
-  for (const button of get("choices").children) {
-    button.disabled = true;
-    button.classList.toggle("chosen", button.dataset.choice === choice);
-  }
+  mark(choice, true);
   try {
     const answer = await ask(`/s/${PERSON}/answers`, { trial: state.trial, choice, seconds });
     await present(answer.next);
@@ -151,7 +161,9 @@ function finish({ trials }) {
 for (const button of get("choices").children) button.addEventListener("click", () => choose(button.dataset.choice));
 
 addEventListener("keydown", (event) => {
-  if (get("trial").hidden || event.ctrlKey || event.metaKey || event.altKey || event.repeat && event.key in KEYS) return;
+  if (get("trial").hidden || event.ctrlKey || event.metaKey || event.altKey) return;
+  const answers = event.key in KEYS ? !event.shiftKey : event.key === "Enter" && get("choices").contains(event.target);
+  if (event.repeat && answers) return event.preventDefault(); // a key that is held is one answer
   if (event.shiftKey ? lens.press(`Shift+${event.key}`) || lens.press(event.key) : lens.press(event.key)) event.preventDefault();
   else if (event.key in KEYS && !event.shiftKey) {
     event.preventDefault();
