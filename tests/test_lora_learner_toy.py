@@ -40,7 +40,6 @@ def test_a_lora_brings_a_pretrained_twin_nearer_to_toys_that_it_has_not_seen(tmp
     """After a minute; how much better than copying the photo that is, the slow test below says."""
     found = scores(tmp_path, "kontext", vae_steps=110, pretraining=100, steps=60)
     assert found["LoRA"] > found["base"] + 0.1, found
-    assert found["LoRA"] > found["copy"], found
 
 
 @pytest.mark.slow
