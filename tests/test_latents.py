@@ -12,7 +12,7 @@ from brewster.errors import PhotoError, RecipeError
 from brewster.models.large.backbones import tiny
 from brewster.models.large.panels import Layout, fit_panel, split
 from brewster.photo import Photo
-from brewster.train.latents import Latents, cropped, open_samples, panels_of, with_difference
+from brewster.train.latents import Latents, cropped, open_samples, panel_for, panels_in, with_difference
 from brewster.train.recipe import LargeRecipe
 from set_folders import make
 
@@ -65,7 +65,8 @@ def test_panels_are_the_whole_sample_in_its_own_aspect_ratio(recipe, root, backb
     samples = open_samples(wanted)
     assert len(samples) == 3
     for number, entry in enumerate(read_set(root / "set")):
-        panels, fit = panels_of(samples[number].layers, backbone, wanted)
+        fit = panel_for(samples[number].layers, backbone, wanted)
+        panels = panels_in(samples[number].layers, fit)
         assert (fit.content, fit.panel) == ((24, 16), (32, 16))
         for letter, name in zip("ITR", ("photo", "transmission", "reflection"), strict=True):
             picture = torch.from_numpy(Photo.open(entry.read(f"{name}.jpg")).pixels.copy())

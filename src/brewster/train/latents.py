@@ -145,16 +145,6 @@ def cropped(dice: Dice, layers: UInt8[Tensor, "h w 9"], fit: Fit) -> UInt8[Tenso
     return layers[top : top + rows, left : left + columns]
 
 
-def panels_of(layers: Tensor, backbone: Backbone, recipe: LargeRecipe) -> tuple[dict[str, Tensor], Fit]:
-    """I, T and R of a whole sample as panels, as `panels_in` makes them; and how they stand in them.
-
-    Raises:
-        PhotoError: the sample is smaller than a panel.
-    """
-    fit = panel_for(layers, backbone, recipe)
-    return panels_in(layers, fit), fit
-
-
 def panels_in(layers: UInt8[Tensor, "h w 9"], fit: Fit) -> dict[str, Float[Tensor, "1 3 p q"]]:
     """I, T and R, shrunk in linear light until they fit, in [-1, 1]."""
     light = to_linear(layers.permute(2, 0, 1)[None] / 255)
