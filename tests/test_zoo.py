@@ -3,7 +3,8 @@ from dataclasses import replace
 import pytest
 
 from brewster.errors import ModelError
-from brewster.models.zoo import MODELS, find_model
+from brewster.models.large.backbones import BACKBONES
+from brewster.models.zoo import LARGE, MODELS, find_model
 
 
 def test_every_shipped_model_is_whole_small_enough_and_has_a_card():
@@ -26,3 +27,7 @@ def test_a_damaged_file_does_not_pass(tmp_path):
     broken.write_bytes(MODELS["compact"].path.read_bytes()[:-1])
     with pytest.raises(ModelError, match="SHA-256"):
         replace(MODELS["compact"], path=broken).verify()
+
+
+def test_the_large_models_that_are_named_are_the_backbones_that_there_are():
+    assert list(LARGE) == list(BACKBONES)

@@ -18,14 +18,15 @@ Quality = Literal["draft", "standard", "best"]
 Container = Literal["jpeg", "png", "tiff", "webp", "avif", "heic", "exr", "hdr"]
 Device = Literal["auto", "cuda", "rocm", "directml", "coreml", "cpu"]
 
-Quantise = Literal["int8", "float8", "nf4"]
+Quantisation = Literal["int8", "float8", "nf4"]
+"""How a large base is stored that would not fit as it is: 8 bits by torchao, 4 by bitsandbytes."""
 
 
 class Large(TypedDict, total=False):
     """What can be asked of large image models alone; see `Options` for what each is."""
 
     base: str | None
-    quantise: Quantise | None
+    quantise: Quantisation | None
     steps: int | None
     average: int
     plain: bool
@@ -84,7 +85,7 @@ class Options:
             "Of a LoRA: the folder or hub id of its base, if that lies not where it was trained."
         ),
     )
-    quantise: Quantise | None = field(
+    quantise: Quantisation | None = field(
         default=None,
         metadata=_about("Of large models: store the weights in 8 or 4 bits, as small cards need it."),
     )

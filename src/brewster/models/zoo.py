@@ -76,11 +76,15 @@ LARGE: Final = ("kontext", "klein", "qwen")
 """Large image models by name; they and what is trained on them lie elsewhere, and need the extra `large`."""
 
 
+TINY: Final = "tiny:"
+"""What a backbone's toy twin is called, before the backbone's name."""
+
+
 def is_large(name: str) -> bool:
     """Whether this names a large image model or a LoRA: by name, folder, toy twin ("tiny:kontext") or hub id."""
     if name in MODELS or Path(name).is_file():
         return False
-    return name in LARGE or name.startswith("tiny:") or Path(name).is_dir() or _is_hub_id(name)
+    return name in LARGE or name.startswith(TINY) or Path(name).is_dir() or _is_hub_id(name)
 
 
 def model_name(model: str) -> str:

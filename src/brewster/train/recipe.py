@@ -19,11 +19,12 @@ from brewster.dataset.live import Mixing, Target
 from brewster.dataset.mix import MixRecipe
 from brewster.errors import RecipeError
 from brewster.models.compact import STRIDE
-from brewster.models.large.backbones import TINY
 from brewster.models.large.panels import Direction, Layout, Panel
 from brewster.models.large.prompt import PROMPTS
 from brewster.models.large.sampling import GUIDANCE
-from brewster.models.large.task import PAPER_PX, Objective, Quantisation, Task
+from brewster.models.large.task import PAPER_PX, Objective, Task
+from brewster.models.zoo import TINY
+from brewster.options import Quantisation
 from brewster.scene.values import Above0, From0, Positive, Seed, Share, Values, read_toml, wrong_value
 
 _COMPARE = "the recipes in recipes/train/"

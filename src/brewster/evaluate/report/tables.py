@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
 from brewster.evaluate.results import AVERAGE, Results
+from brewster.latex import escaped
 
 _MAIN: Final = ("psnr", "ssim", "lpips")
 _SIR2: Final = ("postcard", "solidobject", "wildscene")
@@ -164,7 +165,7 @@ def to_latex(results: Results) -> str:
     rows = [
         " & ".join(
             [
-                _escaped(method),
+                escaped(method),
                 *(cell for key in keys for cell in _latex_cells(results, key, method, metrics)),
             ]
         )
@@ -199,7 +200,9 @@ def _latex_heads(results: Results, keys: list[str], width: int) -> list[str]:
 
     def head(key: str, rows: int) -> str:
         selection = results["selections"][key]
-        text = f"{_escaped(selection['title'].partition(',')[0].removeprefix('SIR2 '))} ({selection['pictures']})"
+        text = (
+            f"{escaped(selection['title'].partition(',')[0].removeprefix('SIR2 '))} ({selection['pictures']})"
+        )
         return _spanning(width, f"\\multirow{{{rows}}}{{*}}{{{text}}}" if rows > 1 else text)
 
     if len(sir2) < 2:
@@ -261,16 +264,6 @@ def is_complete(table: Mapping[str, Any], method: str, metric: str) -> bool:
     """Whether a method is judged on as many pictures in this metric as any other."""
     counts = {name: row[metric]["count"] for name, row in table.items() if row.get(metric)}
     return counts.get(method) == max(counts.values(), default=0)
-
-
-_SPECIAL: Final = str.maketrans(
-    {letter: f"\\{letter}" for letter in "&%$#_{}"}
-    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\^{}"}
-)
-
-
-def _escaped(text: str) -> str:
-    return text.translate(_SPECIAL)
 
 
 # --- CSV

@@ -28,13 +28,11 @@ from brewster.models.large.kontext import Kontext
 from brewster.models.large.prompt import PROMPT, PromptEmbedding
 from brewster.models.large.qwen import Qwen
 from brewster.models.large.stock import bars_on_terminals_only, fetch, library, stock_class, within_memory
-from brewster.models.large.task import Quantisation
+from brewster.models.zoo import TINY
+from brewster.options import Quantisation
 
 BACKBONES: Final[dict[str, type[Backbone]]] = {family.name: family for family in (Kontext, Klein, Qwen)}
 """name -> adapter; each knows its hub id, licence, classes and full-size settings."""
-
-TINY: Final = "tiny:"
-"""What a backbone's toy twin is called, before the backbone's name."""
 
 _INDEX: Final = "model_index.json"
 _CONFIGS: Final = {"transformer": "config.json", "vae": "config.json", "scheduler": "scheduler_config.json"}

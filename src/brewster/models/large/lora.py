@@ -25,8 +25,9 @@ from brewster.errors import ModelError, RecipeError
 from brewster.models.large.family import Backbone
 from brewster.models.large.prompt import PROMPT_FILE, PromptEmbedding, load_prompt
 from brewster.models.large.stock import library
-from brewster.models.large.task import Quantisation, Task
+from brewster.models.large.task import Task
 from brewster.models.large.tensors import read_tensors, write_tensors
+from brewster.options import Quantisation
 
 LORA_FILE: Final = "pytorch_lora_weights.safetensors"
 """The name that stock diffusers looks for."""

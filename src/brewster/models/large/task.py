@@ -13,9 +13,6 @@ from brewster.models.large.sampling import GUIDANCE
 
 Objective = Literal["flow", "one_step"]
 
-Quantisation = Literal["int8", "float8", "nf4"]
-"""How a base is stored that would not fit as it is: 8 bits by torchao, 4 by bitsandbytes."""
-
 PAPER_PX: Final = 1536 * 512
 
 

@@ -7,6 +7,8 @@ import io
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
+from brewster.latex import escaped
+
 _GROUPS: Final = {"kept": "After the rule", "everyone": "Everyone"}
 _CHOICES: Final = """\
 Rates are shares of the answers about a pair of methods. Average weights each dataset by its number of pictures, as the \
@@ -128,7 +130,7 @@ def to_latex(results: Results) -> str:
         "% brewster study report; needs \\usepackage{booktabs}; below each rate its 95\\% interval",
         f"\\begin{{tabular}}{{c|{'|'.join('ccc' for _ in tables)}}}",
         "\\toprule",
-        " & ".join(map(_escaped, ["Dataset", *heads])) + r" \\",
+        " & ".join(map(escaped, ["Dataset", *heads])) + r" \\",
         "\\midrule",
         *lines,
         *(["\\midrule"] if lines else []),
@@ -144,17 +146,7 @@ def _latex_row(tables: Iterable[Mapping[str, Any]], key: str) -> str:
     entries = [row[name] for row in rows for name in ("win", "tie", "lose")]
     above = ["--" if entry["mean"] is None else f"{100 * entry['mean']:.2f}\\%" for entry in entries]
     below = ["" if entry["low"] is None else f"\\scriptsize {_ends(entry, join='--')}" for entry in entries]
-    return " & ".join([_escaped(rows[0]["title"]), *above]) + " \\\\\n" + " & ".join(["", *below]) + r" \\"
-
-
-_SPECIAL: Final = str.maketrans(
-    {letter: f"\\{letter}" for letter in "&%$#_{}"}
-    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\^{}"}
-)
-
-
-def _escaped(text: str) -> str:
-    return text.translate(_SPECIAL)
+    return " & ".join([escaped(rows[0]["title"]), *above]) + " \\\\\n" + " & ".join(["", *below]) + r" \\"
 
 
 # --- CSV
