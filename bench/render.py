@@ -18,8 +18,8 @@ import torch
 from judge import DOME, STREET, TINTED
 from torch.nn.functional import avg_pool2d
 
-from brewster.dataset.build import Job, build
-from brewster.dataset.workers import Here
+from brewster.dataset.build.job import Job, build
+from brewster.dataset.build.workers import Here
 from brewster.render.pane import render
 from brewster.render.sample import LAYERS, Sample
 from brewster.render.tracer import trace

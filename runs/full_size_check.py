@@ -18,10 +18,10 @@ import torch
 from torch import nn
 
 from brewster.errors import DeviceError
+from brewster.models.large.adapter.lora import add_lora
+from brewster.models.large.adapter.prompt import PromptEmbedding
 from brewster.models.large.backbones import build, find_family
-from brewster.models.large.lora import add_lora
 from brewster.models.large.panels import Layout, condition
-from brewster.models.large.prompt import PromptEmbedding
 from brewster.models.large.sampling import GUIDANCE, STEPS, sample
 from brewster.models.large.stock import library
 
@@ -120,7 +120,7 @@ def random_words(backbone, count):
 
 
 def learn(backbone, prompt, photo, rank, row):
-    """The steps of train/lora_learner.py, without its files: encode once, then flow matching on the LoRA alone."""
+    """The steps of train/large/learner.py, without its files: encode once, then flow matching on the LoRA alone."""
     parameters = add_lora(backbone, rank=rank, alpha=rank)
     backbone.transformer.enable_gradient_checkpointing()
     optimizer = torch.optim.AdamW(parameters, lr=1e-4)
@@ -207,7 +207,7 @@ def cap():
 
 def estimate(name, quantise):
     """The numbers of `brewster train --plan` for the recipe of this name, on the paper's card."""
-    from brewster.train.plan import CARDS, plan_for  # noqa: PLC0415  (the trainer may lack its libraries)
+    from brewster.train.large.plan import CARDS, plan_for  # noqa: PLC0415  (the trainer may lack its libraries)
     from brewster.train.recipe import read_recipe  # noqa: PLC0415
 
     card = CARDS["RTX 4090"]

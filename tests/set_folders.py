@@ -2,8 +2,8 @@
 
 import hashlib
 
-from brewster.dataset.build import Job, build
-from brewster.dataset.workers import Here
+from brewster.dataset.build.job import Job, build
+from brewster.dataset.build.workers import Here
 from brewster.scene.recipe import read_scene_recipe
 from brewster.worlds.catalog import BUILTIN_CATALOG
 

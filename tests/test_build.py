@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from pyarrow import parquet
 
-from brewster.dataset import build as building
 from brewster.dataset import sets
-from brewster.dataset.workers import Here
+from brewster.dataset.build import job as building
+from brewster.dataset.build.workers import Here
 from brewster.errors import DeviceError, TargetError
 from set_folders import hashes, job, make, names, statuses
 

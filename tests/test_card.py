@@ -10,13 +10,13 @@ from huggingface_hub import ModelCard
 from PIL import Image
 
 from brewster.errors import ModelError
+from brewster.models.large.adapter.lora import add_lora, lora_parameters, save_lora
+from brewster.models.large.adapter.prompt import PROMPT, PromptEmbedding
 from brewster.models.large.backbones import BACKBONES, tiny
-from brewster.models.large.lora import add_lora, lora_parameters, save_lora
 from brewster.models.large.panels import Layout, condition, split
-from brewster.models.large.prompt import PROMPT, PromptEmbedding
 from brewster.models.large.sampling import sample
 from brewster.models.large.task import Task
-from brewster.train.card import card_text, with_measured, write_card
+from brewster.train.large.card import card_text, with_measured, write_card
 from brewster.train.recipe import LargeRecipe, read_recipe
 from set_folders import make
 

@@ -15,7 +15,8 @@ from pyarrow import parquet
 
 from brewster import Photo
 from brewster.cli import main
-from brewster.dataset import sets, workers
+from brewster.dataset import sets
+from brewster.dataset.build import workers
 from brewster.worlds import assets
 from front_door import as_user, errors, lines
 from set_folders import hashes
@@ -23,7 +24,7 @@ from set_folders import hashes
 FAKED = """
 import sys
 from brewster.cli import main
-from brewster.dataset import workers
+from brewster.dataset.build import workers
 workers.RENDERERS["pane"] = "fake_renderer:{}"
 sys.exit(main(sys.argv[1:]))
 """

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from brewster.dataset import cluster
+from brewster.dataset.build import cluster
 from brewster.errors import DeviceError, MissingExtra
 from set_folders import hashes, job, make, statuses
 
@@ -18,7 +18,7 @@ TESTS = Path(__file__).parent
 LOCAL = """
 import sys
 from pathlib import Path
-from brewster.dataset.cluster import Cluster
+from brewster.dataset.build.cluster import Cluster
 from set_folders import make
 results = make(Path(sys.argv[1]), count=9, crew=lambda job: Cluster(job, "local", 2), renderer=sys.argv[2])
 print([(result.index, result.status) for result in sorted(results, key=lambda result: result.index)])
@@ -29,8 +29,8 @@ import os, sys
 os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
 from pathlib import Path
 from ray.cluster_utils import Cluster as Nodes
-from brewster.dataset.build import build
-from brewster.dataset.cluster import Cluster
+from brewster.dataset.build.job import build
+from brewster.dataset.build.cluster import Cluster
 from set_folders import job
 nodes = Nodes(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
 doomed = nodes.add_node(num_cpus=1)
@@ -69,7 +69,7 @@ def test_without_ray_the_line_that_installs_it_is_named(tmp_path, monkeypatch):
 
 
 def test_making_a_crew_wakes_no_ray(tmp_path):
-    code = "import sys, brewster.dataset.cluster; assert 'ray' not in sys.modules"
+    code = "import sys, brewster.dataset.build.cluster; assert 'ray' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
     assert not cluster.Cluster(job(tmp_path)).is_busy()
 

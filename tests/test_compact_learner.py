@@ -6,7 +6,7 @@ import torch
 
 from brewster.errors import ModelError
 from brewster.train.checkpoint import Checkpoint
-from brewster.train.compact_learner import CompactLearner, train, validate
+from brewster.train.compact.learner import CompactLearner, train, validate
 from brewster.train.data import open_stream
 from brewster.train.recipe import with_value
 

@@ -12,7 +12,7 @@ from brewster.errors import PhotoError, RecipeError
 from brewster.models.large.backbones import tiny
 from brewster.models.large.panels import Layout, fit_panel, split
 from brewster.photo import Photo
-from brewster.train.latents import Latents, cropped, open_samples, panel_for, panels_in, with_difference
+from brewster.train.large.latents import Latents, cropped, open_samples, panel_for, panels_in, with_difference
 from brewster.train.recipe import LargeRecipe
 from set_folders import make
 

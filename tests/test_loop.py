@@ -10,7 +10,7 @@ from brewster.dataset.sources import read_photos
 from brewster.errors import ModelError, RecipeError
 from brewster.photo import Photo
 from brewster.train.checkpoint import Checkpoint
-from brewster.train.compact_learner import CompactLearner, train
+from brewster.train.compact.learner import CompactLearner, train
 from brewster.train.loop import run
 from brewster.train.recipe import with_value
 from front_door import picture

@@ -7,8 +7,7 @@ import torch
 from torch import nn
 
 from brewster.errors import ModelError
-from brewster.models.large.backbones import BACKBONES, tiny
-from brewster.models.large.lora import (
+from brewster.models.large.adapter.lora import (
     LORA_FILE,
     LoraCard,
     add_lora,
@@ -21,9 +20,10 @@ from brewster.models.large.lora import (
     remove_lora,
     save_lora,
 )
+from brewster.models.large.adapter.tensors import read_tensors, write_tensors
+from brewster.models.large.backbones import BACKBONES, tiny
 from brewster.models.large.panels import Layout
 from brewster.models.large.task import Task
-from brewster.models.large.tensors import read_tensors, write_tensors
 
 
 @pytest.fixture(params=list(BACKBONES))

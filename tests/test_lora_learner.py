@@ -11,20 +11,20 @@ import pytest
 import tomli_w
 import torch
 
-import brewster.train.lora_learner as module
+import brewster.train.large.learner as module
 from brewster.dataset.mix import Dice
 from brewster.errors import ModelError, RecipeError
+from brewster.models.large.adapter.lora import LORA_FILE, load_lora, lora_state
+from brewster.models.large.adapter.tensors import read_tensors
 from brewster.models.large.backbones import tiny
-from brewster.models.large.lora import LORA_FILE, load_lora, lora_state
 from brewster.models.large.panels import condition, split
 from brewster.models.large.sampling import GUIDANCE, STEPS, sample
-from brewster.models.large.tensors import read_tensors
 from brewster.photo import Photo
 from brewster.train import crew
 from brewster.train.checkpoint import Checkpoint
+from brewster.train.large.learner import LoraLearner
 from brewster.train.learners import open_learner
 from brewster.train.loop import run
-from brewster.train.lora_learner import LoraLearner
 from brewster.train.recipe import LargeRecipe
 from set_folders import make
 

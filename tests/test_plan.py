@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from brewster.errors import DeviceError, ModelError
-from brewster.train.plan import CARDS, Card, find_card, plan_for
+from brewster.train.large.plan import CARDS, Card, find_card, plan_for
 from brewster.train.recipe import read_recipe, with_value
 
 RECIPES = Path(__file__).parents[1] / "recipes" / "train"

@@ -15,9 +15,9 @@ from urllib.parse import urlsplit
 import pytest
 
 from brewster.cli import cli
-from brewster.dataset import polyhaven
-from brewster.dataset.polyhaven import Order, maps_folder, pull
 from brewster.errors import DownloadError, TargetError
+from brewster.worlds import polyhaven
+from brewster.worlds.polyhaven import Order, maps_folder, pull
 from file_server import loopback_only
 from front_door import errors, lines, tree
 
@@ -464,5 +464,5 @@ def test_a_server_that_fails_is_one_sentence(command, haven):
 
 
 def test_fetching_wakes_no_torch():
-    code = "import brewster.dataset.polyhaven, sys; assert not {'torch', 'numpy', 'click'} & set(sys.modules)"
+    code = "import brewster.worlds.polyhaven, sys; assert not {'torch', 'numpy', 'click'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

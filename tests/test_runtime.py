@@ -8,7 +8,7 @@ from brewster.errors import DeviceError, ModelError
 from brewster.models.compact import LinearSeparator, with_imagenet_features
 from brewster.separate import runtime
 from brewster.separate.runtime import OnnxBackend, available_devices
-from brewster.train.export import export_onnx
+from brewster.train.compact.export import export_onnx
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,8 @@ import torch
 from pyarrow import parquet
 
 from brewster import Photo
-from brewster.dataset import overview, sets
+from brewster.dataset import sets
+from brewster.dataset.build import overview
 from brewster.errors import RecipeError, TargetError
 from brewster.photo import read_layers
 from brewster.render.sample import LAYERS

@@ -67,7 +67,8 @@ def test_the_room_wakes_no_stock_library_until_a_model_is_built_and_then_keeps_i
     code = f"""
 import sys
 from pathlib import Path
-from brewster.models.large import lora, sampling
+from brewster.models.large import sampling
+from brewster.models.large.adapter import lora
 from brewster.models.large.backbones import load_backbone, tiny
 assert not {{'diffusers', 'transformers', 'peft', 'safetensors', 'huggingface_hub'}} & set(sys.modules)
 tiny('kontext')[0].save(Path({str(tmp_path)!r}))

@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from brewster.dataset import sets, workers
-from brewster.dataset.workers import Here, Workers, render_again
+from brewster.dataset import sets
+from brewster.dataset.build import workers
+from brewster.dataset.build.workers import Here, Workers, render_again
 from brewster.errors import DeviceError, RecipeError, TargetError
 from set_folders import hashes, job, make, names, statuses
 
@@ -27,7 +28,7 @@ def in_a_process(out, count, renderer="slow"):
     """A run with a worker, in a process that can be killed."""
     code = f"""
 from pathlib import Path
-from brewster.dataset.workers import Workers
+from brewster.dataset.build.workers import Workers
 from set_folders import make
 make(Path({str(out)!r}), {count}, renderer={renderer!r}, crew=lambda job: Workers(job, 1))
 """

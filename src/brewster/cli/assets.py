@@ -15,7 +15,7 @@ import click
 from brewster.cli.terminal import complain, one_line, progress, say, write_out
 
 if TYPE_CHECKING:
-    from brewster.dataset.polyhaven import Order, Result
+    from brewster.worlds.polyhaven import Order, Result
 
 _COUNT = click.IntRange(min=0)
 
@@ -79,7 +79,7 @@ def pull(
     Maps that are there already are skipped, and a download that was stopped goes on where it was. A map that fails
     does not stop the others: it is named at the end, and the exit code is 1.
     """
-    from brewster.dataset.polyhaven import Order, maps_folder  # noqa: PLC0415  (wakes urllib)
+    from brewster.worlds.polyhaven import Order, maps_folder  # noqa: PLC0415  (wakes urllib)
 
     order = Order(**asked)
     results = _fetch(order, out or maps_folder(), as_json=as_json, quiet=quiet)
@@ -91,7 +91,7 @@ def pull(
 
 def _fetch(order: Order, folder: Path, *, as_json: bool, quiet: bool) -> list[Result]:
     """Fetches the maps and tells of each; those that failed are named at the end, whatever the end is."""
-    from brewster.dataset.polyhaven import pull as fetch  # noqa: PLC0415
+    from brewster.worlds.polyhaven import pull as fetch  # noqa: PLC0415
 
     results: list[Result] = []
     talks_over_bar = as_json and sys.stdout.isatty()

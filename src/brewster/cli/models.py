@@ -94,7 +94,7 @@ def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: boo
     from brewster.cli.doctor import require_extra  # noqa: PLC0415  (which imports this module)
 
     require_extra("large", "pushing")
-    from brewster.models.large import hub  # noqa: PLC0415  (wakes torch)
+    from brewster.models.large.adapter import hub  # noqa: PLC0415  (wakes torch)
 
     plan = hub.plan_push(folder, repo_id, message=message, public=public)
     for remark in plan.remarks:
@@ -134,7 +134,7 @@ def _put_scores(folder: Path, scores: Path) -> None:
 
     require_extra("train", "writing a card")
     from brewster.evaluate.report.tables import overview  # noqa: PLC0415  (wakes torch)
-    from brewster.train.card import with_measured  # noqa: PLC0415
+    from brewster.train.large.card import with_measured  # noqa: PLC0415
 
     try:
         results = json.loads(scores.read_text("utf-8"))

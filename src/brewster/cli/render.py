@@ -17,7 +17,7 @@ from brewster.cli.doctor import require_extra
 from brewster.cli.terminal import complain, interrupts, progress, say, write_out
 
 if TYPE_CHECKING:
-    from brewster.dataset.build import Crew, Job, Result
+    from brewster.dataset.build.job import Crew, Job, Result
     from brewster.scene.recipe import SceneRecipe
 
 _OF_THE_TRACER: Final = frozenset({"mitsuba", "mitsuba-oidn"})
@@ -173,7 +173,7 @@ class _Order:
 
     def render_again(self, scene: Path) -> None:
         """Renders one scene."""
-        from brewster.dataset.workers import render_again  # noqa: PLC0415
+        from brewster.dataset.build.workers import render_again  # noqa: PLC0415
 
         render_again(scene, self.out, (*self.maps, *self.photos), self.renderer)
         if not self.quiet:
@@ -181,8 +181,8 @@ class _Order:
 
     def render_set(self) -> bool:
         """Renders a set and tells; whether all went well."""
-        from brewster.dataset.build import build  # noqa: PLC0415
-        from brewster.dataset.overview import write_preview  # noqa: PLC0415
+        from brewster.dataset.build.job import build  # noqa: PLC0415
+        from brewster.dataset.build.overview import write_preview  # noqa: PLC0415
 
         job, told = self._job(), _Told(self.as_json, self.quiet)
         over_bar = self.as_json and sys.stdout.isatty()
@@ -201,7 +201,7 @@ class _Order:
         return not told.counts["failed"]
 
     def _job(self) -> Job:
-        from brewster.dataset.build import Job  # noqa: PLC0415
+        from brewster.dataset.build.job import Job  # noqa: PLC0415
         from brewster.worlds.catalog import read_catalog  # noqa: PLC0415
 
         recipe = self._recipe()
@@ -223,10 +223,10 @@ class _Order:
         return recipe.model_copy(update={"orders": self.orders}) if self.orders else recipe
 
     def _crew(self, job: Job) -> Crew:
-        from brewster.dataset.workers import Here, Workers  # noqa: PLC0415
+        from brewster.dataset.build.workers import Here, Workers  # noqa: PLC0415
 
         if self.cluster:
-            from brewster.dataset.cluster import Cluster  # noqa: PLC0415
+            from brewster.dataset.build.cluster import Cluster  # noqa: PLC0415
 
             return Cluster(job, self.cluster, self.workers)
         workers = min(_MOST_WORKERS, os.cpu_count() or 1) if self.workers is None else self.workers

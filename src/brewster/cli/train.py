@@ -74,7 +74,7 @@ def train(*, recipe: Path, out: Path | None, plan: bool, card: str | None, quiet
 
 
 def _print_plan(recipe: CompactRecipe | LargeRecipe, card: str | None) -> None:
-    from brewster.train.plan import find_card, is_here, plan_for  # noqa: PLC0415
+    from brewster.train.large.plan import find_card, is_here, plan_for  # noqa: PLC0415
     from brewster.train.recipe import LargeRecipe  # noqa: PLC0415
 
     if not isinstance(recipe, LargeRecipe):

@@ -17,13 +17,13 @@ def open_learner(recipe: CompactRecipe | LargeRecipe) -> Learner:
     """
     crew.assemble()
     if isinstance(recipe, LargeRecipe):
-        from brewster.train.lora_learner import LoraLearner  # noqa: PLC0415  (one network is enough to wake)
+        from brewster.train.large.learner import LoraLearner  # noqa: PLC0415  (one network is enough to wake)
 
         return LoraLearner(recipe)
     if crew.size() > 1:
         raise RecipeError(
             f"{crew.size()} processes are to train the compact network", "one", "start it without torchrun"
         )
-    from brewster.train.compact_learner import CompactLearner  # noqa: PLC0415
+    from brewster.train.compact.learner import CompactLearner  # noqa: PLC0415
 
     return CompactLearner(recipe)

@@ -1,4 +1,4 @@
-"""Renders a set: what there is to do, in which order, and when it may begin; workers.py and cluster.py do it.
+"""Renders a set: what there is to do, in which order, and when it may begin; `workers` and `cluster` do it.
 
     job = Job(Path("out/window"), read_scene_recipe("window"), read_catalog([], [])[0], seed=7)
     build(job, range(1000), Workers(job, 8))
@@ -23,7 +23,7 @@ import tomli_w
 
 import brewster
 from brewster.dataset import sets
-from brewster.dataset.overview import write_index
+from brewster.dataset.build.overview import write_index
 from brewster.errors import DeviceError, MissingExtra, TargetError
 from brewster.files import write_atomically
 from brewster.scene.recipe import SceneRecipe

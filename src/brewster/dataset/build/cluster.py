@@ -11,8 +11,8 @@ import socket
 from types import ModuleType, TracebackType
 from typing import Any, Final, Self, final
 
-from brewster.dataset.build import Job, Result, Task
-from brewster.dataset.workers import TRIES, Hand, one_thread
+from brewster.dataset.build.job import Job, Result, Task
+from brewster.dataset.build.workers import TRIES, Hand, one_thread
 from brewster.errors import DeviceError, MissingExtra
 
 LOCAL: Final = "local"

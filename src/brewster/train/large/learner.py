@@ -23,18 +23,18 @@ from torch.nn import functional
 from brewster.dataset.mix import Dice
 from brewster.errors import RecipeError
 from brewster.files import write_atomically
+from brewster.models.large.adapter.lora import add_lora, load_lora_state, lora_state, save_lora
+from brewster.models.large.adapter.prompt import PROMPTS, PromptEmbedding, load_prompt
 from brewster.models.large.backbones import encode_prompt, load_backbone
 from brewster.models.large.decompose import Decomposer
-from brewster.models.large.family import Backbone
-from brewster.models.large.lora import add_lora, load_lora_state, lora_state, save_lora
+from brewster.models.large.families.family import Backbone
 from brewster.models.large.panels import Fit, split
-from brewster.models.large.prompt import PROMPTS, PromptEmbedding, load_prompt
 from brewster.models.large.sampling import STEPS
 from brewster.models.large.stock import within_memory
 from brewster.train import crew
-from brewster.train.card import write_card
 from brewster.train.data import validation_pairs
-from brewster.train.latents import (
+from brewster.train.large.card import write_card
+from brewster.train.large.latents import (
     Encoded,
     Latents,
     Samples,

@@ -28,7 +28,7 @@ from brewster.dataset.sources import read_pairs
 from brewster.errors import RecipeError
 from brewster.light import to_encoded, to_linear
 from brewster.models.large.decompose import start
-from brewster.models.large.family import Backbone
+from brewster.models.large.families.family import Backbone
 from brewster.models.large.panels import Fit, compose, condition, fit_panel
 from brewster.photo import Photo
 from brewster.train.data import found

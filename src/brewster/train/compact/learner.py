@@ -19,9 +19,9 @@ from torch.nn import functional
 from brewster.dataset.mix import Batch, Stream
 from brewster.models.compact import STRIDE, CompactNetwork, with_imagenet_features
 from brewster.train.checkpoint import Checkpoint, fitting
+from brewster.train.compact.export import export_onnx
 from brewster.train.crew import best_device
 from brewster.train.data import open_stream, validation_pairs
-from brewster.train.export import export_onnx
 from brewster.train.loop import Report, run
 from brewster.train.losses import finite, gain_db, separation_loss
 from brewster.train.recipe import CompactRecipe

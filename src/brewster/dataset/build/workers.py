@@ -24,7 +24,7 @@ from typing import Final, Self, final
 import torch
 
 from brewster.dataset import sets
-from brewster.dataset.build import Job, Result, Task
+from brewster.dataset.build.job import Job, Result, Task
 from brewster.errors import BrewsterError, RecipeError, TargetError
 from brewster.render.sample import Sample
 from brewster.scene.sampler import draw
