@@ -1,10 +1,10 @@
 """A Hugging Face hub on this machine: makes repositories, takes commits, or refuses."""
 
 import base64
-import contextlib
 import json
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from threading import Thread
+from http.server import BaseHTTPRequestHandler
+
+from file_server import on_loopback
 
 
 class Hub:
@@ -54,7 +54,7 @@ class Hub:
 
 class _Answers(BaseHTTPRequestHandler):
     def do_GET(self):
-        hub, length = self.server.hub, int(self.headers["Content-Length"] or 0)
+        hub, length = self.server.content, int(self.headers["Content-Length"] or 0)
         body, path = self.rfile.read(length), self.path.partition("?")[0]
         hub.asked.append(path)
         known = self.headers["Authorization"] == f"Bearer {hub.token}"
@@ -72,13 +72,6 @@ class _Answers(BaseHTTPRequestHandler):
         pass
 
 
-@contextlib.contextmanager
 def served():
     """A hub, until it is left."""
-    with ThreadingHTTPServer(("127.0.0.1", 0), _Answers) as server:
-        server.hub = Hub(f"http://127.0.0.1:{server.server_port}")
-        thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        yield server.hub
-        server.shutdown()
-        thread.join()
+    return on_loopback(_Answers, Hub)

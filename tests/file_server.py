@@ -8,7 +8,7 @@ from threading import Thread
 
 class _Answers(BaseHTTPRequestHandler):
     def do_GET(self):
-        files = self.server.files
+        files = self.server.content
         files.asked.append((self.path, self.headers["Range"]))
         body, fault = files.bodies.get(self.path), files.faults.pop(0) if files.faults else None
         if body is None or isinstance(fault, int):
@@ -47,15 +47,20 @@ def loopback_only(monkeypatch):
 
 
 @contextlib.contextmanager
-def served():
-    """A server, until it is left."""
-    with ThreadingHTTPServer(("127.0.0.1", 0), _Answers) as server:
-        server.files = Files(f"http://127.0.0.1:{server.server_port}")
+def on_loopback(answers, content):
+    """A server whose handler finds `content(its address)`, which is given, until it is left."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), answers) as server:
+        server.content = content(f"http://127.0.0.1:{server.server_port}")
         thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
-        yield server.files
+        yield server.content
         server.shutdown()
         thread.join()
+
+
+def served():
+    """A server of files, until it is left."""
+    return on_loopback(_Answers, Files)
 
 
 def unheard():

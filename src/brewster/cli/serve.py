@@ -6,7 +6,8 @@ import contextlib
 import re
 import secrets
 import webbrowser
-from typing import Final, get_args
+from collections.abc import Callable
+from typing import Any, Final, get_args
 
 import click
 
@@ -15,7 +16,7 @@ from brewster.cli.terminal import say
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.options import Device
 
-_AUTO: Final = "auto"
+AUTO: Final = "auto"
 _MAX_BYTES: Final = 100_000_000
 _TOKEN: Final = re.compile(r"[A-Za-z0-9_-]{16,200}")
 _WARNING: Final = (
@@ -24,30 +25,53 @@ _WARNING: Final = (
 )
 
 
-def read_token(_context: click.Context, _parameter: click.Parameter, token: str | None) -> str | None:
+def at_an_address(port: int, token_help: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """The options that every server has: --host, --port and --token."""
+
+    def decorated(command: Callable[..., Any]) -> Callable[..., Any]:
+        for option in (
+            click.option("--token", callback=_read_token, metavar="TOKEN|auto", help=token_help),
+            click.option(
+                "--port",
+                type=click.IntRange(0, 65535),
+                default=port,
+                show_default=True,
+                metavar="NUMBER",
+                help="The port; 0 takes a free one.",
+            ),
+            click.option(
+                "--host",
+                default="127.0.0.1",
+                show_default=True,
+                metavar="ADDRESS",
+                help="The address to bind to.",
+            ),
+        ):
+            command = option(command)
+        return command
+
+    return decorated
+
+
+def invite(url: str, token: str | None) -> str:
+    """Says on standard output where the server is, with the token; the link."""
+    link = f"{url}?token={token}" if token else url
+    click.echo(link)
+    say("Ctrl-C stops the server")
+    return link
+
+
+def _read_token(_context: click.Context, _parameter: click.Parameter, token: str | None) -> str | None:
     """A token as it can stand in a link and a cookie, too long to be guessed."""
-    if token not in (None, _AUTO) and not _TOKEN.fullmatch(token):
+    if token not in (None, AUTO) and not _TOKEN.fullmatch(token):
         raise click.BadParameter("a token has 16 letters or more, of A-Z a-z 0-9 _ and -; auto makes one.")
     return token
 
 
 @click.command
-@click.option(
-    "--host", default="127.0.0.1", show_default=True, metavar="ADDRESS", help="The address to bind to."
-)
-@click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=8417,
-    show_default=True,
-    metavar="NUMBER",
-    help="The port; 0 takes a free one.",
-)
-@click.option(
-    "--token",
-    callback=read_token,
-    metavar="TOKEN|auto",
-    help="Let in only who brings this token; auto makes one. Needed, and so made, for every address but this machine's own.",
+@at_an_address(
+    8417,
+    "Let in only who brings this token; auto makes one. Needed, and so made, for every address but this machine's own.",
 )
 @click.option(
     "--model",
@@ -122,20 +146,18 @@ def serve(
 
     if not is_loopback(host):
         say(_WARNING.format(host=host))
-        token = token or _AUTO
-    token = secrets.token_urlsafe(16) if token == _AUTO else token
+        token = token or AUTO
+    token = secrets.token_urlsafe(16) if token == AUTO else token
     shelf = Shelf(models, device=device)
     shelf.separator(shelf.names[0])  # what is wrong with the model is said now
     router = separation(shelf, Desk(queue=queue, seconds=timeout), max_pixels=max_pixels)
     app = web.application(router, guard=Guard.at(host, token=token, max_bytes=max_bytes))
+
+    def tell(url: str) -> None:
+        link = invite(url, token)
+        if opens:
+            webbrowser.open(link)
+
     with contextlib.suppress(KeyboardInterrupt):  # the usual end
-        web.serve(app, host=host, port=port, tell=lambda url: _invite(url, token, opens=opens))
+        web.serve(app, host=host, port=port, tell=tell)
     say("stopped")
-
-
-def _invite(url: str, token: str | None, *, opens: bool) -> None:
-    link = f"{url}?token={token}" if token else url
-    click.echo(link)
-    say("Ctrl-C stops the server")
-    if opens:
-        webbrowser.open(link)

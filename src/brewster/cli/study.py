@@ -14,11 +14,10 @@ import click
 
 from brewster.cli.doctor import require_extra
 from brewster.cli.evaluate import Named
-from brewster.cli.serve import read_token
+from brewster.cli.serve import AUTO, at_an_address, invite
 from brewster.cli.terminal import progress, say, write_out
 from brewster.errors import BrewsterError
 
-_AUTO: Final = "auto"
 _NAME: Final = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)*", re.IGNORECASE)
 _MAX_BYTES: Final = 10_000  # an answer has eighty
 _FOLDER: Final = click.Path(path_type=Path, file_okay=False)
@@ -148,10 +147,7 @@ def _read_names(_context: click.Context, _parameter: click.Parameter, names: tup
 
 @study.command
 @click.argument("folder", metavar="STUDY", type=_FOLDER)
-@click.option(
-    "--host", default="127.0.0.1", show_default=True, metavar="ADDRESS", help="The address to bind to."
-)
-@click.option("--port", type=click.IntRange(0, 65535), default=8420, show_default=True, metavar="NUMBER", help="The port; 0 takes a free one.")  # fmt: skip
+@at_an_address(8420, "Let in only who brings this token; auto makes one and keeps it in STUDY/token.")
 @click.option(
     "--called",
     multiple=True,
@@ -159,7 +155,6 @@ def _read_names(_context: click.Context, _parameter: click.Parameter, names: tup
     metavar="NAME",
     help="Another name that browsers call this server by, such as that of a proxy before it: study.example.org.",
 )
-@click.option("--token", callback=read_token, metavar="TOKEN|auto", help="Let in only who brings this token; auto makes one and keeps it in STUDY/token.")  # fmt: skip
 @click.option(
     "--most", type=click.IntRange(1), metavar="NUMBER", help="Admit no more participants than this."
 )
@@ -182,19 +177,14 @@ def serve(
     made.refuse_changed()
     if not is_loopback(host):
         say(_WARNING.format(host=host))
-    token = kept_token(folder) if token == _AUTO else token
+    token = kept_token(folder) if token == AUTO else token
     guard = Guard.at(host, token=token, max_bytes=_MAX_BYTES)
     guard = replace(guard, hosts=guard.hosts | {*called})
     store = Store(made)
     app = web.application(participants(made, store, most=most, token=token), guard=guard, home="study.html")
     with contextlib.closing(store), contextlib.suppress(KeyboardInterrupt):  # the usual end
-        web.serve(app, host=host, port=port, tell=lambda url: _invite(url, token))
+        web.serve(app, host=host, port=port, tell=lambda url: invite(url, token))
     say("stopped; all answers are kept")
-
-
-def _invite(url: str, token: str | None) -> None:
-    click.echo(f"{url}?token={token}" if token else url)
-    say("Ctrl-C stops the server")
 
 
 @study.command
