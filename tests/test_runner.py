@@ -2,7 +2,11 @@
 
 import json
 import os
+import subprocess
+import sys
+import time
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import final
 
 import numpy as np
@@ -16,6 +20,7 @@ from brewster.errors import BrewsterError, PhotoError, TargetError
 from brewster.evaluate.methods import Answer, Model, Nothing, Predictions
 from brewster.evaluate.protocol import Protocol
 from brewster.evaluate.runner import SCORES, score
+from other_processes import children, is_alive, wait_for
 
 QUICK = Protocol(metrics=("psnr", "ssim"))
 NAMES = ["1", "2", "3"]
@@ -146,6 +151,47 @@ class Deadly:
 
     def kept(self, case):
         return None
+
+
+@final
+@dataclass(frozen=True)
+class Endless:
+    """A method that says that it has begun, and never answers."""
+
+    begun: Path
+    name: str = "endless"
+    alone: bool = False
+
+    def key(self, case):
+        return self.name
+
+    def answer(self, case, photo):
+        (self.begun / case.name).touch()
+        time.sleep(1000)
+
+    def kept(self, case):
+        return None
+
+
+def test_a_run_that_is_killed_takes_its_workers_along(real20, tmp_path):
+    (tmp_path / "begun").mkdir()
+    code = f"""
+from pathlib import Path
+from test_runner import QUICK, Endless, read_benchmark, score
+folder = Path({str(tmp_path)!r})
+if __name__ == "__main__":
+    parts = read_benchmark("real20", folder / "real20")
+    score(parts, [Endless(folder / "begun")], QUICK, folder / "out", workers=2)
+"""
+    (tmp_path / "run.py").write_text(code)
+    with subprocess.Popen(
+        [sys.executable, tmp_path / "run.py"], env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    ) as run:
+        wait_for(lambda: len(list((tmp_path / "begun").iterdir())) == 2, seconds=120)
+        crew = children(run)
+        run.kill()
+    wait_for(lambda: not any(map(is_alive, crew)))
+    assert len(crew) >= 2
 
 
 def test_kept_layers_score_exactly_as_fresh_ones(real20, model, tmp_path):

@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from functools import partial
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from brewster.dataset import sets
 from brewster.dataset.build import workers
 from brewster.dataset.build.workers import Here, Workers, render_again
 from brewster.errors import DeviceError, RecipeError, TargetError
+from other_processes import children, is_alive, wait_for
 from set_folders import hashes, job, make, names, statuses
 
 TESTS = Path(__file__).parent
@@ -33,24 +33,6 @@ from set_folders import make
 make(Path({str(out)!r}), {count}, renderer={renderer!r}, crew=lambda job: Workers(job, 1))
 """
     return subprocess.Popen([sys.executable, "-c", code], cwd=TESTS, stderr=subprocess.PIPE)
-
-
-def wait_for(condition, seconds=30):
-    patience = time.monotonic() + seconds
-    while not condition() and time.monotonic() < patience:
-        time.sleep(0.01)
-    assert condition()
-
-
-def children(process):
-    return Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-
-
-def is_alive(pid):
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().split()[2] != "Z"
-    except OSError:
-        return False
 
 
 def test_two_workers_make_what_one_process_makes_even_if_one_of_them_dies(tmp_path, monkeypatch):

@@ -13,7 +13,6 @@ import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from itertools import groupby
 from multiprocessing import get_context
@@ -27,6 +26,7 @@ from brewster.evaluate.judge import Judge, Truth
 from brewster.evaluate.methods import Answer, Method, refuse_names
 from brewster.evaluate.protocol import Protocol
 from brewster.metrics import Lpips
+from brewster.processes import end_with_parent, one_thread
 
 SCORES: Final = "scores.jsonl"
 
@@ -209,7 +209,7 @@ def _run(
     """
     named = {method.name: method for method in methods}
     if workers == 1:
-        with _one_thread():
+        with one_thread():
             for task in tasks:
                 take(_do(task, named, protocol))
         return
@@ -243,25 +243,13 @@ _process: dict[str, Any] = {}
 
 def _begin(methods: dict[str, Method], protocol: Protocol) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which lets a case be finished
+    end_with_parent()
     _process.update(methods=methods, protocol=protocol)
 
 
 def _do_here(task: _Task) -> list[Row]:
-    with _one_thread():
+    with one_thread():
         return _do(task, _process["methods"], _process["protocol"])
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Torch sums in another order with more threads."""
-    import torch  # noqa: PLC0415  (only here)
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 # --- the log

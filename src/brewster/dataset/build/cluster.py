@@ -12,8 +12,9 @@ from types import ModuleType, TracebackType
 from typing import Any, Final, Self, final
 
 from brewster.dataset.build.job import Job, Result, Task
-from brewster.dataset.build.workers import TRIES, Hand, one_thread
+from brewster.dataset.build.workers import TRIES, Hand
 from brewster.errors import DeviceError, MissingExtra
+from brewster.processes import one_thread
 
 LOCAL: Final = "local"
 _PATIENCE_S: Final = 10.0

@@ -6,26 +6,23 @@ One thread each: torch sums in another order with more, and the bytes of a sampl
 from __future__ import annotations
 
 import importlib
-import os
 import signal
-import threading
 import time
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from multiprocessing import connection, get_context, parent_process, resource_tracker
+from multiprocessing import connection, get_context, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self, final
 
-import torch
-
 from brewster.dataset import sets
 from brewster.dataset.build.job import Job, Result, Task
 from brewster.errors import BrewsterError, RecipeError, TargetError
+from brewster.processes import end_with_parent, one_thread
 from brewster.render.sample import Sample
 from brewster.scene.sampler import draw
 from brewster.scene.scene import Scene, read_scene
@@ -111,17 +108,6 @@ def _renderer_of(path: Path) -> str:
             f"{path} was rendered by {name!r}", f"one of {', '.join(RENDERERS)}", "choose it with --renderer"
         )
     return str(name)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Torch with one thread, so that sums are summed in one order."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 # --- this process
@@ -261,17 +247,8 @@ def _deaf_to_interrupts() -> Iterator[None]:
 
 def _serve(pipe: Connection, job: Job) -> None:
     """A worker's life: tasks until the pipe ends."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    torch.set_num_threads(1)
+    end_with_parent()  # the next run may be at the same sample
     hand = Hand(job)
-    with suppress(EOFError):
+    with one_thread(), suppress(EOFError):
         while True:
             pipe.send(hand(pipe.recv()))
-
-
-def _end_with_parent() -> None:
-    """Nobody works on for a run that was killed: the next run may be at the same sample."""
-    parent = parent_process()
-    if parent:
-        parent.join()
-        os._exit(1)
