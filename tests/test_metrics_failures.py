@@ -102,6 +102,16 @@ def test_clipped_values_do_not_mislead_the_gain(scene):
 
 
 @pytest.mark.parametrize("score", SCORES)
+def test_no_answer_gains_by_darkness_where_the_gain_cannot_be_known(scene, score):
+    """A reflection over the whole picture but for 63 pixels: nothing tells how bright an answer should be."""
+    background, photo, reflection = scene
+    reflection = np.maximum(reflection, 60)
+    reflection.reshape(-1, 3)[:63] = 0
+    with pytest.raises(ValueError, match="63 pixels have R"):
+        score(photo // 2, background, photo, reflection)
+
+
+@pytest.mark.parametrize("score", SCORES)
 def test_a_scene_without_such_pixels_is_refused(score):
     grey = np.full((8, 8, 3), 100, np.uint8)
     with pytest.raises(ValueError, match="0 pixels have R"):

@@ -4,6 +4,8 @@ For rendered samples, whose photo I, background B and reflection R share one exp
 in linear light, with R in the photo's light: I = T + R, and T is B as far as the glass lets it through. Methods differ
 on whether they restore what the glass absorbs, so an answer is first multiplied by the one gain that makes it match B
 where nothing is mirrored: the median of B over answer, among pixels that are neither black nor clipped in either.
+Where B has too few such pixels, no score has a meaning; an answer that is black or clipped in nearly all of them is
+taken as it is.
 
 Each score is a share of light, in 0..1, lower is better.
 """
@@ -53,7 +55,8 @@ def removed_content(answer: Picture, background: Picture, photo: Picture, reflec
     sum max(B - g answer, 0) / sum B, over the pixels with R < 2 % of I; I and B not black everywhere there.
 
     Raises:
-        ValueError: the pictures are not uint8 (H, W, 3) or differ in shape, or there are less than 64 such pixels.
+        ValueError: the pictures are not uint8 (H, W, 3) or differ in shape, or there are less than 64 such pixels, or
+            less than 64 from which the gain could be known.
     """
     case = _Case.of(answer, background, photo, reflection)
     return case.removed(case.calm, f"R < {NEGLIGIBLE:.0%} of I")
@@ -103,8 +106,10 @@ class _Case:
         check_pictures(answer, background, photo, reflection)
         given, behind, whole, mirrored = map(_luminance, (answer, background, photo, reflection))
         calm = mirrored < NEGLIGIBLE * whole
-        told = calm & ~_is_clipped(answer) & ~_is_clipped(background)
-        return cls(given * _gain(given[told], behind[told]), behind, whole, mirrored, calm)
+        told = calm & (behind >= BLACK) & ~_is_clipped(background)
+        _refuse_few(told, f"R < {NEGLIGIBLE:.0%} of I and B neither black nor clipped")
+        comparable = told & (given >= BLACK) & ~_is_clipped(answer)
+        return cls(given * _gain(given[comparable], behind[comparable]), behind, whole, mirrored, calm)
 
     def removed(self, where: Region, condition: str) -> float:
         missing = np.maximum(self.background - self.answer, 0)
@@ -112,14 +117,17 @@ class _Case:
 
 
 def _gain(answer: Light, background: Light) -> float:
-    lit = (answer >= BLACK) & (background >= BLACK)
-    return float(np.median(background[lit] / answer[lit])) if lit.any() else 1.0
+    return float(np.median(background / answer)) if answer.size >= LEAST_PIXELS else 1.0
 
 
 def _share(part: Light, whole: Light, where: Region, condition: str) -> float:
+    _refuse_few(where, condition)
+    return float(part[where].sum() / whole[where].sum())
+
+
+def _refuse_few(where: Region, condition: str) -> None:
     if (count := np.count_nonzero(where)) < LEAST_PIXELS:
         raise ValueError(f"{count} pixels have {condition}; a score needs {LEAST_PIXELS}")
-    return float(part[where].sum() / whole[where].sum())
 
 
 def _luminance(picture: Picture) -> Light:
