@@ -59,6 +59,14 @@ def test_the_page_shows_the_worst_of_the_first_model(real20, methods, tmp_path):
     assert f'data-name="{min(scores, key=scores.get)}"' in page
 
 
+def test_the_page_shows_first_what_the_first_model_failed_on(real20, methods, tmp_path):
+    (tmp_path / "theirs" / "2.png").unlink()
+    evaluate(real20, [Nothing(), methods[2]], QUICK, tmp_path / "out", shown=1)
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert 'data-name="2"' in page
+    assert page.count("<article") == 1
+
+
 def test_without_a_model_the_page_shows_the_worst_photos(real20, tmp_path):
     results = evaluate(real20, [Nothing()], QUICK, tmp_path / "out", shown=1)
     scores = {picture["name"]: picture["scores"]["doing nothing"]["psnr"] for picture in results["pictures"]}

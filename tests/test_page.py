@@ -255,7 +255,7 @@ def test_an_estimate_over_fewer_pictures_says_so_and_may_have_no_interval(page):
     given = results()
     given["tables"]["nature20"]["compact"]["psnr"] = estimate(21.5, count=1)
     text = page(given).text
-    assert "21.50of 1" in text
+    assert "21.501 of 2" in text
     assert "★ best 21.50of 1" not in text
 
 
@@ -291,7 +291,7 @@ def test_many_failures_are_folded_away_behind_their_number(page):
     made = page(given, [shown("0")])
     assert "Failed: compact on 9 of 9 pictures" in made.text
     assert [has for has in made.all("details") if has.get("class") == "note" and "open" not in has]
-    assert "1 of 9 pictures are on this page." in made.text
+    assert "1 of 9 pictures are on this page: of each benchmark those that the first method failed on" in made.text
 
 
 # --- pictures

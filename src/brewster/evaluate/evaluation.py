@@ -20,7 +20,8 @@ from brewster.evaluate.protocol import Protocol
 from brewster.evaluate.report.page import Shown, write_report
 from brewster.evaluate.report.published import read_published
 from brewster.evaluate.report.published import to_markdown as published_to_markdown
-from brewster.evaluate.report.tables import to_csv, to_latex, to_markdown
+from brewster.evaluate.report.table1 import to_latex
+from brewster.evaluate.report.tables import to_csv, to_markdown
 from brewster.evaluate.results import Results, draw, summarise
 from brewster.evaluate.runner import Place, Report, Row, find_answer, score
 from brewster.files import write_atomically
@@ -151,13 +152,15 @@ def _worst(
     rows: Mapping[Place, Row],
     most: int,
 ) -> list[Case]:
-    """So many cases of each benchmark: the worst of the first method that does something, in the first metric."""
+    """So many cases of each benchmark: what the first method that does something failed on, then its worst in the first metric."""
     method = next((method.name for method in methods if method.name != NOTHING), NOTHING)
     column, metric = next(iter(protocol.columns().items()))
 
     def merit(case: Case) -> float:
         row = rows.get((case.benchmark, case.name, method))
-        score = row.scores.get(column) if row else None
+        if row is None:
+            return -math.inf
+        score = row.scores.get(column)
         return math.inf if score is None else score if metric.higher_is_better else -score
 
     chosen = []

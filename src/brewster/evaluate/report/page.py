@@ -18,7 +18,7 @@ from typing import Any, Final
 
 from brewster.evaluate.methods import NOTHING
 from brewster.evaluate.report.figures import BRIGHTEST_ERROR, LONGEST, RAMP, Shown, answer_tiles, photo_tiles
-from brewster.evaluate.report.tables import best_mean, is_complete
+from brewster.evaluate.report.tables import is_complete, ranking
 from brewster.files import arriving
 
 __all__ = ["Shown", "write_report"]
@@ -162,7 +162,7 @@ def _means(results: Results) -> str:
     metrics = _used(results)
     bodies = []
     for name, table in results["tables"].items():
-        best = {metric: best_mean(table, metric, about) for metric, about in metrics.items()}
+        best = {metric: next(iter(ranking(table, metric, about)), None) for metric, about in metrics.items()}
         pictures = results["selections"][name]["pictures"]
         rows = (
             (
@@ -190,7 +190,7 @@ def _mean(estimate: Results | None, about: Results, best: str | None, pictures: 
     mean, wins = _number(estimate["mean"], about), f"{estimate['mean']:.{about['digits']}f}" == best
     is_best = " class=best" if wins else ""
     star = "<span class=star>&starf;<span class=hidden> best </span></span>" if wins else ""
-    some = f"<small>of {estimate['count']}</small>" if estimate["count"] != pictures else ""
+    some = f"<small>{estimate['count']} of {pictures}</small>" if estimate["count"] != pictures else ""
     return f"<td{is_best}>{star}<b>{mean}</b>{_interval(estimate, about)}{some}</td>"
 
 
@@ -276,7 +276,10 @@ def _cases(results: Results, shown: Iterable[Shown], scores: list[Any]) -> Itera
         scores.append(picture["scores"])
         yield _case(results, case, picture)
     if len(scores) < len(known):
-        yield f"<p>{len(scores):,} of {_count(len(known), 'picture')} are on this page.</p>\n"
+        yield (
+            f"<p>{len(scores):,} of {_count(len(known), 'picture')} are on this page: of each benchmark those that the "
+            "first method failed on, then the worst of it by the first metric.</p>\n"
+        )
 
 
 def _case(results: Results, case: Shown, picture: Results) -> str:

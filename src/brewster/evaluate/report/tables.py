@@ -1,4 +1,4 @@
-"""Results as tables: Markdown to read, LaTeX in the layout of the paper's Table 1, CSV to go on with."""
+"""Results as tables: Markdown to read, CSV to go on with."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ import io
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
-from brewster.evaluate.results import AVERAGE, Results
-from brewster.latex import escaped
+from brewster.evaluate.results import Results
 
-_MAIN: Final = ("psnr", "ssim", "lpips")
-_SIR2: Final = ("postcard", "solidobject", "wildscene")
+MAIN: Final = ("psnr", "ssim", "lpips")
+"""The metrics of an overview."""
+
 _ARROWS: Final = {True: "↑", False: "↓"}
+_UNFAIR: Final = "\n\nA mean over fewer pictures than the others is not to be compared with them; differences are over common pictures."
 _MINUS: Final = "\N{MINUS SIGN}"
 
 
@@ -39,7 +40,7 @@ def overview(results: Results) -> str:
 
 def _overview(results: Results) -> str:
     """A row a method, a column a selection, the main metrics in each cell."""
-    metrics = [name for name in _MAIN if name in results["metrics"]]
+    metrics = [name for name in MAIN if name in results["metrics"]]
     if not metrics:
         return ""
     titles = " / ".join(_heading(results, name) for name in metrics)
@@ -48,14 +49,26 @@ def _overview(results: Results) -> str:
         [method, *(_cell(results, key, method, metrics) for key in results["selections"])]
         for method in results["methods"]
     ]
-    return f"{titles}\n\n{_grid(rows)}"
+    return f"{titles}\n\n{_grid(rows)}{_UNFAIR if _some_failed(results, metrics) else ''}"
+
+
+def _some_failed(results: Results, metrics: Iterable[str]) -> bool:
+    """Whether a method has means over fewer pictures than another."""
+    return any(
+        metric in row and not is_complete(table, method, metric)
+        for table in results["tables"].values()
+        for method, row in table.items()
+        for metric in metrics
+    )
 
 
 def _cell(results: Results, key: str, method: str, metrics: Iterable[str]) -> str:
     row, pictures = results["tables"][key][method], results["selections"][key]["pictures"]
     text = " / ".join(_number(results, name, row[name]["mean"]) if name in row else "-" for name in metrics)
     counts = sorted({row[name]["count"] if name in row else 0 for name in metrics})
-    return text if counts == [pictures] else f"{text} ({' to '.join(map(str, counts))} of {pictures})"
+    if counts == [pictures]:
+        return text
+    return f"{text} ({' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} of {pictures})"
 
 
 def _details(results: Results, key: str) -> str:
@@ -148,116 +161,17 @@ def _number(results: Results, metric: str, value: float, *, sign: str = "") -> s
     return f"{value:{sign}.{results['metrics'][metric]['digits']}f}"
 
 
-# --- LaTeX
+def ranking(table: Mapping[str, Any], metric: str, about: Mapping[str, Any]) -> list[str]:
+    """The means as they are printed, the best first, so that what prints alike is marked alike; none twice.
 
-
-def to_latex(results: Results) -> str:
-    """The layout of the paper's Table 1: a row a method, three metrics a set, SIR2 under one head, the best in bold.
-
-    A dagger marks means over fewer pictures than others have. Needs the packages booktabs and multirow.
-    """
-    metrics = [name for name in _MAIN if name in results["metrics"]]
-    keys = _of_the_paper(results)
-    if not metrics or not keys:
-        return "% none of PSNR, SSIM and LPIPS was measured\n"
-    columns = "|".join("c" * len(metrics) for _ in keys)
-    marks = [_latex_heading(results, name) for name in metrics]
-    rows = [
-        " & ".join(
-            [
-                escaped(method),
-                *(cell for key in keys for cell in _latex_cells(results, key, method, metrics)),
-            ]
-        )
-        for method in results["methods"]
-    ]
-    return "\n".join([
-        "% brewster evaluate; needs \\usepackage{booktabs,multirow}",
-        f"\\begin{{tabular}}{{l|{columns}}}",
-        "\\toprule",
-        *_latex_heads(results, keys, len(metrics)),
-        " & ".join(["", *(marks * len(keys))]) + r" \\",
-        "\\midrule",
-        *(f"{row} \\\\" for row in rows),
-        "\\bottomrule",
-        "\\end{tabular}",
-        "",
-    ])  # fmt: skip
-
-
-def _of_the_paper(results: Results) -> list[str]:
-    """The selections that the table has: of a benchmark the paper's draw rather than all, SIR2 together, average last."""
-    keys = [
-        key for key in results["selections"] if f"{key}:paper" not in results["selections"] and key != AVERAGE
-    ]
-    keys.sort(key=lambda key: _SIR2.index(name) if (name := key.partition(":")[0]) in _SIR2 else -1)
-    return [*keys, *([AVERAGE] if AVERAGE in results["selections"] else [])]
-
-
-def _latex_heads(results: Results, keys: list[str], width: int) -> list[str]:
-    """The names of the sets, SIR2's below a common one."""
-    sir2 = [key for key in keys if key.partition(":")[0] in _SIR2]
-
-    def head(key: str, rows: int) -> str:
-        selection = results["selections"][key]
-        text = (
-            f"{escaped(selection['title'].partition(',')[0].removeprefix('SIR2 '))} ({selection['pictures']})"
-        )
-        return _spanning(width, f"\\multirow{{{rows}}}{{*}}{{{text}}}" if rows > 1 else text)
-
-    if len(sir2) < 2:
-        return [" & ".join(["Method", *(head(key, 1) for key in keys)]) + r" \\"]
-    pictures = sum(results["selections"][key]["pictures"] for key in sir2)
-    above, below = ["\\multirow{2}{*}{Method}"], [""]
-    for key in keys:
-        if key == sir2[0]:
-            above.append(_spanning(width * len(sir2), f"SIR$^2$ ({pictures})"))
-        elif key not in sir2:
-            above.append(head(key, 2))
-        below.append(head(key, 1) if key in sir2 else _spanning(width, ""))
-    first = 2 + width * keys.index(sir2[0])
-    return [
-        " & ".join(above) + r" \\",
-        f"\\cmidrule(lr){{{first}-{first + width * len(sir2) - 1}}}",
-        " & ".join(below) + r" \\",
-    ]
-
-
-def _spanning(columns: int, text: str) -> str:
-    return f"\\multicolumn{{{columns}}}{{c}}{{{text}}}"
-
-
-def _latex_heading(results: Results, metric: str) -> str:
-    entry = results["metrics"][metric]
-    arrow = "uparrow" if entry["higher_is_better"] else "downarrow"
-    return f"{entry['title']}$\\{arrow}$"
-
-
-def _latex_cells(results: Results, key: str, method: str, metrics: Iterable[str]) -> list[str]:
-    """Means, the best in bold; a dagger where a method is judged on fewer pictures than others."""
-    table, cells = results["tables"][key], []
-    for metric in metrics:
-        if metric not in table[method]:
-            cells.append("--")
-            continue
-        text = _number(results, metric, table[method][metric]["mean"])
-        if not is_complete(table, method, metric):
-            cells.append(f"{text}$^\\dagger$")
-        else:
-            is_best = text == best_mean(table, metric, results["metrics"][metric])
-            cells.append(f"\\textbf{{{text}}}" if is_best else text)
-    return cells
-
-
-def best_mean(table: Mapping[str, Any], metric: str, about: Mapping[str, Any]) -> str | None:
-    """The best mean as it is printed, so that what prints alike is marked alike; None where nothing is compared.
-
-    A method that was judged on fewer pictures than others, since it failed on some, is not in the running.
+    A method that was judged on fewer pictures than others, since it failed on some, is not in the running, and a
+    method alone wins nothing.
     """
     means = [row[metric]["mean"] for method, row in table.items() if is_complete(table, method, metric)]
     if len(means) < 2:
-        return None
-    return f"{(max if about['higher_is_better'] else min)(means):.{about['digits']}f}"
+        return []
+    means.sort(reverse=about["higher_is_better"])
+    return list(dict.fromkeys(f"{mean:.{about['digits']}f}" for mean in means))
 
 
 def is_complete(table: Mapping[str, Any], method: str, metric: str) -> bool:
