@@ -5,6 +5,7 @@ import json
 import pytest
 
 from benchmark_folders import paint
+from brewster import Photo
 from brewster.dataset.benchmarks import Benchmark, read_benchmark
 from brewster.errors import BrewsterError, PhotoError
 from brewster.evaluate.evaluation import evaluate
@@ -86,7 +87,23 @@ def test_the_page_never_shows_another_models_answer(real20, methods, tmp_path):
 def test_pictures_without_a_case_are_said_aloud(real20, methods, tmp_path):
     paint(tmp_path / "theirs" / "other.png", 3)
     results = evaluate(real20, methods, QUICK, tmp_path / "out")
-    assert results["methods"]["theirs"]["remark"].startswith("1 pictures")
+    assert results["methods"]["theirs"]["remark"] == "no case is answered by 1 picture of its folder"
+
+
+def test_a_folder_of_truths_is_said_to_be_one(real20, tmp_path):
+    results = evaluate(real20, [Nothing(), Predictions("self", tmp_path / "real20")], QUICK, tmp_path / "out")
+    assert "the truth itself on 2 pictures of 2" in results["methods"]["self"]["remark"]
+    assert "remark" not in results["methods"]["doing nothing"]
+
+
+def test_reduced_photos_are_left_for_those_who_answer_elsewhere(real20, tmp_path):
+    small = Protocol(metrics=("psnr",), size=8)
+    evaluate(real20, [Nothing()], small, tmp_path / "out")
+    inputs = tmp_path / "out" / "inputs"
+    results = evaluate(real20, [Nothing(), Predictions("copied", inputs)], small, tmp_path / "out")
+    table = results["tables"]["real20"]
+    assert table["copied"] == table["doing nothing"]
+    assert Photo.open(inputs / "real20" / "1.png").size == (12, 8)
 
 
 def test_benchmarks_that_share_a_name_or_hold_no_pair_are_refused(real20, methods, tmp_path):

@@ -5,12 +5,14 @@ import unicodedata
 
 import numpy as np
 import pytest
+import pyvips
 
 from benchmark_folders import picture, repacked, write
 from brewster import Photo
 from brewster.dataset.benchmarks import read_benchmark
 from brewster.errors import BrewsterError, PhotoError
 from brewster.evaluate.methods import Model, Nothing, Predictions, refuse_names
+from brewster.photo import Origin
 
 
 @pytest.fixture
@@ -122,6 +124,14 @@ def test_a_model_answers_as_the_separator_does_and_keeps_its_answer(case, model,
     assert Predictions("again", tmp_path / "kept").files(case).keys() == {"transmission", "reflection"}
 
 
+def test_what_is_kept_of_a_deep_wide_photo_is_what_is_scored(case, model, tmp_path):
+    pixels = np.random.default_rng(1).integers(0, 1 << 16, (6, 8, 3), np.uint16)
+    photo = Photo(pixels, None, Origin(bits=16, icc=bytes(pyvips.Image.profile_load("p3"))))
+    ours = Model("pane", str(model), tmp_path / "kept")
+    answer, kept = ours.answer(case, photo), ours.kept(case)
+    assert np.array_equal(kept.transmission.srgb_8bit(), answer.transmission.srgb_8bit())
+
+
 def test_a_key_changes_with_all_that_the_answer_depends_on(case, model, tmp_path):
     draft = Model("pane", str(model), tmp_path, quality="draft")
     assert draft.key(case) != Model("pane", str(model), tmp_path).key(case)
@@ -145,6 +155,16 @@ def test_two_methods_of_one_name_are_refused(tmp_path):
 def test_names_that_are_no_names_of_folders_are_refused(name, tmp_path):
     with pytest.raises(BrewsterError, match="names become folders"):
         refuse_names([Predictions(name, tmp_path)])
+
+
+def test_a_folder_that_is_a_link_is_looked_into_and_a_loop_ends(case, tmp_path):
+    write(tmp_path / "elsewhere", "1.png")
+    theirs = tmp_path / "theirs"
+    theirs.mkdir()
+    (theirs / "real20").symlink_to(tmp_path / "elsewhere")
+    (theirs / "loop").symlink_to(theirs)
+    (found,) = Predictions("theirs", theirs).files(case).values()
+    assert found == theirs / "real20" / "1.png"
 
 
 def test_folders_and_dangling_links_called_like_pictures_are_passed_over(cases, tmp_path):

@@ -291,7 +291,10 @@ def test_many_failures_are_folded_away_behind_their_number(page):
     made = page(given, [shown("0")])
     assert "Failed: compact on 9 of 9 pictures" in made.text
     assert [has for has in made.all("details") if has.get("class") == "note" and "open" not in has]
-    assert "1 of 9 pictures are on this page: of each benchmark those that the first method failed on" in made.text
+    assert (
+        "1 of 9 pictures are on this page: of each benchmark those that the first method failed on"
+        in made.text
+    )
 
 
 # --- pictures

@@ -12,7 +12,7 @@ import os
 import secrets
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -178,12 +178,21 @@ def _sync(path: Path) -> None:
 
 def _pictures(source: Path) -> Iterator[Path]:
     if _is_folder(source):
-        yield from _walk(source, set())
+        yield from walk(source, _is_wanted)
     else:
         yield source
 
 
-def _walk(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
+def walk(folder: Path, is_wanted: Callable[[Path], bool]) -> Iterator[Path]:
+    """The files in a folder and below that are wanted, in a stable order, hidden folders passed over.
+
+    Links are followed, and a real folder is visited once, so that loops end. A folder that cannot be looked into is
+    given itself.
+    """
+    return _walk(folder, is_wanted, set())
+
+
+def _walk(folder: Path, is_wanted: Callable[[Path], bool], seen: set[tuple[int, int]]) -> Iterator[Path]:
     try:
         entries = sorted(folder.iterdir())
         status = folder.stat()
@@ -196,8 +205,8 @@ def _walk(folder: Path, seen: set[tuple[int, int]]) -> Iterator[Path]:
     for entry in entries:
         if _is_folder(entry):
             if not entry.name.startswith("."):
-                yield from _walk(entry, seen)
-        elif _is_wanted(entry):
+                yield from _walk(entry, is_wanted, seen)
+        elif is_wanted(entry):
             yield entry
 
 

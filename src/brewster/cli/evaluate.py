@@ -306,6 +306,9 @@ def tell_failures(results: Results) -> bool:
     """Names what could not be scored; whether there was nothing."""
     from brewster.evaluate.report.tables import failures  # noqa: PLC0415
 
+    for method, about in results["methods"].items():
+        if "remark" in about:
+            say(f"{method}: {about['remark']}")
     for name in results["unmeasured"]:
         say(f"{name} was not measured: no picture has the truth that it needs")
     for error in failures(results):

@@ -73,7 +73,9 @@ def _trios(folder: Path) -> list[Trio]:
 
 
 def _read_pair(trio: Trio) -> tuple[Tensor, Tensor]:
-    photo, transmission = (_read_photo(path, 10**6) for path in (trio.photo, trio.transmission))
+    photo, transmission = (
+        torch.from_numpy(Photo.open(path).srgb_8bit().copy()) for path in (trio.photo, trio.transmission)
+    )
     if photo.shape != transmission.shape:
         raise RecipeError(
             f"{trio.photo} and {trio.transmission} differ in size",

@@ -9,14 +9,15 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
 from brewster.dataset.benchmarks import Benchmark, Case
 from brewster.errors import BrewsterError, PhotoError
-from brewster.evaluate.judge import Truth
+from brewster.evaluate.judge import Truth, reduced
 from brewster.evaluate.methods import NOTHING, Answer, Method, Predictions, refuse_names
-from brewster.evaluate.protocol import Protocol
+from brewster.evaluate.protocol import IDENTICAL_DB, Protocol
 from brewster.evaluate.report.page import Shown, write_report
 from brewster.evaluate.report.published import read_published
 from brewster.evaluate.report.published import to_markdown as published_to_markdown
@@ -25,8 +26,9 @@ from brewster.evaluate.report.tables import to_csv, to_markdown
 from brewster.evaluate.results import Results, draw, summarise
 from brewster.evaluate.runner import Place, Report, Row, find_answer, score
 from brewster.files import write_atomically
+from brewster.photo import Photo
 
-RESULTS, PAGE = "results.json", "report.html"
+RESULTS, PAGE, INPUTS = "results.json", "report.html", "inputs"
 PICTURES_SHOWN: Final = 50
 
 
@@ -41,6 +43,8 @@ def evaluate(
     report: Report = lambda _done, _of, _row: None,
 ) -> Results:
     """Scores and writes results.json, tables.md, table.tex, table.csv and report.html into `out`.
+
+    Where the protocol reduces photos, they are in `out`/inputs as methods see them.
 
     Args:
         benchmarks: as `read_benchmark` gives them.
@@ -58,11 +62,13 @@ def evaluate(
     """
     check(benchmarks, methods, protocol)
     cases = [case for part in benchmarks for case in part.cases]
+    if protocol.size:
+        _write_inputs(cases, protocol.size, out / INPUTS)
     rows = score(benchmarks, methods, protocol, out, workers=workers, report=report)
     results = summarise(benchmarks, methods, protocol, rows)
     for method in methods:
-        if isinstance(method, Predictions) and (unused := method.unused(cases)):
-            results["methods"][method.name]["remark"] = f"{unused} pictures of its folder answer no case"
+        if remarks := list(_remarks(method, cases, rows)):
+            results["methods"][method.name]["remark"] = "; ".join(remarks)
     _write(results, out)
     write_report(results, _shown(cases, methods, protocol, rows, shown), out / PAGE)
     return results
@@ -96,6 +102,27 @@ def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], protocol: 
     for method in methods:
         if isinstance(method, Predictions):
             method.refuse_wrong_pairing(cases)
+
+
+def _remarks(method: Method, cases: Sequence[Case], rows: Sequence[Row]) -> Iterator[str]:
+    """What is odd about a method's answers."""
+    own = [row for row in rows if row.method == method.name]
+    if count := sum(row.scores.get("psnr") == IDENTICAL_DB for row in own):
+        yield f"its answer is the truth itself on {_pictures(count)} of {len(own)}: are these its own?"
+    if isinstance(method, Predictions) and (unused := method.unused(cases)):
+        yield f"no case is answered by {_pictures(unused)} of its folder"
+
+
+def _pictures(count: int) -> str:
+    return f"{count} {'picture' if count == 1 else 'pictures'}"
+
+
+def _write_inputs(cases: Sequence[Case], size: int, folder: Path) -> None:
+    """The photos as methods see them, for those that answer elsewhere; what cannot be read is told when it is scored."""
+    for case in cases:
+        with suppress(PhotoError):
+            photo = reduced(Photo.open(case.photo.read()), size)
+            photo.save(folder / case.benchmark / f"{case.name}.png", overwrite=True)
 
 
 def _write(results: Results, out: Path) -> None:

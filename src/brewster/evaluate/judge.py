@@ -41,7 +41,7 @@ class Truth:
         """
         files = {"photo": case.photo, "transmission": case.transmission, "reflection": case.reflection}
         photos = {
-            role: _reduced(Photo.open(file.read()), protocol.size) for role, file in files.items() if file
+            role: reduced(Photo.open(file.read()), protocol.size) for role, file in files.items() if file
         }
         for role, photo in photos.items():
             _refuse_size(f"the {role} of {case.benchmark}/{case.name}", photo, photos["photo"].size)
@@ -142,7 +142,7 @@ def _or_none(measure: Callable[[], float]) -> float | None:
         return None
 
 
-def _reduced(photo: Photo, shorter: int | None) -> Photo:
+def reduced(photo: Photo, shorter: int | None) -> Photo:
     """The photo, its shorter side at most so many px, as 8-bit sRGB."""
     if shorter is None or min(photo.size) <= shorter:
         return photo
@@ -155,5 +155,7 @@ def _refuse_size(name: str, photo: Photo, size: tuple[int, int]) -> None:
     if photo.size != size:
         (width, height), (wanted, tall) = photo.size, size
         raise PhotoError(
-            f"{name} is {width}x{height}", f"{wanted}x{tall}, as the photo", "make it again at that size"
+            f"{name} is {width}x{height}",
+            f"{wanted}x{tall}, as the photo",
+            "make it again at that size; with --size, from the photos in inputs/ beside the results",
         )

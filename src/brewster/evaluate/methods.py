@@ -12,7 +12,7 @@ import time
 import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Final, Protocol, final
@@ -22,7 +22,7 @@ import numpy as np
 import brewster
 from brewster.dataset.benchmarks import Case
 from brewster.errors import BrewsterError, PhotoError
-from brewster.files import SUFFIXES, write_atomically
+from brewster.files import SUFFIXES, walk, write_atomically
 from brewster.models.zoo import find_model, is_large
 from brewster.options import Device, Quality
 from brewster.photo import Photo
@@ -150,10 +150,10 @@ class Model:
         separation = separator(photo, quality=self.quality)
         seconds = time.perf_counter() - started
         files = self._files(case)
-        data = {layer: getattr(separation, layer).encode("png", depth=8) for layer in files}
         for layer, path in files.items():
-            write_atomically(path, data[layer], overwrite=True)
-        return Answer(separation.transmission, separation.reflection, seconds, _digest(data.values()))
+            data = getattr(separation, layer).encode("png", depth=8)
+            write_atomically(path, data, overwrite=True)
+        return replace(Answer.read(files), seconds=seconds)  # what is kept is what is scored
 
     def kept(self, case: Case) -> Answer | None:
         """The layers that were kept.
@@ -305,9 +305,8 @@ class Predictions:
     def _pictures(self) -> dict[Path, list[Path]]:
         """The folder's pictures by their paths without suffix."""
         found: defaultdict[Path, list[Path]] = defaultdict(list)
-        for path in sorted(self.folder.rglob("*")):
-            if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file():
-                found[_plain(path.with_suffix(""))].append(path)
+        for path in walk(self.folder, _is_picture):
+            found[_plain(path.with_suffix(""))].append(path)
         return dict(found)
 
     @cached_property
@@ -316,6 +315,10 @@ class Predictions:
         for place in self._pictures:
             stems[place.parent].append(place.name)
         return dict(stems)
+
+
+def _is_picture(path: Path) -> bool:
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
 def _plain(path: Path) -> Path:
