@@ -146,6 +146,11 @@ def test_methods_are_data_that_other_processes_can_take(model, tmp_path):
         assert pickle.loads(pickle.dumps(one)) == one
 
 
+def test_no_method_at_all_is_refused():
+    with pytest.raises(BrewsterError, match="there is no method"):
+        refuse_names([])
+
+
 def test_two_methods_of_one_name_are_refused(tmp_path):
     with pytest.raises(BrewsterError, match="2 methods are called 'doing nothing'"):
         refuse_names([Nothing(), Predictions("doing nothing", tmp_path)])

@@ -20,7 +20,7 @@ from brewster.cli.terminal import interrupts, say
     "out",
     metavar="FOLDER",
     type=click.Path(path_type=Path, file_okay=False),
-    help="Where models, tables and the page go. By default out/ablations/NAME for NAME.toml.",
+    help="Where models, tables and the page go. By default out/ablations/NAME for NAME.toml, NAME-BASE with --base.",
 )
 @click.option(
     "--base",
@@ -50,9 +50,10 @@ def ablate(
     from brewster.evaluate.ablate import ablate as run  # noqa: PLC0415  (wakes torch, in two seconds)
     from brewster.evaluate.ablate import read_study  # noqa: PLC0415
 
-    read, out = read_study(study), out or Path("out") / "ablations" / study.stem
+    read, name = read_study(study), study.stem
     if base:
-        read = read.model_copy(update={"base": base})
+        read, name = read.model_copy(update={"base": base}), f"{name}-{base.stem}"
+    out = out or Path("out") / "ablations" / name
     parts = read.open_benchmarks()
     is_whole = tell_of(parts, quiet=quiet)
 

@@ -343,11 +343,13 @@ def _digest(data: Iterable[bytes]) -> str:
 
 
 def refuse_names(methods: Sequence[Method]) -> None:
-    """Refuses two methods of one name, since tables could not tell them apart, and names that are no names of folders.
+    """Refuses no method at all, two of one name, since tables could not tell them apart, and names that are no names of folders.
 
     Raises:
         BrewsterError: so it is.
     """
+    if not methods:
+        raise BrewsterError("there is no method", "one or more to measure", "begin with Nothing()")
     (name, count), *_ = Counter(method.name for method in methods).most_common(1)
     if count > 1:
         raise BrewsterError(

@@ -19,6 +19,7 @@ AVERAGE: Final = "average"
 PAPER: Final = {"real20": 20, "nature20": 20, "postcard": 20, "solidobject": 20, "wildscene": 101}
 """The paper's sets, and of how many pictures its average takes of each."""
 _DIGITS: Final = 6
+_AVERAGED: Final = "The average is over pictures, not over sets: each counts once, whatever set it is from."
 
 Results = dict[str, Any]
 """What results.json holds: see docs/evaluation.md."""
@@ -111,13 +112,14 @@ def _titled(key: str, group: Sequence[Selection]) -> dict[str, Any]:
 
 
 def _choices(protocol: Protocol, together: Sequence[Selection]) -> list[str]:
-    """The protocol's, and what the paper's average lacks."""
+    """The protocol's, how the average comes about, and what the paper's lacks."""
+    choices = [*protocol.choices(), *([_AVERAGED] if together else [])]
     there = {part.key.partition(":")[0]: len(part.cases) for part in together}
     if not protocol.paper or there == PAPER:
-        return protocol.choices()
+        return choices
     found = ", ".join(f"{count} of {name}" for name, count in there.items()) or "too few sets for one"
     return [
-        *protocol.choices(),
+        *choices,
         f"The paper's average is over {sum(PAPER.values())} pictures; this one is over {found}.",
     ]
 
