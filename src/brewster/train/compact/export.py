@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -20,15 +24,30 @@ def export_onnx(network: CompactNetwork, path: Path) -> None:
     """
     height, width = (torch.export.Dim(name, min=1, max=256) for name in ("rows", "columns"))
     example = torch.rand(1, 3, 4 * STRIDE, 5 * STRIDE)
-    program = torch.onnx.export(
-        LinearSeparator(network).eval(),
-        (example,),
-        input_names=["photo"],
-        output_names=["transmission", "reflection"],
-        dynamic_shapes={"photo": {2: STRIDE * height, 3: STRIDE * width}},
-        opset_version=_OPSET,
-        dynamo=True,
-        verbose=False,
-    )
+    with _quietly():
+        program = torch.onnx.export(
+            LinearSeparator(network).eval(),
+            (example,),
+            input_names=["photo"],
+            output_names=["transmission", "reflection"],
+            dynamic_shapes={"photo": {2: STRIDE * height, 3: STRIDE * width}},
+            opset_version=_OPSET,
+            dynamo=True,
+            verbose=False,
+        )
     assert program is not None
     write_atomically(path, program.model_proto.SerializeToString(), overwrite=True)
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """The exporter warns of a torchvision that nobody needs, and of its own old calls."""
+    logger = logging.getLogger("torch.onnx")
+    before = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)
+            yield
+    finally:
+        logger.setLevel(before)
