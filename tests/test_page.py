@@ -271,6 +271,9 @@ def test_choices_meanings_remarks_and_refused_files_are_said(page):
     assert "c.png has no partner" in text
     assert "sha256 7adb" in text
     assert "No method failed on any picture." in text
+    given = results()
+    given["methods"]["compact"]["remark"] = "its answer is the truth itself on 2 pictures of 2"
+    assert "compact: its answer is the truth itself" in page(given).text
 
 
 def test_failures_are_counted_and_told_at_the_top_and_at_their_picture(page):

@@ -105,9 +105,15 @@ def _problems(results: Results) -> Iterator[str]:
         f"{method} on {count} of {_count(len(pictures), 'picture')}" for method, count in counts.items()
     )
     yield _noted(f"Failed: {said}", [f"{name}, {method}: {error}" for name, method, error in failed])
-    for kind, noun in (("refused", "file refused"), ("remarks", "remark")):
-        points = [f"{benchmark['title']}: {point}" for benchmark in benchmarks for point in benchmark[kind]]
-        yield _noted(_count(len(points), noun), points)
+    refused, remarks = (
+        [f"{benchmark['title']}: {point}" for benchmark in benchmarks for point in benchmark[kind]]
+        for kind in ("refused", "remarks")
+    )
+    remarks += [
+        f"{name}: {about['remark']}" for name, about in results["methods"].items() if "remark" in about
+    ]
+    yield _noted(_count(len(refused), "file refused"), refused)
+    yield _noted(_count(len(remarks), "remark"), remarks)
     if not failed:
         yield "<p>No method failed on any picture.</p>\n"
 
