@@ -56,11 +56,13 @@ def test_a_loss_that_is_not_a_number_stops_the_run_and_keeps_the_weights(recipe)
     assert all(torch.equal(value, before[name]) for name, value in learner.network.state_dict().items())
 
 
-def test_a_run_starts_from_the_averaged_weights_of_another(recipe, tmp_path):
-    given = checkpoint(recipe)
-    ones = {name: torch.ones_like(value) for name, value in given.state["average"].items()}
-    replace(given, state=given.state | {"average": ones}).write(tmp_path / "start.pt")
-    learner = CompactLearner(recipe.model_copy(update={"start_from": tmp_path / "start.pt"}))
-    learner.begin()
-    assert all((value == 1).all() for value in learner.network.state_dict().values())
-    assert all((value == 1).all() for value in learner.average.values())
+def test_a_run_starts_from_the_mean_of_the_averaged_weights_of_others(recipe, tmp_path):
+    given, starts = checkpoint(recipe), (tmp_path / "one.pt", tmp_path / "three.pt")
+    for path, value in zip(starts, (1.0, 3.0), strict=True):
+        same = {name: torch.full_like(weights, value) for name, weights in given.state["average"].items()}
+        replace(given, state=given.state | {"average": same}).write(path)
+    for start_from, mean in ((starts[:1], 1), (starts, 2)):
+        learner = CompactLearner(recipe.model_copy(update={"start_from": start_from}))
+        learner.begin()
+        assert all((value == mean).all() for value in learner.network.state_dict().values())
+        assert all((value == mean).all() for value in learner.average.values())

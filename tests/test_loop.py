@@ -174,15 +174,15 @@ def test_a_run_resumes_when_the_checkpoint_that_it_started_from_has_moved_away(r
     start = tmp_path / "start.pt"
     checkpoint(recipe).write(start)
     with pytest.raises(Killed):
-        train(recipe.model_copy(update={"start_from": start}), tmp_path / "run", die_after(5))
+        train(recipe.model_copy(update={"start_from": (start,)}), tmp_path / "run", die_after(5))
     start.unlink()
-    train(recipe.model_copy(update={"start_from": Path("elsewhere.pt")}), tmp_path / "run", silent)
+    train(recipe.model_copy(update={"start_from": (Path("elsewhere.pt"),)}), tmp_path / "run", silent)
     assert logged_steps(tmp_path / "run") == [3, 6]
 
 
 def test_a_checkpoint_to_start_from_that_is_missing_is_named_with_its_cure(recipe, tmp_path):
     with pytest.raises(ModelError, match=r"gone\.pt cannot be read .* mend start_from"):
-        train(recipe.model_copy(update={"start_from": tmp_path / "gone.pt"}), tmp_path / "run", silent)
+        train(recipe.model_copy(update={"start_from": (tmp_path / "gone.pt",)}), tmp_path / "run", silent)
 
 
 def test_a_checkpoint_of_another_network_is_named(recipe, tmp_path):
@@ -190,7 +190,7 @@ def test_a_checkpoint_of_another_network_is_named(recipe, tmp_path):
     other.write(tmp_path / "checkpoint.pt")
     with pytest.raises(ModelError, match=r"checkpoint\.pt holds another network; .* with -o"):
         train(recipe, tmp_path, silent)
-    started = recipe.model_copy(update={"start_from": tmp_path / "checkpoint.pt"})
+    started = recipe.model_copy(update={"start_from": (tmp_path / "checkpoint.pt",)})
     with pytest.raises(ModelError, match=r"checkpoint\.pt holds another network; .* mend start_from"):
         train(started, tmp_path / "run", silent)
 

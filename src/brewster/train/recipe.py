@@ -143,8 +143,8 @@ class CompactRecipe(Recipe):
     sizes: Sizes
     encoder_learning_rate: Above0
     average_decay: Share
-    start_from: Path | None = None
-    """A checkpoint whose averaged weights this run starts from, relative to the recipe."""
+    start_from: tuple[Path, ...] = ()
+    """Checkpoints, relative to the recipe: this run starts from the mean of their averaged weights."""
     mix: MixRecipe = MixRecipe()
 
     @model_validator(mode="after")
@@ -241,8 +241,8 @@ def read_recipe(path: Path) -> CompactRecipe | LargeRecipe:
     """
     recipe = read_toml(_kind(path), path, compare=_COMPARE)
     changes: dict[str, Any] = {}
-    if isinstance(recipe, CompactRecipe) and recipe.start_from:
-        changes["start_from"] = path.parent / recipe.start_from
+    if isinstance(recipe, CompactRecipe):
+        changes["start_from"] = tuple(path.parent / start for start in recipe.start_from)
     if isinstance(recipe, LargeRecipe) and recipe.prompt.endswith(ENCODED):
         changes["prompt"] = str(path.parent / recipe.prompt)
     rendered = recipe.data.rendered

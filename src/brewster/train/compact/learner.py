@@ -79,18 +79,23 @@ class CompactLearner:
             weight_decay=recipe.weight_decay,
         )
 
+    @torch.no_grad()
     def begin(self) -> None:
-        """Begins with the averaged weights of another run, if the recipe names one.
+        """Begins with the averaged weights of other runs, if the recipe names any; of several, with their mean.
+
+        The mean of runs that began alike is often better than each (Wortsman et al. 2022, model soups).
 
         Raises:
-            ModelError: its checkpoint is missing, damaged or of another network.
+            ModelError: a checkpoint is missing, damaged or of another network.
         """
-        path = self.recipe.start_from
-        if path:
+        for count, path in enumerate(self.recipe.start_from, start=1):
+            other = CompactNetwork()
             average = Checkpoint.read(path, _TRAIN_IT_FIRST).state.get("average", {})
             with fitting(path, _TRAIN_IT_FIRST):
-                self.network.load_state_dict(average)
-            self._begin_average()
+                other.load_state_dict(average)
+            for mine, theirs in zip(self.network.parameters(), other.parameters(), strict=True):
+                mine.lerp_(theirs.to(self.device), 1 / count)
+        self._begin_average()
 
     def state(self) -> dict[str, Any]:
         """Weights, their average, and the optimiser's moments."""
