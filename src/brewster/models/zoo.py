@@ -65,7 +65,7 @@ MODELS: Final = {
         Model(
             "compact",
             _WEIGHTS / "compact.onnx",
-            "284215df47a9149197b6c80b19c17bd0bb9f65bdca7c6fd0b0e15dde35a2f102",
+            "7f297bafce586d1c37b8c69c77602629ddcc3e485a3eaf9fc85afc2d3b57d9d1",
             "Apache-2.0",
         ),
     )
