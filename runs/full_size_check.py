@@ -19,9 +19,9 @@ from torch import nn
 
 from brewster.errors import DeviceError
 from brewster.models.large.adapter.lora import add_lora
-from brewster.models.large.adapter.prompt import PromptEmbedding
 from brewster.models.large.backbones import build, find_family
 from brewster.models.large.panels import Layout, condition
+from brewster.models.large.prompt import PromptEmbedding
 from brewster.models.large.sampling import GUIDANCE, STEPS, sample
 from brewster.models.large.stock import library
 

@@ -12,8 +12,8 @@ from tokenizers.pre_tokenizers import ByteLevel
 from brewster.errors import DeviceError, DownloadError, ModelError
 from brewster.models.large import backbones, stock
 from brewster.models.large.adapter.lora import add_lora
-from brewster.models.large.adapter.prompt import PROMPT
 from brewster.models.large.backbones import BACKBONES, build, encode_prompt, load_backbone, tiny
+from brewster.models.large.prompt import PROMPT
 
 
 @pytest.fixture(scope="module")

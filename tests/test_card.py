@@ -11,9 +11,9 @@ from PIL import Image
 
 from brewster.errors import ModelError
 from brewster.models.large.adapter.lora import add_lora, lora_parameters, save_lora
-from brewster.models.large.adapter.prompt import PROMPT, PromptEmbedding
 from brewster.models.large.backbones import BACKBONES, tiny
 from brewster.models.large.panels import Layout, condition, split
+from brewster.models.large.prompt import PROMPT, PromptEmbedding
 from brewster.models.large.sampling import sample
 from brewster.models.large.task import Task
 from brewster.train.large.card import card_text, with_measured, write_card

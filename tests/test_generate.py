@@ -13,11 +13,11 @@ from brewster import Photo, Separator
 from brewster.errors import DeviceError, DownloadError, ModelError, PhotoError
 from brewster.light import to_encoded, to_linear
 from brewster.models.large.adapter.lora import LORA_FILE, add_lora, lora_parameters, save_lora
-from brewster.models.large.adapter.tensors import read_tensors, write_tensors
 from brewster.models.large.backbones import TINY, tiny
 from brewster.models.large.decompose import fingerprint, open_decomposer
 from brewster.models.large.panels import Layout
 from brewster.models.large.task import Task
+from brewster.models.large.tensors import read_tensors, write_tensors
 from brewster.separate.generate import Panels
 from brewster.separate.separator import DRIFT_LIMIT
 

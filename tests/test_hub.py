@@ -12,9 +12,9 @@ import fake_hub
 from brewster.errors import DownloadError, ModelError
 from brewster.models.large.adapter.hub import FILES, plan_push, push
 from brewster.models.large.adapter.lora import LORA_FILE, add_lora, load_lora, save_lora
-from brewster.models.large.adapter.tensors import read_tensors, said_of
 from brewster.models.large.backbones import BACKBONES, tiny
 from brewster.models.large.task import Task
+from brewster.models.large.tensors import read_tensors, said_of
 from brewster.train.large.card import write_card
 from brewster.train.recipe import LargeRecipe
 from file_server import loopback_only, unheard

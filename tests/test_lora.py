@@ -20,10 +20,10 @@ from brewster.models.large.adapter.lora import (
     remove_lora,
     save_lora,
 )
-from brewster.models.large.adapter.tensors import read_tensors, write_tensors
 from brewster.models.large.backbones import BACKBONES, tiny
 from brewster.models.large.panels import Layout
 from brewster.models.large.task import Task
+from brewster.models.large.tensors import read_tensors, write_tensors
 
 
 @pytest.fixture(params=list(BACKBONES))

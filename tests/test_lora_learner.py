@@ -15,10 +15,10 @@ import brewster.train.large.learner as module
 from brewster.dataset.mix import Dice
 from brewster.errors import ModelError, RecipeError
 from brewster.models.large.adapter.lora import LORA_FILE, load_lora, lora_state
-from brewster.models.large.adapter.tensors import read_tensors
 from brewster.models.large.backbones import tiny
 from brewster.models.large.panels import condition, split
 from brewster.models.large.sampling import GUIDANCE, STEPS, sample
+from brewster.models.large.tensors import read_tensors
 from brewster.photo import Photo
 from brewster.train import crew
 from brewster.train.checkpoint import Checkpoint

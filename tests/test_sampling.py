@@ -6,8 +6,8 @@ from diffusers.pipelines.qwenimage import pipeline_qwenimage_edit
 from PIL import Image
 
 from brewster.errors import DeviceError, ModelError
-from brewster.models.large.adapter.prompt import PromptEmbedding
 from brewster.models.large.backbones import BACKBONES, tiny
+from brewster.models.large.prompt import PromptEmbedding
 from brewster.models.large.sampling import sample
 
 SIZE = (192, 64)

@@ -66,4 +66,4 @@ def ablate(
     if not quiet:
         print_tables(results)
         say(f"all of it is in {out}")
-    context.exit(0 if tell_failures(results) and is_whole else 1)
+    context.exit(0 if tell_failures(results, quiet=quiet) and is_whole else 1)

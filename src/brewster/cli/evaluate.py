@@ -251,7 +251,7 @@ class _Order:
         elif not self.quiet:
             print_tables(results)
             say(f"all of it is in {self.out}; {self.out / PAGE} shows the pictures")
-        return tell_failures(results) and is_whole
+        return tell_failures(results, quiet=self.quiet) and is_whole
 
     def _found(self) -> list[Benchmark]:
         from brewster.dataset.benchmarks import read_benchmark  # noqa: PLC0415
@@ -302,13 +302,15 @@ def print_tables(results: Results) -> None:
     write_out(overview(results).encode(errors=_ODD))
 
 
-def tell_failures(results: Results) -> bool:
-    """Names what could not be scored; whether there was nothing."""
+def tell_failures(results: Results, *, quiet: bool) -> bool:
+    """Says what is odd about methods and names what could not be scored; whether there was nothing of the second."""
     from brewster.evaluate.report.tables import failures  # noqa: PLC0415
 
-    for method, about in results["methods"].items():
-        if "remark" in about:
-            say(f"{method}: {about['remark']}")
+    remarks = [
+        f"{name}: {about['remark']}" for name, about in results["methods"].items() if "remark" in about
+    ]
+    for remark in () if quiet else remarks:
+        say(remark)
     for name in results["unmeasured"]:
         say(f"{name} was not measured: no picture has the truth that it needs")
     for error in failures(results):

@@ -106,10 +106,14 @@ def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], protocol: 
 
 def _remarks(method: Method, cases: Sequence[Case], rows: Sequence[Row]) -> Iterator[str]:
     """What is odd about a method's answers."""
-    own = [row for row in rows if row.method == method.name]
-    if count := sum(row.scores.get("psnr") == IDENTICAL_DB for row in own):
-        yield f"its answer is the truth itself on {_pictures(count)} of {len(own)}: are these its own?"
-    if isinstance(method, Predictions) and (unused := method.unused(cases)):
+    if not isinstance(method, Predictions):
+        return
+    perfect = [row for row in rows if row.scores.get("psnr") == IDENTICAL_DB]
+    trivial = {row.place[:2] for row in perfect if row.method == NOTHING}
+    copied = [row for row in perfect if row.method == method.name and row.place[:2] not in trivial]
+    if copied:
+        yield f"its answer is the truth itself on {_pictures(len(copied))}: are these its own?"
+    if unused := method.unused(cases):
         yield f"no case is answered by {_pictures(unused)} of its folder"
 
 
@@ -186,7 +190,8 @@ def _worst(
     def merit(case: Case) -> float:
         row = rows.get((case.benchmark, case.name, method))
         if row is None:
-            return -math.inf
+            is_readable = any((case.benchmark, case.name, other.name) in rows for other in methods)
+            return -math.inf if is_readable else math.inf
         score = row.scores.get(column)
         return math.inf if score is None else score if metric.higher_is_better else -score
 

@@ -44,7 +44,12 @@ class Truth:
             role: reduced(Photo.open(file.read()), protocol.size) for role, file in files.items() if file
         }
         for role, photo in photos.items():
-            _refuse_size(f"the {role} of {case.benchmark}/{case.name}", photo, photos["photo"].size)
+            _refuse_size(
+                f"the {role} of {case.benchmark}/{case.name}",
+                photo,
+                photos["photo"].size,
+                "mend the benchmark",
+            )
         return cls(case, photos["photo"], {role: photo.srgb_8bit() for role, photo in photos.items()})
 
     def region(self, threshold: float) -> Region:
@@ -62,7 +67,10 @@ class Truth:
         for layer, photo in (("transmission", answer.transmission), ("reflection", answer.reflection)):
             if photo:
                 _refuse_size(
-                    f"{name}'s {layer} of {self.case.benchmark}/{self.case.name}", photo, self.photo.size
+                    f"{name}'s {layer} of {self.case.benchmark}/{self.case.name}",
+                    photo,
+                    self.photo.size,
+                    "make it again at that size; with --size, from the photos in inputs/ beside the results",
                 )
 
 
@@ -151,11 +159,7 @@ def reduced(photo: Photo, shorter: int | None) -> Photo:
     return Photo.from_array(small.srgb_8bit(), encoding="srgb")
 
 
-def _refuse_size(name: str, photo: Photo, size: tuple[int, int]) -> None:
+def _refuse_size(name: str, photo: Photo, size: tuple[int, int], cure: str) -> None:
     if photo.size != size:
         (width, height), (wanted, tall) = photo.size, size
-        raise PhotoError(
-            f"{name} is {width}x{height}",
-            f"{wanted}x{tall}, as the photo",
-            "make it again at that size; with --size, from the photos in inputs/ beside the results",
-        )
+        raise PhotoError(f"{name} is {width}x{height}", f"{wanted}x{tall}, as the photo", cure)

@@ -305,7 +305,7 @@ class Predictions:
     def _pictures(self) -> dict[Path, list[Path]]:
         """The folder's pictures by their paths without suffix."""
         found: defaultdict[Path, list[Path]] = defaultdict(list)
-        for path in walk(self.folder, _is_picture):
+        for path in filter(_is_picture, walk(self.folder, _is_picture)):
             found[_plain(path.with_suffix(""))].append(path)
         return dict(found)
 

@@ -29,6 +29,8 @@ from brewster.metrics import Lpips
 from brewster.processes import end_with_parent, one_thread
 
 SCORES: Final = "scores.jsonl"
+_SCORING: Final = 2
+"""Rises when the same answers come to score differently, so that what was scored before is scored again."""
 
 Report = Callable[[int, int, "Row"], None]
 """Called with (done, of how many, the row) after every answer that was scored."""
@@ -127,7 +129,7 @@ def _rows(
     asked = asdict(protocol) | {"paper": None, "quality": None}
     for method in methods:
         answer_key = _digest(photo, protocol.size, method.key(case))
-        key = _digest(answer_key, truths, asked, case.rendered, brewster.__version__)
+        key = _digest(answer_key, truths, asked, case.rendered, brewster.__version__, _SCORING)
         row = Row(case.benchmark, case.name, method.name, answer_key, key)
         before = known.get(row.place)
         is_answered = before and before.answer_key == answer_key

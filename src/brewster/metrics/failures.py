@@ -55,8 +55,8 @@ def removed_content(answer: Picture, background: Picture, photo: Picture, reflec
     sum max(B - g answer, 0) / sum B, over the pixels with R < 2 % of I; I and B not black everywhere there.
 
     Raises:
-        ValueError: the pictures are not uint8 (H, W, 3) or differ in shape, or there are less than 64 such pixels, or
-            less than 64 from which the gain could be known.
+        ValueError: the pictures are not uint8 (H, W, 3) or differ in shape, or less than 64 pixels are such as the
+            score is over, or such that the gain could be known.
     """
     case = _Case.of(answer, background, photo, reflection)
     return case.removed(case.calm, f"R < {NEGLIGIBLE:.0%} of I")

@@ -19,8 +19,8 @@ from brewster.dataset.live import Mixing, Target
 from brewster.dataset.mix import MixRecipe
 from brewster.errors import RecipeError
 from brewster.models.compact import STRIDE
-from brewster.models.large.adapter.prompt import PROMPTS
 from brewster.models.large.panels import Direction, Layout, Panel
+from brewster.models.large.prompt import PROMPTS
 from brewster.models.large.sampling import GUIDANCE
 from brewster.models.large.task import PAPER_PX, Objective, Task
 from brewster.models.zoo import TINY

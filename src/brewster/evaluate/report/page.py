@@ -284,7 +284,7 @@ def _cases(results: Results, shown: Iterable[Shown], scores: list[Any]) -> Itera
     if len(scores) < len(known):
         yield (
             f"<p>{len(scores):,} of {_count(len(known), 'picture')} are on this page: of each benchmark those that the "
-            "first method failed on, then the worst of it by the first metric.</p>\n"
+            "first method that does something failed on, then its worst by the first metric.</p>\n"
         )
 
 

@@ -22,11 +22,11 @@ import torch
 from torch import Tensor, nn
 
 from brewster.errors import DeviceError, MissingExtra, ModelError
-from brewster.models.large.adapter.prompt import PROMPT, PromptEmbedding
 from brewster.models.large.families.family import Architecture, Backbone
 from brewster.models.large.families.klein import Klein
 from brewster.models.large.families.kontext import Kontext
 from brewster.models.large.families.qwen import Qwen
+from brewster.models.large.prompt import PROMPT, PromptEmbedding
 from brewster.models.large.stock import bars_on_terminals_only, fetch, library, stock_class, within_memory
 from brewster.models.zoo import TINY
 from brewster.options import Quantisation

@@ -20,10 +20,10 @@ from torch import Tensor
 
 from brewster.errors import DeviceError, ModelError
 from brewster.models.large.adapter.lora import LORA_FILE, LoraCard, load_lora, read_card
-from brewster.models.large.adapter.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding
 from brewster.models.large.backbones import BACKBONES, encode_prompt, family_of, load_backbone
 from brewster.models.large.families.family import Backbone
 from brewster.models.large.panels import Layout, compose, condition, split
+from brewster.models.large.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding
 from brewster.models.large.sampling import STEPS, euler, sample
 from brewster.models.large.stock import fetch, within_memory
 from brewster.models.large.task import Task

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from brewster.errors import ModelError
-from brewster.models.large.adapter.prompt import PromptEmbedding
 from brewster.models.large.families.family import Backbone
+from brewster.models.large.prompt import PromptEmbedding
 from brewster.models.large.stock import within_memory
 
 if TYPE_CHECKING:

@@ -1,1 +1,1 @@
-"""How does the compact network learn, and what leaves training of it?"""
+"""How does the compact network learn, and what does its training leave?"""

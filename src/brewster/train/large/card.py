@@ -20,10 +20,10 @@ from brewster.dataset.sets import read_set
 from brewster.errors import BrewsterError, ModelError
 from brewster.files import write_atomically
 from brewster.models.large.adapter.hub import CARD_FILE
-from brewster.models.large.adapter.prompt import PROMPT, PROMPT_FILE, load_prompt
 from brewster.models.large.backbones import BACKBONES
 from brewster.models.large.families.family import Backbone
 from brewster.models.large.panels import fit_panel
+from brewster.models.large.prompt import PROMPT, PROMPT_FILE, load_prompt
 from brewster.models.large.sampling import GUIDANCE, STEPS
 from brewster.models.zoo import TINY
 from brewster.train.data import found

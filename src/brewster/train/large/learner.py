@@ -24,11 +24,11 @@ from brewster.dataset.mix import Dice
 from brewster.errors import RecipeError
 from brewster.files import write_atomically
 from brewster.models.large.adapter.lora import add_lora, load_lora_state, lora_state, save_lora
-from brewster.models.large.adapter.prompt import PROMPTS, PromptEmbedding, load_prompt
 from brewster.models.large.backbones import encode_prompt, load_backbone
 from brewster.models.large.decompose import Decomposer
 from brewster.models.large.families.family import Backbone
 from brewster.models.large.panels import Fit, split
+from brewster.models.large.prompt import PROMPTS, PromptEmbedding, load_prompt
 from brewster.models.large.sampling import STEPS
 from brewster.models.large.stock import within_memory
 from brewster.train import crew

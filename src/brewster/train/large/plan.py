@@ -17,10 +17,10 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from brewster.errors import DeviceError
-from brewster.models.large.adapter.prompt import PromptEmbedding
 from brewster.models.large.backbones import build, find_family
 from brewster.models.large.families.family import Backbone
 from brewster.models.large.panels import fit_panel
+from brewster.models.large.prompt import PromptEmbedding
 from brewster.models.zoo import TINY
 from brewster.train.recipe import LargeRecipe
 

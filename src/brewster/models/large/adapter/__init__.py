@@ -1,1 +1,1 @@
-"""What training leaves of a large model, and what is read, sent and fetched: the LoRA and its encoded prompt, in a folder."""
+"""What training leaves of a large model, and what is read, sent and fetched: the folder of a LoRA."""

@@ -22,10 +22,10 @@ from typing import Any, Final, final
 
 from brewster.errors import DownloadError, ModelError
 from brewster.models.large.adapter.lora import LORA_FILE, LoraCard, read_card, read_prompt
-from brewster.models.large.adapter.prompt import PROMPT_FILE
-from brewster.models.large.adapter.tensors import retold, said_of
 from brewster.models.large.backbones import BACKBONES, find_family
+from brewster.models.large.prompt import PROMPT_FILE
 from brewster.models.large.stock import library
+from brewster.models.large.tensors import retold, said_of
 from brewster.models.zoo import TINY
 
 CARD_FILE: Final = "README.md"

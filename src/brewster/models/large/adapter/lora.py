@@ -22,11 +22,11 @@ from pydantic import Field, TypeAdapter
 from torch import Tensor, nn
 
 from brewster.errors import ModelError, RecipeError
-from brewster.models.large.adapter.prompt import PROMPT_FILE, PromptEmbedding, load_prompt
-from brewster.models.large.adapter.tensors import read_tensors, write_tensors
 from brewster.models.large.families.family import Backbone
+from brewster.models.large.prompt import PROMPT_FILE, PromptEmbedding, load_prompt
 from brewster.models.large.stock import library
 from brewster.models.large.task import Task
+from brewster.models.large.tensors import read_tensors, write_tensors
 from brewster.options import Quantisation
 
 LORA_FILE: Final = "pytorch_lora_weights.safetensors"

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from brewster.errors import ModelError
-from brewster.models.large.adapter.prompt import PROMPT, PromptEmbedding
+from brewster.models.large.prompt import PROMPT, PromptEmbedding
 from brewster.models.large.stock import quiet, stock_class
 
 if TYPE_CHECKING:

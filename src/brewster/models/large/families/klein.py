@@ -7,8 +7,8 @@ from typing import Any, ClassVar, Final, final
 import torch
 from torch import Tensor
 
-from brewster.models.large.adapter.prompt import PromptEmbedding
 from brewster.models.large.families.family import GuidedTwice, grid_of, random_prompt
+from brewster.models.large.prompt import PromptEmbedding
 
 _SCHEDULER: Final = {
     "shift": 3.0, "use_dynamic_shifting": True, "base_shift": 0.5, "max_shift": 1.15,

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from brewster.errors import ModelError
-from brewster.models.large.adapter.tensors import read_tensors, write_tensors
+from brewster.models.large.tensors import read_tensors, write_tensors
 
 if TYPE_CHECKING:
     from jaxtyping import Float
