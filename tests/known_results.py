@@ -25,7 +25,7 @@ def known_results():
     ]
     return {
         "protocol": {"choices": ["Everything is stated."]},
-        "metrics": METRICS,
+        "metrics": dict(METRICS),
         "selections": selections,
         "benchmarks": {
             "real20": {"title": "Real20", "remarks": ["20 of 20"], "refused": ["x.png has no partner"]}

@@ -53,12 +53,13 @@ def at_an_address(port: int, token_help: str) -> Callable[[Callable[..., Any]], 
     return decorated
 
 
-def invite(url: str, token: str | None) -> str:
-    """Says on standard output where the server is, with the token; the link."""
+def invite(url: str, token: str | None, *, opens: bool = False) -> None:
+    """Says on standard output where the server is, with the token, and opens it in the browser if it shall."""
     link = f"{url}?token={token}" if token else url
     click.echo(link)
     say("Ctrl-C stops the server")
-    return link
+    if opens:
+        webbrowser.open(link)
 
 
 def _read_token(_context: click.Context, _parameter: click.Parameter, token: str | None) -> str | None:
@@ -152,12 +153,6 @@ def serve(
     shelf.separator(shelf.names[0])  # what is wrong with the model is said now
     router = separation(shelf, Desk(queue=queue, seconds=timeout), max_pixels=max_pixels)
     app = web.application(router, guard=Guard.at(host, token=token, max_bytes=max_bytes))
-
-    def tell(url: str) -> None:
-        link = invite(url, token)
-        if opens:
-            webbrowser.open(link)
-
     with contextlib.suppress(KeyboardInterrupt):  # the usual end
-        web.serve(app, host=host, port=port, tell=tell)
+        web.serve(app, host=host, port=port, tell=lambda url: invite(url, token, opens=opens))
     say("stopped")

@@ -103,7 +103,7 @@ def serve(
     *,
     host: str,
     port: int,
-    tell: Callable[[str], object] = print,
+    tell: Callable[[str], None] = print,
 ) -> None:
     """Serves until it is interrupted; `tell` is told the URL when browsers may come. For a main thread only.
 
