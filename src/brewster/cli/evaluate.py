@@ -304,12 +304,9 @@ def print_tables(results: Results) -> None:
 
 def tell_failures(results: Results, *, quiet: bool) -> bool:
     """Says what is odd about methods and names what could not be scored; whether there was nothing of the second."""
-    from brewster.evaluate.report.tables import failures  # noqa: PLC0415
+    from brewster.evaluate.report.tables import failures, remarks  # noqa: PLC0415
 
-    remarks = [
-        f"{name}: {about['remark']}" for name, about in results["methods"].items() if "remark" in about
-    ]
-    for remark in () if quiet else remarks:
+    for remark in () if quiet else remarks(results):
         say(remark)
     for name in results["unmeasured"]:
         say(f"{name} was not measured: no picture has the truth that it needs")

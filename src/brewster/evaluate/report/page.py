@@ -18,7 +18,7 @@ from typing import Any, Final
 
 from brewster.evaluate.methods import NOTHING
 from brewster.evaluate.report.figures import BRIGHTEST_ERROR, LONGEST, RAMP, Shown, answer_tiles, photo_tiles
-from brewster.evaluate.report.tables import is_complete, ranking
+from brewster.evaluate.report.tables import is_complete, ranking, remarks
 from brewster.files import arriving
 
 __all__ = ["Shown", "write_report"]
@@ -105,15 +105,13 @@ def _problems(results: Results) -> Iterator[str]:
         f"{method} on {count} of {_count(len(pictures), 'picture')}" for method, count in counts.items()
     )
     yield _noted(f"Failed: {said}", [f"{name}, {method}: {error}" for name, method, error in failed])
-    refused, remarks = (
+    refused, said_of_sets = (
         [f"{benchmark['title']}: {point}" for benchmark in benchmarks for point in benchmark[kind]]
         for kind in ("refused", "remarks")
     )
-    remarks += [
-        f"{name}: {about['remark']}" for name, about in results["methods"].items() if "remark" in about
-    ]
+    points = said_of_sets + remarks(results)
     yield _noted(_count(len(refused), "file refused"), refused)
-    yield _noted(_count(len(remarks), "remark"), remarks)
+    yield _noted(_count(len(points), "remark"), points)
     if not failed:
         yield "<p>No method failed on any picture.</p>\n"
 

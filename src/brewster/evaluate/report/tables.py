@@ -121,12 +121,15 @@ def _told(results: Results) -> str:
         for part in results["benchmarks"].values()
         for text in (*part["remarks"], *(f"left out: {reason}" for reason in part["refused"]))
     ]
-    lines += [
-        f"- {method}: {text}" for method, about in results["methods"].items() if (text := about.get("remark"))
-    ]
+    lines += [f"- {remark}" for remark in remarks(results)]
     lines += [f"- {name}: no picture has the truth that it needs" for name in results["unmeasured"]]
     lines += [f"- {error}" for error in failures(results)]
     return "\n".join(["### Said aloud", "", *lines]) if lines else ""
+
+
+def remarks(results: Mapping[str, Any]) -> list[str]:
+    """What is odd about methods."""
+    return [f"{name}: {about['remark']}" for name, about in results["methods"].items() if "remark" in about]
 
 
 def failures(results: Results) -> list[str]:
