@@ -6,7 +6,8 @@ import torch
 from hypothesis import given, reject
 from hypothesis import strategies as st
 
-from brewster.dataset.mix import Dice, Pairs
+from brewster.dataset.mix import Pairs
+from brewster.dataset.sample_rng import SampleRng
 from brewster.dataset.sets import read_set
 from brewster.errors import PhotoError, RecipeError
 from brewster.models.large.backbones import tiny
@@ -78,10 +79,10 @@ def test_an_encoded_sample_depends_on_the_dice_alone_and_is_encoded_once(recipe,
     wanted = recipe(RENDERED)
     one, other = (Latents(open_samples(wanted), backbone, wanted) for _ in range(2))
     for slot in range(4):
-        other(Dice(1, 0, slot))
-    assert torch.equal(one(Dice(1, 7, 0)).composite, other(Dice(1, 7, 0)).composite)
-    assert one(Dice(1, 7, 0)) is one(Dice(1, 7, 0))
-    grid = one(Dice(1, 7, 0)).composite
+        other(SampleRng(1, 0, slot))
+    assert torch.equal(one(SampleRng(1, 7, 0)).composite, other(SampleRng(1, 7, 0)).composite)
+    assert one(SampleRng(1, 7, 0)) is one(SampleRng(1, 7, 0))
+    grid = one(SampleRng(1, 7, 0)).composite
     assert grid.shape[2:] == (1, 6)
     assert {tuple(panel.shape[2:]) for panel in split(grid, wanted.layout).values()} == {(1, 2)}
 
@@ -91,7 +92,7 @@ def test_mirrored_samples_are_seen_unless_the_recipe_forbids_it(recipe, backbone
     for flip in (True, False):
         wanted = recipe(RENDERED, flip=flip)
         latents = Latents(open_samples(wanted), backbone, wanted)
-        counts.append(len({id(latents(Dice(1, step, 0))) for step in range(60)}))
+        counts.append(len({id(latents(SampleRng(1, step, 0))) for step in range(60)}))
     assert counts == [6, 3]
 
 
@@ -99,7 +100,7 @@ def test_as_many_crops_of_each_sample_are_seen_as_the_recipe_says_beside_the_who
     for crops, seen in ((0, 6), (2, 18)):
         wanted = recipe(LARGE, crops=crops)
         latents = Latents(open_samples(wanted), backbone, wanted)
-        encoded = {id(each): each for each in (latents(Dice(1, step, 0)) for step in range(200))}
+        encoded = {id(each): each for each in (latents(SampleRng(1, step, 0)) for step in range(200))}
         assert len(encoded) == seen
         different = {each.composite.numpy().tobytes() for each in encoded.values()}
         assert len(different) == seen
@@ -127,7 +128,7 @@ def test_a_crop_is_a_window_of_the_samples_shape_and_never_smaller_than_it_is_sh
     except PhotoError:
         reject()
     whole = torch.arange(height * width).reshape(height, width, 1)
-    crop = cropped(Dice(seed, -1, 1), whole, fit)
+    crop = cropped(SampleRng(seed, -1, 1), whole, fit)
     rows, columns, _ = crop.shape
     assert max(fit.content[0], width // 2) <= columns <= width
     assert max(fit.content[1], height // 2) <= rows <= height
@@ -139,7 +140,7 @@ def test_a_crop_is_a_window_of_the_samples_shape_and_never_smaller_than_it_is_sh
 def test_real_pairs_come_as_often_as_their_share(recipe, root):
     samples = open_samples(recipe({**RENDERED, "pairs": ["trios"], "pairs_share": 0.25}))
     assert len(samples) == 4
-    chosen = [samples.choose(Dice(1, step, 0)) for step in range(200)]
+    chosen = [samples.choose(SampleRng(1, step, 0)) for step in range(200)]
     assert set(chosen) == {0, 1, 2, 3}
     assert 30 < chosen.count(3) < 70
 

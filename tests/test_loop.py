@@ -155,9 +155,15 @@ def test_a_run_leaves_a_log_and_sample_pictures(recipe, tmp_path):
 
 
 def test_a_run_of_another_recipe_is_not_continued(recipe, tmp_path):
-    train(recipe.model_copy(update={"steps": 1}), tmp_path, silent)
+    train(recipe.model_copy(update={"steps": 1, "learning_rate": 1e-4}), tmp_path, silent)
     with pytest.raises(RecipeError, match="another recipe"):
         train(recipe, tmp_path, silent)
+
+
+def test_a_run_can_be_made_longer(recipe, tmp_path):
+    train(recipe.model_copy(update={"steps": 1}), tmp_path, silent)
+    train(recipe.model_copy(update={"steps": 2, "report_every": 1}), tmp_path, silent)
+    assert logged_steps(tmp_path) == [1, 2]
 
 
 def test_a_resumed_run_logs_every_step_once(recipe, tmp_path):

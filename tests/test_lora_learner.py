@@ -12,7 +12,7 @@ import tomli_w
 import torch
 
 import brewster.train.large.learner as module
-from brewster.dataset.mix import Dice
+from brewster.dataset.sample_rng import SampleRng
 from brewster.errors import ModelError, RecipeError
 from brewster.models.large.adapter.lora import LORA_FILE, load_lora, lora_state
 from brewster.models.large.backbones import tiny
@@ -181,7 +181,7 @@ def test_a_panel_that_does_not_count_has_no_loss_and_the_others_share_its_weight
 
 def test_a_batch_is_the_mean_of_its_samples(begun):
     learner = begun(batch=2)
-    alone = [learner._losses(Dice(1, 0, slot)) for slot in range(2)]
+    alone = [learner._losses(SampleRng(1, 0, slot)) for slot in range(2)]
     expected = sum(part.item() for parts in alone for part in parts.values()) / 2
     assert learner.advance(0)["loss"] == pytest.approx(expected)
 
@@ -231,8 +231,8 @@ def test_a_loss_that_is_not_a_number_stops_the_run_and_keeps_the_last_good_check
     monkeypatch.setattr(
         LoraLearner,
         "_losses",
-        lambda self, dice: {
-            name: loss * (float("nan") if self.broken else 1) for name, loss in losses(self, dice).items()
+        lambda self, rng: {
+            name: loss * (float("nan") if self.broken else 1) for name, loss in losses(self, rng).items()
         },
     )
     learner = open_learner(recipe())

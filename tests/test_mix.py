@@ -5,13 +5,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brewster.dataset.mix import Batch, Blend, MixRecipe, Mixtures, Pairs
+from brewster.dataset.sample_rng import SampleRng
 from brewster.light import to_linear
 
 QUIET = MixRecipe(
-    map_probability=0, crop=(1, 1), background_level_log=(0.1, 0.1), reflection_ratio_log=(0.5, 0.5),
-    absent_probability=0, highlight_boost=(0, 0), temperature=(0, 0), transmittance=(1, 1), veil_probability=0,
-    veil=(0, 0), sharp_probability=1, blur_px=(1, 1), ghost_probability=0, ghost_weight=(0.5, 0.5), ghost_px=1,
-    falloff_probability=0, edge_probability=0, exposure=(1, 1), gamma_log=(1, 1), contrast=(0, 0), noise=(0, 0),
+    crop=(1, 1), temperature=(0, 0), background_map_probability=0, background_level_log=(0.1, 0.1),
+    highlight_boost=(0, 0), shadow_probability=0, absent_probability=0, partial_probability=0, transmittance=(1, 1),
+    veil_probability=0, reflection_map_probability=0, reflection_ratio_log=(0.5, 0.5),
+    reflection_contrast_log=(1, 1), lamp_probability=0, sign_probability=0, sharp_probability=1,
+    ghost_probability=0, falloff_probability=0, edge_probability=0, exposure=(1, 1), overexposed_probability=0,
+    gamma_log=(1, 1), contrast=(0, 0), noise=(0, 0), jpeg_probability=0,
+)  # fmt: skip
+WILD = MixRecipe(
+    background_map_probability=0.5, shadow_probability=0.5, partial_probability=0.5, veil_probability=0.5,
+    reflection_map_probability=0.5, lamp_probability=0.5, sign_probability=0.5, sharp_probability=0.3,
+    ghost_probability=0.5, falloff_probability=0.5, edge_probability=0.5, overexposed_probability=0.5, jpeg_probability=0.5,
 )  # fmt: skip
 
 
@@ -43,6 +51,41 @@ def test_the_reflection_has_the_asked_strength(photos):
     assert ratio.item() == pytest.approx(0.25, rel=0.15)
 
 
+def test_the_target_is_what_the_pane_lets_through_or_what_is_behind_it(photos):
+    light = {
+        target: to_linear(
+            Mixtures(photos, [], QUIET.model_copy(update={"transmittance": (0.8, 0.8), "target": target}), seed=1)(
+                0, 4, 64
+            ).transmission_encoded
+        ).mean()
+        for target in ("transmission", "background")
+    }
+    assert (light["transmission"] / light["background"]).item() == pytest.approx(0.8, rel=0.05)
+
+
+def test_glass_that_covers_a_part_leaves_the_rest_as_it_was(photos):
+    recipe = QUIET.model_copy(update={"partial_probability": 1.0, "transmittance": (0.5, 0.5)})
+    batch = Mixtures(photos, [], recipe, seed=1)(0, 8, 64)
+    same = (batch.photo_encoded - batch.transmission_encoded).abs().amax(dim=1) < 2 / 255
+    assert (batch.reflection_encoded.amax(dim=1)[same] < 0.1).all()
+    assert 0.05 < same.float().mean() < 0.95
+
+
+def test_an_overexposed_background_is_white_in_photo_and_target(photos):
+    recipe = QUIET.model_copy(update={"overexposed_probability": 1.0, "overexposed_share": (0.2, 0.2)})
+    batch = Mixtures(photos, [], recipe, seed=1)(0, 8, 64)
+    white = batch.transmission_encoded.amax(dim=1) > 0.99
+    assert white.float().mean().item() == pytest.approx(0.2, abs=0.07)
+    assert (batch.photo_encoded.amax(dim=1)[white] > 0.99).all()
+
+
+def test_photos_are_drawn_as_often_as_their_weights_say(photos):
+    stream = Mixtures(photos, [], QUIET, seed=1, weights=[0, 1, 0, 3])
+    drawn = [stream._choose_photo(SampleRng(1, 0, slot)) for slot in range(400)]
+    assert set(drawn) == {1, 3}
+    assert drawn.count(3) == pytest.approx(300, abs=40)
+
+
 def test_absent_reflections_leave_the_photo_as_it_was(photos):
     recipe = QUIET.model_copy(update={"absent_probability": 1.0})
     batch = Mixtures(photos, [], recipe, seed=1)(0, 4, 64)
@@ -57,18 +100,13 @@ def test_every_sample_is_a_picture_and_depends_on_seed_and_step_alone(step, size
     generator = np.random.default_rng(3)
     photos = [torch.from_numpy(generator.integers(0, 256, (70, 90, 3), np.uint8)) for _ in range(3)]
     maps = [torch.from_numpy(generator.random((3, 16, 32), np.float32) * 50).half()]
-    wild = QUIET.model_copy(
-        update={"map_probability": 0.5, "crop": (0.3, 1), "sharp_probability": 0.3, "blur_px": (0.5, 6),
-                "ghost_probability": 0.5, "ghost_px": 6, "falloff_probability": 0.5, "edge_probability": 0.5,
-                "veil_probability": 0.5, "veil": (0, 0.3), "noise": (0, 0.02), "highlight_boost": (0, 8)}
-    )  # fmt: skip
-    first, again = (Mixtures(photos, maps, wild, seed=5)(step, 3, size) for _ in range(2))
+    first, again = (Mixtures(photos, maps, WILD, seed=5)(step, 3, size) for _ in range(2))
     for name in Batch.__dataclass_fields__:
         values = getattr(first, name)
         assert torch.equal(values, getattr(again, name))
         assert values.isfinite().all()
         assert 0 <= values.min() <= values.max() <= 1
-    other = Mixtures(photos, maps, wild, seed=5)(step + 1, 3, size)
+    other = Mixtures(photos, maps, WILD, seed=5)(step + 1, 3, size)
     assert not torch.equal(first.photo_encoded, other.photo_encoded)
 
 

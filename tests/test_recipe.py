@@ -28,7 +28,7 @@ def test_there_are_recipes_and_all_of_them_can_be_read():
 
 def test_a_recipe_that_says_nothing_of_mixtures_gets_those_of_the_shipped_model():
     assert read_recipe(TINY.with_stem("compact")).mix == MixRecipe()
-    assert read_recipe(TINY).mix == MixRecipe(map_probability=0)
+    assert read_recipe(TINY).mix == MixRecipe(reflection_map_probability=0, background_map_probability=0)
 
 
 def test_a_changed_value_leaves_the_rest_of_a_recipe_as_it_was():

@@ -19,8 +19,9 @@ import torch
 from torch import Tensor
 
 from brewster.dataset.blend import blended_layers
-from brewster.dataset.live import Mixing, Rendered, Target
-from brewster.dataset.mix import Batch, Dice, random_crop
+from brewster.dataset.live import Mixing, Rendered
+from brewster.dataset.mix import Batch, Target, random_crop
+from brewster.dataset.sample_rng import SampleRng
 from brewster.dataset.sets import SCENE, Entry, key, read_cause, read_set
 from brewster.errors import RecipeError
 from brewster.light import to_encoded
@@ -67,8 +68,8 @@ class OnDisk:
         Raises:
             RecipeError, PhotoError: a file of a sample is missing or damaged.
         """
-        dice = (Dice(self._seed, step, slot) for slot in range(count))
-        windows = [random_crop(each, self.sample(each.choose(len(self))), self._crop, size) for each in dice]
+        rng = (SampleRng(self._seed, step, slot) for slot in range(count))
+        windows = [random_crop(each, self.sample(each.randint(len(self))), self._crop, size) for each in rng]
         return Batch.of(to_encoded(torch.stack(windows)))
 
     def sample(self, number: int) -> Tensor:
@@ -101,13 +102,13 @@ class InMemory:
             RecipeError: the recipe gives no possible scene, or a file is missing.
             PhotoError: a file cannot be read.
         """
-        dice = (Dice(self._seed, step, slot) for slot in range(count))
-        return Batch.of(torch.stack([self._use(each, size) for each in dice]) / 255)
+        rng = (SampleRng(self._seed, step, slot) for slot in range(count))
+        return Batch.of(torch.stack([self._use(each, size) for each in rng]) / 255)
 
-    def _use(self, dice: Dice, size: int) -> Tensor:
-        index = dice.choose(self._count)
+    def _use(self, rng: SampleRng, size: int) -> Tensor:
+        index = rng.randint(self._count)
         layers = self._kept.once((index, size), lambda: self._render(index, size))
-        return layers.flip(2) if dice.chance(0.5) else layers
+        return layers.flip(2) if rng.bernoulli(0.5) else layers
 
     def _render(self, index: int, size: int) -> Tensor:
         """(9, size, size) uint8, the first time too, so that a sample never changes."""

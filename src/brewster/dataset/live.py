@@ -16,16 +16,12 @@ import torch
 from torch import Tensor
 
 from brewster.dataset.blend import blended
-from brewster.dataset.mix import Batch
+from brewster.dataset.mix import Batch, Target
 from brewster.render.develop import Developed, develop, with_jpeg
 from brewster.render.pane import render
 from brewster.scene.recipe import SceneRecipe
 from brewster.scene.sampler import Catalog, draw
 from brewster.worlds.assets import Assets
-
-Target = Literal["background", "transmission"]
-"""What a network is to find behind the glass: the background B, as benchmarks photograph it with the glass taken
-away, or T, which adds up with R."""
 
 Mixing = Literal["light", "8-bit"]
 """How a photo came about: light that met at the glass, or a blend of the same content in 8 bits, as RDNet's."""

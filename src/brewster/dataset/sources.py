@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
@@ -22,26 +24,45 @@ _PICTURES = SUFFIXES.keys() - _MAPS
 _PHOTO_SIDE_PX = 640
 _MAP_HEIGHT_PX = 512
 _LARGEST_HALF = 65504.0
+_WORD = re.compile(r"[^0-9A-Za-z]")
 
 
-def read_photos(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list[Tensor]:
+def read_photos(
+    folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
+) -> list[Tensor]:
     """Every photo of the folders, uint8 sRGB (H, W, 3), longest side at most 640 px, in order of name.
 
     Raises:
         RecipeError: a folder cannot be read, or there is no photo in any of them.
         PhotoError: a photo cannot be read.
     """
-    return [_read_photo(path, _PHOTO_SIDE_PX) for path in _list(folders, _PICTURES, exclude)]
+    return [_read_photo(path, _PHOTO_SIDE_PX) for path in _list(folders, _PICTURES, exclude, only)]
 
 
-def read_maps(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list[Tensor]:
+def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list[float]:
+    """Relative frequencies of the photos that `read_photos` returns, so that no single source dominates.
+
+    Photos whose names begin with the same word (letters and digits) are of one source; n of them together weigh
+    sqrt(n).
+
+    Raises:
+        RecipeError: as `read_photos`.
+    """
+    sources = [_WORD.split(path.name)[0] for path in _list(folders, _PICTURES, exclude)]
+    counts = Counter(sources)
+    return [counts[source] ** -0.5 for source in sources]
+
+
+def read_maps(
+    folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
+) -> list[Tensor]:
     """Every lat-long map of the folders, half precision (3, H, 2 H), at most 512 px high, linear light.
 
     Raises:
         RecipeError: a folder cannot be read, or there is no map in any of them.
         PhotoError: a map cannot be read.
     """
-    return [_read_map(path) for path in _list(folders, _MAPS, exclude)]
+    return [_read_map(path) for path in _list(folders, _MAPS, exclude, only)]
 
 
 def read_pairs(folders: Sequence[Path]) -> list[tuple[Tensor, Tensor]]:
@@ -101,12 +122,14 @@ def _at_most(photo: Photo, longest_px: int) -> NDArray[np.float32]:
     return photo.small(width, height)
 
 
-def _list(folders: Iterable[Path], suffixes: set[str], exclude: Sequence[str] = ()) -> list[Path]:
+def _list(
+    folders: Iterable[Path], suffixes: set[str], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
+) -> list[Path]:
     found = sorted(
         path
         for folder in folders
         for path in _entries(folder)
-        if path.suffix.lower() in suffixes and not any(fnmatch(path.name, pattern) for pattern in exclude)
+        if path.suffix.lower() in suffixes and _matches(path, only) and not _matches(path, exclude)
     )
     if folders and not found:
         raise RecipeError(
@@ -115,6 +138,10 @@ def _list(folders: Iterable[Path], suffixes: set[str], exclude: Sequence[str] = 
             "name another folder in the recipe, or set BREWSTER_DATA to where the data lies",
         )
     return found
+
+
+def _matches(path: Path, patterns: Sequence[str]) -> bool:
+    return any(fnmatch(path.name, pattern) for pattern in patterns)
 
 
 def _entries(folder: Path) -> list[Path]:

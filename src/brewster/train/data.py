@@ -16,7 +16,7 @@ from torch import Tensor
 from brewster.dataset.kept import InMemory, OnDisk
 from brewster.dataset.live import Rendered
 from brewster.dataset.mix import Batch, Blend, Mixtures, Pairs, Stream
-from brewster.dataset.sources import read_maps, read_pairs, read_photos
+from brewster.dataset.sources import read_maps, read_pairs, read_photos, source_weights
 from brewster.errors import RecipeError
 from brewster.scene.recipe import SceneRecipe, read_scene_recipe
 from brewster.train.recipe import CompactRecipe, DataRecipe, RenderedRecipe, data_folder
@@ -45,7 +45,28 @@ def validation_pairs(data: DataRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]
     """
     folders = tuple(dict.fromkeys(data.validate_on))
     root = data_folder() if folders else Path()
-    return {name: read_pairs([root / folder]) for name, folder in zip(_short(folders), folders, strict=True)}
+    return {
+        name: _evenly(read_pairs([root / folder]), data.validate_at_most)
+        for name, folder in zip(_short(folders), folders, strict=True)
+    }
+
+
+def held_out_mixtures(recipe: CompactRecipe) -> Stream | None:
+    """Mixtures of the recipe's held-out photos and maps, distributed as in training; None if none are held out.
+
+    Raises:
+        RecipeError, PhotoError: no photo is held out, or one cannot be read.
+    """
+    data = recipe.data
+    if not (data.held_out and data.photos):
+        return None
+    photos = read_photos(found(data.photos), data.exclude, only=data.held_out)
+    maps = read_maps(found(data.maps), data.exclude, only=data.held_out)
+    return Mixtures(photos, maps, recipe.mix, seed=recipe.seed + 3)
+
+
+def _evenly(pairs: list[tuple[Tensor, Tensor]], most: int) -> list[tuple[Tensor, Tensor]]:
+    return [pairs[number * len(pairs) // most] for number in range(most)] if len(pairs) > most else pairs
 
 
 def _short(folders: Sequence[Path]) -> list[str]:
@@ -74,8 +95,14 @@ def _open_mixtures(recipe: CompactRecipe) -> Stream:
     data = recipe.data
     if data.is_none:
         return _refuse
-    photos = read_photos(found(data.photos), data.exclude)
-    return Mixtures(photos, read_maps(found(data.maps), data.exclude), recipe.mix, seed=recipe.seed)
+    folders = found(data.photos)
+    return Mixtures(
+        read_photos(folders, data.never_trained_on),
+        read_maps(found(data.maps), data.never_trained_on),
+        recipe.mix,
+        seed=recipe.seed,
+        weights=source_weights(folders, data.never_trained_on),
+    )
 
 
 def _open_pairs(recipe: CompactRecipe) -> Stream:
@@ -100,7 +127,7 @@ def _open_rendered(recipe: CompactRecipe, device: torch.device | str) -> Stream:
 
 def _open_live(recipe: CompactRecipe, wanted: RenderedRecipe, device: torch.device | str) -> Rendered:
     maps, photos = found(wanted.maps), found(wanted.photos)
-    catalog, refused = read_catalog(maps, photos, recipe.data.exclude)
+    catalog, refused = read_catalog(maps, photos, recipe.data.never_trained_on)
     if refused:  # a run of hours has nobody to tell that it learns from less than was asked
         raise refused[0]
     return Rendered(

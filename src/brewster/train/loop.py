@@ -31,6 +31,7 @@ Report = Callable[[int, int, Mapping[str, float], bool], None]
 CHECKPOINT: Final = "checkpoint.pt"
 LOG: Final = "log.jsonl"
 SAMPLES: Final = "samples.png"
+_MAY_CHANGE: Final = {"start_from", "steps", "report_every", "checkpoint_every"}
 
 
 class Learner(Protocol):
@@ -131,12 +132,12 @@ def _of_this_recipe(checkpoint: Checkpoint, recipe: Recipe, path: Path) -> Check
 
 
 def _identity(text: str, recipe: Recipe) -> dict[str, object]:
-    """What a run must keep to be resumed: all but the place of the file that it started from.
+    """What a run must keep to be resumed: all but how long it is, how often it reports, and where it started from.
 
     What a recipe does not name, such as a value that is newer than the run, counts as its default.
     """
     try:
-        return type(recipe).model_validate_json(text).model_dump(exclude={"start_from"})
+        return type(recipe).model_validate_json(text).model_dump(exclude=_MAY_CHANGE)
     except ValidationError:
         return {}
 

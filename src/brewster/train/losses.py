@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from brewster.dataset.mix import Batch
 from brewster.errors import ModelError
+from brewster.light import to_linear
 
 if TYPE_CHECKING:
     from jaxtyping import Float
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 _ROUNDING: Final = 1 / (12 * 255**2)
 """The mean squared error of rounding to 8 bits; pictures that differ by less are the same, at 58.9 dB."""
 _SCALES = (1, 4, 16)
+_LITTLE = 0.02
 _GOOD_ENOUGH = 1e-3
 """Mean squared error, 30 dB, past which a picture no longer pulls."""
 
@@ -54,6 +56,18 @@ def gain_db(answer: Tensor, photo: Tensor, truth: Tensor) -> float:
     errors = [functional.mse_loss(picture, truth).item() for picture in (photo, answer)]
     before, after = (max(error, _ROUNDING) for error in errors)
     return 10 * math.log10(before / after)
+
+
+def tone(answer: Tensor, photo: Tensor, truth: Tensor) -> float:
+    """Mean light of the answer over that of the photo where the truth says that little was added; 1 if that is nowhere.
+
+    Encoded pictures in 0..1; little is less than 2 % of white, in linear light.
+    """
+    before, after, wanted = (to_linear(picture) for picture in (photo, answer, truth))
+    untouched = ((before - wanted).amax(dim=-3, keepdim=True) < _LITTLE).expand_as(before)
+    if not untouched.any():
+        return 1.0
+    return (after[untouched].mean() / before[untouched].mean().clamp(min=_LITTLE**2)).item()
 
 
 def finite(value: Tensor, step: int, name: str = "loss") -> Tensor:

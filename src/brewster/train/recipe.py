@@ -15,8 +15,8 @@ from typing import Annotated, Any, Final, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
-from brewster.dataset.live import Mixing, Target
-from brewster.dataset.mix import MixRecipe
+from brewster.dataset.live import Mixing
+from brewster.dataset.mix import MixRecipe, Target
 from brewster.errors import RecipeError
 from brewster.models.compact import STRIDE
 from brewster.models.large.panels import Direction, Layout, Panel
@@ -94,7 +94,16 @@ class DataRecipe(Values):
     pairs_share: Share = 0.0
     rendered: RenderedRecipe | None = None
     exclude: tuple[str, ...] = ()
+    held_out: tuple[str, ...] = ()
+    """Photos and maps that are not learnt from either: the compact model is validated on mixtures of them."""
     validate_on: tuple[Path, ...] = ()
+    validate_at_most: Positive = 40
+    """Pairs of each folder in `validate_on`, evenly spaced in order of name."""
+
+    @property
+    def never_trained_on(self) -> tuple[str, ...]:
+        """File names that training leaves out."""
+        return self.exclude + self.held_out
 
     @property
     def rendered_share(self) -> float:
@@ -143,6 +152,10 @@ class CompactRecipe(Recipe):
     sizes: Sizes
     encoder_learning_rate: Above0
     average_decay: Share
+    decay_share: Share = 1.0
+    """The last share of the run, over which the learning rate falls to zero along a cosine; constant before."""
+    precision: Literal["float32", "auto"] = "float32"
+    """auto: bfloat16 where the processor computes it natively. Depthwise convolutions and the head stay float32."""
     start_from: tuple[Path, ...] = ()
     """Checkpoints, relative to the recipe: this run starts from the mean of their averaged weights."""
     mix: MixRecipe = MixRecipe()

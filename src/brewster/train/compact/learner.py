@@ -21,9 +21,9 @@ from brewster.models.compact import STRIDE, CompactNetwork, with_imagenet_featur
 from brewster.train.checkpoint import Checkpoint, fitting
 from brewster.train.compact.export import export_onnx
 from brewster.train.crew import best_device
-from brewster.train.data import open_stream, validation_pairs
+from brewster.train.data import held_out_mixtures, open_stream, validation_pairs
 from brewster.train.loop import Report, run
-from brewster.train.losses import finite, gain_db, separation_loss
+from brewster.train.losses import finite, gain_db, separation_loss, tone
 from brewster.train.recipe import CompactRecipe
 
 Pairs = Mapping[str, list[tuple[Tensor, Tensor]]]
@@ -31,6 +31,8 @@ Pairs = Mapping[str, list[tuple[Tensor, Tensor]]]
 
 MODEL: Final = "model.onnx"
 _VALIDATION_SIDE_PX: Final = 384
+_HELD_OUT_MIXTURES: Final = 128
+_HELD_OUT_SIDE_PX: Final = 192
 _MAX_GRADIENT_NORM: Final = 1.0
 _TRAIN_IT_FIRST: Final = "train the recipe that makes it first, or mend start_from in this one"
 
@@ -60,8 +62,11 @@ class CompactLearner:
     def __init__(self, recipe: CompactRecipe, stream: Stream | None = None) -> None:
         self.recipe, self.device = recipe, best_device()
         self.stream = stream or open_stream(recipe, self.device)
-        self._pairs = _fitted(validation_pairs(recipe.data))
+        self._reduced = recipe.precision == "auto" and _has_bfloat16(self.device)
+        self._pairs: Pairs = _fitted(validation_pairs(recipe.data)) | _held_out(recipe)
         self._workers = 1 if self.device.type == "cpu" else os.cpu_count() or 1
+        self._cores = torch.get_num_threads() if self.device.type == "cpu" else 1
+        self._core_pool = ThreadPoolExecutor(self._cores, initializer=torch.set_num_threads, initargs=(1,))
         self._pool = ThreadPoolExecutor(self._workers)
         self._ahead: dict[int, Future[Batch]] = {}
         torch.manual_seed(recipe.seed)
@@ -77,6 +82,7 @@ class CompactLearner:
                 {"params": rest, "peak": recipe.learning_rate},
             ],
             weight_decay=recipe.weight_decay,
+            fused=True,
         )
 
     @torch.no_grad()
@@ -117,16 +123,41 @@ class CompactLearner:
         Raises:
             ModelError: the loss is not a number; the last checkpoint is still good.
         """
-        batch = self._batch(step).to(self.device)
-        parts = separation_loss(self.network(_channels_last(batch.photo_encoded)), batch)
+        parts, gradients = self._gradients(self._batch(step).to(self.device))
         loss = finite(torch.stack(list(parts.values())).sum(), step)
         self._set_learning_rates(step)
-        self.optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
+        for parameter, gradient in zip(self.network.parameters(), gradients, strict=True):
+            parameter.grad = gradient
         nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
         self.optimizer.step()
         self._update_average(step + 1)
         return {"loss": loss.item(), **{name: part.item() for name, part in parts.items()}}
+
+    def _gradients(self, batch: Batch) -> tuple[dict[str, Tensor], list[Tensor]]:
+        """The parts of the loss and the gradient of their sum, means over the batch.
+
+        On a CPU each core computes a share of the batch by itself: measured 1.2-1.3 times faster than all cores on
+        one operation after the other (16 x 128 px, two cores).
+        """
+        count = len(batch.photo_encoded)
+        shares = list(self._core_pool.map(self._share_of_gradients, batch.split(-(-count // self._cores))))
+        names = shares[0][1]
+        parts = {name: torch.stack([part[name] * n / count for n, part, _ in shares]).sum() for name in names}
+        gradients = [
+            torch.stack([gradient * n / count for (n, _, _), gradient in zip(shares, each, strict=True)]).sum(
+                0
+            )
+            for each in zip(*(gradients for _, _, gradients in shares), strict=True)
+        ]
+        return parts, gradients
+
+    def _share_of_gradients(self, batch: Batch) -> tuple[int, dict[str, Tensor], tuple[Tensor, ...]]:
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._reduced, cache_enabled=False):
+            layers = self.network(_channels_last(batch.photo_encoded))
+        parts = separation_loss(layers, batch)
+        total = torch.stack(list(parts.values())).sum()
+        gradients = torch.autograd.grad(total, tuple(self.network.parameters()))
+        return len(batch.photo_encoded), {name: part.detach() for name, part in parts.items()}, gradients
 
     def validate(self) -> tuple[dict[str, float], Tensor]:
         """What the averaged network gains on the recipe's pairs, and what it makes of four of each folder."""
@@ -161,7 +192,8 @@ class CompactLearner:
 
     def _set_learning_rates(self, step: int) -> None:
         warm = min(1.0, (step + 1) / self.recipe.warmup_steps)
-        cosine = 0.5 + 0.5 * math.cos(math.pi * step / self.recipe.steps)
+        left = (1 - step / self.recipe.steps) / max(self.recipe.decay_share, 1e-9)
+        cosine = 0.5 - 0.5 * math.cos(math.pi * min(1.0, left))
         for group in self.optimizer.param_groups:
             group["lr"] = group["peak"] * warm * cosine
 
@@ -179,12 +211,19 @@ class CompactLearner:
 
 @torch.no_grad()
 def validate(network: Callable[[Tensor], Tensor], pairs: Pairs) -> dict[str, float]:
-    """Mean PSNR gain in dB over doing nothing, per folder, at the (small) size of the given pairs."""
-    gains = {}
+    """By folder, at the (small) size of the given pairs: the mean gain in PSNR over the input, in dB; the share of pairs
+    that are worse than the input; and the tone, the light of the answer over that of the input where nothing was added,
+    which is 1 for a network that leaves the exposure alone.
+    """
+    numbers = {}
     for name, folder in pairs.items():
-        scores = [gain_db(network(photo)[:, :3].clamp(0, 1), photo, truth) for photo, truth in folder]
-        gains[f"gain_db_{name}"] = sum(scores) / len(scores)
-    return gains
+        answers = [network(photo)[:, :3].clamp(0, 1) for photo, _ in folder]
+        gains = [gain_db(answer, *pair) for answer, pair in zip(answers, folder, strict=True)]
+        tones = [tone(answer, *pair) for answer, pair in zip(answers, folder, strict=True)]
+        numbers[f"gain_db_{name}"] = sum(gains) / len(gains)
+        numbers[f"worse_{name}"] = sum(gain < 0 for gain in gains) / len(gains)
+        numbers[f"tone_{name}"] = sum(tones) / len(tones)
+    return numbers
 
 
 @torch.no_grad()
@@ -198,8 +237,25 @@ def _sheet(network: CompactNetwork, pairs: Pairs) -> Tensor:
     return torch.cat(rows, dim=1).permute(1, 2, 0)
 
 
-def _fitted(folders: Pairs) -> Pairs:
+def _fitted(folders: Pairs) -> dict[str, list[tuple[Tensor, Tensor]]]:
     return {name: [(_fit(photo), _fit(truth)) for photo, truth in pairs] for name, pairs in folders.items()}
+
+
+def _has_bfloat16(device: torch.device) -> bool:
+    """Whether the processor computes bfloat16 natively; elsewhere it is emulated, 20 to 50 times slower than float32."""
+    if device.type != "cpu":
+        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
+    return bool(torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported())
+
+
+def _held_out(recipe: CompactRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]:
+    """Always the same mixtures of what the recipe holds out."""
+    stream = held_out_mixtures(recipe)
+    if stream is None:
+        return {}
+    batch = stream(0, _HELD_OUT_MIXTURES, _HELD_OUT_SIDE_PX)
+    pairs = zip(batch.photo_encoded[:, None], batch.transmission_encoded[:, None], strict=True)
+    return {"mixtures": list(pairs)}
 
 
 def _fit(picture: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """Samples as a large backbone sees them: whole, in their own aspect ratio, composed of panels, and encoded once.
 
     samples = open_samples(recipe)
-    encoded = Latents(samples, backbone, recipe)(Dice(seed, step, slot))
+    encoded = Latents(samples, backbone, recipe)(SampleRng(seed, step, slot))
 
 Latents are a function of sample, mirroring and crop, by which they are kept, and of bucket (the size of the panels) and
 VAE, which need not stand beside them: a run has one VAE, frozen, and one budget, so that a sample's shape decides its
@@ -23,7 +23,8 @@ from torch.nn import functional
 
 from brewster.dataset.kept import OnDisk
 from brewster.dataset.layouts import Trio, read_folders
-from brewster.dataset.mix import Dice, Pairs
+from brewster.dataset.mix import Pairs
+from brewster.dataset.sample_rng import SampleRng
 from brewster.dataset.sources import read_pairs
 from brewster.errors import RecipeError
 from brewster.light import to_encoded, to_linear
@@ -86,15 +87,15 @@ class Samples:
             yield self._rendered.sample(0)
         yield from (pair.layers for pair in self._pairs)
 
-    def choose(self, dice: Dice) -> int:
+    def choose(self, rng: SampleRng) -> int:
         """The number of a sample: a pair as often as their share says."""
-        if dice.chance(self._share):
-            return self._first_pair + dice.choose(len(self._pairs))
-        return dice.choose(self._first_pair)
+        if rng.bernoulli(self._share):
+            return self._first_pair + rng.randint(len(self._pairs))
+        return rng.randint(self._first_pair)
 
 
 class Latents:
-    """Encodes what the dice choose.
+    """Encodes what the rng choose.
 
     Raises:
         PhotoError: a pair, or the first of the rendered samples, is smaller than a panel.
@@ -106,23 +107,25 @@ class Latents:
             panel_for(layers, backbone, recipe)
         self._encoded = lru_cache(KEPT)(self._encode)
 
-    def __call__(self, dice: Dice) -> Encoded:
+    def __call__(self, rng: SampleRng) -> Encoded:
         """A sample, maybe mirrored, whole or a crop of it.
 
         Raises:
             RecipeError, PhotoError: its files are missing or damaged, or it is smaller than a panel.
         """
-        number = self._samples.choose(dice)
-        mirrored = self._recipe.flip and dice.chance(0.5)
+        number = self._samples.choose(rng)
+        mirrored = self._recipe.flip and rng.bernoulli(0.5)
         crops = self._recipe.crops
-        return self._encoded(number, mirrored, dice.choose(crops + 1) if crops else 0)
+        return self._encoded(number, mirrored, rng.randint(crops + 1) if crops else 0)
 
     def _encode(self, number: int, mirrored: bool, crop: int) -> Encoded:
         sample, layout, see = self._samples[number], self._recipe.layout, self._backbone.encode
         fit = panel_for(sample.layers, self._backbone, self._recipe)
         seen = sample.layers
         if crop:
-            seen = cropped(Dice(self._recipe.seed, -1 - number, crop), seen, fit)  # dice that no step throws
+            seen = cropped(
+                SampleRng(self._recipe.seed, -1 - number, crop), seen, fit
+            )  # rng that no step throws
         panels = panels_in(seen.flip(1) if mirrored else seen, fit)
         many = self._recipe.objective == "flow"
         return Encoded(
@@ -133,15 +136,15 @@ class Latents:
         )
 
 
-def cropped(dice: Dice, layers: UInt8[Tensor, "h w 9"], fit: Fit) -> UInt8[Tensor, "p q 9"]:
+def cropped(rng: SampleRng, layers: UInt8[Tensor, "h w 9"], fit: Fit) -> UInt8[Tensor, "p q 9"]:
     """A window of the sample's aspect ratio, anywhere, with 0.5 to 1 of its sides, yet no smaller than what `fit` shows."""
     height, width, _ = layers.shape
     least = max(_LEAST_SIDE, fit.content[0] / width, fit.content[1] / height)
-    side = dice.uniform((least, 1.0))
+    side = rng.uniform((least, 1.0))
     columns, rows = (
         max(shown, round(side * whole)) for shown, whole in zip(fit.content, (width, height), strict=True)
     )
-    top, left = dice.choose(height - rows + 1), dice.choose(width - columns + 1)
+    top, left = rng.randint(height - rows + 1), rng.randint(width - columns + 1)
     return layers[top : top + rows, left : left + columns]
 
 

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from brewster.dataset.mix import Dice
+from brewster.dataset.sample_rng import SampleRng
 from brewster.errors import RecipeError
 from brewster.files import write_atomically
 from brewster.models.large.adapter.lora import add_lora, load_lora_state, lora_state, save_lora
@@ -161,16 +161,16 @@ class LoraLearner:
         """The gradients, and the parts of the loss, of this process's slots of the batch."""
         totals: dict[str, Tensor] = {}
         for slot in range(crew.rank(), self.recipe.batch, crew.size()):
-            parts = self._losses(Dice(self.recipe.seed, step, slot))
+            parts = self._losses(SampleRng(self.recipe.seed, step, slot))
             share = {name: part / self.recipe.batch for name, part in parts.items()}
             torch.stack(list(share.values())).sum().backward()  # type: ignore[no-untyped-call]
             totals = {name: totals.get(name, 0) + part.detach() for name, part in share.items()}
         return totals
 
-    def _losses(self, dice: Dice) -> dict[str, Tensor]:
+    def _losses(self, rng: SampleRng) -> dict[str, Tensor]:
         """The mean squared error of the velocity, start - picture, in each panel, weighted; they add up to the loss."""
-        encoded, device = self._data(dice), self.backbone.device
-        start, sigma = self._begun(dice, encoded)
+        encoded, device = self._data(rng), self.backbone.device
+        start, sigma = self._begun(rng, encoded)
         moved = (1 - sigma) * encoded.composite + sigma * start
         velocity = self.backbone.predict(
             moved.to(device),
@@ -187,14 +187,14 @@ class LoraLearner:
             for name, panel in split(errors, self.recipe.layout).items()
         }
 
-    def _begun(self, dice: Dice, encoded: Encoded) -> tuple[Tensor, Tensor]:
+    def _begun(self, rng: SampleRng, encoded: Encoded) -> tuple[Tensor, Tensor]:
         """Where this sample starts, and at which time from 0 to 1 it is looked at."""
         if encoded.start is not None:
             return encoded.start, torch.ones(1)
         recipe, grid = self.recipe, encoded.composite
-        normal = recipe.logit_mean + recipe.logit_deviation * dice.normal(1)
+        normal = recipe.logit_mean + recipe.logit_deviation * rng.normal(1)
         sigma = self.backbone.shifted(normal.sigmoid(), grid.shape[2] * grid.shape[3])
-        return dice.normal(*grid.shape), sigma
+        return rng.normal(*grid.shape), sigma
 
     def _weights(self) -> dict[str, float]:
         """How much each panel counts; 1 in all."""

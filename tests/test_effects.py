@@ -1,0 +1,69 @@
+import io
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from brewster.dataset import effects
+from brewster.dataset.sample_rng import SampleRng
+
+
+@pytest.fixture
+def scene(random):
+    """Smooth blobs and a hard edge, (3, 64, 64), encoded."""
+    coarse = torch.from_numpy(random.random((1, 3, 5, 5), np.float32))
+    smooth = torch.nn.functional.interpolate(coarse, (64, 64), mode="bicubic")[0].clamp(0, 1)
+    smooth[:, :, 40:] *= 0.4
+    return (smooth * 255).round() / 255
+
+
+@pytest.mark.parametrize("quality", [30, 60, 90])
+def test_our_jpeg_loses_what_a_codec_loses(scene, quality):
+    file = io.BytesIO()
+    levels = (scene * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
+    Image.fromarray(levels).save(file, "JPEG", quality=quality, subsampling=0)
+    decoded = torch.from_numpy(np.array(Image.open(file))).permute(2, 0, 1) / 255
+    ours = effects.jpeg(scene, quality)
+    lost = (decoded - scene).abs().mean()
+    assert (ours - scene).abs().mean().item() == pytest.approx(lost.item(), rel=0.1)
+    assert (ours - decoded).abs().mean() < 0.5 * lost
+
+
+@given(st.integers(0, 10**6), st.sampled_from(["falloff", "edge", "window", "shadow"]))
+def test_every_mask_is_a_share_of_light(slot, name):
+    mask = getattr(effects, name)(SampleRng(1, 2, slot), 48)
+    assert mask.shape == (1, 48, 48)
+    assert 0 <= mask.min() <= mask.max() <= 1
+
+
+def test_a_window_has_glass_and_wall():
+    shares = [effects.window(SampleRng(1, 0, slot), 64).mean().item() for slot in range(60)]
+    assert 0.2 < sum(shares) / 60 < 0.8
+
+
+def test_a_ghost_keeps_the_mean_of_a_flat_picture():
+    flat = torch.full((3, 32, 32), 0.3)
+    torch.testing.assert_close(effects.ghost(SampleRng(1, 0, 0), flat, 0.7, 5.0), flat)
+
+
+def test_blur_keeps_light_and_removes_detail(scene):
+    for disc in (False, True):
+        soft = effects.blur(scene, 2.0, disc=disc)
+        assert soft.mean().item() == pytest.approx(scene.mean().item(), rel=0.03)
+        assert soft.diff(dim=2).abs().max() < 0.5 * scene.diff(dim=2).abs().max()
+
+
+def test_lamps_are_far_brighter_than_their_glow():
+    for slot in range(20):
+        light = effects.lamps(SampleRng(1, 0, slot), 96)
+        assert light.min() >= 0
+        assert light.max() > 20 * light.median()
+
+
+def test_a_sign_leaves_most_of_the_picture_alone(scene):
+    changes = [(effects.sign(SampleRng(1, 0, slot), scene) - scene).abs() for slot in range(40)]
+    changed = [(change > 0.02).float().mean().item() for change in changes]
+    assert 0.02 < sum(changed) / 40 < 0.8
