@@ -16,6 +16,9 @@ def network():
     torch.manual_seed(1)
     network = with_imagenet_features().eval()
     torch.nn.init.normal_(network.head.weight, std=0.1)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.copy_(parameter.half())  # the file's precision
     return network
 
 
@@ -33,6 +36,11 @@ def test_the_exported_model_equals_the_network_at_any_size(network, exported, si
         expected = LinearSeparator(network)(torch.from_numpy(tile).permute(2, 0, 1)[None])
     for layer, truth in zip(OnnxBackend(exported, "cpu")(tile), expected, strict=True):
         np.testing.assert_allclose(layer, truth[0].permute(1, 2, 0).numpy(), atol=2e-5)
+
+
+def test_the_file_holds_two_bytes_a_weight(network, exported):
+    weights = sum(parameter.numel() for parameter in network.parameters())
+    assert 2 * weights < exported.stat().st_size < 2 * weights + 5e5
 
 
 @pytest.mark.parametrize("size", [(1, 1), (33, 31), (5, 200)])

@@ -8,16 +8,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import torch
+from onnx import ModelProto, TensorProto, helper, numpy_helper
 
 from brewster.files import write_atomically
 from brewster.models.compact import STRIDE, CompactNetwork, LinearSeparator
 
 _OPSET = 18
+_SMALLEST_WEIGHT = 16
 
 
 def export_onnx(network: CompactNetwork, path: Path) -> None:
     """Writes `photo` -> `transmission`, `reflection`, linear light (1, 3, H, W), H and W multiples of 32.
+
+    The weights are stored in half precision, which halves the file; the network still computes in float32.
 
     Raises:
         TargetError: the file cannot be written.
@@ -36,7 +41,27 @@ def export_onnx(network: CompactNetwork, path: Path) -> None:
             verbose=False,
         )
     assert program is not None
-    write_atomically(path, program.model_proto.SerializeToString(), overwrite=True)
+    write_atomically(path, with_half_weights(program.model_proto).SerializeToString(), overwrite=True)
+
+
+def with_half_weights(model: ModelProto) -> ModelProto:
+    """The same graph, its weights stored as float16 and cast to float32 before use.
+
+    The runtime folds the casts when it loads the file, so that they cost no time afterwards. Small tensors stay as they
+    are: they are constants of the graph, such as the numbers of the sRGB curve.
+    """
+    graph = model.graph
+    casts = []
+    for index, weight in enumerate(graph.initializer):
+        values = numpy_helper.to_array(weight)
+        if values.dtype == np.float32 and values.size >= _SMALLEST_WEIGHT:
+            half = f"{weight.name}_half"
+            casts.append(helper.make_node("Cast", [half], [weight.name], to=TensorProto.FLOAT))
+            graph.initializer[index].CopyFrom(numpy_helper.from_array(values.astype(np.float16), half))
+    nodes = [*casts, *graph.node]
+    del graph.node[:]
+    graph.node.extend(nodes)
+    return model
 
 
 @contextmanager
