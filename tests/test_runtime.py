@@ -35,7 +35,7 @@ def test_the_exported_model_equals_the_network_at_any_size(network, exported, si
     with torch.no_grad():
         expected = LinearSeparator(network)(torch.from_numpy(tile).permute(2, 0, 1)[None])
     for layer, truth in zip(OnnxBackend(exported, "cpu")(tile), expected, strict=True):
-        np.testing.assert_allclose(layer, truth[0].permute(1, 2, 0).numpy(), atol=2e-5)
+        np.testing.assert_allclose(layer, truth[0].permute(1, 2, 0).numpy(), atol=2e-4)
 
 
 def test_the_file_holds_two_bytes_a_weight(network, exported):
