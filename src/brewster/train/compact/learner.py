@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,6 +19,7 @@ from torch.nn import functional
 
 from brewster.dataset.mix import Batch, Stream
 from brewster.models.compact import STRIDE, CompactNetwork, with_imagenet_features
+from brewster.processes import one_thread
 from brewster.train.checkpoint import Checkpoint, fitting
 from brewster.train.compact.export import export_onnx
 from brewster.train.crew import best_device
@@ -33,6 +35,8 @@ MODEL: Final = "model.onnx"
 _VALIDATION_SIDE_PX: Final = 384
 _HELD_OUT_MIXTURES: Final = 128
 _HELD_OUT_SIDE_PX: Final = 192
+_VISIBLE: Final = 1e-4
+"""Mean squared difference, encoded: a photo at more than 40 dB from its transmission has no visible reflection."""
 _MAX_GRADIENT_NORM: Final = 1.0
 _TRAIN_IT_FIRST: Final = "train the recipe that makes it first, or mend start_from in this one"
 
@@ -46,7 +50,8 @@ def train(recipe: CompactRecipe, out: Path, report: Report) -> CompactNetwork:
         ModelError, TargetError: as `loop.run`.
     """
     learner = CompactLearner(recipe)
-    run(learner, out, report)
+    with one_thread():  # of the caller; the learner's own threads have one each
+        run(learner, out, report)
     return learner.averaged_network()
 
 
@@ -66,8 +71,8 @@ class CompactLearner:
         self._pairs: Pairs = _fitted(validation_pairs(recipe.data)) | _held_out(recipe)
         self._workers = 1 if self.device.type == "cpu" else os.cpu_count() or 1
         self._cores = torch.get_num_threads() if self.device.type == "cpu" else 1
-        self._core_pool = ThreadPoolExecutor(self._cores, initializer=torch.set_num_threads, initargs=(1,))
-        self._pool = ThreadPoolExecutor(self._workers)
+        self._core_pool = _one_thread_each(self._cores)
+        self._pool = _one_thread_each(self._workers)
         self._ahead: dict[int, Future[Batch]] = {}
         torch.manual_seed(recipe.seed)
         network = with_imagenet_features()
@@ -162,7 +167,8 @@ class CompactLearner:
     def validate(self) -> tuple[dict[str, float], Tensor]:
         """What the averaged network gains on the recipe's pairs, and what it makes of four of each folder."""
         network = self.averaged_network()
-        return validate(network, self._pairs), _sheet(network, self._pairs or self._some())
+        numbers = validate(network, self._pairs, self._core_pool.map)
+        return numbers, _sheet(network, self._pairs or self._some())
 
     def export(self, folder: Path) -> Path:
         """Writes model.onnx, which needs no torch.
@@ -209,17 +215,22 @@ class CompactLearner:
         return {"training": list(pairs)}
 
 
-@torch.no_grad()
-def validate(network: Callable[[Tensor], Tensor], pairs: Pairs) -> dict[str, float]:
+def validate(
+    network: Callable[[Tensor], Tensor], pairs: Pairs, map_: Callable[..., Iterable[Any]] = map
+) -> dict[str, float]:
     """By folder, at the (small) size of the given pairs: the mean gain in PSNR over the input, in dB; the share of pairs
     that are worse than the input; and the tone, the light of the answer over that of the input where nothing was added,
-    which is 1 for a network that leaves the exposure alone.
+    which is 1 for a network that leaves the exposure alone. `map_` may be that of a pool of threads.
     """
+
+    @torch.no_grad()
+    def measure(pair: tuple[Tensor, Tensor]) -> tuple[float, float]:
+        answer = network(pair[0])[:, :3].clamp(0, 1)
+        return gain_db(answer, *pair), tone(answer, *pair)
+
     numbers = {}
-    for name, folder in pairs.items():
-        answers = [network(photo)[:, :3].clamp(0, 1) for photo, _ in folder]
-        gains = [gain_db(answer, *pair) for answer, pair in zip(answers, folder, strict=True)]
-        tones = [tone(answer, *pair) for answer, pair in zip(answers, folder, strict=True)]
+    for name, folder in filter(itemgetter(1), pairs.items()):
+        gains, tones = zip(*map_(measure, folder), strict=True)
         numbers[f"gain_db_{name}"] = sum(gains) / len(gains)
         numbers[f"worse_{name}"] = sum(gain < 0 for gain in gains) / len(gains)
         numbers[f"tone_{name}"] = sum(tones) / len(tones)
@@ -241,6 +252,11 @@ def _fitted(folders: Pairs) -> dict[str, list[tuple[Tensor, Tensor]]]:
     return {name: [(_fit(photo), _fit(truth)) for photo, truth in pairs] for name, pairs in folders.items()}
 
 
+def _one_thread_each(count: int) -> ThreadPoolExecutor:
+    """Threads that compute side by side, each operation in one of them: they never wait for each other."""
+    return ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(1,))
+
+
 def _has_bfloat16(device: torch.device) -> bool:
     """Whether the processor computes bfloat16 natively; elsewhere it is emulated, 20 to 50 times slower than float32."""
     if device.type != "cpu":
@@ -249,13 +265,17 @@ def _has_bfloat16(device: torch.device) -> bool:
 
 
 def _held_out(recipe: CompactRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]:
-    """Always the same mixtures of what the recipe holds out."""
+    """Always the same mixtures of what the recipe holds out: those with a visible reflection, and those without."""
     stream = held_out_mixtures(recipe)
     if stream is None:
         return {}
     batch = stream(0, _HELD_OUT_MIXTURES, _HELD_OUT_SIDE_PX)
-    pairs = zip(batch.photo_encoded[:, None], batch.transmission_encoded[:, None], strict=True)
-    return {"mixtures": list(pairs)}
+    pairs = list(zip(batch.photo_encoded[:, None], batch.transmission_encoded[:, None], strict=True))
+    visible = [functional.mse_loss(*pair).item() > _VISIBLE for pair in pairs]
+    return {
+        name: [pair for pair, shown in zip(pairs, visible, strict=True) if shown is wanted]
+        for name, wanted in (("mixtures", True), ("plain", False))
+    }
 
 
 def _fit(picture: Tensor) -> Tensor:
