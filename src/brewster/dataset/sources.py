@@ -65,14 +65,21 @@ def read_maps(
     return [_read_map(path) for path in _list(folders, _MAPS, exclude, only)]
 
 
-def read_pairs(folders: Sequence[Path]) -> list[tuple[Tensor, Tensor]]:
+def read_pairs(folders: Sequence[Path], at_most: int | None = None) -> list[tuple[Tensor, Tensor]]:
     """Aligned (photo, transmission) pairs of folders as `layouts.read_folders` joins them, in order of path.
+
+    Of each folder `at_most` so many are read, evenly spaced.
 
     Raises:
         RecipeError: a folder cannot be read or is empty; a picture has no partner, or one of another size.
         PhotoError: a picture cannot be read.
     """
-    return [_read_pair(trio) for folder in folders for trio in _trios(folder)]
+    return [_read_pair(trio) for folder in folders for trio in _evenly(_trios(folder), at_most)]
+
+
+def _evenly(trios: list[Trio], at_most: int | None) -> list[Trio]:
+    count = min(len(trios), at_most or len(trios))
+    return [trios[number * len(trios) // count] for number in range(count)]
 
 
 def _trios(folder: Path) -> list[Trio]:

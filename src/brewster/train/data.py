@@ -46,7 +46,7 @@ def validation_pairs(data: DataRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]
     folders = tuple(dict.fromkeys(data.validate_on))
     root = data_folder() if folders else Path()
     return {
-        name: _evenly(read_pairs([root / folder]), data.validate_at_most)
+        name: read_pairs([root / folder], data.validate_at_most)
         for name, folder in zip(_short(folders), folders, strict=True)
     }
 
@@ -63,10 +63,6 @@ def held_out_mixtures(recipe: CompactRecipe) -> Stream | None:
     photos = read_photos(found(data.photos), data.exclude, only=data.held_out)
     maps = read_maps(found(data.maps), data.exclude, only=data.held_out)
     return Mixtures(photos, maps, recipe.mix, seed=recipe.seed + 3)
-
-
-def _evenly(pairs: list[tuple[Tensor, Tensor]], most: int) -> list[tuple[Tensor, Tensor]]:
-    return [pairs[number * len(pairs) // most] for number in range(most)] if len(pairs) > most else pairs
 
 
 def _short(folders: Sequence[Path]) -> list[str]:
