@@ -138,7 +138,7 @@ class CompactLearner:
         self._update_average(step + 1)
         return {"loss": loss.item(), **{name: part.item() for name, part in parts.items()}}
 
-    def _gradients(self, batch: Batch) -> tuple[dict[str, Tensor], list[Tensor]]:
+    def _gradients(self, batch: Batch) -> tuple[dict[str, Tensor], tuple[Tensor, ...]]:
         """The parts of the loss and the gradient of their sum, means over the batch.
 
         On a CPU each core computes a share of the batch by itself: measured 1.2-1.3 times faster than all cores on
@@ -148,12 +148,11 @@ class CompactLearner:
         shares = list(self._core_pool.map(self._share_of_gradients, batch.split(-(-count // self._cores))))
         names = shares[0][1]
         parts = {name: torch.stack([part[name] * n / count for n, part, _ in shares]).sum() for name in names}
-        gradients = [
-            torch.stack([gradient * n / count for (n, _, _), gradient in zip(shares, each, strict=True)]).sum(
-                0
-            )
-            for each in zip(*(gradients for _, _, gradients in shares), strict=True)
-        ]
+        (first, _, gradients), *others = shares
+        for index, total in enumerate(gradients):
+            total.mul_(first / count)
+            for n, _, others_gradients in others:
+                total.add_(others_gradients[index], alpha=n / count)
         return parts, gradients
 
     def _share_of_gradients(self, batch: Batch) -> tuple[int, dict[str, Tensor], tuple[Tensor, ...]]:
