@@ -1,3 +1,5 @@
+import copy
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,9 +10,20 @@ from brewster.errors import ModelError
 from brewster.train.checkpoint import Checkpoint
 from brewster.train.compact.learner import CompactLearner, train, validate
 from brewster.train.data import open_stream
+from brewster.train.losses import separation_loss
 from brewster.train.recipe import with_value
 
 RECIPES = Path(__file__).parents[1] / "recipes"
+
+
+@contextmanager
+def two_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def silent(step, steps, numbers, logged):
@@ -44,6 +57,31 @@ def test_training_lowers_the_loss_on_a_batch_seen_again_and_again(recipe):
     learner = CompactLearner(longer, lambda step, count, size: stream(0, 2, 64))
     losses = [learner.advance(step)["loss"] for step in range(30)]
     assert losses[-1] < 0.8 * losses[0]
+
+
+def test_shares_of_a_batch_on_two_cores_make_the_step_of_plain_adamw(recipe):
+    batch = open_stream(recipe)(0, 3, 64)
+    with two_threads():
+        learner = CompactLearner(recipe, lambda step, count, size: batch)
+    torch.nn.init.normal_(learner.network.head.weight, std=0.1)
+    plain = copy.deepcopy(learner.network)
+    encoder = list(plain.encoder.parameters())
+    rest = list(plain.parameters())[len(encoder) :]
+    warm = 1 / recipe.warmup_steps
+    rates = (recipe.encoder_learning_rate * warm, recipe.learning_rate * warm)
+    optimizer = torch.optim.AdamW(
+        [{"params": group, "lr": rate} for group, rate in zip((encoder, rest), rates, strict=True)],
+        weight_decay=recipe.weight_decay,
+        eps=1e-3,
+        fused=False,
+    )
+    learner.optimizer.param_groups[0]["eps"] = learner.optimizer.param_groups[1]["eps"] = 1e-3
+    sum(separation_loss(plain(batch.photo_encoded), batch).values()).backward()
+    torch.nn.utils.clip_grad_norm_(plain.parameters(), 1.0)
+    optimizer.step()
+    learner.advance(0)
+    for (name, ours), theirs in zip(learner.network.named_parameters(), plain.parameters(), strict=True):
+        torch.testing.assert_close(ours, theirs, atol=1e-6, rtol=1e-4, msg=name)
 
 
 def test_a_loss_that_is_not_a_number_stops_the_run_and_keeps_the_weights(recipe):

@@ -128,32 +128,32 @@ class CompactLearner:
         Raises:
             ModelError: the loss is not a number; the last checkpoint is still good.
         """
-        parts, gradients = self._gradients(self._batch(step).to(self.device))
+        parts = self._set_gradients(self._batch(step).to(self.device))
         loss = finite(torch.stack(list(parts.values())).sum(), step)
         self._set_learning_rates(step)
-        for parameter, gradient in zip(self.network.parameters(), gradients, strict=True):
-            parameter.grad = gradient
         nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
         self.optimizer.step()
         self._update_average(step + 1)
         return {"loss": loss.item(), **{name: part.item() for name, part in parts.items()}}
 
-    def _gradients(self, batch: Batch) -> tuple[dict[str, Tensor], tuple[Tensor, ...]]:
-        """The parts of the loss and the gradient of their sum, means over the batch.
+    def _set_gradients(self, batch: Batch) -> dict[str, Tensor]:
+        """Sets each parameter's gradient of the loss, a mean over the batch; returns the parts of the loss.
 
         On a CPU each core computes a share of the batch by itself: measured 1.2-1.3 times faster than all cores on
         one operation after the other (16 x 128 px, two cores).
         """
         count = len(batch.photo_encoded)
         shares = list(self._core_pool.map(self._share_of_gradients, batch.split(-(-count // self._cores))))
+        for parameter in self.network.parameters():
+            parameter.grad = torch.zeros_like(
+                parameter
+            )  # the fused optimiser needs the parameter's memory layout
+        for n, _, gradients in shares:
+            for parameter, gradient in zip(self.network.parameters(), gradients, strict=True):
+                assert parameter.grad is not None
+                parameter.grad.add_(gradient, alpha=n / count)
         names = shares[0][1]
-        parts = {name: torch.stack([part[name] * n / count for n, part, _ in shares]).sum() for name in names}
-        (first, _, gradients), *others = shares
-        for index, total in enumerate(gradients):
-            total.mul_(first / count)
-            for n, _, others_gradients in others:
-                total.add_(others_gradients[index], alpha=n / count)
-        return parts, gradients
+        return {name: torch.stack([part[name] * n / count for n, part, _ in shares]).sum() for name in names}
 
     def _share_of_gradients(self, batch: Batch) -> tuple[int, dict[str, Tensor], tuple[Tensor, ...]]:
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self._reduced, cache_enabled=False):
