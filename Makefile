@@ -5,7 +5,7 @@ BIN := .venv/bin
 export BREWSTER_DATA ?= $(wildcard ../shared/data)
 PHOTO ?= tests/pictures
 
-.PHONY: demo test test-slow check docs bench clean
+.PHONY: demo test test-slow coverage check docs bench dist clean
 
 demo: .venv/core
 	$(BIN)/python runs/demo.py "$(PHOTO)"
@@ -16,11 +16,21 @@ test: .venv/dev
 test-slow: .venv/dev
 	$(BIN)/python -m pytest -m slow
 
+coverage: .venv/dev
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile --cov --cov-report term
+
 check: .venv/dev
-	$(BIN)/ruff format --check . && $(BIN)/ruff check . && $(BIN)/mypy && $(BIN)/lint-imports
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python -m brewster.cli.reference | diff docs/reference.md - || { echo "docs/reference.md is out of date: run make docs"; exit 1; }
 
 docs: .venv/dev
 	$(BIN)/python -m brewster.cli.reference > docs/reference.md
+
+dist:
+	PYTHON=$(PYTHON) .ci/release
 
 bench: .venv/dev
 	$(BIN)/python bench/run.py

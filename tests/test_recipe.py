@@ -80,6 +80,10 @@ def test_a_scene_recipe_of_ones_own_lies_beside_the_recipe(tmp_path):
         (("seed = 1", ""), "seed; Field required"),
         (("seed = 1", "seed = -1"), "seed"),
         (("steps = 6", "steps = 0"), "steps"),
+        (
+            ("steps = 6", 'steps = 6\nnetwork = "lite3"'),
+            "network; there is no network 'lite3': one of lite2-unet",
+        ),
         (("weight_decay = 1e-4", "weight_decay = inf"), "weight_decay"),
         (("[[0.0, 64], [0.5, 96]]", "[]"), "sizes"),
         (("[[0.0, 64], [0.5, 96]]", "[[0.1, 64]]"), "sizes; .* start at 0"),

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from brewster.errors import DeviceError, ModelError
-from brewster.models.compact import LinearSeparator, with_imagenet_features
+from brewster.models.compact import STRIDE, LinearSeparator, with_imagenet_features
 from brewster.separate import runtime
 from brewster.separate.runtime import OnnxBackend, available_devices
 from brewster.train.compact.export import export_onnx
@@ -25,7 +25,7 @@ def network():
 @pytest.fixture(scope="module")
 def exported(network, tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "model.onnx"
-    export_onnx(network, path)
+    export_onnx(network, path, STRIDE)
     return path
 
 

@@ -30,4 +30,4 @@ def test_a_damaged_file_does_not_pass(tmp_path):
 
 
 def test_the_large_models_that_are_named_are_the_backbones_that_there_are():
-    assert list(LARGE) == list(BACKBONES)
+    assert list(LARGE) == list(BACKBONES) == [backbone.name for backbone in BACKBONES.values()]

@@ -86,8 +86,8 @@ class _Size(click.ParamType[int]):
     type=Named("real20=data/real20"),
     multiple=True,
     required=True,
-    help="A benchmark and where your copy lies; may be given again. NAME is real20, nature20, sir2, postcard, "
-    "solidobject, wildscene, openrr, pairs (any folder of pairs) or rendered (a set of brewster render).",
+    help="A benchmark and the folder of your copy; may be given again. NAME is one of docs/evaluation.md, such as real20, "
+    "sir2, pairs (any folder of pairs) or rendered (a set of brewster render); an unknown one is answered with all.",
 )
 @click.option(
     "--model",

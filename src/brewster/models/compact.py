@@ -172,7 +172,7 @@ class CompactNetwork(nn.Module):
 class LinearSeparator(nn.Module):
     """The network with the transfer curves inside: linear light in, both layers in linear light out."""
 
-    def __init__(self, network: CompactNetwork) -> None:
+    def __init__(self, network: nn.Module) -> None:
         super().__init__()
         self.network = network
 

@@ -72,8 +72,12 @@ MODELS: Final = {
 }
 
 
-LARGE: Final = ("kontext", "klein", "qwen")
-"""Large image models by name; they and what is trained on them lie elsewhere, and need the extra `large`."""
+LARGE: Final = {
+    "kontext": "brewster.models.large.families.kontext:Kontext",
+    "klein": "brewster.models.large.families.klein:Klein",
+    "qwen": "brewster.models.large.families.qwen:Qwen",
+}
+"""Large image models: name -> its `Backbone`, as text because importing it imports torch; needs the extra `large`."""
 
 
 TINY: Final = "tiny:"

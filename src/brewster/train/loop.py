@@ -122,10 +122,12 @@ def _take_up(learner: Learner, saved: Path) -> int:
 
 
 def _of_this_recipe(checkpoint: Checkpoint, recipe: Recipe, path: Path) -> Checkpoint:
-    if _identity(checkpoint.recipe, recipe) == _identity(recipe.model_dump_json(), recipe):
+    before, now = _identity(checkpoint.recipe, recipe), _identity(recipe.model_dump_json(), recipe)
+    if before == now:
         return checkpoint
+    changed = ", ".join(name for name in now if before and before.get(name) != now[name])
     raise RecipeError(
-        f"{path} belongs to another recipe",
+        f"{path} belongs to another recipe{f' (other values: {changed})' if changed else ''}",
         "a run resumes only with the recipe that it began with",
         "choose another folder with -o",
     )

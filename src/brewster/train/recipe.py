@@ -18,11 +18,11 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 from brewster.dataset.live import Mixing
 from brewster.dataset.mix import MixRecipe, Target
 from brewster.errors import RecipeError
-from brewster.models.compact import STRIDE
 from brewster.models.large.panels import Direction, Layout, Panel
 from brewster.models.large.prompt import PROMPTS
 from brewster.models.large.sampling import GUIDANCE
 from brewster.models.large.task import PAPER_PX, Objective, Task
+from brewster.models.networks import DEFAULT_NETWORK, LARGEST_STRIDE, NETWORKS
 from brewster.models.zoo import TINY
 from brewster.options import Quantisation
 from brewster.scene.values import Above0, From0, Positive, Seed, Share, Values, read_toml, wrong_value
@@ -32,14 +32,21 @@ _COMPARE = "the recipes in recipes/train/"
 ENCODED: Final = ".safetensors"
 """The ending of an encoded prompt's file."""
 
-Side = Annotated[int, Field(gt=0, multiple_of=STRIDE)]
-
 
 def _rising_from_0(sizes: list[tuple[float, int]]) -> list[tuple[float, int]]:
     starts, sides = zip(*sizes, strict=True)
     if starts[0] != 0 or list(starts) != sorted(set(starts)) or list(sides) != sorted(sides):
         raise ValueError("the shares start at 0 and rise, and so do the sides")
     return sizes
+
+
+Side = Annotated[int, Field(gt=0, multiple_of=LARGEST_STRIDE)]
+
+
+def _known_network(name: str) -> str:
+    if name not in NETWORKS:
+        raise ValueError(f"there is no network {name!r}: one of {', '.join(NETWORKS)}")
+    return name
 
 
 Sizes = Annotated[list[tuple[Share, Side]], Field(min_length=1), AfterValidator(_rising_from_0)]
@@ -147,8 +154,10 @@ class Recipe(Values):
 
 
 class CompactRecipe(Recipe):
-    """A run of the compact network. `sizes` lists (share of the run, side in px): small pictures first."""
+    """A run of a compact network. `sizes` lists (share of the run, side in px): small pictures first."""
 
+    network: Annotated[str, AfterValidator(_known_network)] = DEFAULT_NETWORK
+    """A name in the table of `brewster.models.networks`."""
     sizes: Sizes
     encoder_learning_rate: Above0
     average_decay: Share

@@ -12,6 +12,7 @@ import contextlib
 import difflib
 import importlib.util
 import json
+import pkgutil
 import zlib
 from collections.abc import Iterator
 from dataclasses import replace
@@ -23,16 +24,15 @@ from torch import Tensor, nn
 
 from brewster.errors import DeviceError, MissingExtra, ModelError
 from brewster.models.large.families.family import Architecture, Backbone
-from brewster.models.large.families.klein import Klein
-from brewster.models.large.families.kontext import Kontext
-from brewster.models.large.families.qwen import Qwen
 from brewster.models.large.prompt import PROMPT, PromptEmbedding
 from brewster.models.large.stock import bars_on_terminals_only, fetch, library, stock_class, within_memory
-from brewster.models.zoo import TINY
+from brewster.models.zoo import LARGE, TINY
 from brewster.options import Quantisation
 
-BACKBONES: Final[dict[str, type[Backbone]]] = {family.name: family for family in (Kontext, Klein, Qwen)}
-"""name -> adapter; each knows its hub id, licence, classes and full-size settings."""
+BACKBONES: Final[dict[str, type[Backbone]]] = {
+    name: pkgutil.resolve_name(adapter) for name, adapter in LARGE.items()
+}
+"""name -> adapter, which holds its hub id, licence, classes, full-size settings and card text. The rows are in `zoo`."""
 
 _INDEX: Final = "model_index.json"
 _CONFIGS: Final = {"transformer": "config.json", "vae": "config.json", "scheduler": "scheduler_config.json"}

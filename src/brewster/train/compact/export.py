@@ -11,16 +11,17 @@ from pathlib import Path
 import numpy as np
 import torch
 from onnx import ModelProto, TensorProto, helper, numpy_helper
+from torch import nn
 
 from brewster.files import write_atomically
-from brewster.models.compact import STRIDE, CompactNetwork, LinearSeparator
+from brewster.models.compact import LinearSeparator
 
 _OPSET = 18
 _SMALLEST_WEIGHT = 16
 
 
-def export_onnx(network: CompactNetwork, path: Path) -> None:
-    """Writes `photo` -> `transmission`, `reflection`, linear light (1, 3, H, W), H and W multiples of 32.
+def export_onnx(network: nn.Module, path: Path, stride: int) -> None:
+    """Writes `photo` -> `transmission`, `reflection`, linear light (1, 3, H, W), H and W multiples of `stride`.
 
     The weights are stored in half precision, which halves the file; the network still computes in float32.
 
@@ -28,14 +29,14 @@ def export_onnx(network: CompactNetwork, path: Path) -> None:
         TargetError: the file cannot be written.
     """
     height, width = (torch.export.Dim(name, min=1, max=256) for name in ("rows", "columns"))
-    example = torch.rand(1, 3, 4 * STRIDE, 5 * STRIDE)
+    example = torch.rand(1, 3, 4 * stride, 5 * stride)
     with _quietly():
         program = torch.onnx.export(
             LinearSeparator(network).eval(),
             (example,),
             input_names=["photo"],
             output_names=["transmission", "reflection"],
-            dynamic_shapes={"photo": {2: STRIDE * height, 3: STRIDE * width}},
+            dynamic_shapes={"photo": {2: stride * height, 3: stride * width}},
             opset_version=_OPSET,
             dynamo=True,
             verbose=False,

@@ -5,6 +5,7 @@ network = train(read_recipe(Path("recipes/train/compact.toml")), Path("out/compa
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
@@ -18,7 +19,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from brewster.dataset.mix import Batch, Stream
-from brewster.models.compact import STRIDE, CompactNetwork, with_imagenet_features
+from brewster.errors import ModelError
+from brewster.models.networks import DEFAULT_NETWORK, NETWORKS
 from brewster.processes import one_thread
 from brewster.train.checkpoint import Checkpoint, fitting
 from brewster.train.compact.export import export_onnx
@@ -41,7 +43,7 @@ _MAX_GRADIENT_NORM: Final = 1.0
 _TRAIN_IT_FIRST: Final = "train the recipe that makes it first, or mend start_from in this one"
 
 
-def train(recipe: CompactRecipe, out: Path, report: Report) -> CompactNetwork:
+def train(recipe: CompactRecipe, out: Path, report: Report) -> nn.Module:
     """Runs or resumes the recipe in folder `out`, as `loop.run` does; the network that users get.
 
     Raises:
@@ -66,19 +68,20 @@ class CompactLearner:
 
     def __init__(self, recipe: CompactRecipe, stream: Stream | None = None) -> None:
         self.recipe, self.device = recipe, best_device()
+        self._entry = NETWORKS[recipe.network]
         self.stream = stream or open_stream(recipe, self.device)
         self._reduced = recipe.precision == "auto" and _has_bfloat16(self.device)
-        self._pairs: Pairs = _fitted(validation_pairs(recipe.data)) | _held_out(recipe)
+        self._pairs: Pairs = _fitted(validation_pairs(recipe.data), self._entry.stride) | _held_out(recipe)
         self._workers = 1 if self.device.type == "cpu" else os.cpu_count() or 1
         self._cores = torch.get_num_threads() if self.device.type == "cpu" else 1
         self._core_pool = _one_thread_each(self._cores)
         self._pool = _one_thread_each(self._workers)
         self._ahead: dict[int, Future[Batch]] = {}
         torch.manual_seed(recipe.seed)
-        network = with_imagenet_features()
+        network = self._entry.pretrained()
         self.network = network.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._begin_average()
-        encoder = list(self.network.encoder.parameters())
+        encoder = list(self.network.get_submodule("encoder").parameters())
         known = set(map(id, encoder))
         rest = [parameter for parameter in self.network.parameters() if id(parameter) not in known]
         self.optimizer = torch.optim.AdamW(
@@ -100,10 +103,10 @@ class CompactLearner:
             ModelError: a checkpoint is missing, damaged or of another network.
         """
         for count, path in enumerate(self.recipe.start_from, start=1):
-            other = CompactNetwork()
-            average = Checkpoint.read(path, _TRAIN_IT_FIRST).state.get("average", {})
+            other, checkpoint = self._entry.build(), Checkpoint.read(path, _TRAIN_IT_FIRST)
             with fitting(path, _TRAIN_IT_FIRST):
-                other.load_state_dict(average)
+                _refuse_another_network(path, checkpoint, self.recipe.network)
+                other.load_state_dict(checkpoint.state.get("average", {}))
             for mine, theirs in zip(self.network.parameters(), other.parameters(), strict=True):
                 mine.lerp_(theirs.to(self.device), 1 / count)
         self._begin_average()
@@ -175,12 +178,12 @@ class CompactLearner:
         Raises:
             TargetError: it cannot be written.
         """
-        export_onnx(self.averaged_network(), folder / MODEL)
+        export_onnx(self.averaged_network(), folder / MODEL, self._entry.stride)
         return folder / MODEL
 
-    def averaged_network(self) -> CompactNetwork:
+    def averaged_network(self) -> nn.Module:
         """The network with the running average of its weights, ready to be used."""
-        network = CompactNetwork().eval()
+        network = self._entry.build().eval()
         network.load_state_dict(self.average)
         return network
 
@@ -237,7 +240,7 @@ def validate(
 
 
 @torch.no_grad()
-def _sheet(network: CompactNetwork, pairs: Pairs) -> Tensor:
+def _sheet(network: nn.Module, pairs: Pairs) -> Tensor:
     """Rows of photo, truth, transmission and reflection, four of each folder: (H, 960, 3)."""
     rows = []
     for photo, truth in (pair for folder in pairs.values() for pair in folder[:4]):
@@ -247,8 +250,22 @@ def _sheet(network: CompactNetwork, pairs: Pairs) -> Tensor:
     return torch.cat(rows, dim=1).permute(1, 2, 0)
 
 
-def _fitted(folders: Pairs) -> dict[str, list[tuple[Tensor, Tensor]]]:
-    return {name: [(_fit(photo), _fit(truth)) for photo, truth in pairs] for name, pairs in folders.items()}
+def _fitted(folders: Pairs, stride: int) -> dict[str, list[tuple[Tensor, Tensor]]]:
+    return {
+        name: [(_fit(photo, stride), _fit(truth, stride)) for photo, truth in pairs]
+        for name, pairs in folders.items()
+    }
+
+
+def _refuse_another_network(path: Path, checkpoint: Checkpoint, wanted: str) -> None:
+    """Checkpoints of runs older than the recipe's `network` hold the default one."""
+    found = json.loads(checkpoint.recipe).get("network", DEFAULT_NETWORK)
+    if found != wanted:
+        raise ModelError(
+            f"{path} holds the network {found}",
+            f"a checkpoint of {wanted}, the network that the recipe trains",
+            _TRAIN_IT_FIRST,
+        )
 
 
 def _one_thread_each(count: int) -> ThreadPoolExecutor:
@@ -277,11 +294,11 @@ def _held_out(recipe: CompactRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]:
     }
 
 
-def _fit(picture: Tensor) -> Tensor:
+def _fit(picture: Tensor, stride: int) -> Tensor:
     """uint8 (H, W, 3) to float (1, 3, h, w) that the network takes, longest side 384 px."""
     height, width, _ = picture.shape
     scale = _VALIDATION_SIDE_PX / max(height, width)
-    size = [max(1, round(side * scale / STRIDE)) * STRIDE for side in (height, width)]
+    size = [max(1, round(side * scale / stride)) * stride for side in (height, width)]
     planes = picture.permute(2, 0, 1)[None] / 255
     return functional.interpolate(planes, size, mode="bilinear", antialias=True)
 

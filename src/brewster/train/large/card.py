@@ -21,7 +21,7 @@ from brewster.errors import BrewsterError, ModelError
 from brewster.files import write_atomically
 from brewster.models.large.adapter.hub import CARD_FILE
 from brewster.models.large.backbones import BACKBONES
-from brewster.models.large.families.family import Backbone
+from brewster.models.large.families.family import APACHE_2, Backbone, StockCall
 from brewster.models.large.panels import fit_panel
 from brewster.models.large.prompt import PROMPT, PROMPT_FILE, load_prompt
 from brewster.models.large.sampling import GUIDANCE, STEPS
@@ -29,36 +29,12 @@ from brewster.models.zoo import TINY
 from brewster.train.data import found
 from brewster.train.recipe import LargeRecipe
 
-_LICENCES: Final = {
-    "Apache-2.0": {"license": "apache-2.0"},
-    "FLUX.1 [dev] Non-Commercial License": {
-        "license": "other",
-        "license_name": "flux-1-dev-non-commercial-license",
-        "license_link": "https://huggingface.co/black-forest-labs/FLUX.1-Kontext-dev/blob/main/LICENSE.md",
-    },
-}
-"""A licence as `Backbone.licence` calls it -> as the hub does. A LoRA is handed on as its base is."""
-
 _TAGS: Final = ("lora", "reflection-removal", "image-decomposition", "brewster")
 _PANELS: Final = {
     "I": "the photo again (I)",
     "T": "what is behind the glass (T, the transmission)",
     "R": "what is mirrored in it (R, the reflection)",
 }
-_STOCK_OPTIONS: Final = {
-    "kontext": 'pooled_prompt_embeds=words["pooled"], max_area={area}, _auto_resize=False,',
-    "klein": 'negative_prompt_embeds=words["negative"],',
-}
-_STOCK_PARTS: Final = {
-    "kontext": "text_encoder=None, text_encoder_2=None, tokenizer=None, tokenizer_2=None",
-    "klein": "text_encoder=None, tokenizer=None",
-}
-_STOCK_TRAPS: Final = {
-    "kontext": "Without `max_area` and `_auto_resize=False` the pipeline rescales both pictures in silence.",
-    "klein": "A condition of more than 1024 x 1024 pixels would be rescaled in silence.",
-}
-"""What stock pipelines want said; one that is not here cannot be shown what the LoRA learnt."""
-
 _SQUARE: Final = (4096, 4096)
 """A large square photo, whose panels fill the budget best."""
 _MEASURED: Final = "## Measured"
@@ -127,10 +103,10 @@ def _front_matter(recipe: LargeRecipe, base: type[Backbone]) -> str:
     """What the hub reads: YAML, of which JSON's strings and lists are a part."""
     about: dict[str, object] = {}
     if _is_toy(recipe):
-        about |= {"license": "apache-2.0"}
+        about |= APACHE_2.hub
     else:
         about |= {"base_model": _base_id(recipe, base), "base_model_relation": "adapter"}
-        about |= _LICENCES.get(base.licence, {"license": "unknown"})
+        about |= base.licence.hub
     about |= {"library_name": "diffusers", "pipeline_tag": "image-to-image"}
     about |= {"tags": [*_TAGS, *(["toy"] if _is_toy(recipe) else [])]}
     lines = [f"{name}: {json.dumps(value)}" for name, value in about.items()]
@@ -181,18 +157,19 @@ def _stock_use(recipe: LargeRecipe, base: type[Backbone]) -> str:
     loads = 'Stock diffusers loads it with `pipe.load_lora_weights("lora")`'
     if recipe.objective == "one_step":
         return f"{loads}, but starts from noise, where this LoRA starts from the photo, and takes one step."
-    if base.name not in _STOCK_OPTIONS:
-        return f"{loads}, but resizes what it is shown to a megapixel, so that its panels are not the ones learnt."
+    stock = base.stock_use
+    if isinstance(stock, str):
+        return f"{loads}, {stock}."
     return f"""{loads}.
 Shown the same at the same size, it makes the same composite: small, and without brewster's care for detail and colour.
-Both sides of a panel are multiples of {base.multiple}. {_STOCK_TRAPS[base.name]}
+Both sides of a panel are multiples of {base.multiple}. {stock.caution}
 
 ```python
-{_stock_code(recipe, base)}
+{_stock_code(recipe, base, stock)}
 ```"""
 
 
-def _stock_code(recipe: LargeRecipe, base: type[Backbone]) -> str:
+def _stock_code(recipe: LargeRecipe, base: type[Backbone], stock: StockCall) -> str:
     fit = fit_panel(_SQUARE, recipe.layout, budget_px=recipe.budget_px, multiple=base.multiple)
     (width, height), (whole, high) = fit.panel, recipe.layout.composite_size(fit.panel)
     corners = {
@@ -212,7 +189,7 @@ from safetensors.torch import load_file
 
 pipe = {base.classes["pipeline"]}.from_pretrained(
     "{_base_id(recipe, base)}",
-    dtype=torch.bfloat16, {_STOCK_PARTS[base.name]},
+    dtype=torch.bfloat16, {stock.parts},
 ).to("cuda")
 pipe.load_lora_weights("lora")
 words = load_file("lora/{PROMPT_FILE}", device="cuda")
@@ -220,7 +197,7 @@ photo = Image.open("photo.jpg").convert("RGB").resize(({width}, {height}))  # fo
 {shown}
 made = pipe(
     image=shown, prompt_embeds=words["embeds"], width={whole}, height={high},
-    {_STOCK_OPTIONS[base.name].format(area=whole * high)}
+    {stock.options.format(area=whole * high)}
     num_inference_steps={STEPS}, guidance_scale={GUIDANCE}, generator=torch.Generator().manual_seed(0),
 ).images[0]
 transmission = made.crop(({x}, {y}, {x + width}, {y + height}))"""
@@ -289,9 +266,9 @@ def _titled(name: str) -> str:
 
 def _licence(recipe: LargeRecipe, base: type[Backbone]) -> str:
     if _is_toy(recipe):
-        return "Apache-2.0: nobody else's weights are in it."
-    text = f"{base.licence}, that of the base."
-    if "Non-Commercial" in base.licence:
+        return f"{APACHE_2.title}: nobody else's weights are in it."
+    text = f"{base.licence.title}, that of the base."
+    if not base.licence.is_commercial:
         text += " **Not for commercial use.** The base is gated: ask for access on its page."
     return text
 

@@ -249,8 +249,8 @@ def _remarks(folder: Path, card: LoraCard, renamed: Mapping[str, str]) -> Iterat
     licence = find_family(card.backbone).licence
     if _is_toy(card):
         yield f"its base is {card.base}, a toy: nobody can separate photos with it"
-    elif "Non-Commercial" in licence:
-        yield f"its base is under the {licence}: so is the LoRA, and it is not for commercial use"
+    elif not licence.is_commercial:
+        yield f"its base is under the {licence.title}: so is the LoRA, and it is not for commercial use"
     yield from (f"{place} is called {name} in what is sent" for place, name in renamed.items())
     others = sorted(path.name for path in folder.iterdir() if path.name not in FILES)
     if others:

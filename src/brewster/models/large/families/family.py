@@ -9,8 +9,9 @@ from __future__ import annotations
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final, final
 
 import numpy as np
 import torch
@@ -33,6 +34,33 @@ Architecture = Mapping[str, Mapping[str, Any]]
 """The settings of the three parts "transformer", "vae" and "scheduler"."""
 
 
+@final
+@dataclass(frozen=True)
+class Licence:
+    """The terms of a base, which are those of every LoRA on it."""
+
+    title: str
+    hub: Mapping[str, str]
+    """Its entries in the front matter of a model card on the hub."""
+    is_commercial: bool = True
+
+
+APACHE_2: Final = Licence("Apache-2.0", {"license": "apache-2.0"})
+
+
+@final
+@dataclass(frozen=True)
+class StockCall:
+    """How the card of a LoRA calls the stock pipeline so that it makes the same composite, as Python source."""
+
+    parts: str
+    """Arguments of `from_pretrained` that leave out the text encoders."""
+    options: str
+    """Arguments of the call; {area} stands for the pixels of the composite, `words` for the encoded prompt."""
+    caution: str
+    """What the pipeline does unless it is called so, one sentence."""
+
+
 class Backbone(ABC):
     """A flow-matching transformer that generates a picture beside a conditioning picture, its VAE and scheduler.
 
@@ -41,7 +69,9 @@ class Backbone(ABC):
 
     name: ClassVar[str]
     hub_id: ClassVar[str]
-    licence: ClassVar[str]
+    licence: ClassVar[Licence]
+    stock_use: ClassVar[StockCall | str]
+    """For the card: how to call the stock pipeline, or why it cannot make the same picture, "but ..."."""
     classes: ClassVar[Mapping[str, str]]
     """Names in diffusers of the "pipeline", "transformer", "vae" and "scheduler"."""
     real: ClassVar[Architecture]

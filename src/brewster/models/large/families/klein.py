@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Final, final
 import torch
 from torch import Tensor
 
-from brewster.models.large.families.family import GuidedTwice, grid_of, random_prompt
+from brewster.models.large.families.family import APACHE_2, GuidedTwice, StockCall, grid_of, random_prompt
 from brewster.models.large.prompt import PromptEmbedding
 
 _SCHEDULER: Final = {
@@ -27,7 +27,12 @@ class Klein(GuidedTwice):
 
     name = "klein"
     hub_id = "black-forest-labs/FLUX.2-klein-base-4B"
-    licence = "Apache-2.0"
+    licence = APACHE_2
+    stock_use = StockCall(
+        "text_encoder=None, tokenizer=None",
+        'negative_prompt_embeds=words["negative"],',
+        "A condition of more than 1024 x 1024 pixels would be rescaled in silence.",
+    )
     classes: ClassVar = {
         "pipeline": "Flux2KleinPipeline", "transformer": "Flux2Transformer2DModel",
         "vae": "AutoencoderKLFlux2", "scheduler": "FlowMatchEulerDiscreteScheduler",

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from brewster.errors import ModelError
-from brewster.models.large.families.family import Backbone, grid_of, random_prompt
+from brewster.models.large.families.family import Backbone, Licence, StockCall, grid_of, random_prompt
 from brewster.models.large.prompt import PromptEmbedding
 
 _SCHEDULER: Final = {
@@ -28,7 +28,20 @@ class Kontext(Backbone):
 
     name = "kontext"
     hub_id = "black-forest-labs/FLUX.1-Kontext-dev"
-    licence = "FLUX.1 [dev] Non-Commercial License"
+    licence = Licence(
+        "FLUX.1 [dev] Non-Commercial License",
+        {
+            "license": "other",
+            "license_name": "flux-1-dev-non-commercial-license",
+            "license_link": "https://huggingface.co/black-forest-labs/FLUX.1-Kontext-dev/blob/main/LICENSE.md",
+        },
+        is_commercial=False,
+    )
+    stock_use = StockCall(
+        "text_encoder=None, text_encoder_2=None, tokenizer=None, tokenizer_2=None",
+        'pooled_prompt_embeds=words["pooled"], max_area={area}, _auto_resize=False,',
+        "Without `max_area` and `_auto_resize=False` the pipeline rescales both pictures in silence.",
+    )
     classes: ClassVar = {
         "pipeline": "FluxKontextPipeline", "transformer": "FluxTransformer2DModel",
         "vae": "AutoencoderKL", "scheduler": "FlowMatchEulerDiscreteScheduler",

@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Final, final
 import torch
 from torch import Tensor
 
-from brewster.models.large.families.family import PATCH, GuidedTwice, grid_of, random_prompt
+from brewster.models.large.families.family import APACHE_2, PATCH, GuidedTwice, grid_of, random_prompt
 from brewster.models.large.prompt import PromptEmbedding
 
 _SCHEDULER: Final = {
@@ -27,7 +27,8 @@ class Qwen(GuidedTwice):
 
     name = "qwen"
     hub_id = "Qwen/Qwen-Image-Edit"
-    licence = "Apache-2.0"
+    licence = APACHE_2
+    stock_use = "but resizes what it is shown to a megapixel, so that its panels are not the ones learnt"
     words_need = ("torchvision",)
     classes: ClassVar = {
         "pipeline": "QwenImageEditPipeline", "transformer": "QwenImageTransformer2DModel",

@@ -1,0 +1,99 @@
+"""docs/how-to-extend.md is true: its blocks are applied to a copy of the package, and its checks pass there."""
+
+import ast
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PLACE = re.compile(r"# (?:new file )?(\S+)(?:, (among the imports|(?:in|before) [\w.]+))?\n")
+
+
+def sections():
+    """The code blocks of each section, by its heading."""
+    chapters = re.split(r"^## ", (ROOT / "docs/how-to-extend.md").read_text(), flags=re.M)[1:]
+    return {
+        chapter.partition("\n")[0]: re.findall(r"^```\w+\n(.*?)^```", chapter, re.M | re.S)
+        for chapter in chapters
+    }
+
+
+@pytest.fixture
+def checkout(tmp_path):
+    """A copy of what the examples change, next to links to what they use."""
+    shutil.copytree(ROOT / "src", tmp_path / "src", ignore=shutil.ignore_patterns("weights"))
+    (tmp_path / "src/brewster/models/weights").symlink_to(ROOT / "src/brewster/models/weights")
+    shutil.copytree(ROOT / "recipes", tmp_path / "recipes")
+    (tmp_path / "tests").symlink_to(ROOT / "tests")
+    return tmp_path
+
+
+def apply(block, root):
+    """Puts a block where its first line says."""
+    path, place = PLACE.match(block).groups()
+    body, path = block.partition("\n")[2], root / path
+    if block.startswith("# new file"):
+        assert not path.exists(), f"{path} exists already"
+        path.write_text(body)
+        return
+    lines = path.read_text().splitlines(keepends=True)
+    line, indent = find(ast.parse("".join(lines)), place)
+    path.write_text("".join([*lines[:line], textwrap.indent(body, " " * indent), *lines[line:]]))
+
+
+def find(tree, place):
+    """The number of lines before the place, and its indentation."""
+    if place == "among the imports":
+        return max(node.end_lineno for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)), 0
+    side, name = place.split(" ")
+    node = tree
+    for part in name.split("."):
+        node = next(child for child in node.body if part in names(child))
+    if side == "before":
+        return node.lineno - 1, 0
+    if isinstance(node, ast.ClassDef):
+        return node.end_lineno, 4
+    if isinstance(node, ast.FunctionDef):  # before it returns
+        return node.body[-1].lineno - 1, node.body[-1].col_offset
+    return node.end_lineno - 1, 4  # before the bracket that ends a table
+
+
+def names(node):
+    """What a statement defines."""
+    if isinstance(node, ast.ClassDef | ast.FunctionDef):
+        return {node.name}
+    targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+    return {target.id for target in targets if isinstance(target, ast.Name)}
+
+
+def test_every_extension_point_has_a_section():
+    assert list(sections()) == [
+        "A compact network", "A metric", "A glass effect", "A backbone for large models", "A benchmark",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("section", list(sections()))
+def test_what_the_section_adds_works_and_changes_no_other_file(section, checkout):
+    if section == "A metric" and not importlib.util.find_spec("brewster.metrics.metric"):
+        pytest.skip("the rows of METRICS have no function yet")
+    *changes, check = sections()[section]
+    for block in changes:
+        apply(block, checkout)
+    kind, _, code = check.partition("\n")
+    assert kind == "# try it"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=checkout,
+        env=os.environ | {"PYTHONPATH": str(checkout / "src"), "HF_HUB_OFFLINE": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr

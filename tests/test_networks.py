@@ -1,0 +1,96 @@
+"""The table of compact networks: what a row promises to the trainer and to the exported file."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import nn
+
+from brewster.errors import ModelError, RecipeError
+from brewster.models.networks import DEFAULT_NETWORK, LARGEST_STRIDE, NETWORKS, NetworkEntry
+from brewster.separate.runtime import OnnxBackend
+from brewster.train.checkpoint import Checkpoint
+from brewster.train.compact.learner import CompactLearner, train
+from brewster.train.recipe import with_value
+
+
+class Small(nn.Module):
+    """A network of two convolutions at a stride of 4."""
+
+    def __init__(self):
+        super().__init__()
+        self.encoder = nn.Conv2d(3, 8, 4, stride=4)
+        self.head = nn.ConvTranspose2d(8, 6, 4, stride=4)
+
+    def forward(self, photo_encoded):
+        return self.head(self.encoder(photo_encoded)) + torch.cat([photo_encoded, 0 * photo_encoded], dim=1)
+
+
+@pytest.fixture
+def small(monkeypatch):
+    monkeypatch.setitem(NETWORKS, "small", NetworkEntry(Small, Small, stride=4))
+    return "small"
+
+
+def silent(step, steps, numbers, logged):
+    pass
+
+
+@pytest.mark.parametrize("name", list(NETWORKS))
+def test_every_network_keeps_the_promises_of_its_row(name):
+    entry = NETWORKS[name]
+    assert LARGEST_STRIDE % entry.stride == 0
+    fresh, started = entry.build(), entry.pretrained()
+    assert fresh.state_dict().keys() == started.state_dict().keys()
+    assert list(started.get_submodule("encoder").parameters())
+    assert fresh(torch.rand(2, 3, entry.stride, 2 * entry.stride)).shape == (
+        2,
+        6,
+        entry.stride,
+        2 * entry.stride,
+    )
+
+
+def test_a_recipe_without_a_network_trains_the_default_one(recipe):
+    assert recipe.network == DEFAULT_NETWORK
+    assert type(CompactLearner(recipe).network) is NETWORKS[DEFAULT_NETWORK].build
+
+
+def test_a_recipe_trains_and_exports_the_network_that_it_names(recipe, small, tmp_path):
+    recipe = with_value(recipe, "network", small)
+    assert isinstance(train(recipe, tmp_path, silent), Small)
+    learner = CompactLearner(recipe)
+    learner.restore(Checkpoint.read(tmp_path / "checkpoint.pt").state)
+    backend = OnnxBackend(learner.export(tmp_path), "cpu")
+    photo = torch.rand(8, 20, 3).numpy()
+    transmission, reflection = backend(photo)
+    assert transmission.shape == reflection.shape == photo.shape
+
+
+def test_a_run_of_one_network_does_not_start_from_a_checkpoint_of_another(recipe, small, tmp_path):
+    learner = CompactLearner(recipe)
+    Checkpoint(0, recipe.model_dump_json(), learner.state()).write(tmp_path / "start.pt")
+    other = with_value(recipe, "network", small).model_copy(update={"start_from": (tmp_path / "start.pt",)})
+    with pytest.raises(
+        ModelError,
+        match=r"start.pt holds the network lite2-unet; a checkpoint of small, .*; train the recipe",
+    ):
+        CompactLearner(other).begin()
+
+
+def test_a_run_of_one_network_is_not_resumed_with_another(recipe, small, tmp_path):
+    train(recipe, tmp_path, silent)
+    with pytest.raises(RecipeError, match=r"belongs to another recipe \(other values: network\)"):
+        train(with_value(recipe, "network", small), tmp_path, silent)
+
+
+def test_checkpoints_older_than_the_choice_of_network_hold_the_default_one(recipe, tmp_path):
+    learner = CompactLearner(recipe)
+    older = recipe.model_dump_json(exclude={"network"})
+    assert "network" not in older
+    average = {name: torch.full_like(value, 2.0) for name, value in learner.average.items()}
+    checkpoint = replace(Checkpoint(0, older, learner.state()), state=learner.state() | {"average": average})
+    checkpoint.write(tmp_path / "start.pt")
+    started = CompactLearner(recipe.model_copy(update={"start_from": (tmp_path / "start.pt",)}))
+    started.begin()
+    assert all((value == 2).all() for value in started.network.state_dict().values())
