@@ -245,7 +245,8 @@ class _Told:
         """One line at once for what was rendered or failed."""
         self.counts[result.status] += 1
         if self._as_json:
-            write_out(f"{json.dumps(asdict(result))}\n".encode())
+            row = {name: value for name, value in asdict(result).items() if name != "fatal"}
+            write_out(f"{json.dumps(row)}\n".encode())
         if result.error:
             complain(f"sample {result.index}: {result.error}")
         elif result.status == "rendered" and not self._quiet:

@@ -24,14 +24,14 @@ import tomli_w
 import brewster
 from brewster.dataset import sets
 from brewster.dataset.build.overview import write_index
-from brewster.errors import DeviceError, MissingExtra, TargetError
+from brewster.errors import BrewsterError, DeviceError, MissingExtra, TargetError
 from brewster.files import write_atomically
 from brewster.scene.recipe import SceneRecipe
 from brewster.scene.sampler import Catalog
 
 RECORD: Final = "set.toml"
 _LOCK: Final = ".lock"
-_HOPELESS: Final = {error.__name__: error for error in (TargetError, MissingExtra, DeviceError)}
+FATAL: Final = (TargetError, MissingExtra, DeviceError)
 """Errors that the next sample would meet too: they end the run."""
 
 
@@ -79,13 +79,17 @@ class Task:
 @final
 @dataclass(frozen=True)
 class Result:
-    """What became of a sample (or, if packing failed, of its block); `kind` is the class of the error."""
+    """What became of a sample (or, if packing failed, of its block).
+
+    `kind` is the class of the error; `fatal` is the error itself if it ends the run.
+    """
 
     index: int
     status: Literal["rendered", "skipped", "failed"]
     seconds: float = 0.0
     error: str | None = None
     kind: str | None = None
+    fatal: BrewsterError | None = None
 
 
 Report = Callable[[Result], None]
@@ -139,16 +143,11 @@ def _work(schedule: _Schedule, crew: Crew) -> None:
             crew.submit(task)
         elif crew.is_busy():
             for result in crew.wait():
-                _end_if_hopeless(result)
+                if result.fatal:
+                    raise result.fatal
                 schedule.note(result)
         else:
             return
-
-
-def _end_if_hopeless(result: Result) -> None:
-    """Raises an error that happened in another process, made again from the three beats of its message."""
-    if result.error and result.kind in _HOPELESS:
-        raise _HOPELESS[result.kind](*result.error.removesuffix(".").split("; ", 2))
 
 
 @final

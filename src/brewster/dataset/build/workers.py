@@ -20,7 +20,7 @@ from types import TracebackType
 from typing import Final, Self, final
 
 from brewster.dataset import sets
-from brewster.dataset.build.job import Job, Result, Task
+from brewster.dataset.build.job import FATAL, Job, Result, Task
 from brewster.errors import BrewsterError, RecipeError, TargetError
 from brewster.processes import end_with_parent, one_thread
 from brewster.render.sample import Sample
@@ -66,7 +66,8 @@ class Hand:
         try:
             work()
         except BrewsterError as error:
-            return Result(index, "failed", error=str(error), kind=type(error).__name__)
+            fatal = error if isinstance(error, FATAL) else None
+            return Result(index, "failed", error=str(error), kind=type(error).__name__, fatal=fatal)
         except MemoryError:
             return Result(
                 index, "failed", error="it does not fit into memory; use fewer --workers", kind="MemoryError"
