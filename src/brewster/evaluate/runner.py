@@ -25,7 +25,6 @@ from brewster.errors import BrewsterError, TargetError
 from brewster.evaluate.judge import Judge, Truth
 from brewster.evaluate.methods import Answer, Method, refuse_names
 from brewster.evaluate.protocol import Protocol
-from brewster.metrics import Lpips
 from brewster.processes import end_with_parent, one_thread
 
 SCORES: Final = "scores.jsonl"
@@ -103,8 +102,9 @@ def score(
     alone = [method.name for method in methods if method.alone]
     tasks = list(_tasks(cases, [row for row in todo if row.method not in alone]))
     later = [task for name in alone for task in _tasks(cases, [row for row in todo if row.method == name])]
-    if todo and any(name.startswith("lpips") for name in protocol.metrics):
-        Lpips.load()  # here, once: its weights may have to be fetched, or be missing
+    for metric in protocol.columns().values() if todo else ():
+        if metric.prepare:  # here, once: weights may have to be fetched, or be missing
+            metric.prepare()
     log = _Log(out / SCORES)
 
     def take(made: Sequence[Row]) -> None:
