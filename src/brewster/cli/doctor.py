@@ -14,6 +14,7 @@ from typing import Final, Literal, final
 import click
 
 from brewster.cli.models import describe
+from brewster.cli.terminal import print_out
 from brewster.errors import BrewsterError, MissingExtra
 from brewster.models import zoo
 
@@ -119,10 +120,10 @@ def doctor(context: click.Context, *, as_json: bool) -> None:
     checks = list(examine())
     is_well = all(check.status == "ok" for check in checks if check.needed)
     if as_json:
-        click.echo(json.dumps({"ok": is_well, "checks": [asdict(check) for check in checks]}))
+        print_out(json.dumps({"ok": is_well, "checks": [asdict(check) for check in checks]}))
     else:
         _print(checks)
-        click.echo(
+        print_out(
             "All that is needed works." if is_well else "Something needed does not work: see !! and -- above."
         )
     context.exit(0 if is_well else 1)
@@ -255,7 +256,7 @@ def _print(checks: list[Check]) -> None:
     area = None
     for check in checks:
         if check.area != area:
-            click.echo(check.area)
+            print_out(check.area)
         area = check.area
         cure = f"\n{'':8}{check.cure}" if check.cure else ""
-        click.echo(f"  {_MARKS[check.status]}  {check.name:16} {check.detail}{cure}")
+        print_out(f"  {_MARKS[check.status]}  {check.name:16} {check.detail}{cure}")

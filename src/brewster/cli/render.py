@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,7 +13,7 @@ import click
 from click.core import ParameterSource
 
 from brewster.cli.doctor import require_extra
-from brewster.cli.terminal import complain, interrupts, progress, say, write_out
+from brewster.cli.terminal import complain, interrupts, progress, say, standard_output, write_out
 
 if TYPE_CHECKING:
     from brewster.dataset.build.job import Crew, Job, Result
@@ -185,7 +184,7 @@ class _Order:
         from brewster.dataset.build.overview import write_preview  # noqa: PLC0415
 
         job, told = self._job(), _Told(self.as_json, self.quiet)
-        over_bar = self.as_json and sys.stdout.isatty()
+        over_bar = self.as_json and standard_output.stream.isatty()
         with progress(self.count, shown=not self.quiet and not over_bar) as advance:
 
             def report(result: Result) -> None:
