@@ -4,8 +4,11 @@ import errno
 import fcntl
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
+import filelock
 import pytest
 from pyarrow import parquet
 
@@ -201,16 +204,28 @@ def test_a_folder_of_something_else_is_refused(tmp_path):
 
 
 def test_two_runs_in_one_folder_are_refused_until_one_has_ended(four):
-    with (four / ".lock").open("ab") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        with pytest.raises(TargetError, match="another run is writing"):
-            make(four)
+    with filelock.FileLock(four / ".lock"), pytest.raises(TargetError, match="another run is writing"):
+        make(four)
     make(four)
 
 
-def test_a_file_system_without_locks_is_named(four, monkeypatch):
+def test_a_run_releases_its_lock_even_if_it_fails(four):
+    with pytest.raises(TargetError, match="its seed is"):
+        make(four, seed=8)
+    with filelock.FileLock(four / ".lock", blocking=False):
+        pass
+
+
+def test_rendering_starts_where_there_is_no_fcntl():
+    """As on Windows."""
+    code = "import sys; sys.modules['fcntl'] = None; import brewster.dataset.build.workers"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS])
+def test_a_file_system_without_locks_is_named(four, monkeypatch, number):
     def refuse(file, how):
-        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+        raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(fcntl, "flock", refuse)
     with pytest.raises(TargetError, match="cannot be locked"):

@@ -9,7 +9,6 @@ is done, a killed run needs no memory, and neither memory nor the cost of a samp
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import tomllib
 from collections import deque
@@ -17,8 +16,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Final, Literal, Protocol, final
+from typing import Any, Final, Literal, Protocol, final
 
+import filelock
 import tomli_w
 
 import brewster
@@ -200,23 +200,26 @@ class _Schedule:
 
 @contextmanager
 def _alone_in(out: Path) -> Iterator[None]:
-    """Holds the folder's lock, which a killed process gives back by dying."""
+    """Holds the folder's lock, which is released by the operating system if the process is killed."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        file = (out / _LOCK).open("ab")
+        (out / _LOCK).touch()
     except OSError as error:
         raise TargetError(
             f"{out} cannot be written to ({error.strerror})", "a folder for the set", "name another one"
         ) from error
-    with file:
-        _lock(file, out)
-        yield
-
-
-def _lock(file: BinaryIO, out: Path) -> None:
+    lock = filelock.FileLock(out / _LOCK, blocking=False, fallback_to_soft=False)
+    _acquire(lock, out)
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
+        yield
+    finally:
+        lock.release()
+
+
+def _acquire(lock: filelock.BaseFileLock, out: Path) -> None:
+    try:
+        lock.acquire()
+    except filelock.Timeout as error:
         raise TargetError(
             f"another run is writing in {out}", "one writes at a time", "wait for it, or name another folder"
         ) from error

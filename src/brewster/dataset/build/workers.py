@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import signal
+import sys
 import time
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
@@ -238,6 +239,9 @@ class Workers:
 @contextmanager
 def _deaf_to_interrupts() -> Iterator[None]:
     """Processes started here never see Ctrl-C, which a terminal sends to all: who started them will stop them."""
+    if sys.platform == "win32":  # it has no signal masks; _serve ignores Ctrl-C as soon as it runs
+        yield
+        return
     resource_tracker.ensure_running()  # or it would start below, and lift the mask
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -248,6 +252,7 @@ def _deaf_to_interrupts() -> Iterator[None]:
 
 def _serve(pipe: Connection, job: Job) -> None:
     """A worker's life: tasks until the pipe ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()  # the next run may be at the same sample
     hand = Hand(job)
     with one_thread(), suppress(EOFError):
