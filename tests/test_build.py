@@ -12,6 +12,7 @@ import filelock
 import pytest
 from pyarrow import parquet
 
+import brewster
 from brewster.dataset import sets
 from brewster.dataset.build import job as building
 from brewster.dataset.build.workers import Here
@@ -186,6 +187,15 @@ def test_other_maps_are_another_job(four):
     poorer = asked.catalog.model_copy(update={"maps": asked.catalog.maps[1:]})
     with pytest.raises(TargetError, match="its catalog is"):
         building.build(building.Job(**{**vars(asked), "catalog": poorer}), range(4), Here(asked))
+
+
+def test_a_set_grows_across_versions_until_its_samples_change(four, tmp_path, monkeypatch):
+    shutil.copytree(four, tmp_path / "set")
+    monkeypatch.setattr(brewster, "__version__", "99")
+    assert statuses(make(tmp_path / "set", count=5))[4] == "rendered"
+    monkeypatch.setattr(sets, "SAMPLE_FORMAT", 99)
+    with pytest.raises(TargetError, match="its format is 1, and 99 was asked for"):
+        make(tmp_path / "set")
 
 
 def test_a_record_that_cannot_be_read_is_named(four, tmp_path):

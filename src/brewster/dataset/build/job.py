@@ -21,7 +21,6 @@ from typing import Any, Final, Literal, Protocol, final
 import filelock
 import tomli_w
 
-import brewster
 from brewster.dataset import sets
 from brewster.dataset.build.overview import write_index
 from brewster.errors import BrewsterError, DeviceError, MissingExtra, TargetError
@@ -53,7 +52,7 @@ class Job:
     def record(self) -> dict[str, Any]:
         """The values that a set's bytes depend on, for set.toml."""
         return {
-            "version": brewster.__version__,
+            "format": sets.SAMPLE_FORMAT,
             "renderer": self.renderer,
             "seed": self.seed,
             "catalog": hashlib.sha256(self.catalog.model_dump_json().encode()).hexdigest(),
