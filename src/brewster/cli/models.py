@@ -8,6 +8,7 @@ from typing import Any
 
 import click
 
+from brewster.cli.extras import require_extra
 from brewster.cli.terminal import complain, print_out, say
 from brewster.errors import BrewsterError, ModelError
 from brewster.files import write_atomically
@@ -91,8 +92,6 @@ def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: boo
     Sent are its weights, its prompt, its recipe and its card, nothing else; places of this machine are not named. The
     token is HF_TOKEN, or the one of `hf auth login`.
     """
-    from brewster.cli.doctor import require_extra  # noqa: PLC0415  (which imports this module)
-
     require_extra("large", "pushing")
     from brewster.models.large.adapter import hub  # noqa: PLC0415  (wakes torch)
 
@@ -130,8 +129,6 @@ def _read_card(folder: Path) -> str:
 
 def _put_scores(folder: Path, scores: Path) -> None:
     """Replaces what the card in this folder says was measured."""
-    from brewster.cli.doctor import require_extra  # noqa: PLC0415  (which imports this module)
-
     require_extra("train", "writing a card")
     from brewster.evaluate.report.tables import overview  # noqa: PLC0415  (wakes torch)
     from brewster.train.large.card import with_measured  # noqa: PLC0415

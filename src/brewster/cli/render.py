@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, final
 import click
 from click.core import ParameterSource
 
-from brewster.cli.doctor import require_extra
+from brewster.cli.extras import require_extra
 from brewster.cli.terminal import complain, interrupts, progress, say, standard_output, write_out
 
 if TYPE_CHECKING:

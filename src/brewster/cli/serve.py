@@ -11,7 +11,7 @@ from typing import Any, Final, get_args
 
 import click
 
-from brewster.cli.doctor import require_extra
+from brewster.cli.extras import require_extra
 from brewster.cli.terminal import print_out, say
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.options import Device

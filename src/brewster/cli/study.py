@@ -12,8 +12,8 @@ from typing import Final
 
 import click
 
-from brewster.cli.doctor import require_extra
 from brewster.cli.evaluate import Named
+from brewster.cli.extras import require_extra
 from brewster.cli.serve import AUTO, at_an_address, invite
 from brewster.cli.terminal import print_out, progress, say, write_out
 from brewster.errors import BrewsterError

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from brewster.cli.doctor import require_extra
+from brewster.cli.extras import require_extra
 from brewster.cli.terminal import interrupts, print_out, progress, say
 from brewster.errors import RecipeError, TargetError
 
