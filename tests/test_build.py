@@ -4,11 +4,15 @@ import errno
 import fcntl
 import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
+import filelock
 import pytest
 from pyarrow import parquet
 
+import brewster
 from brewster.dataset import sets
 from brewster.dataset.build import job as building
 from brewster.dataset.build.workers import Here
@@ -185,6 +189,15 @@ def test_other_maps_are_another_job(four):
         building.build(building.Job(**{**vars(asked), "catalog": poorer}), range(4), Here(asked))
 
 
+def test_a_set_grows_across_versions_until_its_samples_change(four, tmp_path, monkeypatch):
+    shutil.copytree(four, tmp_path / "set")
+    monkeypatch.setattr(brewster, "__version__", "99")
+    assert statuses(make(tmp_path / "set", count=5))[4] == "rendered"
+    monkeypatch.setattr(sets, "SAMPLE_FORMAT", 99)
+    with pytest.raises(TargetError, match="its format is 1, and 99 was asked for"):
+        make(tmp_path / "set")
+
+
 def test_a_record_that_cannot_be_read_is_named(four, tmp_path):
     shutil.copytree(four, tmp_path / "set")
     (tmp_path / "set" / "set.toml").write_text("not toml")
@@ -201,16 +214,28 @@ def test_a_folder_of_something_else_is_refused(tmp_path):
 
 
 def test_two_runs_in_one_folder_are_refused_until_one_has_ended(four):
-    with (four / ".lock").open("ab") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        with pytest.raises(TargetError, match="another run is writing"):
-            make(four)
+    with filelock.FileLock(four / ".lock"), pytest.raises(TargetError, match="another run is writing"):
+        make(four)
     make(four)
 
 
-def test_a_file_system_without_locks_is_named(four, monkeypatch):
+def test_a_run_releases_its_lock_even_if_it_fails(four):
+    with pytest.raises(TargetError, match="its seed is"):
+        make(four, seed=8)
+    with filelock.FileLock(four / ".lock", blocking=False):
+        pass
+
+
+def test_rendering_starts_where_there_is_no_fcntl():
+    """As on Windows."""
+    code = "import sys; sys.modules['fcntl'] = None; import brewster.dataset.build.workers"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOSYS])
+def test_a_file_system_without_locks_is_named(four, monkeypatch, number):
     def refuse(file, how):
-        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+        raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(fcntl, "flock", refuse)
     with pytest.raises(TargetError, match="cannot be locked"):

@@ -21,7 +21,7 @@ from brewster.errors import BrewsterError
 from brewster.options import Options
 from brewster.separate import QUALITIES
 from brewster.separate.runtime import DEVICES
-from front_door import picture, tree
+from front_door import as_user, lines, picture, tree
 
 ROOT = Path(__file__).parents[1]
 
@@ -230,6 +230,53 @@ def test_no_picture_is_poured_into_a_terminal(run, tmp_path, monkeypatch):
     code, out, err = run("-", stdin=picture())
     assert (code, out) == (2, b"")
     assert "terminal" in err
+
+
+NOISY = """
+import ctypes, os, sys
+from brewster.cli import main
+from brewster.photo import Photo
+
+quiet = Photo.open.__func__
+def loud(cls, *args, **options):
+    print("said in Python")
+    ctypes.CDLL(None).puts(b"said in C")
+    os.system("echo said by a child")
+    return quiet(cls, *args, **options)
+Photo.open = classmethod(loud)
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_what_libraries_print_stays_out_of_standard_output(model, tmp_path):
+    """C code keeps its own buffer, which is written when the process ends: that is too late for a redirection."""
+    command = [sys.executable, "-c", NOISY, "-", "--model", model]
+    done = subprocess.run(command, input=picture(), capture_output=True, check=False)
+    plain = as_user("-", "--model", model, input=picture())
+    assert (done.returncode, done.stdout) == (0, plain.stdout)
+    for said in (b"in Python", b"in C", b"by a child"):
+        assert done.stderr.count(b"said " + said) == 1
+
+
+def test_a_damaged_exr_leaves_the_json_whole(model, tmp_path):
+    """OpenEXR's binding prints a warning where Python prints."""
+    light = np.zeros((8, 10, 3), np.float32)
+    data = bytearray(Photo.from_array(light, encoding="linear").encode("exr"))
+    data[-1] ^= 0xFF
+    (tmp_path / "a.exr").write_bytes(data)
+    done = as_user(tmp_path / "a.exr", "--model", model, "--json")
+    assert done.returncode == 1
+    assert [line["status"] for line in lines(done.stdout)] == ["failed"]
+    assert b"Warning: " in done.stderr
+    done = as_user("-", "--model", model, input=bytes(data))
+    assert (done.returncode, done.stdout) == (1, b"")
+
+
+def test_help_goes_to_standard_output():
+    for words in (["--help"], ["separate", "--help"], ["models", "list", "--help"], ["--version"]):
+        done = as_user(*words)
+        assert (done.returncode, done.stderr) == (0, b"")
+        assert done.stdout
 
 
 # --- usage

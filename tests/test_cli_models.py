@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from brewster import Photo, Separator
-from brewster.cli.doctor import CORE, EXTRAS
+from brewster.cli.extras import CORE, EXTRAS
 from brewster.models import zoo
 from front_door import picture
 

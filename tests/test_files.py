@@ -6,9 +6,11 @@ import errno
 import os
 from pathlib import Path
 
+import platformdirs
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from platformdirs import macos, unix
 
 from brewster import files
 from brewster.errors import TargetError
@@ -240,13 +242,23 @@ def test_impossible_targets_are_explained(tmp_path: Path, target: str, word: str
         write_atomically(tmp_path / target, b"layer", overwrite=True)
 
 
-def test_what_was_fetched_is_kept_in_the_users_cache_folder(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", "/cache")
-    assert cache_folder() == Path("/cache/brewster")
-    monkeypatch.setenv("HOME", "/home/ann")
-    for nowhere in ("relative", ""):
-        monkeypatch.setenv("XDG_CACHE_HOME", nowhere)
-        assert cache_folder() == Path("/home/ann/.cache/brewster")
+@pytest.mark.parametrize(
+    ("system", "variables", "folder"),
+    [
+        (unix.Unix, {"XDG_CACHE_HOME": "/cache"}, "/cache/brewster"),
+        (unix.Unix, {"HOME": "/home/ann"}, "/home/ann/.cache/brewster"),
+        (unix.Unix, {"HOME": "/home/ann", "XDG_CACHE_HOME": "relative"}, "/home/ann/.cache/brewster"),
+        (macos.MacOS, {"HOME": "/Users/ann"}, "/Users/ann/Library/Caches/brewster"),
+    ],
+)
+def test_downloads_are_kept_where_the_system_has_its_caches(
+    monkeypatch: pytest.MonkeyPatch, system: type, variables: dict[str, str], folder: str
+) -> None:
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(platformdirs, "PlatformDirs", system)
+    assert cache_folder() == Path(folder)
 
 
 def test_ctrl_c_just_after_a_file_took_its_name_leaves_nothing_else(tmp_path, monkeypatch):

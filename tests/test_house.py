@@ -3,6 +3,7 @@
 import ast
 import importlib
 import inspect
+import os
 import pkgutil
 import re
 import subprocess
@@ -15,6 +16,7 @@ import brewster
 import brewster.errors
 import brewster.photo
 import brewster.separate
+from brewster.options import Options
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "brewster"
@@ -64,6 +66,35 @@ def test_large_image_models_have_one_door():
 def test_separating_a_photo_needs_no_torch():
     code = "import brewster.separate, sys; assert not {'torch', 'scipy', 'PIL'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_signature_of_separate_shows_the_source_and_every_option():
+    shown = inspect.signature(brewster.separate)
+    assert shown == inspect.signature(brewster.separate.separate)
+    assert list(shown.parameters)[:3] == ["source", "model", "device"]
+    assert set(Options.__dataclass_fields__) & {"strength", "quality", "additive"} <= set(shown.parameters)
+
+
+def test_type_checkers_know_every_public_name_and_no_other(tmp_path):
+    """A module's __getattr__ would make every misspelt name an `object`."""
+    (tmp_path / "user.py").write_text("""import brewster
+layer: brewster.Photo = brewster.separate("window.jpg", strength=0.5).transmission
+separator: brewster.Separator = brewster.Separator.load("compact")
+brewster.Separater.load("compact")
+brewster.separate()
+""")
+    done = subprocess.run(
+        [Path(sys.executable).with_name("mypy"), "--follow-imports=silent", "--strict", "user.py"],
+        cwd=tmp_path,
+        env=os.environ | {"MYPYPATH": str(SOURCE.parent)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    errors = [line.partition("error: ")[2] for line in done.stdout.splitlines() if "error: " in line]
+    assert len(errors) == 2, done.stdout
+    assert errors[0].startswith('Module has no attribute "Separater"')
+    assert errors[1].startswith('Missing positional argument "source"')
 
 
 def test_every_public_name_is_exported_and_documented():

@@ -10,6 +10,8 @@ from brewster.dataset.benchmarks import read_benchmark
 from brewster.evaluate.judge import Judge, Truth
 from brewster.evaluate.methods import Answer, Nothing
 from brewster.evaluate.protocol import Protocol
+from brewster.evaluate.runner import score
+from brewster.metrics import METRICS, Lpips, Metric, kept_reflection, lpips, psnr, removed_content, ssim
 from set_folders import make
 
 
@@ -114,3 +116,102 @@ def test_lpips_of_the_dev_pairs_is_small_for_the_truth_and_large_for_noise(data,
     ]
     assert scores[0] == 0 < scores[1] < 0.5 < scores[2]
     assert judge.score(Answer(truth.photo))["lpips_region"] > scores[1]
+
+
+def a_metric(name, score, **more):
+    return Metric(name, name, "", True, 3, "A score.", "transmission", score, **more)
+
+
+def test_a_new_metric_is_one_row_with_its_function(triplet, tmp_path, monkeypatch):
+    """No other place knows metrics by their names."""
+    monkeypatch.setitem(
+        METRICS,
+        "darkest",
+        a_metric("darkest", lambda case: float(case.answer.pixels.min()) - float(case.truth.pixels.min())),
+    )
+    protocol = Protocol(metrics=("darkest",))
+    (row,) = score(read_benchmark("pairs", triplet), [Nothing()], protocol, tmp_path / "out")
+    truth, _ = open_case(triplet, protocol)
+    least = {role: float(picture.min()) for role, picture in truth.pictures.items()}
+    assert row.scores == {"darkest": least["photo"] - least["transmission"]} != {"darkest": 0}
+
+
+def test_a_metric_of_a_region_is_given_the_region_of_its_column(triplet, monkeypatch):
+    row = a_metric("share", lambda case: float(case.region.mean()), where="region")
+    monkeypatch.setitem(METRICS, "share", row)
+    truth, judge = open_case(triplet, Protocol(metrics=("share",), thresholds=(0.01, 0.1)))
+    assert judge.score(Answer(truth.photo)) == {
+        f"share@{threshold}": pytest.approx(truth.region(threshold).mean(), abs=1e-6)
+        for threshold in (0.01, 0.1)
+    }
+
+
+def test_what_a_metric_needs_is_loaded_before_the_first_score(triplet, tmp_path, monkeypatch):
+    order = []
+    row = a_metric("late", lambda case: float(len(order)), prepare=lambda: order.append("prepared"))
+    monkeypatch.setitem(METRICS, "late", row)
+    benchmarks, protocol = read_benchmark("pairs", triplet), Protocol(metrics=("late",))
+    (first,) = score(benchmarks, [Nothing()], protocol, tmp_path / "out")
+    (again,) = score(benchmarks, [Nothing()], protocol, tmp_path / "out")
+    assert first.scores == again.scores == {"late": 1.0}
+    assert order == ["prepared"]
+
+
+def test_features_are_computed_once_for_each_picture(triplet, monkeypatch):
+    """Two metrics share them, and the truth's serve every answer."""
+    computed = []
+
+    def compute(picture):
+        computed.append(picture)
+        return float(picture.mean())
+
+    def measure(case):
+        return case.answer.features(compute) - case.truth.features(compute)
+
+    for name in ("one", "two"):
+        monkeypatch.setitem(METRICS, name, a_metric(name, measure))
+    truth, judge = open_case(triplet, Protocol(metrics=("one", "two")))
+    scores = [judge.score(Answer(photo)) for photo in (truth.photo, truth.photo)]
+    assert scores[0] == scores[1]
+    assert [picture is truth.pictures["transmission"] for picture in computed] == [False, True, False]
+
+
+def test_every_row_scores_as_its_own_function_says(data, monkeypatch):
+    """Each row is checked against a direct call, so that a row with another's function is noticed."""
+    monkeypatch.setenv("BREWSTER_DATA", str(data))
+    names = tuple(name for name, metric in METRICS.items() if metric.of == "transmission")
+    truth, judge = open_case(data / "real/dev/nature", Protocol(metrics=names, size=96), "nature20")
+    photo, behind = truth.pictures["photo"], truth.pictures["transmission"]
+    region = truth.region(0.08)
+    assert judge.score(Answer(truth.photo)) == {
+        "psnr": pytest.approx(psnr(photo, behind), abs=1e-6),
+        "ssim": pytest.approx(ssim(photo, behind), abs=1e-6),
+        "ssim_gaussian": pytest.approx(ssim(photo, behind, window="gaussian"), abs=1e-6),
+        "lpips": pytest.approx(lpips(photo, behind), abs=1e-6),
+        "psnr_region": pytest.approx(psnr(photo, behind, region=region), abs=1e-6),
+        "ssim_region": pytest.approx(ssim(photo, behind, region=region), abs=1e-6),
+        "lpips_region": pytest.approx(lpips(photo, behind, region=region), abs=1e-6),
+    }
+
+
+def test_rows_of_rendered_samples_and_reflections_score_as_their_own_functions_say(rendered):
+    names = ("psnr_reflection", "ssim_reflection", "removed_content", "removed_white", "kept_reflection")
+    truth, judge = open_case(rendered, Protocol(metrics=names), "rendered")
+    photo, behind, mirrored = (truth.pictures[role] for role in ("photo", "transmission", "reflection"))
+    scores = judge.score(Answer(truth.photo, truth.photo))
+    assert scores["psnr_reflection"] == pytest.approx(psnr(photo, mirrored), abs=1e-6)
+    assert scores["ssim_reflection"] == pytest.approx(ssim(photo, mirrored), abs=1e-6)
+    for name, measure in (("removed_content", removed_content), ("kept_reflection", kept_reflection)):
+        assert scores[name] == pytest.approx(measure(photo, behind, photo, mirrored), abs=1e-6), name
+    assert scores["removed_white"] is None  # nothing behind this glass is white
+
+
+def test_lpips_looks_at_each_picture_once(data, monkeypatch):
+    monkeypatch.setenv("BREWSTER_DATA", str(data))
+    seen, features = [], Lpips.features
+    monkeypatch.setattr(Lpips, "features", lambda self, picture: seen.append(1) or features(self, picture))
+    protocol = Protocol(metrics=("lpips", "lpips_region"), thresholds=(0.05, 0.1), size=96)
+    truth, judge = open_case(data / "real/dev/nature", protocol, "nature20")
+    judge.score(Answer(truth.photo))
+    judge.score(Answer(truth.photo))
+    assert len(seen) == 3

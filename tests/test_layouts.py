@@ -314,3 +314,9 @@ def test_training_pairs_that_are_not_there_are_an_error_of_the_recipe(tmp_path):
         RecipeError, match=r"gone cannot be read \(No such file or directory\); .*BREWSTER_DATA"
     ):
         read_pairs([tmp_path / "gone"])
+
+
+def test_a_folder_with_a_semicolon_in_its_name_is_named_whole(tmp_path):
+    with pytest.raises(RecipeError) as raised:
+        read_pairs([tmp_path / "window; north"])
+    assert raised.value.happened == f"{tmp_path}/window; north cannot be read (No such file or directory)"

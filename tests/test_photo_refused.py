@@ -75,6 +75,17 @@ def test_truncated_floats_are_refused(container: str, part: float) -> None:
     refused(data[: int(len(data) * part)], PhotoError, "; ")
 
 
+def test_a_heic_without_an_image_is_refused() -> None:
+    data = Photo.from_array(NOISE, encoding="srgb").encode("heic")
+    refused(data.replace(b"hvcC", b"hvcX"), UnreadablePhoto, "no image in it can be decoded")
+
+
+def test_a_heic_whose_picture_is_longer_than_the_file_is_refused() -> None:
+    data = bytearray(Photo.from_array(NOISE, encoding="srgb").encode("heic"))
+    data[data.index(b"mdat") + 4] = 0xFF  # the length of the first unit
+    refused(bytes(data), UnreadablePhoto, "end of file")
+
+
 def test_an_empty_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.jpg").write_bytes(b"")
     refused(tmp_path / "a.jpg", UnreadablePhoto, "empty")

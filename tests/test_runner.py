@@ -12,7 +12,6 @@ from typing import final
 import numpy as np
 import pytest
 
-import brewster
 from benchmark_folders import paint, repacked, write
 from brewster import Photo
 from brewster.dataset.benchmarks import read_benchmark
@@ -122,12 +121,34 @@ def test_an_answer_that_was_changed_on_the_disk_is_made_again(real20, model, tmp
     assert [row.scores["psnr"] for row in again] == [row.scores["psnr"] for row in first]
 
 
-def test_another_version_of_brewster_scores_anew(real20, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("changed", "asked"),
+    [("brewster.__version__", []), ("brewster.evaluate.runner.SCORE_FORMAT", NAMES)],
+)
+def test_scores_are_made_again_when_scoring_changes_and_not_with_a_new_version(
+    real20, tmp_path, monkeypatch, changed, asked
+):
     score(real20, [Fake()], QUICK, tmp_path / "out")
-    monkeypatch.setattr(brewster, "__version__", "99")
+    monkeypatch.setattr(changed, 99)
     fake = Fake()
     score(real20, [fake], QUICK, tmp_path / "out")
-    assert fake.asked == NAMES
+    assert fake.asked == asked
+
+
+@pytest.mark.parametrize(
+    ("changed", "asked"),
+    [("brewster.__version__", 0), ("brewster.evaluate.methods.ANSWER_FORMAT", 3)],
+)
+def test_answers_are_made_again_when_answering_changes_and_not_with_a_new_version(
+    real20, model, tmp_path, monkeypatch, changed, asked
+):
+    ours = Model("pane", str(model), tmp_path / "kept")
+    score(real20, [ours], QUICK, tmp_path / "out")
+    monkeypatch.setattr(changed, 99)
+    made, answer = [], Model.answer
+    monkeypatch.setattr(Model, "answer", lambda self, *case: made.append(1) or answer(self, *case))
+    score(real20, [ours], QUICK, tmp_path / "out")
+    assert len(made) == asked
 
 
 def test_a_worker_that_dies_is_told_and_scores_are_kept(real20, model, tmp_path):

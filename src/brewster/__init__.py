@@ -19,20 +19,22 @@ if TYPE_CHECKING:
     from brewster.separate import Separation, Separator, separate
 
     __version__: str
+else:  # a type checker would take any name, even a misspelt one, for what __getattr__ returns
+
+    def __getattr__(name: str) -> object:
+        """Names are looked up when they are first used."""
+        if name in _HOMES:
+            return getattr(importlib.import_module(_HOMES[name]), name)
+        if name == "separate":
+            return importlib.import_module("brewster.separate")  # a package that can be called: see there
+        if name == "__version__":
+            return _version()
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
 
 __all__ = ["Photo", "Separation", "Separator", "__version__", "errors", "separate"]
 
 _HOMES = {"Photo": "brewster.photo", "Separation": "brewster.separate", "Separator": "brewster.separate"}
-
-
-def __getattr__(name: str) -> object:
-    if name in _HOMES:
-        return getattr(importlib.import_module(_HOMES[name]), name)
-    if name == "separate":
-        return importlib.import_module("brewster.separate")  # a room that can be called: see there
-    if name == "__version__":
-        return _version()
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

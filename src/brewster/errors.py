@@ -12,17 +12,31 @@
     |-- DownloadError          a server cannot be reached, or did not send what it promised
     `-- MissingExtra           an optional part is not installed
 
-Messages have three beats: what happened (with the value), what was expected, what to do.
+Messages have three parts: what happened (with the value), what was expected, what to do.
 """
 
 from __future__ import annotations
 
 
 class BrewsterError(Exception):
-    """Anything brewster can explain; the message is one sentence in three beats."""
+    """Anything brewster can explain; the message is one sentence in three parts.
+
+    Attributes:
+        happened: what happened, with the value.
+        expected: what was expected.
+        cure: what to do.
+    """
 
     def __init__(self, happened: str, expected: str, cure: str) -> None:
-        super().__init__(f"{happened}; {expected}; {cure}{'' if cure.endswith('?') else '.'}")
+        super().__init__(happened, expected, cure)
+        self.happened, self.expected, self.cure = happened, expected, cure
+
+    def __str__(self) -> str:
+        return f"{self.happened}; {self.expected}; {self.cure}{'' if self.cure.endswith('?') else '.'}"
+
+    def __reduce__(self) -> tuple[type[BrewsterError], tuple[str, str, str]]:
+        """Errors are sent between processes; the attributes count, as a caller may have changed them."""
+        return type(self), (self.happened, self.expected, self.cure)
 
 
 class PhotoError(BrewsterError):

@@ -11,10 +11,13 @@ import errno
 import os
 import secrets
 import shutil
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+
+import platformdirs
 
 from brewster.errors import TargetError
 
@@ -169,7 +172,10 @@ def _replace(place: Path, part: Path) -> None:
 
 
 def _sync(path: Path) -> None:
-    file = os.open(path, os.O_RDONLY)
+    is_folder = path.is_dir()
+    if is_folder and sys.platform == "win32":  # a folder cannot be opened there
+        return
+    file = os.open(path, os.O_RDONLY if is_folder else os.O_RDWR)  # Windows syncs what it may write
     try:
         os.fsync(file)
     finally:
@@ -310,6 +316,5 @@ def _target_error(path: Path, error: OSError) -> TargetError:
 
 
 def cache_folder() -> Path:
-    """Where what was fetched once is kept: brewster in the user's cache folder (XDG Base Directory, 0.8)."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return (cache if cache.is_absolute() else Path.home() / ".cache") / "brewster"
+    """Where downloads are kept: brewster's part of the user's cache folder, as each operating system has it."""
+    return platformdirs.user_cache_path("brewster", appauthor=False)

@@ -6,14 +6,14 @@ Commands import what they need when they run, so that `brewster --help` answers 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import click
 
 import brewster
 from brewster.cli import ablate, assets, doctor, evaluate, models, render, separate, serve, study, train
-from brewster.cli.terminal import complain, interrupts, say
+from brewster.cli.terminal import complain, interrupts, say, standard_output
 from brewster.errors import BrewsterError
 
 _STOPPED = 130  # what a shell expects after Ctrl-C: 128 + SIGINT
@@ -73,8 +73,23 @@ for _command in (
     cli.add_command(_command)
 
 
+def _commands(group: click.Group) -> Iterator[click.Command]:
+    """Those that do something: groups are looked into."""
+    for command in group.commands.values():
+        if isinstance(command, click.Group):
+            yield from _commands(command)
+        else:
+            yield command
+
+
+for _command in _commands(cli):
+    assert _command.callback
+    _command.callback = standard_output.reserved()(_command.callback)
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit code: 0 fine, 1 an error, 2 a wrong usage, 130 Ctrl-C."""
+    standard_output.take_descriptor()
     try:
         with interrupts.noticed():
             return int(cli.main(args, prog_name="brewster", standalone_mode=False) or 0)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import click
 
-from brewster.cli.doctor import require_extra
 from brewster.cli.evaluate import print_tables, tell_failures, tell_of
+from brewster.cli.extras import require_extra
 from brewster.cli.terminal import interrupts, say
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from brewster.cli.terminal import complain, one_line, progress, say, write_out
+from brewster.cli.terminal import complain, one_line, progress, say, standard_output, write_out
 
 if TYPE_CHECKING:
     from brewster.worlds.polyhaven import Order, Result
@@ -94,7 +93,7 @@ def _fetch(order: Order, folder: Path, *, as_json: bool, quiet: bool) -> list[Re
     from brewster.worlds.polyhaven import pull as fetch  # noqa: PLC0415
 
     results: list[Result] = []
-    talks_over_bar = as_json and sys.stdout.isatty()
+    talks_over_bar = as_json and standard_output.stream.isatty()
     try:
         with progress(order.indoor + order.outdoor, shown=not quiet and not talks_over_bar) as advance:
             for result in fetch(order, folder):

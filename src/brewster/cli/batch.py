@@ -17,7 +17,16 @@ from typing import TYPE_CHECKING, Literal, final
 
 import click
 
-from brewster.cli.terminal import Advance, complain, interrupts, one_line, progress, say, write_out
+from brewster.cli.terminal import (
+    Advance,
+    complain,
+    interrupts,
+    one_line,
+    progress,
+    say,
+    standard_output,
+    write_out,
+)
 from brewster.errors import BrewsterError, PhotoError, TargetError
 from brewster.files import SUFFIXES, find, write_atomically
 from brewster.options import Options
@@ -150,7 +159,7 @@ class Batch:
         entries: list[Entry] = []
         bugs: list[Exception] = []
         self._sources = {os.path.realpath(task.source) for task in tasks if task.source}
-        talks_over_bar = self.as_json and sys.stdout.isatty()
+        talks_over_bar = self.as_json and standard_output.stream.isatty()
         with progress(len(tasks), shown=not self.quiet and not talks_over_bar) as advance:
             for task in tasks:
                 advance(len(entries), task.name)

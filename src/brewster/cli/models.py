@@ -8,7 +8,8 @@ from typing import Any
 
 import click
 
-from brewster.cli.terminal import complain, say
+from brewster.cli.extras import require_extra
+from brewster.cli.terminal import complain, print_out, say
 from brewster.errors import BrewsterError, ModelError
 from brewster.files import write_atomically
 from brewster.models import zoo
@@ -29,11 +30,11 @@ def list_models(*, as_json: bool) -> None:
     """List the models that come with brewster."""
     rows = [describe(model) for model in zoo.MODELS.values()]
     if as_json:
-        click.echo(json.dumps(rows))
+        print_out(json.dumps(rows))
         return
     for row in rows:
         size = f"{row['bytes'] / 1e6:.1f} MB" if row["error"] is None else "damaged"
-        click.echo(f"{row['name']:20} {size:>10}  {row['licence']}")
+        print_out(f"{row['name']:20} {size:>10}  {row['licence']}")
 
 
 @models.command
@@ -49,7 +50,7 @@ def card(*, name: str, scores: Path | None) -> None:
     if scores:
         _put_scores(Path(name), scores)
     is_folder = name not in zoo.MODELS and Path(name).is_dir()
-    click.echo(_read_card(Path(name)) if is_folder else zoo.find_model(name).card())
+    print_out(_read_card(Path(name)) if is_folder else zoo.find_model(name).card())
 
 
 @models.command
@@ -58,7 +59,7 @@ def path(*, name: str) -> None:
     """Print where the file of a model lies."""
     model = zoo.find_model(name)
     model.verify()
-    click.echo(model.path)
+    print_out(model.path)
 
 
 @models.command
@@ -69,12 +70,12 @@ def verify(context: click.Context, *, names: tuple[str, ...], as_json: bool) -> 
     """Check that the files of models, of all unless some are named, are those that were shipped."""
     rows = [describe(zoo.find_model(name)) for name in names or zoo.MODELS]
     if as_json:
-        click.echo(json.dumps(rows))
+        print_out(json.dumps(rows))
     for row in rows:
         if row["error"]:
             complain(row["error"])
         elif not as_json:
-            click.echo(f"{row['name']}: {row['sha256']}")
+            print_out(f"{row['name']}: {row['sha256']}")
     context.exit(1 if any(row["error"] for row in rows) else 0)
 
 
@@ -91,8 +92,6 @@ def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: boo
     Sent are its weights, its prompt, its recipe and its card, nothing else; places of this machine are not named. The
     token is HF_TOKEN, or the one of `hf auth login`.
     """
-    from brewster.cli.doctor import require_extra  # noqa: PLC0415  (which imports this module)
-
     require_extra("large", "pushing")
     from brewster.models.large.adapter import hub  # noqa: PLC0415  (wakes torch)
 
@@ -101,10 +100,10 @@ def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: boo
         say(remark)
     address = None if dry_run else hub.push(plan)
     if as_json:
-        click.echo(json.dumps(plan.about() | {"address": address}))
+        print_out(json.dumps(plan.about() | {"address": address}))
     else:
-        click.echo(plan.table())
-        click.echo(f"sent: {address}" if address else "nothing was sent")
+        print_out(plan.table())
+        print_out(f"sent: {address}" if address else "nothing was sent")
 
 
 def describe(model: zoo.Model) -> dict[str, Any]:
@@ -130,8 +129,6 @@ def _read_card(folder: Path) -> str:
 
 def _put_scores(folder: Path, scores: Path) -> None:
     """Replaces what the card in this folder says was measured."""
-    from brewster.cli.doctor import require_extra  # noqa: PLC0415  (which imports this module)
-
     require_extra("train", "writing a card")
     from brewster.evaluate.report.tables import overview  # noqa: PLC0415  (wakes torch)
     from brewster.train.large.card import with_measured  # noqa: PLC0415

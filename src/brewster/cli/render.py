@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Final, final
 import click
 from click.core import ParameterSource
 
-from brewster.cli.doctor import require_extra
-from brewster.cli.terminal import complain, interrupts, progress, say, write_out
+from brewster.cli.extras import require_extra
+from brewster.cli.terminal import complain, interrupts, progress, say, standard_output, write_out
 
 if TYPE_CHECKING:
     from brewster.dataset.build.job import Crew, Job, Result
@@ -185,7 +184,7 @@ class _Order:
         from brewster.dataset.build.overview import write_preview  # noqa: PLC0415
 
         job, told = self._job(), _Told(self.as_json, self.quiet)
-        over_bar = self.as_json and sys.stdout.isatty()
+        over_bar = self.as_json and standard_output.stream.isatty()
         with progress(self.count, shown=not self.quiet and not over_bar) as advance:
 
             def report(result: Result) -> None:
@@ -245,7 +244,8 @@ class _Told:
         """One line at once for what was rendered or failed."""
         self.counts[result.status] += 1
         if self._as_json:
-            write_out(f"{json.dumps(asdict(result))}\n".encode())
+            row = {name: value for name, value in asdict(result).items() if name != "fatal"}
+            write_out(f"{json.dumps(row)}\n".encode())
         if result.error:
             complain(f"sample {result.index}: {result.error}")
         elif result.status == "rendered" and not self._quiet:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import sys
 from collections.abc import Callable
 from types import NoneType
 from typing import Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
@@ -13,6 +12,7 @@ import click
 from click.core import ParameterSource
 
 from brewster.cli.batch import Batch, goes_to_one_file, plan
+from brewster.cli.terminal import standard_output
 from brewster.errors import BrewsterError
 from brewster.options import Options
 
@@ -145,7 +145,7 @@ def _refuse_occupied_output(*, as_json: bool) -> None:
     """A picture goes to standard output: nothing else may, and nobody may be reading there."""
     if as_json:
         raise click.UsageError("--json and a picture cannot share standard output: name the picture with -o.")
-    if sys.stdout.isatty():
+    if standard_output.stream.isatty():
         raise click.UsageError(
             "A picture would go to the terminal: send it on with > or |, or name it with -o."
         )

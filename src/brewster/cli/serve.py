@@ -11,8 +11,8 @@ from typing import Any, Final, get_args
 
 import click
 
-from brewster.cli.doctor import require_extra
-from brewster.cli.terminal import say
+from brewster.cli.extras import require_extra
+from brewster.cli.terminal import print_out, say
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.options import Device
 
@@ -56,7 +56,7 @@ def at_an_address(port: int, token_help: str) -> Callable[[Callable[..., Any]], 
 def invite(url: str, token: str | None, *, opens: bool = False) -> None:
     """Says on standard output where the server is, with the token, and opens it in the browser if it shall."""
     link = f"{url}?token={token}" if token else url
-    click.echo(link)
+    print_out(link)
     say("Ctrl-C stops the server")
     if opens:
         webbrowser.open(link)

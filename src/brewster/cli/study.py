@@ -12,10 +12,10 @@ from typing import Final
 
 import click
 
-from brewster.cli.doctor import require_extra
 from brewster.cli.evaluate import Named
+from brewster.cli.extras import require_extra
 from brewster.cli.serve import AUTO, at_an_address, invite
-from brewster.cli.terminal import progress, say, write_out
+from brewster.cli.terminal import print_out, progress, say, write_out
 from brewster.errors import BrewsterError
 
 _NAME: Final = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)*", re.IGNORECASE)
@@ -269,13 +269,13 @@ def plan(
 
     answer = planned(difference=difference, tie=tie, pairs=pairs, correlation=correlation, power=power)
     if as_json:
-        click.echo(json.dumps(asdict(answer)))
+        print_out(json.dumps(asdict(answer)))
         return
-    click.echo(
+    print_out(
         f"{answer.participants} participants ({answer.answers} answers) show {answer.win:.1%} wins to {answer.lose:.1%} "
         f"losses with {power:.0%} power at the 5 % level."
     )
-    click.echo(
+    print_out(
         f"{pairs} pairs each, correlation {correlation:g}: {answer.design_effect:.2f} answers do what an independent one "
         f"would, and participants' own differences scatter by {answer.deviation:.0%} about the mean."
     )

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, final
+from contextlib import contextmanager, redirect_stdout
+from typing import TYPE_CHECKING, Final, TextIO, final
 
 from brewster.errors import TargetError
 
@@ -73,18 +73,76 @@ def complain(text: object) -> None:
     say(f"error: {text}")
 
 
+@final
+class _Output:
+    """Standard output, which belongs to the command: what a library prints there goes to standard error.
+
+    Libraries print in two ways, and each is led away in its own: C code writes to file descriptor 1 (so do processes
+    that are started here), and Python code writes to `sys.stdout`, as OpenEXR does for a damaged file.
+    """
+
+    def __init__(self) -> None:
+        self._stream: TextIO | None = None
+
+    @property
+    def stream(self) -> TextIO:
+        """Where results are written."""
+        return self._stream or sys.stdout
+
+    def take_descriptor(self) -> None:
+        """Points file descriptor 1 to standard error, for the rest of this process; `sys.stdout` gets another one.
+
+        It is not given back, because C code keeps what it prints in a buffer until the process ends.
+        """
+        try:
+            if sys.stdout.fileno() != _STDOUT:  # a test or a notebook has put something else there
+                return
+            sys.stdout.flush()
+            own = os.dup(_STDOUT)
+            os.dup2(_STDERR, _STDOUT)
+        except (AttributeError, OSError):  # one of the two is closed, or none
+            return
+        sys.stdout = open(own, "w", encoding=sys.stdout.encoding, errors=sys.stdout.errors, closefd=False)  # noqa: SIM115
+
+    @contextmanager
+    def reserved(self) -> Iterator[None]:
+        """Within this block, `sys.stdout` is standard error, and only `print_out` and `write_out` write results."""
+        self._stream = sys.stdout
+        try:
+            with redirect_stdout(sys.stderr):
+                yield
+        finally:
+            self._stream = None
+
+
+standard_output = _Output()
+_STDOUT: Final = 1
+_STDERR: Final = 2
+
+
+def print_out(text: object) -> None:
+    """One line to standard output, now.
+
+    Raises:
+        TargetError: it cannot be written.
+    """
+    stream = standard_output.stream
+    write_out(f"{text}\n".encode(stream.encoding or "utf-8", stream.errors or "strict"))
+
+
 def write_out(data: bytes) -> None:
     """Bytes to standard output, now.
 
     Raises:
         TargetError: they cannot be written.
     """
+    stream = standard_output.stream
     try:
-        sys.stdout.buffer.write(data)
-        sys.stdout.flush()
+        stream.buffer.write(data)
+        stream.flush()
     except OSError as error:
         # What is still in the buffer must not fail again when Python ends.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         raise TargetError(
             f"standard output was not written ({error.strerror})",
             "somebody must take all of it",

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from brewster.cli.doctor import require_extra
-from brewster.cli.terminal import interrupts, progress, say
+from brewster.cli.extras import require_extra
+from brewster.cli.terminal import interrupts, print_out, progress, say
 from brewster.errors import RecipeError, TargetError
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ def _print_plan(recipe: CompactRecipe | LargeRecipe, card: str | None) -> None:
     if card is None and not is_here(found):
         say(f"there is no graphics card here: planned for {found.name}, the paper's; --card names another")
     estimate = plan_for(recipe, found)
-    click.echo(estimate.table())
+    print_out(estimate.table())
     estimate.refuse_misfit()
 
 

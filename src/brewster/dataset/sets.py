@@ -68,6 +68,10 @@ def statistics(sample: Sample, developed: Developed) -> dict[str, float]:
     return {name: float(f"{measure(sample, developed):.6g}") for name, measure in STATISTICS.items()}
 
 
+SAMPLE_FORMAT: Final = 1
+"""Raised when the same job comes to give other samples, so that no set mixes the two; see test_house_formats."""
+
+
 def encode_sample(sample: Sample, renderer: str) -> dict[str, bytes]:
     """The files of a sample by name.
 

@@ -87,7 +87,7 @@ def _trios(folder: Path) -> list[Trio]:
         found = read_folders(folder)
     except PhotoError as error:
         raise RecipeError(
-            str(error).split("; ")[0],
+            error.happened,
             "blended/ and transmission_layer/ beside each other",
             "name another folder in the recipe, or set BREWSTER_DATA to where the data lies",
         ) from error

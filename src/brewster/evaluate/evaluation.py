@@ -17,7 +17,7 @@ from brewster.dataset.benchmarks import Benchmark, Case
 from brewster.errors import BrewsterError, PhotoError
 from brewster.evaluate.judge import Truth, reduced
 from brewster.evaluate.methods import NOTHING, Answer, Method, Predictions, refuse_names
-from brewster.evaluate.protocol import IDENTICAL_DB, Protocol
+from brewster.evaluate.protocol import Protocol
 from brewster.evaluate.report.page import Shown, write_report
 from brewster.evaluate.report.published import read_published
 from brewster.evaluate.report.published import to_markdown as published_to_markdown
@@ -26,6 +26,7 @@ from brewster.evaluate.report.tables import to_csv, to_markdown
 from brewster.evaluate.results import Results, draw, summarise
 from brewster.evaluate.runner import Place, Report, Row, find_answer, score
 from brewster.files import write_atomically
+from brewster.metrics import IDENTICAL_DB
 from brewster.photo import Photo
 
 RESULTS, PAGE, INPUTS = "results.json", "report.html", "inputs"

@@ -7,19 +7,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from brewster import metrics
 from brewster.dataset.benchmarks import Case
 from brewster.errors import PhotoError
 from brewster.evaluate.methods import Answer
-from brewster.evaluate.protocol import IDENTICAL_DB, Protocol
-from brewster.metrics import Metric, Window
+from brewster.evaluate.protocol import Protocol
+from brewster.metrics import CachedPicture, Comparison, Metric, Picture, Region
 from brewster.photo import Photo
 
-Picture = NDArray[np.uint8]
-Region = NDArray[np.bool_]
 _DIGITS: Final = 6
 
 
@@ -80,7 +75,7 @@ class Judge:
 
     def __init__(self, truth: Truth, protocol: Protocol) -> None:
         self._truth, self._protocol = truth, protocol
-        self._features: dict[str, metrics.Features] = {}
+        self._pictures = {role: CachedPicture(picture) for role, picture in truth.pictures.items()}
         self._regions: dict[float, Region] = {}
 
     @cached_property
@@ -90,57 +85,34 @@ class Judge:
 
     def score(self, answer: Answer) -> dict[str, float | None]:
         """column -> score; None where it has no meaning: no region, no such layer, a picture too small."""
-        layers = {"transmission": answer.transmission.srgb_8bit()}
+        layers = {"transmission": CachedPicture(answer.transmission.srgb_8bit())}
         if answer.reflection:
-            layers["reflection"] = answer.reflection.srgb_8bit()
-        self._seen: dict[str, metrics.Features] = {}
+            layers["reflection"] = CachedPicture(answer.reflection.srgb_8bit())
         return {
             column: _or_none(lambda column=column, metric=metric: self._measure(column, metric, layers))  # type: ignore[misc]
             for column, metric in self._protocol.columns().items()
             if self._has_meaning(metric, layers)
         }
 
-    def _has_meaning(self, metric: Metric, layers: Mapping[str, Picture]) -> bool:
+    def _has_meaning(self, metric: Metric, layers: Mapping[str, CachedPicture]) -> bool:
         if metric.of == "rendered":
             return self._truth.case.rendered
-        return metric.of in layers and metric.of in self._truth.pictures
+        return metric.of in layers and metric.of in self._pictures
 
-    def _measure(self, column: str, metric: Metric, layers: Mapping[str, Picture]) -> float:
+    def _measure(self, column: str, metric: Metric, layers: Mapping[str, CachedPicture]) -> float:
+        layer = "transmission" if metric.of == "rendered" else metric.of
         truths = self._truth.pictures
-        if metric.of == "rendered":
-            return _FAILURES[metric.name](
-                layers["transmission"], truths["transmission"], truths["photo"], truths["reflection"]
-            )
         region = self._region(self._protocol.threshold(column)) if metric.where == "region" else None
-        picture, truth = layers[metric.of], truths[metric.of]
-        family = metric.name.split("_")[0]
-        if family == "psnr":
-            return min(metrics.psnr(picture, truth, region=region), IDENTICAL_DB)
-        if family == "ssim":
-            window: Window = "gaussian" if metric.name == "ssim_gaussian" else "uniform"
-            return metrics.ssim(picture, truth, window=window, region=region)
-        ours, theirs = (
-            self._look(self._seen, metric.of, picture),
-            self._look(self._features, metric.of, truth),
+        return metric.score(
+            Comparison(
+                layers[layer], self._pictures[layer], truths["photo"], truths.get("reflection"), region
+            )
         )
-        return metrics.Lpips.load().distance(ours, theirs, region=region)
 
     def _region(self, threshold: float) -> Region:
         if threshold not in self._regions:
             self._regions[threshold] = self._truth.region(threshold)
         return self._regions[threshold]
-
-    def _look(self, seen: dict[str, metrics.Features], layer: str, picture: Picture) -> metrics.Features:
-        if layer not in seen:
-            seen[layer] = metrics.Lpips.load().features(picture)
-        return seen[layer]
-
-
-_FAILURES: Final[dict[str, Callable[[Picture, Picture, Picture, Picture], float]]] = {
-    "removed_content": metrics.removed_content,
-    "removed_white": metrics.removed_white,
-    "kept_reflection": metrics.kept_reflection,
-}
 
 
 def _or_none(measure: Callable[[], float]) -> float | None:

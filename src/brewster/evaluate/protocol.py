@@ -8,12 +8,10 @@ from typing import Final, final
 from brewster.dataset.benchmarks import PAPER_SEED
 from brewster.errors import BrewsterError
 from brewster.evaluate.statistics import RESAMPLES
-from brewster.metrics import DEFAULT_THRESHOLD, METRICS, Metric, find_metric
+from brewster.metrics import DEFAULT_THRESHOLD, IDENTICAL_DB, METRICS, Metric, find_metric
 from brewster.options import Quality
 
 DEFAULT_METRICS: Final = tuple(name for name in METRICS if name != "ssim_gaussian")
-IDENTICAL_DB: Final = 100.0
-"""What the PSNR of identical pictures, which is infinite, counts as."""
 
 
 @final

@@ -19,18 +19,16 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Final, final
 
-import brewster
 from brewster.dataset.benchmarks import Benchmark, Case
 from brewster.errors import BrewsterError, TargetError
 from brewster.evaluate.judge import Judge, Truth
 from brewster.evaluate.methods import Answer, Method, refuse_names
 from brewster.evaluate.protocol import Protocol
-from brewster.metrics import Lpips
 from brewster.processes import end_with_parent, one_thread
 
 SCORES: Final = "scores.jsonl"
-_SCORING: Final = 2
-"""Rises when the same answers come to score differently, so that what was scored before is scored again."""
+SCORE_FORMAT: Final = 2
+"""Raised when the same answers come to score differently, so that they are scored again; see test_house_formats."""
 
 Report = Callable[[int, int, "Row"], None]
 """Called with (done, of how many, the row) after every answer that was scored."""
@@ -103,8 +101,9 @@ def score(
     alone = [method.name for method in methods if method.alone]
     tasks = list(_tasks(cases, [row for row in todo if row.method not in alone]))
     later = [task for name in alone for task in _tasks(cases, [row for row in todo if row.method == name])]
-    if todo and any(name.startswith("lpips") for name in protocol.metrics):
-        Lpips.load()  # here, once: its weights may have to be fetched, or be missing
+    for metric in protocol.columns().values() if todo else ():
+        if metric.prepare:  # here, once: weights may have to be fetched, or be missing
+            metric.prepare()
     log = _Log(out / SCORES)
 
     def take(made: Sequence[Row]) -> None:
@@ -129,7 +128,7 @@ def _rows(
     asked = asdict(protocol) | {"paper": None, "quality": None}
     for method in methods:
         answer_key = _digest(photo, protocol.size, method.key(case))
-        key = _digest(answer_key, truths, asked, case.rendered, brewster.__version__, _SCORING)
+        key = _digest(answer_key, truths, asked, case.rendered, SCORE_FORMAT)
         row = Row(case.benchmark, case.name, method.name, answer_key, key)
         before = known.get(row.place)
         is_answered = before and before.answer_key == answer_key

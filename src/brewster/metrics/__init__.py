@@ -10,21 +10,28 @@ failures: what was removed wrongly or left, where the truth is known exactly. Pi
 from __future__ import annotations
 
 import difflib
-from dataclasses import dataclass
-from typing import Final, Literal, final
+from collections.abc import Callable
+from typing import Final
 
 from brewster.errors import BrewsterError
 from brewster.metrics.failures import kept_reflection, removed_content, removed_white
 from brewster.metrics.fidelity import Window, psnr, ssim
+from brewster.metrics.metric import CachedPicture, Comparison, Metric
 from brewster.metrics.perceptual import Features, Lpips, lpips
 from brewster.metrics.region import DEFAULT_THRESHOLD, reflection_region
+from brewster.metrics.windows import Picture, Region
 
 __all__ = [
     "DEFAULT_THRESHOLD",
+    "IDENTICAL_DB",
     "METRICS",
+    "CachedPicture",
+    "Comparison",
     "Features",
     "Lpips",
     "Metric",
+    "Picture",
+    "Region",
     "Window",
     "find_metric",
     "kept_reflection",
@@ -37,25 +44,41 @@ __all__ = [
 ]
 
 
-@final
-@dataclass(frozen=True)
-class Metric:
-    """What a score is: how to print it, and how to read it."""
+def _psnr(case: Comparison) -> float:
+    return min(psnr(case.answer.pixels, case.truth.pixels, region=case.region), IDENTICAL_DB)
 
-    name: str
-    title: str
-    unit: str
-    """"dB", or nothing for a pure number."""
-    higher_is_better: bool
-    digits: int
-    """After the point, in tables."""
-    about: str
-    """The definition with its parameters, in one sentence."""
-    of: Literal["transmission", "reflection", "rendered"]
-    """Which truth it needs: the transmission, the reflection, or all layers of a rendered sample."""
-    where: Literal["picture", "region"] = "picture"
-    """Over the whole picture, or in the reflection region only."""
 
+def _ssim(case: Comparison) -> float:
+    return ssim(case.answer.pixels, case.truth.pixels, region=case.region)
+
+
+def _ssim_gaussian(case: Comparison) -> float:
+    return ssim(case.answer.pixels, case.truth.pixels, window="gaussian", region=case.region)
+
+
+def _lpips(case: Comparison) -> float:
+    answer, truth = (picture.features(_lpips_features) for picture in (case.answer, case.truth))
+    return Lpips.load().distance(answer, truth, region=case.region)
+
+
+def _lpips_features(picture: Picture) -> Features:
+    return Lpips.load().features(picture)
+
+
+def _of_rendered(
+    score: Callable[[Picture, Picture, Picture, Picture], float],
+) -> Callable[[Comparison], float]:
+    """A score of all layers of a rendered sample: answer, background, photo, reflection."""
+
+    def score_case(case: Comparison) -> float:
+        assert case.reflection is not None
+        return score(case.answer.pixels, case.truth.pixels, case.photo, case.reflection)
+
+    return score_case
+
+
+IDENTICAL_DB: Final = 100.0
+"""What the PSNR of identical pictures, which is infinite, counts as."""
 
 _PSNR: Final = "10 log10(255^2 / MSE) over the three channels of 8-bit sRGB"
 _SSIM: Final = "per RGB channel of 8-bit sRGB, K1 0.01, K2 0.03, range 255"
@@ -70,8 +93,8 @@ _GAIN: Final = (
 )
 
 _ROWS: Final = (
-    Metric("psnr", "PSNR", "dB", True, 2, f"{_PSNR} of all pixels.", "transmission"),
-    Metric("ssim", "SSIM", "", True, 3, f"Mean local SSIM, {_UNIFORM}.", "transmission"),
+    Metric("psnr", "PSNR", "dB", True, 2, f"{_PSNR} of all pixels.", "transmission", _psnr),
+    Metric("ssim", "SSIM", "", True, 3, f"Mean local SSIM, {_UNIFORM}.", "transmission", _ssim),
     Metric(
         "ssim_gaussian",
         "SSIM (Gaussian)",
@@ -81,10 +104,29 @@ _ROWS: Final = (
         f"Mean local SSIM, Gaussian 11x11 window of sigma 1.5, population covariance, {_SSIM},"
         " outermost 5 pixels left out.",
         "transmission",
+        _ssim_gaussian,
     ),
-    Metric("lpips", "LPIPS", "", False, 3, f"{_LPIPS}, each layer averaged over its map.", "transmission"),
     Metric(
-        "psnr_region", "PSNR in region", "dB", True, 2, f"{_PSNR} of {_REGION}.", "transmission", "region"
+        "lpips",
+        "LPIPS",
+        "",
+        False,
+        3,
+        f"{_LPIPS}, each layer averaged over its map.",
+        "transmission",
+        _lpips,
+        prepare=Lpips.load,
+    ),
+    Metric(
+        "psnr_region",
+        "PSNR in region",
+        "dB",
+        True,
+        2,
+        f"{_PSNR} of {_REGION}.",
+        "transmission",
+        _psnr,
+        "region",
     ),
     Metric(
         "ssim_region",
@@ -94,6 +136,7 @@ _ROWS: Final = (
         3,
         f"Mean local SSIM, {_UNIFORM}, over {_REGION}.",
         "transmission",
+        _ssim,
         "region",
     ),
     Metric(
@@ -104,10 +147,12 @@ _ROWS: Final = (
         3,
         f"{_LPIPS}, each layer's map enlarged to the picture (bilinear), averaged over {_REGION}.",
         "transmission",
+        _lpips,
         "region",
+        prepare=Lpips.load,
     ),
-    Metric("psnr_reflection", "PSNR of R", "dB", True, 2, f"{_PSNR} of all pixels.", "reflection"),
-    Metric("ssim_reflection", "SSIM of R", "", True, 3, f"Mean local SSIM, {_UNIFORM}.", "reflection"),
+    Metric("psnr_reflection", "PSNR of R", "dB", True, 2, f"{_PSNR} of all pixels.", "reflection", _psnr),
+    Metric("ssim_reflection", "SSIM of R", "", True, 3, f"Mean local SSIM, {_UNIFORM}.", "reflection", _ssim),
     Metric(
         "lpips_reflection",
         "LPIPS of R",
@@ -116,6 +161,8 @@ _ROWS: Final = (
         3,
         f"{_LPIPS}, each layer averaged over its map.",
         "reflection",
+        _lpips,
+        prepare=Lpips.load,
     ),
     Metric(
         "removed_content",
@@ -126,6 +173,7 @@ _ROWS: Final = (
         "Share of the background's light that the answer lacks where the reflection is below 2 % of the photo,"
         f" {_GAIN}.",
         "rendered",
+        _of_rendered(removed_content),
     ),
     Metric(
         "removed_white",
@@ -137,6 +185,7 @@ _ROWS: Final = (
         " background is white (encoded channels above 0.75 and less than 0.12 apart),"
         f" {_GAIN}.",
         "rendered",
+        _of_rendered(removed_white),
     ),
     Metric(
         "kept_reflection",
@@ -147,6 +196,7 @@ _ROWS: Final = (
         "Share of the reflection's light that the answer still has above the background, where the reflection is at"
         f" least 10 % of the photo and the photo is not clipped, {_GAIN}.",
         "rendered",
+        _of_rendered(kept_reflection),
     ),
 )
 

@@ -287,7 +287,7 @@ _MORE = {"jpeg": _more_jpeg, "tiff": _more_tiff, "webp": _more_webp, "avif": _mo
 
 # --- HEIC
 
-_HEIC_ERRORS = (ValueError, RuntimeError, OSError, SyntaxError)
+_HEIC_ERRORS = (ValueError, RuntimeError, OSError, SyntaxError, EOFError)
 
 
 def _open_heic(data: bytes, max_pixels: int) -> Any:  # noqa: ANN401  (pillow-heif has no types)
@@ -300,6 +300,8 @@ def _open_heic(data: bytes, max_pixels: int) -> Any:  # noqa: ANN401  (pillow-he
         ) from error
     try:
         heif = pillow_heif.open_heif(data, convert_hdr_to_8bit=False)
+        if not len(heif):
+            raise ValueError("no image in it can be decoded")
         if heif.size[0] * heif.size[1] > max_pixels:
             raise too_large(heif.size[0], heif.size[1], max_pixels)
     except _HEIC_ERRORS as error:

@@ -4,6 +4,7 @@
 `brewster.separate("window.jpg")` is `brewster.separate.separate("window.jpg")`.
 """
 
+import inspect
 import sys
 from types import ModuleType
 
@@ -16,6 +17,7 @@ __all__ = ["QUALITIES", "Quality", "Separation", "Separator", "separate"]
 
 class _Room(ModuleType):
     __call__ = staticmethod(separate)
+    __signature__ = inspect.signature(separate)  # or tools would take `source` for a `self`, and hide it
 
 
 sys.modules[__name__].__class__ = _Room

@@ -118,7 +118,7 @@ def naming(name: str) -> Iterator[None]:
         yield
     except BrewsterError as error:
         if name not in str(error):
-            error.args = (f"{name}: {error}",)
+            error.happened = f"{name}: {error.happened}"
         raise
 
 

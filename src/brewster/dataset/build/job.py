@@ -9,7 +9,6 @@ is done, a killed run needs no memory, and neither memory nor the cost of a samp
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import tomllib
 from collections import deque
@@ -17,21 +16,21 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Final, Literal, Protocol, final
+from typing import Any, Final, Literal, Protocol, final
 
+import filelock
 import tomli_w
 
-import brewster
 from brewster.dataset import sets
 from brewster.dataset.build.overview import write_index
-from brewster.errors import DeviceError, MissingExtra, TargetError
+from brewster.errors import BrewsterError, DeviceError, MissingExtra, TargetError
 from brewster.files import write_atomically
 from brewster.scene.recipe import SceneRecipe
 from brewster.scene.sampler import Catalog
 
 RECORD: Final = "set.toml"
 _LOCK: Final = ".lock"
-_HOPELESS: Final = {error.__name__: error for error in (TargetError, MissingExtra, DeviceError)}
+FATAL: Final = (TargetError, MissingExtra, DeviceError)
 """Errors that the next sample would meet too: they end the run."""
 
 
@@ -53,7 +52,7 @@ class Job:
     def record(self) -> dict[str, Any]:
         """The values that a set's bytes depend on, for set.toml."""
         return {
-            "version": brewster.__version__,
+            "format": sets.SAMPLE_FORMAT,
             "renderer": self.renderer,
             "seed": self.seed,
             "catalog": hashlib.sha256(self.catalog.model_dump_json().encode()).hexdigest(),
@@ -79,13 +78,17 @@ class Task:
 @final
 @dataclass(frozen=True)
 class Result:
-    """What became of a sample (or, if packing failed, of its block); `kind` is the class of the error."""
+    """What became of a sample (or, if packing failed, of its block).
+
+    `kind` is the class of the error; `fatal` is the error itself if it ends the run.
+    """
 
     index: int
     status: Literal["rendered", "skipped", "failed"]
     seconds: float = 0.0
     error: str | None = None
     kind: str | None = None
+    fatal: BrewsterError | None = None
 
 
 Report = Callable[[Result], None]
@@ -139,16 +142,11 @@ def _work(schedule: _Schedule, crew: Crew) -> None:
             crew.submit(task)
         elif crew.is_busy():
             for result in crew.wait():
-                _end_if_hopeless(result)
+                if result.fatal:
+                    raise result.fatal
                 schedule.note(result)
         else:
             return
-
-
-def _end_if_hopeless(result: Result) -> None:
-    """Raises an error that happened in another process, made again from the three beats of its message."""
-    if result.error and result.kind in _HOPELESS:
-        raise _HOPELESS[result.kind](*result.error.removesuffix(".").split("; ", 2))
 
 
 @final
@@ -201,23 +199,26 @@ class _Schedule:
 
 @contextmanager
 def _alone_in(out: Path) -> Iterator[None]:
-    """Holds the folder's lock, which a killed process gives back by dying."""
+    """Holds the folder's lock, which is released by the operating system if the process is killed."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        file = (out / _LOCK).open("ab")
+        (out / _LOCK).touch()
     except OSError as error:
         raise TargetError(
             f"{out} cannot be written to ({error.strerror})", "a folder for the set", "name another one"
         ) from error
-    with file:
-        _lock(file, out)
-        yield
-
-
-def _lock(file: BinaryIO, out: Path) -> None:
+    lock = filelock.FileLock(out / _LOCK, blocking=False, fallback_to_soft=False)
+    _acquire(lock, out)
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
+        yield
+    finally:
+        lock.release()
+
+
+def _acquire(lock: filelock.BaseFileLock, out: Path) -> None:
+    try:
+        lock.acquire()
+    except filelock.Timeout as error:
         raise TargetError(
             f"another run is writing in {out}", "one writes at a time", "wait for it, or name another folder"
         ) from error

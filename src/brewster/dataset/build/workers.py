@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import signal
+import sys
 import time
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
@@ -20,7 +21,7 @@ from types import TracebackType
 from typing import Final, Self, final
 
 from brewster.dataset import sets
-from brewster.dataset.build.job import Job, Result, Task
+from brewster.dataset.build.job import FATAL, Job, Result, Task
 from brewster.errors import BrewsterError, RecipeError, TargetError
 from brewster.processes import end_with_parent, one_thread
 from brewster.render.sample import Sample
@@ -66,7 +67,8 @@ class Hand:
         try:
             work()
         except BrewsterError as error:
-            return Result(index, "failed", error=str(error), kind=type(error).__name__)
+            fatal = error if isinstance(error, FATAL) else None
+            return Result(index, "failed", error=str(error), kind=type(error).__name__, fatal=fatal)
         except MemoryError:
             return Result(
                 index, "failed", error="it does not fit into memory; use fewer --workers", kind="MemoryError"
@@ -237,6 +239,9 @@ class Workers:
 @contextmanager
 def _deaf_to_interrupts() -> Iterator[None]:
     """Processes started here never see Ctrl-C, which a terminal sends to all: who started them will stop them."""
+    if sys.platform == "win32":  # it has no signal masks; _serve ignores Ctrl-C as soon as it runs
+        yield
+        return
     resource_tracker.ensure_running()  # or it would start below, and lift the mask
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
@@ -247,6 +252,7 @@ def _deaf_to_interrupts() -> Iterator[None]:
 
 def _serve(pipe: Connection, job: Job) -> None:
     """A worker's life: tasks until the pipe ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()  # the next run may be at the same sample
     hand = Hand(job)
     with one_thread(), suppress(EOFError):

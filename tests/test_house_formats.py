@@ -1,0 +1,279 @@
+"""What is cached is keyed by a format number, and a changed output forces the number to be raised.
+
+Each test compares a small fixed output with the numbers that are pinned here under the format's number. If one fails
+because you changed the output on purpose: raise the number named in its message by one, and pin the new output under
+it (each test prints it). Numbers are compared within what processors differ by, not to the bit.
+"""
+
+import hashlib
+import re
+
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper
+
+from brewster import Photo
+from brewster.dataset.benchmarks import Case
+from brewster.dataset.sets import SAMPLE_FORMAT
+from brewster.evaluate.judge import Judge, Truth
+from brewster.evaluate.methods import ANSWER_FORMAT, Answer, Model
+from brewster.evaluate.protocol import Protocol
+from brewster.evaluate.runner import SCORE_FORMAT
+from brewster.metrics import METRICS
+from brewster.render.develop import develop
+from brewster.render.pane import render
+from brewster.scene.recipe import read_scene_recipe
+from brewster.scene.sampler import draw
+from brewster.separate import QUALITIES
+from brewster.worlds.catalog import BUILTIN_CATALOG
+from brewster.worlds.procedural import WORLDS as WORLDS_BY_NAME
+from picture_files import smooth
+from worlds_of_one import WORLDS, a_scene, around, board
+
+ANSWERS = {
+    1: {
+        "draft": [
+            7,
+            217,
+            149,
+            104,
+            55,
+            201,
+            163,
+            127,
+            35,
+            120,
+            191,
+            169,
+            17,
+            143,
+            98,
+            71,
+            33,
+            131,
+            107,
+            82,
+            22,
+            85,
+            123,
+            111,
+        ],
+        "standard": [
+            0,
+            218,
+            149,
+            102,
+            55,
+            202,
+            163,
+            127,
+            33,
+            119,
+            192,
+            169,
+            17,
+            142,
+            98,
+            71,
+            33,
+            130,
+            106,
+            81,
+            23,
+            88,
+            120,
+            109,
+        ],
+        "best": [
+            0,
+            219,
+            149,
+            101,
+            56,
+            203,
+            164,
+            127,
+            33,
+            118,
+            194,
+            170,
+            17,
+            137,
+            97,
+            74,
+            33,
+            127,
+            105,
+            81,
+            24,
+            91,
+            114,
+            106,
+        ],
+    },
+}
+SCORES = {
+    2: {
+        "psnr": 20.003941,
+        "ssim": 0.862947,
+        "ssim_gaussian": 0.876058,
+        "psnr_region": 19.012883,
+        "ssim_region": 0.864838,
+        "psnr_reflection": 16.204101,
+        "ssim_reflection": 0.258754,
+        "removed_content": 0.435374,
+        "removed_white": 0.580899,
+        "kept_reflection": 0.609849,
+    },
+}
+LPIPS = {
+    2: {"lpips": 0.033937, "lpips_region": 0.035948, "lpips_reflection": 0.283549},
+}
+SCENES = {
+    1: {"tiny": "3110c6324c047d3d", "window": "e2d8b2c9af23a561"},
+}
+SAMPLES = {
+    1: {
+        "photo, light": [1.0143, 0.8571, 1.1205],
+        "transmission, light": [0.7423, 0.6429, 0.8384],
+        "background, light": [0.9394, 0.7656, 1.0188],
+        "reflection, light": [0.2719, 0.2142, 0.2821],
+        "mirror, light": [2.1322, 1.543, 2.0908],
+        "photo": [0.6699, 0.6691, 0.6722, 0.6348, 0.6333, 0.636, 0.6028, 0.601, 0.6047],
+        "transmission": [0.5879, 0.5871, 0.59, 0.5574, 0.5561, 0.5584, 0.5294, 0.528, 0.5309],
+        "background": [0.6365, 0.6356, 0.6388, 0.6036, 0.6022, 0.6047, 0.5735, 0.5719, 0.5752],
+        "reflection": [0.3521, 0.3517, 0.3533, 0.3312, 0.3302, 0.3321, 0.3125, 0.3111, 0.314],
+        "mirror": [0.6659, 0.6653, 0.6679, 0.6292, 0.6274, 0.6306, 0.596, 0.5935, 0.5984],
+    },
+}
+MAPS = {
+    1: {
+        "room": [
+            -1.134,
+            -1.145,
+            -0.686,
+            -0.948,
+            -0.369,
+            -0.327,
+            -1.083,
+            -0.779,
+            -0.908,
+            -0.928,
+            -1.128,
+            -0.783,
+        ]
+    },
+}
+
+
+def same(name, number, pinned, made, tolerance=0.0):
+    """Compares an output, lists of numbers by name, with the one pinned for this format; says what to do if it differs."""
+    print(f"{number}: {made!r},")
+    assert number in pinned, f"{name} is {number}, and no output is pinned for it"
+    for part, values in pinned[number].items():
+        expected = pytest.approx(values, abs=tolerance) if tolerance else values
+        assert made[part] == expected, (
+            f"{part} changed: raise {name} ({number}) by one, and pin the new output"
+        )
+
+
+def picture(seed, height=40, width=56):
+    """Soft colours with some hard edges."""
+    blocks = np.random.default_rng(seed).integers(0, 120, (height // 8, width // 8, 3))
+    return (smooth(height, width) // 2 + np.kron(blocks, np.ones((8, 8, 1)))).astype(np.uint8)
+
+
+def case(rendered=False):
+    return Case("pairs", "a", "a", "a", *[None] * 3, rendered)
+
+
+@pytest.fixture(scope="module")
+def leaning(tmp_path_factory):
+    """A model that sees to the left and above: turned, flipped or cut otherwise, it answers otherwise."""
+    shares = {"transmission": 0.7, "reflection": 0.2}
+    kernels = {name: np.zeros((3, 1, 3, 3), np.float32) for name in shares}
+    for name, kernel in kernels.items():
+        kernel[:, 0, 1, 1], kernel[:, 0, 1, 0], kernel[:, 0, 0, 1] = shares[name], 0.1, 0.05
+    shape = [1, 3, "height", "width"]
+    graph = helper.make_graph(
+        [
+            helper.make_node("Conv", ["photo", f"{name}_kernel"], [name], group=3, pads=[1] * 4)
+            for name in shares
+        ],
+        "leaning",
+        [helper.make_tensor_value_info("photo", TensorProto.FLOAT, shape)],
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name in shares],
+        [onnx.numpy_helper.from_array(kernels[name], f"{name}_kernel") for name in shares],
+    )
+    path = tmp_path_factory.mktemp("model") / "leaning.onnx"
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10), path)
+    return path
+
+
+def test_a_changed_answer_raises_the_format_of_answers(leaning, tmp_path):
+    photo, made = Photo.from_array(picture(1, 720, 960), encoding="srgb"), {}
+    for quality in QUALITIES:
+        answer = Model("leaning", str(leaning), tmp_path, quality=quality).answer(case(), photo)
+        layers = np.concatenate(
+            [layer.pixels[7::240, 9::240, 1] for layer in (answer.transmission, answer.reflection)]
+        )
+        made[quality] = layers.ravel().tolist()
+    same("evaluate.methods.ANSWER_FORMAT", ANSWER_FORMAT, ANSWERS, made, 1)
+
+
+def scores(names):
+    photo = picture(1)
+    behind, mirrored = (photo * 0.85).astype(np.uint8), photo // 2
+    behind[:, :20], mirrored[:, :20] = photo[:, :20], 0  # nothing is mirrored at the left
+    behind[:16, :16] = 220  # something white
+    pictures = {"photo": photo, "transmission": behind, "reflection": mirrored}
+    truth = Truth(case(rendered=True), Photo.from_array(photo, encoding="srgb"), pictures)
+    moved = np.roll(behind, 1, axis=1) // 2 + photo // 2
+    layers = (Photo.from_array(layer, encoding="srgb") for layer in (moved, photo // 7))
+    return Judge(truth, Protocol(metrics=names)).score(Answer(*layers))
+
+
+def test_a_changed_score_raises_the_format_of_scores():
+    names = tuple(name for name in METRICS if not name.startswith("lpips"))
+    made = scores(names)
+    assert None not in made.values()
+    same("evaluate.runner.SCORE_FORMAT", SCORE_FORMAT, SCORES, made, 2e-6)
+
+
+def test_a_changed_lpips_raises_the_format_of_scores(data, monkeypatch):
+    monkeypatch.setenv("BREWSTER_DATA", str(data))
+    names = tuple(name for name in METRICS if name.startswith("lpips"))
+    same("evaluate.runner.SCORE_FORMAT", SCORE_FORMAT, LPIPS, scores(names), 1e-4)
+
+
+def test_a_changed_draw_raises_the_format_of_samples():
+    made = {}
+    for name in ("tiny", "window"):
+        recipe = read_scene_recipe(name)
+        text = "".join(draw(recipe, BUILTIN_CATALOG, 7, index).to_toml() for index in range(20))
+        text = re.sub(r'^version = ".*"\n', "", text, flags=re.MULTILINE)
+        made[name] = hashlib.sha256(text.encode()).hexdigest()[:16]
+    same("dataset.sets.SAMPLE_FORMAT", SAMPLE_FORMAT, SCENES, made)
+
+
+def test_a_changed_rendering_raises_the_format_of_samples():
+    scene = a_scene(
+        camera={"aperture_mm": 5.0},
+        panes=[{"absorption_per_m": (20.0, 5.0, 10.0)}, {}],
+        behind=board("soft"),
+        front=around("soft", radius_mm=4000.0, luminance=2.0),
+        samples=4,
+        seed=5,
+    )
+    sample = render(scene, WORLDS)
+    made = {f"{name}, light": layer[:, 5, 17].tolist() for name, layer in sample.layers().items()}
+    made |= {name: layer[1, 3::9, 4::9].ravel().tolist() for name, layer in develop(sample).layers().items()}
+    rounded = {name: [round(value, 4) for value in values] for name, values in made.items()}
+    same("dataset.sets.SAMPLE_FORMAT", SAMPLE_FORMAT, SAMPLES, rounded, 2e-3)
+
+
+def test_a_changed_world_raises_the_format_of_samples():
+    world = WORLDS_BY_NAME["room"](3, 32)
+    made = {"room": [round(float(value), 3) for value in np.log(world[5::11, 7::17, 1] + 0.01).ravel()]}
+    same("dataset.sets.SAMPLE_FORMAT", SAMPLE_FORMAT, MAPS, made, 0.05)
