@@ -5,7 +5,7 @@ BIN := .venv/bin
 export BREWSTER_DATA ?= $(wildcard ../shared/data)
 PHOTO ?= tests/pictures
 
-.PHONY: demo test test-slow check docs bench clean
+.PHONY: demo test test-slow check docs bench mutants clean
 
 demo: .venv/core
 	$(BIN)/python runs/demo.py "$(PHOTO)"
@@ -24,6 +24,9 @@ docs: .venv/dev
 
 bench: .venv/dev
 	$(BIN)/python bench/run.py
+
+mutants: .venv/dev
+	$(BIN)/python bench/mutants.py
 
 clean:
 	rm -rf .venv out build dist src/*.egg-info
