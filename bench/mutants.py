@@ -178,7 +178,16 @@ def _pytest(copy: Path, tests: Sequence[str], log: Path) -> None:
 def _import_heavy() -> None:
     """What most tests import, once: every run is forked from here, which saves seconds each time."""
     os.environ |= {"OMP_NUM_THREADS": "1", "VIPS_CONCURRENCY": "1"}
-    for name in ("torch", "pydantic", "fastapi", "peft"):
+    for name in (
+        "torch",
+        "peft",
+        "fastapi",
+        "hypothesis",
+        "jaxtyping",
+        "schemathesis.pytest",
+        "click",
+        "rich",
+    ):
         importlib.import_module(name)
 
 

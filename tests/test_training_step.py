@@ -154,3 +154,28 @@ def test_a_loras_long_gradient_is_shortened_and_its_rate_warms_up(lora):
         rates.append(one._optimizer.param_groups[0]["lr"])
     np.testing.assert_allclose(seen, 1, rtol=1e-3)
     assert rates == pytest.approx([0.25e-3, 0.5e-3, 0.75e-3, 1e-3, 1e-3])
+
+
+def test_who_knows_the_picture_has_no_loss(lora, monkeypatch):
+    """At time t a sample is (1 - t) picture + t noise, and the velocity asked for is noise - picture."""
+    one = lora()
+    picture = one._data(SampleRng(1, 0, 0)).composite
+
+    def knowing(latents, condition, sigma, prompt, guidance):
+        return (latents - picture) / sigma
+
+    monkeypatch.setattr(one.backbone, "predict", knowing)
+    parts = one._losses(SampleRng(1, 0, 0))
+    assert parts.keys() == {"panel_I", "panel_T", "panel_R"}
+    assert max(float(part) for part in parts.values()) < 1e-6
+
+
+def test_the_gradients_of_earlier_steps_are_forgotten(lora):
+    one, seen = lora(learning_rate=1e-12), []
+    for parameter in one._parameters:
+        parameter.register_hook(lambda gradient: gradient * 1e-4)  # too short to be clipped
+    one._optimizer.register_step_pre_hook(lambda *_: seen.append(norm(p.grad for p in one._parameters)))
+    one.advance(0)
+    one.advance(0)
+    assert 0 < seen[0] < 1
+    assert seen[1] == pytest.approx(seen[0], rel=1e-3)
