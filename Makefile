@@ -5,7 +5,7 @@ BIN := .venv/bin
 export BREWSTER_DATA ?= $(wildcard ../shared/data)
 PHOTO ?= tests/pictures
 
-.PHONY: demo test test-slow coverage check docs bench dist clean
+.PHONY: demo test test-slow coverage check docs bench mutants dist clean
 
 demo: .venv/core
 	$(BIN)/python runs/demo.py "$(PHOTO)"
@@ -34,6 +34,9 @@ dist:
 
 bench: .venv/dev
 	$(BIN)/python bench/run.py
+
+mutants: .venv/dev
+	$(BIN)/python bench/mutants.py
 
 clean:
 	rm -rf .venv out build dist src/*.egg-info

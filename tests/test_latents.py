@@ -181,3 +181,11 @@ def test_a_sample_that_is_smaller_than_a_panel_is_refused_with_the_budget_that_f
 def test_more_samples_than_there_are_are_refused(recipe):
     with pytest.raises(RecipeError, match="3 rendered samples; the recipe learns from 9"):
         open_samples(recipe({"rendered": {"sets": ["set"], "count": 9}}))
+
+
+def test_crops_have_half_to_all_of_the_samples_sides():
+    fit = fit_panel((300, 200), Layout(), budget_px=3 * 48 * 32, multiple=16)
+    whole = torch.zeros(200, 300, 1)
+    shares = [cropped(SampleRng(seed, -1, 1), whole, fit).shape[0] / 200 for seed in range(200)]
+    assert 0.5 <= min(shares) < 0.52
+    assert 0.98 < max(shares) <= 1

@@ -191,6 +191,16 @@ def test_a_checkpoint_to_start_from_that_is_missing_is_named_with_its_cure(recip
         train(recipe.model_copy(update={"start_from": (tmp_path / "gone.pt",)}), tmp_path / "run", silent)
 
 
+def test_a_checkpoint_is_written_every_so_many_steps_and_at_the_end(recipe, tmp_path):
+    path, steps = tmp_path / "checkpoint.pt", []
+
+    def look(step, steps_in_all, numbers, logged):
+        steps.append(Checkpoint.read(path).step if path.exists() else 0)
+
+    run(Counting(recipe.model_copy(update={"steps": 5, "checkpoint_every": 2})), tmp_path, look)
+    assert steps == [0, 2, 2, 4, 5]
+
+
 def test_a_checkpoint_of_another_network_is_named(recipe, tmp_path):
     other = replace(checkpoint(recipe), state={"network": {}, "average": {}})
     other.write(tmp_path / "checkpoint.pt")

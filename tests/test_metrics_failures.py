@@ -80,6 +80,18 @@ def test_a_black_answer_removes_everything_and_keeps_nothing(scene):
     assert [score(np.zeros_like(photo), background, photo, reflection) for score in SCORES] == [1, 1, 0]
 
 
+def test_a_third_of_the_pixels_at_half_their_light_does_not_change_the_gain(scene):
+    """The gain is the median's: the others, which are right, fix it, and half of the third's light is missing."""
+    background, photo, reflection = scene
+    third = np.s_[: SIDE // 3]
+    light = to_linear(background / 255)
+    answer = light * 0.7
+    answer[third] /= 2
+    calm = np.s_[:, : SIDE // 2]
+    lost = light[third][calm].sum() / 2 / light[calm].sum()
+    assert removed_content(encode(answer), background, photo, reflection) == pytest.approx(lost, abs=0.01)
+
+
 @pytest.mark.parametrize("gain", [0.8, 1.1])
 def test_scores_hardly_depend_on_the_brightness_of_an_answer(scene, gain):
     background, photo, reflection = scene

@@ -51,6 +51,20 @@ def test_the_reflection_has_the_asked_strength(photos):
     assert ratio.item() == pytest.approx(0.25, rel=0.15)
 
 
+def test_a_veil_adds_even_light_the_asked_share_of_the_photos_mean(photos):
+    recipe = QUIET.model_copy(update={"veil_probability": 1.0, "veil": (0.3, 0.3)})
+    batch = Mixtures(photos, [], recipe, seed=1)(0, 4, 64)
+    photo, transmission, reflection = (
+        to_linear(layer)
+        for layer in (batch.photo_encoded, batch.transmission_encoded, batch.reflection_encoded)
+    )
+    both = transmission + reflection
+    veil = 0.3 * both.mean(dim=(2, 3), keepdim=True).expand_as(photo)
+    inside = photo < 0.95
+    torch.testing.assert_close((photo - both)[inside], veil[inside], atol=0.02, rtol=0)
+    assert veil.mean() > 0.03
+
+
 def test_the_target_is_what_the_pane_lets_through_or_what_is_behind_it(photos):
     light = {
         target: to_linear(

@@ -268,3 +268,16 @@ def test_a_line_near_the_glass_is_mirrored_twice_as_far_apart_as_the_formula_say
     r_s, r_p = surface(math.cos(math.radians(incidence_deg)), 1, 1.5)
     fainter = (r_s * (1 - r_s) ** 2 + r_p * (1 - r_p) ** 2) / (r_s + r_p)
     assert columns[ghost].sum() / columns[main].sum() == pytest.approx(fainter, rel=0.03)
+
+
+def test_a_ghost_that_is_a_pixel_away_moves_the_lines_centroid_by_its_share():
+    """Orders are looked up apart from each other unless they land within a tenth of a pixel."""
+    columns, pixel_mm = line_mirrored(40, 0.4)
+    apart = ghost_distance_mm(Pane(thickness_mm=0.4), 40) / pixel_mm
+    assert 0.5 < apart < 1.5
+    table = orders((0.04,))
+    shares = order_shares(Glazing(), exact(math.cos(math.radians(40))), table)
+    mirrored = [(float(s), o.traversals[0] / 2) for s, o in zip(shares, table, strict=True) if not o.behind]
+    mean_order = sum(share * number for share, number in mirrored) / sum(share for share, _ in mirrored)
+    found = np.average(np.arange(48) + 0.5, weights=columns)
+    assert 24 - found == pytest.approx(apart * mean_order, abs=0.05)

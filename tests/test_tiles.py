@@ -1,8 +1,10 @@
+import itertools
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brewster.separate.tiles import in_tiles
+from brewster.separate.tiles import in_tiles, tiles_of
 
 
 def halves(tile):
@@ -26,6 +28,14 @@ def test_no_tile_is_larger_than_asked():
 
     in_tiles(spy, np.zeros((70, 130, 3), np.float32), tile_px=50, overlap_px=10)
     assert sizes == {(50, 50, 3)}
+
+
+@given(st.integers(1, 400), st.integers(9, 60), st.integers(1, 8))
+def test_tiles_cover_the_picture_and_neighbours_share_the_overlap(side, tile, overlap):
+    rows = [vertical for vertical, _ in tiles_of((side, 1), tile_px=tile, overlap_px=overlap)]
+    assert (rows[0].start, rows[-1].stop) == (0, side)
+    assert all(row.stop - row.start == min(side, tile) for row in rows)
+    assert all(first.stop - second.start >= overlap for first, second in itertools.pairwise(rows))
 
 
 def test_neighbouring_tiles_fade_into_each_other_without_a_seam():

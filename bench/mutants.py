@@ -1,0 +1,200 @@
+"""Do the tests notice small faults? Applies those of mutants.toml one at a time, and runs the tests that should fail.
+
+    make mutants                                  # all of them
+    python bench/mutants.py losses render/pane    # those whose file or text contains one of these words
+
+Each runs in a temporary copy of the tree. A fault is noticed if a test fails that passes without the fault; a run
+beyond the time limit counts as failed. mutmut and cosmic-ray generate every possible mutation of a file, thousands
+here; neither runs a short list with a few test files each.
+"""
+
+from __future__ import annotations
+
+import ast
+import compileall
+import importlib
+import os
+import py_compile
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import tomllib
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+LIST = ROOT / "bench" / "mutants.toml"
+PACKAGE = Path("src/brewster")
+COPIED = (
+    "src",
+    "tests",
+    "recipes",
+    "docs",
+    "runs",
+    "bench",
+    "README.md",
+    "pyproject.toml",
+    "constraints.txt",
+)
+SECONDS = 900
+TARGET = 0.95
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One fault: `old` in `file` becomes `new`, and one of `tests` should fail. `survives` is why none can."""
+
+    file: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+    survives: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.file}: {_short(self.old)} -> {_short(self.new)}"
+
+    def applied(self, root: Path = ROOT) -> str:
+        """The mutated source.
+
+        Raises:
+            ValueError: the file is missing, `old` is not in it exactly once, or the program stays the same.
+        """
+        path = root / PACKAGE / self.file
+        source = path.read_text("utf-8") if path.is_file() else ""
+        if (count := source.count(self.old)) != 1:
+            raise ValueError(f"{self}: found {count} times, expected once; change this entry of {LIST.name}")
+        mutated = source.replace(self.old, self.new)
+        if ast.dump(ast.parse(mutated)) == ast.dump(ast.parse(source)):
+            raise ValueError(f"{self}: the program is still the same; change this entry of {LIST.name}")
+        return mutated
+
+
+def read_list() -> list[Mutant]:
+    """Every entry of mutants.toml."""
+    entries = tomllib.loads(LIST.read_text("utf-8"))["mutant"]
+    return [Mutant(**entry | {"tests": tuple(entry["tests"])}) for entry in entries]
+
+
+def main(words: Sequence[str]) -> int:
+    """Prints one line per mutant and the share that is noticed; 0 if that is at least 95 %."""
+    mutants = [m for m in read_list() if not words or any(word in f"{m.file} {m.old}" for word in words)]
+    for mutant in mutants:
+        mutant.applied()
+    _import_heavy()
+    with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
+        copy = _copy(Path(folder))
+        survivors = {mutant: reason for mutant in mutants if (reason := _survives(copy, mutant))}
+    noticed = len(mutants) - len(survivors)
+    print(f"\n{noticed} of {len(mutants)} mutants noticed, {noticed / max(1, len(mutants)):.1%}")
+    for mutant, reason in survivors.items():
+        print(f"survives: {mutant}\n    {reason}")
+    return int(noticed < TARGET * len(mutants))
+
+
+def _survives(copy: Path, mutant: Mutant) -> str:
+    """Why no test notices the mutant; empty if one does."""
+    started = time.monotonic()
+    path, tests = copy / PACKAGE / mutant.file, [f"tests/{test}" for test in mutant.tests]
+    source = path.read_text("utf-8")
+    path.write_text(mutant.applied(copy), "utf-8")
+    try:
+        is_noticed, failed = _fails(copy, tests)
+    finally:
+        path.write_text(source, "utf-8")
+    reason = "" if is_noticed else mutant.survives or "no reason is known: write a test"
+    if is_noticed and _fails(copy, failed or tests)[0]:
+        reason = f"{' '.join(failed or tests)} fails without it, too: mend that first"
+    told = f"SURVIVES  {reason}" if reason else f"noticed   {' '.join(failed)[:100] or 'by the time limit'}"
+    print(f"{time.monotonic() - started:4.0f} s  {mutant}\n        {told}", flush=True)
+    return reason
+
+
+def _copy(folder: Path) -> Path:
+    """The tree without caches; its bytecode is checked by content, as a mutation may keep size and time."""
+    copy = folder / "brewster"
+    copy.mkdir()
+    for name in COPIED:
+        source = ROOT / name
+        if source.is_dir():
+            shutil.copytree(source, copy / name, ignore=shutil.ignore_patterns("__pycache__", "*.egg-info"))
+        else:
+            shutil.copy(source, copy / name)
+    checked = py_compile.PycInvalidationMode.CHECKED_HASH
+    compileall.compile_dir(copy / PACKAGE, quiet=1, invalidation_mode=checked)
+    return copy
+
+
+def _fails(copy: Path, tests: Sequence[str]) -> tuple[bool, list[str]]:
+    """Whether these tests fail, and the first that does; at the time limit all that was started is killed."""
+    log = copy.parent / "failed.txt"
+    log.write_text("")
+    process = get_context("fork").Process(target=_pytest, args=(copy, tests, log))
+    process.start()
+    process.join(SECONDS)
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid or 0, signal.SIGKILL)
+    process.join()
+    if process.exitcode in {pytest.ExitCode.USAGE_ERROR, pytest.ExitCode.NO_TESTS_COLLECTED}:
+        raise ValueError(f"pytest finds no test in {' '.join(tests)}; change this entry of {LIST.name}")
+    return process.exitcode != 0, log.read_text().splitlines()
+
+
+class _Recorder:
+    """A pytest plugin that writes down which tests fail."""
+
+    def __init__(self, log: Path) -> None:
+        self._log = log
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.failed:
+            self._log.write_text(f"{report.nodeid}\n")
+
+    def pytest_collectreport(self, report: pytest.CollectReport) -> None:
+        if report.failed:
+            self._log.write_text(f"{report.nodeid}\n")
+
+
+def _pytest(copy: Path, tests: Sequence[str], log: Path) -> None:
+    """Becomes a process that looks like `python -m pytest` in the copy, with heavy libraries imported already."""
+    os.setsid()
+    for stream in (1, 2):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+    os.chdir(copy)
+    data = os.environ.get("BREWSTER_DATA") or str(ROOT.parent / "shared" / "data")
+    os.environ |= {"PYTHONPATH": str(copy / "src"), "BREWSTER_DATA": data}
+    sys.path[0] = str(copy / "src")
+    plugins_are_imported = "ignore::pytest.PytestAssertRewriteWarning"
+    options = ["-x", "-q", "-p", "no:cacheprovider", "--tb=no", "-W", plugins_are_imported]
+    sys.exit(pytest.main([*options, *tests], plugins=[_Recorder(log)]))
+
+
+def _import_heavy() -> None:
+    """What most tests import, once: every run is forked from here, which saves seconds each time."""
+    os.environ |= {"OMP_NUM_THREADS": "1", "VIPS_CONCURRENCY": "1"}
+    for name in (
+        "torch",
+        "peft",
+        "fastapi",
+        "hypothesis",
+        "jaxtyping",
+        "schemathesis.pytest",
+        "click",
+        "rich",
+    ):
+        importlib.import_module(name)
+
+
+def _short(text: str) -> str:
+    words = " ".join(text.split())
+    return repr(words if len(words) <= 50 else f"{words[:47]}...")
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

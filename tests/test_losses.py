@@ -1,0 +1,82 @@
+"""The loss, part by part, against numbers worked out by hand."""
+
+import math
+
+import pytest
+import torch
+
+from brewster.dataset.mix import Batch
+from brewster.errors import ModelError
+from brewster.train.losses import finite, gain_db, separation_loss, tone
+
+
+def truth(level=0.4, trust=1.0):
+    """Two samples of 32 px: photo, transmission and reflection of one grey."""
+    grey = torch.full((2, 3, 32, 32), level)
+    return Batch(grey, grey, grey, torch.full((2,), trust))
+
+
+def loss_of(transmission_error=0.0, reflection_error=0.0, *, trust=1.0):
+    """The parts of the loss of an answer that is wrong by so much."""
+    batch = truth(trust=trust)
+    zero = torch.zeros_like(batch.photo_encoded)
+    layers = [batch.transmission_encoded + transmission_error, batch.reflection_encoded + reflection_error]
+    parts = separation_loss(torch.cat([layer + zero for layer in layers], dim=1), batch)
+    return {name: float(part) for name, part in parts.items()}
+
+
+def test_an_even_error_counts_once_at_each_of_three_scales():
+    parts = loss_of(transmission_error=0.1)
+    assert parts["transmission"] == pytest.approx(3 * 0.1, rel=1e-5)
+    assert parts["edges"] == pytest.approx(0, abs=1e-6)
+    assert parts["reflection"] == 0
+
+
+def test_a_reflection_counts_three_tenths_of_a_transmission_that_is_as_wrong():
+    parts = loss_of(reflection_error=0.1)
+    assert parts["reflection"] == pytest.approx(0.3 * 3 * 0.1, rel=1e-5)
+    assert parts["transmission"] == parts["edges"] == 0
+
+
+def test_a_reflection_counts_as_much_as_its_truth_is_trusted():
+    assert loss_of(reflection_error=0.1, trust=0.5)["reflection"] == pytest.approx(0.3 * 3 * 0.05, rel=1e-5)
+
+
+def test_fine_stripes_count_at_the_finest_scale_only_and_as_edges():
+    stripes = torch.tensor([0.1, -0.1]).repeat(16)  # neighbours differ by 0.2, means of 4 and of 16 are 0
+    for error in (stripes, stripes[:, None]):
+        parts = loss_of(transmission_error=error)
+        assert parts["transmission"] == pytest.approx(0.1, rel=1e-5)
+        assert parts["edges"] == pytest.approx(0.2, rel=1e-5)
+
+
+def test_the_logarithm_of_the_squared_error_is_limited_at_30_db():
+    assert loss_of(transmission_error=0.1)["psnr"] == pytest.approx(0.02 * math.log(0.01 + 0.001), rel=1e-4)
+    assert loss_of()["psnr"] == pytest.approx(0.02 * math.log(0.001), rel=1e-4)
+
+
+def test_the_loss_has_four_parts():
+    assert loss_of().keys() == {"transmission", "reflection", "edges", "psnr"}
+
+
+def test_a_tenth_of_the_error_is_twenty_decibels_gained():
+    wanted = torch.full((1, 3, 8, 8), 0.5)
+    assert gain_db(wanted + 0.02, wanted + 0.2, wanted) == pytest.approx(20, abs=1e-3)
+    assert gain_db(wanted + 0.2, wanted + 0.02, wanted) == pytest.approx(-20, abs=1e-3)
+
+
+def test_tone_is_the_light_kept_where_nothing_was_added():
+    """A white spot was added to one corner; elsewhere the answer has half of the photo's light."""
+    wanted = torch.full((1, 3, 8, 8), 0.5)
+    photo, answer = wanted.clone(), torch.full_like(wanted, 0.3611)  # half the linear light of 0.5
+    photo[..., :2, :2] = 1
+    answer[..., :2, :2] = 1
+    assert tone(answer, photo, wanted) == pytest.approx(0.5, abs=1e-3)
+    assert tone(answer, torch.ones_like(wanted), wanted) == 1
+
+
+@pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])
+def test_a_value_that_is_no_number_is_refused(value):
+    with pytest.raises(ModelError, match=r"gradient is .* at step 7"):
+        finite(torch.tensor(value), 7, "gradient")
+    assert finite(torch.tensor(1.0), 7) == 1

@@ -1,0 +1,44 @@
+"""The analytic renderer against Mitsuba, in its scalar variant, which runs wherever Mitsuba is installed."""
+
+import importlib
+
+import pytest
+import torch
+
+try:
+    importlib.import_module("mitsuba")
+except Exception as error:  # noqa: BLE001 - a missing system library ends in a NameError of Dr.Jit
+    pytest.skip(f"mitsuba cannot be imported: {error!r}", allow_module_level=True)
+
+from brewster.render import tracer
+from brewster.render.pane import render
+from worlds_of_one import WORLDS, a_scene, at, board
+
+SCENE = a_scene(
+    camera=at(25, 5, width=16, height=16, fov_deg=12),
+    panes=[{"thickness_mm": 12.0, "absorption_per_m": (20.0, 5.0, 30.0)}],
+    behind=board("mottled", width_mm=900),
+    front=board("mottled", width_mm=400, offset_mm=(420.0, 0.0)),
+    samples=64,
+)
+RUNS = 4
+
+
+@pytest.fixture(scope="module")
+def traced():
+    """Independent pictures of every layer, (RUNS, 3, H, W) each: their spread is the noise."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tracer, "variant", lambda: "scalar_rgb")
+        seeds = [SCENE.model_copy(update={"seed": seed}) for seed in range(RUNS)]
+        samples = [tracer.trace(scene, WORLDS, noise=0.02, most_samples=512).layers() for scene in seeds]
+    return {name: torch.stack([sample[name] for sample in samples]).double() for name in samples[0]}
+
+
+@pytest.mark.parametrize("layer", ["photo", "transmission", "background", "reflection", "mirror"])
+def test_the_analytic_renderer_gives_the_picture_that_mitsuba_traces(traced, layer):
+    """In every pixel as far as the noise lets one see, and 1.5 % of the light in the mean."""
+    mine = render(SCENE, WORLDS).layers()[layer].double()
+    theirs, noise = traced[layer].mean(0), traced[layer].std(0) / RUNS**0.5
+    light = float(theirs.mean())
+    assert float((mine - theirs).abs().mean()) < 1.3 * float(noise.mean()) + 0.01 * light
+    assert mine.mean((1, 2)).tolist() == pytest.approx(theirs.mean((1, 2)).tolist(), rel=0.015)
