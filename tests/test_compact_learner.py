@@ -1,4 +1,5 @@
 import copy
+import math
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -91,6 +92,14 @@ def test_a_loss_that_is_not_a_number_stops_the_run_and_keeps_the_weights(recipe)
     before = {name: value.clone() for name, value in learner.network.state_dict().items()}
     with pytest.raises(ModelError, match="finite"):
         learner.advance(0)
+    assert all(torch.equal(value, before[name]) for name, value in learner.network.state_dict().items())
+
+
+def test_a_batch_whose_gradient_is_infinite_is_skipped(recipe):
+    learner = CompactLearner(recipe, lambda step, count, size: open_stream(recipe)(step, count, size))
+    before = copy.deepcopy(learner.network.state_dict())
+    next(learner.network.parameters()).register_hook(lambda gradient: gradient / 0)
+    assert math.isfinite(learner.advance(0)["loss"])
     assert all(torch.equal(value, before[name]) for name, value in learner.network.state_dict().items())
 
 

@@ -96,8 +96,8 @@ class MixRecipe(Values):
     partial_probability: Share = 0.12
     """Share of samples whose glass covers a part of the picture only."""
     transmittance: Range = (0.85, 1.0)
-    veil_probability: Share = 0.25
-    veil: Range = (0.0, 0.2)
+    veil_probability: Share = 0.1
+    veil: Range = (0.0, 0.1)
     """Scattered light of the pane, uniform, over the mean of the photo."""
 
     reflection_map_probability: Share = 0.4

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _ROUNDING: Final = 1 / (12 * 255**2)
 """The mean squared error of rounding to 8 bits; pictures that differ by less are the same, at 58.9 dB."""
 _SCALES = (1, 4, 16)
-_LITTLE = 0.02
+_LITTLE = 0.05
 _GOOD_ENOUGH = 1e-3
 """Mean squared error, 30 dB, past which a picture no longer pulls."""
 
@@ -59,15 +59,14 @@ def gain_db(answer: Tensor, photo: Tensor, truth: Tensor) -> float:
 
 
 def tone(answer: Tensor, photo: Tensor, truth: Tensor) -> float:
-    """Mean light of the answer over that of the photo where the truth says that little was added; 1 if that is nowhere.
+    """Light of the answer over that of the photo where the truth says that little was added; 1 if that is nowhere.
 
-    Encoded pictures in 0..1; little is less than 2 % of white, in linear light.
+    Encoded pictures in 0..1; little is less than a twentieth of the photo's own light in every channel.
     """
     before, after, wanted = (to_linear(picture) for picture in (photo, answer, truth))
-    untouched = ((before - wanted).amax(dim=-3, keepdim=True) < _LITTLE).expand_as(before)
-    if not untouched.any():
-        return 1.0
-    return (after[untouched].mean() / before[untouched].mean().clamp(min=_LITTLE**2)).item()
+    untouched = (before - wanted < _LITTLE * before + _LITTLE**2).all(dim=-3, keepdim=True).expand_as(before)
+    light = before[untouched].sum()
+    return (after[untouched].sum() / light).item() if light > 0 else 1.0
 
 
 def finite(value: Tensor, step: int, name: str = "loss") -> Tensor:

@@ -134,9 +134,10 @@ class CompactLearner:
         parts = self._set_gradients(self._batch(step).to(self.device))
         loss = finite(torch.stack(list(parts.values())).sum(), step)
         self._set_learning_rates(step)
-        nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
-        self.optimizer.step()
-        self._update_average(step + 1)
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
+        if norm.isfinite():  # else this batch is skipped: one infinite gradient would end a run of hours
+            self.optimizer.step()
+            self._update_average(step + 1)
         return {"loss": loss.item(), **{name: part.item() for name, part in parts.items()}}
 
     def _set_gradients(self, batch: Batch) -> dict[str, Tensor]:
