@@ -54,9 +54,9 @@ def test_the_reflection_has_the_asked_strength(photos):
 def test_the_target_is_what_the_pane_lets_through_or_what_is_behind_it(photos):
     light = {
         target: to_linear(
-            Mixtures(photos, [], QUIET.model_copy(update={"transmittance": (0.8, 0.8), "target": target}), seed=1)(
-                0, 4, 64
-            ).transmission_encoded
+            Mixtures(
+                photos, [], QUIET.model_copy(update={"transmittance": (0.8, 0.8), "target": target}), seed=1
+            )(0, 4, 64).transmission_encoded
         ).mean()
         for target in ("transmission", "background")
     }

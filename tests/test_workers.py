@@ -122,7 +122,6 @@ def test_a_scene_is_never_rendered_over_something(tmp_path):
 
 
 def test_every_renderer_is_there():
-    pytest.importorskip("mitsuba")
     assert all(callable(workers.find_renderer(name)) for name in workers.RENDERERS)
 
 
