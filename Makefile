@@ -24,7 +24,7 @@ test-all: test-system test test-slow
 # What some tests need and pip does not install; without it they are skipped.
 test-system:
 	@if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; \
-	then apt-get update -qq && apt-get install -y -qq chromium libatomic1; \
+	then apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq chromium libatomic1; \
 	else echo "not root on Debian: to run all tests, install the packages chromium and libatomic1"; fi
 
 check: .venv/dev
