@@ -6,7 +6,10 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("VIPS_CONCURRENCY", "1")
 
+import shutil
 import socket
+import warnings
+from collections import Counter
 from pathlib import Path
 
 import hypothesis
@@ -15,12 +18,33 @@ import pytest
 
 from brewster import Photo
 from brewster.cli import main
+from brewster.errors import MissingExtra
 from front_door import write_pane
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 
 hypothesis.settings.register_profile("shared machine", deadline=None)
 hypothesis.settings.load_profile("shared machine")
+
+SLOW_SECONDS = 1800
+"""The time limit of a test marked as slow; that of the others is in pyproject.toml."""
+
+
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(SLOW_SECONDS))
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Which tests this machine skipped, and what would enable them."""
+    reports = terminalreporter.getreports("skipped")
+    if not reports:
+        return
+    reasons = Counter(str(report.longrepr[2]).removeprefix("Skipped: ") for report in reports)
+    terminalreporter.section(f"{len(reports)} tests skipped: how many, and what they need")
+    for reason, count in reasons.most_common():
+        terminalreporter.write_line(f"{count:5}  {reason}")
 
 
 @pytest.fixture(autouse=True)
@@ -46,6 +70,45 @@ def data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no data: {folder} does not exist, and BREWSTER_DATA names no other folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def mitsuba():
+    """Mitsuba, with one thread; the test is skipped where it cannot be imported."""
+    from brewster.render import llvm  # noqa: PLC0415
+
+    try:
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # LLVM: see below
+            mitsuba = llvm.load()
+    except MissingExtra as error:
+        pytest.skip(str(error))
+    import drjit  # noqa: PLC0415  (only after it is decided which LLVM it loads)
+
+    drjit.set_thread_count(1)
+    return mitsuba
+
+
+@pytest.fixture
+def compiled(mitsuba):
+    """The test is skipped where Mitsuba's kernels cannot be compiled."""
+    from brewster.render import llvm  # noqa: PLC0415
+
+    if llvm.probe().variant != llvm.COMPILED:
+        pytest.skip(f"no LLVM works for Mitsuba; run: {llvm.INSTALL_LLVM}")
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    """Debian's Chromium without a window; the test is skipped where it is not installed."""
+    program = shutil.which("chromium")
+    if not program:
+        pytest.skip("no browser; run: apt install chromium")
+    from playwright.sync_api import sync_playwright  # noqa: PLC0415
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        yield browser
+        browser.close()
 
 
 @pytest.fixture(scope="session")

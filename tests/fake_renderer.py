@@ -4,6 +4,7 @@ import os
 import signal
 import time
 from pathlib import Path
+from threading import Event
 
 import torch
 
@@ -19,6 +20,13 @@ def render(scene, assets):
 
 def slow(scene, assets):
     time.sleep(0.1)
+    return render(scene, assets)
+
+
+def waits(scene, assets):
+    """Never finishes sample 2 where FAKE_WAIT is set."""
+    if scene.index == 2 and "FAKE_WAIT" in os.environ:
+        Event().wait()
     return render(scene, assets)
 
 

@@ -18,6 +18,7 @@ from brewster.web.guard import Guard
 from brewster.web.line import server
 from brewster.web.separation import separation
 from brewster.web.shelf import ModelRow
+from other_processes import started
 
 
 def pane(tile):
@@ -101,7 +102,7 @@ def served(app):
 
 def spoken(port, *pieces):
     """What a server answers to these bytes, sent one after another; connected until it closes."""
-    with socket.create_connection(("127.0.0.1", port), timeout=30) as connection:
+    with socket.create_connection(("127.0.0.1", port)) as connection:
         for piece in pieces:
             connection.sendall(piece)
         answer = b""
@@ -114,12 +115,11 @@ def spoken(port, *pieces):
 def as_a_user(*args):
     """`brewster serve` in a process of its own: its first line, a link; its exit code is checked at the end."""
     command = [sys.executable, "-m", "brewster", "serve", "--port", "0", "--device", "cpu", *map(str, args)]
-    with subprocess.Popen(
-        command, stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONUNBUFFERED": "1"}
-    ) as process:
+    how = {"stdout": subprocess.PIPE, "text": True, "env": {**os.environ, "PYTHONUNBUFFERED": "1"}}
+    with started(command, **how) as process:
         try:
             yield process.stdout.readline().strip()
         finally:
             process.send_signal(signal.SIGINT)
-            process.wait(30)
+            process.wait()
     assert process.returncode == 0

@@ -1,14 +1,26 @@
 """Processes that tests start, watch and kill."""
 
+import contextlib
+import subprocess
 import time
 from pathlib import Path
 
 
-def wait_for(condition, seconds=30):
-    patience = time.monotonic() + seconds
-    while not condition() and time.monotonic() < patience:
+@contextlib.contextmanager
+def started(command, **how):
+    """A process that is killed in the end, if it has not ended by itself."""
+    with subprocess.Popen([*map(str, command)], **how) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def wait_for(condition, process=None):
+    """Waits until something is so, while this process runs; only the time limit of the test ends it before."""
+    while not condition():
+        assert process is None or process.poll() is None, f"it ended, with exit code {process.returncode}"
         time.sleep(0.01)
-    assert condition()
 
 
 def children(process):

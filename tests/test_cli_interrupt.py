@@ -5,8 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from pathlib import Path
 
 import pytest
 
@@ -14,6 +12,7 @@ from brewster import Photo
 from brewster.errors import UnreadablePhoto
 from brewster.separate import Separator
 from front_door import errors, lines, picture, results, tree
+from other_processes import started
 
 
 def test_ctrl_c_while_a_file_is_written_leaves_no_half_file(run, tmp_path, monkeypatch):
@@ -83,23 +82,37 @@ def test_what_else_c_code_drops_is_still_reported(run, tmp_path, monkeypatch):
     assert [what.exc_type for what in dropped] == [ZeroDivisionError] * 2
 
 
+ENDLESS = """
+import sys
+from brewster.cli import main
+from brewster.cli.terminal import interrupts
+from brewster.separate import Separator
+separate = Separator.__call__
+def endless(self, source, **options):
+    while source.name == "06.jpg":
+        separate(self, source, **options)
+        print("at work", flush=True)
+        interrupts.heed()
+    return separate(self, source, **options)
+Separator.__call__ = endless
+sys.exit(main(sys.argv[1:]))
+"""
+"""The command line, never done with one photo."""
+
+
 def test_ctrl_c_in_mid_batch_leaves_whole_files_only_and_the_same_command_goes_on(run, tmp_path, model):
-    count = 12
+    names = [f"{index:02}" for index in range(12)]
     (tmp_path / "in").mkdir()
-    for index in range(count):
-        (tmp_path / "in" / f"{index}.jpg").write_bytes(picture(400, 300, seed=index))
-    command = [sys.executable, "-m", "brewster", "in", "-o", "out", "--model", model, "--quality", "draft"]
-    batch = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE)
-    patience = time.monotonic() + 30
-    while len(list(tmp_path.glob("out/*.jpg"))) < 5 and time.monotonic() < patience:
-        time.sleep(0.01)
-    batch.send_signal(signal.SIGINT)
-    _, err = batch.communicate(timeout=30)
+    for index, name in enumerate(names):
+        (tmp_path / "in" / f"{name}.jpg").write_bytes(picture(400, 300, seed=index))
+    command = [sys.executable, "-c", ENDLESS, "in", "-o", "out", "--model", model, "--quality", "draft"]
+    with started(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as batch:
+        assert batch.stdout.readline() == b"at work\n"
+        batch.send_signal(signal.SIGINT)
+        _, err = batch.communicate()
     assert batch.returncode == 130
     assert b"Traceback" not in err
-    written = [Path(path) for path in tmp_path.glob("out/*")]
-    assert 5 <= len(written) < 2 * count
-    assert {path.suffix for path in tmp_path.glob("out/.*")} <= set()
-    assert all(Photo.open(path).size == (400, 300) for path in written)
+    assert tree(tmp_path / "out") == results(*names[:6])
+    assert all(Photo.open(path).size == (400, 300) for path in tmp_path.glob("out/*"))
     assert run("in", "-o", "out", "--quality", "draft")[0] == 0
-    assert len(tree(tmp_path / "out")) == 2 * count
+    assert tree(tmp_path / "out") == results(*names)

@@ -208,7 +208,7 @@ if __name__ == "__main__":
     with subprocess.Popen(
         [sys.executable, tmp_path / "run.py"], env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
     ) as run:
-        wait_for(lambda: len(list((tmp_path / "begun").iterdir())) == 2, seconds=120)
+        wait_for(lambda: len(list((tmp_path / "begun").iterdir())) == 2, run)
         crew = children(run)
         run.kill()
     wait_for(lambda: not any(map(is_alive, crew)))

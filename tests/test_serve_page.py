@@ -15,7 +15,6 @@ from front_door import picture
 from glass_server import as_a_user
 from picture_files import exif_block, file_of, smooth
 
-CHROMIUM = Path("/usr/bin/chromium")
 PATIENCE_MS = 120_000  # a busy machine is no failure
 MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
 
@@ -24,18 +23,6 @@ MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
 def link(model):
     with as_a_user("--model", model, "--token", "auto") as link:
         yield link
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    if not CHROMIUM.exists():
-        pytest.skip(f"no browser: {CHROMIUM} does not exist")
-    from playwright.sync_api import sync_playwright  # noqa: PLC0415
-
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

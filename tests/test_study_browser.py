@@ -1,11 +1,10 @@
 """The study in a real browser: with the keyboard alone, on a phone, interrupted, and against a failing server."""
 
 from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import expect, sync_playwright
+from playwright.sync_api import expect
 
 from brewster import Photo
 from brewster.study.store import Store
@@ -16,8 +15,6 @@ from file_server import loopback_only
 from glass_server import on_a_thread
 from small_studies import beside, made
 
-CHROMIUM = Path("/usr/bin/chromium")
-pytestmark = pytest.mark.skipif(not CHROMIUM.exists(), reason=f"no browser: {CHROMIUM} is not installed")
 READY = "#trial:not(.waiting):not([hidden])"
 
 NAMED = {
@@ -31,14 +28,6 @@ NAMED = {
 @pytest.fixture(autouse=True)
 def _network_off(monkeypatch):
     loopback_only(monkeypatch)
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")
@@ -60,12 +49,12 @@ def url(store):
 
 
 @pytest.fixture
-def open_page(browser):
+def open_page(chromium):
     """A page of a participant; whatever goes wrong in its scripts fails the test."""
     contexts, errors = [], []
 
     def open_page(url, **how):
-        context = browser.new_context(**how)
+        context = chromium.new_context(**how)
         contexts.append(context)
         context.set_default_timeout(120_000)  # a busy machine is no failure
         page = context.new_page()

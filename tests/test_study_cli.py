@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from functools import partial
 
 import httpx
 import pytest
@@ -14,7 +15,12 @@ import pytest
 from brewster.study.store import Store
 from brewster.study.study import read_study
 from file_server import loopback_only
+from other_processes import started
 from small_studies import choice_for, write_pictures
+
+get, post = (
+    partial(ask, timeout=None) for ask in (httpx.get, httpx.post)
+)  # the test has a time limit itself
 
 
 @pytest.fixture(autouse=True)
@@ -94,34 +100,43 @@ def test_plan_answers_in_words_and_in_json(bare):
     assert bare("study", "plan", "--difference", 0.9)[0] == 1
 
 
+ON_LOOPBACK = """
+import sys
+from brewster.cli import main
+from brewster.web import application
+listen = application.listen
+application.listen = lambda host, port: listen("127.0.0.1", port)
+sys.exit(main(sys.argv[1:]))
+"""
+"""The command line, whose servers are reached from this machine only, whatever --host says."""
+
+
 def serve(folder, *args):
-    command = [sys.executable, "-m", "brewster", "study", "serve", str(folder), "--port", "0", *args]
-    return subprocess.Popen(
-        command,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "PYTHONUNBUFFERED": "1"},
-    )
+    """A server in a process, which is killed in the end if it still runs; its first line is a link."""
+    command = [sys.executable, "-c", ON_LOOPBACK, "study", "serve", folder, "--port", "0", *args]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return started(command, **pipes, env={**os.environ, "PYTHONUNBUFFERED": "1"})
+
+
+def interrupted(server):
+    """What a server says on standard error until Ctrl-C has ended it."""
+    server.send_signal(signal.SIGINT)
+    return server.communicate()[1]
 
 
 def test_a_server_goes_on_where_a_killed_one_was_and_ends_with_ctrl_c(created):
-    first = serve(created.folder)
-    url = first.stdout.readline().strip()
-    assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", url)
-    link = httpx.post(f"{url}participants", json={"agreed": True}).json()["link"]
-    given = {"trial": 0, "choice": "right", "seconds": 3}
-    assert httpx.post(f"{url}{link[1:]}/answers", json=given).json()["kept"] == "right"
-    first.send_signal(signal.SIGKILL)
-    first.communicate()
-    second = serve(created.folder, "--called", "study.example")
-    url = second.stdout.readline().strip()
-    state = httpx.get(f"{url}{link[1:]}/trial", headers={"Host": "study.example"}).json()
-    assert state["trial"] == 1
-    second.send_signal(signal.SIGINT)
-    _, said = second.communicate(timeout=30)
+    with serve(created.folder) as first:
+        url = first.stdout.readline().strip()
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", url)
+        link = post(f"{url}participants", json={"agreed": True}).json()["link"]
+        given = {"trial": 0, "choice": "right", "seconds": 3}
+        assert post(f"{url}{link[1:]}/answers", json=given).json()["kept"] == "right"
+    with serve(created.folder, "--called", "study.example") as second:
+        url = second.stdout.readline().strip()
+        state = get(f"{url}{link[1:]}/trial", headers={"Host": "study.example"}).json()
+        assert state["trial"] == 1
+        assert "all answers are kept" in interrupted(second)
     assert second.returncode == 0
-    assert "all answers are kept" in said
 
 
 def test_serving_a_study_whose_pictures_changed_is_refused(bare, created):
@@ -131,29 +146,25 @@ def test_serving_a_study_whose_pictures_changed_is_refused(bare, created):
 
 
 def test_another_address_is_served_with_a_warning(created):
-    server = serve(created.folder, "--host", "0.0.0.0", "--token", "auto")
-    link = server.stdout.readline().strip()
-    server.send_signal(signal.SIGINT)
-    _, said = server.communicate(timeout=30)
-    assert "nothing they send is encrypted" in said
+    with serve(created.folder, "--host", "0.0.0.0", "--token", "auto") as server:
+        link = server.stdout.readline().strip()
+        assert get(link).status_code < 400  # it has an answer only when it heeds signals
+        assert "nothing they send is encrypted" in interrupted(server)
     assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{22}", link)
 
 
 def test_a_token_of_its_own_is_kept_for_its_owner_and_links_survive_a_restart(created):
-    first = serve(created.folder, "--token", "auto")
-    url, _, token = first.stdout.readline().strip().partition("?token=")
-    bearer = {"Authorization": f"Bearer {token}"}
-    link = httpx.post(f"{url}participants", json={"agreed": True}, headers=bearer).json()["link"]
-    first.send_signal(signal.SIGKILL)
-    first.communicate()
+    with serve(created.folder, "--token", "auto") as first:
+        url, _, token = first.stdout.readline().strip().partition("?token=")
+        bearer = {"Authorization": f"Bearer {token}"}
+        link = post(f"{url}participants", json={"agreed": True}, headers=bearer).json()["link"]
     place = created.folder / "token"
     assert place.read_text().strip() == token
     assert place.stat().st_mode & 0o777 == 0o600
-    second = serve(created.folder, "--token", "auto")
-    url = second.stdout.readline().strip().partition("?")[0]
-    assert httpx.get(url + link[1:]).status_code == 200
-    second.send_signal(signal.SIGINT)
-    second.communicate(timeout=30)
+    with serve(created.folder, "--token", "auto") as second:
+        url = second.stdout.readline().strip().partition("?")[0]
+        assert get(url + link[1:]).status_code == 200
+        interrupted(second)
 
 
 def test_a_kept_token_that_is_none_is_refused(bare, created):

@@ -1,16 +1,9 @@
 import math
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
-pytest.importorskip("mitsuba")
-
-import drjit
-import mitsuba
-
-from brewster.errors import DeviceError, MissingExtra, RecipeError
+from brewster.errors import RecipeError
 from brewster.render import llvm, tracer
 from brewster.render.studio import Studio, between
 from brewster.render.tracer import trace
@@ -19,7 +12,10 @@ from brewster.scene.glass import Glazing, Pane
 from brewster.scene.scene import Scene
 from brewster.scene.world import Map, Plane, Side, Source
 
-drjit.set_thread_count(1)
+pytestmark = [
+    pytest.mark.usefixtures("mitsuba"),
+    pytest.mark.filterwarnings("ignore:no LLVM works:RuntimeWarning"),
+]
 
 WHITE = np.ones((64, 128, 3), np.float32)
 RED_RIGHT = WHITE.copy()
@@ -60,7 +56,8 @@ def traced(scene, **more):
 
 def shot(scene, side, glass, samples=64):
     """One picture (H, W, 3) without the other four."""
-    with tracer._rendering_by(mitsuba, llvm.variant()):
+    mitsuba = llvm.load()
+    with tracer._rendering_by(mitsuba, llvm.probe().variant):
         room = Studio(mitsuba, scene, Pictures()).room(behind=side == "behind", glass=glass)
         return np.array(mitsuba.render(mitsuba.load_dict(room), spp=samples))
 
@@ -79,47 +76,6 @@ def slab(incidence_deg, index=1.5):
     s = ((cosine - index * inside) / (cosine + index * inside)) ** 2
     p = ((index * cosine - inside) / (index * cosine + inside)) ** 2
     return 2 * s / (1 + s), 2 * p / (1 + p)
-
-
-def test_importing_the_tracer_wakes_no_mitsuba():
-    code = "import brewster.render.tracer, sys; assert not {'mitsuba', 'drjit'} & set(sys.modules)"
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_without_an_llvm_that_works_the_scalar_variant_renders(monkeypatch):
-    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/nonexistent")
-    llvm.probe.cache_clear()
-    try:
-        with pytest.warns(RuntimeWarning, match="/nonexistent"):
-            assert llvm.variant() == "scalar_rgb"
-        sample = traced(a_scene(camera={"width": 16, "height": 16}), most_samples=64)
-        assert float(sample.photo.mean()) == pytest.approx(1, abs=0.01)
-        with pytest.raises(DeviceError, match="libllvm19"):
-            traced(a_scene(), polarised=True)
-    finally:
-        llvm.probe.cache_clear()
-
-
-def test_an_llvm_that_aborts_costs_no_more_than_a_line(monkeypatch):
-    monkeypatch.setattr(llvm, "_PICTURE", "import os; os.abort()")
-    assert "ends the process" in llvm._fails(None)
-    monkeypatch.setattr(llvm, "_PICTURE", "raise ValueError('no kernel')")
-    assert llvm._fails(None) == "ValueError: no kernel"
-
-
-def test_known_good_llvm_versions_are_tried_first(tmp_path, monkeypatch):
-    monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
-    monkeypatch.setattr(llvm, "_FOLDERS", [str(tmp_path)])
-    for name in ("libLLVM-14.so.1", "libLLVM-18.so.1", "libLLVM.so.19.1", "libLLVM.so.21.0"):
-        (tmp_path / name).touch()
-    names = [path and path.rpartition("/")[2] for path in llvm._candidates()]
-    assert names == ["libLLVM.so.19.1", "libLLVM-18.so.1", "libLLVM.so.21.0", None]
-
-
-def test_a_missing_mitsuba_is_named_with_its_cure(monkeypatch):
-    monkeypatch.setitem(sys.modules, "mitsuba", None)
-    with pytest.raises(MissingExtra, match=r"brewster\[render\]"):
-        traced(a_scene())
 
 
 def test_glass_that_does_not_refract_is_not_there():
@@ -152,7 +108,7 @@ def test_tinted_panes_absorb_as_beer_and_lambert_say():
     np.testing.assert_allclose(light.mean((0, 1)), 0.96**4 * np.exp([-0.4, 0, -0.2]), rtol=0.01)
 
 
-def test_polarised_light_follows_the_closed_form_at_brewsters_angle():
+def test_polarised_light_follows_the_closed_form_at_brewsters_angle(compiled):
     """In colour, Mitsuba averages s and p at each surface, which is wrong by an eighth there."""
     camera = {**at(56.31), "width": 16, "height": 16}
     sample = traced(a_scene(camera=camera), polarised=True, noise=0.01)
@@ -160,7 +116,7 @@ def test_polarised_light_follows_the_closed_form_at_brewsters_angle():
     assert float(sample.reflection.mean()) == pytest.approx((s + p) / 2, rel=0.02)
 
 
-def test_s_and_p_light_each_follow_the_closed_form():
+def test_s_and_p_light_each_follow_the_closed_form(compiled, mitsuba):
     camera = {**at(56.31), "width": 16, "height": 16}
     with tracer._rendering_by(mitsuba, tracer._variant(polarised=True)):
         room = Studio(mitsuba, a_scene(camera=camera), Pictures(), colour=0).room(behind=False, glass="full")
@@ -203,7 +159,9 @@ def test_a_map_begins_at_its_heading_and_a_mirror_shows_what_is_behind_the_camer
 
 @pytest.mark.parametrize("radius_mm", [math.inf, 3000])
 @pytest.mark.parametrize("behind", [True, False])
-def test_a_map_shines_as_its_texels_say_and_only_on_its_own_side(radius_mm, behind, random):
+def test_a_map_shines_as_its_texels_say_and_only_on_its_own_side(
+    radius_mm, behind, random, compiled, mitsuba
+):
     lit = around("mottled", heading_deg=37, radius_mm=radius_mm)
     glass = Glazing(heading_deg=-20, pitch_deg=10)
     scene = a_scene(behind=lit, front=lit, glass=glass, camera={"position_mm": (100, 0, 500)})
@@ -222,12 +180,6 @@ def test_a_map_shines_as_its_texels_say_and_only_on_its_own_side(radius_mm, behi
     height = to_glass[2] @ ahead
     clear = np.abs(height) > 0.01
     np.testing.assert_allclose(light[:, clear], (expected * ((height < 0) == behind))[:, clear], atol=1e-4)
-
-
-def test_between_texels_light_is_bilinear_and_wraps():
-    texels = np.arange(8, dtype=np.float32).reshape(2, 4, 1).repeat(3, 2)
-    place = np.array([0.125, 0.25, 0.0]), np.array([0.0, 0.25, 0.5])
-    assert between(texels, *place)[..., 0].tolist() == [[0, 0.5, 1.5], [0, 0.5, 1.5], [2, 2.5, 3.5]]
 
 
 def test_a_plane_hides_the_map_behind_it():
@@ -325,7 +277,7 @@ def test_denoising_keeps_the_light():
     assert float(clean.mean()) == pytest.approx(float(noisy.mean()), rel=0.2)
 
 
-def test_another_variant_that_was_chosen_before_comes_back():
+def test_another_variant_that_was_chosen_before_comes_back(mitsuba):
     traced(a_scene(), most_samples=4)
     mitsuba.set_variant("scalar_rgb")
     traced(a_scene(), most_samples=4)

@@ -14,7 +14,7 @@ from brewster.dataset import sets
 from brewster.dataset.build import workers
 from brewster.dataset.build.workers import Here, Workers, render_again
 from brewster.errors import DeviceError, RecipeError, TargetError
-from other_processes import children, is_alive, wait_for
+from other_processes import children, is_alive, started, wait_for
 from set_folders import hashes, job, make, names, statuses
 
 TESTS = Path(__file__).parent
@@ -24,15 +24,16 @@ def two(job):
     return Workers(job, 2)
 
 
-def in_a_process(out, count, renderer="slow"):
-    """A run with a worker, in a process that can be killed."""
+def in_a_process(out, count):
+    """A run with a worker that never finishes sample 2, in a process that can be killed."""
     code = f"""
 from pathlib import Path
 from brewster.dataset.build.workers import Workers
 from set_folders import make
-make(Path({str(out)!r}), {count}, renderer={renderer!r}, crew=lambda job: Workers(job, 1))
+make(Path({str(out)!r}), {count}, renderer="waits", crew=lambda job: Workers(job, 1))
 """
-    return subprocess.Popen([sys.executable, "-c", code], cwd=TESTS, stderr=subprocess.PIPE)
+    waiting = {**os.environ, "FAKE_WAIT": "1"}
+    return started([sys.executable, "-c", code], cwd=TESTS, stderr=subprocess.PIPE, env=waiting)
 
 
 def test_two_workers_make_what_one_process_makes_even_if_one_of_them_dies(tmp_path, monkeypatch):
@@ -45,32 +46,29 @@ def test_two_workers_make_what_one_process_makes_even_if_one_of_them_dies(tmp_pa
 
 
 def test_a_run_killed_in_the_middle_takes_its_workers_along_and_is_resumed(tmp_path):
-    out, count = tmp_path / "set", 8
-    run = in_a_process(out, count)
-    wait_for(lambda: len(list(out.glob("0*"))) >= 2)
-    crew = children(run)
-    run.kill()
-    run.communicate()
+    out, count = tmp_path / "set", 4
+    with in_a_process(out, count) as run:
+        wait_for(lambda: len(list(out.glob("0*"))) == 2, run)
+        crew = children(run)
+        run.kill()
+        run.communicate()
     wait_for(lambda: not any(map(is_alive, crew)))
-    finished = list(out.glob("0*"))
-    assert 2 <= len(finished) < count
-    assert all(names(folder) == set(sets.FILES) for folder in finished)
-    results = make(out, count=count, renderer="slow")
-    assert sorted(statuses(results).values()) == ["rendered"] * (count - len(finished)) + ["skipped"] * len(
-        finished
-    )
-    make(tmp_path / "undisturbed", count=count, renderer="slow")
+    assert sorted(folder.name for folder in out.glob("0*")) == ["000000", "000001"]
+    assert all(names(folder) == set(sets.FILES) for folder in out.glob("0*"))
+    results = make(out, count=count, renderer="waits")
+    assert statuses(results) == {0: "skipped", 1: "skipped", 2: "rendered", 3: "rendered"}
+    make(tmp_path / "undisturbed", count=count, renderer="waits")
     assert hashes(out) == hashes(tmp_path / "undisturbed")
 
 
 def test_ctrl_c_stops_all_at_once_and_leaves_nothing_half(tmp_path):
     out = tmp_path / "set"
-    run = in_a_process(out, 400)
-    wait_for(lambda: len(list(out.glob("0*"))) >= 2)
-    crew = children(run)
-    for pid in [*map(int, crew), run.pid]:  # a terminal sends it to everybody
-        os.kill(pid, signal.SIGINT)
-    _, err = run.communicate(timeout=20)
+    with in_a_process(out, 4) as run:
+        wait_for(lambda: len(list(out.glob("0*"))) == 2, run)
+        crew = children(run)
+        for pid in [*map(int, crew), run.pid]:  # a terminal sends it to everybody
+            os.kill(pid, signal.SIGINT)
+        _, err = run.communicate()
     assert err.count(b"KeyboardInterrupt") == 1
     wait_for(lambda: not any(map(is_alive, crew)))
     assert not list(out.glob(".brewster-*"))
@@ -122,7 +120,6 @@ def test_a_scene_is_never_rendered_over_something(tmp_path):
 
 
 def test_every_renderer_is_there():
-    pytest.importorskip("mitsuba")
     assert all(callable(workers.find_renderer(name)) for name in workers.RENDERERS)
 
 

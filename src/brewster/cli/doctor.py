@@ -7,6 +7,7 @@ import json
 import platform
 import shutil
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Final, Literal, final
@@ -71,6 +72,7 @@ def examine() -> Iterator[Check]:
     yield from _devices()
     yield from _formats()
     yield from _models()
+    yield from _tracer()
     yield from _large()
 
 
@@ -165,6 +167,28 @@ def _models() -> Iterator[Check]:
             yield Check("models", row["name"], "broken", row["error"], cure)
         else:
             yield Check("models", row["name"], "ok", f"sha256 {row['sha256']}")
+
+
+def _tracer() -> Iterator[Check]:
+    """Whether Mitsuba can be imported, and the LLVM that compiles its kernels."""
+    version = _version("mitsuba")
+    if version is None:
+        return
+    from brewster.render import llvm  # noqa: PLC0415  (not for --help)
+
+    try:
+        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # about LLVM: see below
+            llvm.load()
+    except MissingExtra as error:
+        yield Check("tracer", "mitsuba", "broken", str(error), llvm.cure(str(error)), needed=False)
+        return
+    yield Check("tracer", "mitsuba", "ok", version)
+    found = llvm.probe()
+    if found.variant == llvm.COMPILED:
+        yield Check("tracer", "llvm", "ok", found.library or "the one Dr.Jit finds")
+    else:
+        about = f"none works, rendering is several times slower ({found.reason})"
+        yield Check("tracer", "llvm", "missing", about, llvm.INSTALL_LLVM, needed=False)
 
 
 def _large() -> Iterator[Check]:

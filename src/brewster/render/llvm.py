@@ -1,14 +1,19 @@
-"""Which Mitsuba can run here: compiled by LLVM where a good one is found, else the slow scalar one.
+"""Loads Mitsuba: compiled by an LLVM that works here, else as the slow scalar variant.
 
-    name = variant()  # "llvm_ad_rgb" or "scalar_rgb"
+    mitsuba = load()
+    mitsuba.set_variant(probe().variant)  # "llvm_ad_rgb" or "scalar_rgb"
 
-Dr.Jit loads the first LLVM it finds, and an unsuitable one (14 to 16) aborts the whole process at the first kernel.
-So each candidate is tried in a process of its own first. `DRJIT_LIBLLVM_PATH` names one and ends the search.
+Dr.Jit loads an LLVM when it is imported, and an unsuitable one (14 to 16) aborts the whole process at the first kernel.
+So each candidate renders a small picture in a process of its own first. The candidates are the LLVM of the pip package
+`karellen-llvm-core`, then those of the system; `DRJIT_LIBLLVM_PATH` names one and ends the search.
 """
 
 from __future__ import annotations
 
+import ctypes
+import importlib
 import os
+import platform
 import re
 import site
 import subprocess
@@ -17,8 +22,10 @@ import tempfile
 import warnings
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 from typing import Final
 
 from brewster.errors import MissingExtra
@@ -27,11 +34,26 @@ LIBRARY: Final = "DRJIT_LIBLLVM_PATH"
 COMPILED: Final = "llvm_ad_rgb"
 SCALAR: Final = "scalar_rgb"
 
+INSTALL_LLVM: Final = (
+    "pip install karellen-llvm-core"
+    if (sys.platform, platform.machine()) == ("linux", "x86_64")
+    else "apt install libllvm19"
+)
+"""The line that installs an LLVM that works; the pip package exists for x86-64 Linux only."""
+
+_PACKAGE: Final = "karellen-llvm-core"
+_RUNTIME: Final = ("libunwind.so.1.0", "libc++abi.so.1.0", "libc++.so.1.0")
+"""What the package's LLVM is linked to, in the order in which one needs the other."""
 _KNOWN_GOOD: Final = (19, 20, 18, 17)
 _FOLDERS: Final = ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/opt", "/usr/local/opt")
 _PATTERNS: Final = ("libLLVM*.so*", "*/libLLVM*.so*", "*/lib/libLLVM*.so*", "*/lib/libLLVM*.dylib")
+_NO_LLVM: Final = "no-llvm"
+"""A library that does not exist, so that Dr.Jit loads none."""
 _SECONDS: Final = 60
 _PICTURE: Final = """
+import ctypes, sys
+for runtime in sys.argv[1:]:
+    ctypes.CDLL(runtime)
 import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 ball = {"type": "sphere", "bsdf": {"type": "dielectric"}}
@@ -43,25 +65,50 @@ assert 0 < mi.Bitmap(mi.render(scene, spp=1)).channel_count()
 
 @dataclass(frozen=True)
 class Probe:
-    """What was found: the variant, the LLVM it needs (None: the one Dr.Jit finds), and why it is not compiled."""
+    """What was found: the variant, the LLVM to load (None: the one Dr.Jit finds), and why it is not compiled."""
 
     variant: str
     library: str | None = None
     reason: str = ""
 
 
-def variant() -> str:
-    """The Mitsuba variant that works here; it points `DRJIT_LIBLLVM_PATH` of this process to the LLVM that does.
+def load() -> ModuleType:
+    """Mitsuba, with the LLVM that works here; without any, with none, so that only scalar variants can be chosen.
 
-    The first call takes a second or two and warns if it must fall back to the scalar variant.
+    The first call takes a second or two, and warns if only the scalar variant works.
 
     Raises:
-        MissingExtra: mitsuba is not installed.
+        MissingExtra: mitsuba is not installed, or a system library that it needs is missing.
     """
     found = probe()
+    for runtime in _runtime_of(found.library):
+        ctypes.CDLL(
+            runtime
+        )  # never RTLD_GLOBAL: exceptions of other C++ libraries would then end the process
     if found.library:
         os.environ[LIBRARY] = found.library
-    return found.variant
+    try:
+        mitsuba = importlib.import_module("mitsuba")
+    except (ImportError, NameError) as error:  # Dr.Jit hides the ImportError behind a NameError of its own
+        reason = str(error.__context__ or error)
+        raise MissingExtra(
+            f"mitsuba cannot be imported ({reason})", "the tracer renders with it", f"run: {cure(reason)}"
+        ) from error
+    if found.variant != COMPILED:
+        warnings.warn(
+            f"no LLVM works for Mitsuba, so that rendering is several times slower; install LLVM 17 or newer"
+            f" ({INSTALL_LLVM}) or name it in {LIBRARY} ({found.reason})",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    return mitsuba
+
+
+def cure(reason: str) -> str:
+    """The line that installs what is missing if importing Mitsuba fails for this reason."""
+    return (
+        "apt install libatomic1" if "libatomic" in reason else "pip install --force-reinstall mitsuba drjit"
+    )
 
 
 @lru_cache(maxsize=1)
@@ -81,26 +128,43 @@ def probe() -> Probe:
         if not reason:
             return Probe(COMPILED, library)
         reasons.append(f"{library or 'the one Dr.Jit finds'}: {reason}")
-    found = Probe(SCALAR, reason="; ".join(reasons))
-    warnings.warn(
-        f"no LLVM works for Mitsuba, so that rendering is several times slower; install LLVM 17 or newer"
-        f" (apt install libllvm19) or name it in {LIBRARY} ({found.reason})",
-        RuntimeWarning,
-        stacklevel=3,
-    )
-    return found
+    return Probe(SCALAR, _NO_LLVM, "; ".join(reasons))
 
 
 def _candidates() -> list[str | None]:
-    """The one that the user named; else those found, known good ones first, then what Dr.Jit finds by itself."""
-    if named := os.environ.get(LIBRARY):
+    """The one that the user named; else those found, known good ones first, then what Dr.Jit finds by itself.
+
+    If Dr.Jit is imported already, it has loaded what the variable names, or what it found: that one only.
+    """
+    named = os.environ.get(LIBRARY)
+    if named or "drjit" in sys.modules:
         return [named]
     paths = {
         path.resolve() for folder in _FOLDERS for pattern in _PATTERNS for path in Path(folder).glob(pattern)
     }
     dated = {_version(path): str(path) for path in sorted(paths)}
     newer = sorted(version for version in dated if version > max(_KNOWN_GOOD))
-    return [*(dated[version] for version in (*_KNOWN_GOOD, *newer) if version in dated), None]
+    known = [dated[version] for version in (*_KNOWN_GOOD, *newer) if version in dated]
+    return [*_of_the_package(), *known, None]
+
+
+def _of_the_package() -> list[str]:
+    try:
+        files = metadata.files(_PACKAGE) or []
+    except metadata.PackageNotFoundError:
+        return []
+    return [
+        str(Path(file.locate()).resolve()) for file in files if re.fullmatch(r"libLLVM\.so[.\d]+", file.name)
+    ]
+
+
+def _runtime_of(library: str | None) -> list[str]:
+    """The C++ runtime that the package installs in a folder next to its LLVM; nothing for any other LLVM.
+
+    It must be loaded before, as the links by which the LLVM would find it are only made when Python next starts.
+    """
+    folder = Path(library or "").parent / "x86_64-unknown-linux-gnu"
+    return [str(folder / name) for name in _RUNTIME if (folder / name).exists()]
 
 
 def _version(path: Path) -> int:
@@ -119,7 +183,7 @@ def _fails(library: str | None) -> str:
         chosen = {LIBRARY: library} if library else {}
         try:
             subprocess.run(  # noqa: S603 - our own interpreter and program
-                [sys.executable, "-c", _PICTURE],
+                [sys.executable, "-c", _PICTURE, *_runtime_of(library)],
                 env={**os.environ, **places, **chosen},
                 capture_output=True,
                 text=True,

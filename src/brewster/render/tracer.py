@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from brewster.errors import DeviceError, MissingExtra
-from brewster.render.llvm import COMPILED, variant
+from brewster.render.llvm import COMPILED, INSTALL_LLVM, load, probe
 from brewster.render.sample import Sample
 from brewster.render.studio import Glass, Studio
 from brewster.scene.scene import Scene
@@ -54,24 +54,15 @@ def trace(
     `polarised` traces each colour so, at several times the cost; rough surfaces depolarise, in Mitsuba.
 
     Raises:
-        MissingExtra: mitsuba is not installed, or mitsuba-oidn for `denoise`.
+        MissingExtra: mitsuba is not installed or cannot be imported, or mitsuba-oidn is not installed, for `denoise`.
         DeviceError: polarised light is asked for, and no LLVM works here.
         RecipeError: a wedge or lens has no thickness left somewhere in the view, or a file is missing.
         PhotoError: a file cannot be read or is no map.
     """
-    mi = _mitsuba()
+    mi = load()
     with _rendering_by(mi, _variant(polarised)):
         studios = [Studio(mi, scene, assets, colour) for colour in (range(3) if polarised else (None,))]
         return _pictures(studios, noise, most_samples, denoise)
-
-
-def _mitsuba(name: str = "mitsuba") -> ModuleType:
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise MissingExtra(
-            f"{name} is not installed", "the tracer renders with it", "run: pip install 'brewster[render]'"
-        ) from error
 
 
 @contextmanager
@@ -87,12 +78,12 @@ def _rendering_by(mi: ModuleType, name: str) -> Iterator[None]:
 
 
 def _variant(polarised: bool) -> str:
-    name = variant()
+    name = probe().variant
     if polarised and name != COMPILED:
         raise DeviceError(
             "polarised light cannot be traced",
             "it needs an LLVM that works",
-            "install LLVM 17 or newer: apt install libllvm19",
+            f"install LLVM 17 or newer: {INSTALL_LLVM}",
         )
     return _POLARISED if polarised else name
 
@@ -120,8 +111,17 @@ def _pictures(studios: Sequence[Studio], noise: float, most_samples: int, denois
 def _finished(light: NDArray[np.float64], denoise: bool) -> Tensor:
     picture = np.ascontiguousarray(light, np.float32)
     if denoise:
-        picture = np.array(_mitsuba("mitsuba_oidn").denoise(picture, hdr=True), np.float32)
+        picture = np.array(_denoiser().denoise(picture, hdr=True), np.float32)
     return torch.from_numpy(picture).permute(2, 0, 1).contiguous()
+
+
+def _denoiser() -> ModuleType:
+    try:
+        return importlib.import_module("mitsuba_oidn")
+    except ImportError as error:
+        raise MissingExtra(
+            "mitsuba_oidn is not installed", "it denoises pictures", "run: pip install 'brewster[render]'"
+        ) from error
 
 
 class _Estimate:
