@@ -17,6 +17,8 @@ from brewster import light
 from brewster.errors import UnsupportedPhoto
 from brewster.photo import Origin, Photo
 from brewster.photo.colour import SRGB, Curve, space_of
+from brewster.photo.decode import read_size
+from brewster.photo.lut_profiles import in_display_p3
 
 quick = settings(max_examples=25, deadline=None, database=None)
 
@@ -25,6 +27,7 @@ STRAIGHT = struct.pack(">4s4xI", b"curv", 0)
 SAMPLED = (
     struct.pack(">4s4xI", b"curv", 1024) + (np.linspace(0, 1, 1024) ** 1.8 * 65535).astype(">u2").tobytes()
 )
+NOISE_8BIT = np.random.default_rng(1).integers(0, 256, (8, 8, 3), np.uint8)
 SRGB_PARA = struct.pack(">4s4xHH", b"para", 3, 0) + struct.pack(
     ">5i", *(round(65536 * x) for x in (2.4, 1 / 1.055, 0.055 / 1.055, 1 / 12.92, 0.04045))
 )
@@ -54,6 +57,42 @@ def profile(curve: bytes, colourants: tuple[tuple[float, ...], ...] | None) -> b
     )
     return head.ljust(68, b"\0") + struct.pack(">3i", 63190, 65536, 54061) + bytes(48) + body
 
+
+def table_profile(points: int = 33) -> bytes:
+    """An ICC profile without matrix: a table (lut16Type) from RGB, with a curve of 1.8 and turned primaries, to Lab."""
+    grid = np.linspace(0, 1, points)
+    rgb = np.stack(np.meshgrid(grid, grid, grid, indexing="ij"), axis=-1)
+    xyz = rgb**1.8 @ np.array(TURNED) / (0.9642, 1.0, 0.8249)
+    root = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29)
+    lightness, red, yellow = (
+        116 * root[..., 1] - 16,
+        500 * (root[..., 0] - root[..., 1]),
+        200 * (root[..., 1] - root[..., 2]),
+    )
+    lab = np.stack([lightness * 652.8, (red + 128) * 256, (yellow + 128) * 256], axis=-1)
+    straight = struct.pack(">6H", *(0, 65535) * 3)
+    table = np.rint(lab).clip(0, 65535).astype(">u2").tobytes()
+    matrix = struct.pack(">9i", *(65536 * (i % 4 == 0) for i in range(9)))
+    lut = struct.pack(">4s4x4B", b"mft2", 3, 3, points, 0) + matrix + struct.pack(">2H", 2, 2)
+    lut += straight + table + straight
+    lut += bytes(-len(lut) % 4)
+    white = struct.pack(">4s4x3i", b"XYZ ", 63190, 65536, 54061)
+    body, rows, start = b"", b"", 132 + 2 * 12
+    for name, tag in ((b"wtpt", white), (b"A2B0", lut)):
+        rows += struct.pack(">4sII", name, start + len(body), len(tag))
+        body += tag
+    size = start + len(body)
+    head = struct.pack(">I4sI4s4s4s12x4s", size, bytes(4), 0x02400000, b"scnr", b"RGB ", b"Lab ", b"acsp")
+    head = head.ljust(68, b"\0") + struct.pack(">3i", 63190, 65536, 54061) + bytes(48)
+    return head + struct.pack(">I", 2) + rows + body
+
+
+TURNED = (
+    (0.35, 0.20, 0.05),
+    (0.42, 0.68, 0.09),
+    (0.1942, 0.12, 0.6849),
+)
+"""XYZ of red, green and blue, under D50: inside Display P3."""
 
 PROFILES = {
     "Display P3": bytes(pyvips.Image.profile_load("p3")),
@@ -254,6 +293,56 @@ def test_all_parametric_functions_of_icc_agree_with_littlecms(function: int, cou
     )
     ours = light.to_encoded(stored(pixels, test_profile).linear().clip(0, 1)) * 255
     assert np.abs(ours - np.asarray(theirs)).max() <= 1.5
+
+
+def light_by_table(pixels: np.ndarray) -> np.ndarray:
+    """What the table profile means, in linear Rec.709, by its formula."""
+    rec709 = np.array(((0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410)))
+    return (pixels / np.iinfo(pixels.dtype).max) ** 1.8 @ np.array(TURNED) @ np.linalg.inv(rec709)
+
+
+@pytest.mark.parametrize(
+    ("container", "kind", "tolerance"), [("png", np.uint8, 0.01), ("tiff", np.uint16, 0.006)]
+)
+def test_a_profile_of_tables_gives_its_colours_and_they_survive(container, kind, tolerance) -> None:
+    random = np.random.default_rng(8).integers(0, np.iinfo(kind).max + 1, (24, 24, 3)).astype(kind)
+    data = stored(random, table_profile()).encode(container)
+    photo = Photo.open(data)
+    assert photo.pixels.dtype == kind
+    np.testing.assert_allclose(photo.linear(), light_by_table(random), atol=tolerance)
+    assert photo.origin.icc == PROFILES["Display P3"]
+    again = Photo.open(photo.with_linear(photo.linear()).encode())
+    assert again.origin.container == container
+    assert np.array_equal(again.pixels, photo.pixels)
+    assert read_size(data) == (24, 24)
+
+
+def test_a_pil_image_with_a_profile_of_tables_is_read_as_its_file_is() -> None:
+    random = np.random.default_rng(9).integers(0, 256, (16, 16, 3), np.uint8)
+    data = stored(random, table_profile()).encode("png")
+    assert np.array_equal(Photo.open(Image.open(io.BytesIO(data))).pixels, Photo.open(data).pixels)
+
+
+def test_white_by_a_profile_of_tables_stays_white() -> None:
+    white = Photo.open(stored(np.full((4, 4, 3), 255, np.uint8), table_profile()).encode("png"))
+    assert white.srgb_8bit().min() >= 254
+
+
+@pytest.mark.parametrize(
+    "icc",
+    [table_profile()[:100_000], table_profile().replace(b"mft2", b"mftX")],
+    ids=["cut short", "unknown"],
+)
+def test_a_damaged_profile_of_tables_is_refused(icc: bytes) -> None:
+    """libvips would take sRGB instead, and say nothing."""
+    with pytest.raises(UnsupportedPhoto, match="profile of tables"):
+        Photo.open(stored(NOISE_8BIT, icc).encode("tiff"))
+
+
+@pytest.mark.parametrize(("kind", "channels"), [(np.uint8, 1), (np.float32, 3)])
+def test_a_profile_of_tables_is_for_whole_numbers_in_colour(kind: type, channels: int) -> None:
+    with pytest.raises(UnsupportedPhoto, match="RGB of 8 or 16 bits"):
+        in_display_p3(np.ones((4, 4, channels), kind), Origin(icc=table_profile()))
 
 
 @pytest.mark.parametrize(

@@ -198,7 +198,7 @@ def _to_rec709(to_d50: Float64) -> Matrix:
 
 def _profile_space(icc: bytes) -> Space:
     try:
-        tags = _tags(icc)
+        tags = tags_of(icc)
         if icc[16:20] == b"GRAY":
             return _snapped(Space((_curve(tags[b"kTRC"]),) * 3))
         to_d50 = np.array([_xyz(tags[name]) for name in (b"rXYZ", b"gXYZ", b"bXYZ")]).T
@@ -222,7 +222,12 @@ def _snapped(space: Space) -> Space:
     return SRGB if max(off) < 2e-4 and turned < 1e-3 else space
 
 
-def _tags(icc: bytes) -> dict[bytes, bytes]:
+def tags_of(icc: bytes) -> dict[bytes, bytes]:
+    """The tags of an ICC profile by signature.
+
+    Raises:
+        struct.error: the profile is cut short.
+    """
     (count,) = struct.unpack_from(">I", icc, 128)
     rows = (struct.unpack_from(">4sII", icc, 132 + 12 * i) for i in range(min(count, 100)))
     return {name: icc[start : start + size] for name, start, size in rows}

@@ -22,6 +22,7 @@ from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.photo import metadata
 from brewster.photo.colour import space_of
 from brewster.photo.floats import read_exr, read_hdr, too_large
+from brewster.photo.lut_profiles import has_only_tables
 from brewster.photo.origin import Origin
 
 pyvips.cache_set_max(0)  # each picture is read once: libvips' cache of operations would only hold memory
@@ -69,13 +70,18 @@ def read_size(data: bytes) -> tuple[int, int]:
         return width, height
     if container == "heic":
         heif = _open_heic(data, DEFAULT_MAX_PIXELS)
-        space_of(_heic_profile(heif, data), None, is_float=False)
+        _check_profile(_heic_profile(heif, data), is_float=False)
         return heif.size[0], heif.size[1]
     image = _open_vips(data, container, DEFAULT_MAX_PIXELS)
     icc = image.get("icc-profile-data") if image.get_typeof("icc-profile-data") else None
-    space_of(icc or _profile_of(data, container), None, is_float=image.format == "float")
+    _check_profile(icc or _profile_of(data, container), is_float=image.format == "float")
     sides = int(image.width), int(image.height)
     return sides[::-1] if _orientation(image, container) in _SIDEWAYS else sides
+
+
+def _check_profile(icc: bytes | None, *, is_float: bool) -> None:
+    if is_float or not has_only_tables(icc):
+        space_of(icc, None, is_float=is_float)
 
 
 _STARTS = (

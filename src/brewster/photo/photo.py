@@ -20,6 +20,7 @@ from brewster.photo.colour import SRGB, Space, space_of
 from brewster.photo.decode import Decoded, decode, split, upright
 from brewster.photo.encode import encode
 from brewster.photo.floats import too_large
+from brewster.photo.lut_profiles import has_only_tables, in_display_p3
 from brewster.photo.origin import DEPTHS, LINEAR, Origin, container_of, depth_for
 
 Float32 = NDArray[np.float32]
@@ -57,7 +58,7 @@ class Photo:
         """A photo from whatever holds one: a path, the bytes of a file, an array, a PIL image, or a photo.
 
         An array needs its `encoding` stated, the others tell theirs. Raises UnreadablePhoto (missing, empty,
-        truncated, no picture), UnsupportedPhoto (CMYK, animation, five channels, not-a-number, table-based
+        truncated, no picture), UnsupportedPhoto (CMYK, animation, five channels, not-a-number, damaged
         profile), PhotoTooLarge (beyond `max_pixels`, told from the header), MissingExtra (EXR, HEIC), or
         PhotoError for an encoding that is missing, unknown or out of place.
         """
@@ -81,7 +82,10 @@ class Photo:
 
     @classmethod
     def _of(cls, decoded: Decoded) -> Photo:
-        photo = cls(decoded.pixels, decoded.alpha, decoded.origin)
+        pixels, origin = decoded.pixels, decoded.origin
+        if has_only_tables(origin.icc):
+            pixels, origin = in_display_p3(pixels, origin)
+        photo = cls(pixels, decoded.alpha, origin)
         photo.space()  # a profile we cannot use is an error now, not in the middle of the work
         return photo
 
