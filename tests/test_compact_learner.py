@@ -52,6 +52,14 @@ def test_a_photo_that_equals_its_truth_has_no_infinite_score():
     assert -60 < worse < 0
 
 
+def test_pairs_that_became_worse_are_counted():
+    """Of four answers that are black, one is worse than its photo, one equal, and two are better."""
+    black, grey = torch.zeros(1, 3, 32, 32), torch.full((1, 3, 32, 32), 0.4)
+    pairs = [(grey, grey), (black, grey), (grey, black), (grey, black)]
+    numbers = validate(torch.zeros_like, {"four": pairs})
+    assert numbers["worse_four"] == 1 / 4
+
+
 def test_training_lowers_the_loss_on_a_batch_seen_again_and_again(recipe):
     stream = open_stream(recipe)
     longer = recipe.model_copy(update={"steps": 40})

@@ -10,7 +10,7 @@ from brewster.dataset.sources import source_weights
 from brewster.errors import RecipeError, UnsupportedPhoto
 from brewster.photo import Photo
 from brewster.scene.recipe import read_scene_recipe
-from brewster.train.data import open_stream
+from brewster.train.data import open_stream, validation_pairs
 from brewster.train.recipe import DataRecipe, read_recipe, with_value
 from brewster.worlds.assets import Assets
 from brewster.worlds.catalog import BUILTIN_CATALOG
@@ -153,3 +153,13 @@ def test_the_photos_of_a_source_weigh_together_as_the_root_of_their_number(recip
         )
     assert source_weights([root / "sources"]) == [1, 0.5, 0.5, 0.5, 0.5]
     assert source_weights([root / "sources"], ["few*"]) == [0.5] * 4
+
+
+def test_pairs_to_validate_on_are_evenly_spaced_in_order_of_name(recipe, root):
+    for number in range(7):
+        grey = np.full((8, 8, 3), 30 * number, np.uint8)
+        for role in ("blended", "transmission"):
+            Photo.from_array(grey, encoding="srgb").save(root / "many" / role / f"{number}.png")
+    data = recipe.data.model_copy(update={"validate_on": (Path("many"),), "validate_at_most": 3})
+    seen = [int(photo[0, 0, 0]) // 30 for photo, _ in validation_pairs(data)["many"]]
+    assert seen == [0, 2, 4]

@@ -195,6 +195,16 @@ def test_every_white_balance_takes_away_a_cast(balance):
     torch.testing.assert_close(gains * CAST / (gains * CAST)[1], torch.ones(3, 1, 1), atol=1e-3, rtol=0)
 
 
+@pytest.mark.parametrize("strength", [0.25, 0.5, 1.0])
+def test_white_balance_of_any_strength_keeps_luminance(strength):
+    picture = noise((3, 40, 56)) * CAST
+    developed = develop(
+        sample_of(picture, white_balance="grey-world", white_balance_strength=strength, exposure=0.01)
+    )
+    gains = torch.tensor(developed.white_balance).view(3, 1, 1)
+    assert mean_luminance(picture * gains) == pytest.approx(mean_luminance(picture), rel=1e-3)
+
+
 @pytest.mark.parametrize("balance", BALANCES)
 def test_half_the_strength_goes_half_the_way_in_stops(balance):
     full, half, none = (

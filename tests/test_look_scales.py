@@ -58,6 +58,16 @@ def test_a_copy_is_never_larger_than_the_photo_and_each_size_is_shown_once():
     assert shown("best", 100, 150) == [100 * 150] * 2
 
 
+@pytest.mark.parametrize("size", [(12_000, 1500), (1500, 12_000), (40_000, 400)])
+def test_a_long_thin_photo_is_shown_larger_so_that_its_short_side_is_160_px_at_least(size):
+    """Yet no side of a copy is more than three times as long as that of a photo of ordinary shape."""
+    (pixels,) = QUALITIES["draft"]
+    ((width, height),) = Views(lambda tile: (tile, tile)).sizes(size, "draft")
+    assert width / height == pytest.approx(size[0] / size[1], rel=0.05)
+    largest = 9 * pixels
+    assert min(width, height) == 160 or width * height == pytest.approx(largest, rel=0.05)
+
+
 def test_the_answer_is_the_mean_over_all_copies():
     """The transmission's change is proportional to the copy's height: the mean is that of the heights."""
     photo = np.full((900, 1200, 3), 0.5, np.float32)

@@ -92,6 +92,42 @@ def test_a_third_of_the_pixels_at_half_their_light_does_not_change_the_gain(scen
     assert removed_content(encode(answer), background, photo, reflection) == pytest.approx(lost, abs=0.01)
 
 
+def halves(share):
+    """Background, photo and reflection: on the right, this share of the photo's light is mirrored."""
+    behind = np.full((SIDE, SIDE, 3), 0.3)
+    mirrored = np.zeros_like(behind)
+    mirrored[:, SIDE // 2 :] = 0.3 * share / (1 - share)
+    return encode(behind), encode(behind + mirrored), encode(mirrored)
+
+
+@pytest.mark.parametrize(("share", "lost"), [(0.01, 0.5), (0.05, 0), (0.15, 0)])
+def test_content_counts_where_less_than_two_percent_is_mirrored(share, lost):
+    background, photo, reflection = halves(share)
+    answer = background.copy()
+    answer[:, SIDE // 2 :] = 0
+    assert removed_content(answer, background, photo, reflection) == pytest.approx(lost, abs=0.01)
+
+
+def test_a_reflection_counts_from_a_tenth_of_the_photo_on():
+    assert kept_reflection(halves(0.12)[1], *halves(0.12)) == pytest.approx(1, abs=0.05)
+    with pytest.raises(ValueError, match="0 pixels have R >= 10%"):
+        kept_reflection(halves(0.08)[1], *halves(0.08))
+
+
+@pytest.mark.parametrize(
+    ("sheet", "is_white"),
+    [((200, 200, 200), True), ((185, 185, 185), False), ((250, 250, 225), True), ((250, 250, 200), False)],
+)
+def test_white_is_bright_in_all_channels_and_without_colour(scene, sheet, is_white):
+    """Encoded above 0.75 of 255 = 191, and no two channels 0.12 of it = 31 apart."""
+    background, photo, reflection = scene
+    background = background.copy()
+    background[30:46, 4:20] = sheet
+    answer = background.copy()
+    answer[30:46, 4:20] = 0
+    assert (removed_white(answer, background, photo, reflection) > 0.1) == is_white
+
+
 @pytest.mark.parametrize("gain", [0.8, 1.1])
 def test_scores_hardly_depend_on_the_brightness_of_an_answer(scene, gain):
     background, photo, reflection = scene

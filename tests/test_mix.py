@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -63,6 +65,107 @@ def test_a_veil_adds_even_light_the_asked_share_of_the_photos_mean(photos):
     inside = photo < 0.95
     torch.testing.assert_close((photo - both)[inside], veil[inside], atol=0.02, rtol=0)
     assert veil.mean() > 0.03
+
+
+def layers_of(photos, maps=(), **changes):
+    """Photo, transmission and reflection of four samples, encoded; the same numbers are drawn whatever changes."""
+    batch = Mixtures(photos, list(maps), QUIET.model_copy(update=changes), seed=1)(0, 4, 64)
+    return batch.photo_encoded, batch.transmission_encoded, batch.reflection_encoded
+
+
+@pytest.mark.parametrize("effect", ["falloff_probability", "edge_probability"])
+def test_a_reflection_that_fades_or_ends_is_darker_somewhere_and_brighter_nowhere(photos, effect):
+    _, behind, mirrored = layers_of(photos)
+    _, same, faded = layers_of(photos, **{effect: 1.0})
+    assert (same - behind).abs().max() < 0.04  # the pane's own tint is drawn anew
+    assert (faded <= mirrored + 1e-6).all()
+    assert faded.mean() < 0.95 * mirrored.mean()
+
+
+def test_lamps_are_added_to_the_reflection_alone(photos):
+    _, behind, mirrored = layers_of(photos)
+    _, same, lit = layers_of(photos, lamp_probability=1.0)
+    assert (same - behind).abs().max() < 0.04  # the pane's own tint is drawn anew
+    assert (lit >= mirrored - 1e-6).all()
+    assert lit.amax(dim=(1, 2, 3)).min() > mirrored.amax()
+
+
+def test_a_reflection_that_is_not_sharp_is_blurred_and_keeps_its_light(photos):
+    _, _, mirrored = layers_of(photos)
+    _, _, blurred = layers_of(photos, sharp_probability=0.0, blur_px_log=(4.0, 4.0))
+    edges = [layer.diff(dim=3).square().mean() for layer in (mirrored, blurred)]
+    assert edges[1] < edges[0] / 2
+    assert to_linear(blurred).mean().item() == pytest.approx(to_linear(mirrored).mean().item(), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"ghost_probability": 1.0}, {"sign_probability": 1.0}, {"reflection_contrast_log": (1.6, 1.6)}],
+    ids=lambda changes: next(iter(changes)),
+)
+def test_ghosts_signs_and_contrast_change_the_reflection_alone(photos, changes):
+    _, behind, mirrored = layers_of(photos)
+    _, same, changed = layers_of(photos, **changes)
+    assert (same - behind).abs().max() < 0.04  # the pane's own tint is drawn anew
+    assert (changed - mirrored).abs().mean() > 0.005
+
+
+@pytest.mark.parametrize("changes", [{"shadow_probability": 1.0}, {"highlight_boost": (5.0, 5.0)}], ids=str)
+def test_shadows_and_highlights_change_the_background(photos, changes):
+    bright = [photo + 55 for photo in photos]
+    _, behind, _ = layers_of(bright)
+    _, changed, _ = layers_of(bright, **changes)
+    assert (changed - behind).abs().mean() > 0.01
+
+
+def test_a_warmer_light_has_more_red_and_less_blue(photos):
+    _, plain, _ = layers_of(photos, reflection_ratio_log=(1e-6, 1e-6))
+    _, warm, _ = layers_of(photos, reflection_ratio_log=(1e-6, 1e-6), temperature=(0.3, 0.3))
+    inside = (warm < 0.95).all(dim=1) & (plain > 0.05).all(dim=1)
+    for channel, gain in enumerate((math.exp(0.3), 1, math.exp(-0.3))):
+        ratio = to_linear(warm[:, channel][inside]) / to_linear(plain[:, channel][inside])
+        torch.testing.assert_close(ratio, torch.full_like(ratio, gain), atol=0.01, rtol=0)
+
+
+def test_exposure_is_the_photos_mean_at_most(photos):
+    photo, behind, mirrored = layers_of(photos, exposure=(0.05, 0.05))
+    plain = layers_of(photos)
+    assert to_linear(photo).mean(dim=(1, 2, 3)).tolist() == pytest.approx([0.05] * 4, rel=0.03)
+    for dark, layer in zip((behind, mirrored), plain[1:], strict=True):
+        ratio = to_linear(dark).sum(dim=(1, 2, 3)) / to_linear(layer).sum(dim=(1, 2, 3))
+        torch.testing.assert_close(ratio, 0.05 / to_linear(plain[0]).mean(dim=(1, 2, 3)), atol=0.02, rtol=0)
+
+
+def test_the_tone_curve_is_a_power_then_an_s_and_the_same_for_all_layers(photos):
+    power = layers_of(photos, gamma_log=(1.2, 1.2))
+    s_shaped = layers_of(photos, contrast=(0.4, 0.4))
+    for plain, by_power, by_s in zip(layers_of(photos)[1:], power[1:], s_shaped[1:], strict=True):
+        torch.testing.assert_close(by_power, plain**1.2, atol=1e-5, rtol=0)
+        torch.testing.assert_close(
+            by_s, plain + 0.4 * (3 * plain**2 - 2 * plain**3 - plain), atol=1e-5, rtol=0
+        )
+
+
+def test_noise_and_jpeg_are_in_the_photo_alone(photos):
+    plain = layers_of(photos)
+    for changes, low, high in (
+        ({"noise": (0.02, 0.02)}, 0.018, 0.022),
+        ({"jpeg_probability": 1.0}, 0.002, 0.05),
+    ):
+        changed = layers_of(photos, **changes)
+        assert low < (changed[0] - plain[0]).std() < high
+        assert all(torch.equal(one, other) for one, other in zip(plain[1:], changed[1:], strict=True))
+
+
+def test_maps_are_seen_as_often_as_the_recipe_says(photos):
+    red = torch.zeros(3, 32, 64)
+    red[0] = 1
+    for layer, name in ((1, "background"), (2, "reflection")):
+        changes = {f"{name}_map_probability": 1.0}
+        seen = layers_of(photos, [red.half()], **changes)[layer]
+        assert seen[:, 0].min() > 0
+        assert not seen[:, 1:].any()
+        assert layers_of(photos, [red.half()])[layer][:, 1:].any()
 
 
 def test_the_target_is_what_the_pane_lets_through_or_what_is_behind_it(photos):

@@ -343,3 +343,15 @@ def test_the_same_photo_gives_the_same_bytes() -> None:
 def test_what_only_some_files_need_is_imported_only_then() -> None:
     code = "import brewster.photo, sys; assert not {'PIL', 'OpenEXR', 'pillow_heif'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_sixteen_bits_become_the_nearest_of_eight():
+    values = np.arange(0, 65536, 37, np.uint16)
+    photo = Photo.from_array(np.repeat(values[None, :, None], 3, axis=2), encoding="srgb")
+    stored = Photo.open(photo.encode("png", depth=8)).pixels[0, :, 0]
+    assert (stored == np.rint(values / 257)).all()
+
+
+def test_a_jpeg_of_what_had_no_quality_has_95():
+    photo = Photo.from_array(np.full((16, 16, 3), 99, np.uint8), encoding="srgb")
+    assert Photo.open(photo.encode("jpeg")).origin.jpeg_quality == 95

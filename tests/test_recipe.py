@@ -57,6 +57,12 @@ def test_a_value_that_cannot_be_changed_so_is_refused_by_name(dotted, value, com
         with_value(read_recipe(BASES[0]), dotted, value)
 
 
+def test_pictures_grow_at_the_shares_of_the_run_that_the_recipe_names():
+    recipe = read_recipe(FOLDER / "train/tiny.toml")
+    assert (recipe.steps, recipe.sizes) == (6, [(0.0, 64), (0.5, 96)])
+    assert [recipe.size_at(step) for step in range(6)] == [64, 64, 64, 96, 96, 96]
+
+
 def test_what_has_no_share_may_be_listed(tmp_path):
     no_pairs = 'pairs = ["real"]\npairs_share = 0.0\n'
     rendered = '[data.rendered]\nrecipe = "tiny"\n'

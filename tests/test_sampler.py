@@ -157,3 +157,25 @@ def test_a_recipe_of_maps_needs_maps_that_are_sharp_enough():
 def test_an_impossible_recipe_says_why(camera, says):
     with pytest.raises(RecipeError, match=says):
         drawn(changed("tiny", camera=camera), 0)
+
+
+@pytest.mark.parametrize("share", [0, 1])
+def test_panes_pinholes_and_focus_come_as_often_as_their_probabilities_say(share):
+    recipe = changed(
+        "window",
+        glass={"double_probability": share},
+        camera={"pinhole_probability": share, "focus_on_front_probability": share},
+        behind={"map_probability": 1.0, "dome_probability": 0.0, "picture_probability": 0.0},
+        front={"picture_probability": 1.0},
+    )
+    scenes = [drawn(recipe, index) for index in range(12)]
+    assert {len(scene.glass.panes) for scene in scenes} == {1 + share}
+    assert {scene.camera.aperture_mm == 0 for scene in scenes} == {bool(share)}
+    assert {scene.camera.focus_mm < 1e6 for scene in scenes} == {bool(share)}  # behind, all is far
+
+
+def test_a_logarithmic_range_has_its_median_at_the_geometric_mean():
+    recipe = changed("window", glass={"thickness_mm": (1.0, 100.0), "structural_probability": 0.0})
+    thick = sorted(drawn(recipe, index).glass.panes[0].thickness_mm for index in range(101))
+    assert 1 <= thick[0] <= thick[-1] <= 100
+    assert 4 < thick[50] < 25  # uniform, it would be 50

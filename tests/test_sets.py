@@ -104,7 +104,9 @@ def test_packing_goes_on_where_a_killed_run_left_folders_that_are_in_the_shard(f
     sets.pack(tmp_path / "set", 0)
     shard = (tmp_path / "set" / "shard-000000.tar").read_bytes()
     shutil.copytree(four / "000002", tmp_path / "set" / "000002")
-    assert [entry.index for entry in sets.read_set(tmp_path / "set")] == [0, 1, 2, 3]
+    entries = list(sets.read_set(tmp_path / "set"))
+    assert [entry.index for entry in entries] == [0, 1, 2, 3]
+    assert {entry.place.name for entry in entries} == {"shard-000000.tar"}
     sets.pack(tmp_path / "set", 0)
     assert not (tmp_path / "set" / "000002").exists()
     assert (tmp_path / "set" / "shard-000000.tar").read_bytes() == shard

@@ -1,5 +1,7 @@
 """What one training step does to the weights: learning rates, schedule, clipping and the running average."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -98,6 +100,14 @@ def test_the_average_keeps_the_share_that_the_recipe_says_less_at_first(learner,
         torch.testing.assert_close(one.average[name], expected, atol=1e-6, rtol=1e-6)
 
 
+def test_the_network_that_users_get_has_the_averaged_weights(learner):
+    one = learner(learning_rate=0.1, encoder_learning_rate=0.1)
+    one.advance(0)
+    exported, trained = copy_of(one.averaged_network()), copy_of(one.network)
+    assert all(value.equal(one.average[name]) for name, value in exported.items())
+    assert not any(value.equal(trained[name]) for name, value in exported.items() if "head" in name)
+
+
 def test_the_loss_is_the_sum_of_its_parts(learner):
     told = learner().advance(0)
     assert told["edges"] > 0
@@ -168,6 +178,18 @@ def test_who_knows_the_picture_has_no_loss(lora, monkeypatch):
     parts = one._losses(SampleRng(1, 0, 0))
     assert parts.keys() == {"panel_I", "panel_T", "panel_R"}
     assert max(float(part) for part in parts.values()) < 1e-6
+
+
+def test_a_reflection_counts_as_much_as_it_is_trusted(lora, monkeypatch):
+    one = lora()
+    encoded = one._data(SampleRng(1, 0, 0))
+    parts = []
+    for trust in (1.0, 0.25):
+        monkeypatch.setattr(one, "_data", lambda rng, trust=trust: replace(encoded, trust=trust))
+        parts.append({name: part.item() for name, part in one._losses(SampleRng(1, 0, 0)).items()})
+    whole, quarter = parts
+    assert quarter["panel_R"] == pytest.approx(whole["panel_R"] / 4, rel=1e-5)
+    assert quarter["panel_T"] == pytest.approx(whole["panel_T"], rel=1e-5)
 
 
 def test_the_gradients_of_earlier_steps_are_forgotten(lora):
