@@ -104,7 +104,7 @@ def test_a_loss_that_is_not_a_number_stops_the_run_and_keeps_the_weights(recipe)
 
 
 def test_a_batch_whose_gradient_is_infinite_is_skipped(recipe):
-    learner = CompactLearner(recipe, lambda step, count, size: open_stream(recipe)(step, count, size))
+    learner = CompactLearner(recipe, open_stream(recipe))
     before = copy.deepcopy(learner.network.state_dict())
     next(learner.network.parameters()).register_hook(lambda gradient: gradient / 0)
     assert math.isfinite(learner.advance(0)["loss"])
