@@ -16,10 +16,14 @@ import hypothesis
 import numpy as np
 import pytest
 
-from brewster import Photo
-from brewster.cli import main
-from brewster.errors import MissingExtra
-from front_door import write_pane
+from shape_checks import check_shapes
+
+check_shapes()
+
+from brewster import Photo  # noqa: E402
+from brewster.cli import main  # noqa: E402
+from brewster.errors import MissingExtra  # noqa: E402
+from front_door import write_pane  # noqa: E402
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 

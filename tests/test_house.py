@@ -10,6 +10,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jaxtyping
+import numpy as np
 import pytest
 
 import brewster
@@ -17,6 +19,7 @@ import brewster.errors
 import brewster.photo
 import brewster.separate
 from brewster.options import Options
+from brewster.separate.tiles import in_tiles
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "brewster"
@@ -50,6 +53,15 @@ def test_a_light_start_wakes_no_heavy_library(command):
     )
     imported = {line.split("|")[-1].strip().split(".")[0] for line in done.stderr.splitlines()}
     assert not imported & HEAVY
+
+
+def test_shapes_that_annotations_state_are_checked_while_tests_run():
+    """Without the hook of shape_checks.py, these annotations are never looked at."""
+    flat = np.zeros((8, 8), np.float32)
+    with pytest.raises(jaxtyping.TypeCheckError, match="picture"):
+        in_tiles(lambda tile: (tile, tile), flat, tile_px=16, overlap_px=2)
+    with pytest.raises(jaxtyping.TypeCheckError, match="return value"):
+        in_tiles(lambda tile: (tile[..., 0],), flat[..., None].repeat(3, 2), tile_px=16, overlap_px=2)
 
 
 def test_large_image_models_have_one_door():

@@ -127,13 +127,15 @@ def test_a_crop_is_a_window_of_the_samples_shape_and_never_smaller_than_it_is_sh
         fit = fit_panel((width, height), layout, budget_px=3 * 16 * 16 * cells, multiple=16)
     except PhotoError:
         reject()
-    whole = torch.arange(height * width).reshape(height, width, 1)
+    numbers = torch.arange(height * width).reshape(height, width, 1)
+    whole = torch.cat([numbers % 256, numbers // 256 % 256, numbers // 65536], dim=2).byte().repeat(1, 1, 3)
     crop = cropped(SampleRng(seed, -1, 1), whole, fit)
     rows, columns, _ = crop.shape
     assert max(fit.content[0], width // 2) <= columns <= width
     assert max(fit.content[1], height // 2) <= rows <= height
     assert abs(columns - width * rows / height) <= 1 + width / height
-    top, left = divmod(crop[0, 0, 0].item(), width)
+    low, middle, high = crop[0, 0, :3].tolist()
+    top, left = divmod(low + 256 * middle + 65536 * high, width)
     assert torch.equal(crop, whole[top : top + rows, left : left + columns])
 
 

@@ -123,7 +123,7 @@ class Backbone(ABC):
         return (functional.pixel_unshuffle(seen, PATCH).float() - mean) / deviation
 
     @torch.no_grad()
-    def decode(self, latents: Float[Tensor, "n c h w"]) -> Float[Tensor, "n 3 16h 16w"]:
+    def decode(self, latents: Float[Tensor, "n c h w"]) -> Float[Tensor, "n 3 16*h 16*w"]:
         """Latent grids as pictures, about [-1, 1], not clamped, float32."""
         mean, deviation = self.statistics()
         grid = latents.to(self.vae.device).float() * deviation + mean
@@ -192,7 +192,7 @@ class Backbone(ABC):
             return moved
         return scheduler.shift * sigma / (1 + (scheduler.shift - 1) * sigma)  # type: ignore[no-any-return]
 
-    def schedule(self, tokens: int, steps: int) -> Float[Tensor, " steps+1"]:
+    def schedule(self, tokens: int, steps: int) -> Float[Tensor, " sigmas"]:
         """The sigmas from 1 to 0, by the stock scheduler itself: steps + 1 values, falling."""
         if steps == 1:  # any shift leaves 1 where it is, but a stretched end would divide 0 by 0
             return torch.tensor([1.0, 0.0])
