@@ -7,7 +7,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from benchmark_folders import paint
 from brewster import Photo
 from brewster.dataset.benchmarks import read_benchmark
-from brewster.evaluate.judge import Judge, Truth, reduced
+from brewster.evaluate.judge import Judge, Truth
 from brewster.evaluate.methods import Answer, Nothing
 from brewster.evaluate.protocol import Protocol
 from set_folders import make
@@ -114,13 +114,3 @@ def test_lpips_of_the_dev_pairs_is_small_for_the_truth_and_large_for_noise(data,
     ]
     assert scores[0] == 0 < scores[1] < 0.5 < scores[2]
     assert judge.score(Answer(truth.photo))["lpips_region"] > scores[1]
-
-
-@pytest.mark.parametrize(
-    ("size", "small"), [((60, 40), (30, 20)), ((40, 60), (20, 30)), ((50, 18), (50, 18))]
-)
-def test_a_photo_is_reduced_to_its_shorter_side_and_never_enlarged(size, small):
-    width, height = size
-    photo = Photo.from_array(np.zeros((height, width, 3), np.uint8), encoding="srgb")
-    assert reduced(photo, 20).size == small
-    assert reduced(photo, None) is photo
