@@ -109,8 +109,8 @@ def test_words_are_not_drawn(quick, pairs, data, tmp_path, monkeypatch):
     assert (tmp_path / "out" / "mixing-8-bit" / "model.onnx").is_file()
 
 
-def test_prompts_are_compared_on_a_backbone_that_nobody_has_trained(pairs, tmp_path, monkeypatch):
-    monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
+def test_prompts_are_compared_on_a_backbone_that_nobody_has_trained(pairs, data, tmp_path, monkeypatch):
+    monkeypatch.setenv("BREWSTER_DATA", str(data))
     study = read_study(RECIPES / "prompt.toml").model_copy(update={"base": RECIPES / "backbone-tiny.toml"})
     results = ablate(study, pairs, tmp_path / "out")
     assert list(results["methods"]) == ["doing nothing", "prompt generic", "prompt detailed"]

@@ -96,6 +96,19 @@ def test_the_doctor_says_what_is_missing_and_the_line_that_installs_it(bare, shi
     assert b"pip install no-such-package" in out
 
 
+def test_an_extra_is_missing_if_any_of_its_packages_is_and_nothing_is_ill_for_that(
+    bare, shipped, monkeypatch
+):
+    monkeypatch.delitem(zoo.MODELS, "research")
+    monkeypatch.setitem(EXTRAS, "exr", {"numpy": "numpy", "no-such-package": "nothing"})
+    code, out, _ = bare("doctor", "--json")
+    told = json.loads(out)
+    exr = next(check for check in told["checks"] if (check["area"], check["name"]) == ("extras", "exr"))
+    assert (code, told["ok"]) == (0, True)
+    assert (exr["status"], exr["detail"]) == ("missing", "without no-such-package")
+    assert exr["cure"] == "pip install 'brewster[exr]'"
+
+
 def test_a_package_that_does_not_load_is_broken(bare, shipped, monkeypatch):
     monkeypatch.setitem(CORE, "click", "no_such_module")
     code, out, _ = bare("doctor", "--json")

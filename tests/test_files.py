@@ -230,6 +230,9 @@ def test_file_systems_without_links_are_written_to_as_well(
     monkeypatch.setattr(os, "link", refuse)
     write_atomically(tmp_path / "a.png", b"whole")
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
+    with pytest.raises(TargetError, match="overwrite"):
+        write_atomically(tmp_path / "a.png", b"another")
+    assert (tmp_path / "a.png").read_bytes() == b"whole"
 
 
 @pytest.mark.parametrize(

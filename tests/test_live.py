@@ -4,6 +4,8 @@ import pytest
 import torch
 
 from brewster.dataset.live import Rendered
+from brewster.photo import Photo
+from brewster.render.develop import jpeg
 from brewster.scene.recipe import read_scene_recipe
 from brewster.worlds.assets import Assets
 from brewster.worlds.catalog import BUILTIN_CATALOG
@@ -42,6 +44,19 @@ def test_iterating_gives_the_samples_in_order_at_the_recipes_size(assets):
     first = next(iter(live))
     assert first.photo_encoded.shape == (3, 64, 96)
     assert torch.equal(first.photo_encoded, live.sample(0).photo_encoded)
+
+
+@pytest.mark.parametrize("mixing", ["light", "8-bit"])
+def test_the_photo_has_been_through_its_jpeg_and_no_truth_has(assets, mixing):
+    """A second JPEG of the same quality changes next to nothing."""
+    sample = stream(assets, mixing=mixing).sample(0)
+
+    def change(encoded):
+        decoded = Photo.open(jpeg(encoded, sample.scene.development.jpeg_quality)).pixels.copy()
+        return (torch.from_numpy(decoded).permute(2, 0, 1) / 255 - encoded).abs().mean()
+
+    assert change(sample.photo_encoded) < 1e-3
+    assert change(sample.background_encoded) > 5e-3
 
 
 def test_the_target_is_the_background_or_the_transmission(assets):

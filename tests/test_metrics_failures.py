@@ -114,6 +114,14 @@ def test_a_reflection_counts_from_a_tenth_of_the_photo_on():
         kept_reflection(halves(0.08)[1], *halves(0.08))
 
 
+def test_where_the_photo_is_clipped_nothing_is_known_of_its_reflection():
+    background, mirrored = np.full((SIDE, SIDE, 3), 0.5), np.zeros((SIDE, SIDE, 3))
+    mirrored[:, SIDE // 2 :] = 0.6
+    layers = [encode(layer) for layer in (background, background + mirrored, mirrored)]
+    with pytest.raises(ValueError, match=r"0 pixels have .* not clipped"):
+        kept_reflection(layers[1], *layers)
+
+
 @pytest.mark.parametrize(
     ("sheet", "is_white"),
     [((200, 200, 200), True), ((185, 185, 185), False), ((250, 250, 225), True), ((250, 250, 200), False)],

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -110,6 +111,24 @@ def test_the_unexplained_remainder_is_reported():
     photo = Photo.from_array(np.full((64, 64, 3), 0.4, np.float32), encoding="linear")
     result = Separator(lambda tile: (tile * 0.5, tile * 0.25))(photo)
     assert result.remainder == pytest.approx(0.1, abs=0.005)
+
+
+def test_light_that_is_too_much_and_light_that_is_missing_do_not_cancel_in_the_remainder():
+    """Dark: 0.2 - 0.1 - 0.05 = 0.05 is missing. Bright: 0.6 - 0.3 - 0.45 = -0.15 is too much."""
+    light = np.full((64, 64, 3), 0.2, np.float32)
+    light[32:] = 0.6
+
+    def uneven(tile):
+        return tile * 0.5, np.where(tile < 0.4, tile * 0.25, tile * 0.75)
+
+    photo = Photo.from_array(light, encoding="linear")
+    assert Separator(uneven)(photo).remainder == pytest.approx(0.1, abs=0.01)
+
+
+@pytest.mark.parametrize(("drift", "doubtful"), [(None, False), (0.0, False), (0.05, False), (0.07, True)])
+def test_a_separation_is_doubtful_where_the_model_redraws_the_photo(drift, doubtful):
+    separation = Separator(nothing)(picture(8, 8), encoding="srgb")
+    assert replace(separation, drift=drift).doubtful == doubtful
 
 
 def test_confidence_falls_where_the_two_views_disagree():

@@ -1,5 +1,8 @@
 """Intervals where all answers agree, and resamples therefore tell nothing: the exact bound, and what it holds."""
 
+import math
+from statistics import NormalDist
+
 import numpy as np
 import pytest
 from scipy.stats import binom, binomtest
@@ -61,3 +64,12 @@ def test_near_1_the_interval_of_few_participants_holds_the_truth_in_19_of_20():
         _, low, high = estimated(*[[[1, 0, 0]]] * wins, *[[[0, 0, 1]]] * (30 - wins))[:, 0, 0]
         held += binom.pmf(wins, 30, 0.95) * (low <= 0.95 <= high)
     assert held > 0.93
+
+
+@pytest.mark.parametrize(("participants", "quantile"), [(5, 2.776), (20, 2.093), (1000, 1.962)])
+def test_intervals_of_few_participants_are_as_wide_as_students_t(participants, quantile):
+    """Resamples of n spread too little by sqrt((n - 1) / n); `quantile` is that of t with n - 1 degrees of freedom."""
+    draws = np.array([NormalDist().inv_cdf((i + 0.5) / 50_000) for i in range(50_000)])
+    low, high = interval(draws[:, None], participants)[:, 0]
+    assert high == pytest.approx(quantile * math.sqrt(participants / (participants - 1)), rel=0.02)
+    assert low == pytest.approx(-high, rel=0.02)

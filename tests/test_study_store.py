@@ -41,6 +41,14 @@ def test_a_participant_is_shown_what_the_draw_says_and_goes_on_where_they_stoppe
     assert store.next_trial(person) is None
 
 
+def test_a_trial_that_was_passed_over_comes_next(store):
+    person = store.participant(store.admit())
+    store.answer(person, 1, "left", seconds=2)
+    assert store.next_trial(person) == 0
+    store.answer(person, 0, "left", seconds=2)
+    assert store.next_trial(person) == 2
+
+
 def test_the_first_answer_stays(store):
     person = store.participant(store.admit())
     assert store.answer(person, 0, "left", seconds=2) == "left"
