@@ -1,6 +1,7 @@
 """Processes that tests start, watch and kill."""
 
 import contextlib
+import signal
 import subprocess
 import time
 from pathlib import Path
@@ -8,12 +9,20 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def started(command, **how):
-    """A process that is killed in the end, if it has not ended by itself."""
-    with subprocess.Popen([*map(str, command)], **how) as process:
+    """A process that is killed in the end, if it has not ended by itself; Ctrl-C reaches it.
+
+    A shell starts background jobs with SIGINT ignored, and children inherit that.
+    """
+    command = [*map(str, command)]
+    with subprocess.Popen(command, preexec_fn=_heed_interrupts, **how) as process:
         try:
             yield process
         finally:
             process.kill()
+
+
+def _heed_interrupts():
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def wait_for(condition, process=None):
