@@ -14,7 +14,7 @@ def started(command, **how):
     A shell starts background jobs with SIGINT ignored, and children inherit that.
     """
     command = [*map(str, command)]
-    with subprocess.Popen(command, preexec_fn=_heed_interrupts, **how) as process:
+    with subprocess.Popen(command, preexec_fn=_heed_interrupts, **how) as process:  # noqa: PLW1509
         try:
             yield process
         finally:

@@ -91,7 +91,7 @@ separate = Separator.__call__
 def endless(self, source, **options):
     while source.name == "06.jpg":
         separate(self, source, **options)
-        print("at work", flush=True)
+        print("at work", file=sys.stderr, flush=True)
         interrupts.heed()
     return separate(self, source, **options)
 Separator.__call__ = endless
@@ -107,7 +107,7 @@ def test_ctrl_c_in_mid_batch_leaves_whole_files_only_and_the_same_command_goes_o
         (tmp_path / "in" / f"{name}.jpg").write_bytes(picture(400, 300, seed=index))
     command = [sys.executable, "-c", ENDLESS, "in", "-o", "out", "--model", model, "--quality", "draft"]
     with started(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as batch:
-        assert batch.stdout.readline() == b"at work\n"
+        assert batch.stderr.readline() == b"at work\n"
         batch.send_signal(signal.SIGINT)
         _, err = batch.communicate()
     assert batch.returncode == 130
