@@ -187,7 +187,7 @@ def test_more_samples_than_there_are_are_refused(recipe):
 
 def test_crops_have_half_to_all_of_the_samples_sides():
     fit = fit_panel((300, 200), Layout(), budget_px=3 * 48 * 32, multiple=16)
-    whole = torch.zeros(200, 300, 1)
+    whole = torch.zeros(200, 300, 9, dtype=torch.uint8)
     shares = [cropped(SampleRng(seed, -1, 1), whole, fit).shape[0] / 200 for seed in range(200)]
     assert 0.5 <= min(shares) < 0.52
     assert 0.98 < max(shares) <= 1
