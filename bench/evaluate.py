@@ -16,7 +16,7 @@ import numpy as np
 
 from brewster import Photo
 from brewster.evaluate.runner import SCORES
-from brewster.light import to_encoded
+from brewster.srgb import to_encoded
 
 OUT = Path("out/bench/evaluate")
 SIZE = (540, 400)

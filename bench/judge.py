@@ -16,21 +16,21 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-from brewster.render.pane import render
-from brewster.render.rays import scatter
-from brewster.render.sample import LAYERS, Sample
-from brewster.render.tracer import trace
+from brewster.environments.assets import Assets
+from brewster.render.analytic import render
+from brewster.render.mitsuba.renderer import trace
+from brewster.render.rays import rough_glass
+from brewster.render.sample import LAYERS, LightSample
 from brewster.scene.camera import Camera
 from brewster.scene.glass import Glazing, Pane
 from brewster.scene.scene import Scene
-from brewster.scene.world import Map, Plane, Side, Source
-from brewster.worlds.assets import Assets
+from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
 
-STREET = Map(source=Source(file="builtin:street:3"), heading_deg=200)
-ROOM = Map(source=Source(file="builtin:room:2"), heading_deg=70)
+STREET = EnvironmentMap(source=AssetSource(file="builtin:street:3"), heading_deg=200)
+ROOM = EnvironmentMap(source=AssetSource(file="builtin:room:2"), heading_deg=70)
 DOME = ROOM.model_copy(update={"radius_mm": 4000.0})
-ART = Plane(source=Source(file="builtin:painting:5"), distance_mm=60, width_mm=700, luminance=0.6)
-PORTRAIT = Plane(source=Source(file="builtin:painting:8"), distance_mm=900, width_mm=800, luminance=2.0)
+ART = Plane(source=AssetSource(file="builtin:painting:5"), distance_mm=60, width_mm=700, luminance=0.6)
+PORTRAIT = Plane(source=AssetSource(file="builtin:painting:8"), distance_mm=900, width_mm=800, luminance=2.0)
 CAMERA = Camera(width=128, height=96, fov_deg=36, heading_deg=4, position_mm=(-40, 0, 700), focus_mm=2500)
 LENS = CAMERA.model_copy(update={"aperture_mm": 20.0})
 CLEAR, THICK = Pane(), Pane(thickness_mm=20)
@@ -69,12 +69,12 @@ def averaged_at_every_surface() -> Iterator[None]:
         s, p = apart(cosine, here, beyond)
         return (s + p) / 2, (s + p) / 2
 
-    apart = scatter._reflectances
-    scatter._reflectances = averaged
+    apart = rough_glass._reflectances
+    rough_glass._reflectances = averaged
     try:
         yield
     finally:
-        scatter._reflectances = apart
+        rough_glass._reflectances = apart
 
 
 def compared(scene: Scene, assets: Assets, samples: int) -> list[str]:
@@ -89,7 +89,7 @@ def compared(scene: Scene, assets: Assets, samples: int) -> list[str]:
     return [_line(name, ours, again, first, second) for name in LAYERS]
 
 
-def _line(name: str, ours: Sample, again: Sample, first: Sample, second: Sample) -> str:
+def _line(name: str, ours: LightSample, again: LightSample, first: LightSample, second: LightSample) -> str:
     one, two, a, b = (getattr(sample, name).double() for sample in (ours, again, first, second))
     mine, theirs = (one + two) / 2, (a + b) / 2
     error = (mine - theirs).square().mean()

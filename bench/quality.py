@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from brewster import Photo
-from brewster.dataset.benchmarks import Case, read_benchmark
+from brewster.benchmarks.registry import Case, read_benchmark
+from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.evaluation import evaluate
-from brewster.evaluate.methods import Model, Nothing, Predictions
-from brewster.evaluate.protocol import Protocol
+from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder
 from brewster.evaluate.report.tables import overview
 from brewster.evaluate.runner import SCORES
 from brewster.models.zoo import MODELS
@@ -34,13 +34,13 @@ def main(data: Path) -> None:
     parts = [part for name, folder in folders.items() for part in read_benchmark(name, folder)]
     cases = [case for part in parts for case in part.cases]
     seconds = run_peer(cases)
-    models = [Model(name, name, OUT / "predictions" / name, device="cpu") for name in MODELS]
+    models = [ModelMethod(name, name, OUT / "predictions" / name, device="cpu") for name in MODELS]
     (OUT / SCORES).unlink(missing_ok=True)  # times are measured anew
     timed = {}
     results = evaluate(
         parts,
-        [Nothing(), *models, Predictions("fast-reflection-removal", OUT / "peer")],
-        Protocol(),
+        [IdentityBaseline(), *models, PredictionFolder("fast-reflection-removal", OUT / "peer")],
+        EvaluationConfig(),
         OUT,
         report=lambda _done, _of, row: timed.setdefault(row.method, []).append(row),
     )

@@ -18,24 +18,24 @@ import torch
 from judge import DOME, STREET, TINTED
 from torch.nn.functional import avg_pool2d
 
-from brewster.dataset.build.job import Job, build
-from brewster.dataset.build.workers import Here
-from brewster.render.pane import render
-from brewster.render.sample import LAYERS, Sample
-from brewster.render.tracer import trace
+from brewster.environments.assets import Assets
+from brewster.environments.catalog import BUILTIN_CATALOG
+from brewster.render.analytic import render
+from brewster.render.mitsuba.renderer import trace
+from brewster.render.sample import LAYERS, LightSample
+from brewster.rendered.generation.job import RenderJob, build
+from brewster.rendered.generation.workers import SerialExecutor
 from brewster.scene.camera import Camera
 from brewster.scene.glass import Glazing
 from brewster.scene.recipe import read_scene_recipe
 from brewster.scene.scene import Scene
-from brewster.scene.world import Map, Plane, Side, Source
-from brewster.worlds.assets import Assets
-from brewster.worlds.catalog import BUILTIN_CATALOG
+from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
 
 GOOD = 1e-3
 MOST_CPU_S = 60.0
 CAMERA = Camera(fov_deg=50, position_mm=(0, 0, 800), heading_deg=10)
-ROOM = Map(source=Source(file="builtin:room:2"))
-ART = Plane(source=Source(file="builtin:painting:5"), distance_mm=500, width_mm=2500)
+ROOM = EnvironmentMap(source=AssetSource(file="builtin:room:2"))
+ART = Plane(source=AssetSource(file="builtin:painting:5"), distance_mm=500, width_mm=2500)
 SCENES = {
     "one smooth pane, sun": Scene(camera=CAMERA, behind=Side(map=STREET), front=Side(map=ROOM)),
     "two tinted panes, near photo": Scene(
@@ -47,7 +47,7 @@ SCENES = {
 }
 
 
-def relative_error(sample: Sample, reference: Sample) -> float:
+def relative_error(sample: LightSample, reference: LightSample) -> float:
     """relMSE, averaged over the five pictures."""
     errors = []
     for name in LAYERS:
@@ -56,7 +56,7 @@ def relative_error(sample: Sample, reference: Sample) -> float:
     return float(sum(errors) / len(errors))
 
 
-def converged(scene: Scene, assets: Assets) -> Sample:
+def converged(scene: Scene, assets: Assets) -> LightSample:
     """The scene at four times the size, averaged down."""
     camera = scene.camera.model_copy(
         update={"width": 4 * scene.camera.width, "height": 4 * scene.camera.height}
@@ -66,7 +66,7 @@ def converged(scene: Scene, assets: Assets) -> Sample:
 
 
 def mitsuba(
-    scene: Scene, assets: Assets, reference: Sample, *, denoise: bool
+    scene: Scene, assets: Assets, reference: LightSample, *, denoise: bool
 ) -> tuple[float, float, int, bool]:
     """CPU-seconds to reach GOOD, the error reached, rays a pixel, and whether the seconds are extrapolated."""
     samples = 4
@@ -110,9 +110,9 @@ def sets_a_second() -> None:
     print("| sets | CPU-s a set |\n|---|---|")
     for count in (10, 30, 90):
         with tempfile.TemporaryDirectory() as folder:
-            job = Job(Path(folder) / "set", recipe, BUILTIN_CATALOG, 7, "pane", ())
+            job = RenderJob(Path(folder) / "set", recipe, BUILTIN_CATALOG, 7, "pane", ())
             start = time.process_time()
-            build(job, range(count), Here(job), shards=False, report=lambda _: None)
+            build(job, range(count), SerialExecutor(job), shards=False, report=lambda _: None)
             print(f"| {count} | {(time.process_time() - start) / count:.2f} |", flush=True)
 
 

@@ -22,10 +22,10 @@ import httpx
 import numpy as np
 
 from brewster import Photo
-from brewster.study.create import Choices, create
-from brewster.study.report.people import Rule, people
-from brewster.study.report.results import summarise
-from brewster.study.store import Store
+from brewster.user_study.create import StudyOptions, create
+from brewster.user_study.report.participants import ExclusionRule, people
+from brewster.user_study.report.results import summarise
+from brewster.user_study.store import AnswerStore
 
 OUT = Path("out/bench/study")
 PEOPLE, KILLS = 100, 10
@@ -102,7 +102,7 @@ def make(folder):
                 blocks = np.kron(dice.integers(0, 256, (6, 8, 3)), np.ones((20, 20, 1))).astype(np.uint8)
                 Photo.from_array(blocks, encoding="srgb").save(folder / part / name / f"{i}.png")
     methods = {name: folder / name for name in ("ours", "RDNet", "DSIT")}
-    return create(folder / "study", folder / "inputs", methods, Choices(seed=1))
+    return create(folder / "study", folder / "inputs", methods, StudyOptions(seed=1))
 
 
 async def run(study):
@@ -133,8 +133,8 @@ def main():
             "SELECT '/s/' || token, trial, choice FROM answers JOIN participants ON number = participant"
         ).fetchall()
     kept = {(link, trial): choice for link, trial, choice in rows}
-    answered = people(Store(study).everything())
-    results = summarise(study, answered, Rule(1.0, 0.0))
+    answered = people(AnswerStore(study).everything())
+    results = summarise(study, answered, ExclusionRule(1.0, 0.0))
     slowest = statistics.quantiles(crowd.times, n=100)[98]
     lines = {
         "participants at once": PEOPLE,

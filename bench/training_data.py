@@ -16,10 +16,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from brewster.dataset.sources import read_pairs
-from brewster.light import to_encoded, to_linear
-from brewster.train.data import open_stream
-from brewster.train.recipe import read_recipe
+from brewster.srgb import to_encoded, to_linear
+from brewster.training.data.image_loading import read_pairs
+from brewster.training.recipe import read_recipe
+from brewster.training.streams import open_stream
 
 SIZE_PX = 256
 COUNT = 200

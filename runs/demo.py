@@ -11,7 +11,7 @@ import numpy as np
 
 from brewster import Photo, Separation, Separator
 from brewster.errors import BrewsterError
-from brewster.files import Job, find
+from brewster.files import SeparationPaths, find
 
 OUT = Path("out/demo")
 ROW_PX = 240
@@ -36,7 +36,7 @@ def main(source: Path) -> int:
     return 1 if failures or not rows else 0
 
 
-def separate(separator: Separator, job: Job) -> np.ndarray:
+def separate(separator: Separator, job: SeparationPaths) -> np.ndarray:
     """Separates one photo, saves its layers and returns its row of the sheet."""
     started = time.perf_counter()
     result = separator(job.source)

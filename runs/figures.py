@@ -10,14 +10,14 @@ from pathlib import Path
 
 import torch
 
-from brewster.dataset.blend import blended
+from brewster.environments.assets import Assets
+from brewster.environments.catalog import read_catalog
 from brewster.photo import Photo
-from brewster.render.develop import develop, to_bytes
-from brewster.render.pane import render
+from brewster.render.analytic import render
+from brewster.render.camera_response import develop, to_bytes
 from brewster.scene.recipe import RECIPES, read_scene_recipe
 from brewster.scene.sampler import draw
-from brewster.worlds.assets import Assets
-from brewster.worlds.catalog import read_catalog
+from brewster.training.data.alpha_blend import blended
 
 DATA = os.environ.get("BREWSTER_DATA")
 MAPS = [Path(DATA) / "hdri"] if DATA else []

@@ -18,12 +18,12 @@ import torch
 from torch import nn
 
 from brewster.errors import DeviceError
-from brewster.models.large.adapter.lora import add_lora
-from brewster.models.large.backbones import build, find_family
-from brewster.models.large.panels import Layout, condition
-from brewster.models.large.prompt import PromptEmbedding
-from brewster.models.large.sampling import GUIDANCE, STEPS, sample
-from brewster.models.large.stock import library
+from brewster.models.diffusion.adapter.lora import add_lora
+from brewster.models.diffusion.backbones import build, find_family
+from brewster.models.diffusion.lazy_imports import library
+from brewster.models.diffusion.panels import PanelLayout, condition
+from brewster.models.diffusion.prompt import PromptEmbedding
+from brewster.models.diffusion.sampling import GUIDANCE, STEPS, sample
 
 GIB = 1 << 30
 CAP_GIB = 23.0  # a 24 GB card, less what CUDA itself takes
@@ -126,7 +126,7 @@ def learn(backbone, prompt, photo, rank, row):
     optimizer = torch.optim.AdamW(parameters, lr=1e-4)
     row.lora, row.optimizer = sum(each.numel() for each in parameters) / 1e6, "AdamW, float32 moments"
     reset_peak(backbone.device)
-    composite, shown = (backbone.encode(condition(photo, Layout())) for _ in range(2))
+    composite, shown = (backbone.encode(condition(photo, PanelLayout())) for _ in range(2))
     cells = composite.shape[2] * composite.shape[3]
     row.tokens = f"{cells}, {shown.shape[2] * shown.shape[3]}, {prompt.embeds.shape[1]}"
     times = [timed(lambda: step(backbone, prompt, composite, shown, optimizer)) for _ in range(WARM + TIMED)]
@@ -149,8 +149,8 @@ def step(backbone, prompt, composite, shown, optimizer):
 
 
 def separate(backbone, prompt, photo, row):
-    shown = condition(photo, Layout())
-    size = Layout().composite_size((photo.shape[3], photo.shape[2]))
+    shown = condition(photo, PanelLayout())
+    size = PanelLayout().composite_size((photo.shape[3], photo.shape[2]))
     gc.collect()
     reset_peak(backbone.device)
     row.picture_s = timed(
@@ -207,8 +207,8 @@ def cap():
 
 def estimate(name, quantise):
     """The numbers of `brewster train --plan` for the recipe of this name, on the paper's card."""
-    from brewster.train.large.plan import CARDS, plan_for  # noqa: PLC0415  (the trainer may lack its libraries)
-    from brewster.train.recipe import read_recipe  # noqa: PLC0415
+    from brewster.training.lora.resource_estimate import CARDS, plan_for  # noqa: PLC0415  (the trainer may lack its libraries)
+    from brewster.training.recipe import read_recipe  # noqa: PLC0415
 
     card = CARDS["RTX 4090"]
     recipe = read_recipe(Path(__file__).parents[1] / f"recipes/train/{name}.toml")

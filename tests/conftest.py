@@ -79,11 +79,11 @@ def data() -> Path:
 @pytest.fixture(scope="session")
 def mitsuba():
     """Mitsuba, with one thread; the test is skipped where it cannot be imported."""
-    from brewster.render import llvm  # noqa: PLC0415
+    from brewster.render.mitsuba import variant  # noqa: PLC0415
 
     try:
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # LLVM: see below
-            mitsuba = llvm.load()
+            mitsuba = variant.load()
     except MissingExtra as error:
         pytest.skip(str(error))
     import drjit  # noqa: PLC0415  (only after it is decided which LLVM it loads)
@@ -95,10 +95,10 @@ def mitsuba():
 @pytest.fixture
 def compiled(mitsuba):
     """The test is skipped where Mitsuba's kernels cannot be compiled."""
-    from brewster.render import llvm  # noqa: PLC0415
+    from brewster.render.mitsuba import variant  # noqa: PLC0415
 
-    if llvm.probe().variant != llvm.COMPILED:
-        pytest.skip(f"no LLVM works for Mitsuba; run: {llvm.INSTALL_LLVM}")
+    if variant.probe().variant != variant.COMPILED:
+        pytest.skip(f"no LLVM works for Mitsuba; run: {variant.INSTALL_LLVM}")
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +143,7 @@ def bare(run):
 @pytest.fixture
 def recipe(tmp_path, monkeypatch, random):
     """The tiny training recipe, with three photos to learn from."""
-    from brewster.train.recipe import read_recipe  # noqa: PLC0415  (wakes torch)
+    from brewster.training.recipe import read_recipe  # noqa: PLC0415  (wakes torch)
 
     folder = tmp_path / "data" / "photos" / "permissive"
     folder.mkdir(parents=True)
@@ -157,10 +157,10 @@ def recipe(tmp_path, monkeypatch, random):
 @pytest.fixture
 def rendered(monkeypatch):
     """A recipe that renders; its worlds are computed once, as that takes longer than all the rest."""
-    from brewster.train.recipe import read_recipe  # noqa: PLC0415
-    from brewster.worlds.assets import Assets  # noqa: PLC0415
+    from brewster.environments.assets import Assets  # noqa: PLC0415
+    from brewster.training.recipe import read_recipe  # noqa: PLC0415
 
     assets = Assets()
-    monkeypatch.setattr("brewster.train.data.Assets", lambda folders: assets)
+    monkeypatch.setattr("brewster.training.streams.Assets", lambda folders: assets)
     monkeypatch.delenv("BREWSTER_DATA", raising=False)
     return read_recipe(RECIPES / "ablations/tiny.toml")

@@ -9,13 +9,13 @@ from threading import Event
 import torch
 
 from brewster.errors import DeviceError, RecipeError
-from brewster.render.sample import LAYERS, Sample
+from brewster.render.sample import LAYERS, LightSample
 
 
 def render(scene, assets):
     """Colours that depend on the scene alone."""
     generator = torch.Generator().manual_seed(1000 * scene.seed + scene.index)
-    return Sample(scene, **{layer: torch.rand(3, 16, 24, generator=generator) for layer in LAYERS})
+    return LightSample(scene, **{layer: torch.rand(3, 16, 24, generator=generator) for layer in LAYERS})
 
 
 def slow(scene, assets):

@@ -11,13 +11,13 @@ from threading import Event, Thread
 
 import httpx
 
-from brewster.separate import Separator
+from brewster.inference import Separator
 from brewster.web.application import application, listen
-from brewster.web.desk import Desk
-from brewster.web.guard import Guard
-from brewster.web.line import server
+from brewster.web.job_queue import JobQueue
+from brewster.web.middleware import RequestLimits
+from brewster.web.model_cache import ModelRow
 from brewster.web.separation import separation
-from brewster.web.shelf import ModelRow
+from brewster.web.server import server
 from other_processes import started
 
 
@@ -56,7 +56,8 @@ class Stubborn:
 
 def app_of(backend=pane, *, desk=None, max_pixels=10**8, guard=None):
     return application(
-        separation(OneModel(backend), desk or Desk(), max_pixels=max_pixels), guard=guard or Guard()
+        separation(OneModel(backend), desk or JobQueue(), max_pixels=max_pixels),
+        guard=guard or RequestLimits(),
     )
 
 

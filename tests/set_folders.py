@@ -2,17 +2,17 @@
 
 import hashlib
 
-from brewster.dataset.build.job import Job, build
-from brewster.dataset.build.workers import Here
+from brewster.environments.catalog import BUILTIN_CATALOG
+from brewster.rendered.generation.job import RenderJob, build
+from brewster.rendered.generation.workers import SerialExecutor
 from brewster.scene.recipe import read_scene_recipe
-from brewster.worlds.catalog import BUILTIN_CATALOG
 
 
 def job(out, renderer="render", seed=7, recipe="tiny"):
-    return Job(out, read_scene_recipe(recipe), BUILTIN_CATALOG, seed, f"fake_renderer:{renderer}")
+    return RenderJob(out, read_scene_recipe(recipe), BUILTIN_CATALOG, seed, f"fake_renderer:{renderer}")
 
 
-def make(out, count=4, first=0, crew=Here, shards=False, **of_job):
+def make(out, count=4, first=0, crew=SerialExecutor, shards=False, **of_job):
     """Builds a set; what became of its samples."""
     results = []
     asked = job(out, **of_job)

@@ -3,8 +3,8 @@
 import numpy as np
 
 from brewster import Photo
-from brewster.study.create import Choices, create
-from brewster.study.study import PICTURES, Catch, Comparison, Description, Picture, Study
+from brewster.user_study.create import StudyOptions, create
+from brewster.user_study.study import PICTURES, CatchTrial, Comparison, Study, StudyDescription, StudyPicture
 
 
 def described(
@@ -23,9 +23,9 @@ def described(
         for dataset, name in photos
         for other in methods[1:]
     ]
-    catches_there = [Catch(*photo, "-".join(photo), "good", "spoilt") for photo in photos]
+    catches_there = [CatchTrial(*photo, "-".join(photo), "good", "spoilt") for photo in photos]
     names = {name for row in comparisons for name in (row.photo, *row.outputs)}
-    return Description(
+    return StudyDescription(
         brewster="0",
         seed=seed,
         pairs=pairs,
@@ -33,7 +33,7 @@ def described(
         consent="Yes?",
         methods=tuple(methods),
         datasets=tuple(datasets),
-        pictures=tuple(Picture(name, 3, 2, "", "") for name in sorted(names)),
+        pictures=tuple(StudyPicture(name, 3, 2, "", "") for name in sorted(names)),
         comparisons=tuple(comparisons),
         catch_pool=tuple(catches_there),
     )
@@ -71,7 +71,7 @@ def made(
         method: write_pictures(folder / method, names, size=size, seed=i + 1)
         for i, method in enumerate(methods)
     }
-    return create(folder / "study", inputs, outputs, Choices(**{"seed": 3} | choices))
+    return create(folder / "study", inputs, outputs, StudyOptions(**{"seed": 3} | choices))
 
 
 def choice_for(trial, outcome):

@@ -9,8 +9,8 @@ import pytest
 
 from brewster.errors import TargetError
 from brewster.web.application import address, listen
-from brewster.web.desk import Desk
-from brewster.web.guard import Guard
+from brewster.web.job_queue import JobQueue
+from brewster.web.middleware import RequestLimits
 from file_server import loopback_only
 from front_door import picture
 from glass_server import Stubborn, app_of, on_a_thread, spoken
@@ -52,7 +52,7 @@ def test_a_photo_is_separated_over_a_socket():
 
 def test_an_upload_too_long_is_answered_although_nobody_reads_it_whole():
     """A client that sends all before it reads must find an answer, and no broken connection."""
-    with on_a_thread(app_of(guard=Guard(max_bytes=10_000))) as port:
+    with on_a_thread(app_of(guard=RequestLimits(max_bytes=10_000))) as port:
         long = bytes(3_000_000)
         assert status(spoken(port, head(f"Content-Length: {len(long)}"), long)) == 413
         chunked = [chunk(bytes(100_000)) for _ in range(30)]
@@ -61,7 +61,7 @@ def test_an_upload_too_long_is_answered_although_nobody_reads_it_whole():
 
 
 def test_a_slow_upload_is_given_up():
-    with on_a_thread(app_of(guard=Guard(body_seconds=0.1))) as port:
+    with on_a_thread(app_of(guard=RequestLimits(body_seconds=0.1))) as port:
         answer = spoken(port, head(f"Content-Length: {len(FORM)}"), FORM[:50])
         assert status(answer) == 408
         assert b"send it again" in answer
@@ -69,7 +69,7 @@ def test_a_slow_upload_is_given_up():
 
 
 def test_an_upload_that_is_cut_off_harms_nobody():
-    desk = Desk(queue=0)
+    desk = JobQueue(queue=0)
     with on_a_thread(app_of(desk=desk)) as port:
         for end in (0, 30, 90, len(FORM) - 3):
             with socket.create_connection(("127.0.0.1", port)) as connection:
@@ -81,7 +81,7 @@ def test_an_upload_that_is_cut_off_harms_nobody():
 
 
 def test_a_connection_that_breaks_stops_the_work():
-    backend, desk = Stubborn(), Desk()
+    backend, desk = Stubborn(), JobQueue()
     with on_a_thread(app_of(backend, desk=desk)) as port:
         with socket.create_connection(("127.0.0.1", port)) as connection:
             connection.sendall(b"".join(whole()))
@@ -104,7 +104,7 @@ def test_what_is_no_http_is_answered_and_forgotten(rubbish):
 SERVING = """
 from fastapi import APIRouter
 from brewster.web.application import application, serve
-from brewster.web.guard import Guard
+from brewster.web.middleware import Guard
 try:
     serve(application(APIRouter(), guard=Guard()), host="127.0.0.1", port=0, tell=lambda url: print(url, flush=True))
 except KeyboardInterrupt:

@@ -5,12 +5,12 @@ import numpy as np
 import OpenEXR
 import pytest
 
+from brewster.environments import assets as worlds
+from brewster.environments.assets import Assets
 from brewster.errors import PhotoError, RecipeError, UnreadablePhoto, UnsupportedPhoto
-from brewster.light import REC709_LUMINANCE, to_linear
 from brewster.photo import Photo
-from brewster.scene.world import Map, Plane, Source
-from brewster.worlds import assets as worlds
-from brewster.worlds.assets import Assets
+from brewster.scene.world import AssetSource, EnvironmentMap, Plane
+from brewster.srgb import REC709_LUMINANCE, to_linear
 from picture_files import file_of, smooth
 
 HEIGHT, WIDTH = 32, 64
@@ -51,12 +51,12 @@ def folder(tmp_path):
 
 def map_light(folder, name, data, **values):
     (folder / name).write_bytes(data)
-    return Assets([folder]).map_light(Map(source=Source(file=name), **values))
+    return Assets([folder]).map_light(EnvironmentMap(source=AssetSource(file=name), **values))
 
 
 def plane_light(folder, name, data, **values):
     (folder / name).write_bytes(data)
-    plane = Plane(source=Source(file=name), distance_mm=1000, width_mm=1000, **values)
+    plane = Plane(source=AssetSource(file=name), distance_mm=1000, width_mm=1000, **values)
     return Assets([folder]).plane_light(plane)
 
 
@@ -106,7 +106,7 @@ def test_builtin_maps_need_no_folder(monkeypatch, random):
     monkeypatch.setitem(
         worlds.WORLDS, "street", lambda seed, height: asked.append((seed, height)) or sky(random)
     )
-    light = Assets().map_light(Map(source=Source(file="builtin:street:7"), luminance=3))
+    light = Assets().map_light(EnvironmentMap(source=AssetSource(file="builtin:street:7"), luminance=3))
     assert sphere_mean(luminance(light)) == pytest.approx(3, rel=1e-4)
     assert asked == [(7, worlds.BUILTIN_HEIGHT)]
 
@@ -116,7 +116,7 @@ def test_builtin_maps_need_no_folder(monkeypatch, random):
 )
 def test_maps_that_are_not_built_in_are_refused(name):
     with pytest.raises(RecipeError, match="is not built in") as error:
-        Assets().map_light(Map(source=Source(file=name)))
+        Assets().map_light(EnvironmentMap(source=AssetSource(file=name)))
     refused(error, name, "street, room, night")
 
 
@@ -125,10 +125,10 @@ def test_maps_that_are_not_built_in_are_refused(name):
 
 def test_a_missing_file_is_named_with_the_folders_that_were_searched(folder):
     with pytest.raises(RecipeError, match="was not found") as error:
-        Assets([folder]).map_light(Map(source=Source(file="gone.hdr")))
+        Assets([folder]).map_light(EnvironmentMap(source=AssetSource(file="gone.hdr")))
     refused(error, "gone.hdr", str(folder), "--maps")
     with pytest.raises(RecipeError, match="no folder"):
-        Assets().map_light(Map(source=Source(file="gone.hdr")))
+        Assets().map_light(EnvironmentMap(source=AssetSource(file="gone.hdr")))
 
 
 def test_another_file_of_the_same_name_is_refused(folder, random):
@@ -136,9 +136,11 @@ def test_another_file_of_the_same_name_is_refused(folder, random):
     (folder / "sky.hdr").write_bytes(data)
     right, wrong = hashlib.sha256(data).hexdigest(), hashlib.sha256(b"").hexdigest()
     assets = Assets([folder])
-    assets.map_light(Map(source=Source(file="sky.hdr", sha256=right)))
+    assets.map_light(EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=right)))
     with pytest.raises(RecipeError, match="not the file that the scene was drawn with") as error:
-        assets.map_light(Map(source=Source(file="sky.hdr", sha256=wrong)))  # not even from memory
+        assets.map_light(
+            EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=wrong))
+        )  # not even from memory
     refused(error, str(folder / "sky.hdr"), wrong)
 
 
@@ -148,7 +150,7 @@ def test_the_folder_with_the_right_file_is_found(tmp_path, folder, random):
     (folder / "sky.hdr").write_bytes(second)
     assets = Assets([tmp_path, folder])
     lights = [
-        assets.map_light(Map(source=Source(file="sky.hdr", sha256=sha256)))
+        assets.map_light(EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=sha256)))
         for sha256 in (hashlib.sha256(first).hexdigest(), hashlib.sha256(second).hexdigest(), "")
     ]
     assert not np.array_equal(lights[0], lights[1])
@@ -162,7 +164,7 @@ def test_a_file_that_cannot_be_read_is_named(folder, random, monkeypatch):
     monkeypatch.setattr(type(folder), "read_bytes", refuse)
     (folder / "sky.hdr").write_text("")
     with pytest.raises(RecipeError, match="Permission denied") as error:
-        Assets([folder]).map_light(Map(source=Source(file="sky.hdr")))
+        Assets([folder]).map_light(EnvironmentMap(source=AssetSource(file="sky.hdr")))
     refused(error, "sky.hdr")
 
 
@@ -274,7 +276,7 @@ def test_a_picture_whose_pixels_are_missing_is_refused_by_name(folder):
 
 def test_builtin_paintings_and_no_others():
     def plane(name):
-        return Plane(source=Source(file=name), distance_mm=1, width_mm=1)
+        return Plane(source=AssetSource(file=name), distance_mm=1, width_mm=1)
 
     assert Assets().plane_light(plane("builtin:painting:3")).shape == (512, 768, 3)
     with pytest.raises(RecipeError, match="is not built in") as error:
@@ -296,7 +298,7 @@ def test_what_was_used_last_is_kept_and_memory_is_bounded(folder, random, monkey
 
     def read(name):
         before = len(opened)
-        assets.map_light(Map(source=Source(file=f"{name}.hdr")))
+        assets.map_light(EnvironmentMap(source=AssetSource(file=f"{name}.hdr")))
         return len(opened) - before
 
     assert [read(name) for name in "ababacacb"] == [1, 1, 0, 0, 0, 1, 0, 0, 1]
@@ -306,15 +308,18 @@ def test_a_map_larger_than_the_bound_is_kept_alone(folder, random, monkeypatch):
     monkeypatch.setattr(worlds, "_KEPT_BYTES", 10)
     (folder / "a.hdr").write_bytes(hdr_of(sky(random)))
     assets = Assets([folder])
-    first = assets.map_light(Map(source=Source(file="a.hdr")))
+    first = assets.map_light(EnvironmentMap(source=AssetSource(file="a.hdr")))
     (folder / "a.hdr").unlink()
-    assert np.array_equal(assets.map_light(Map(source=Source(file="a.hdr"))), first)
+    assert np.array_equal(assets.map_light(EnvironmentMap(source=AssetSource(file="a.hdr"))), first)
 
 
 def test_the_scene_s_luminance_does_not_change_what_is_kept(folder, random):
     (folder / "a.hdr").write_bytes(hdr_of(sky(random)))
     assets = Assets([folder])
-    bright, dim = (assets.map_light(Map(source=Source(file="a.hdr"), luminance=value)) for value in (8, 0.5))
+    bright, dim = (
+        assets.map_light(EnvironmentMap(source=AssetSource(file="a.hdr"), luminance=value))
+        for value in (8, 0.5)
+    )
     np.testing.assert_allclose(bright, 16 * dim, rtol=1e-6)
 
 

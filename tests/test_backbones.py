@@ -10,10 +10,10 @@ import transformers
 from tokenizers.pre_tokenizers import ByteLevel
 
 from brewster.errors import DeviceError, DownloadError, ModelError
-from brewster.models.large import backbones, stock
-from brewster.models.large.adapter.lora import add_lora
-from brewster.models.large.backbones import BACKBONES, build, encode_prompt, load_backbone, tiny
-from brewster.models.large.prompt import PROMPT
+from brewster.models.diffusion import backbones, lazy_imports
+from brewster.models.diffusion.adapter.lora import add_lora
+from brewster.models.diffusion.backbones import BACKBONES, build, encode_prompt, load_backbone, tiny
+from brewster.models.diffusion.prompt import PROMPT
 
 
 @pytest.fixture(scope="module")
@@ -172,7 +172,7 @@ def with_words(tmp_path_factory):
         },
         "klein": {"tokenizer": qwen, "text_encoder": transformers.Qwen3ForCausalLM(layers)},
     }
-    stock.bars_on_terminals_only()
+    lazy_imports.bars_on_terminals_only()
     for name, reader in readers.items():
         pipeline = tiny(name)[0].pipeline()
         pipeline.register_modules(**reader)

@@ -7,11 +7,11 @@ import pillow_heif
 import pytest
 from PIL import Image
 
+from brewster.environments.catalog import BUILTIN_CATALOG, read_catalog
 from brewster.errors import PhotoTooLarge, RecipeError, UnreadablePhoto, UnsupportedPhoto
 from brewster.photo import Photo, read_size
 from brewster.photo import decode as decoding
 from brewster.scene.sampler import Catalog
-from brewster.worlds.catalog import BUILTIN_CATALOG, read_catalog
 from picture_files import exif_block, file_of, smooth
 
 KINDS = ["JPEG", "PNG", "TIFF", "WEBP", "AVIF", "GIF"]

@@ -18,9 +18,9 @@ from brewster import Photo, files, photo
 from brewster.cli import cli
 from brewster.cli.reference import reference
 from brewster.errors import BrewsterError
+from brewster.inference import QUALITIES
+from brewster.inference.onnx_backend import DEVICES
 from brewster.options import Options
-from brewster.separate import QUALITIES
-from brewster.separate.runtime import DEVICES
 from front_door import as_user, lines, picture, tree
 
 ROOT = Path(__file__).parents[1]
@@ -373,9 +373,9 @@ def test_a_terminal_shows_progress_and_standard_output_stays_clean(model, tmp_pa
 
 
 def test_the_names_of_the_house_are_there_in_any_order_of_import():
-    for start in ("import brewster", "import brewster.separate.tiles as brewster_tiles; import brewster"):
+    for start in ("import brewster", "import brewster.inference.tiles as brewster_tiles; import brewster"):
         code = f"{start}\nassert callable(brewster.separate) and callable(brewster.separate)\n"
-        code += "from brewster import Separator; assert brewster.separate.Separator is Separator\n"
+        code += "from brewster import Separator; assert brewster.inference.Separator is Separator\n"
         code += "assert callable(brewster.separate) and not hasattr(brewster, 'nonsense')\n"
         code += "assert set(brewster.__all__) <= set(dir(brewster)); from brewster import *"
         subprocess.run([sys.executable, "-c", code], check=True)

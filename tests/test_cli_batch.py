@@ -12,7 +12,7 @@ import pytest
 import pyvips
 
 from brewster import Photo
-from brewster.separate import Separator
+from brewster.inference import Separator
 from front_door import LAYERS, errors, lines, picture, results, tree
 
 # --- bad pictures
@@ -353,7 +353,7 @@ def test_json_says_what_became_of_every_photo(run, tmp_path, model):
     done, failed = lines(out)
     assert code == 1
     assert len(err.splitlines()) == 1
-    made_by = {"model", "sha256", "device", "seconds", "remainder", "drift", "doubtful"}
+    made_by = {"model", "sha256", "device", "seconds", "residual", "reconstruction_error", "doubtful"}
     keys = {"source", "status", "outputs", "error"} | made_by
     assert keys == set(done) == set(failed)
     assert done["outputs"] == {layer: f"a.{layer}.jpg" for layer in LAYERS}
@@ -366,7 +366,7 @@ def test_json_says_what_became_of_every_photo(run, tmp_path, model):
     assert len(done["sha256"]) == 64
     assert done["device"]
     assert set(done["seconds"]) == {"decode", "network", "detail", "encode"}
-    assert done["remainder"] == pytest.approx(0, abs=0.01)
+    assert done["residual"] == pytest.approx(0, abs=0.01)
     assert (failed["source"], failed["status"], failed["outputs"]) == ("b.jpg", "failed", {})
     assert failed["error"]
 

@@ -10,7 +10,7 @@ import pytest
 
 from brewster import Photo
 from brewster.errors import UnreadablePhoto
-from brewster.separate import Separator
+from brewster.inference import Separator
 from front_door import errors, lines, picture, results, tree
 from other_processes import started, wait_for
 
@@ -87,7 +87,7 @@ import sys
 from pathlib import Path
 from brewster.cli import main
 from brewster.cli.terminal import interrupts
-from brewster.separate import Separator
+from brewster.inference import Separator
 separate = Separator.__call__
 def endless(self, source, **options):
     while source.name == "06.jpg":

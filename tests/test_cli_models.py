@@ -20,11 +20,11 @@ ROOT = Path(__file__).parents[1]
 @pytest.fixture
 def shipped(model, monkeypatch, tmp_path):
     """A zoo with a whole model and a damaged one."""
-    whole = zoo.Model("compact", model, zoo.Model("", model, None, "").digest(), "Apache-2.0")
+    whole = zoo.ModelFile("compact", model, zoo.ModelFile("", model, None, "").digest(), "Apache-2.0")
     broken = tmp_path.parent / f"{tmp_path.name}.onnx"
     broken.write_bytes(b"half a mod")
     model.with_suffix(".md").write_text("# pane\nFails at night.\n")
-    damaged = zoo.Model("research", broken, "0" * 64, "CC-BY-NC-4.0")
+    damaged = zoo.ModelFile("research", broken, "0" * 64, "CC-BY-NC-4.0")
     monkeypatch.setattr(zoo, "MODELS", {"compact": whole, "research": damaged})
 
 

@@ -15,16 +15,16 @@ from pyarrow import parquet
 
 from brewster import Photo
 from brewster.cli import main
-from brewster.dataset import sets
-from brewster.dataset.build import workers
-from brewster.worlds import assets
+from brewster.environments import assets
+from brewster.rendered import store
+from brewster.rendered.generation import workers
 from front_door import as_user, errors, lines
 from set_folders import hashes
 
 FAKED = """
 import sys
 from brewster.cli import main
-from brewster.dataset.build import workers
+from brewster.rendered.generation import workers
 workers.RENDERERS["pane"] = "fake_renderer:{}"
 sys.exit(main(sys.argv[1:]))
 """
@@ -50,7 +50,7 @@ def test_a_set_is_rendered_shown_and_each_of_its_scenes_rendered_again(bare, tmp
     assert code == 0, err
     assert [(line["index"], line["status"]) for line in lines(out)] == [(0, "rendered"), (1, "rendered")]
     assert "2 rendered" in err
-    assert {path.name for path in (tmp_path / "set" / "000001").iterdir()} == set(sets.FILES)
+    assert {path.name for path in (tmp_path / "set" / "000001").iterdir()} == set(store.FILES)
     assert Photo.open(tmp_path / "set" / "000001" / "photo.jpg").size == (48, 32)
     assert Photo.open(tmp_path / "set" / "preview.png").size == (800, 240)
     assert parquet.read_table(tmp_path / "set" / "index.parquet")["orders"].to_pylist() == ["paper"] * 2
@@ -74,7 +74,7 @@ def test_shards_are_one_option_away(bare, fake, tmp_path):
     )
     for shard, key in (("shard-000000.tar", "000099"), ("shard-000001.tar", "000100")):
         with tarfile.open(tmp_path / "set" / shard) as tar:
-            assert tar.getnames() == [f"{key}.{name}" for name in sets.FILES]
+            assert tar.getnames() == [f"{key}.{name}" for name in store.FILES]
 
 
 def test_quiet_says_nothing(bare, fake):

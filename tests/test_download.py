@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from brewster.download import Line, Promise, digest_of
+from brewster.download import Downloader, RemoteFile, digest_of
 from brewster.errors import DownloadError, TargetError
 from file_server import loopback_only, served, unheard
 
@@ -28,7 +28,7 @@ def server():
 
 @pytest.fixture
 def promise(server):
-    return Promise(f"{server.url}/map", len(BODY), "sha256", hashlib.sha256(BODY).hexdigest())
+    return RemoteFile(f"{server.url}/map", len(BODY), "sha256", hashlib.sha256(BODY).hexdigest())
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def waited():
 
 @pytest.fixture
 def line(waited):
-    return Line(sleep=waited.append)
+    return Downloader(sleep=waited.append)
 
 
 @pytest.fixture
@@ -70,9 +70,9 @@ def test_a_line_that_breaks_is_taken_up_where_it_was(server, line, promise, targ
 def test_what_came_of_half_a_file_is_kept_for_the_next_call(server, promise, target):
     server.faults = ["cut"]
     with pytest.raises(DownloadError, match="ended after 160000 of 320000 bytes"):
-        Line(pauses_s=()).fetch(promise, target)
+        Downloader(pauses_s=()).fetch(promise, target)
     assert [path.name for path in target.parent.iterdir()] == ["map.part"]
-    Line(pauses_s=()).fetch(promise, target)
+    Downloader(pauses_s=()).fetch(promise, target)
     assert server.asked[-1] == ("/map", "bytes=160000-")
 
 

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from brewster.dataset import effects
-from brewster.dataset.sample_rng import SampleRng
+from brewster.training.data import effects
+from brewster.training.data.sample_rng import SampleRng
 
 
 @pytest.fixture

@@ -6,13 +6,13 @@ import pytest
 
 from benchmark_folders import paint
 from brewster import Photo
-from brewster.dataset.benchmarks import Benchmark, read_benchmark
+from brewster.benchmarks.registry import Benchmark, read_benchmark
 from brewster.errors import BrewsterError, PhotoError
+from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.evaluation import evaluate
-from brewster.evaluate.methods import Model, Nothing, Predictions
-from brewster.evaluate.protocol import Protocol
+from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder
 
-QUICK = Protocol(metrics=("psnr", "ssim", "psnr_region"))
+QUICK = EvaluationConfig(metrics=("psnr", "ssim", "psnr_region"))
 
 
 @pytest.fixture
@@ -27,9 +27,9 @@ def real20(tmp_path):
 @pytest.fixture
 def methods(model, tmp_path):
     return [
-        Nothing(),
-        Model("pane", str(model), tmp_path / "kept"),
-        Predictions("theirs", tmp_path / "theirs"),
+        IdentityBaseline(),
+        ModelMethod("pane", str(model), tmp_path / "kept"),
+        PredictionFolder("theirs", tmp_path / "theirs"),
     ]
 
 
@@ -62,7 +62,7 @@ def test_the_page_shows_the_worst_of_the_first_model(real20, methods, tmp_path):
 
 def test_the_page_shows_first_what_the_first_model_failed_on(real20, methods, tmp_path):
     (tmp_path / "theirs" / "2.png").unlink()
-    evaluate(real20, [Nothing(), methods[2]], QUICK, tmp_path / "out", shown=1)
+    evaluate(real20, [IdentityBaseline(), methods[2]], QUICK, tmp_path / "out", shown=1)
     page = (tmp_path / "out" / "report.html").read_text()
     assert 'data-name="2"' in page
     assert page.count("<article") == 1
@@ -71,7 +71,7 @@ def test_the_page_shows_first_what_the_first_model_failed_on(real20, methods, tm
 def test_a_truth_that_cannot_be_read_takes_no_place_on_the_page(real20, methods, tmp_path):
     path = tmp_path / "real20" / "transmission_layer" / "2.png"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    evaluate(real20, [Nothing(), methods[2]], QUICK, tmp_path / "out", shown=1)
+    evaluate(real20, [IdentityBaseline(), methods[2]], QUICK, tmp_path / "out", shown=1)
     assert 'data-name="1"' in (tmp_path / "out" / "report.html").read_text()
 
 
@@ -80,13 +80,13 @@ def test_who_rightly_changes_nothing_is_not_accused(tmp_path):
         paint(tmp_path / place, 1)
     parts = read_benchmark("real20", tmp_path / "real20")
     results = evaluate(
-        parts, [Nothing(), Predictions("theirs", tmp_path / "theirs")], QUICK, tmp_path / "out"
+        parts, [IdentityBaseline(), PredictionFolder("theirs", tmp_path / "theirs")], QUICK, tmp_path / "out"
     )
     assert not any("remark" in about for about in results["methods"].values())
 
 
 def test_without_a_model_the_page_shows_the_worst_photos(real20, tmp_path):
-    results = evaluate(real20, [Nothing()], QUICK, tmp_path / "out", shown=1)
+    results = evaluate(real20, [IdentityBaseline()], QUICK, tmp_path / "out", shown=1)
     scores = {picture["name"]: picture["scores"]["doing nothing"]["psnr"] for picture in results["pictures"]}
     page = (tmp_path / "out" / "report.html").read_text()
     assert f'data-name="{min(scores, key=scores.get)}"' in page
@@ -108,16 +108,20 @@ def test_pictures_without_a_case_are_said_aloud(real20, methods, tmp_path):
 
 
 def test_a_folder_of_truths_is_said_to_be_one(real20, tmp_path):
-    results = evaluate(real20, [Nothing(), Predictions("self", tmp_path / "real20")], QUICK, tmp_path / "out")
+    results = evaluate(
+        real20, [IdentityBaseline(), PredictionFolder("self", tmp_path / "real20")], QUICK, tmp_path / "out"
+    )
     assert "the truth itself on 2 pictures" in results["methods"]["self"]["remark"]
     assert "remark" not in results["methods"]["doing nothing"]
 
 
 def test_reduced_photos_are_left_for_those_who_answer_elsewhere(real20, tmp_path):
-    small = Protocol(metrics=("psnr",), size=8)
-    evaluate(real20, [Nothing()], small, tmp_path / "out")
+    small = EvaluationConfig(metrics=("psnr",), size=8)
+    evaluate(real20, [IdentityBaseline()], small, tmp_path / "out")
     inputs = tmp_path / "out" / "inputs"
-    results = evaluate(real20, [Nothing(), Predictions("copied", inputs)], small, tmp_path / "out")
+    results = evaluate(
+        real20, [IdentityBaseline(), PredictionFolder("copied", inputs)], small, tmp_path / "out"
+    )
     table = results["tables"]["real20"]
     assert table["copied"] == table["doing nothing"]
     assert Photo.open(inputs / "real20" / "1.png").size == (12, 8)

@@ -14,7 +14,7 @@ from platformdirs import macos, unix
 
 from brewster import files
 from brewster.errors import TargetError
-from brewster.files import SUFFIXES, Job, cache_folder, find, write_atomically
+from brewster.files import SUFFIXES, SeparationPaths, cache_folder, find, write_atomically
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -25,7 +25,7 @@ def touch(folder: Path, *names: str) -> Path:
     return folder
 
 
-def names(jobs: list[Job]) -> dict[str, str]:
+def names(jobs: list[SeparationPaths]) -> dict[str, str]:
     return {job.source.name: job.name for job in jobs}
 
 

@@ -16,10 +16,10 @@ import pytest
 
 import brewster
 import brewster.errors
+import brewster.inference
 import brewster.photo
-import brewster.separate
+from brewster.inference.tiles import in_tiles
 from brewster.options import Options
-from brewster.separate.tiles import in_tiles
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "brewster"
@@ -71,18 +71,18 @@ def test_large_image_models_have_one_door():
         for path in FILES
         for library in re.findall(r'\b(?:library|stock_class)\("?(\w+)', path.read_text())
     }
-    outside = {library for room, library in opened if room != ("models", "large")}
+    outside = {library for room, library in opened if room != ("models", "diffusion")}
     assert outside == {"accelerate"}  # train/crew
 
 
 def test_separating_a_photo_needs_no_torch():
-    code = "import brewster.separate, sys; assert not {'torch', 'scipy', 'PIL'} & set(sys.modules)"
+    code = "import brewster.inference, sys; assert not {'torch', 'scipy', 'PIL'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_the_signature_of_separate_shows_the_source_and_every_option():
     shown = inspect.signature(brewster.separate)
-    assert shown == inspect.signature(brewster.separate.separate)
+    assert shown == inspect.signature(brewster.inference.separate)
     assert list(shown.parameters)[:3] == ["source", "model", "device"]
     assert set(Options.__dataclass_fields__) & {"strength", "quality", "additive"} <= set(shown.parameters)
 
@@ -111,7 +111,7 @@ brewster.separate()
 
 def test_every_public_name_is_exported_and_documented():
     """What a module defines without an underscore and other rooms use is what it exports."""
-    for module in (brewster.photo, brewster.separate):
+    for module in (brewster.photo, brewster.inference):
         assert module.__all__ == sorted(module.__all__, key=lambda name: (not name.isupper(), name))
         defined = {
             name
@@ -196,7 +196,19 @@ def test_every_link_in_the_documents_leads_somewhere():
             assert (document.parent / link).exists(), f"{document.name}: {link}"
 
 
-def test_every_test_file_is_named_after_a_module_a_room_or_a_rule():
-    modules = {path.stem for path in FILES} | {path.parent.name for path in FILES} | {"house"}
+def test_every_test_file_is_named_after_a_module_a_package_or_the_house():
+    names = {path.stem for path in FILES} | {path.parent.name for path in FILES} | {"house", "report"}
     for path in (ROOT / "tests").glob("test_*.py"):
-        assert path.stem.removeprefix("test_").split("_")[0] in modules, path.name
+        words = path.stem.removeprefix("test_").split("_")
+        beginnings = {"_".join(words[:count]) for count in range(1, len(words) + 1)}
+        assert beginnings & names, path.name
+
+
+def test_public_class_names_are_unique():
+    names = [
+        node.name
+        for path in FILES
+        for node in ast.parse(path.read_text()).body
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+    ]
+    assert sorted(set(names)) == sorted(names)

@@ -14,20 +14,20 @@ import pytest
 from onnx import TensorProto, helper
 
 from brewster import Photo
-from brewster.dataset.benchmarks import Case
-from brewster.dataset.sets import SAMPLE_FORMAT
-from brewster.evaluate.judge import Judge, Truth
-from brewster.evaluate.methods import ANSWER_FORMAT, Answer, Model
-from brewster.evaluate.protocol import Protocol
+from brewster.benchmarks.registry import Case
+from brewster.environments.catalog import BUILTIN_CATALOG
+from brewster.environments.procedural.rooms import WORLDS as WORLDS_BY_NAME
+from brewster.evaluate.config import EvaluationConfig
+from brewster.evaluate.methods import ANSWER_FORMAT, MethodOutput, ModelMethod
 from brewster.evaluate.runner import SCORE_FORMAT
+from brewster.evaluate.scoring import GroundTruth, Scorer
+from brewster.inference import QUALITIES
 from brewster.metrics import METRICS
-from brewster.render.develop import develop
-from brewster.render.pane import render
+from brewster.render.analytic import render
+from brewster.render.camera_response import develop
+from brewster.rendered.store import SAMPLE_FORMAT
 from brewster.scene.recipe import read_scene_recipe
 from brewster.scene.sampler import draw
-from brewster.separate import QUALITIES
-from brewster.worlds.catalog import BUILTIN_CATALOG
-from brewster.worlds.procedural import WORLDS as WORLDS_BY_NAME
 from picture_files import smooth
 from worlds_of_one import WORLDS, a_scene, around, board
 
@@ -214,7 +214,7 @@ def leaning(tmp_path_factory):
 def test_a_changed_answer_raises_the_format_of_answers(leaning, tmp_path):
     photo, made = Photo.from_array(picture(1, 720, 960), encoding="srgb"), {}
     for quality in QUALITIES:
-        answer = Model("leaning", str(leaning), tmp_path, quality=quality).answer(case(), photo)
+        answer = ModelMethod("leaning", str(leaning), tmp_path, quality=quality).answer(case(), photo)
         layers = np.concatenate(
             [layer.pixels[7::240, 9::240, 1] for layer in (answer.transmission, answer.reflection)]
         )
@@ -228,10 +228,10 @@ def scores(names):
     behind[:, :20], mirrored[:, :20] = photo[:, :20], 0  # nothing is mirrored at the left
     behind[:16, :16] = 220  # something white
     pictures = {"photo": photo, "transmission": behind, "reflection": mirrored}
-    truth = Truth(case(rendered=True), Photo.from_array(photo, encoding="srgb"), pictures)
+    truth = GroundTruth(case(rendered=True), Photo.from_array(photo, encoding="srgb"), pictures)
     moved = np.roll(behind, 1, axis=1) // 2 + photo // 2
     layers = (Photo.from_array(layer, encoding="srgb") for layer in (moved, photo // 7))
-    return Judge(truth, Protocol(metrics=names)).score(Answer(*layers))
+    return Scorer(truth, EvaluationConfig(metrics=names)).score(MethodOutput(*layers))
 
 
 def test_a_changed_score_raises_the_format_of_scores():

@@ -12,7 +12,7 @@ import click
 import pytest
 
 from brewster.cli import cli
-from brewster.models.large.adapter.hub import FILES
+from brewster.models.diffusion.adapter.hub import FILES
 from brewster.photo import Photo
 
 ROOT = Path(__file__).parents[1]

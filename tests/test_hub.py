@@ -10,13 +10,13 @@ from huggingface_hub import ModelCard
 
 import fake_hub
 from brewster.errors import DownloadError, ModelError
-from brewster.models.large.adapter.hub import FILES, plan_push, push
-from brewster.models.large.adapter.lora import LORA_FILE, add_lora, load_lora, save_lora
-from brewster.models.large.backbones import BACKBONES, tiny
-from brewster.models.large.task import Task
-from brewster.models.large.tensors import read_tensors, said_of
-from brewster.train.large.card import write_card
-from brewster.train.recipe import LargeRecipe
+from brewster.models.diffusion.adapter.hub import FILES, plan_push, push
+from brewster.models.diffusion.adapter.lora import LORA_FILE, add_lora, load_lora, save_lora
+from brewster.models.diffusion.backbones import BACKBONES, tiny
+from brewster.models.diffusion.task import DecompositionTask
+from brewster.models.diffusion.tensors import read_tensors, said_of
+from brewster.training.lora.model_card import write_card
+from brewster.training.recipe import LoraRecipe
 from file_server import loopback_only, unheard
 
 REPO = "somebody/sees-through-glass"
@@ -45,8 +45,8 @@ def write(twin, tmp_path):
     def write(base="kontext", sets="sets/window"):
         folder = tmp_path / "lora"
         hub_id = BACKBONES["kontext"].hub_id if base == "kontext" else base
-        save_lora(folder, *twin, Task(), base=hub_id)
-        recipe = LargeRecipe.model_validate(
+        save_lora(folder, *twin, DecompositionTask(), base=hub_id)
+        recipe = LoraRecipe.model_validate(
             VALUES | {"backbone": base, "data": {"rendered": {"sets": [sets]}}}
         )
         (folder / "recipe.json").write_text(json.dumps(recipe.model_dump(mode="json"), indent=2))

@@ -6,15 +6,22 @@ import torch
 from hypothesis import given, reject
 from hypothesis import strategies as st
 
-from brewster.dataset.mix import Pairs
-from brewster.dataset.sample_rng import SampleRng
-from brewster.dataset.sets import read_set
 from brewster.errors import PhotoError, RecipeError
-from brewster.models.large.backbones import tiny
-from brewster.models.large.panels import Layout, fit_panel, split
+from brewster.models.diffusion.backbones import tiny
+from brewster.models.diffusion.panels import PanelLayout, fit_panel, split
 from brewster.photo import Photo
-from brewster.train.large.latents import Latents, cropped, open_samples, panel_for, panels_in, with_difference
-from brewster.train.recipe import LargeRecipe
+from brewster.rendered.store import read_set
+from brewster.training.data.mixtures import Pairs
+from brewster.training.data.sample_rng import SampleRng
+from brewster.training.lora.latents import (
+    LatentEncoder,
+    cropped,
+    open_samples,
+    panel_for,
+    panels_in,
+    with_difference,
+)
+from brewster.training.recipe import LoraRecipe
 from set_folders import make
 
 RECIPE = {
@@ -53,7 +60,7 @@ def root(tmp_path_factory):
 @pytest.fixture
 def recipe(root, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(root))
-    return lambda data, **changes: LargeRecipe.model_validate(RECIPE | {"data": data} | changes)
+    return lambda data, **changes: LoraRecipe.model_validate(RECIPE | {"data": data} | changes)
 
 
 RENDERED = {"rendered": {"sets": ["set"], "target": "transmission"}}
@@ -77,7 +84,7 @@ def test_panels_are_the_whole_sample_in_its_own_aspect_ratio(recipe, root, backb
 
 def test_an_encoded_sample_depends_on_the_dice_alone_and_is_encoded_once(recipe, backbone, monkeypatch):
     wanted = recipe(RENDERED)
-    one, other = (Latents(open_samples(wanted), backbone, wanted) for _ in range(2))
+    one, other = (LatentEncoder(open_samples(wanted), backbone, wanted) for _ in range(2))
     for slot in range(4):
         other(SampleRng(1, 0, slot))
     assert torch.equal(one(SampleRng(1, 7, 0)).composite, other(SampleRng(1, 7, 0)).composite)
@@ -91,7 +98,7 @@ def test_mirrored_samples_are_seen_unless_the_recipe_forbids_it(recipe, backbone
     counts = []
     for flip in (True, False):
         wanted = recipe(RENDERED, flip=flip)
-        latents = Latents(open_samples(wanted), backbone, wanted)
+        latents = LatentEncoder(open_samples(wanted), backbone, wanted)
         counts.append(len({id(latents(SampleRng(1, step, 0))) for step in range(60)}))
     assert counts == [6, 3]
 
@@ -99,7 +106,7 @@ def test_mirrored_samples_are_seen_unless_the_recipe_forbids_it(recipe, backbone
 def test_as_many_crops_of_each_sample_are_seen_as_the_recipe_says_beside_the_whole(recipe, backbone):
     for crops, seen in ((0, 6), (2, 18)):
         wanted = recipe(LARGE, crops=crops)
-        latents = Latents(open_samples(wanted), backbone, wanted)
+        latents = LatentEncoder(open_samples(wanted), backbone, wanted)
         encoded = {id(each): each for each in (latents(SampleRng(1, step, 0)) for step in range(200))}
         assert len(encoded) == seen
         different = {each.composite.numpy().tobytes() for each in encoded.values()}
@@ -110,7 +117,7 @@ def test_as_many_crops_of_each_sample_are_seen_as_the_recipe_says_beside_the_who
 def test_a_crop_depends_on_seed_sample_and_its_number_alone(recipe, backbone):
     def encoded(number, crop, **changes):
         wanted = recipe(LARGE, crops=3, **changes)
-        return Latents(open_samples(wanted), backbone, wanted)._encode(number, False, crop).composite
+        return LatentEncoder(open_samples(wanted), backbone, wanted)._encode(number, False, crop).composite
 
     assert torch.equal(encoded(1, 2), encoded(1, 2, steps=9, flip=False))
     for other in (encoded(1, 1), encoded(0, 2), encoded(1, 2, seed=2), encoded(1, 0)):
@@ -121,7 +128,7 @@ def test_a_crop_depends_on_seed_sample_and_its_number_alone(recipe, backbone):
 def test_a_crop_is_a_window_of_the_samples_shape_and_never_smaller_than_it_is_shown(
     width, height, cells, seed
 ):
-    layout = Layout()
+    layout = PanelLayout()
     cells = min(cells, (width // 16) * (height // 16))
     try:
         fit = fit_panel((width, height), layout, budget_px=3 * 16 * 16 * cells, multiple=16)
@@ -174,10 +181,10 @@ def test_a_reflection_that_is_given_is_trusted_and_one_that_is_not_is_the_light_
 def test_a_sample_that_is_smaller_than_a_panel_is_refused_with_the_budget_that_fits(recipe, backbone):
     wanted = recipe(RENDERED, budget_px=10**6)
     with pytest.raises(PhotoError, match="lower budget_px to 768"):
-        Latents(open_samples(wanted), backbone, wanted)
+        LatentEncoder(open_samples(wanted), backbone, wanted)
     pair = recipe({"pairs": ["trios"], "pairs_share": 1.0}, budget_px=10**6)
     with pytest.raises(PhotoError, match="lower budget_px to"):
-        Latents(open_samples(pair), backbone, pair)
+        LatentEncoder(open_samples(pair), backbone, pair)
 
 
 def test_more_samples_than_there_are_are_refused(recipe):
@@ -186,7 +193,7 @@ def test_more_samples_than_there_are_are_refused(recipe):
 
 
 def test_crops_have_half_to_all_of_the_samples_sides():
-    fit = fit_panel((300, 200), Layout(), budget_px=3 * 48 * 32, multiple=16)
+    fit = fit_panel((300, 200), PanelLayout(), budget_px=3 * 48 * 32, multiple=16)
     whole = torch.zeros(200, 300, 9, dtype=torch.uint8)
     shares = [cropped(SampleRng(seed, -1, 1), whole, fit).shape[0] / 200 for seed in range(200)]
     assert 0.5 <= min(shares) < 0.52

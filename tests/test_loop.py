@@ -6,13 +6,13 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from brewster.dataset.sources import read_photos
 from brewster.errors import ModelError, RecipeError
 from brewster.photo import Photo
-from brewster.train.checkpoint import Checkpoint
-from brewster.train.compact.learner import CompactLearner, train
-from brewster.train.loop import run
-from brewster.train.recipe import with_value
+from brewster.training.checkpoint import Checkpoint
+from brewster.training.compact.trainer import CompactTrainer, train
+from brewster.training.data.image_loading import read_photos
+from brewster.training.loop import run
+from brewster.training.recipe import with_value
 from front_door import picture
 
 RECIPES = Path(__file__).parents[1] / "recipes"
@@ -62,7 +62,7 @@ class Counting:
 
 def checkpoint(recipe):
     """The state that a run begins with."""
-    return Checkpoint(0, recipe.model_dump_json(), CompactLearner(recipe).state())
+    return Checkpoint(0, recipe.model_dump_json(), CompactTrainer(recipe).state())
 
 
 def logged_steps(out):

@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from brewster.errors import ModelError
-from brewster.models.large.adapter.lora import (
+from brewster.models.diffusion.adapter.lora import (
     LORA_FILE,
     LoraCard,
     add_lora,
@@ -20,10 +20,10 @@ from brewster.models.large.adapter.lora import (
     remove_lora,
     save_lora,
 )
-from brewster.models.large.backbones import BACKBONES, tiny
-from brewster.models.large.panels import Layout
-from brewster.models.large.task import Task
-from brewster.models.large.tensors import read_tensors, write_tensors
+from brewster.models.diffusion.backbones import BACKBONES, tiny
+from brewster.models.diffusion.panels import PanelLayout
+from brewster.models.diffusion.task import DecompositionTask
+from brewster.models.diffusion.tensors import read_tensors, write_tensors
 
 
 @pytest.fixture(params=list(BACKBONES))
@@ -115,7 +115,7 @@ def test_a_saved_lora_gives_the_same_picture_reloaded_and_in_stock_diffusers(twi
     untouched = velocity(backbone, prompt)
     with_lora = velocity(trained(backbone, alpha=alpha), prompt)
     assert (with_lora - untouched).abs().max() > 1e-3
-    card = save_lora(tmp_path, backbone, prompt, Task())
+    card = save_lora(tmp_path, backbone, prompt, DecompositionTask())
 
     backbone.transformer = copy.deepcopy(plain)
     assert load_lora(tmp_path, backbone)[0] == card == read_card(tmp_path)
@@ -131,7 +131,7 @@ def test_the_same_lora_gives_the_same_bytes(kontext, tmp_path):
     backbone, prompt = kontext
     trained(backbone)
     for name in "ab":
-        save_lora(tmp_path / name, backbone, prompt, Task())
+        save_lora(tmp_path / name, backbone, prompt, DecompositionTask())
     assert (tmp_path / "a" / LORA_FILE).read_bytes() == (tmp_path / "b" / LORA_FILE).read_bytes()
 
 
@@ -157,7 +157,7 @@ def test_removing_a_lora_gives_the_plain_backbone_back(twin):
 
 def test_a_lora_of_another_backbone_is_refused(kontext, tmp_path):
     backbone, prompt = kontext
-    save_lora(tmp_path, trained(backbone), prompt, Task())
+    save_lora(tmp_path, trained(backbone), prompt, DecompositionTask())
     with pytest.raises(ModelError, match="is a LoRA of kontext; one of klein; load the backbone kontext"):
         load_lora(tmp_path, tiny("klein")[0])
 
@@ -170,7 +170,7 @@ def changed_card(folder, **changes):
 
 def test_a_card_that_does_not_fit_its_weights_is_refused_and_leaves_no_trace(kontext, tmp_path):
     backbone, prompt = kontext
-    save_lora(tmp_path, trained(backbone), prompt, Task())
+    save_lora(tmp_path, trained(backbone), prompt, DecompositionTask())
     changed_card(tmp_path, rank=8)
     fresh, _ = tiny("kontext", seed=1)
     with pytest.raises(ModelError, match=r"has the shape \(4, 32\); \(8, 32\); use the rank"):
@@ -180,7 +180,7 @@ def test_a_card_that_does_not_fit_its_weights_is_refused_and_leaves_no_trace(kon
 
 def test_a_smaller_backbone_of_the_same_family_is_refused(kontext, tmp_path):
     backbone, prompt = kontext
-    save_lora(tmp_path, trained(backbone), prompt, Task())
+    save_lora(tmp_path, trained(backbone), prompt, DecompositionTask())
     fresh, _ = tiny("kontext", seed=1)
     fresh.transformer.single_transformer_blocks = fresh.transformer.single_transformer_blocks[:1]
     with pytest.raises(ModelError, match=r"too few or too many, single_transformer_blocks\.1"):
@@ -189,7 +189,7 @@ def test_a_smaller_backbone_of_the_same_family_is_refused(kontext, tmp_path):
 
 def test_another_prompt_in_the_folder_is_refused(kontext, tmp_path):
     backbone, prompt = kontext
-    save_lora(tmp_path, trained(backbone), prompt, Task())
+    save_lora(tmp_path, trained(backbone), prompt, DecompositionTask())
     changed_card(tmp_path, prompt_sha256="0" * 64)
     with pytest.raises(ModelError, match="is not the prompt that the LoRA was trained with"):
         load_lora(tmp_path, tiny("kontext")[0])
@@ -199,7 +199,7 @@ def test_a_corrupt_or_foreign_or_missing_file_is_refused(kontext, tmp_path):
     backbone, prompt = kontext
     with pytest.raises(ModelError, match="is missing"):
         load_lora(tmp_path, backbone)
-    save_lora(tmp_path, trained(backbone), prompt, Task())
+    save_lora(tmp_path, trained(backbone), prompt, DecompositionTask())
     path = tmp_path / LORA_FILE
     tensors, _ = read_tensors(path)
     path.write_bytes(path.read_bytes()[:1000])
@@ -216,17 +216,17 @@ def test_a_corrupt_or_foreign_or_missing_file_is_refused(kontext, tmp_path):
 def test_one_lora_at_a_time_and_only_what_is_there(kontext, tmp_path):
     backbone, prompt = kontext
     with pytest.raises(ModelError, match="has no LoRA"):
-        save_lora(tmp_path, backbone, prompt, Task())
+        save_lora(tmp_path, backbone, prompt, DecompositionTask())
     with pytest.raises(ModelError, match="the rank is 0"):
         add_lora(backbone, rank=0)
     add_lora(backbone, rank=2)
     with pytest.raises(ModelError, match="has a LoRA already"):
         add_lora(backbone)
     with pytest.raises(ModelError, match="encoded for klein"):
-        save_lora(tmp_path, backbone, tiny("klein")[1], Task())
+        save_lora(tmp_path, backbone, tiny("klein")[1], DecompositionTask())
 
 
 def test_a_card_comes_back_from_its_line():
-    task = Task(Layout(("T", "R"), "stacked"), 4096, "one_step", 1.0)
+    task = DecompositionTask(PanelLayout(("T", "R"), "stacked"), 4096, "one_step", 1.0)
     card = LoraCard("qwen", "Qwen/Qwen-Image-Edit", "int8", 16, 8, task, "abc")
     assert LoraCard.from_json(card.to_json()) == card

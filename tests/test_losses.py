@@ -5,15 +5,15 @@ import math
 import pytest
 import torch
 
-from brewster.dataset.mix import Batch
 from brewster.errors import ModelError
-from brewster.train.losses import finite, gain_db, separation_loss, tone
+from brewster.training.data.mixtures import TrainingBatch
+from brewster.training.losses import finite, gain_db, separation_loss, tone
 
 
 def truth(level=0.4, trust=1.0):
     """Two samples of 32 px: photo, transmission and reflection of one grey."""
     grey = torch.full((2, 3, 32, 32), level)
-    return Batch(grey, grey, grey, torch.full((2,), trust))
+    return TrainingBatch(grey, grey, grey, torch.full((2,), trust))
 
 
 def loss_of(transmission_error=0.0, reflection_error=0.0, *, trust=1.0):

@@ -9,10 +9,10 @@ import pyvips
 
 from benchmark_folders import picture, repacked, write
 from brewster import Photo
-from brewster.dataset.benchmarks import read_benchmark
+from brewster.benchmarks.registry import read_benchmark
 from brewster.errors import BrewsterError, PhotoError
-from brewster.evaluate.methods import Model, Nothing, Predictions, refuse_names
-from brewster.photo import Origin
+from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder, refuse_names
+from brewster.photo import FileInfo
 
 
 @pytest.fixture
@@ -29,7 +29,7 @@ def case(cases):
 
 def method(tmp_path, *places):
     write(tmp_path / "theirs", *places)
-    return Predictions("theirs", tmp_path / "theirs")
+    return PredictionFolder("theirs", tmp_path / "theirs")
 
 
 NAMES = [
@@ -98,7 +98,7 @@ def test_a_folder_in_which_no_name_fits_is_refused_at_once(cases, tmp_path):
     with pytest.raises(PhotoError, match="called like a case"):
         method(tmp_path, "a.png", "b.png").refuse_wrong_pairing(cases)
     with pytest.raises(PhotoError, match="no folder"):
-        Predictions("theirs", tmp_path / "nowhere").refuse_wrong_pairing(cases)
+        PredictionFolder("theirs", tmp_path / "nowhere").refuse_wrong_pairing(cases)
 
 
 def test_pictures_that_answer_no_case_are_counted(cases, tmp_path):
@@ -107,13 +107,13 @@ def test_pictures_that_answer_no_case_are_counted(cases, tmp_path):
 
 def test_doing_nothing_is_the_photo_and_black(case):
     photo = Photo.open(case.photo.read())
-    answer = Nothing().answer(case, photo)
+    answer = IdentityBaseline().answer(case, photo)
     assert answer.transmission is photo
     assert not answer.reflection.pixels.any()
 
 
 def test_a_model_answers_as_the_separator_does_and_keeps_its_answer(case, model, tmp_path):
-    ours = Model("pane", str(model), tmp_path / "kept")
+    ours = ModelMethod("pane", str(model), tmp_path / "kept")
     assert ours.kept(case) is None
     photo = Photo.open(case.photo.read())
     answer = ours.answer(case, photo)
@@ -121,28 +121,28 @@ def test_a_model_answers_as_the_separator_does_and_keeps_its_answer(case, model,
     kept = ours.kept(case)
     assert np.array_equal(kept.transmission.srgb_8bit(), answer.transmission.srgb_8bit())
     assert np.array_equal(kept.reflection.srgb_8bit(), answer.reflection.srgb_8bit())
-    assert Predictions("again", tmp_path / "kept").files(case).keys() == {"transmission", "reflection"}
+    assert PredictionFolder("again", tmp_path / "kept").files(case).keys() == {"transmission", "reflection"}
 
 
 def test_what_is_kept_of_a_deep_wide_photo_is_what_is_scored(case, model, tmp_path):
     pixels = np.random.default_rng(1).integers(0, 1 << 16, (6, 8, 3), np.uint16)
-    photo = Photo(pixels, None, Origin(bits=16, icc=bytes(pyvips.Image.profile_load("p3"))))
-    ours = Model("pane", str(model), tmp_path / "kept")
+    photo = Photo(pixels, None, FileInfo(bits=16, icc=bytes(pyvips.Image.profile_load("p3"))))
+    ours = ModelMethod("pane", str(model), tmp_path / "kept")
     answer, kept = ours.answer(case, photo), ours.kept(case)
     assert np.array_equal(kept.transmission.srgb_8bit(), answer.transmission.srgb_8bit())
 
 
 def test_a_key_changes_with_all_that_the_answer_depends_on(case, model, tmp_path):
-    draft = Model("pane", str(model), tmp_path, quality="draft")
-    assert draft.key(case) != Model("pane", str(model), tmp_path).key(case)
+    draft = ModelMethod("pane", str(model), tmp_path, quality="draft")
+    assert draft.key(case) != ModelMethod("pane", str(model), tmp_path).key(case)
     theirs = method(tmp_path, "1.png")
     before = theirs.key(case)
     write(tmp_path / "theirs", "1.png", data=picture((8, 7), "png"))
-    assert Predictions("theirs", tmp_path / "theirs").key(case) != before
+    assert PredictionFolder("theirs", tmp_path / "theirs").key(case) != before
 
 
 def test_methods_are_data_that_other_processes_can_take(model, tmp_path):
-    for one in (Nothing(), Model("pane", str(model), tmp_path), method(tmp_path, "1.png")):
+    for one in (IdentityBaseline(), ModelMethod("pane", str(model), tmp_path), method(tmp_path, "1.png")):
         assert pickle.loads(pickle.dumps(one)) == one
 
 
@@ -153,13 +153,13 @@ def test_no_method_at_all_is_refused():
 
 def test_two_methods_of_one_name_are_refused(tmp_path):
     with pytest.raises(BrewsterError, match="2 methods are called 'doing nothing'"):
-        refuse_names([Nothing(), Predictions("doing nothing", tmp_path)])
+        refuse_names([IdentityBaseline(), PredictionFolder("doing nothing", tmp_path)])
 
 
 @pytest.mark.parametrize("name", ["../out", "a/b", "a\\b", "..", ".", "", "two\nlines", "\udcff"])
 def test_names_that_are_no_names_of_folders_are_refused(name, tmp_path):
     with pytest.raises(BrewsterError, match="names become folders"):
-        refuse_names([Predictions(name, tmp_path)])
+        refuse_names([PredictionFolder(name, tmp_path)])
 
 
 def test_a_folder_that_is_a_link_is_looked_into_and_a_loop_ends(case, tmp_path):
@@ -168,7 +168,7 @@ def test_a_folder_that_is_a_link_is_looked_into_and_a_loop_ends(case, tmp_path):
     theirs.mkdir()
     (theirs / "real20").symlink_to(tmp_path / "elsewhere")
     (theirs / "loop").symlink_to(theirs)
-    (found,) = Predictions("theirs", theirs).files(case).values()
+    (found,) = PredictionFolder("theirs", theirs).files(case).values()
     assert found == theirs / "real20" / "1.png"
 
 

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from brewster.light import to_encoded, to_linear
 from brewster.metrics import kept_reflection, removed_content, removed_white
+from brewster.srgb import to_encoded, to_linear
 
 SIDE = 48
 TRANSMITTANCE = 0.8

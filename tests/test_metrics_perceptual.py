@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from torch.nn import functional
 
-from brewster.download import Line, Promise
+from brewster.download import Downloader, RemoteFile
 from brewster.errors import DownloadError, MissingExtra, ModelError
 from brewster.metrics import Lpips, lpips, perceptual
 from brewster.metrics.weights import FILE, NAMES, digest_of, load_backbone, read_backbone, read_heads
@@ -242,7 +242,7 @@ def saved(state, path=None):
 
 def promised(server, body):
     server.bodies["/whole.pth"] = body
-    return Promise(f"{server.url}/whole.pth", len(body), "sha256", hashlib.sha256(body).hexdigest())
+    return RemoteFile(f"{server.url}/whole.pth", len(body), "sha256", hashlib.sha256(body).hexdigest())
 
 
 def test_the_file_in_the_shared_data_has_the_pinned_digest(data):
@@ -276,16 +276,16 @@ def test_half_a_download_is_taken_up_and_none_is_taken_for_whole(server, state, 
     promise, digest = promised(server, body), digest_of(state)
     server.faults = ["cut"]
     with pytest.raises(DownloadError, match="ended after"):
-        load_backbone(promise, digest, line=Line(pauses_s=()))
+        load_backbone(promise, digest, line=Downloader(pauses_s=()))
     assert [path.name for path in cache.iterdir()] == ["whole.pth.part"]
-    load_backbone(promise, digest, line=Line(pauses_s=()))
+    load_backbone(promise, digest, line=Downloader(pauses_s=()))
     assert server.asked[-1] == ("/whole.pth", f"bytes={len(body) // 2}-")
 
 
 def test_a_server_that_is_not_there_is_explained():
-    promise = Promise(f"{unheard()}/whole.pth", 9, "sha256", "0")
+    promise = RemoteFile(f"{unheard()}/whole.pth", 9, "sha256", "0")
     with pytest.raises(DownloadError, match="check the connection"):
-        load_backbone(promise, line=Line(pauses_s=()))
+        load_backbone(promise, line=Downloader(pauses_s=()))
 
 
 def test_another_file_from_the_server_is_dropped(server, state, cache):

@@ -7,11 +7,11 @@ import torch
 from torch import nn
 
 from brewster.errors import ModelError, RecipeError
+from brewster.inference.onnx_backend import OnnxBackend
 from brewster.models.networks import DEFAULT_NETWORK, LARGEST_STRIDE, NETWORKS, NetworkEntry
-from brewster.separate.runtime import OnnxBackend
-from brewster.train.checkpoint import Checkpoint
-from brewster.train.compact.learner import CompactLearner, train
-from brewster.train.recipe import with_value
+from brewster.training.checkpoint import Checkpoint
+from brewster.training.compact.trainer import CompactTrainer, train
+from brewster.training.recipe import with_value
 
 
 class Small(nn.Module):
@@ -53,13 +53,13 @@ def test_every_network_keeps_the_promises_of_its_row(name):
 
 def test_a_recipe_without_a_network_trains_the_default_one(recipe):
     assert recipe.network == DEFAULT_NETWORK
-    assert type(CompactLearner(recipe).network) is NETWORKS[DEFAULT_NETWORK].build
+    assert type(CompactTrainer(recipe).network) is NETWORKS[DEFAULT_NETWORK].build
 
 
 def test_a_recipe_trains_and_exports_the_network_that_it_names(recipe, small, tmp_path):
     recipe = with_value(recipe, "network", small)
     assert isinstance(train(recipe, tmp_path, silent), Small)
-    learner = CompactLearner(recipe)
+    learner = CompactTrainer(recipe)
     learner.restore(Checkpoint.read(tmp_path / "checkpoint.pt").state)
     backend = OnnxBackend(learner.export(tmp_path), "cpu")
     photo = torch.rand(8, 20, 3).numpy()
@@ -68,14 +68,14 @@ def test_a_recipe_trains_and_exports_the_network_that_it_names(recipe, small, tm
 
 
 def test_a_run_of_one_network_does_not_start_from_a_checkpoint_of_another(recipe, small, tmp_path):
-    learner = CompactLearner(recipe)
+    learner = CompactTrainer(recipe)
     Checkpoint(0, recipe.model_dump_json(), learner.state()).write(tmp_path / "start.pt")
     other = with_value(recipe, "network", small).model_copy(update={"start_from": (tmp_path / "start.pt",)})
     with pytest.raises(
         ModelError,
         match=r"start.pt holds the network lite2-unet; a checkpoint of small, .*; train the recipe",
     ):
-        CompactLearner(other).begin()
+        CompactTrainer(other).begin()
 
 
 def test_a_run_of_one_network_is_not_resumed_with_another(recipe, small, tmp_path):
@@ -85,12 +85,12 @@ def test_a_run_of_one_network_is_not_resumed_with_another(recipe, small, tmp_pat
 
 
 def test_checkpoints_older_than_the_choice_of_network_hold_the_default_one(recipe, tmp_path):
-    learner = CompactLearner(recipe)
+    learner = CompactTrainer(recipe)
     older = recipe.model_dump_json(exclude={"network"})
     assert "network" not in older
     average = {name: torch.full_like(value, 2.0) for name, value in learner.average.items()}
     checkpoint = replace(Checkpoint(0, older, learner.state()), state=learner.state() | {"average": average})
     checkpoint.write(tmp_path / "start.pt")
-    started = CompactLearner(recipe.model_copy(update={"start_from": (tmp_path / "start.pt",)}))
+    started = CompactTrainer(recipe.model_copy(update={"start_from": (tmp_path / "start.pt",)}))
     started.begin()
     assert all((value == 2).all() for value in started.network.state_dict().values())

@@ -6,10 +6,10 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from brewster.errors import PhotoError, RecipeError
-from brewster.models.large.panels import Layout, compose, condition, fit_panel, split
+from brewster.models.diffusion.panels import PanelLayout, compose, condition, fit_panel, split
 
 LAYOUTS = [
-    Layout(panels, direction)
+    PanelLayout(panels, direction)
     for panels in [("I", "T", "R"), ("T", "R"), ("R", "I", "T"), ("T",)]
     for direction in ["side by side", "stacked"]
 ]
@@ -31,7 +31,7 @@ def test_splitting_undoes_composing_to_the_bit(layout, height, width, seed):
 
 def test_the_model_is_shown_the_photo_and_white_space():
     photo = torch.rand(1, 3, 4, 5) - 1
-    shown = split(condition(photo, Layout()), Layout())
+    shown = split(condition(photo, PanelLayout()), PanelLayout())
     assert torch.equal(shown["I"], photo)
     assert shown["T"].eq(1).all()
     assert shown["R"].eq(1).all()
@@ -39,11 +39,11 @@ def test_the_model_is_shown_the_photo_and_white_space():
 
 def test_without_a_generated_photo_the_photo_is_shown_alone():
     photo = torch.rand(1, 3, 4, 5)
-    assert torch.equal(condition(photo, Layout(("T", "R"))), photo)
+    assert torch.equal(condition(photo, PanelLayout(("T", "R"))), photo)
 
 
 def test_the_papers_composite_is_three_squares_of_512_pixels():
-    assert fit_panel((2000, 2000), Layout(), budget_px=1536 * 512, multiple=16).panel == (512, 512)
+    assert fit_panel((2000, 2000), PanelLayout(), budget_px=1536 * 512, multiple=16).panel == (512, 512)
 
 
 @given(
@@ -99,11 +99,11 @@ def test_a_photo_smaller_than_its_panel_is_told_a_budget_that_works(width, heigh
 
 def test_a_thread_of_a_photo_is_refused_plainly():
     with pytest.raises(PhotoError, match=r"no panel with the shape of 9000 x 2 pixels fits"):
-        fit_panel((9000, 2), Layout(), budget_px=30_000, multiple=16)
+        fit_panel((9000, 2), PanelLayout(), budget_px=30_000, multiple=16)
 
 
 def test_padding_continues_the_picture_by_its_reflection():
-    fit = fit_panel((100, 61), Layout(("T",)), budget_px=48 * 80, multiple=16)
+    fit = fit_panel((100, 61), PanelLayout(("T",)), budget_px=48 * 80, multiple=16)
     assert (fit.content, fit.panel) == ((79, 48), (80, 48))
     picture = torch.rand(1, 3, 48, 79)
     assert torch.equal(fit.pad(picture)[..., 79], picture[..., 77])
@@ -112,21 +112,21 @@ def test_padding_continues_the_picture_by_its_reflection():
 @pytest.mark.parametrize("panels", [(), ("I", "I"), ("I", "B")])
 def test_panels_are_some_of_three_letters_each_once(panels):
     with pytest.raises(RecipeError, match="some of I, T and R, each once"):
-        Layout(panels)
+        PanelLayout(panels)
 
 
 def test_an_unknown_direction_is_refused():
     with pytest.raises(RecipeError, match="side by side"):
-        Layout(direction="diagonal")
+        PanelLayout(direction="diagonal")
 
 
 def test_panels_that_do_not_belong_together_are_refused():
     one = torch.zeros(1, 3, 4, 4)
     with pytest.raises(PhotoError, match="there is no panel R"):
-        compose({"I": one, "T": one}, Layout())
+        compose({"I": one, "T": one}, PanelLayout())
     with pytest.raises(PhotoError, match="they must be alike"):
-        compose({"T": one, "R": one[..., :2]}, Layout(("T", "R")))
+        compose({"T": one, "R": one[..., :2]}, PanelLayout(("T", "R")))
     with pytest.raises(PhotoError, match="does not divide by 3"):
-        split(one, Layout())
+        split(one, PanelLayout())
     with pytest.raises(PhotoError, match="resize it first"):
-        fit_panel((64, 64), Layout(("T",)), budget_px=64 * 64, multiple=16).pad(one)
+        fit_panel((64, 64), PanelLayout(("T",)), budget_px=64 * 64, multiple=16).pad(one)

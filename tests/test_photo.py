@@ -17,7 +17,7 @@ from hypothesis.extra import numpy as arrays
 from PIL import Image, ImageOps
 
 from brewster.errors import MissingExtra, PhotoError, TargetError, UnsupportedPhoto
-from brewster.photo import DEPTHS, Origin, Photo
+from brewster.photo import DEPTHS, FileInfo, Photo
 from picture_files import exif_block, file_of, pil, smooth
 
 quick = settings(max_examples=25, deadline=None, database=None)
@@ -163,18 +163,18 @@ def test_primaries_that_span_no_colours_are_passed_over(stated: str) -> None:
 
 @pytest.mark.parametrize("container", ["png", "tiff", "exr", "hdr"])
 def test_light_is_the_same_in_every_container(container: str) -> None:
-    photo = Photo(smooth(), None, Origin(icc=P3))
+    photo = Photo(smooth(), None, FileInfo(icc=P3))
     again = Photo.open(photo.encode(container)).linear()
     np.testing.assert_allclose(again, photo.linear().clip(0 if container == "hdr" else -1), atol=5e-3)
 
 
 @pytest.mark.parametrize(("asked", "dtype"), [(8, np.uint8), (16, np.uint16), (32, np.float32)])
 def test_depth_is_changed_only_when_asked(asked: int, dtype: type) -> None:
-    for photo in (Photo(smooth(), None, Origin(icc=P3)), Photo.from_array(smooth() / 255, encoding="srgb")):
+    for photo in (Photo(smooth(), None, FileInfo(icc=P3)), Photo.from_array(smooth() / 255, encoding="srgb")):
         again = Photo.open(photo.encode("tiff", depth=asked))
         assert again.pixels.dtype == dtype
         np.testing.assert_allclose(again.linear(), photo.linear(), atol=5e-3)
-    assert Photo.open(Photo(smooth(), None, Origin()).encode("tiff")).pixels.dtype == np.uint8
+    assert Photo.open(Photo(smooth(), None, FileInfo()).encode("tiff")).pixels.dtype == np.uint8
 
 
 # --- HEIC
@@ -182,7 +182,7 @@ def test_depth_is_changed_only_when_asked(asked: int, dtype: type) -> None:
 
 def test_heic_keeps_profile_exif_and_pixels() -> None:
     pytest.importorskip("pillow_heif")
-    photo = Photo(smooth(), None, Origin(icc=P3, exif=exif_block(1).removeprefix(b"Exif\0\0")))
+    photo = Photo(smooth(), None, FileInfo(icc=P3, exif=exif_block(1).removeprefix(b"Exif\0\0")))
     for depth in DEPTHS["heic"]:
         again = Photo.open(photo.encode("heic", depth=depth))
         assert (again.origin.container, again.origin.bits) == ("heic", depth)
@@ -292,7 +292,7 @@ def test_strips_cover_every_row_once() -> None:
 
 
 def test_a_photo_may_be_used_by_many_threads() -> None:
-    photo = Photo(noise(200, 200), None, Origin(icc=P3))
+    photo = Photo(noise(200, 200), None, FileInfo(icc=P3))
     with ThreadPoolExecutor(4) as pool:
         linears = list(pool.map(lambda _: photo.with_linear(photo.linear()).encode(), range(8)))
     assert len(set(linears)) == 1

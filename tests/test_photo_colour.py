@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from PIL import Image, ImageCms
 
-from brewster import light
+from brewster import srgb
 from brewster.errors import UnsupportedPhoto
-from brewster.photo import Origin, Photo
-from brewster.photo.colour import SRGB, Curve, space_of
+from brewster.photo import FileInfo, Photo
+from brewster.photo.colour import SRGB, ToneCurve, space_of
 from brewster.photo.decode import read_size
 from brewster.photo.lut_profiles import in_display_p3
 
@@ -103,7 +103,7 @@ PROFILES = {
 
 
 def stored(pixels: np.ndarray, icc: bytes | None) -> Photo:
-    return Photo(pixels, None, Origin(bits=8 * pixels.dtype.itemsize, icc=icc))
+    return Photo(pixels, None, FileInfo(bits=8 * pixels.dtype.itemsize, icc=icc))
 
 
 def ramp(kind: type, channels: int = 3) -> np.ndarray:
@@ -116,7 +116,7 @@ def ramp(kind: type, channels: int = 3) -> np.ndarray:
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
 def test_srgb_light_is_the_curve_and_every_value_comes_back(kind: type) -> None:
     photo = stored(ramp(kind), None)
-    formula = light.to_linear(photo.pixels / np.iinfo(kind).max)
+    formula = srgb.to_linear(photo.pixels / np.iinfo(kind).max)
     np.testing.assert_allclose(photo.linear(), formula, atol=1e-7)
     assert np.array_equal(photo.with_linear(photo.linear()).pixels, photo.pixels)
 
@@ -126,7 +126,7 @@ def test_new_light_is_rounded_to_the_nearest_value(kind: type) -> None:
     linear = np.linspace(-0.1, 1.1, 30_000, dtype=np.float32).reshape(10, 1000, 3)
     white = np.iinfo(kind).max
     found = stored(np.zeros((10, 1000, 3), kind), None).with_linear(linear).pixels
-    exact = light.to_encoded(linear.clip(0, 1).astype(np.float64)) * white
+    exact = srgb.to_encoded(linear.clip(0, 1).astype(np.float64)) * white
     assert np.abs(found - exact).max() <= 0.6
 
 
@@ -147,14 +147,14 @@ def test_a_profile_agrees_with_littlecms_on_the_way_in(name: str) -> None:
         renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
         flags=ImageCms.Flags.NOOPTIMIZE,
     )
-    ours = light.to_encoded(stored(pixels, PROFILES[name]).linear().clip(0, 1)) * 255
+    ours = srgb.to_encoded(stored(pixels, PROFILES[name]).linear().clip(0, 1)) * 255
     assert np.abs(ours - np.asarray(theirs)).max() <= 1
 
 
 @pytest.mark.parametrize("name", PROFILES)
 def test_a_profile_agrees_with_littlecms_on_the_way_back(name: str) -> None:
     linear = np.random.default_rng(3).random((32, 32, 3), dtype=np.float32)
-    encoded = np.rint(light.to_encoded(linear) * 255).astype(np.uint8)
+    encoded = np.rint(srgb.to_encoded(linear) * 255).astype(np.uint8)
     theirs = ImageCms.profileToProfile(
         Image.fromarray(encoded),
         ImageCms.createProfile("sRGB"),
@@ -162,7 +162,7 @@ def test_a_profile_agrees_with_littlecms_on_the_way_back(name: str) -> None:
         renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
         flags=ImageCms.Flags.NOOPTIMIZE,
     )
-    ours = stored(np.zeros_like(encoded), PROFILES[name]).with_linear(light.to_linear(encoded / 255)).pixels
+    ours = stored(np.zeros_like(encoded), PROFILES[name]).with_linear(srgb.to_linear(encoded / 255)).pixels
     assert np.abs(ours.astype(int) - np.asarray(theirs)).max() <= 1
 
 
@@ -273,7 +273,7 @@ def test_chromaticities_turn_into_rec709_with_white_on_white() -> None:
 )
 def test_a_parametric_curve_and_its_inverse_agree(parameters: tuple[float, ...]) -> None:
     values = np.linspace(0, 1.5, 1000)
-    curve = Curve(parameters=parameters)
+    curve = ToneCurve(parameters=parameters)
     np.testing.assert_allclose(curve.encode(curve.decode(values)), values, atol=1e-4)
 
 
@@ -291,7 +291,7 @@ def test_all_parametric_functions_of_icc_agree_with_littlecms(function: int, cou
         renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
         flags=ImageCms.Flags.NOOPTIMIZE,
     )
-    ours = light.to_encoded(stored(pixels, test_profile).linear().clip(0, 1)) * 255
+    ours = srgb.to_encoded(stored(pixels, test_profile).linear().clip(0, 1)) * 255
     assert np.abs(ours - np.asarray(theirs)).max() <= 1.5
 
 
@@ -342,7 +342,7 @@ def test_a_damaged_profile_of_tables_is_refused(icc: bytes) -> None:
 @pytest.mark.parametrize(("kind", "channels"), [(np.uint8, 1), (np.float32, 3)])
 def test_a_profile_of_tables_is_for_whole_numbers_in_colour(kind: type, channels: int) -> None:
     with pytest.raises(UnsupportedPhoto, match="RGB of 8 or 16 bits"):
-        in_display_p3(np.ones((4, 4, channels), kind), Origin(icc=table_profile()))
+        in_display_p3(np.ones((4, 4, channels), kind), FileInfo(icc=table_profile()))
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import ImageOps
 
-from brewster.photo import Origin, Photo, metadata
+from brewster.photo import FileInfo, Photo, metadata
 from picture_files import exif_block, file_of, pil, smooth
 
 quick = settings(max_examples=25, deadline=None, database=None)
@@ -56,7 +56,7 @@ def test_a_grey_jpeg_keeps_its_quality() -> None:
 @pytest.mark.parametrize("container", ["webp", "avif"])
 def test_lossless_webp_and_avif_stay_lossless(container: str) -> None:
     pixels = np.random.default_rng(0).integers(0, 256, (24, 40, 3), np.uint8)
-    origin = Origin(container=container, lossless=True)
+    origin = FileInfo(container=container, lossless=True)
     photo = Photo.open(Photo(pixels, None, origin).encode())
     assert photo.origin.lossless
     assert np.array_equal(photo.pixels, pixels)
@@ -75,7 +75,7 @@ def test_white_is_white_whatever_the_bits(container: str, bits: int) -> None:
     if container == "heic":
         pytest.importorskip("pillow_heif")
     white = np.full((32, 32, 3), 65535, np.uint16)
-    photo = Photo.open(Photo(white, None, Origin(container=container, bits=bits, lossless=True)).encode())
+    photo = Photo.open(Photo(white, None, FileInfo(container=container, bits=bits, lossless=True)).encode())
     assert np.array_equal(photo.pixels, white)
     assert photo.origin.bits == bits
 
@@ -84,7 +84,7 @@ def test_white_is_white_whatever_the_bits(container: str, bits: int) -> None:
 def test_avif_of_ten_and_twelve_bits_keeps_them_and_its_white(bits: int) -> None:
     levels = np.linspace(0, 2**bits - 1, 2**bits).round().astype(np.uint16)
     shifted = np.repeat((levels << (16 - bits)).reshape(32, -1, 1), 3, axis=2)
-    photo = Photo.open(Photo(shifted, None, Origin(container="avif", bits=bits, lossless=True)).encode())
+    photo = Photo.open(Photo(shifted, None, FileInfo(container="avif", bits=bits, lossless=True)).encode())
     assert photo.origin.bits == bits
     assert photo.pixels.max() == 65535
     assert np.array_equal(photo.pixels >> (16 - bits), shifted >> (16 - bits))
@@ -112,7 +112,7 @@ def test_exif_profile_and_xmp_are_kept_byte_for_byte(container: str) -> None:
     exif, upright = exif_block(), exif_block(1)
     data = file_of(smooth(), container, exif=exif, icc_profile=P3)
     photo = Photo.open(data)
-    photo = Photo(photo.pixels, None, Origin(**{**vars(photo.origin), "xmp": UPRIGHT_XMP}))
+    photo = Photo(photo.pixels, None, FileInfo(**{**vars(photo.origin), "xmp": UPRIGHT_XMP}))
     written = pil(photo.encode())
     found = written.info["exif"].removeprefix(b"Exif\0\0")
     if container != "avif":  # whose orientation Pillow has taken out before

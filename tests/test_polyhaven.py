@@ -15,9 +15,9 @@ from urllib.parse import urlsplit
 import pytest
 
 from brewster.cli import cli
+from brewster.environments import polyhaven
+from brewster.environments.polyhaven import DownloadRequest, maps_folder, pull
 from brewster.errors import DownloadError, TargetError
-from brewster.worlds import polyhaven
-from brewster.worlds.polyhaven import Order, maps_folder, pull
 from file_server import loopback_only
 from front_door import errors, lines, tree
 
@@ -130,7 +130,7 @@ def fetch(haven, tmp_path):
     """Pulls into a folder: what became of each asset."""
 
     def fetch(indoor=1, outdoor=0, **how):
-        order = Order(indoor=indoor, outdoor=outdoor, **({"server": haven.url} | how))
+        order = DownloadRequest(indoor=indoor, outdoor=outdoor, **({"server": haven.url} | how))
         return list(pull(order, tmp_path / "maps"))
 
     return fetch
@@ -309,11 +309,11 @@ def test_when_all_fail_the_rest_is_not_tried(haven, tmp_path):
     haven.assets = {f"room_{i}": IN for i in range(9)}
     haven.faults = {f"/file/room_{i}": [404] for i in range(9)}
     with pytest.raises(DownloadError, match="5 assets in a row"):
-        list(pull(Order(server=haven.url), tmp_path))
+        list(pull(DownloadRequest(server=haven.url), tmp_path))
     assert haven.ranges("room_4")
     assert not haven.ranges("room_5")
     haven.faults = {f"/file/room_{i}": [404] for i in (0, 1, 2, 3, 5, 6, 7, 8)}
-    assert len(list(pull(Order(server=haven.url), tmp_path))) == 9
+    assert len(list(pull(DownloadRequest(server=haven.url), tmp_path))) == 9
 
 
 @pytest.mark.parametrize("body", [b"<html>", b"", b"\xff", b"[" * 100_000, b"[]", b"null"])
@@ -412,7 +412,7 @@ def command(bare, haven):
 def test_the_command_offers_what_an_order_takes():
     command = cli.commands["assets"].commands["pull"]
     taken = command.make_context("pull", ["polyhaven"]).params
-    assert {field.name: taken[field.name] for field in fields(Order)} == vars(Order())
+    assert {field.name: taken[field.name] for field in fields(DownloadRequest)} == vars(DownloadRequest())
 
 
 def test_the_command_tells_what_it_did_and_that_the_server_had_fewer(command, tmp_path):
@@ -464,5 +464,5 @@ def test_a_server_that_fails_is_one_sentence(command, haven):
 
 
 def test_fetching_wakes_no_torch():
-    code = "import brewster.worlds.polyhaven, sys; assert not {'torch', 'numpy', 'click'} & set(sys.modules)"
+    code = "import brewster.environments.polyhaven, sys; assert not {'torch', 'numpy', 'click'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

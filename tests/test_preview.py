@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from brewster import Photo
-from brewster.light import to_encoded, to_linear
+from brewster.inference import Separator
 from brewster.options import Options
-from brewster.separate import Separator
+from brewster.srgb import to_encoded, to_linear
 from brewster.web.preview import PREVIEW_PIXELS, preview
 from front_door import picture
 from glass_server import app_of, ask, form, pane
@@ -30,7 +30,7 @@ class Maps:
         low, high = self.head["range"]
         numbers = parts[1].view("<u2").reshape(*shape, 3)
         self.transmitted = low + numbers / 65535 * (high - low)
-        self.sureness = parts[3].reshape(shape)
+        self.confidence_map = parts[3].reshape(shape)
 
     def at(self, strength):
         """Transmission and reflection, in codes, by the formula that light.js uses."""
@@ -61,7 +61,7 @@ def test_what_the_browser_composites_is_what_the_server_makes(shipped, mixture, 
         apart = np.abs(layer.pixels.astype(int) - ours)
         assert apart.max() <= 2
         assert apart.mean() < 0.2
-    assert np.abs(made.confidence.pixels[..., 0].astype(int) - mixture.sureness).max() <= 1
+    assert np.abs(made.confidence.pixels[..., 0].astype(int) - mixture.confidence_map).max() <= 1
 
 
 def too_much(tile):
@@ -116,10 +116,10 @@ def test_a_rotated_photo_is_shown_upright_and_a_grey_one_grey():
 def test_a_wide_gamut_photo_is_shown_in_srgb():
     import pyvips  # noqa: PLC0415
 
-    from brewster.photo.origin import Origin  # noqa: PLC0415
+    from brewster.photo.file_info import FileInfo  # noqa: PLC0415
 
     p3 = Photo(
-        np.full((20, 30, 3), (230, 60, 60), np.uint8), None, Origin(icc=pyvips.Image.profile_load("p3"))
+        np.full((20, 30, 3), (230, 60, 60), np.uint8), None, FileInfo(icc=pyvips.Image.profile_load("p3"))
     )
     maps = maps_of(p3.encode("png"))
     assert np.abs(maps.photo.astype(int) - p3.srgb_8bit()).max() <= 1

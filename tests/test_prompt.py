@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from brewster.errors import ModelError
-from brewster.models.large.prompt import PROMPT, PromptEmbedding, load_prompt
+from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding, load_prompt
 
 PAPER = Path(__file__).parents[2] / "shared" / "paper.tex"
 

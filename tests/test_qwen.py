@@ -10,9 +10,9 @@ from tokenizers.pre_tokenizers import ByteLevel
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil
 
 from brewster.errors import MissingExtra
-from brewster.models.large.backbones import encode_prompt, tiny
-from brewster.models.large.families.qwen import Qwen
-from brewster.models.large.prompt import PROMPT
+from brewster.models.diffusion.backbones import encode_prompt, tiny
+from brewster.models.diffusion.families.qwen import Qwen
+from brewster.models.diffusion.prompt import PROMPT
 
 MARKS = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>"]
 MARKS += ["<|image_pad|>", "<|video_pad|>"]

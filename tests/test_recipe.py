@@ -2,9 +2,9 @@ from pathlib import Path
 
 import pytest
 
-from brewster.dataset.mix import MixRecipe
 from brewster.errors import RecipeError
-from brewster.train.recipe import CompactRecipe, LargeRecipe, read_recipe, with_value
+from brewster.training.data.mixtures import MixRecipe
+from brewster.training.recipe import CompactRecipe, LoraRecipe, read_recipe, with_value
 
 FOLDER = Path(__file__).parents[1] / "recipes"
 RECIPES = sorted(FOLDER.glob("train/*.toml"))
@@ -150,7 +150,7 @@ def test_a_wrong_recipe_is_refused_by_the_name_of_what_is_wrong(tmp_path, change
 
 
 def test_a_recipe_that_names_a_backbone_is_a_large_ones():
-    large = {path.stem for path in RECIPES if isinstance(read_recipe(path), LargeRecipe)}
+    large = {path.stem for path in RECIPES if isinstance(read_recipe(path), LoraRecipe)}
     assert large == {"kontext", "klein", "qwen", "large-tiny"}
     assert isinstance(read_recipe(TINY), CompactRecipe)
 

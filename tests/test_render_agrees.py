@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from brewster.errors import MissingExtra
-from brewster.render import tracer
-from brewster.render.pane import render
+from brewster.render.analytic import render
+from brewster.render.mitsuba import renderer
 from worlds_of_one import WORLDS, a_scene, at, board
 
 SCENE = a_scene(
@@ -28,9 +28,11 @@ def traced():
         pytest.MonkeyPatch.context() as patch,
         warnings.catch_warnings(action="ignore", category=RuntimeWarning),  # of an LLVM, which is not needed
     ):
-        patch.setattr(tracer, "_variant", lambda polarised: "scalar_rgb")
+        patch.setattr(renderer, "_variant", lambda polarised: "scalar_rgb")
         try:
-            samples = [tracer.trace(scene, WORLDS, noise=0.02, most_samples=512).layers() for scene in seeds]
+            samples = [
+                renderer.trace(scene, WORLDS, noise=0.02, most_samples=512).layers() for scene in seeds
+            ]
         except MissingExtra as error:
             pytest.skip(f"Mitsuba cannot be used: {error}")
     return {name: torch.stack([sample[name] for sample in samples]).double() for name in samples[0]}

@@ -5,25 +5,25 @@ import json
 import pytest
 
 from benchmark_folders import repacked, sir2
-from brewster.dataset.benchmarks import Benchmark, Case, File, read_benchmark
+from brewster.benchmarks.registry import Benchmark, Case, PictureFile, read_benchmark
 from brewster.errors import BrewsterError
-from brewster.evaluate.methods import Nothing, Predictions
-from brewster.evaluate.protocol import Protocol
+from brewster.evaluate.config import EvaluationConfig
+from brewster.evaluate.methods import IdentityBaseline, PredictionFolder
 from brewster.evaluate.results import summarise
-from brewster.evaluate.runner import Row
+from brewster.evaluate.runner import ScoreRow
 
-PSNR = Protocol(metrics=("psnr",))
+PSNR = EvaluationConfig(metrics=("psnr",))
 
 
 def benchmark(name, count, refused=()):
-    file = File("nowhere")
+    file = PictureFile("nowhere")
     cases = tuple(Case(name, str(i), str(i), str(i), file, file) for i in range(count))
     return Benchmark(name, name.title(), cases, refused=refused)
 
 
 def rows(benchmarks, methods, score):
     return [
-        Row(case.benchmark, case.name, method.name, "", "", {"psnr": score(case, method)})
+        ScoreRow(case.benchmark, case.name, method.name, "", "", {"psnr": score(case, method)})
         for part in benchmarks
         for case in part.cases
         for method in methods
@@ -32,7 +32,7 @@ def rows(benchmarks, methods, score):
 
 @pytest.fixture
 def methods(tmp_path):
-    return [Nothing(), Predictions("theirs", tmp_path)]
+    return [IdentityBaseline(), PredictionFolder("theirs", tmp_path)]
 
 
 def test_the_average_is_over_all_pictures(methods):
@@ -67,7 +67,7 @@ def test_differences_are_to_every_method_named_before(methods):
 def test_a_failed_picture_is_counted_out_and_named(methods):
     parts = [benchmark("a", 3, refused=("x.png has no partner",))]
     told = rows(parts, methods, lambda case, method: float(case.name))
-    told[1] = Row("a", "0", "theirs", "", "", error="theirs failed")
+    told[1] = ScoreRow("a", "0", "theirs", "", "", error="theirs failed")
     results = summarise(parts, methods, PSNR, told)
     assert results["tables"]["a"]["theirs"]["psnr"] | {"low": 0, "high": 0} == {
         "mean": 1.5,
@@ -81,7 +81,7 @@ def test_a_failed_picture_is_counted_out_and_named(methods):
 
 def test_metrics_that_nothing_was_measured_in_are_left_out(methods):
     parts = [benchmark("a", 2)]
-    protocol = Protocol(metrics=("psnr", "kept_reflection"))
+    protocol = EvaluationConfig(metrics=("psnr", "kept_reflection"))
     results = summarise(parts, methods, protocol, rows(parts, methods, lambda *_: 1.0))
     assert list(results["metrics"]) == ["psnr"]
     assert results["metrics"]["psnr"]["unit"] == "dB"
@@ -101,7 +101,7 @@ def test_the_papers_protocol_averages_over_181_pictures_and_reports_all_too(tmp_
     parts = [
         part for name in ("real20", "nature20", "sir2") for part in read_benchmark(name, tmp_path / name)
     ]
-    protocol = Protocol(metrics=("psnr",), paper=True)
+    protocol = EvaluationConfig(metrics=("psnr",), paper=True)
     results = summarise(parts, methods, protocol, rows(parts, methods, lambda *_: 1.0))
     pictures = {key: selection["pictures"] for key, selection in results["selections"].items()}
     assert pictures == {
@@ -120,7 +120,7 @@ def test_the_papers_protocol_averages_over_181_pictures_and_reports_all_too(tmp_
 
 def test_the_papers_average_is_over_the_papers_sets_only_and_says_what_it_lacks(tmp_path, methods):
     parts = [benchmark("real20", 20), benchmark("nature20", 10), benchmark("mine", 7)]
-    protocol = Protocol(metrics=("psnr",), paper=True)
+    protocol = EvaluationConfig(metrics=("psnr",), paper=True)
     results = summarise(parts, methods, protocol, rows(parts, methods, lambda *_: 1.0))
     assert results["selections"]["average"]["pictures"] == 30
     assert (
@@ -131,7 +131,7 @@ def test_the_papers_average_is_over_the_papers_sets_only_and_says_what_it_lacks(
 
 def test_a_metric_that_was_asked_for_in_vain_is_told(methods):
     parts = [benchmark("a", 2)]
-    protocol = Protocol(metrics=("psnr", "kept_reflection"))
+    protocol = EvaluationConfig(metrics=("psnr", "kept_reflection"))
     results = summarise(parts, methods, protocol, rows(parts, methods, lambda *_: 1.0))
     assert results["unmeasured"] == ["kept_reflection"]
 
@@ -141,5 +141,8 @@ def test_the_papers_draw_is_refused_where_scenes_cannot_be_told(tmp_path, method
     parts = read_benchmark("postcard", tmp_path / "postcard")
     with pytest.raises(BrewsterError, match="scene"):
         summarise(
-            parts, methods, Protocol(metrics=("psnr",), paper=True), rows(parts, methods, lambda *_: 1.0)
+            parts,
+            methods,
+            EvaluationConfig(metrics=("psnr",), paper=True),
+            rows(parts, methods, lambda *_: 1.0),
         )

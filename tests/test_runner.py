@@ -14,21 +14,21 @@ import pytest
 
 from benchmark_folders import paint, repacked, write
 from brewster import Photo
-from brewster.dataset.benchmarks import read_benchmark
+from brewster.benchmarks.registry import read_benchmark
 from brewster.errors import BrewsterError, PhotoError, TargetError
-from brewster.evaluate.methods import Answer, Model, Nothing, Predictions
-from brewster.evaluate.protocol import Protocol
+from brewster.evaluate.config import EvaluationConfig
+from brewster.evaluate.methods import IdentityBaseline, MethodOutput, ModelMethod, PredictionFolder
 from brewster.evaluate.runner import SCORES, score
 from other_processes import children, is_alive, wait_for
 
-QUICK = Protocol(metrics=("psnr", "ssim"))
+QUICK = EvaluationConfig(metrics=("psnr", "ssim"))
 NAMES = ["1", "2", "3"]
 
 
 class Fake:
     """A method that fails or answers as it is told, and counts how often it was asked."""
 
-    alone = False
+    exclusive = False
 
     def __init__(self, name="fake", answers=None):
         self.name, self.answers, self.asked = name, answers or {}, []
@@ -41,7 +41,7 @@ class Fake:
 
     def answer(self, case, photo):
         self.asked.append(case.name)
-        answer = self.answers.get(case.name, Answer(photo))
+        answer = self.answers.get(case.name, MethodOutput(photo))
         if isinstance(answer, Exception):
             raise answer
         return answer
@@ -63,7 +63,7 @@ def numbers(rows):
 
 
 def test_every_method_is_scored_on_every_case_in_order(real20, tmp_path):
-    rows = score(real20, [Nothing(), Fake()], QUICK, tmp_path / "out")
+    rows = score(real20, [IdentityBaseline(), Fake()], QUICK, tmp_path / "out")
     assert [row.place[1:] for row in rows] == [
         (case, method) for case in NAMES for method in ("doing nothing", "fake")
     ]
@@ -105,19 +105,19 @@ def test_a_changed_photo_truth_or_protocol_is_measured_anew(real20, tmp_path):
 
 
 def test_other_metrics_do_not_make_a_model_answer_again(real20, model, tmp_path, monkeypatch):
-    ours = Model("pane", str(model), tmp_path / "out" / "predictions" / "pane")
+    ours = ModelMethod("pane", str(model), tmp_path / "out" / "predictions" / "pane")
     first = score(real20, [ours], QUICK, tmp_path / "out")
-    monkeypatch.setattr(Model, "answer", lambda *_: pytest.fail("it was asked again"))
-    more = score(real20, [ours], Protocol(metrics=("psnr", "psnr_region")), tmp_path / "out")
+    monkeypatch.setattr(ModelMethod, "answer", lambda *_: pytest.fail("it was asked again"))
+    more = score(real20, [ours], EvaluationConfig(metrics=("psnr", "psnr_region")), tmp_path / "out")
     assert [row.scores["psnr"] for row in more] == [row.scores["psnr"] for row in first]
 
 
 def test_an_answer_that_was_changed_on_the_disk_is_made_again(real20, model, tmp_path):
-    ours = Model("pane", str(model), tmp_path / "kept")
+    ours = ModelMethod("pane", str(model), tmp_path / "kept")
     first = score(real20, [ours], QUICK, tmp_path / "out")
     kept = tmp_path / "kept" / "real20" / "2.transmission.png"
     kept.write_bytes((tmp_path / "real20" / "blended" / "2.png").read_bytes())
-    again = score(real20, [ours], Protocol(metrics=("psnr",)), tmp_path / "out")
+    again = score(real20, [ours], EvaluationConfig(metrics=("psnr",)), tmp_path / "out")
     assert [row.scores["psnr"] for row in again] == [row.scores["psnr"] for row in first]
 
 
@@ -142,18 +142,18 @@ def test_scores_are_made_again_when_scoring_changes_and_not_with_a_new_version(
 def test_answers_are_made_again_when_answering_changes_and_not_with_a_new_version(
     real20, model, tmp_path, monkeypatch, changed, asked
 ):
-    ours = Model("pane", str(model), tmp_path / "kept")
+    ours = ModelMethod("pane", str(model), tmp_path / "kept")
     score(real20, [ours], QUICK, tmp_path / "out")
     monkeypatch.setattr(changed, 99)
-    made, answer = [], Model.answer
-    monkeypatch.setattr(Model, "answer", lambda self, *case: made.append(1) or answer(self, *case))
+    made, answer = [], ModelMethod.answer
+    monkeypatch.setattr(ModelMethod, "answer", lambda self, *case: made.append(1) or answer(self, *case))
     score(real20, [ours], QUICK, tmp_path / "out")
     assert len(made) == asked
 
 
 def test_a_worker_that_dies_is_told_and_scores_are_kept(real20, model, tmp_path):
     with pytest.raises(BrewsterError, match="a worker process died"):
-        score(real20, [Nothing(), Deadly()], QUICK, tmp_path / "out", workers=2)
+        score(real20, [IdentityBaseline(), Deadly()], QUICK, tmp_path / "out", workers=2)
 
 
 @final
@@ -162,7 +162,7 @@ class Deadly:
     """A method that kills its process."""
 
     name: str = "deadly"
-    alone: bool = False
+    exclusive: bool = False
 
     def key(self, case):
         return self.name
@@ -181,7 +181,7 @@ class Endless:
 
     begun: Path
     name: str = "endless"
-    alone: bool = False
+    exclusive: bool = False
 
     def key(self, case):
         return self.name
@@ -216,15 +216,15 @@ if __name__ == "__main__":
 
 
 def test_kept_layers_score_exactly_as_fresh_ones(real20, model, tmp_path):
-    ours = Model("pane", str(model), tmp_path / "kept")
+    ours = ModelMethod("pane", str(model), tmp_path / "kept")
     fresh = score(real20, [ours], QUICK, tmp_path / "out")
-    kept = score(real20, [Predictions("pane", tmp_path / "kept")], QUICK, tmp_path / "out")
+    kept = score(real20, [PredictionFolder("pane", tmp_path / "kept")], QUICK, tmp_path / "out")
     assert [row.scores for row in fresh] == [row.scores for row in kept]
 
 
 def test_two_workers_give_the_same_rows_as_one(real20, model, tmp_path):
-    methods = [Nothing(), Model("pane", str(model), tmp_path / "kept")]
-    protocol = Protocol(metrics=("psnr", "ssim", "psnr_region"))
+    methods = [IdentityBaseline(), ModelMethod("pane", str(model), tmp_path / "kept")]
+    protocol = EvaluationConfig(metrics=("psnr", "ssim", "psnr_region"))
     one = score(real20, methods, protocol, tmp_path / "one")
     two = score(real20, methods, protocol, tmp_path / "two", workers=2)
     assert numbers(one) == numbers(two)
@@ -232,7 +232,7 @@ def test_two_workers_give_the_same_rows_as_one(real20, model, tmp_path):
 
 def test_a_method_that_fails_on_one_picture_is_named_and_the_rest_is_scored(real20, tmp_path):
     fake = Fake(answers={"2": PhotoError("the picture is odd", "an even one", "paint another")})
-    rows = score(real20, [Nothing(), fake], QUICK, tmp_path / "out")
+    rows = score(real20, [IdentityBaseline(), fake], QUICK, tmp_path / "out")
     assert [bool(row.error) for row in rows] == [False, False, False, True, False, False]
     assert rows[3].error.startswith("fake failed on real20/2: the picture is odd")
 
@@ -247,14 +247,14 @@ def test_a_crash_is_named_with_its_picture_and_is_tried_again_next_time(real20, 
 
 def test_an_answer_of_another_size_is_refused_never_resized(real20, tmp_path):
     small = Photo.from_array(np.zeros((8, 8, 3), np.uint8), encoding="srgb")
-    rows = score(real20, [Fake(answers={"1": Answer(small)})], QUICK, tmp_path / "out")
+    rows = score(real20, [Fake(answers={"1": MethodOutput(small)})], QUICK, tmp_path / "out")
     assert "fake's transmission of real20/1 is 8x8; 24x16" in rows[0].error
 
 
 def test_a_picture_that_cannot_be_decoded_fails_for_all_methods(real20, tmp_path):
     path = tmp_path / "real20" / "blended" / "2.png"
     path.write_bytes(path.read_bytes()[:200])
-    rows = score(real20, [Nothing(), Fake()], QUICK, tmp_path / "out")
+    rows = score(real20, [IdentityBaseline(), Fake()], QUICK, tmp_path / "out")
     assert [row.case for row in rows if row.error] == ["2", "2"]
 
 
@@ -267,7 +267,9 @@ def test_grey_alpha_and_sixteen_bits_are_measured_as_what_they_show(tmp_path):
         path = tmp_path / "real20" / role / "1.png"
         path.parent.mkdir(parents=True)
         path.write_bytes(Photo.from_array(pixels, encoding="srgb").encode("png"))
-    (row,) = score(read_benchmark("real20", tmp_path / "real20"), [Nothing()], QUICK, tmp_path / "out")
+    (row,) = score(
+        read_benchmark("real20", tmp_path / "real20"), [IdentityBaseline()], QUICK, tmp_path / "out"
+    )
     assert row.scores == {"psnr": 100.0, "ssim": 1.0}
 
 
@@ -277,7 +279,9 @@ def test_a_permuted_folder_gives_the_same_rows(tmp_path):
             paint(tmp_path / place / "transmission_layer" / f"{name}.png", int(name))
             paint(tmp_path / place / "blended" / f"{name}.png", int(name), noise=9)
     rows = [
-        score(read_benchmark("real20", tmp_path / place), [Nothing()], QUICK, tmp_path / f"out-{place}")
+        score(
+            read_benchmark("real20", tmp_path / place), [IdentityBaseline()], QUICK, tmp_path / f"out-{place}"
+        )
         for place in "ab"
     ]
     assert numbers(rows[0]) == numbers(rows[1])
@@ -287,7 +291,7 @@ def test_pictures_are_reduced_before_any_method_sees_them(tmp_path):
     repacked(tmp_path / "real20", ["1"], size=(80, 40))
     fake = Fake()
     seen = []
-    fake.answer = lambda case, photo: seen.append(photo.size) or Answer(photo)
+    fake.answer = lambda case, photo: seen.append(photo.size) or MethodOutput(photo)
     (row,) = score(
         read_benchmark("real20", tmp_path / "real20"), [fake], replace(QUICK, size=20), tmp_path / "out"
     )
@@ -303,7 +307,13 @@ def test_a_folder_that_cannot_be_written_is_an_error(real20, tmp_path):
 
 def test_progress_is_told_after_every_answer(real20, tmp_path):
     told = []
-    score(real20, [Nothing(), Fake()], QUICK, tmp_path / "out", report=lambda *now: told.append(now[:2]))
+    score(
+        real20,
+        [IdentityBaseline(), Fake()],
+        QUICK,
+        tmp_path / "out",
+        report=lambda *now: told.append(now[:2]),
+    )
     assert told == [(i, 6) for i in range(1, 7)]
 
 
@@ -319,7 +329,7 @@ def test_an_interrupt_leaves_what_was_scored(real20, tmp_path, monkeypatch):
     def answer(case, photo):
         if case.name == "3":
             raise KeyboardInterrupt
-        return Answer(photo)
+        return MethodOutput(photo)
 
     monkeypatch.setattr(fake, "answer", answer)
     with pytest.raises(KeyboardInterrupt):
@@ -330,7 +340,7 @@ def test_an_interrupt_leaves_what_was_scored(real20, tmp_path, monkeypatch):
 class Large(Fake):
     """Writes down who asked it, and in which process."""
 
-    alone = True
+    exclusive = True
 
     def __init__(self, name, log):
         super().__init__(name)

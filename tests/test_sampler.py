@@ -6,13 +6,13 @@ import sys
 
 import pytest
 
+from brewster.environments.catalog import BUILTIN_CATALOG
 from brewster.errors import RecipeError
-from brewster.render.pane import render
+from brewster.render.analytic import render
 from brewster.scene.recipe import RECIPES, read_scene_recipe
 from brewster.scene.sampler import Asset, Catalog, draw
 from brewster.scene.scene import Scene
-from brewster.scene.world import Source
-from brewster.worlds.catalog import BUILTIN_CATALOG
+from brewster.scene.world import AssetSource
 from worlds_of_one import WORLDS, Worlds
 
 WIDTHS = {asset.source: asset.width for asset in BUILTIN_CATALOG.maps}
@@ -52,7 +52,7 @@ def test_another_process_draws_the_same_scene(fifty):
     code = """
 from brewster.scene.recipe import read_scene_recipe
 from brewster.scene.sampler import draw
-from brewster.worlds.catalog import BUILTIN_CATALOG
+from brewster.environments.catalog import BUILTIN_CATALOG
 print(draw(read_scene_recipe("tiny"), BUILTIN_CATALOG, 7, 12).to_toml(), end="")
 """
     done = subprocess.run(
@@ -124,7 +124,7 @@ def test_categories_are_kept_and_a_map_without_one_fits_everywhere():
     asked = changed("window", behind={"map_probability": 1.0, "maps": ("indoor",)})
     rooms = {drawn(asked, index).behind.map.source.file for index in range(20)}
     assert rooms <= {f"builtin:room:{number}" for number in range(8)}
-    plain = Catalog(maps=(Asset(source=Source(file="a.hdr"), width=4096, height=2048),))
+    plain = Catalog(maps=(Asset(source=AssetSource(file="a.hdr"), width=4096, height=2048),))
     assert drawn(asked, 0, catalog=plain).behind.map.source.file == "a.hdr"
 
 
@@ -137,7 +137,7 @@ def test_a_recipe_of_maps_needs_maps_that_are_sharp_enough():
     asked = changed("window", behind={"map_probability": 1.0, "picture_probability": 0.0})
     for catalog in (
         Catalog(pictures=BUILTIN_CATALOG.pictures),
-        Catalog(maps=(Asset(source=Source(file="a.hdr"), width=64, height=32),)),
+        Catalog(maps=(Asset(source=AssetSource(file="a.hdr"), width=64, height=32),)),
     ):
         with pytest.raises(RecipeError, match=rf"of {len(catalog.maps)} maps none fits the recipe"):
             drawn(asked, 0, catalog=catalog)

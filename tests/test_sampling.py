@@ -6,9 +6,9 @@ from diffusers.pipelines.qwenimage import pipeline_qwenimage_edit
 from PIL import Image
 
 from brewster.errors import DeviceError, ModelError
-from brewster.models.large.backbones import BACKBONES, tiny
-from brewster.models.large.prompt import PromptEmbedding
-from brewster.models.large.sampling import sample
+from brewster.models.diffusion.backbones import BACKBONES, tiny
+from brewster.models.diffusion.prompt import PromptEmbedding
+from brewster.models.diffusion.sampling import sample
 
 SIZE = (192, 64)
 STEPS = 4

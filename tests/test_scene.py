@@ -5,12 +5,12 @@ import tomllib
 
 import pytest
 
+from brewster.environments.catalog import BUILTIN_CATALOG
 from brewster.errors import RecipeError
 from brewster.scene.camera import Camera
 from brewster.scene.recipe import RECIPES, read_scene_recipe
 from brewster.scene.sampler import draw
 from brewster.scene.scene import Scene, read_scene
-from brewster.worlds.catalog import BUILTIN_CATALOG
 from worlds_of_one import looks
 
 MAP = "source.file = 'builtin:street:1'"

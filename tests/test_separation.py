@@ -13,12 +13,12 @@ from schemathesis.specs.openapi.checks import negative_data_rejection, positive_
 
 import brewster
 from brewster import Photo
-from brewster.separate import Separator
+from brewster.inference import Separator
 from brewster.web.application import application
-from brewster.web.desk import Desk
-from brewster.web.guard import Guard
+from brewster.web.job_queue import JobQueue
+from brewster.web.middleware import RequestLimits
+from brewster.web.model_cache import ModelCache
 from brewster.web.separation import separation
-from brewster.web.shelf import Shelf
 from front_door import picture
 from glass_server import Stubborn, app_of, ask, client, form, pane
 from picture_files import exif_block, file_of, smooth
@@ -45,7 +45,9 @@ def error_of(answer):
 
 
 def test_the_shipped_model_answers_as_the_command_line_does(bare, tmp_path):
-    app = application(separation(Shelf(device="cpu"), Desk(), max_pixels=10**8), guard=Guard())
+    app = application(
+        separation(ModelCache(device="cpu"), JobQueue(), max_pixels=10**8), guard=RequestLimits()
+    )
     answer = separate(app, MIXTURE.read_bytes(), MIXTURE.name, quality="draft", strength="0.7")
     bare(MIXTURE, "-o", tmp_path, "--quality", "draft", "--strength", "0.7", "--device", "cpu")
     with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
@@ -84,7 +86,7 @@ def test_how_it_was_made_stands_in_the_headers(app):
     assert headers["brewster-model"] == "pane"
     assert headers["brewster-sha256"] == "0" * 64
     assert headers["brewster-device"] == "cpu"
-    assert 0 <= float(headers["brewster-remainder"]) < 0.01
+    assert 0 <= float(headers["brewster-residual"]) < 0.01
     assert float(headers["brewster-seconds"]) > 0
 
 
@@ -191,7 +193,7 @@ def test_a_bug_is_told_without_its_traceback():
 
 
 def test_a_client_that_goes_away_stops_the_work():
-    backend, desk = Stubborn(), Desk()
+    backend, desk = Stubborn(), JobQueue()
 
     async def leave():
         async with client(app_of(backend, desk=desk)) as asking:
@@ -212,7 +214,7 @@ def test_a_client_that_goes_away_stops_the_work():
 
 
 def test_a_full_server_says_when_to_come_back_and_goes_on():
-    backend, desk = Stubborn(), Desk(queue=1)
+    backend, desk = Stubborn(), JobQueue(queue=1)
 
     async def crowd():
         async with client(app_of(backend, desk=desk)) as asking:
@@ -237,7 +239,7 @@ def test_work_beyond_the_time_limit_is_given_up():
     backend = Stubborn()
 
     async def wait():
-        async with client(app_of(backend, desk=Desk(seconds=0.01))) as asking:
+        async with client(app_of(backend, desk=JobQueue(seconds=0.01))) as asking:
             answer = await asking.post("/separate", **form(SMALL))
             backend.go.set()
             return answer
@@ -289,7 +291,7 @@ def test_no_documentation_page_fetches_assets_from_elsewhere(app):
     assert ask(app, "GET", "/docs").status_code == ask(app, "GET", "/redoc").status_code == 404
 
 
-TRIED = app_of(guard=Guard(hosts=frozenset({"testserver"})))  # as schemathesis calls it
+TRIED = app_of(guard=RequestLimits(hosts=frozenset({"testserver"})))  # as schemathesis calls it
 SCHEMA = schemathesis.openapi.from_asgi("/openapi.json", TRIED)
 
 

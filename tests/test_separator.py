@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 import brewster
 from brewster import Photo, Separator
 from brewster.errors import BrewsterError, PhotoError
+from brewster.inference import QUALITIES
 from brewster.metrics import psnr, ssim
-from brewster.photo import Origin
-from brewster.separate import QUALITIES
+from brewster.photo import FileInfo
 
 PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
 
@@ -45,13 +45,13 @@ def test_what_the_backend_leaves_alone_comes_back_bit_equal(height, width, chann
     result = Separator(nothing)(Photo.from_array(array, encoding="srgb"))
     assert (result.transmission.pixels == result.photo.pixels).all()
     assert not result.reflection.pixels.any()
-    assert result.remainder == 0
+    assert result.residual == 0
 
 
 @pytest.mark.parametrize("profile", ["srgb", "p3"])
 def test_strength_nought_returns_the_photo_and_no_reflection_whatever_the_profile(profile):
     icc = bytes(pyvips.Image.profile_load(profile))
-    photo = Photo(picture(300, 500), origin=Origin(icc=icc))
+    photo = Photo(picture(300, 500), origin=FileInfo(icc=icc))
     result = Separator(glass)(photo, strength=0)
     assert (result.transmission.pixels == photo.pixels).all()
     assert not result.reflection.pixels.any()
@@ -101,7 +101,7 @@ def test_additive_layers_sum_to_the_photo_to_the_last_bit(channels):
     light = photo.linear()[..., : photo.pixels.shape[2]]
     assert (layers[0] + layers[1] == light).all()
     assert min(layer.min() for layer in layers) >= 0
-    assert result.remainder == 0
+    assert result.residual == 0
     assert (result.transmission.alpha is None) == (photo.alpha is None)
     if photo.alpha is not None:
         np.testing.assert_allclose(result.transmission.alpha, photo.alpha / 255, atol=1e-6)
@@ -110,7 +110,7 @@ def test_additive_layers_sum_to_the_photo_to_the_last_bit(channels):
 def test_the_unexplained_remainder_is_reported():
     photo = Photo.from_array(np.full((64, 64, 3), 0.4, np.float32), encoding="linear")
     result = Separator(lambda tile: (tile * 0.5, tile * 0.25))(photo)
-    assert result.remainder == pytest.approx(0.1, abs=0.005)
+    assert result.residual == pytest.approx(0.1, abs=0.005)
 
 
 def test_light_that_is_too_much_and_light_that_is_missing_do_not_cancel_in_the_remainder():
@@ -122,13 +122,15 @@ def test_light_that_is_too_much_and_light_that_is_missing_do_not_cancel_in_the_r
         return tile * 0.5, np.where(tile < 0.4, tile * 0.25, tile * 0.75)
 
     photo = Photo.from_array(light, encoding="linear")
-    assert Separator(uneven)(photo).remainder == pytest.approx(0.1, abs=0.01)
+    assert Separator(uneven)(photo).residual == pytest.approx(0.1, abs=0.01)
 
 
-@pytest.mark.parametrize(("drift", "doubtful"), [(None, False), (0.0, False), (0.05, False), (0.07, True)])
-def test_a_separation_is_doubtful_where_the_model_redraws_the_photo(drift, doubtful):
+@pytest.mark.parametrize(
+    ("reconstruction_error", "doubtful"), [(None, False), (0.0, False), (0.05, False), (0.07, True)]
+)
+def test_a_separation_is_doubtful_where_the_model_redraws_the_photo(reconstruction_error, doubtful):
     separation = Separator(nothing)(picture(8, 8), encoding="srgb")
-    assert replace(separation, drift=drift).doubtful == doubtful
+    assert replace(separation, reconstruction_error=reconstruction_error).doubtful == doubtful
 
 
 def test_confidence_falls_where_the_two_views_disagree():
@@ -154,7 +156,7 @@ def test_a_mixture_comes_closer_to_what_is_behind_the_glass(separator):
 def test_tiled_and_untiled_agree(separator, monkeypatch):
     photo = Photo.open(PICTURES[0])
     whole = separator(photo, quality="best").transmission.pixels
-    monkeypatch.setattr("brewster.separate.look._TILE_PX", 416)
+    monkeypatch.setattr("brewster.inference.predictor._TILE_PX", 416)
     assert psnr(separator(photo, quality="best").transmission.pixels, whole) > 40
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from brewster import Photo
-from brewster.light import to_encoded, to_linear
-from brewster.photo.origin import Origin
+from brewster.photo.file_info import FileInfo
+from brewster.srgb import to_encoded, to_linear
 from front_door import picture
 from glass_server import as_a_user
 from picture_files import exif_block, file_of, smooth
@@ -136,7 +136,7 @@ def test_a_wide_gamut_photo_and_a_rotated_one_look_right(visit):
     import pyvips  # noqa: PLC0415
 
     colours = np.kron(np.array([[[230, 60, 60], [60, 200, 60]]], np.uint8), np.ones((30, 30, 1), np.uint8))
-    wide = Photo(colours, None, Origin(icc=pyvips.Image.profile_load("p3")))
+    wide = Photo(colours, None, FileInfo(icc=pyvips.Image.profile_load("p3")))
     page = visit()
     upload(page, ("p3.png", wide.encode("png")))
     assert apart(canvas(page, "left"), wide.srgb_8bit()).max() <= 1

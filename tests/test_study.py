@@ -10,9 +10,9 @@ import pytest
 
 from brewster import Photo
 from brewster.errors import BrewsterError, TargetError
-from brewster.study.create import Choices, create
-from brewster.study.spoil import spoil
-from brewster.study.study import read_study
+from brewster.user_study.create import StudyOptions, create
+from brewster.user_study.degrade import spoil
+from brewster.user_study.study import read_study
 from small_studies import made, write_pictures
 
 NAMES = ("real/1", "real/2", "real/10", "nature/1")
@@ -87,7 +87,7 @@ def test_file_names_and_bytes_tell_no_method_and_no_picture(tmp_path):
 def test_the_same_seed_makes_the_same_study_and_another_another(tmp_path, folders):
     inputs, methods = folders
     first, second, third = (
-        create(tmp_path / name, inputs, methods, Choices(seed=seed)).description
+        create(tmp_path / name, inputs, methods, StudyOptions(seed=seed)).description
         for name, seed in (("a", 5), ("b", 5), ("c", 6))
     )
     assert first == second
@@ -129,9 +129,9 @@ def test_one_name_in_two_formats_is_refused(tmp_path, folders):
 @pytest.mark.parametrize(
     ("choices", "told"),
     [
-        (Choices(datasets=("wild",)), "no dataset 'wild'"),
-        (Choices(pairs=5), "5 pairs .* there are 4"),
-        (Choices(catches=5), "5 catch trials .* there are 4"),
+        (StudyOptions(datasets=("wild",)), "no dataset 'wild'"),
+        (StudyOptions(pairs=5), "5 pairs .* there are 4"),
+        (StudyOptions(catches=5), "5 catch trials .* there are 4"),
     ],
 )
 def test_more_than_there_is_is_refused(tmp_path, folders, choices, told):
@@ -214,7 +214,7 @@ def test_pictures_beside_folders_of_pictures_are_named_and_refused_unless_datase
     write_pictures(inputs, ["stray"])
     with pytest.raises(BrewsterError, match=r"stray\.png\) beside folders of them \(nature, real\)"):
         create(tmp_path / "study", inputs, methods)
-    study = create(tmp_path / "study", inputs, methods, Choices(datasets=("nature", "real")))
+    study = create(tmp_path / "study", inputs, methods, StudyOptions(datasets=("nature", "real")))
     assert len(study.description.comparisons) == 4
 
 

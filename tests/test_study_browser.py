@@ -7,9 +7,9 @@ import pytest
 from playwright.sync_api import expect
 
 from brewster import Photo
-from brewster.study.store import Store
+from brewster.user_study.store import AnswerStore
 from brewster.web.application import application
-from brewster.web.guard import Guard
+from brewster.web.middleware import RequestLimits
 from brewster.web.study import participants
 from file_server import loopback_only
 from glass_server import on_a_thread
@@ -37,13 +37,13 @@ def original(tmp_path_factory):
 
 @pytest.fixture
 def store(original, tmp_path):
-    with closing(Store(beside(original, tmp_path / "study"))) as store:
+    with closing(AnswerStore(beside(original, tmp_path / "study"))) as store:
         yield store
 
 
 @pytest.fixture
 def url(store):
-    app = application(participants(store.study, store), guard=Guard(), home="study.html")
+    app = application(participants(store.study, store), guard=RequestLimits(), home="study.html")
     with on_a_thread(app) as port:
         yield f"http://127.0.0.1:{port}/"
 

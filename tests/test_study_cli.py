@@ -12,8 +12,8 @@ from functools import partial
 import httpx
 import pytest
 
-from brewster.study.store import Store
-from brewster.study.study import read_study
+from brewster.user_study.store import AnswerStore
+from brewster.user_study.study import read_study
 from file_server import loopback_only
 from other_processes import started
 from small_studies import choice_for, write_pictures
@@ -42,7 +42,7 @@ def created(bare, folders, tmp_path):
 
 
 def answer_all(study, people, dice):
-    store = Store(study)
+    store = AnswerStore(study)
     for _ in range(people):
         person = store.participant(store.admit())
         for number, trial in enumerate(person.trials):

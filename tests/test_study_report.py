@@ -11,24 +11,17 @@ import pytest
 
 from brewster import Photo
 from brewster.errors import BrewsterError
-from brewster.study.draw import Trial, draw
-from brewster.study.report import figure
-from brewster.study.report.agreement import alpha
-from brewster.study.report.figure import plot
-from brewster.study.report.people import Person, Rule, outcome, people
-from brewster.study.report.results import AVERAGES, summarise, write
-from brewster.study.report.statistics import (
-    averages,
-    correlation,
-    interval,
-    rates,
-    resampled,
-    summed,
-)
-from brewster.study.report.strengths import strengths
-from brewster.study.report.tables import to_csv, to_latex, to_markdown
-from brewster.study.store import Answer, Participant
-from brewster.study.study import Study
+from brewster.user_study.assignment import TrialDraw, draw
+from brewster.user_study.report import figure
+from brewster.user_study.report.bradley_terry import strengths
+from brewster.user_study.report.figure import plot
+from brewster.user_study.report.krippendorff import alpha
+from brewster.user_study.report.participants import ExclusionRule, ParticipantAnswers, outcome, people
+from brewster.user_study.report.results import AVERAGES, summarise, write
+from brewster.user_study.report.statistics import averages, correlation, interval, rates, resampled, summed
+from brewster.user_study.report.tables import to_csv, to_latex, to_markdown
+from brewster.user_study.store import Participant, StoredAnswer
+from brewster.user_study.study import Study
 from small_studies import choice_for, described
 
 TRUTH = np.array([0.45, 0.28, 0.27])
@@ -188,11 +181,11 @@ def test_alpha_is_1_in_full_agreement_0_by_chance_and_nothing_where_nothing_can_
     [(False, "left", 0), (False, "right", 2), (True, "left", 2), (True, "right", 0), (True, "similar", 1)],
 )
 def test_a_choice_is_the_first_method_s_win_on_whichever_side_it_stood(flipped, choice, means):
-    assert outcome(Trial("", "", "", 0, flipped), choice) == means
+    assert outcome(TrialDraw("", "", "", 0, flipped), choice) == means
 
 
 def person(**about):
-    return Person(
+    return ParticipantAnswers(
         **{"number": 0, "votes": {0: 1}, "catches": 4, "failed": 0, "seconds": 5.0, "is_complete": True}
         | about
     )
@@ -212,7 +205,7 @@ def person(**about):
     ],
 )
 def test_the_rule_leaves_out_who_does_not_look_and_nobody_else(about, reason):
-    assert Rule().reason(person(**about)) == reason
+    assert ExclusionRule().reason(person(**about)) == reason
 
 
 def answered(description, number, dice, chances, *, catches=1.0, seconds=6.0, trials=None):
@@ -225,7 +218,7 @@ def answered(description, number, dice, chances, *, catches=1.0, seconds=6.0, tr
         else:
             wrong = "left" if trial.expected != "left" else "right"
             choice = trial.expected if dice.random() < catches else wrong
-        answers[i] = Answer(choice, seconds * dice.uniform(0.5, 2))
+        answers[i] = StoredAnswer(choice, seconds * dice.uniform(0.5, 2))
     return Participant(number, row), answers
 
 
@@ -248,7 +241,7 @@ def hundred(tmp_path_factory):
     ]
     study = Study(tmp_path_factory.mktemp("hundred"), description)
     who = people(everybody)
-    return study, who, summarise(study, who, Rule())
+    return study, who, summarise(study, who, ExclusionRule())
 
 
 def test_a_hundred_simulated_people_are_understood(hundred):
@@ -275,7 +268,7 @@ def test_results_are_plain_json_and_the_same_in_any_order(hundred):
     study, who, results = hundred
     assert json.loads(json.dumps(results, allow_nan=False)) == results
     assert (
-        summarise(study, who[::-1], Rule())["kept"]["tables"][0]["rows"][0]["win"]["mean"]
+        summarise(study, who[::-1], ExclusionRule())["kept"]["tables"][0]["rows"][0]["win"]["mean"]
         == (results["kept"]["tables"][0]["rows"][0]["win"]["mean"])
     )
 
@@ -320,19 +313,19 @@ def test_markdown_says_all_and_csv_has_a_line_for_each_number(hundred):
 def test_without_answers_there_is_no_report(hundred):
     study, *_ = hundred
     with pytest.raises(BrewsterError, match="no answers yet"):
-        summarise(study, [], Rule())
+        summarise(study, [], ExclusionRule())
 
 
 def test_one_person_gives_rates_without_intervals(hundred):
     study, who, _ = hundred
-    row = summarise(study, who[20:21], Rule())["kept"]["tables"][0]["rows"][-1]
+    row = summarise(study, who[20:21], ExclusionRule())["kept"]["tables"][0]["rows"][-1]
     assert row["win"]["mean"] is not None
     assert row["win"]["low"] is None
 
 
 def test_a_rule_that_leaves_nobody_still_tells_of_everyone(hundred):
     study, who, _ = hundred
-    results = summarise(study, who[:5], Rule())
+    results = summarise(study, who[:5], ExclusionRule())
     assert results["kept"]["participants"] == 0
     assert to_latex(results).startswith("% the rule leaves nobody")
     assert plot(results)[1:4] == b"PNG"
@@ -350,7 +343,7 @@ def named(tmp_path, datasets, methods):
 
 def test_a_dataset_that_is_called_average_is_told_from_the_average(tmp_path):
     study, who = named(tmp_path, ("Average", "real"), ("ours", "RDNet"))
-    results = summarise(study, who, Rule())
+    results = summarise(study, who, ExclusionRule())
     lines = csv.DictReader(io.StringIO(to_csv(results)))
     told = {line["key"]: line["dataset"] for line in lines}
     assert told == {"Average": "Average (dataset)", "real": "real"} | AVERAGES
@@ -364,7 +357,7 @@ def test_the_plot_has_a_bar_for_each_row_and_takes_names_as_they_are(tmp_path, m
     draw_bars = figure._bars
     monkeypatch.setattr(figure, "_bars", lambda axis, *rest: (axes.append(axis), draw_bars(axis, *rest)))
     study, who = named(tmp_path, ("$x^$", "\u96e8"), ("$a_{b$", "RDNet"))
-    results = summarise(study, who, Rule())
+    results = summarise(study, who, ExclusionRule())
     for row in results["kept"]["tables"][0]["rows"]:
         row["title"] = "alike" if row["key"] in ("\u96e8", "/average") else row["title"]
     results["kept"]["tables"][0]["second"] = "\u96e8"
@@ -381,7 +374,7 @@ def test_a_plot_of_everyone_says_so(hundred, monkeypatch):
     said = []
     monkeypatch.setattr("matplotlib.figure.Figure.suptitle", lambda _self, text, **_how: said.append(text))
     for count in (20, 5):  # of the five, nobody is kept
-        plot(summarise(study, who[:count], Rule()))
+        plot(summarise(study, who[:count], ExclusionRule()))
     assert said == ["Everyone: the rule leaves nobody"]
 
 
@@ -398,5 +391,5 @@ def test_answers_csv_says_who_is_left_out_and_why(hundred, tmp_path):
 def test_strengths_that_are_alike_in_all_resamples_have_no_interval(hundred):
     study, *_ = hundred
     tied = [person(number=i, votes={0: 1, 1: 1}) for i in range(5)]
-    worth = summarise(study, tied, Rule())["kept"]["strengths"]["ours"]
+    worth = summarise(study, tied, ExclusionRule())["kept"]["strengths"]["ours"]
     assert worth == {"mean": pytest.approx(0), "low": None, "high": None}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, binomtest
 
-from brewster.study.report.statistics import interval, least, rates, resampled, summed, widened
+from brewster.user_study.report.statistics import interval, least, rates, resampled, summed, widened
 
 
 def estimated(*counts, pictures=(1.0,)):

@@ -13,15 +13,15 @@ from dataclasses import replace
 import pytest
 
 from brewster.errors import BrewsterError
-from brewster.study.draw import draw
-from brewster.study.store import Store
-from brewster.study.study import read_study, write_study
+from brewster.user_study.assignment import draw
+from brewster.user_study.store import AnswerStore
+from brewster.user_study.study import read_study, write_study
 from small_studies import described, empty
 
 
 @pytest.fixture
 def store(tmp_path):
-    store = Store(empty(tmp_path / "study"))
+    store = AnswerStore(empty(tmp_path / "study"))
     yield store
     store.close()
 
@@ -93,7 +93,7 @@ def test_absurd_times_are_cut(store):
 
 
 def test_two_servers_and_many_threads_lose_nothing_and_number_nobody_twice(store):
-    other = Store(store.study)
+    other = AnswerStore(store.study)
 
     def take_part(number):
         own = (store, other)[number % 2]
@@ -113,14 +113,14 @@ def test_a_file_that_is_no_database_is_told_in_one_sentence(tmp_path):
     study = empty(tmp_path / "study")
     study.answers.write_bytes(b"no database at all, but long enough to be read as a header" * 20)
     with pytest.raises(BrewsterError, match=r"answers\.sqlite cannot be used"):
-        Store(study)
+        AnswerStore(study)
 
 
 WRITER = """
 import sys
 from pathlib import Path
-from brewster.study.store import Store
-from brewster.study.study import read_study
+from brewster.user_study.store import Store
+from brewster.user_study.study import read_study
 
 store = Store(read_study(Path(sys.argv[1])))
 while True:
@@ -143,7 +143,7 @@ def test_what_was_acknowledged_before_kill_9_is_there_once(tmp_path):
         os.kill(writer.pid, signal.SIGKILL)
         rest = writer.communicate()[0].splitlines()
         acknowledged += [tuple(map(int, line.split())) for line in rest if re.fullmatch(r"\d+ \d+", line)]
-    store = Store(read_study(tmp_path))
+    store = AnswerStore(read_study(tmp_path))
     kept = all_answers(store)
     store.close()
     assert len(set(acknowledged)) == len(acknowledged) >= 30
@@ -163,9 +163,9 @@ def test_a_copy_of_the_folder_after_kill_9_has_all_answers_and_once_opened_again
     os.kill(writer.pid, signal.SIGKILL)
     writer.communicate()
     shutil.copytree(tmp_path / "study", tmp_path / "copy")
-    copied = all_answers(Store(read_study(tmp_path / "copy"), only_reads=True))
+    copied = all_answers(AnswerStore(read_study(tmp_path / "copy"), only_reads=True))
     assert sum(map(len, copied.values())) >= 15
-    store = Store(read_study(tmp_path / "study"))
+    store = AnswerStore(read_study(tmp_path / "study"))
     assert all_answers(alone(store.study, tmp_path / "alone")) == copied
     store.close()
 
@@ -174,11 +174,11 @@ def alone(study, folder):
     """The answers of a copy of answers.sqlite without its log."""
     folder.mkdir()
     shutil.copy(study.answers, folder)
-    return Store(replace(study, folder=folder))
+    return AnswerStore(replace(study, folder=folder))
 
 
 def test_a_store_that_is_closed_leaves_all_in_the_file_though_others_have_it_open(store, tmp_path):
-    other = Store(store.study)
+    other = AnswerStore(store.study)
     person = store.participant(store.admit())
     store.answer(person, 0, "left", seconds=2)
     store.close()
@@ -189,12 +189,12 @@ def test_a_store_that_is_closed_leaves_all_in_the_file_though_others_have_it_ope
 def test_a_reader_makes_no_database_and_sees_what_a_server_writes(store):
     person = store.participant(store.admit())
     store.answer(person, 0, "left", seconds=2)
-    reader = Store(store.study, only_reads=True)
+    reader = AnswerStore(store.study, only_reads=True)
     store.answer(person, 1, "right", seconds=2)
     assert all_answers(reader) == all_answers(store)
     with pytest.raises(BrewsterError, match="cannot be used"):
         reader.admit()
     reader.close()
     nobody = empty(store.study.folder / "nobody")
-    assert all_answers(Store(nobody, only_reads=True)) == {}
+    assert all_answers(AnswerStore(nobody, only_reads=True)) == {}
     assert not nobody.answers.exists()

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from brewster import Photo
-from brewster.study.create import create
-from brewster.study.store import Store
+from brewster.user_study.create import create
+from brewster.user_study.store import AnswerStore
 from brewster.web.application import application
-from brewster.web.guard import Guard
+from brewster.web.middleware import RequestLimits
 from brewster.web.study import participants
 from glass_server import ask
 from small_studies import beside, made
@@ -30,13 +30,13 @@ def study(original, tmp_path):
 
 @pytest.fixture
 def store(study):
-    with closing(Store(study)) as store:
+    with closing(AnswerStore(study)) as store:
         yield store
 
 
 @pytest.fixture
 def app(study, store):
-    return application(participants(study, store), guard=Guard(), home="study.html")
+    return application(participants(study, store), guard=RequestLimits(), home="study.html")
 
 
 def begin(app):
@@ -140,7 +140,7 @@ def test_trials_beyond_the_last_are_told_so(app):
 
 
 def test_a_full_study_lets_nobody_else_in_and_those_inside_go_on(study, store):
-    app = application(participants(study, store, most=1), guard=Guard(), home="study.html")
+    app = application(participants(study, store, most=1), guard=RequestLimits(), home="study.html")
     link = begin(app)
     assert not ask(app, "GET", "/invitation").json()["is_open"]
     refused = ask(app, "POST", "/participants", json={"agreed": True})
@@ -150,7 +150,7 @@ def test_a_full_study_lets_nobody_else_in_and_those_inside_go_on(study, store):
 
 
 def test_a_personal_link_carries_the_token_that_the_server_wants(study, store):
-    guard = Guard(token=TOKEN)
+    guard = RequestLimits(token=TOKEN)
     app = application(participants(study, store, token=TOKEN), guard=guard, home="study.html")
     assert ask(app, "POST", "/participants", json={"agreed": True}).status_code == 401
     bearer = {"Authorization": f"Bearer {TOKEN}"}
@@ -170,8 +170,8 @@ def test_a_wide_and_a_deep_picture_look_as_they_do_elsewhere(tmp_path):
         deep.save(tmp_path / folder / "a.png", overwrite=True)
     methods = {name: tmp_path / name for name in ("Secretlus", "Rivalino")}
     study = create(tmp_path / "again", tmp_path / "inputs", methods)
-    with closing(Store(study)) as store:
-        app = application(participants(study, store), guard=Guard(), home="study.html")
+    with closing(AnswerStore(study)) as store:
+        app = application(participants(study, store), guard=RequestLimits(), home="study.html")
         shown = Photo.open(ask(app, "GET", f"{begin(app)}/pictures/0/photo").content)
     assert shown.pixels.dtype == np.uint8
     assert np.array_equal(shown.pixels, deep.srgb_8bit())
@@ -196,8 +196,8 @@ def test_an_answer_that_the_disk_refuses_is_not_acknowledged_and_can_be_sent_aga
 
 def test_a_picture_that_is_gone_is_told_so_and_not_as_a_failure_that_passes(tmp_path):
     study = made(tmp_path)
-    with closing(Store(study)) as store:
-        app = application(participants(study, store), guard=Guard(), home="study.html")
+    with closing(AnswerStore(study)) as store:
+        app = application(participants(study, store), guard=RequestLimits(), home="study.html")
         link = begin(app)
         trial = store.participant(link.removeprefix("/s/")).trials[0]
         study.file(trial.left).unlink()

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from brewster.errors import ModelError
-from brewster.models.large.tensors import read_tensors, write_tensors
+from brewster.models.diffusion.tensors import read_tensors, write_tensors
 
 
 def test_tensors_and_what_is_said_about_them_come_back(tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brewster.separate.tiles import in_tiles, tiles_of
+from brewster.inference.tiles import in_tiles, tiles_of
 
 
 def halves(tile):

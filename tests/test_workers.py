@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from brewster.dataset import sets
-from brewster.dataset.build import workers
-from brewster.dataset.build.workers import Here, Workers, render_again
 from brewster.errors import DeviceError, RecipeError, TargetError
+from brewster.rendered import store
+from brewster.rendered.generation import workers
+from brewster.rendered.generation.workers import ProcessExecutor, SerialExecutor, render_again
 from other_processes import children, is_alive, started, wait_for
 from set_folders import hashes, job, make, names, statuses
 
@@ -21,16 +21,16 @@ TESTS = Path(__file__).parent
 
 
 def two(job):
-    return Workers(job, 2)
+    return ProcessExecutor(job, 2)
 
 
 def in_a_process(out, count):
     """A run with a worker that never finishes sample 2, in a process that can be killed."""
     code = f"""
 from pathlib import Path
-from brewster.dataset.build.workers import Workers
+from brewster.rendered.generation.workers import Workers
 from set_folders import make
-make(Path({str(out)!r}), {count}, renderer="waits", crew=lambda job: Workers(job, 1))
+make(Path({str(out)!r}), {count}, renderer="waits", crew=lambda job: ProcessExecutor(job, 1))
 """
     waiting = {**os.environ, "FAKE_WAIT": "1"}
     return started([sys.executable, "-c", code], cwd=TESTS, stderr=subprocess.PIPE, env=waiting)
@@ -54,7 +54,7 @@ def test_a_run_killed_in_the_middle_takes_its_workers_along_and_is_resumed(tmp_p
         run.communicate()
     wait_for(lambda: not any(map(is_alive, crew)))
     assert sorted(folder.name for folder in out.glob("0*")) == ["000000", "000001"]
-    assert all(names(folder) == set(sets.FILES) for folder in out.glob("0*"))
+    assert all(names(folder) == set(store.FILES) for folder in out.glob("0*"))
     results = make(out, count=count, renderer="waits")
     assert statuses(results) == {0: "skipped", 1: "skipped", 2: "rendered", 3: "rendered"}
     make(tmp_path / "undisturbed", count=count, renderer="waits")
@@ -76,7 +76,7 @@ def test_ctrl_c_stops_all_at_once_and_leaves_nothing_half(tmp_path):
 
 def test_a_sample_that_kills_every_worker_is_named_and_the_rest_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr(workers, "TRIES", 1)
-    results = make(tmp_path / "set", renderer="deadly", crew=partial(Workers, count=1))
+    results = make(tmp_path / "set", renderer="deadly", crew=partial(ProcessExecutor, count=1))
     assert statuses(results) == {0: "rendered", 1: "rendered", 2: "failed", 3: "rendered"}
     assert "its worker died 1 times (exit code -9)" in next(
         result.error for result in results if result.error
@@ -85,7 +85,7 @@ def test_a_sample_that_kills_every_worker_is_named_and_the_rest_goes_on(tmp_path
 
 def test_what_ends_the_run_ends_it_from_another_process_too(tmp_path):
     with pytest.raises(DeviceError, match=r"^there is no light; a lamp; or two; buy one\.$"):
-        make(tmp_path / "set", renderer="deviceless", crew=partial(Workers, count=1))
+        make(tmp_path / "set", renderer="deviceless", crew=partial(ProcessExecutor, count=1))
 
 
 def test_rendering_here_leaves_the_threads_of_torch_as_they_were(tmp_path):
@@ -100,7 +100,7 @@ def test_rendering_here_leaves_the_threads_of_torch_as_they_were(tmp_path):
 
 def test_a_scene_is_rendered_again_byte_for_byte(tmp_path):
     make(tmp_path / "set", count=2)
-    scene = tmp_path / "set" / "000001" / sets.SCENE
+    scene = tmp_path / "set" / "000001" / store.SCENE
     render_again(scene, tmp_path / "again", renderer="fake_renderer:render")
     assert hashes(tmp_path / "again") == hashes(scene.parent)
 
@@ -108,12 +108,12 @@ def test_a_scene_is_rendered_again_byte_for_byte(tmp_path):
 def test_a_scene_file_cannot_choose_what_code_is_run(tmp_path):
     make(tmp_path / "set", count=1)
     with pytest.raises(RecipeError, match="was rendered by 'fake_renderer:render'"):
-        render_again(tmp_path / "set" / "000000" / sets.SCENE, tmp_path / "again")
+        render_again(tmp_path / "set" / "000000" / store.SCENE, tmp_path / "again")
 
 
 def test_a_scene_is_never_rendered_over_something(tmp_path):
     make(tmp_path / "set", count=1)
-    scene = tmp_path / "set" / "000000" / sets.SCENE
+    scene = tmp_path / "set" / "000000" / store.SCENE
     for taken in (scene, scene.parent):
         with pytest.raises(TargetError, match="is taken"):
             render_again(scene, taken, renderer="fake_renderer:render")
@@ -125,10 +125,10 @@ def test_every_renderer_is_there():
 
 def test_an_unfinished_task_is_done_only_where_it_is_not(tmp_path):
     asked = job(tmp_path)
-    hand = workers.Hand(asked)
+    hand = workers.TaskRunner(asked)
     task = workers.Task("render", (0, 1))
     hand(task)
     before = (tmp_path / "000000").stat().st_ino
     assert [result.status for result in hand(task)] == ["rendered", "rendered"]
     assert (tmp_path / "000000").stat().st_ino == before
-    assert not Here(asked).is_busy()
+    assert not SerialExecutor(asked).is_busy()

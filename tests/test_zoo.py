@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 
 from brewster.errors import ModelError
-from brewster.models.large.backbones import BACKBONES
+from brewster.models.diffusion.backbones import BACKBONES
 from brewster.models.zoo import LARGE, MODELS, find_model
 
 

@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from brewster.light import to_encoded, to_linear
-from brewster.models.large.backbones import tiny
-from brewster.models.large.panels import Layout, compose, condition
+from brewster.models.diffusion.backbones import tiny
+from brewster.models.diffusion.panels import PanelLayout, compose, condition
 from brewster.photo import Photo
+from brewster.srgb import to_encoded, to_linear
 
 SIDE_PX = 32
-LAYOUT = Layout()
+LAYOUT = PanelLayout()
 ANY, FAINT, STRONG = (0.1, 1.5), (0.1, 0.8), (0.7, 1.5)
 """Light of the shapes; white is 1."""
 FOLDERS = {"I": "blended", "T": "transmission", "R": "reflection"}

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from brewster.scene.camera import Camera, axes
 from brewster.scene.glass import Glazing, Pane
 from brewster.scene.scene import Scene
-from brewster.scene.world import Map, Plane, Side, Source
+from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
 
 
 class Worlds:
@@ -66,11 +66,11 @@ WORLDS = Worlds(
 
 
 def around(name="white", **more):
-    return Side(map=Map(source=Source(file=name), **more))
+    return Side(map=EnvironmentMap(source=AssetSource(file=name), **more))
 
 
 def board(name="white", **more):
-    return Side(plane=Plane(source=Source(file=name), **{"distance_mm": 800, "width_mm": 8000, **more}))
+    return Side(plane=Plane(source=AssetSource(file=name), **{"distance_mm": 800, "width_mm": 8000, **more}))
 
 
 def at(heading_deg, pitch_deg=0.0, distance_mm=500.0, **more):

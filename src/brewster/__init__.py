@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 from brewster import errors
 
 if TYPE_CHECKING:
+    from brewster.inference import Separation, Separator, separate
     from brewster.photo import Photo
-    from brewster.separate import Separation, Separator, separate
 
     __version__: str
 else:  # a type checker would take any name, even a misspelt one, for what __getattr__ returns
@@ -25,8 +25,6 @@ else:  # a type checker would take any name, even a misspelt one, for what __get
         """Names are looked up when they are first used."""
         if name in _HOMES:
             return getattr(importlib.import_module(_HOMES[name]), name)
-        if name == "separate":
-            return importlib.import_module("brewster.separate")  # a package that can be called: see there
         if name == "__version__":
             return _version()
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
@@ -34,7 +32,12 @@ else:  # a type checker would take any name, even a misspelt one, for what __get
 
 __all__ = ["Photo", "Separation", "Separator", "__version__", "errors", "separate"]
 
-_HOMES = {"Photo": "brewster.photo", "Separation": "brewster.separate", "Separator": "brewster.separate"}
+_HOMES = {
+    "Photo": "brewster.photo",
+    "Separation": "brewster.inference",
+    "Separator": "brewster.inference",
+    "separate": "brewster.inference",
+}
 
 
 def __dir__() -> list[str]:

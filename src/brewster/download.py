@@ -31,7 +31,7 @@ _WEB = "http:// or https://"
 _T = TypeVar("_T")
 
 
-class Promise(NamedTuple):
+class RemoteFile(NamedTuple):
     """A file as its server, or we, promise it; the digest is in lower-case hexadecimal digits."""
 
     url: str
@@ -41,7 +41,7 @@ class Promise(NamedTuple):
 
 
 @final
-class _Lost(Exception):
+class _RetryableError(Exception):
     """The line broke, or the server asks for patience: worth another attempt, after so many seconds."""
 
     def __init__(self, why: object, wait_s: float = 0.0) -> None:
@@ -51,7 +51,7 @@ class _Lost(Exception):
 
 @final
 @dataclass(frozen=True)
-class Line:
+class Downloader:
     """How to ask: the pauses between attempts, how long silence is borne, and how to wait."""
 
     pauses_s: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0)
@@ -71,7 +71,7 @@ class Line:
 
         return self._patiently(url, attempt)
 
-    def fetch(self, promise: Promise, target: Path) -> None:
+    def fetch(self, promise: RemoteFile, target: Path) -> None:
         """Downloads a file, making its folder; the target has its name only when it is whole and right.
 
         Raises:
@@ -96,7 +96,7 @@ class Line:
         while True:
             try:
                 return attempt()
-            except _Lost as lost:
+            except _RetryableError as lost:
                 if (pause := next(pauses, None)) is None:
                     happened = f"{url} did not come in {len(self.pauses_s) + 1} attempts ({lost})"
                     cure = "check the connection, or run again later: what came is kept"
@@ -115,17 +115,19 @@ class Line:
             error.close()
             if error.code in _BUSY:
                 wait = error.headers.get("Retry-After", "")
-                raise _Lost(error, min(float(wait), _LONGEST_WAIT_S) if wait.isdecimal() else 0) from error
+                raise _RetryableError(
+                    error, min(float(wait), _LONGEST_WAIT_S) if wait.isdecimal() else 0
+                ) from error
             raise DownloadError(f"{url} was refused ({error})", "a file", "run again later") from error
         except (ValueError, InvalidURL) as error:
             raise DownloadError(f"{url!r} is no address ({error})", _WEB, "check the address") from error
         except (OSError, HTTPException) as error:
-            raise _Lost(error) from error
+            raise _RetryableError(error) from error
         if answer is None:
             raise DownloadError(f"{url!r} leads elsewhere", _WEB, "check the address")
         return cast("HTTPResponse", answer)
 
-    def _fetch_rest(self, promise: Promise, part: Path) -> None:
+    def _fetch_rest(self, promise: RemoteFile, part: Path) -> None:
         came = part.stat().st_size if part.exists() else 0
         if came == promise.size:
             return
@@ -138,7 +140,7 @@ class Line:
                 file.flush()
                 os.fsync(file.fileno())
         if there < promise.size:
-            raise _Lost(f"it ended after {there} of {promise.size} bytes")
+            raise _RetryableError(f"it ended after {there} of {promise.size} bytes")
 
 
 def digest_of(path: Path, algorithm: str) -> str:
@@ -163,7 +165,7 @@ def _read(response: HTTPResponse, most: int | None = None) -> bytes:
     try:
         return response.read() if most is None else response.read1(most)
     except (OSError, HTTPException) as error:
-        raise _Lost(error) from error
+        raise _RetryableError(error) from error
 
 
 @functools.cache

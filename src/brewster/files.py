@@ -50,7 +50,7 @@ _ALWAYS_PNG = ("confidence",)  # a grey map, not a photograph: no container of t
 
 
 @dataclass(frozen=True)
-class Job:
+class SeparationPaths:
     """One picture to separate, and where its layers go: `folder/name.layer.suffix`."""
 
     source: Path
@@ -64,7 +64,7 @@ class Job:
         return self.folder / f"{self.name}.{layer}{suffix or (own if writable else '.png')}"
 
 
-def find(sources: Iterable[Path], into: Path | None = None) -> list[Job]:
+def find(sources: Iterable[Path], into: Path | None = None) -> list[SeparationPaths]:
     """Every picture in the files and folders given, each once, in a stable order.
 
     Layers go beside their picture, or under `into`, where the tree below a folder is mirrored. They are
@@ -78,7 +78,7 @@ def find(sources: Iterable[Path], into: Path | None = None) -> list[Job]:
 
     Raises TargetError when two pictures would be written under one name.
     """
-    jobs: dict[str, Job] = {}
+    jobs: dict[str, SeparationPaths] = {}
     wanted: dict[Path, Counter[str]] = {}
     for source in sources:
         for picture in _pictures(source):
@@ -87,7 +87,7 @@ def find(sources: Iterable[Path], into: Path | None = None) -> list[Job]:
                 wanted[beside] = _wanted_names(beside)
             inside = Path() if picture == source else beside.relative_to(source)
             folder = beside if into is None else into / inside
-            job = Job(picture, folder, _layer_name(picture, wanted[beside]))
+            job = SeparationPaths(picture, folder, _layer_name(picture, wanted[beside]))
             jobs.setdefault(_place(picture), job)
     _refuse_shared_names(jobs.values())
     return list(jobs.values())
@@ -245,8 +245,8 @@ def _is_wanted(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and not ours
 
 
-def _refuse_shared_names(jobs: Iterable[Job]) -> None:
-    owners: dict[str, Job] = {}
+def _refuse_shared_names(jobs: Iterable[SeparationPaths]) -> None:
+    owners: dict[str, SeparationPaths] = {}
     for job in jobs:
         name = job.folder / job.name
         other = owners.setdefault(_place(name), job)

@@ -22,7 +22,7 @@ Quantisation = Literal["int8", "float8", "nf4"]
 """How a large base is stored that would not fit as it is: 8 bits by torchao, 4 by bitsandbytes."""
 
 
-class Large(TypedDict, total=False):
+class DiffusionOptions(TypedDict, total=False):
     """What can be asked of large image models alone; see `Options` for what each is."""
 
     base: str | None
@@ -121,7 +121,7 @@ class Options:
 
     def load(self) -> dict[str, Any]:
         """The keywords for loading a `Separator`."""
-        large = {name: getattr(self, name) for name in Large.__annotations__}
+        large = {name: getattr(self, name) for name in DiffusionOptions.__annotations__}
         asked = {name: value for name, value in large.items() if value != getattr(Options, name)}
         return {"model": self.model, "device": self.device, **asked}
 

@@ -13,8 +13,8 @@ from scipy.ndimage import gaussian_filter, shift
 from skimage import data
 from skimage.transform import resize
 
-from brewster.light import to_linear
 from brewster.photo import Photo
+from brewster.srgb import to_linear
 
 HERE = Path(__file__).parent
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from brewster.light import to_encoded
+from brewster.environments.procedural.rooms import WORLDS, painting
 from brewster.photo import Photo
-from brewster.worlds.procedural import WORLDS, painting
+from brewster.srgb import to_encoded
 
 HERE = Path(__file__).parent
 HEIGHT = 64

@@ -47,8 +47,8 @@ def ablate(
     """
     require_extra("train", "training")
     require_extra("evaluate", "evaluating")
-    from brewster.evaluate.ablate import ablate as run  # noqa: PLC0415  (wakes torch, in two seconds)
-    from brewster.evaluate.ablate import read_study  # noqa: PLC0415
+    from brewster.evaluate.ablation import ablate as run  # noqa: PLC0415  (wakes torch, in two seconds)
+    from brewster.evaluate.ablation import read_study  # noqa: PLC0415
 
     read, name = read_study(study), study.stem
     if base:

@@ -14,7 +14,7 @@ import click
 from brewster.cli.terminal import complain, one_line, progress, say, standard_output, write_out
 
 if TYPE_CHECKING:
-    from brewster.worlds.polyhaven import Order, Result
+    from brewster.environments.polyhaven import DownloadRequest, DownloadResult
 
 _COUNT = click.IntRange(min=0)
 
@@ -78,9 +78,9 @@ def pull(
     Maps that are there already are skipped, and a download that was stopped goes on where it was. A map that fails
     does not stop the others: it is named at the end, and the exit code is 1.
     """
-    from brewster.worlds.polyhaven import Order, maps_folder  # noqa: PLC0415  (wakes urllib)
+    from brewster.environments.polyhaven import DownloadRequest, maps_folder  # noqa: PLC0415  (wakes urllib)
 
-    order = Order(**asked)
+    order = DownloadRequest(**asked)
     results = _fetch(order, out or maps_folder(), as_json=as_json, quiet=quiet)
     if not quiet:
         _own_up(order, results)
@@ -88,11 +88,11 @@ def pull(
     context.exit(1 if any(result.error for result in results) else 0)
 
 
-def _fetch(order: Order, folder: Path, *, as_json: bool, quiet: bool) -> list[Result]:
+def _fetch(order: DownloadRequest, folder: Path, *, as_json: bool, quiet: bool) -> list[DownloadResult]:
     """Fetches the maps and tells of each; those that failed are named at the end, whatever the end is."""
-    from brewster.worlds.polyhaven import pull as fetch  # noqa: PLC0415
+    from brewster.environments.polyhaven import pull as fetch  # noqa: PLC0415
 
-    results: list[Result] = []
+    results: list[DownloadResult] = []
     talks_over_bar = as_json and standard_output.stream.isatty()
     try:
         with progress(order.indoor + order.outdoor, shown=not quiet and not talks_over_bar) as advance:
@@ -105,7 +105,7 @@ def _fetch(order: Order, folder: Path, *, as_json: bool, quiet: bool) -> list[Re
     return results
 
 
-def _tell(result: Result, *, as_json: bool, quiet: bool) -> None:
+def _tell(result: DownloadResult, *, as_json: bool, quiet: bool) -> None:
     if as_json:
         write_out(f"{json.dumps(asdict(result))}\n".encode())
     elif result.status == "planned":
@@ -120,7 +120,7 @@ def _tell(result: Result, *, as_json: bool, quiet: bool) -> None:
         say(f"{result.asset} -> {result.file} ({(result.bytes or 0) / 1e6:.1f} MB)")
 
 
-def _sum_up(results: Sequence[Result], *, quiet: bool) -> None:
+def _sum_up(results: Sequence[DownloadResult], *, quiet: bool) -> None:
     counts = Counter(result.status for result in results)
     if counts and not quiet:
         say(", ".join(f"{count} {status}" for status, count in sorted(counts.items())))
@@ -129,7 +129,7 @@ def _sum_up(results: Sequence[Result], *, quiet: bool) -> None:
             complain(f"{result.asset}: {result.error}")
 
 
-def _own_up(order: Order, results: Sequence[Result]) -> None:
+def _own_up(order: DownloadRequest, results: Sequence[DownloadResult]) -> None:
     """Says aloud when the server has fewer maps than were asked for."""
     for category, asked in (("indoor", order.indoor), ("outdoor", order.outdoor)):
         found = sum(result.category == category and result.status != "missing" for result in results)

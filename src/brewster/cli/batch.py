@@ -32,12 +32,12 @@ from brewster.files import SUFFIXES, find, write_atomically
 from brewster.options import Options
 
 if TYPE_CHECKING:
-    from brewster.separate import Separator
+    from brewster.inference import Separator
 
 
 @final
 @dataclass(frozen=True)
-class Task:
+class BatchItem:
     """A photo and where its layers go; None stands for standard input and standard output."""
 
     source: Path | None
@@ -51,7 +51,7 @@ class Task:
 
 @final
 @dataclass
-class Entry:
+class BatchResult:
     """What became of a photo: a line of `--json`."""
 
     source: str
@@ -61,8 +61,8 @@ class Entry:
     sha256: str | None = None
     device: str | None = None
     seconds: dict[str, float] = field(default_factory=dict)
-    remainder: float | None = None
-    drift: float | None = None
+    residual: float | None = None
+    reconstruction_error: float | None = None
     doubtful: bool = False
     error: str | None = None
 
@@ -75,7 +75,7 @@ def goes_to_one_file(photos: Sequence[str], output: str | None) -> bool:
     return "-" in photos or output == "-" or _names_a_picture(output)
 
 
-def plan(photos: Sequence[str], output: str | None, options: Options) -> list[Task]:
+def plan(photos: Sequence[str], output: str | None, options: Options) -> list[BatchItem]:
     """The photos in the files and folders named, each with the files for its layers.
 
     Raises:
@@ -86,7 +86,7 @@ def plan(photos: Sequence[str], output: str | None, options: Options) -> list[Ta
     if goes_to_one_file(photos, output):
         return [_plan_one(photos, output, options)]
     tasks = [
-        Task(
+        BatchItem(
             job.source,
             {layer: job.target(layer, options.suffix(layer, job.source)) for layer in options.layers},
         )
@@ -101,7 +101,7 @@ def plan(photos: Sequence[str], output: str | None, options: Options) -> list[Ta
     return tasks
 
 
-def _plan_one(photos: Sequence[str], output: str | None, options: Options) -> Task:
+def _plan_one(photos: Sequence[str], output: str | None, options: Options) -> BatchItem:
     if len(photos) > 1 or Path(photos[0]).is_dir():
         raise click.UsageError("Standard input, standard output and a picture named with -o take one photo.")
     if len(options.layers) > 1:
@@ -113,7 +113,7 @@ def _plan_one(photos: Sequence[str], output: str | None, options: Options) -> Ta
         target = Path(output)
         _refuse_container(SUFFIXES.get(target.suffix.lower()), options)
     source = None if photos[0] == "-" else Path(photos[0])
-    return Task(source, {options.layers[0]: target})
+    return BatchItem(source, {options.layers[0]: target})
 
 
 def _refuse_container(container: str | None, options: Options) -> None:
@@ -140,7 +140,7 @@ def _names_a_picture(output: str | None) -> bool:
 
 @final
 @dataclass
-class Batch:
+class SeparationBatch:
     """How the photos are to be done."""
 
     options: Options
@@ -149,14 +149,14 @@ class Batch:
     as_json: bool = False
     quiet: bool = False
 
-    def run(self, tasks: Sequence[Task]) -> bool:
+    def run(self, tasks: Sequence[BatchItem]) -> bool:
         """Does them all and tells; whether all went well.
 
         Raises:
             ModelError: no such model, or a damaged one.
             DeviceError: the asked device is not there.
         """
-        entries: list[Entry] = []
+        entries: list[BatchResult] = []
         bugs: list[Exception] = []
         self._sources = {os.path.realpath(task.source) for task in tasks if task.source}
         talks_over_bar = self.as_json and standard_output.stream.isatty()
@@ -177,12 +177,12 @@ class Batch:
 
     @cached_property
     def _separator(self) -> Separator:
-        from brewster.separate import Separator  # noqa: PLC0415  (wakes ONNX Runtime and pyvips)
+        from brewster.inference import Separator  # noqa: PLC0415  (wakes ONNX Runtime and pyvips)
 
         return Separator.load(**self.options.load())
 
-    def _do(self, task: Task, bugs: list[Exception]) -> Entry:
-        entry = Entry(task.name)
+    def _do(self, task: BatchItem, bugs: list[Exception]) -> BatchResult:
+        entry = BatchResult(task.name)
         try:
             missing = self._missing(task)
         except BrewsterError as error:
@@ -205,7 +205,7 @@ class Batch:
             return _failed(entry, f"brewster stumbled ({type(bug).__name__}: {bug}); please report it")
         return entry
 
-    def _missing(self, task: Task) -> dict[str, Path | None]:
+    def _missing(self, task: BatchItem) -> dict[str, Path | None]:
         """The layers that are still to be written.
 
         Raises:
@@ -232,11 +232,11 @@ class Batch:
         except OSError:  # one of them is not there
             return False
 
-    def _separate(self, source: Path | None, targets: dict[str, Path | None], entry: Entry) -> None:
+    def _separate(self, source: Path | None, targets: dict[str, Path | None], entry: BatchResult) -> None:
         photo = source or sys.stdin.buffer.read()
         separation = self._separator(photo, tell=self._tell_share, **self.options.call())
-        entry.seconds, entry.remainder = dict(separation.seconds), separation.remainder
-        entry.drift, entry.doubtful = separation.drift, separation.doubtful
+        entry.seconds, entry.residual = dict(separation.seconds), separation.residual
+        entry.reconstruction_error, entry.doubtful = separation.reconstruction_error, separation.doubtful
         started = time.perf_counter()
         for layer, target in targets.items():
             own = separation.photo.origin.container
@@ -250,7 +250,7 @@ class Batch:
             entry.outputs[layer] = str(target or "-")
         entry.seconds["encode"] = time.perf_counter() - started
 
-    def _tell(self, entry: Entry) -> None:
+    def _tell(self, entry: BatchResult) -> None:
         outputs = ", ".join(entry.outputs.values())
         if self.as_json:
             write_out(_json_line(entry))
@@ -264,10 +264,10 @@ class Batch:
             say(f"{entry.source} -> {outputs} ({sum(entry.seconds.values()):.1f} s)")
             if entry.doubtful:
                 say(
-                    f"{entry.source}: doubtful, the model redrew the photo (drift {entry.drift:.2f}): look at it"
+                    f"{entry.source}: doubtful, the model redrew the photo (reconstruction_error {entry.reconstruction_error:.2f}): look at it"
                 )
 
-    def _sum_up(self, entries: Sequence[Entry]) -> None:
+    def _sum_up(self, entries: Sequence[BatchResult]) -> None:
         counts = dict.fromkeys(("separated", "planned", "skipped", "failed"), 0)
         for entry in entries:
             counts[entry.status] += 1
@@ -285,12 +285,12 @@ def _tell_share(advance: Advance, before: int, name: str, share: float) -> None:
     advance(before + share, name)
 
 
-def _failed(entry: Entry, error: object) -> Entry:
+def _failed(entry: BatchResult, error: object) -> BatchResult:
     entry.status, entry.error = "failed", str(error)
     return entry
 
 
-def _json_line(entry: Entry) -> bytes:
+def _json_line(entry: BatchResult) -> bytes:
     said = asdict(entry)
     said["seconds"] = {name: round(seconds, 4) for name, seconds in entry.seconds.items()}
     return f"{json.dumps(said)}\n".encode()

@@ -111,7 +111,7 @@ def _version(package: str) -> str | None:
 
 def _devices() -> Iterator[Check]:
     try:
-        from brewster.separate.runtime import available_devices  # noqa: PLC0415  (wakes ONNX Runtime)
+        from brewster.inference.onnx_backend import available_devices  # noqa: PLC0415  (wakes ONNX Runtime)
 
         devices = available_devices()
     except (ImportError, OSError) as error:
@@ -174,21 +174,21 @@ def _tracer() -> Iterator[Check]:
     version = _version("mitsuba")
     if version is None:
         return
-    from brewster.render import llvm  # noqa: PLC0415  (not for --help)
+    from brewster.render.mitsuba import variant  # noqa: PLC0415  (not for --help)
 
     try:
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # about LLVM: see below
-            llvm.load()
+            variant.load()
     except MissingExtra as error:
-        yield Check("tracer", "mitsuba", "broken", str(error), llvm.cure(str(error)), needed=False)
+        yield Check("tracer", "mitsuba", "broken", str(error), variant.cure(str(error)), needed=False)
         return
     yield Check("tracer", "mitsuba", "ok", version)
-    found = llvm.probe()
-    if found.variant == llvm.COMPILED:
+    found = variant.probe()
+    if found.variant == variant.COMPILED:
         yield Check("tracer", "llvm", "ok", found.library or "the one Dr.Jit finds")
     else:
         about = f"none works, rendering is several times slower ({found.reason})"
-        yield Check("tracer", "llvm", "missing", about, llvm.INSTALL_LLVM, needed=False)
+        yield Check("tracer", "llvm", "missing", about, variant.INSTALL_LLVM, needed=False)
 
 
 def _large() -> Iterator[Check]:
@@ -199,7 +199,7 @@ def _large() -> Iterator[Check]:
     about = version or "not installed; for nf4 and 8-bit AdamW on NVIDIA cards"
     cure = None if version else "pip install bitsandbytes"
     yield Check("large", "bitsandbytes", "ok" if version else "missing", about, cure, needed=False)
-    from brewster.models.large.stock import has_token  # noqa: PLC0415  (wakes torch)
+    from brewster.models.diffusion.lazy_imports import has_token  # noqa: PLC0415  (wakes torch)
 
     found = has_token()
     about = "found" if found else "none; gated models such as FLUX.1 Kontext want one"

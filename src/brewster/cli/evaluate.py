@@ -15,15 +15,15 @@ from brewster.cli.terminal import complain, interrupts, progress, say, write_out
 from brewster.options import Device, Quality
 
 if TYPE_CHECKING:
-    from brewster.dataset.benchmarks import Benchmark
+    from brewster.benchmarks.registry import Benchmark
+    from brewster.evaluate.config import EvaluationConfig
     from brewster.evaluate.methods import Method
-    from brewster.evaluate.protocol import Protocol
     from brewster.evaluate.results import Results
-    from brewster.evaluate.runner import Row
+    from brewster.evaluate.runner import ScoreRow
 
 
 @final
-class Named(click.ParamType[tuple[str, str]]):
+class NamedValue(click.ParamType[tuple[str, str]]):
     """NAME=VALUE, as two strings; without a name that is empty, where this is allowed."""
 
     name = "named"
@@ -46,7 +46,7 @@ class Named(click.ParamType[tuple[str, str]]):
 
 
 @final
-class _Numbers(click.ParamType[tuple[float, ...]]):
+class _NumberList(click.ParamType[tuple[float, ...]]):
     """Numbers with commas between."""
 
     name = "numbers"
@@ -83,7 +83,7 @@ class _Size(click.ParamType[int]):
     "--benchmark",
     "benchmarks",
     metavar="NAME=DIR",
-    type=Named("real20=data/real20"),
+    type=NamedValue("real20=data/real20"),
     multiple=True,
     required=True,
     help="A benchmark and the folder of your copy; may be given again. NAME is one of docs/evaluation.md, such as real20, "
@@ -93,14 +93,14 @@ class _Size(click.ParamType[int]):
     "--model",
     "models",
     metavar="[NAME=]MODEL",
-    type=Named("ours=model.onnx", needs_name=False),
+    type=NamedValue("ours=model.onnx", needs_name=False),
     multiple=True,
     help="A model to run, as `brewster --model` takes it; may be given again.",
 )
 @click.option(
     "--predictions",
     metavar="NAME=DIR",
-    type=Named("RDNet=out/rdnet"),
+    type=NamedValue("RDNet=out/rdnet"),
     multiple=True,
     help="A folder of another method's pictures, called like the cases; may be given again.",
 )
@@ -134,7 +134,7 @@ class _Size(click.ParamType[int]):
 @click.option(
     "--region-threshold",
     "thresholds",
-    type=_Numbers(),
+    type=_NumberList(),
     metavar="NUMBER,...",
     help="How much photo and truth differ where there is reflection, as a share of the full scale; several are swept.",
 )
@@ -185,13 +185,13 @@ def evaluate(context: click.Context, /, *, dry_run: bool, **asked: Any) -> None:
     the exit code is 1.
     """
     require_extra("evaluate", "evaluating")
-    order = _Order(**asked)
+    order = _EvaluateRequest(**asked)
     context.exit(0 if (order.tell() if dry_run else order.run()) else 1)
 
 
 @final
 @dataclass(frozen=True)
-class _Order:
+class _EvaluateRequest:
     """What was asked for; imports wait until it is carried out, as torch takes two seconds to wake."""
 
     benchmarks: tuple[tuple[str, str], ...]
@@ -233,7 +233,7 @@ class _Order:
         total = len(methods) * sum(len(part.cases) for part in found)
         with progress(total, shown=not self.quiet) as advance:
 
-            def report(done: int, _of: int, row: Row) -> None:
+            def report(done: int, _of: int, row: ScoreRow) -> None:
                 interrupts.heed()
                 advance(done, f"{row.benchmark}/{row.case} {row.method}")
 
@@ -254,30 +254,30 @@ class _Order:
         return tell_failures(results, quiet=self.quiet) and is_whole
 
     def _found(self) -> list[Benchmark]:
-        from brewster.dataset.benchmarks import read_benchmark  # noqa: PLC0415
+        from brewster.benchmarks.registry import read_benchmark  # noqa: PLC0415
 
         return [part for name, folder in self.benchmarks for part in read_benchmark(name, Path(folder))]
 
-    def _protocol(self) -> Protocol:
-        from brewster.evaluate.protocol import Protocol  # noqa: PLC0415
+    def _protocol(self) -> EvaluationConfig:
+        from brewster.evaluate.config import EvaluationConfig  # noqa: PLC0415
 
         chosen: dict[str, Any] = {"size": self.size, "quality": self.quality, "paper": self.paper}
         if self.metrics is not None:
             chosen["metrics"] = tuple(name.strip() for name in self.metrics.split(","))
         if self.thresholds is not None:
             chosen["thresholds"] = self.thresholds
-        return Protocol(**chosen)
+        return EvaluationConfig(**chosen)
 
     def _methods(self) -> list[Method]:
-        from brewster.evaluate.methods import Model, Nothing, Predictions  # noqa: PLC0415
+        from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder  # noqa: PLC0415
         from brewster.models.zoo import model_name  # noqa: PLC0415
 
         models = [(name or model_name(model), model) for name, model in self.models]
         answers = self.out / "predictions"
         return [
-            Nothing(),
-            *(Model(name, model, answers / name, self.quality, self.device) for name, model in models),
-            *(Predictions(name, Path(folder)) for name, folder in self.predictions),
+            IdentityBaseline(),
+            *(ModelMethod(name, model, answers / name, self.quality, self.device) for name, model in models),
+            *(PredictionFolder(name, Path(folder)) for name, folder in self.predictions),
         ]
 
 

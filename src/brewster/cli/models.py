@@ -93,7 +93,7 @@ def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: boo
     token is HF_TOKEN, or the one of `hf auth login`.
     """
     require_extra("large", "pushing")
-    from brewster.models.large.adapter import hub  # noqa: PLC0415  (wakes torch)
+    from brewster.models.diffusion.adapter import hub  # noqa: PLC0415  (wakes torch)
 
     plan = hub.plan_push(folder, repo_id, message=message, public=public)
     for remark in plan.remarks:
@@ -106,7 +106,7 @@ def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: boo
         print_out(f"sent: {address}" if address else "nothing was sent")
 
 
-def describe(model: zoo.Model) -> dict[str, Any]:
+def describe(model: zoo.ModelFile) -> dict[str, Any]:
     """A model in plain values; `error` says what is wrong with its file, or is None."""
     row = {"name": model.name, "path": str(model.path), "licence": model.licence, "sha256": model.sha256}
     try:
@@ -131,7 +131,7 @@ def _put_scores(folder: Path, scores: Path) -> None:
     """Replaces what the card in this folder says was measured."""
     require_extra("train", "writing a card")
     from brewster.evaluate.report.tables import overview  # noqa: PLC0415  (wakes torch)
-    from brewster.train.large.card import with_measured  # noqa: PLC0415
+    from brewster.training.lora.model_card import with_measured  # noqa: PLC0415
 
     try:
         results = json.loads(scores.read_text("utf-8"))

@@ -16,7 +16,7 @@ from brewster.cli.extras import require_extra
 from brewster.cli.terminal import complain, interrupts, progress, say, standard_output, write_out
 
 if TYPE_CHECKING:
-    from brewster.dataset.build.job import Crew, Job, Result
+    from brewster.rendered.generation.job import Executor, RenderJob, RenderResult
     from brewster.scene.recipe import SceneRecipe
 
 _OF_THE_TRACER: Final = frozenset({"mitsuba", "mitsuba-oidn"})
@@ -140,7 +140,7 @@ def render(
     if (out is None) == (output is None):
         raise click.UsageError("Name one folder to render into: brewster render OUT.")
     require_extra("render", "rendering", without=_OF_THE_TRACER)
-    order = _Order(out or output or Path(), **asked)
+    order = _RenderRequest(out or output or Path(), **asked)
     if scene:
         _refuse_out_of_place(context)
         order.render_again(scene)
@@ -150,7 +150,7 @@ def render(
 
 @final
 @dataclass(frozen=True)
-class _Order:
+class _RenderRequest:
     """What was asked for; imports wait until it is carried out, as torch takes two seconds to wake."""
 
     out: Path
@@ -172,7 +172,7 @@ class _Order:
 
     def render_again(self, scene: Path) -> None:
         """Renders one scene."""
-        from brewster.dataset.build.workers import render_again  # noqa: PLC0415
+        from brewster.rendered.generation.workers import render_again  # noqa: PLC0415
 
         render_again(scene, self.out, (*self.maps, *self.photos), self.renderer)
         if not self.quiet:
@@ -180,14 +180,14 @@ class _Order:
 
     def render_set(self) -> bool:
         """Renders a set and tells; whether all went well."""
-        from brewster.dataset.build.job import build  # noqa: PLC0415
-        from brewster.dataset.build.overview import write_preview  # noqa: PLC0415
+        from brewster.rendered.generation.job import build  # noqa: PLC0415
+        from brewster.rendered.generation.preview import write_preview  # noqa: PLC0415
 
-        job, told = self._job(), _Told(self.as_json, self.quiet)
+        job, told = self._job(), _RenderProgress(self.as_json, self.quiet)
         over_bar = self.as_json and standard_output.stream.isatty()
         with progress(self.count, shown=not self.quiet and not over_bar) as advance:
 
-            def report(result: Result) -> None:
+            def report(result: RenderResult) -> None:
                 told.tell(result)
                 advance(told.counts.total(), f"sample {result.index}")
                 interrupts.heed()
@@ -199,16 +199,16 @@ class _Order:
         told.sum_up(self.out)
         return not told.counts["failed"]
 
-    def _job(self) -> Job:
-        from brewster.dataset.build.job import Job  # noqa: PLC0415
-        from brewster.worlds.catalog import read_catalog  # noqa: PLC0415
+    def _job(self) -> RenderJob:
+        from brewster.environments.catalog import read_catalog  # noqa: PLC0415
+        from brewster.rendered.generation.job import RenderJob  # noqa: PLC0415
 
         recipe = self._recipe()
         catalog, left_out = read_catalog(self.maps, self.photos)
         for error in left_out:
             complain(f"left out: {error}")
         folders = tuple(folder.resolve() for folder in (*self.maps, *self.photos))
-        return Job(self.out.resolve(), recipe, catalog, self.seed, self.renderer or "pane", folders)
+        return RenderJob(self.out.resolve(), recipe, catalog, self.seed, self.renderer or "pane", folders)
 
     def _recipe(self) -> SceneRecipe:
         """The recipe with the size and orders that were asked for instead of its own."""
@@ -221,26 +221,26 @@ class _Order:
             recipe = recipe.model_copy(update={"camera": camera})
         return recipe.model_copy(update={"orders": self.orders}) if self.orders else recipe
 
-    def _crew(self, job: Job) -> Crew:
-        from brewster.dataset.build.workers import Here, Workers  # noqa: PLC0415
+    def _crew(self, job: RenderJob) -> Executor:
+        from brewster.rendered.generation.workers import ProcessExecutor, SerialExecutor  # noqa: PLC0415
 
         if self.cluster:
-            from brewster.dataset.build.cluster import Cluster  # noqa: PLC0415
+            from brewster.rendered.generation.ray_cluster import RayExecutor  # noqa: PLC0415
 
-            return Cluster(job, self.cluster, self.workers)
+            return RayExecutor(job, self.cluster, self.workers)
         workers = min(_MOST_WORKERS, os.cpu_count() or 1) if self.workers is None else self.workers
-        return Workers(job, workers) if workers else Here(job)
+        return ProcessExecutor(job, workers) if workers else SerialExecutor(job)
 
 
 @final
-class _Told:
+class _RenderProgress:
     """Tells of samples as they come, and counts them: what is kept does not grow."""
 
     def __init__(self, as_json: bool, quiet: bool) -> None:
         self._as_json, self._quiet = as_json, quiet
         self.counts: Counter[str] = Counter()
 
-    def tell(self, result: Result) -> None:
+    def tell(self, result: RenderResult) -> None:
         """One line at once for what was rendered or failed."""
         self.counts[result.status] += 1
         if self._as_json:

@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar, cast, get_args, get_origin, get_type_h
 import click
 from click.core import ParameterSource
 
-from brewster.cli.batch import Batch, goes_to_one_file, plan
+from brewster.cli.batch import SeparationBatch, goes_to_one_file, plan
 from brewster.cli.terminal import standard_output
 from brewster.errors import BrewsterError
 from brewster.options import Options
@@ -19,7 +19,7 @@ from brewster.options import Options
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
-class _Number(click.FloatRange):
+class _RangedNumber(click.FloatRange):
     """A number in a range; `nan` is neither below nor above it, and no number."""
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> float:
@@ -30,7 +30,7 @@ class _Number(click.FloatRange):
         return number
 
 
-class _Words(click.ParamType[tuple[str, ...]]):
+class _WordList(click.ParamType[tuple[str, ...]]):
     """Words with commas between, each of them known."""
 
     name = "words"
@@ -81,11 +81,11 @@ def _kind(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[Any]:
     if NoneType in get_args(hint):
         return _kind(get_args(hint)[0], field)
     if hint is float:
-        return _Number(low, high)
+        return _RangedNumber(low, high)
     if hint is int:
         return click.IntRange(low, high)
     if get_origin(hint) is tuple:
-        return _Words(get_args(get_args(hint)[0]))
+        return _WordList(get_args(get_args(hint)[0]))
     return click.Choice(get_args(hint)) if get_origin(hint) is Literal else click.STRING
 
 
@@ -137,7 +137,7 @@ def separate(
     tasks = plan(photos, output, options)
     if None in tasks[0].targets.values() and not dry_run:
         _refuse_occupied_output(as_json=as_json)
-    batch = Batch(options, overwrite=overwrite, dry_run=dry_run, as_json=as_json, quiet=quiet)
+    batch = SeparationBatch(options, overwrite=overwrite, dry_run=dry_run, as_json=as_json, quiet=quiet)
     context.exit(0 if batch.run(tasks) else 1)
 
 

@@ -140,19 +140,19 @@ def serve(
     """
     require_extra("web", "serving", without=frozenset({"matplotlib"}))
     from brewster.web import application as web  # noqa: PLC0415  (wakes FastAPI)
-    from brewster.web.desk import Desk  # noqa: PLC0415
-    from brewster.web.guard import Guard, is_loopback  # noqa: PLC0415
+    from brewster.web.job_queue import JobQueue  # noqa: PLC0415
+    from brewster.web.middleware import RequestLimits, is_loopback  # noqa: PLC0415
+    from brewster.web.model_cache import ModelCache  # noqa: PLC0415
     from brewster.web.separation import separation  # noqa: PLC0415
-    from brewster.web.shelf import Shelf  # noqa: PLC0415
 
     if not is_loopback(host):
         say(_WARNING.format(host=host))
         token = token or AUTO
     token = secrets.token_urlsafe(16) if token == AUTO else token
-    shelf = Shelf(models, device=device)
+    shelf = ModelCache(models, device=device)
     shelf.separator(shelf.names[0])  # what is wrong with the model is said now
-    router = separation(shelf, Desk(queue=queue, seconds=timeout), max_pixels=max_pixels)
-    app = web.application(router, guard=Guard.at(host, token=token, max_bytes=max_bytes))
+    router = separation(shelf, JobQueue(queue=queue, seconds=timeout), max_pixels=max_pixels)
+    app = web.application(router, guard=RequestLimits.at(host, token=token, max_bytes=max_bytes))
     with contextlib.suppress(KeyboardInterrupt):  # the usual end
         web.serve(app, host=host, port=port, tell=lambda url: invite(url, token, opens=opens))
     say("stopped")

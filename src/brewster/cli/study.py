@@ -12,7 +12,7 @@ from typing import Final
 
 import click
 
-from brewster.cli.evaluate import Named
+from brewster.cli.evaluate import NamedValue
 from brewster.cli.extras import require_extra
 from brewster.cli.serve import AUTO, at_an_address, invite
 from brewster.cli.terminal import print_out, progress, say, write_out
@@ -48,7 +48,7 @@ def study() -> None:
 @click.option(
     "--method",
     "methods",
-    type=Named("RDNet=out/rdnet"),
+    type=NamedValue("RDNet=out/rdnet"),
     multiple=True,
     required=True,
     metavar="NAME=DIR",
@@ -97,9 +97,9 @@ def create(
     and nature, DIR/12.png to the only one. What is missing, double, unreadable or of another size is named, and nothing
     is written. The study holds copies of all pictures, and can be moved.
     """
-    from brewster.study.create import CATCH_POOL, CONSENT, Choices  # noqa: PLC0415  (wakes pyvips)
-    from brewster.study.create import create as freeze  # noqa: PLC0415
-    from brewster.study.folders import find_pictures  # noqa: PLC0415
+    from brewster.user_study.create import CATCH_POOL, CONSENT, StudyOptions  # noqa: PLC0415  (wakes pyvips)
+    from brewster.user_study.create import create as freeze  # noqa: PLC0415
+    from brewster.user_study.folders import find_pictures  # noqa: PLC0415
 
     folders = {name: Path(folder) for name, folder in methods}
     if len(folders) < len(methods):
@@ -109,7 +109,7 @@ def create(
             "give each its own",
         )
     text = CONSENT if consent is None else _text(consent)
-    chosen = Choices(
+    chosen = StudyOptions(
         datasets=datasets, pairs=pairs, catches=catches, all_pairs=all_pairs, seed=seed, consent=text
     )
     total = len(find_pictures(inputs, datasets)) * (1 + len(folders)) + CATCH_POOL
@@ -166,11 +166,11 @@ def serve(
     Every answer is on the disk before it is acknowledged. A server that was stopped or killed goes on where it was.
     """
     require_extra("web", "serving", without=frozenset({"matplotlib"}))
-    from brewster.study.store import Store  # noqa: PLC0415
-    from brewster.study.study import read_study  # noqa: PLC0415
-    from brewster.study.token import kept_token  # noqa: PLC0415
+    from brewster.user_study.access_token import kept_token  # noqa: PLC0415
+    from brewster.user_study.store import AnswerStore  # noqa: PLC0415
+    from brewster.user_study.study import read_study  # noqa: PLC0415
     from brewster.web import application as web  # noqa: PLC0415  (wakes FastAPI)
-    from brewster.web.guard import Guard, is_loopback  # noqa: PLC0415
+    from brewster.web.middleware import RequestLimits, is_loopback  # noqa: PLC0415
     from brewster.web.study import participants  # noqa: PLC0415
 
     made = read_study(folder)
@@ -178,9 +178,9 @@ def serve(
     if not is_loopback(host):
         say(_WARNING.format(host=host))
     token = kept_token(folder) if token == AUTO else token
-    guard = Guard.at(host, token=token, max_bytes=_MAX_BYTES)
+    guard = RequestLimits.at(host, token=token, max_bytes=_MAX_BYTES)
     guard = replace(guard, hosts=guard.hosts | {*called})
-    store = Store(made)
+    store = AnswerStore(made)
     app = web.application(participants(made, store, most=most, token=token), guard=guard, home="study.html")
     with contextlib.closing(store), contextlib.suppress(KeyboardInterrupt):  # the usual end
         web.serve(app, host=host, port=port, tell=lambda url: invite(url, token))
@@ -218,16 +218,16 @@ def report(
     answers.csv and plot.png into a folder. The server may be running meanwhile.
     """
     require_extra("web", "reporting", without=frozenset({"fastapi", "python-multipart", "uvicorn"}))
-    from brewster.study.report.people import Rule, people  # noqa: PLC0415
-    from brewster.study.report.results import summarise, write  # noqa: PLC0415
-    from brewster.study.report.tables import overview  # noqa: PLC0415
-    from brewster.study.store import Store  # noqa: PLC0415
-    from brewster.study.study import read_study  # noqa: PLC0415
+    from brewster.user_study.report.participants import ExclusionRule, people  # noqa: PLC0415
+    from brewster.user_study.report.results import summarise, write  # noqa: PLC0415
+    from brewster.user_study.report.tables import overview  # noqa: PLC0415
+    from brewster.user_study.store import AnswerStore  # noqa: PLC0415
+    from brewster.user_study.study import read_study  # noqa: PLC0415
 
     made = read_study(folder)
-    with contextlib.closing(Store(made, only_reads=True)) as store:
+    with contextlib.closing(AnswerStore(made, only_reads=True)) as store:
         answered = people(store.everything())
-    results = summarise(made, answered, Rule(most_failed, least_seconds))
+    results = summarise(made, answered, ExclusionRule(most_failed, least_seconds))
     out = folder / "report" if out is None else out
     write(results, made, answered, out)
     write_out((json.dumps(results) + "\n" if as_json else overview(results)).encode())
@@ -265,7 +265,7 @@ def plan(
     *, difference: float, tie: float, pairs: int, correlation: float, power: float, as_json: bool
 ) -> None:
     """Say how many participants a difference needs, at the 5 % level."""
-    from brewster.study.plan import plan as planned  # noqa: PLC0415
+    from brewster.user_study.power_analysis import plan as planned  # noqa: PLC0415
 
     answer = planned(difference=difference, tie=tie, pairs=pairs, correlation=correlation, power=power)
     if as_json:

@@ -18,7 +18,7 @@ Advance = Callable[[float, str], None]
 
 
 @final
-class _Interrupts:
+class _DeferredInterrupts:
     """Ctrl-C that got lost.
 
     Where C code calls Python (libvips does, whenever it has something to log), no exception can pass: Python drops
@@ -52,7 +52,7 @@ class _Interrupts:
             raise KeyboardInterrupt
 
 
-interrupts = _Interrupts()
+interrupts = _DeferredInterrupts()
 
 
 def one_line(text: object) -> str:

@@ -13,7 +13,7 @@ from brewster.cli.terminal import interrupts, print_out, progress, say
 from brewster.errors import RecipeError, TargetError
 
 if TYPE_CHECKING:
-    from brewster.train.recipe import CompactRecipe, LargeRecipe
+    from brewster.training.recipe import CompactRecipe, LoraRecipe
 
 
 @click.command
@@ -42,21 +42,21 @@ def train(*, recipe: Path, out: Path | None, plan: bool, card: str | None, quiet
     command is given again, and ends with the same weights. Under torchrun several GPUs learn a large backbone together.
     """
     require_extra("train", "training")
-    from brewster.train.recipe import LargeRecipe, read_recipe  # noqa: PLC0415  (wakes torch, in two seconds)
+    from brewster.training.recipe import LoraRecipe, read_recipe  # noqa: PLC0415  (wakes torch, in two seconds)
 
     read, out = read_recipe(recipe), out or Path("out") / recipe.stem
-    if isinstance(read, LargeRecipe):
+    if isinstance(read, LoraRecipe):
         require_extra("large", "a large backbone")
     if plan or card:
         _print_plan(read, card)
         return
     _make(out)
-    from brewster.train.crew import leads  # noqa: PLC0415
-    from brewster.train.learners import open_learner  # noqa: PLC0415
-    from brewster.train.loop import run  # noqa: PLC0415
+    from brewster.training.distributed import is_main_process  # noqa: PLC0415
+    from brewster.training.loop import run  # noqa: PLC0415
+    from brewster.training.trainers import open_trainer  # noqa: PLC0415
 
-    learner = open_learner(read)
-    quiet = quiet or not leads()
+    learner = open_trainer(read)
+    quiet = quiet or not is_main_process()
     with progress(read.steps, shown=not quiet) as advance:
 
         def report(step: int, steps: int, numbers: Mapping[str, float], logged: bool) -> None:
@@ -67,17 +67,17 @@ def train(*, recipe: Path, out: Path | None, plan: bool, card: str | None, quiet
                 say(f"step {step} of {steps}: {told}")
 
         run(learner, out, report)
-    if leads():
+    if is_main_process():
         model = learner.export(out)
         if not quiet:
             say(f"the model is {model}")
 
 
-def _print_plan(recipe: CompactRecipe | LargeRecipe, card: str | None) -> None:
-    from brewster.train.large.plan import find_card, is_here, plan_for  # noqa: PLC0415
-    from brewster.train.recipe import LargeRecipe  # noqa: PLC0415
+def _print_plan(recipe: CompactRecipe | LoraRecipe, card: str | None) -> None:
+    from brewster.training.lora.resource_estimate import find_card, is_here, plan_for  # noqa: PLC0415
+    from brewster.training.recipe import LoraRecipe  # noqa: PLC0415
 
-    if not isinstance(recipe, LargeRecipe):
+    if not isinstance(recipe, LoraRecipe):
         raise RecipeError(
             "the recipe trains the compact network", "a large backbone's recipe", "train it without --plan"
         )

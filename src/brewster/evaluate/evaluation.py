@@ -13,18 +13,18 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
-from brewster.dataset.benchmarks import Benchmark, Case
+from brewster.benchmarks.registry import Benchmark, Case
 from brewster.errors import BrewsterError, PhotoError
-from brewster.evaluate.judge import Truth, reduced
-from brewster.evaluate.methods import NOTHING, Answer, Method, Predictions, refuse_names
-from brewster.evaluate.protocol import Protocol
-from brewster.evaluate.report.page import Shown, write_report
+from brewster.evaluate.config import EvaluationConfig
+from brewster.evaluate.methods import NOTHING, Method, MethodOutput, PredictionFolder, refuse_names
+from brewster.evaluate.report.html_report import CaseImages, write_report
+from brewster.evaluate.report.latex import to_latex
 from brewster.evaluate.report.published import read_published
 from brewster.evaluate.report.published import to_markdown as published_to_markdown
-from brewster.evaluate.report.table1 import to_latex
 from brewster.evaluate.report.tables import to_csv, to_markdown
 from brewster.evaluate.results import Results, draw, summarise
-from brewster.evaluate.runner import Place, Report, Row, find_answer, score
+from brewster.evaluate.runner import Place, Report, ScoreRow, find_answer, score
+from brewster.evaluate.scoring import GroundTruth, reduced
 from brewster.files import write_atomically
 from brewster.metrics import IDENTICAL_DB
 from brewster.photo import Photo
@@ -36,7 +36,7 @@ PICTURES_SHOWN: Final = 50
 def evaluate(
     benchmarks: Sequence[Benchmark],
     methods: Sequence[Method],
-    protocol: Protocol,
+    protocol: EvaluationConfig,
     out: Path,
     *,
     workers: int = 1,
@@ -75,7 +75,7 @@ def evaluate(
     return results
 
 
-def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], protocol: Protocol) -> None:
+def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], protocol: EvaluationConfig) -> None:
     """Refuses what cannot be measured as asked, before anything is.
 
     Raises:
@@ -101,13 +101,13 @@ def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], protocol: 
         draw(benchmarks)
     cases = [case for part in benchmarks for case in part.cases]
     for method in methods:
-        if isinstance(method, Predictions):
+        if isinstance(method, PredictionFolder):
             method.refuse_wrong_pairing(cases)
 
 
-def _remarks(method: Method, cases: Sequence[Case], rows: Sequence[Row]) -> Iterator[str]:
+def _remarks(method: Method, cases: Sequence[Case], rows: Sequence[ScoreRow]) -> Iterator[str]:
     """What is odd about a method's answers."""
-    if not isinstance(method, Predictions):
+    if not isinstance(method, PredictionFolder):
         return
     perfect = [row for row in rows if row.scores.get("psnr") == IDENTICAL_DB]
     trivial = {row.place[:2] for row in perfect if row.method == NOTHING}
@@ -145,13 +145,17 @@ def _write(results: Results, out: Path) -> None:
 
 
 def _shown(
-    cases: Sequence[Case], methods: Sequence[Method], protocol: Protocol, rows: Sequence[Row], most: int
-) -> Iterator[Shown]:
+    cases: Sequence[Case],
+    methods: Sequence[Method],
+    protocol: EvaluationConfig,
+    rows: Sequence[ScoreRow],
+    most: int,
+) -> Iterator[CaseImages]:
     """The pictures, read again one case at a time."""
     good = {row.place: row for row in rows if not row.error}
     for case in _worst(cases, methods, protocol, good, most):
         try:
-            truth = Truth.open(case, protocol)
+            truth = GroundTruth.open(case, protocol)
         except PhotoError:
             continue  # named in the tables already
         answers = {
@@ -162,8 +166,8 @@ def _shown(
         yield _show(truth, answers, protocol)
 
 
-def _show(truth: Truth, answers: dict[str, Answer], protocol: Protocol) -> Shown:
-    return Shown(
+def _show(truth: GroundTruth, answers: dict[str, MethodOutput], protocol: EvaluationConfig) -> CaseImages:
+    return CaseImages(
         benchmark=truth.case.benchmark,
         name=truth.case.name,
         photo=truth.pictures["photo"],
@@ -180,8 +184,8 @@ def _show(truth: Truth, answers: dict[str, Answer], protocol: Protocol) -> Shown
 def _worst(
     cases: Sequence[Case],
     methods: Sequence[Method],
-    protocol: Protocol,
-    rows: Mapping[Place, Row],
+    protocol: EvaluationConfig,
+    rows: Mapping[Place, ScoreRow],
     most: int,
 ) -> list[Case]:
     """So many cases of each benchmark: what the first method that does something failed on, then its worst in the first metric."""

@@ -19,13 +19,13 @@ from typing import Final, Protocol, final
 
 import numpy as np
 
-from brewster.dataset.benchmarks import Case
+from brewster.benchmarks.registry import Case
 from brewster.errors import BrewsterError, PhotoError
 from brewster.files import SUFFIXES, walk, write_atomically
+from brewster.inference import Separator
 from brewster.models.zoo import find_model, is_large
 from brewster.options import Device, Quality
 from brewster.photo import Photo
-from brewster.separate import Separator
 
 NOTHING: Final = "doing nothing"
 ANSWER_FORMAT: Final = 1
@@ -36,7 +36,7 @@ _ENDINGS: Final = {"transmission": ("_t", "_l"), "reflection": ("_r",)}
 
 @final
 @dataclass(frozen=True, eq=False)
-class Answer:
+class MethodOutput:
     """The layers that a method gives for a photo.
 
     `seconds` is the wall time that this took it, if it was seen; `kept` the digest of the files that keep the answer.
@@ -48,7 +48,7 @@ class Answer:
     kept: str | None = None
 
     @classmethod
-    def read(cls, files: Mapping[str, Path]) -> Answer:
+    def read(cls, files: Mapping[str, Path]) -> MethodOutput:
         """The answer in these files, by layer.
 
         Raises:
@@ -68,7 +68,7 @@ class Method(Protocol):
         ...
 
     @property
-    def alone(self) -> bool:
+    def exclusive(self) -> bool:
         """Whether it needs the memory for itself, and so answers after the others."""
         ...
 
@@ -80,22 +80,22 @@ class Method(Protocol):
         """All that its answer depends on, beside the photo."""
         ...
 
-    def answer(self, case: Case, photo: Photo) -> Answer:
+    def answer(self, case: Case, photo: Photo) -> MethodOutput:
         """Its layers for the photo of this case."""
         ...
 
-    def kept(self, case: Case) -> Answer | None:
+    def kept(self, case: Case) -> MethodOutput | None:
         """The answer as it lies on the disk, if it does."""
         ...
 
 
 @final
 @dataclass(frozen=True)
-class Nothing:
+class IdentityBaseline:
     """The photo itself as transmission and black as reflection: what every method must beat."""
 
     name: str = NOTHING
-    alone: Final = False
+    exclusive: Final = False
 
     def about(self) -> dict[str, str]:
         """Its kind."""
@@ -105,18 +105,18 @@ class Nothing:
         """Nothing."""
         return "nothing"
 
-    def answer(self, case: Case, photo: Photo) -> Answer:  # noqa: ARG002
+    def answer(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002
         """The photo and black."""
-        return Answer(photo, photo.with_pixels(np.zeros_like(photo.pixels)))
+        return MethodOutput(photo, photo.with_pixels(np.zeros_like(photo.pixels)))
 
-    def kept(self, case: Case) -> Answer | None:  # noqa: ARG002
+    def kept(self, case: Case) -> MethodOutput | None:  # noqa: ARG002
         """Nothing is kept: it costs nothing."""
         return None
 
 
 @final
 @dataclass(frozen=True)
-class Model:
+class ModelMethod:
     """A model, run through the `Separator` that users use; its answers are kept as PNG in `folder`.
 
     `folder` takes the form of a folder of predictions, and can be measured as one later.
@@ -129,7 +129,7 @@ class Model:
     device: Device = "auto"
 
     @property
-    def alone(self) -> bool:
+    def exclusive(self) -> bool:
         """Large image models: two of them fill any card."""
         return is_large(self.model)
 
@@ -141,13 +141,13 @@ class Model:
         """The model's digest, its quality, and the format of the answers."""
         return f"{self._sha256} {self.quality} {ANSWER_FORMAT}"
 
-    def answer(self, case: Case, photo: Photo) -> Answer:
+    def answer(self, case: Case, photo: Photo) -> MethodOutput:
         """Separates the photo and keeps both layers.
 
         Raises:
             BrewsterError: the model or the photo cannot be used, or the layers cannot be written.
         """
-        separator = (_large if self.alone else _small)(self.model, self.device)
+        separator = (_large if self.exclusive else _small)(self.model, self.device)
         started = time.perf_counter()
         separation = separator(photo, quality=self.quality)
         seconds = time.perf_counter() - started
@@ -155,22 +155,22 @@ class Model:
         for layer, path in files.items():
             data = getattr(separation, layer).encode("png", depth=8)
             write_atomically(path, data, overwrite=True)
-        return replace(Answer.read(files), seconds=seconds)  # what is kept is what is scored
+        return replace(MethodOutput.read(files), seconds=seconds)  # what is kept is what is scored
 
-    def kept(self, case: Case) -> Answer | None:
+    def kept(self, case: Case) -> MethodOutput | None:
         """The layers that were kept.
 
         Raises:
             PhotoError: they cannot be read.
         """
         files = self._files(case)
-        return Answer.read(files) if all(path.is_file() for path in files.values()) else None
+        return MethodOutput.read(files) if all(path.is_file() for path in files.values()) else None
 
     @cached_property
     def _sha256(self) -> str:
-        if not self.alone:
+        if not self.exclusive:
             return find_model(self.model).verify()
-        from brewster.models.large.decompose import fingerprint  # noqa: PLC0415  (wakes torch)
+        from brewster.models.diffusion.pipeline import fingerprint  # noqa: PLC0415  (wakes torch)
 
         return fingerprint(self.model, device=self.device)
 
@@ -199,12 +199,12 @@ def _large(model: str, device: Device) -> Separator:
 
 @final
 @dataclass(frozen=True)
-class Predictions:
+class PredictionFolder:
     """A folder with another method's pictures, found by name; README and docs say how they may be called."""
 
     name: str
     folder: Path
-    alone: Final = False
+    exclusive: Final = False
 
     def about(self) -> dict[str, str]:
         """Its kind."""
@@ -217,17 +217,17 @@ class Predictions:
         except BrewsterError as error:
             return str(error)
 
-    def answer(self, case: Case, photo: Photo) -> Answer:  # noqa: ARG002  (it is answered already)
+    def answer(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002  (it is answered already)
         """Reads its pictures for this case.
 
         Raises:
             PhotoError: there is none, there are several, or they cannot be read.
         """
-        return Answer.read(self.files(case))
+        return MethodOutput.read(self.files(case))
 
-    def kept(self, case: Case) -> Answer | None:
+    def kept(self, case: Case) -> MethodOutput | None:
         """What `answer` gives, and raises."""
-        return Answer.read(self.files(case))
+        return MethodOutput.read(self.files(case))
 
     def files(self, case: Case) -> dict[str, Path]:
         """layer -> file for this case, transmission and perhaps reflection.

@@ -9,10 +9,10 @@ from typing import Any, Final, final
 import numpy as np
 
 import brewster
-from brewster.dataset.benchmarks import PAPER_SEED, Benchmark, Case, paper_draw
+from brewster.benchmarks.registry import PAPER_SEED, Benchmark, Case, paper_draw
+from brewster.evaluate.config import DEFAULT_METRICS, EvaluationConfig
 from brewster.evaluate.methods import Method
-from brewster.evaluate.protocol import DEFAULT_METRICS, Protocol
-from brewster.evaluate.runner import Row
+from brewster.evaluate.runner import ScoreRow
 from brewster.evaluate.statistics import Stratum, differences, estimate
 
 AVERAGE: Final = "average"
@@ -36,7 +36,10 @@ class Selection:
 
 
 def summarise(
-    benchmarks: Sequence[Benchmark], methods: Sequence[Method], protocol: Protocol, rows: Sequence[Row]
+    benchmarks: Sequence[Benchmark],
+    methods: Sequence[Method],
+    protocol: EvaluationConfig,
+    rows: Sequence[ScoreRow],
 ) -> Results:
     """The results of a run; the same for any order of rows.
 
@@ -78,7 +81,7 @@ def summarise(
     }
 
 
-def _missing(protocol: Protocol, measured: set[str]) -> list[str]:
+def _missing(protocol: EvaluationConfig, measured: set[str]) -> list[str]:
     """Metrics that were asked for, and that no picture has the truth for."""
     return [name for name in protocol.columns() if name not in measured]
 
@@ -108,7 +111,7 @@ def _titled(key: str, group: Sequence[Selection]) -> dict[str, Any]:
     return {"title": "Average" if key == AVERAGE else group[0].title, "pictures": pictures}
 
 
-def _choices(protocol: Protocol, together: Sequence[Selection]) -> list[str]:
+def _choices(protocol: EvaluationConfig, together: Sequence[Selection]) -> list[str]:
     """The protocol's, how the average comes about, and what the paper's lacks."""
     choices = [*protocol.choices(), *([_AVERAGED] if together else [])]
     there = {part.key.partition(":")[0]: len(part.cases) for part in together}
@@ -122,7 +125,7 @@ def _choices(protocol: Protocol, together: Sequence[Selection]) -> list[str]:
 
 
 def _stratum(
-    selection: Selection, series: Sequence[tuple[str, str]], rows: Mapping[tuple[str, str, str], Row]
+    selection: Selection, series: Sequence[tuple[str, str]], rows: Mapping[tuple[str, str, str], ScoreRow]
 ) -> Stratum:
     values = [
         [_score(rows[case.benchmark, case.name, method], column) for method, column in series]
@@ -133,7 +136,7 @@ def _stratum(
     return Stratum(selection.key, scenes, np.array(values, float).reshape(shape))
 
 
-def _score(row: Row, column: str) -> float:
+def _score(row: ScoreRow, column: str) -> float:
     score = row.scores.get(column)
     return float("nan") if score is None else score
 
@@ -165,7 +168,9 @@ def _described(part: Benchmark) -> dict[str, Any]:
     }
 
 
-def _picture(case: Case, methods: Sequence[str], rows: Mapping[tuple[str, str, str], Row]) -> dict[str, Any]:
+def _picture(
+    case: Case, methods: Sequence[str], rows: Mapping[tuple[str, str, str], ScoreRow]
+) -> dict[str, Any]:
     own = {method: rows[case.benchmark, case.name, method] for method in methods}
     seen = next((row for row in own.values() if not row.error), None)
     return {

@@ -19,18 +19,18 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Final, final
 
-from brewster.dataset.benchmarks import Benchmark, Case
+from brewster.benchmarks.registry import Benchmark, Case
 from brewster.errors import BrewsterError, TargetError
-from brewster.evaluate.judge import Judge, Truth
-from brewster.evaluate.methods import Answer, Method, refuse_names
-from brewster.evaluate.protocol import Protocol
-from brewster.processes import end_with_parent, one_thread
+from brewster.evaluate.config import EvaluationConfig
+from brewster.evaluate.methods import Method, MethodOutput, refuse_names
+from brewster.evaluate.scoring import GroundTruth, Scorer
+from brewster.worker_setup import end_with_parent, one_thread
 
 SCORES: Final = "scores.jsonl"
 SCORE_FORMAT: Final = 2
 """Raised when the same answers come to score differently, so that they are scored again; see test_house_formats."""
 
-Report = Callable[[int, int, "Row"], None]
+Report = Callable[[int, int, "ScoreRow"], None]
 """Called with (done, of how many, the row) after every answer that was scored."""
 
 Place = tuple[str, str, str]
@@ -38,7 +38,7 @@ Place = tuple[str, str, str]
 
 @final
 @dataclass(frozen=True)
-class Row:
+class ScoreRow:
     """What became of one method's answer to one case.
 
     `key` is a digest of all that the scores depend on, `answer_key` of all that the answer does: where it is equal,
@@ -66,22 +66,22 @@ class Row:
 
 @final
 @dataclass(frozen=True)
-class _Task:
+class _ScoringTask:
     """A case, and the rows that are to be filled; `kept` of a row says which answer on the disk is the right one."""
 
     case: Case
-    rows: tuple[Row, ...]
+    rows: tuple[ScoreRow, ...]
 
 
 def score(
     benchmarks: Sequence[Benchmark],
     methods: Sequence[Method],
-    protocol: Protocol,
+    protocol: EvaluationConfig,
     out: Path,
     *,
     workers: int = 1,
     report: Report = lambda _done, _of, _row: None,
-) -> list[Row]:
+) -> list[ScoreRow]:
     """Has every method answer every case and scores the answers; those that `out` knows already are not made again.
 
     Methods that need the memory for themselves go through all cases one after another, when the others are done.
@@ -98,15 +98,17 @@ def score(
     wanted = [row for case in cases.values() for row in _rows(case, methods, protocol, known)]
     rows = {row.place: known[row.place] for row in wanted if _is_scored(row, known)}
     todo = [row for row in wanted if row.place not in rows]
-    alone = [method.name for method in methods if method.alone]
-    tasks = list(_tasks(cases, [row for row in todo if row.method not in alone]))
-    later = [task for name in alone for task in _tasks(cases, [row for row in todo if row.method == name])]
+    exclusive = [method.name for method in methods if method.exclusive]
+    tasks = list(_tasks(cases, [row for row in todo if row.method not in exclusive]))
+    later = [
+        task for name in exclusive for task in _tasks(cases, [row for row in todo if row.method == name])
+    ]
     for metric in protocol.columns().values() if todo else ():
         if metric.prepare:  # here, once: weights may have to be fetched, or be missing
             metric.prepare()
     log = _Log(out / SCORES)
 
-    def take(made: Sequence[Row]) -> None:
+    def take(made: Sequence[ScoreRow]) -> None:
         for row in made:
             log.write(row)
             rows[row.place] = row
@@ -118,8 +120,8 @@ def score(
 
 
 def _rows(
-    case: Case, methods: Sequence[Method], protocol: Protocol, known: Mapping[Place, Row]
-) -> Iterator[Row]:
+    case: Case, methods: Sequence[Method], protocol: EvaluationConfig, known: Mapping[Place, ScoreRow]
+) -> Iterator[ScoreRow]:
     """Rows without scores; their keys are digests of all that they depend on."""
     photo, *truths = (
         hashlib.sha256(file.read()).hexdigest() if file else ""
@@ -129,19 +131,19 @@ def _rows(
     for method in methods:
         answer_key = _digest(photo, protocol.size, method.key(case))
         key = _digest(answer_key, truths, asked, case.rendered, SCORE_FORMAT)
-        row = Row(case.benchmark, case.name, method.name, answer_key, key)
+        row = ScoreRow(case.benchmark, case.name, method.name, answer_key, key)
         before = known.get(row.place)
         is_answered = before and before.answer_key == answer_key
         yield replace(row, kept=before.kept) if before and is_answered else row
 
 
-def _tasks(cases: Mapping[tuple[str, str], Case], todo: Sequence[Row]) -> Iterator[_Task]:
+def _tasks(cases: Mapping[tuple[str, str], Case], todo: Sequence[ScoreRow]) -> Iterator[_ScoringTask]:
     """Case by case."""
     for place, rows in groupby(todo, lambda row: row.place[:2]):
-        yield _Task(cases[place], tuple(rows))
+        yield _ScoringTask(cases[place], tuple(rows))
 
 
-def _is_scored(row: Row, known: Mapping[Place, Row]) -> bool:
+def _is_scored(row: ScoreRow, known: Mapping[Place, ScoreRow]) -> bool:
     return row.place in known and known[row.place].key == row.key
 
 
@@ -152,17 +154,17 @@ def _digest(*parts: object) -> str:
 # --- one case
 
 
-def _do(task: _Task, methods: Mapping[str, Method], protocol: Protocol) -> list[Row]:
+def _do(task: _ScoringTask, methods: Mapping[str, Method], protocol: EvaluationConfig) -> list[ScoreRow]:
     """Scores all answers to a case."""
     try:
-        truth = Truth.open(task.case, protocol)
+        truth = GroundTruth.open(task.case, protocol)
     except BrewsterError as error:
         return [replace(row, error=f"{row.benchmark}/{row.case}: {error}") for row in task.rows]
-    judge = Judge(truth, protocol)
+    judge = Scorer(truth, protocol)
     return [_scored(row, truth, judge, methods[row.method]) for row in task.rows]
 
 
-def _scored(row: Row, truth: Truth, judge: Judge, method: Method) -> Row:
+def _scored(row: ScoreRow, truth: GroundTruth, judge: Scorer, method: Method) -> ScoreRow:
     try:
         answer = find_answer(truth, method, row)
         truth.check(answer, method.name)
@@ -182,7 +184,7 @@ def _scored(row: Row, truth: Truth, judge: Judge, method: Method) -> Row:
     )
 
 
-def find_answer(truth: Truth, method: Method, row: Row) -> Answer:
+def find_answer(truth: GroundTruth, method: Method, row: ScoreRow) -> MethodOutput:
     """The answer that lies on the disk, if it is the one that the row knows; else a new one.
 
     Raises:
@@ -192,17 +194,21 @@ def find_answer(truth: Truth, method: Method, row: Row) -> Answer:
     return kept if kept and kept.kept == row.kept else method.answer(truth.case, truth.photo)
 
 
-def _failed(row: Row, error: str) -> Row:
+def _failed(row: ScoreRow, error: str) -> ScoreRow:
     return replace(row, error=f"{row.method} failed on {row.benchmark}/{row.case}: {error}")
 
 
 # --- all cases
 
-Take = Callable[[Sequence[Row]], None]
+Take = Callable[[Sequence[ScoreRow]], None]
 
 
 def _run(
-    tasks: Sequence[_Task], methods: Sequence[Method], protocol: Protocol, take: Take, workers: int
+    tasks: Sequence[_ScoringTask],
+    methods: Sequence[Method],
+    protocol: EvaluationConfig,
+    take: Take,
+    workers: int,
 ) -> None:
     """Does the tasks here, or in so many processes, and hands their rows over as they come.
 
@@ -235,20 +241,20 @@ def _run(
         pool.shutdown(cancel_futures=True)
 
 
-def _finished(futures: set[Future[list[Row]]]) -> Iterator[list[Row]]:
+def _finished(futures: set[Future[list[ScoreRow]]]) -> Iterator[list[ScoreRow]]:
     return (future.result() for future in futures if not future.cancelled() and not future.exception())
 
 
 _process: dict[str, Any] = {}
 
 
-def _begin(methods: dict[str, Method], protocol: Protocol) -> None:
+def _begin(methods: dict[str, Method], protocol: EvaluationConfig) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which lets a case be finished
     end_with_parent()
     _process.update(methods=methods, protocol=protocol)
 
 
-def _do_here(task: _Task) -> list[Row]:
+def _do_here(task: _ScoringTask) -> list[ScoreRow]:
     with one_thread():
         return _do(task, _process["methods"], _process["protocol"])
 
@@ -263,7 +269,7 @@ class _Log:
     def __init__(self, path: Path) -> None:
         self._path = path
 
-    def write(self, row: Row) -> None:
+    def write(self, row: ScoreRow) -> None:
         """Adds a line.
 
         Raises:
@@ -288,12 +294,12 @@ class _Log:
         return b"" if file.read(1) == b"\n" else b"\n"
 
 
-def _read(path: Path) -> dict[Place, Row]:
+def _read(path: Path) -> dict[Place, ScoreRow]:
     """The last row of earlier runs at each place; failures, half lines and lines of other versions are passed over."""
     rows = {}
     for line in path.read_text(errors="replace").splitlines() if path.is_file() else ():
         try:
-            row = Row(**json.loads(line))
+            row = ScoreRow(**json.loads(line))
         except (ValueError, TypeError):
             continue
         if not row.error:

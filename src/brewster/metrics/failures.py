@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Final, final
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.light import REC709_LUMINANCE, to_linear
 from brewster.metrics.windows import Picture, Region, check_pictures
+from brewster.srgb import REC709_LUMINANCE, to_linear
 
 if TYPE_CHECKING:
     from jaxtyping import Float

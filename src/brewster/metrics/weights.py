@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.download import Line, Promise
+from brewster.download import Downloader, RemoteFile
 from brewster.errors import DownloadError, ModelError
 from brewster.files import cache_folder, write_atomically
 
@@ -34,7 +34,7 @@ FILE: Final = "lpips_alexnet_features.pth"
 DIGEST: Final = "b58cb12516261361a1ed14f3b70c0abad70c1ca4c1c75e1aa576654d3759aa06"
 """See `digest_of`."""
 
-TORCHVISION: Final = Promise(
+TORCHVISION: Final = RemoteFile(
     "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
     size=244_408_911,
     algorithm="sha256",
@@ -60,7 +60,7 @@ _BROKEN: Final = (
 
 
 def load_backbone(
-    promise: Promise = TORCHVISION, digest: str = DIGEST, *, line: Line | None = None
+    promise: RemoteFile = TORCHVISION, digest: str = DIGEST, *, line: Downloader | None = None
 ) -> dict[str, Tensor]:
     """The ten tensors by name, float32, from the first place that has them; else downloaded into the cache.
 
@@ -74,7 +74,7 @@ def load_backbone(
     for path in (cached, *([Path(data) / "weights" / FILE] if data else [])):
         if path.is_file():
             return read_backbone(path, digest)
-    return _fetch(promise, digest, cached, line or Line())
+    return _fetch(promise, digest, cached, line or Downloader())
 
 
 def read_backbone(path: Path, digest: str = DIGEST) -> dict[str, Tensor]:
@@ -110,7 +110,7 @@ def digest_of(tensors: dict[str, Tensor]) -> str:
     return digest.hexdigest()
 
 
-def _fetch(promise: Promise, digest: str, cached: Path, line: Line) -> dict[str, Tensor]:
+def _fetch(promise: RemoteFile, digest: str, cached: Path, line: Downloader) -> dict[str, Tensor]:
     """Keeps the ten tensors of the whole network's file, and drops the file: 96 % of it are of no use here."""
     import torch  # noqa: PLC0415 - an extra
 

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from brewster.errors import MissingExtra
-from brewster.light import to_encoded, to_linear
+from brewster.srgb import to_encoded, to_linear
 
 if TYPE_CHECKING:
     from jaxtyping import Float

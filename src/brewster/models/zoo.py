@@ -16,7 +16,7 @@ _WEIGHTS: Final = Path(__file__).parent / "weights"
 
 @final
 @dataclass(frozen=True)
-class Model:
+class ModelFile:
     """A model file, the digest that its bytes must have (None for a user's own file), and its licence."""
 
     name: str
@@ -62,7 +62,7 @@ class Model:
 MODELS: Final = {
     model.name: model
     for model in (
-        Model(
+        ModelFile(
             "compact",
             _WEIGHTS / "compact.onnx",
             "7f297bafce586d1c37b8c69c77602629ddcc3e485a3eaf9fc85afc2d3b57d9d1",
@@ -73,9 +73,9 @@ MODELS: Final = {
 
 
 LARGE: Final = {
-    "kontext": "brewster.models.large.families.kontext:Kontext",
-    "klein": "brewster.models.large.families.klein:Klein",
-    "qwen": "brewster.models.large.families.qwen:Qwen",
+    "kontext": "brewster.models.diffusion.families.kontext:Kontext",
+    "klein": "brewster.models.diffusion.families.klein:Klein",
+    "qwen": "brewster.models.diffusion.families.qwen:Qwen",
 }
 """Large image models: name -> its `Backbone`, as text because importing it imports torch; needs the extra `large`."""
 
@@ -108,7 +108,7 @@ def _is_hub_id(name: str) -> bool:
     return is_one and not name.endswith(".onnx") and not Path(name).parent.is_dir()
 
 
-def find_model(name: str) -> Model:
+def find_model(name: str) -> ModelFile:
     """A model by its name in the zoo, or by the path of an .onnx file.
 
     Raises:
@@ -124,7 +124,7 @@ def find_model(name: str) -> Model:
         )
     path = Path(name)
     if path.is_file():
-        return Model(path.stem, path, None, "unknown")
+        return ModelFile(path.stem, path, None, "unknown")
     close = difflib.get_close_matches(name, (*MODELS, *LARGE), n=1) if path.name == name else []
     raise ModelError(
         f"there is no model {name!r}",

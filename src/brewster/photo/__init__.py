@@ -8,15 +8,15 @@ pyvips is used in this room only (decode, encode), OpenEXR and pillow-heif only 
 
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.photo.decode import read_size
-from brewster.photo.floats import read_layers, write_layers
-from brewster.photo.origin import DEPTHS, Origin
+from brewster.photo.file_info import DEPTHS, FileInfo
+from brewster.photo.hdr_formats import read_layers, write_layers
 from brewster.photo.photo import Encoding, Photo, Source
 
 __all__ = [
     "DEFAULT_MAX_PIXELS",
     "DEPTHS",
     "Encoding",
-    "Origin",
+    "FileInfo",
     "Photo",
     "Source",
     "read_layers",

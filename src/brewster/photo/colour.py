@@ -1,6 +1,6 @@
 """Colour: stored pixels to linear Rec.709 light and back, through tone curves, matrices and tables.
 
-A `Space` is all that is needed: the tone curve of each channel and the matrix from the space's linear light
+A `ColourSpace` is all that is needed: the tone curve of each channel and the matrix from the space's linear light
 to linear Rec.709. It comes from an ICC matrix profile (ICC.1:2022), from an EXR's chromaticities, or is plain
 sRGB. Light outside the Rec.709 gamut has values below 0 or above 1: nothing is clipped on the way in.
 """
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster import light
+from brewster import srgb
 from brewster.errors import UnsupportedPhoto
 
 Float32 = NDArray[np.float32]
@@ -29,7 +29,7 @@ _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0
 
 
 @dataclass(frozen=True)
-class Curve:
+class ToneCurve:
     """A tone curve: values 0..1 as stored to linear light (ICC.1:2022 10.6 and 10.18).
 
     Either samples, or seven parameters: (a x + b)^g + e from x = d on, c x + f below.
@@ -56,23 +56,23 @@ class Curve:
 
 
 @dataclass(frozen=True)
-class SrgbCurve(Curve):
-    """The curve of sRGB, extended past 1 (brewster.light)."""
+class SrgbToneCurve(ToneCurve):
+    """The curve of sRGB, extended past 1 (brewster.srgb)."""
 
     def decode(self, stored: Float64) -> Float64:
         """Stored values to linear light, any shape."""
-        return light.to_linear(stored)
+        return srgb.to_linear(stored)
 
     def encode(self, linear: Float64) -> Float64:
         """Linear light to stored values, any shape."""
-        return light.to_encoded(linear)
+        return srgb.to_encoded(linear)
 
 
 @dataclass(frozen=True)
-class Space:
+class ColourSpace:
     """How stored pixels mean light: a tone curve per channel, then a matrix to linear Rec.709, if any."""
 
-    curves: tuple[Curve, Curve, Curve]
+    curves: tuple[ToneCurve, ToneCurve, ToneCurve]
     matrix: Matrix | None = None
 
     def to_linear(self, stored: Stored) -> Float32:
@@ -103,17 +103,17 @@ class Space:
             stored[same] = before[same]
         return stored
 
-    def _curves(self, stored: Stored) -> tuple[Curve, ...]:
+    def _curves(self, stored: Stored) -> tuple[ToneCurve, ...]:
         """Grey takes the green curve: profiles for grey have but one, and neutral is neutral in any RGB."""
         return self.curves if stored.shape[-1] == 3 else (self.curves[1],)
 
 
-SRGB = Space((SrgbCurve(),) * 3)
-LINEAR_REC709 = Space((Curve(),) * 3)
+SRGB = ColourSpace((SrgbToneCurve(),) * 3)
+LINEAR_REC709 = ColourSpace((ToneCurve(),) * 3)
 
 
 @lru_cache(maxsize=16)
-def space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_float: bool) -> Space:
+def space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_float: bool) -> ColourSpace:
     """The space of stored pixels: that of the ICC profile, of the chromaticities, or of nothing said.
 
     Nothing said means sRGB for whole numbers and linear Rec.709 for floats. Raises UnsupportedPhoto for
@@ -122,20 +122,20 @@ def space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_float: b
     if icc is not None:
         return _profile_space(icc)
     if primaries is not None and not np.allclose(primaries, REC709, atol=1e-4):
-        return Space((Curve(),) * 3, _to_rec709(_to_d50(primaries)))
+        return ColourSpace((ToneCurve(),) * 3, _to_rec709(_to_d50(primaries)))
     return LINEAR_REC709 if is_float else SRGB
 
 
-def _decoded(stored: Stored, curve: Curve) -> Float32:
+def _decoded(stored: Stored, curve: ToneCurve) -> Float32:
     if stored.dtype.kind == "f":
-        is_straight = curve == Curve()
+        is_straight = curve == ToneCurve()
         return stored if is_straight else curve.decode(stored.astype(np.float64)).astype(np.float32)
     return _decode_table(curve, np.iinfo(stored.dtype).max).take(stored)
 
 
-def _encoded(linear: Float32, curve: Curve, dtype: np.dtype[Any]) -> Stored:
+def _encoded(linear: Float32, curve: ToneCurve, dtype: np.dtype[Any]) -> Stored:
     if dtype.kind == "f":
-        is_straight = curve == Curve()
+        is_straight = curve == ToneCurve()
         return linear if is_straight else curve.encode(linear.astype(np.float64)).astype(np.float32)
     table = _encode_table(curve, np.iinfo(dtype).max)
     root = np.sqrt(np.fmin(np.fmax(linear, np.float32(0)), np.float32(1)))
@@ -143,12 +143,12 @@ def _encoded(linear: Float32, curve: Curve, dtype: np.dtype[Any]) -> Stored:
 
 
 @lru_cache(maxsize=16)
-def _decode_table(curve: Curve, white: int) -> Float32:
+def _decode_table(curve: ToneCurve, white: int) -> Float32:
     return curve.decode(np.arange(white + 1) / white).astype(np.float32)
 
 
 @lru_cache(maxsize=16)
-def _encode_table(curve: Curve, white: int) -> NDArray[Any]:
+def _encode_table(curve: ToneCurve, white: int) -> NDArray[Any]:
     """Stored whole numbers over the square root of linear light, which spreads the dark as encodings do.
 
     2**16 steps round 8 bits to within 0.01 of a level, 2**20 steps 16 bits to within 0.1.
@@ -168,7 +168,7 @@ def _product(matrix: Matrix, channels: list[Float32]) -> list[Float32]:
 def _grey(linear: Float32) -> Float32:
     """Luminance, and exactly the common value where the three agree."""
     red, green, blue = (linear[..., i] for i in range(3))
-    weights = np.array(light.REC709_LUMINANCE, np.float32)
+    weights = np.array(srgb.REC709_LUMINANCE, np.float32)
     neutral = (red == green) & (green == blue)
     return np.where(neutral, green, weights[0] * red + weights[1] * green + weights[2] * blue)
 
@@ -196,14 +196,14 @@ def _to_rec709(to_d50: Float64) -> Matrix:
     return _as_matrix(np.linalg.inv(_to_d50(REC709)) @ to_d50)
 
 
-def _profile_space(icc: bytes) -> Space:
+def _profile_space(icc: bytes) -> ColourSpace:
     try:
         tags = tags_of(icc)
         if icc[16:20] == b"GRAY":
-            return _snapped(Space((_curve(tags[b"kTRC"]),) * 3))
+            return _snapped(ColourSpace((_curve(tags[b"kTRC"]),) * 3))
         to_d50 = np.array([_xyz(tags[name]) for name in (b"rXYZ", b"gXYZ", b"bXYZ")]).T
         red, green, blue = (_curve(tags[name]) for name in (b"rTRC", b"gTRC", b"bTRC"))
-        space = _snapped(Space((red, green, blue), _to_rec709(to_d50)))
+        space = _snapped(ColourSpace((red, green, blue), _to_rec709(to_d50)))
         _inverse(space.matrix or _as_matrix(np.eye(3)))
     except (KeyError, ValueError, struct.error, np.linalg.LinAlgError) as error:
         raise UnsupportedPhoto(
@@ -214,10 +214,10 @@ def _profile_space(icc: bytes) -> Space:
     return space
 
 
-def _snapped(space: Space) -> Space:
+def _snapped(space: ColourSpace) -> ColourSpace:
     """Plain sRGB where a profile means that, to within its rounding and a small part of an 8-bit level."""
     levels = np.arange(256) / 255
-    off = [np.abs(curve.decode(levels) - light.to_linear(levels)).max() for curve in space.curves]
+    off = [np.abs(curve.decode(levels) - srgb.to_linear(levels)).max() for curve in space.curves]
     turned = np.abs(np.array(space.matrix) - np.eye(3)).max() if space.matrix else 0.0
     return SRGB if max(off) < 2e-4 and turned < 1e-3 else space
 
@@ -241,7 +241,7 @@ def _xyz(tag: bytes) -> tuple[float, float, float]:
 _PLACES = ("g", "gab", "gabc", "gabcd", "gabcdef")  # the parameters that each of ICC's function types gives
 
 
-def _curve(tag: bytes) -> Curve:
+def _curve(tag: bytes) -> ToneCurve:
     """A curveType or parametricCurveType tag (ICC.1:2022 10.6 and 10.18)."""
     kind, count = struct.unpack_from(">4s4xI", tag)
     if kind == b"para":
@@ -249,14 +249,14 @@ def _curve(tag: bytes) -> Curve:
     if kind != b"curv":
         raise ValueError(kind)
     if count == 0:
-        return Curve()
+        return ToneCurve()
     numbers = struct.unpack_from(f">{count}H", tag, 12)
     if count == 1:
-        return Curve(parameters=(numbers[0] / 256, 1, 0, 0, 0, 0, 0))
-    return Curve(samples=tuple(number / 65535 for number in numbers))
+        return ToneCurve(parameters=(numbers[0] / 256, 1, 0, 0, 0, 0, 0))
+    return ToneCurve(samples=tuple(number / 65535 for number in numbers))
 
 
-def _parametric(function: int, tag: bytes) -> Curve:
+def _parametric(function: int, tag: bytes) -> ToneCurve:
     names = _PLACES[function] if function < len(_PLACES) else ""
     given = dict(zip(names, struct.unpack_from(f">{len(names)}i", tag, 12), strict=True))
     g, a, b, c, d, e, f = (given.get(name, 65536 * (name == "a")) / 65536 for name in "gabcdef")
@@ -264,4 +264,4 @@ def _parametric(function: int, tag: bytes) -> Curve:
         c, d, e, f = 0.0, -b / a, c, c
     if g <= 0 or a <= 0:
         raise ValueError(names)
-    return Curve(parameters=(g, a, b, c, d, e, f))
+    return ToneCurve(parameters=(g, a, b, c, d, e, f))

@@ -21,9 +21,9 @@ from brewster.errors import MissingExtra, PhotoError, UnreadablePhoto, Unsupport
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.photo import metadata
 from brewster.photo.colour import space_of
-from brewster.photo.floats import read_exr, read_hdr, too_large
+from brewster.photo.file_info import FileInfo
+from brewster.photo.hdr_formats import read_exr, read_hdr, too_large
 from brewster.photo.lut_profiles import has_only_tables
-from brewster.photo.origin import Origin
 
 pyvips.cache_set_max(0)  # each picture is read once: libvips' cache of operations would only hold memory
 logging.getLogger("pyvips").addHandler(logging.NullHandler())  # its warnings come as errors of ours
@@ -37,7 +37,7 @@ class Decoded:
 
     pixels: Stored
     alpha: Stored | None
-    origin: Origin
+    origin: FileInfo
 
 
 def decode(data: bytes, max_pixels: int) -> Decoded:
@@ -214,12 +214,12 @@ def _is_raw(tags: metadata.Tags) -> bool:
     return 50706 in tags or metadata.number_of(tags, 254, 0) & 1 == 1
 
 
-def _origin(image: pyvips.Image, data: bytes, container: str) -> Origin:
+def _origin(image: pyvips.Image, data: bytes, container: str) -> FileInfo:
     names = ("icc-profile-data", "exif-data", "xmp-data", "iptc-data")
     icc, exif, xmp, iptc = (image.get(name) if image.get_typeof(name) else None for name in names)
     bits = {"float": 32, "uchar": 8}.get(image.format, 16)
     has_resolution = (image.xres, image.yres) != (1.0, 1.0)
-    origin = Origin(
+    origin = FileInfo(
         container="png" if container == "gif" else container,
         bits=image.get("bits-per-sample") if container == "avif" else bits,
         icc=icc or _profile_of(data, container),
@@ -326,7 +326,7 @@ def _decode_heic(data: bytes, max_pixels: int) -> Decoded:
     except _HEIC_ERRORS as error:
         raise _unreadable("heic", error) from error
     exif, xmp = heif.info.get("exif"), heif.info.get("xmp")
-    origin = Origin(
+    origin = FileInfo(
         container="heic",
         bits=heif.info.get("bit_depth", 8),
         icc=_heic_profile(heif, data),
@@ -357,7 +357,7 @@ def upright(array: Stored, orientation: int) -> Stored:
     return array
 
 
-def split(array: Stored, origin: Origin) -> Decoded:
+def split(array: Stored, origin: FileInfo) -> Decoded:
     """Colour and alpha apart, each whole in memory."""
     has_alpha = array.shape[2] in (2, 4)
     colours = array.shape[2] - has_alpha

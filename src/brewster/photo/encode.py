@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from brewster.errors import MissingExtra, UnsupportedPhoto
 from brewster.photo import metadata
-from brewster.photo.floats import Floats, write_exr, write_hdr
-from brewster.photo.origin import Origin
+from brewster.photo.file_info import FileInfo
+from brewster.photo.hdr_formats import HdrPixels, write_exr, write_hdr
 
 Stored = NDArray[Any]
 
@@ -24,7 +24,7 @@ _FINE_AVIF = 90  # AV1's scale differs
 _PLAIN_RESOLUTION = (72 / 25.4, 72 / 25.4)
 
 
-def encode(pixels: Stored, alpha: Stored | None, origin: Origin) -> bytes:
+def encode(pixels: Stored, alpha: Stored | None, origin: FileInfo) -> bytes:
     """The file. `pixels` (H, W, 1|3) and `alpha` (H, W) have the type that the origin's bits ask for.
 
     Raises UnsupportedPhoto where the container cannot hold the picture, MissingExtra for EXR and HEIC.
@@ -36,16 +36,16 @@ def encode(pixels: Stored, alpha: Stored | None, origin: Origin) -> bytes:
             "write PNG, TIFF, WebP, AVIF or EXR",
         )
     if origin.container == "exr":
-        return write_exr(Floats(pixels, alpha, origin))
+        return write_exr(HdrPixels(pixels, alpha, origin))
     if origin.container == "hdr":
-        return write_hdr(Floats(pixels, alpha, origin))
+        return write_hdr(HdrPixels(pixels, alpha, origin))
     array = pixels if alpha is None else np.concatenate([pixels, alpha[..., None]], axis=2)
     if origin.container == "heic":
         return _encode_heic(array, origin)
     return _with_exif(_encode_vips(array, origin), array, origin)
 
 
-def _encode_vips(array: Stored, origin: Origin) -> bytes:
+def _encode_vips(array: Stored, origin: FileInfo) -> bytes:
     height, width, bands = array.shape
     across, down = origin.resolution or _PLAIN_RESOLUTION
     contiguous = np.ascontiguousarray(array)
@@ -81,7 +81,7 @@ def _interpretation(array: Stored) -> str:
     )
 
 
-def _saver(origin: Origin, dtype: np.dtype[Any]) -> tuple[str, dict[str, Any]]:
+def _saver(origin: FileInfo, dtype: np.dtype[Any]) -> tuple[str, dict[str, Any]]:
     """libvips' saver for a container and its options; chroma is subsampled only where the source's was."""
     match origin.container:
         case "jpeg":
@@ -104,7 +104,7 @@ def _saver(origin: Origin, dtype: np.dtype[Any]) -> tuple[str, dict[str, Any]]:
     return "tiffsave_buffer", options
 
 
-def _with_exif(data: bytes, array: Stored, origin: Origin) -> bytes:
+def _with_exif(data: bytes, array: Stored, origin: FileInfo) -> bytes:
     if origin.container == "jpeg":
         per_inch = origin.resolution and (25.4 * origin.resolution[0], 25.4 * origin.resolution[1])
         return metadata.with_jpeg_head(data, origin.exif, per_inch)
@@ -121,7 +121,7 @@ def _with_exif(data: bytes, array: Stored, origin: Origin) -> bytes:
     return metadata.with_tiff_exif(data, origin.exif)
 
 
-def _encode_heic(array: Stored, origin: Origin) -> bytes:
+def _encode_heic(array: Stored, origin: FileInfo) -> bytes:
     try:
         import pillow_heif  # noqa: PLC0415  (an extra, for the patents on HEVC)
     except ImportError as error:

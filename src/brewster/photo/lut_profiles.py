@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from brewster.errors import UnsupportedPhoto
 from brewster.photo.colour import tags_of
-from brewster.photo.origin import Origin
+from brewster.photo.file_info import FileInfo
 
 _MATRIX = {b"rXYZ", b"gXYZ", b"bXYZ", b"rTRC", b"gTRC", b"bTRC"}
 _TABLES = {b"A2B0", b"A2B1"}
@@ -34,7 +34,7 @@ def has_only_tables(icc: bytes | None) -> bool:
     return bool(tags & _TABLES) and not tags >= _MATRIX
 
 
-def in_display_p3(pixels: NDArray[Any], origin: Origin) -> tuple[NDArray[Any], Origin]:
+def in_display_p3(pixels: NDArray[Any], origin: FileInfo) -> tuple[NDArray[Any], FileInfo]:
     """Pixels (H, W, 3) of 8 or 16 bits, converted from a profile of tables (relative colorimetric), and their new origin.
 
     Raises:

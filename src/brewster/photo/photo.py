@@ -12,16 +12,16 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster import light
+from brewster import srgb
 from brewster.errors import PhotoError, UnreadablePhoto, UnsupportedPhoto
 from brewster.files import DEFAULT_MAX_PIXELS, write_atomically
 from brewster.photo import metadata
-from brewster.photo.colour import SRGB, Space, space_of
+from brewster.photo.colour import SRGB, ColourSpace, space_of
 from brewster.photo.decode import Decoded, decode, split, upright
 from brewster.photo.encode import encode
-from brewster.photo.floats import too_large
+from brewster.photo.file_info import DEPTHS, LINEAR, FileInfo, container_of, depth_for
+from brewster.photo.hdr_formats import too_large
 from brewster.photo.lut_profiles import has_only_tables, in_display_p3
-from brewster.photo.origin import DEPTHS, LINEAR, Origin, container_of, depth_for
 
 Float32 = NDArray[np.float32]
 Stored = NDArray[Any]
@@ -42,7 +42,7 @@ class Photo:
 
     pixels: Stored = field(repr=False)
     alpha: Stored | None = field(default=None, repr=False)
-    origin: Origin = field(default_factory=Origin, repr=False)
+    origin: FileInfo = field(default_factory=FileInfo, repr=False)
 
     def __post_init__(self) -> None:
         """Fix the arrays, so that photos can share them."""
@@ -110,14 +110,14 @@ class Photo:
         pixels, alpha = array[..., :colours], array[..., colours] if array.shape[2] == 4 else None
         if encoding == "linear" or array.dtype.kind == "f":
             pixels = pixels / np.float32(_LEVELS[array.dtype.name])
-            pixels = light.to_linear(pixels) if encoding == "srgb" else pixels
+            pixels = srgb.to_linear(pixels) if encoding == "srgb" else pixels
             alpha = None if alpha is None else alpha / np.float32(_LEVELS[array.dtype.name])
         floats = pixels.dtype.kind == "f"
         kind = np.dtype(np.float32) if floats else array.dtype
         return cls(
             np.ascontiguousarray(pixels, kind),
             None if alpha is None else np.ascontiguousarray(alpha, kind),
-            Origin(bits=8 * kind.itemsize),
+            FileInfo(bits=8 * kind.itemsize),
         )
 
     @classmethod
@@ -144,7 +144,7 @@ class Photo:
         exif, icc = image.info.get("exif"), image.info.get("icc_profile")
         container = (image.format or "png").lower()
         array = np.asarray(image).reshape(image.height, image.width, -1)
-        origin = Origin(
+        origin = FileInfo(
             container=container if container in DEPTHS else "png",
             bits=16 if image.mode == "I;16" else 8,
             icc=icc or None,
@@ -157,7 +157,7 @@ class Photo:
         """Width and height in pixels."""
         return self.pixels.shape[1], self.pixels.shape[0]
 
-    def space(self) -> Space:
+    def space(self) -> ColourSpace:
         """What light the stored numbers mean."""
         return space_of(self.origin.icc, self.origin.primaries, self.pixels.dtype.kind == "f")
 

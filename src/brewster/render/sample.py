@@ -15,7 +15,7 @@ LAYERS: Final = ("photo", "transmission", "background", "reflection", "mirror")
 
 
 @dataclass(frozen=True, eq=False)
-class Sample:
+class LightSample:
     """Five pictures (3, H, W) float32 of linear light, and the scene that is their cause.
 
     `photo` is I, with full glass effects; `transmission` T and `reflection` R are its two layers;
@@ -33,6 +33,6 @@ class Sample:
         """The five pictures by name."""
         return {name: getattr(self, name) for name in LAYERS}
 
-    def each(self, change: Callable[[Tensor], Tensor]) -> Sample:
+    def each(self, change: Callable[[Tensor], Tensor]) -> LightSample:
         """The same sample with every picture changed alike."""
-        return Sample(self.scene, **{name: change(layer) for name, layer in self.layers().items()})
+        return LightSample(self.scene, **{name: change(layer) for name, layer in self.layers().items()})

@@ -8,13 +8,13 @@ from typing import Annotated
 from pydantic import Field
 
 from brewster.scene.glass import Point
-from brewster.scene.values import Above0, From0, Values
+from brewster.scene.values import Above0, From0, FrozenModel
 
 Axes = tuple[Point, Point, Point]
 """Unit vectors to the right, up and back."""
 
 
-class Camera(Values):
+class Camera(FrozenModel):
     """Where it stands, where it looks, and its thin lens; square pixels.
 
     `fov_deg` spans the picture's width. An aperture of 0 is a pinhole; `focus_mm` is measured along the axis.

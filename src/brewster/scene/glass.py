@@ -10,7 +10,7 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from brewster.scene.values import Above0, From0, Values
+from brewster.scene.values import Above0, From0, FrozenModel
 
 Point = tuple[float, float, float]
 """Millimetres in the world: x to the right, y up, -z ahead."""
@@ -18,7 +18,7 @@ Point = tuple[float, float, float]
 ORDINARY_INDEX = 1.5
 
 
-class Pane(Values):
+class Pane(FrozenModel):
     """One sheet of glass. A wedge turns its far surface about the vertical axis."""
 
     thickness_mm: Annotated[float, Field(gt=0, le=200)] = 4.0
@@ -30,7 +30,7 @@ class Pane(Values):
     wedge_deg: Annotated[float, Field(ge=-5, le=5)] = 0.0
 
 
-class Glazing(Values):
+class Glazing(FrozenModel):
     """Panes with equal gaps of air between them, and where they stand.
 
     `frame_mm` is the width and height of the opening in a black wall (None: the glass fills the view);

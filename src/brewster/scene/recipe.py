@@ -13,14 +13,14 @@ from pydantic import Field, model_validator
 
 from brewster.errors import RecipeError
 from brewster.scene.scene import WhiteBalance
-from brewster.scene.values import From0, LogRange, Positive, Range, Share, Values, read_toml
+from brewster.scene.values import From0, FrozenModel, LogRange, Positive, Range, Share, read_toml
 
 _FOLDER: Final = Path(__file__).parent / "recipes"
 RECIPES: Final = tuple(sorted(path.stem for path in _FOLDER.glob("*.toml")))
 """The names of the packaged recipes."""
 
 
-class GlassRecipe(Values):
+class GlassRecipe(FrozenModel):
     """The glass of one kind of scene."""
 
     double_probability: Share = 0.0
@@ -49,7 +49,7 @@ class GlassRecipe(Values):
         return self
 
 
-class CameraRecipe(Values):
+class CameraRecipe(FrozenModel):
     """Cameras that look at the glass."""
 
     width: Annotated[int, Field(ge=16)] = 512
@@ -64,7 +64,7 @@ class CameraRecipe(Values):
     """Of a lens that is set on what is mirrored, instead of on what is behind the glass."""
 
 
-class SideRecipe(Values):
+class SideRecipe(FrozenModel):
     """What one side may hold. A map is taken only where a pixel spans at least 1 / most_px_per_texel texels."""
 
     map_probability: Share = 1.0
@@ -82,7 +82,7 @@ class SideRecipe(Values):
     luminance_log: LogRange = (1.0, 1.0)
 
 
-class DevelopmentRecipe(Values):
+class DevelopmentRecipe(FrozenModel):
     """How the photographs are developed; see `Development`."""
 
     exposure: LogRange = (0.2, 0.5)
@@ -105,7 +105,7 @@ class DevelopmentRecipe(Values):
         return self
 
 
-class SceneRecipe(Values):
+class SceneRecipe(FrozenModel):
     """One kind of scene."""
 
     name: str

@@ -18,23 +18,23 @@ from brewster.scene.camera import Camera, axes, dot
 from brewster.scene.glass import Glazing, Pane, Point
 from brewster.scene.recipe import CameraRecipe, DevelopmentRecipe, GlassRecipe, SceneRecipe, SideRecipe
 from brewster.scene.scene import Development, Scene
-from brewster.scene.values import Values
-from brewster.scene.world import Map, Plane, Side, Source
+from brewster.scene.values import FrozenModel
+from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
 
 _TRIES: Final = 100
 _FAR_MM: Final = 1e6
 
 
-class Asset(Values):
+class Asset(FrozenModel):
     """A file that can light a scene: its size, and a category such as indoor, outdoor or night."""
 
-    source: Source
+    source: AssetSource
     width: int
     height: int
     category: str = ""
 
 
-class Catalog(Values):
+class Catalog(FrozenModel):
     """The maps and pictures to draw from."""
 
     maps: tuple[Asset, ...] = ()
@@ -47,7 +47,7 @@ def draw(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) -> Scene:
     Raises:
         RecipeError: the recipe asks for maps or pictures that the catalog lacks, or for the impossible.
     """
-    dice = _Dice(f"{recipe.name}/{seed}/{index}")
+    dice = _NamedRng(f"{recipe.name}/{seed}/{index}")
     reason = ""
     for _ in range(_TRIES):
         try:
@@ -64,7 +64,7 @@ def _six(number: float) -> float:
     return float(f"{number:.6g}")
 
 
-class _Dice(Random):
+class _NamedRng(Random):
     """Random numbers by the words of a recipe."""
 
     def within(self, bounds: tuple[float, float]) -> float:
@@ -78,21 +78,21 @@ class _Dice(Random):
 
 
 @dataclass(frozen=True)
-class _Draft:
+class _PartialScene:
     """What is settled when the sides are drawn."""
 
-    dice: _Dice
+    dice: _NamedRng
     catalog: Catalog
     glass: Glazing
     camera: Camera
 
 
-def _try(recipe: SceneRecipe, catalog: Catalog, dice: _Dice, seed: int, index: int) -> Scene:
+def _try(recipe: SceneRecipe, catalog: Catalog, dice: _NamedRng, seed: int, index: int) -> Scene:
     glass = _glass(recipe.glass, dice)
     behind_map = _choose_map(recipe.behind, recipe.camera, catalog, dice)
     front_map = _choose_map(recipe.front, recipe.camera, catalog, dice)
     camera = _camera(recipe, [(recipe.behind, behind_map), (recipe.front, front_map)], dice)
-    draft = _Draft(dice, catalog, glass, camera)
+    draft = _PartialScene(dice, catalog, glass, camera)
     behind = _side(recipe.behind, behind_map, draft, glass.depth_mm)
     front = _side(recipe.front, front_map, draft, _camera_in_glass(camera, glass)[2])
     return Scene(
@@ -110,7 +110,7 @@ def _try(recipe: SceneRecipe, catalog: Catalog, dice: _Dice, seed: int, index: i
     )
 
 
-def _glass(recipe: GlassRecipe, dice: _Dice) -> Glazing:
+def _glass(recipe: GlassRecipe, dice: _NamedRng) -> Glazing:
     count = 2 if dice.chance(recipe.double_probability) else 1
     structural = dice.chance(recipe.structural_probability)
     tint, strength = dice.choice(recipe.tints), dice.within_log(recipe.tint_strength_log)
@@ -135,7 +135,7 @@ def _glass(recipe: GlassRecipe, dice: _Dice) -> Glazing:
     )
 
 
-def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, dice: _Dice) -> Asset | None:
+def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, dice: _NamedRng) -> Asset | None:
     """A map that is sharp enough for the widest view that the recipe allows; None for a side of pictures."""
     wanted = [asset for asset in catalog.maps if not recipe.maps or asset.category in ("", *recipe.maps)]
     sharp = [asset for asset in wanted if _least_fov(asset, recipe, camera) <= camera.fov_deg[1]]
@@ -156,7 +156,7 @@ def _least_fov(asset: Asset, recipe: SideRecipe, camera: CameraRecipe) -> float:
     return camera.width * 360 / asset.width / recipe.most_px_per_texel
 
 
-def _camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]], dice: _Dice) -> Camera:
+def _camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]], dice: _NamedRng) -> Camera:
     """A camera whose axis meets the glass near its middle; where it focuses is settled later."""
     wanted = recipe.camera
     least = max([wanted.fov_deg[0], *(_least_fov(asset, side, wanted) for side, asset in maps if asset)])
@@ -174,14 +174,14 @@ def _camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]], di
     )
 
 
-def _side(recipe: SideRecipe, asset: Asset | None, draft: _Draft, nearest_mm: float) -> Side:
+def _side(recipe: SideRecipe, asset: Asset | None, draft: _PartialScene, nearest_mm: float) -> Side:
     """A map, a picture, or both; the picture stands further from the glass than `nearest_mm`."""
     dice = draft.dice
     luminance = dice.within_log(recipe.luminance_log)
     world = plane = None
     if asset:
         is_dome = dice.chance(recipe.dome_probability)
-        world = Map(
+        world = EnvironmentMap(
             source=asset.source,
             heading_deg=dice.within((0, 360)),
             luminance=luminance,
@@ -192,7 +192,7 @@ def _side(recipe: SideRecipe, asset: Asset | None, draft: _Draft, nearest_mm: fl
     return Side(map=world, plane=plane)
 
 
-def _plane(recipe: SideRecipe, draft: _Draft, luminance: float, distance_mm: float) -> Plane:
+def _plane(recipe: SideRecipe, draft: _PartialScene, luminance: float, distance_mm: float) -> Plane:
     """A picture that covers as much of the view, straight or mirrored, as the recipe says."""
     if not draft.catalog.pictures:
         raise RecipeError(
@@ -237,7 +237,7 @@ def _reach(
     return (min(xs), max(xs)), (min(ys), max(ys))
 
 
-def _focused(recipe: CameraRecipe, draft: _Draft, behind: Side, front: Side) -> Camera:
+def _focused(recipe: CameraRecipe, draft: _PartialScene, behind: Side, front: Side) -> Camera:
     """The camera with its lens set on something of the scene."""
     dice, camera = draft.dice, draft.camera
     on = front if dice.chance(recipe.focus_on_front_probability) else behind
@@ -252,7 +252,7 @@ def _focused(recipe: CameraRecipe, draft: _Draft, behind: Side, front: Side) -> 
     )
 
 
-def _development(recipe: DevelopmentRecipe, dice: _Dice) -> Development:
+def _development(recipe: DevelopmentRecipe, dice: _NamedRng) -> Development:
     return Development(
         exposure=dice.within_log(recipe.exposure),
         white_balance=dice.choice(recipe.white_balance),

@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from brewster.scene.camera import Camera, axes, dot
 from brewster.scene.glass import Glazing
-from brewster.scene.values import From0, Positive, Seed, Share, Values, read_toml
+from brewster.scene.values import From0, FrozenModel, Positive, Seed, Share, read_toml
 from brewster.scene.world import Side
 
 STEEPEST_DEG = 85.0
@@ -23,7 +23,7 @@ STEEPEST_DEG = 85.0
 WhiteBalance = Literal["none", "grey-world", "white-patch", "grey-edge"]
 
 
-class Development(Values):
+class Development(FrozenModel):
     """From light to a photograph: decided on I, applied to all layers alike."""
 
     exposure: Annotated[float, Field(gt=0, le=1)] = 0.4
@@ -40,7 +40,7 @@ class Development(Values):
     """Of I; the truths are written at 95."""
 
 
-class Scene(Values):
+class Scene(FrozenModel):
     """Everything a sample is made from; (scene, version) gives the same bytes again.
 
     orders "all": T and R are the full sums, so that I = T + R. "paper": T is the path without any reflection,

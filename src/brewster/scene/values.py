@@ -11,7 +11,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from brewster.errors import RecipeError
 
 
-class Values(BaseModel):
+class FrozenModel(BaseModel):
     """Frozen values; unknown names and numbers that are not numbers are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -31,7 +31,7 @@ Seed = Annotated[int, Field(ge=0, lt=2**32)]
 Range = Annotated[tuple[float, float], AfterValidator(_rising)]
 LogRange = Annotated[tuple[Above0, Above0], AfterValidator(_rising)]
 
-Read = TypeVar("Read", bound=Values)
+Read = TypeVar("Read", bound=FrozenModel)
 
 
 def read_toml(kind: type[Read], path: Path, *, compare: str) -> Read:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field, PlainSerializer, model_validator
 
-from brewster.scene.values import Above0, From0, Values
+from brewster.scene.values import Above0, From0, FrozenModel
 
 BUILTIN = "builtin:"
 """A source that is computed, not read: `builtin:street:7` is the seventh street."""
@@ -15,17 +15,17 @@ BUILTIN = "builtin:"
 Radius = Annotated[float, Field(gt=0, allow_inf_nan=True), PlainSerializer(float)]
 
 
-class Source(Values):
+class AssetSource(FrozenModel):
     """A file's name below its assets folder with the sha256 of its bytes, or a builtin world, which has none."""
 
     file: str
     sha256: str = ""
 
 
-class Map(Values):
+class EnvironmentMap(FrozenModel):
     """A lat-long map (u = atan2(x, -z) / 2 pi, v = acos(y) / pi) at infinity, or on a dome around the glass."""
 
-    source: Source
+    source: AssetSource
     heading_deg: float = 0.0
     """The map's left edge lies in this direction."""
     luminance: From0 = 1.0
@@ -33,14 +33,14 @@ class Map(Values):
     radius_mm: Radius = math.inf
 
 
-class Plane(Values):
+class Plane(FrozenModel):
     """A picture on an upright plane, seen from the glass; its height follows from the picture's own shape.
 
     In front of the glass it is seen in the mirror alone: between glass and camera it belongs beside the view, since
     the pane renderer does not show it directly.
     """
 
-    source: Source
+    source: AssetSource
     distance_mm: Above0
     """From the glazing's position, straight out to its side."""
     offset_mm: tuple[float, float] = (0.0, 0.0)
@@ -60,10 +60,10 @@ class Plane(Values):
         return self.distance_mm - turned * self.width_mm / 2
 
 
-class Side(Values):
+class Side(FrozenModel):
     """What lies on one side of the glass; with neither map nor plane, darkness."""
 
-    map: Map | None = None
+    map: EnvironmentMap | None = None
     plane: Plane | None = None
 
     @model_validator(mode="after")

@@ -33,9 +33,9 @@ from brewster.errors import (
     UnreadablePhoto,
     UnsupportedPhoto,
 )
-from brewster.web.asked import explain
-from brewster.web.guard import HEADERS, Guard, Guarded
-from brewster.web.line import server
+from brewster.web.middleware import HEADERS, LimitMiddleware, RequestLimits
+from brewster.web.request_schema import explain
+from brewster.web.server import server
 
 PAGE: Final = Path(__file__).parent / "page"
 _STATUSES: Final[dict[type[BrewsterError], int]] = {
@@ -51,10 +51,10 @@ _STATUSES: Final[dict[type[BrewsterError], int]] = {
 """Of errors that are not named here, the asker is to blame: 422."""
 
 
-def application(*routers: APIRouter, guard: Guard, home: str = "index.html") -> FastAPI:
+def application(*routers: APIRouter, guard: RequestLimits, home: str = "index.html") -> FastAPI:
     """An application of these routers whose first page is the file `home` in web/page/, behind the guard."""
     app = FastAPI(title="brewster", version=brewster.__version__, docs_url=None, redoc_url=None)
-    app.add_middleware(Guarded, guard=guard)
+    app.add_middleware(LimitMiddleware, guard=guard)
     for kind in (ClientDisconnect, HTTPException, RequestValidationError, BrewsterError, Exception):
         app.add_exception_handler(kind, _explain)
     for router in routers:

@@ -17,10 +17,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.light import to_encoded
+from brewster.inference import Separator
 from brewster.options import Options
 from brewster.photo import Photo
-from brewster.separate import Separator
+from brewster.srgb import to_encoded
 
 PREVIEW_PIXELS: Final = 1_400_000
 """Larger photos are made smaller: about as many pixels as a window shows."""

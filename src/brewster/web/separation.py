@@ -24,12 +24,12 @@ from starlette.responses import Response
 
 import brewster
 from brewster.files import SUFFIXES
+from brewster.inference.predictor import ProgressCallback
 from brewster.photo import Photo
-from brewster.separate.look import Tell
-from brewster.web.asked import Asked, form_schema, read_form
-from brewster.web.desk import Desk, Progress
+from brewster.web.job_queue import JobProgress, JobQueue
+from brewster.web.model_cache import ModelCache, ModelRow
 from brewster.web.preview import preview
-from brewster.web.shelf import ModelRow, Shelf
+from brewster.web.request_schema import SeparationRequest, form_schema, read_form
 
 _MEDIA: Final = {
     "exr": "image/x-exr",
@@ -39,7 +39,7 @@ _EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # zip has no earlier; the same layers mak
 
 
 @final
-class Trouble(BaseModel):
+class ErrorResponse(BaseModel):
     """What every refusal looks like."""
 
     error: str
@@ -47,7 +47,7 @@ class Trouble(BaseModel):
 
 
 @final
-class Health(BaseModel):
+class HealthResponse(BaseModel):
     """Whether the server is well."""
 
     status: Literal["ok"] = "ok"
@@ -58,8 +58,8 @@ class Health(BaseModel):
     """How many there can be."""
 
 
-Make = Callable[[Shelf, Asked, Tell], Response]
-_TROUBLE: Final[dict[str, Any]] = {"model": Trouble}
+Make = Callable[[ModelCache, SeparationRequest, ProgressCallback], Response]
+_TROUBLE: Final[dict[str, Any]] = {"model": ErrorResponse}
 _ANSWERS: Final[dict[int | str, dict[str, Any]]] = {
     200: {
         "description": "One layer, or a zip of several.",
@@ -73,7 +73,7 @@ JobName = Annotated[
 ]
 
 
-def separation(shelf: Shelf, desk: Desk, *, max_pixels: int) -> APIRouter:
+def separation(shelf: ModelCache, desk: JobQueue, *, max_pixels: int) -> APIRouter:
     """The routes of the API, and the page's own previews."""
     router = APIRouter()
     form = {"multipart/form-data": {"schema": form_schema(shelf.names)}}
@@ -98,7 +98,7 @@ def separation(shelf: Shelf, desk: Desk, *, max_pixels: int) -> APIRouter:
         return await work(request, job, _preview)
 
     @router.get("/progress/{job}", responses={404: _TROUBLE})
-    async def progress(job: str) -> Progress:
+    async def progress(job: str) -> JobProgress:
         """How far a job is that a client has named; 404 before it begins and after its end."""
         found = desk.progress(job)
         if found is None:
@@ -111,14 +111,14 @@ def separation(shelf: Shelf, desk: Desk, *, max_pixels: int) -> APIRouter:
         return shelf.rows()
 
     @router.get("/health")
-    async def health() -> Health:
+    async def health() -> HealthResponse:
         """Whether the server is well, and how busy."""
-        return Health(jobs=desk.jobs, places=desk.workers + desk.queue)
+        return HealthResponse(jobs=desk.jobs, places=desk.workers + desk.queue)
 
     return router
 
 
-def _separate(shelf: Shelf, asked: Asked, tell: Tell) -> Response:
+def _separate(shelf: ModelCache, asked: SeparationRequest, tell: ProgressCallback) -> Response:
     """The layers as files."""
     started = time.perf_counter()
     options = asked.options
@@ -136,18 +136,18 @@ def _separate(shelf: Shelf, asked: Asked, tell: Tell) -> Response:
         "Brewster-Model": quote(separation.model),
         "Brewster-SHA256": separation.sha256 or "",
         "Brewster-Device": separation.device,
-        "Brewster-Remainder": f"{separation.remainder:.6f}",
+        "Brewster-Residual": f"{separation.residual:.6f}",
         "Brewster-Seconds": f"{time.perf_counter() - started:.4f}",
     }
-    if separation.drift is not None:
+    if separation.reconstruction_error is not None:
         headers |= {
-            "Brewster-Drift": f"{separation.drift:.6f}",
+            "Brewster-Reconstruction-Error": f"{separation.reconstruction_error:.6f}",
             "Brewster-Doubtful": str(separation.doubtful).lower(),
         }
     return Response(data, headers=headers, media_type=_media(name))
 
 
-def _preview(shelf: Shelf, asked: Asked, tell: Tell) -> Response:
+def _preview(shelf: ModelCache, asked: SeparationRequest, tell: ProgressCallback) -> Response:
     photo = Photo.open(asked.photo, max_pixels=asked.options.max_pixels)
     maps = preview(shelf.separator(asked.options.model), photo, asked.options, tell)
     return Response(maps, media_type="application/octet-stream")

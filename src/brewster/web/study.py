@@ -17,10 +17,10 @@ from fastapi.responses import Response
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.exceptions import HTTPException
 
-from brewster.study import draw
-from brewster.study.draw import Choice
-from brewster.study.store import Participant, Store
-from brewster.study.study import Study
+from brewster.user_study import assignment
+from brewster.user_study.assignment import Choice
+from brewster.user_study.store import AnswerStore, Participant
+from brewster.user_study.study import Study
 from brewster.web.application import page
 
 _KEEP: Final = {"Cache-Control": "private, max-age=86400, immutable"}
@@ -39,19 +39,19 @@ class Invitation(_Strict):
     is_open: bool
 
 
-class Agreement(_Strict):
+class ConsentRequest(_Strict):
     """That somebody takes part."""
 
     agreed: Literal[True]
 
 
-class Link(_Strict):
+class PersonalLink(_Strict):
     """The personal link, from the server's root."""
 
     link: str
 
 
-class Trial(_Strict):
+class TrialResponse(_Strict):
     """The first trial without an answer, from 0, and the size of its pictures in px; no trial where all are answered."""
 
     trial: int | None
@@ -60,7 +60,7 @@ class Trial(_Strict):
     height: int | None = None
 
 
-class Given(_Strict):
+class AnswerRequest(_Strict):
     """An answer, and for how many seconds the pictures were seen."""
 
     trial: Annotated[int, Field(ge=0)]
@@ -68,11 +68,11 @@ class Given(_Strict):
     seconds: Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
-class Kept(_Strict):
+class AnswerResponse(_Strict):
     """What is on the disk now, which is the first answer that came, and what is next."""
 
     kept: Choice
-    next: Trial
+    next: TrialResponse
 
 
 Token = Annotated[str, FromPath(max_length=64)]
@@ -80,10 +80,10 @@ Side = Literal["photo", "left", "right"]
 
 
 def participants(
-    study: Study, store: Store, *, most: int | None = None, token: str | None = None
+    study: Study, store: AnswerStore, *, most: int | None = None, token: str | None = None
 ) -> APIRouter:
     """The routes of a study that admits at most so many; personal links carry the guard's token, if there is one."""
-    door, router = _Door(study, store, most, token), APIRouter(tags=["study"])
+    door, router = _StudyRoutes(study, store, most, token), APIRouter(tags=["study"])
     router.get("/invitation")(door.invitation)
     router.post("/participants", status_code=201)(door.admit)
     router.get("/s/{person}", include_in_schema=False)(door.begin)
@@ -96,11 +96,11 @@ def participants(
 
 @final
 @dataclass(frozen=True)
-class _Door:
+class _StudyRoutes:
     """What the routes do, each in a thread, as the disk is waited for."""
 
     study: Study
-    store: Store
+    store: AnswerStore
     most: int | None
     token: str | None
 
@@ -112,7 +112,7 @@ class _Door:
             consent=description.consent, trials=description.pairs + description.catches, is_open=is_open
         )
 
-    def admit(self, _agreement: Annotated[Agreement, Body()]) -> Link:
+    def admit(self, _agreement: Annotated[ConsentRequest, Body()]) -> PersonalLink:
         """Admits somebody who agrees to take part, and gives them a link of their own."""
         person = self.store.admit(most=self.most)
         if person is None:
@@ -125,12 +125,12 @@ class _Door:
         answer.status_code = 404 if self.store.participant(person) is None else 200
         return answer
 
-    def link(self, person: Token) -> Link:
+    def link(self, person: Token) -> PersonalLink:
         """The personal link, whole: the page's own address has lost the guard's token."""
         self._participant(person)
         return self._link(person)
 
-    def next_trial(self, person: Token, response: Response) -> Trial:
+    def next_trial(self, person: Token, response: Response) -> TrialResponse:
         """The first trial without an answer."""
         response.headers.update(_FORGET)
         return self._next(self._participant(person))
@@ -148,15 +148,15 @@ class _Door:
             ) from error
         return Response(data, media_type="image/png", headers=_KEEP)
 
-    def answer(self, person: Token, given: Annotated[Given, Body()]) -> Kept:
+    def answer(self, person: Token, given: Annotated[AnswerRequest, Body()]) -> AnswerResponse:
         """Keeps an answer on the disk. The first one to a trial stays: sent again, it changes nothing."""
         participant = self._participant(person)
         _shown(participant, given.trial)
         kept = self.store.answer(participant, given.trial, given.choice, seconds=given.seconds)
-        return Kept(kept=kept, next=self._next(participant))
+        return AnswerResponse(kept=kept, next=self._next(participant))
 
-    def _link(self, person: str) -> Link:
-        return Link(link=f"/s/{person}" + (f"?token={self.token}" if self.token else ""))
+    def _link(self, person: str) -> PersonalLink:
+        return PersonalLink(link=f"/s/{person}" + (f"?token={self.token}" if self.token else ""))
 
     def _participant(self, person: str) -> Participant:
         participant = self.store.participant(person)
@@ -166,15 +166,15 @@ class _Door:
             )
         return participant
 
-    def _next(self, participant: Participant) -> Trial:
+    def _next(self, participant: Participant) -> TrialResponse:
         trial, count = self.store.next_trial(participant), len(participant.trials)
         if trial is None:
-            return Trial(trial=None, trials=count)
+            return TrialResponse(trial=None, trials=count)
         photo = self.study.picture(participant.trials[trial].photo)
-        return Trial(trial=trial, trials=count, width=photo.width, height=photo.height)
+        return TrialResponse(trial=trial, trials=count, width=photo.width, height=photo.height)
 
 
-def _shown(participant: Participant, trial: int) -> draw.Trial:
+def _shown(participant: Participant, trial: int) -> assignment.TrialDraw:
     if not 0 <= trial < len(participant.trials):
         raise HTTPException(404, f"there is no trial {trial}; load the page again")
     return participant.trials[trial]

@@ -22,7 +22,7 @@ _Name = TypeVar("_Name")
 
 @final
 @dataclass(frozen=True)
-class Published:
+class PublishedScores:
     """A method's figures as one source printed them.
 
     `scores` is set -> metric -> value: PSNR in dB, SSIM and LPIPS without a unit. A value prints as it was printed.
@@ -36,10 +36,10 @@ class Published:
     scores: dict[str, dict[str, float]]
 
 
-class _Figure(float):
+class _PrintedNumber(float):
     """A number that remembers how it was printed: 26.60 is not 26.6."""
 
-    def __new__(cls, printed: str) -> _Figure:
+    def __new__(cls, printed: str) -> _PrintedNumber:
         figure = super().__new__(cls, printed)
         figure._printed = printed
         return figure
@@ -50,17 +50,17 @@ class _Figure(float):
         return self._printed
 
 
-def read_published() -> list[Published]:
+def read_published() -> list[PublishedScores]:
     """Every row of published.toml, in its order."""
-    tables = tomllib.loads(_FILE.read_text("utf-8"), parse_float=_Figure)["table"]
+    tables = tomllib.loads(_FILE.read_text("utf-8"), parse_float=_PrintedNumber)["table"]
     return [
-        Published(method, table["source"], table["read_in"], table["protocol"].strip(), scores)
+        PublishedScores(method, table["source"], table["read_in"], table["protocol"].strip(), scores)
         for table in tables
         for method, scores in table["rows"].items()
     ]
 
 
-def to_markdown(published: Sequence[Published]) -> str:
+def to_markdown(published: Sequence[PublishedScores]) -> str:
     """A section of Markdown: a table for each protocol, which stands above it with its sources.
 
     Rows of one protocol belong together only if they follow each other.
@@ -70,7 +70,7 @@ def to_markdown(published: Sequence[Published]) -> str:
     return "\n\n".join([f"## {_HEADING}", *parts]) + "\n"
 
 
-def _table(protocol: str, rows: list[Published]) -> str:
+def _table(protocol: str, rows: list[PublishedScores]) -> str:
     sets = _names(name for row in rows for name in row.scores)
     metrics = _names(metric for row in rows for scores in row.scores.values() for metric in scores)
     said = " / ".join(_METRICS.get(metric, metric) for metric in metrics)
@@ -86,13 +86,13 @@ def _table(protocol: str, rows: list[Published]) -> str:
     return "\n".join(lines)
 
 
-def _sources(rows: list[Published]) -> list[str]:
+def _sources(rows: list[PublishedScores]) -> list[str]:
     places = _names((row.source, row.read_in) for row in rows)
     methods = {place: [row.method for row in rows if (row.source, row.read_in) == place] for place in places}
     return [f"- {', '.join(methods[place])}: {place[0]}; read in {place[1]}" for place in places]
 
 
-def _cell(row: Published, name: str, metrics: list[str]) -> str:
+def _cell(row: PublishedScores, name: str, metrics: list[str]) -> str:
     scores = row.scores.get(name)
     return " / ".join(str(scores.get(metric, "-")) for metric in metrics) if scores else "-"
 

@@ -32,7 +32,7 @@ def to_markdown(results: Results) -> str:
 
 
 def overview(results: Results) -> str:
-    """The tables alone, as a terminal shows them."""
+    """The tables exclusive, as a terminal shows them."""
     return (
         "\n\n".join([_overview(results), *(_details(results, key) for key in results["selections"])]) + "\n"
     )
@@ -168,7 +168,7 @@ def ranking(table: Mapping[str, Any], metric: str, about: Mapping[str, Any]) -> 
     """The means as they are printed, the best first, so that what prints alike is marked alike; none twice.
 
     A method that was judged on fewer pictures than others, since it failed on some, is not in the running, and a
-    method alone wins nothing.
+    method exclusive wins nothing.
     """
     means = [row[metric]["mean"] for method, row in table.items() if is_complete(table, method, metric)]
     if len(means) < 2:

@@ -13,7 +13,7 @@ function toEncoded(linear) {
   return linear <= 0.0031308 ? linear * 12.92 : 1.055 * linear ** (1 / 2.4) - 0.055;
 }
 
-// The maps of a preview. `photo` and `sureness` are codes, `change` and `reflection` linear light at strength 1.
+// The maps of a preview. `photo` and `confidence_map` are codes, `change` and `reflection` linear light at strength 1.
 export function readMaps(buffer) {
   const end = new Uint8Array(buffer).indexOf(10);
   const head = JSON.parse(new TextDecoder().decode(buffer.slice(0, end)));
@@ -32,7 +32,7 @@ export function readMaps(buffer) {
   for (let i = 0; i < change.length; i++) {
     change[i] = lowest + (numbers[i] / 65535) * (highest - lowest) - LINEAR[photo[i]];
   }
-  return { ...head, photo, change, mirrored, sureness: take(Uint8Array, count) };
+  return { ...head, photo, change, mirrored, confidence_map: take(Uint8Array, count) };
 }
 
 const VIEWS = {
@@ -40,7 +40,7 @@ const VIEWS = {
   transmission: ({ photo, change }, strength) => (i) => code(LINEAR[photo[i]] + strength * change[i]),
   reflection: ({ photo, mirrored }, strength) => (i) =>
     code(Math.min(strength * LINEAR[mirrored[i]], LINEAR[photo[i]])),
-  confidence: ({ sureness }) => (i) => sureness[(i / 3) | 0],
+  confidence: ({ confidence_map }) => (i) => confidence_map[(i / 3) | 0],
 };
 
 // Draws a view of the maps at a strength, 0 to 1, on a canvas of their size.

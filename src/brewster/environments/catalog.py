@@ -1,0 +1,121 @@
+"""What is there to light scenes with: folders of maps and photos as a catalog, or the builtin worlds."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+from collections.abc import Iterator, Sequence
+from fnmatch import fnmatch
+from pathlib import Path
+
+from brewster.environments.assets import BUILTIN_HEIGHT, check_map, naming, read_bytes
+from brewster.errors import BrewsterError, RecipeError
+from brewster.files import SUFFIXES
+from brewster.photo import Photo, read_size
+from brewster.scene.sampler import Asset, Catalog
+from brewster.scene.world import BUILTIN, AssetSource
+
+_MAP_KINDS = ("exr", "hdr")
+_WORLD_COUNT = 8
+_PAINTING_COUNT = 64
+_CATEGORIES = {"street": "outdoor", "room": "indoor", "night": "night"}
+
+BUILTIN_CATALOG = Catalog(
+    maps=tuple(
+        Asset(
+            source=AssetSource(file=f"{BUILTIN}{name}:{seed}"),
+            width=2 * BUILTIN_HEIGHT,
+            height=BUILTIN_HEIGHT,
+            category=category,
+        )
+        for name, category in _CATEGORIES.items()
+        for seed in range(_WORLD_COUNT)
+    ),
+    pictures=tuple(
+        Asset(source=AssetSource(file=f"{BUILTIN}painting:{seed}"), width=768, height=512)
+        for seed in range(_PAINTING_COUNT)
+    ),
+)
+"""Worlds that need no file: streets, rooms, nights, and paintings."""
+
+
+def read_catalog(
+    maps: Sequence[Path], pictures: Sequence[Path], exclude: Sequence[str] = ()
+) -> tuple[Catalog, list[BrewsterError]]:
+    """The maps and pictures of some folders, and what was wrong with those left out.
+
+    Maps are read whole; of a picture only the header, so one that is damaged further on is refused when drawn.
+    A `manifest.csv` with the columns file and category tells what a map is. Where no folder is given for maps
+    or for pictures, the builtin ones take their place. Files whose names match a pattern of `exclude` are passed over.
+
+    Raises:
+        RecipeError: a folder or its manifest cannot be read, or none of its files can be used.
+    """
+    refused: list[BrewsterError] = []
+    found_maps = _read(maps, exclude, refused, are_maps=True) if maps else BUILTIN_CATALOG.maps
+    found_pictures = (
+        _read(pictures, exclude, refused, are_maps=False) if pictures else BUILTIN_CATALOG.pictures
+    )
+    return Catalog(maps=found_maps, pictures=found_pictures), refused
+
+
+def _read(
+    folders: Sequence[Path], exclude: Sequence[str], refused: list[BrewsterError], *, are_maps: bool
+) -> tuple[Asset, ...]:
+    found: dict[str, Asset] = {}
+    for folder in folders:
+        categories = _categories(folder)
+        for path in _files(folder, are_maps):
+            if path.name in found or any(fnmatch(path.name, pattern) for pattern in exclude):
+                continue
+            try:
+                found[path.name] = _asset(path, categories.get(path.name, ""), are_maps)
+            except BrewsterError as error:
+                refused.append(error)
+    if not found:
+        raise RecipeError(
+            f"no {'maps' if are_maps else 'photos'} in {', '.join(map(str, folders))}",
+            "lat-long .hdr or .exr files" if are_maps else "picture files",
+            str(refused[0]) if refused else "name another folder",
+        )
+    return tuple(found[name] for name in sorted(found))
+
+
+def _asset(path: Path, category: str, is_map: bool) -> Asset:
+    data = read_bytes(path)
+    with naming(str(path)):
+        width, height = _map_size(data, str(path)) if is_map else read_size(data)
+    source = AssetSource(file=path.name, sha256=hashlib.sha256(data).hexdigest())
+    return Asset(source=source, width=width, height=height, category=category)
+
+
+def _map_size(data: bytes, name: str) -> tuple[int, int]:
+    height, width = check_map(Photo.open(data).linear(), name).shape[:2]
+    return width, height
+
+
+def _files(folder: Path, are_maps: bool) -> Iterator[Path]:
+    try:
+        entries = sorted(folder.iterdir())
+    except OSError as error:
+        raise RecipeError(
+            f"{folder} cannot be read ({error.strerror})", "a folder of files", "name another folder"
+        ) from error
+    for path in entries:
+        kind = SUFFIXES.get(path.suffix.lower())
+        if kind and not path.name.startswith(".") and (kind in _MAP_KINDS) == are_maps:
+            yield path
+
+
+def _categories(folder: Path) -> dict[str, str]:
+    try:
+        with (folder / "manifest.csv").open(newline="", encoding="utf-8-sig") as file:
+            return {row["file"]: row.get("category") or "" for row in csv.DictReader(file) if row.get("file")}
+    except OSError:
+        return {}
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise RecipeError(
+            f"{folder / 'manifest.csv'} cannot be read ({error})",
+            "a table with the columns file and category, as UTF-8",
+            "save it so, or remove it",
+        ) from error

@@ -1,0 +1,217 @@
+"""Downloads CC0 lat-long maps from Poly Haven: which they are, and whether they came whole.
+
+    for result in pull(Order(indoor=2, outdoor=1), maps_folder()):
+        print(result.status, result.file)
+
+One connection at a time. What was begun is kept, and the next call goes on from there (brewster.download).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import sleep
+from typing import Literal, NamedTuple, final
+
+from brewster.download import Downloader, RemoteFile, digest_of, explained
+from brewster.errors import DownloadError, TargetError
+from brewster.files import cache_folder, write_atomically
+
+_COLUMNS = ("file", "asset", "category", "resolution", "md5", "authors", "licence")  # of manifest.csv
+_SAFE_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,200}", re.ASCII)
+_PAUSES_S = (1.0, 2.0, 4.0, 8.0)  # between five attempts
+_TIMEOUT_S = 30.0
+_PATIENCE = 5  # when so many assets in a row have failed, it is the server or the line
+
+
+@final
+@dataclass(frozen=True)
+class DownloadRequest:
+    """What is wanted: how many maps of each category, which files of them, and from which server."""
+
+    indoor: int = 140
+    outdoor: int = 30
+    resolution: str = "4k"
+    format: str = "hdr"
+    server: str = "https://api.polyhaven.com"
+    dry_run: bool = False
+
+
+@final
+@dataclass(frozen=True)
+class DownloadResult:
+    """What became of an asset; `missing` is one that has no file of the resolution and format asked for."""
+
+    asset: str
+    category: str
+    status: Literal["downloaded", "skipped", "planned", "missing", "failed"] = "missing"
+    file: str | None = None
+    url: str | None = None
+    bytes: int | None = None
+    md5: str | None = None
+    error: str | None = None
+
+
+class _Asset(NamedTuple):
+    """A map in the server's list; its id is what the server says, and not yet safe as a file name."""
+
+    id: str
+    category: str
+    authors: str
+
+
+def maps_folder() -> Path:
+    """Where maps lie unless another folder is named: brewster/maps in the user's cache folder."""
+    return cache_folder() / "maps"
+
+
+def pull(order: DownloadRequest, out: Path) -> Iterator[DownloadResult]:
+    """Downloads maps into a folder, asset by asset in order of their ids, and notes them in its manifest.csv.
+
+    A map that is there already is skipped. Where an asset has no such file, the next one takes its place; where a
+    download fails none does, so that the next call asks for the same maps.
+
+    Raises:
+        DownloadError: the server's list cannot be had, or several assets in a row failed.
+        TargetError: the folder cannot be written.
+    """
+    _read_manifest(out)  # another's manifest is refused before anything is fetched
+    assets = _list_assets(order)
+    in_a_row = 0
+    for category, asked in (("indoor", order.indoor), ("outdoor", order.outdoor)):
+        candidates = (asset for asset in assets if asset.category == category)
+        taken = 0
+        while taken < asked and (asset := next(candidates, None)):
+            result = _settle(asset, order, out)
+            yield result
+            taken += result.status != "missing"
+            in_a_row = in_a_row + 1 if result.status == "failed" else 0
+            if in_a_row == _PATIENCE:
+                cure = "see why they did, and run again: what came is kept"
+                raise DownloadError(f"{in_a_row} assets in a row failed", "the rest was not tried", cure)
+
+
+def _settle(asset: _Asset, order: DownloadRequest, out: Path) -> DownloadResult:
+    result = DownloadResult(asset.id, asset.category)
+    try:
+        target = out / _file_name(asset, order)
+        promise = _ask_for_file(asset, order)
+        if promise is None:
+            return result
+        url, size, _, md5 = promise
+        result = replace(result, status="skipped", file=str(target), url=url, bytes=size, md5=md5)
+        if not _is_there(target, promise):
+            if order.dry_run:
+                return replace(result, status="planned")
+            _line().fetch(promise, target)
+            result = replace(result, status="downloaded")
+    except DownloadError as error:
+        return replace(result, status="failed", error=str(error))
+    if not order.dry_run:
+        row = (target.name, asset.id, asset.category, order.resolution, md5, asset.authors, "CC0")
+        _note(out, dict(zip(_COLUMNS, row, strict=True)))
+    return result
+
+
+# --- what the server says (api.polyhaven.com; swagger.yml in github.com/Poly-Haven/Public-API)
+
+
+def _list_assets(order: DownloadRequest) -> list[_Asset]:
+    listed = _fetch_json(f"{order.server.rstrip('/')}/assets?type=hdris")
+    return [
+        _Asset(name, category, _authors(record))
+        for name, record in sorted(listed.items())
+        if (category := _category(record))
+    ]
+
+
+def _category(record: object) -> str | None:
+    """Indoor before outdoor; `attributes` are to replace `categories` one day, and both are looked at."""
+    categories = _dig(record, "categories")
+    words = [*categories] if isinstance(categories, list) else []
+    words.append(_dig(record, "attributes", "environment"))
+    return next((category for category in ("indoor", "outdoor") if category in words), None)
+
+
+def _authors(record: object) -> str:
+    authors = _dig(record, "authors")
+    return "; ".join(authors)[:1000] if isinstance(authors, dict) else ""
+
+
+def _ask_for_file(asset: _Asset, order: DownloadRequest) -> RemoteFile | None:
+    url = f"{order.server.rstrip('/')}/files/{asset.id}"
+    match _dig(_fetch_json(url), "hdri", order.resolution, order.format):
+        case None:
+            return None
+        case {"url": str(address), "size": int(size), "md5": str(md5)} if size > 0:
+            return RemoteFile(address, size, "md5", md5.lower())
+    raise DownloadError(f"{url} promises no file", "address, size and MD5 sum", "try another --server")
+
+
+def _file_name(asset: _Asset, order: DownloadRequest) -> str:
+    name = f"{asset.id}_{order.resolution}.{order.format}"
+    if not _SAFE_NAME.fullmatch(name):
+        expected, cure = "letters, digits, '_', '-' and '.' only", "try another --server: this may mean harm"
+        raise DownloadError(f"{name!r} is no name for a file", expected, cure)
+    return name
+
+
+def _fetch_json(url: str) -> dict[str, object]:
+    try:
+        said = json.loads(_line().read(url))
+    except (ValueError, RecursionError) as error:
+        raise DownloadError(f"{url} answered no JSON ({error})", "JSON", "check --server") from error
+    if not isinstance(said, dict):
+        raise DownloadError(f"{url} answered {said!r:.40}", "a JSON object", "check --server")
+    return said
+
+
+def _dig(tree: object, *keys: str) -> object:
+    for key in keys:
+        tree = tree.get(key) if isinstance(tree, dict) else None
+    return tree
+
+
+def _line() -> Downloader:
+    return Downloader(_PAUSES_S, _TIMEOUT_S, sleep)
+
+
+# --- onto the disk
+
+
+def _is_there(target: Path, promise: RemoteFile) -> bool:
+    with explained(target):
+        there = target.exists()
+        if there and digest_of(target, promise.algorithm) != promise.digest:
+            expected, cure = f"one with the MD5 sum {promise.digest}", "move it away, and run again"
+            raise DownloadError(f"{target} is there, and is not the server's file", expected, cure)
+    return there
+
+
+def _read_manifest(out: Path) -> list[dict[str, str]]:
+    """The rows for the maps that are still there."""
+    path = out / "manifest.csv"
+    with explained(path):
+        text = path.read_text("utf-8", errors="replace") if path.exists() else ",".join(_COLUMNS)
+        rows = csv.DictReader(io.StringIO(text, newline=""))
+        if tuple(rows.fieldnames or ()) != _COLUMNS:
+            expected, cure = f"a table with the columns {','.join(_COLUMNS)}", "name another folder"
+            raise TargetError(f"{path} is not one of brewster's", expected, cure)
+        return [row for row in rows if (out / row["file"]).is_file()]
+
+
+def _note(out: Path, row: dict[str, str]) -> None:
+    """Puts a map into the manifest, which is written anew each time: stopped at any moment, it is true."""
+    rows = _read_manifest(out)
+    if row not in rows:
+        rows = [other for other in rows if other["file"] != row["file"]]
+        text = io.StringIO()
+        table = csv.DictWriter(text, _COLUMNS, extrasaction="ignore")
+        table.writeheader()
+        table.writerows(sorted([*rows, row], key=lambda row: row["file"]))
+        write_atomically(out / "manifest.csv", text.getvalue().encode(errors="replace"), overwrite=True)

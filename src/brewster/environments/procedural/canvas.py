@@ -1,0 +1,335 @@
+"""Textured rectangles around a viewer, and the lat-long map that shows them: the kit of the procedural worlds.
+
+A world paints each surface flat on a `Canvas`, hangs it in space as a `Quad` with its light baked in, and
+`render` casts rays at all of them. Lengths are metres, the viewer is the origin, y is up, light is linear.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Final, Literal, TypeAlias
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+Floats: TypeAlias = NDArray[Any]
+"""float32 of any shape."""
+Colour: TypeAlias = Sequence[float] | Floats
+Box: TypeAlias = tuple[float, float, float, float]
+"""Left, top, width and height in metres from the upper left corner of a canvas."""
+Lighting: TypeAlias = Callable[[Floats, Floats], Floats]
+"""Light on points (h, w, 3) of a surface with a unit normal (3,): irradiance / pi, (h, w, 3)."""
+
+_STRIP_ROWS: Final = 32
+
+
+def vector(*values: float) -> Floats:
+    """A float32 vector."""
+    return np.array(values, np.float32)
+
+
+def unit(values: Floats) -> Floats:
+    """The same direction, (..., 3), with length 1."""
+    directed: Floats = values / np.linalg.norm(values, axis=-1, keepdims=True)
+    return directed
+
+
+def tint(random: Generator, value: float, saturation: float) -> Floats:
+    """A colour (3,) of roughly this brightness: mostly warm, often blue, sometimes of any hue."""
+    hues = random.normal(0.92, 0.05), random.normal(0.38, 0.05), random.uniform()
+    phase = hues[random.choice(3, p=(0.5, 0.3, 0.2))] + vector(0, 1 / 3, 2 / 3)
+    return np.clip(value * (1 + saturation * np.cos(2 * np.pi * phase)), 0.01, 1).astype(np.float32)
+
+
+def resize(picture: Floats, height: int, width: int, *, wrap: bool = False) -> Floats:
+    """Bilinear interpolation of (h, w, ...) between texel centres; no smoothing when it shrinks."""
+    return _stretch(_stretch(picture, height, 0, wrap), width, 1, wrap)
+
+
+def _stretch(picture: Floats, size: int, axis: int, wrap: bool) -> Floats:
+    old = picture.shape[axis]
+    if old == size:
+        return picture
+    place = (np.arange(size, dtype=np.float32) + 0.5) * (old / size) - 0.5
+    low = np.floor(place).astype(np.int32)
+    share = (place - low).reshape([-1 if side == axis else 1 for side in range(picture.ndim)])
+    mode: Literal["wrap", "clip"] = "wrap" if wrap else "clip"
+    first: Floats = picture.take(low, axis, mode=mode)
+    second: Floats = picture.take(low + 1, axis, mode=mode)
+    second -= first
+    second *= share
+    second += first
+    return second
+
+
+def fractal(random: Generator, height: int, width: int, cells: float = 4, octaves: int = 5) -> Floats:
+    """Tileable noise (height, width) at several scales, mean 0, deviation 1; `cells` span the height."""
+    total = np.zeros((1, 1), np.float32)
+    for octave in range(octaves):
+        rows = max(1, round(cells * 2**octave))
+        size = min(rows, height), min(max(1, round(rows * width / height)), width)
+        total = resize(total, *size, wrap=True) + random.standard_normal(size, np.float32) * 0.65**octave
+        if size == (height, width):
+            break
+    total = resize(total, height, width, wrap=True)
+    noise: Floats = (total - total.mean()) / (total.std() + 1e-6)
+    return noise
+
+
+def lettering(random: Generator, count: int, height: int, width: int) -> Floats:
+    """The mask (height, width) of a line of `count` letter-like glyphs with gaps between words."""
+    glyphs = np.zeros((count, 9, 6), np.float32)
+    bars = random.uniform(size=(count, 3)) < 0.6
+    stems = random.uniform(size=(count, 4)) < 0.6
+    glyphs[:, 1:8, 0] = stems[:, :1] | ~stems[:, 1:2]
+    glyphs[:, 1:4, 4] = stems[:, 1:2]
+    glyphs[:, 4:8, 4] = stems[:, 2:3]
+    glyphs[:, 1:8, 2] = np.maximum(glyphs[:, 1:8, 2], (stems[:, 3:] & ~bars[:, :1]).astype(np.float32))
+    glyphs[:, [1, 4, 7], :5] = np.maximum(glyphs[:, [1, 4, 7], :5], bars[:, :, None])
+    glyphs *= (random.uniform(size=(count, 1, 1)) > 0.14) | (count < 6)
+    line = glyphs.transpose(1, 0, 2).reshape(9, -1)
+    return np.clip((resize(line, height, width) - 0.45) * 4 + 0.5, 0, 1)
+
+
+@dataclass
+class Canvas:
+    """A surface seen flat: what is painted on it shows radiance = colour * (light + glow) where opaque."""
+
+    width: float
+    height: float
+    density: float
+    """Texels per metre."""
+    colour: Colour = (0.5, 0.5, 0.5)
+    pixels: Floats = field(init=False)
+    """(h, w, 5): red, green, blue, opacity, glow."""
+
+    def __post_init__(self) -> None:
+        size = (max(2, round(self.height * self.density)), max(2, round(self.width * self.density)), 5)
+        self.pixels = np.empty(size, np.float32)
+        self.pixels[:] = (*self.colour, 1, 0)
+
+    def area(self, box: Box) -> Floats:
+        """The texels (h, w, 5) of a box, as a view to paint on; empty where it leaves the canvas."""
+        left, top, width, height = (self.density * side for side in box)
+        rows = slice(max(0, round(top)), max(0, round(top + height)))
+        return self.pixels[rows, max(0, round(left)) : max(0, round(left + width))]
+
+    def rect(self, box: Box, colour: Colour, *, glow: float = 0) -> None:
+        """Paints a box in one colour."""
+        self.area(box)[:] = (*colour, 1, glow)
+
+    def paste(self, picture: Floats, box: Box, *, glow: float = 0) -> None:
+        """Paints a picture (h, w, 3), stretched into the box."""
+        area = self.area(box)
+        area[..., :3] = resize(picture, *area.shape[:2])
+        area[..., 3:] = (1, glow)
+
+    def write(self, random: Generator, box: Box, colour: Colour, *, glow: float = 0) -> None:
+        """Writes one line of letter-like glyphs that fills the box."""
+        area = self.area(box)
+        if min(area.shape[:2]) > 2:
+            count = max(1, round(box[2] / box[3] * 1.3))
+            mask = lettering(random, count, *area.shape[:2])[..., None]
+            area += (np.array((*colour, 1, glow), np.float32) - area) * mask
+
+    def roughen(self, random: Generator, amount: float, cells: float = 6, octaves: int = 6) -> None:
+        """Weathers the colours by fractal noise; `amount` is its relative deviation."""
+        height, width = self.pixels.shape[:2]
+        noise = fractal(random, height, width, cells, octaves)
+        self.pixels[..., :3] *= np.clip(1 + amount * noise, 0.2, 2)[..., None]
+
+
+class PaintingTexture:
+    """A picture (h, w, c) and its halvings, looked up at any scale."""
+
+    def __init__(self, picture: Floats) -> None:
+        levels = [picture]
+        while min(levels[-1].shape[:2]) > 1:
+            last = levels[-1][: levels[-1].shape[0] // 2 * 2, : levels[-1].shape[1] // 2 * 2]
+            levels.append((last[::2, ::2] + last[1::2, ::2] + last[::2, 1::2] + last[1::2, 1::2]) * 0.25)
+        self._texels = np.concatenate([level.reshape(-1, picture.shape[2]) for level in levels])
+        self._rows, self._columns = np.array([level.shape[:2] for level in levels], np.int32).T
+        self._starts = np.cumsum([0, *(self._rows * self._columns)[:-1]], dtype=np.int32)
+
+    def sample(self, across: Floats, down: Floats, footprint: Floats) -> Floats:
+        """Texels (n, c) at places 0..1 that repeat; `footprint` is the span of a sample in finest texels."""
+        level = np.log2(np.maximum(footprint, 1)).astype(np.int32)
+        level = np.minimum(level, len(self._starts) - 1)
+        rows, columns = self._rows[level], self._columns[level]
+        row = (down * rows).astype(np.int32) % rows
+        column = (across * columns).astype(np.int32) % columns
+        texels: Floats = self._texels.take(self._starts[level] + row * columns + column, axis=0)
+        return texels
+
+
+class Quad:
+    """A canvas hung in space between `corner`, `corner + across` and `corner + down`, lit once and for all."""
+
+    def __init__(self, canvas: Canvas, corner: Floats, sides: tuple[Floats, Floats], light: Lighting) -> None:
+        across, down = sides
+        normal = unit(np.cross(across, down))
+        self.distance = abs(float(normal @ corner))
+        self.density = canvas.density
+        self._outline = corner, across, down
+        self._canvas, self._light = canvas, light
+        self._normal = normal if normal @ corner < 0 else -normal
+
+    @cached_property
+    def forms(self) -> Floats:
+        """The matrix (3, 3) that takes a direction to its place (across, down, 1) over the distance there."""
+        corner, across, down = self._outline
+        return np.linalg.inv(np.stack([across, down, corner], 1).astype(np.float64)).astype(np.float32)
+
+    @cached_property
+    def texture(self) -> PaintingTexture:
+        """Radiance and opacity (h, w, 4)."""
+        corner, across, down = self._outline
+        pixels = self._canvas.pixels
+        del self._canvas  # the largest thing in memory, and from here on of no use
+        fine = 8 / (1 + self.distance / 6)
+        lattice = [int(np.clip(np.linalg.norm(side) * fine, 4, 128)) for side in (down, across)]
+        rows, columns = ((np.arange(count, dtype=np.float32) + 0.5) / count for count in lattice)
+        points = corner + rows[:, None, None] * down + columns[:, None] * across
+        light = resize(self._light(points, self._normal).astype(np.float32), *pixels.shape[:2])
+        radiance = pixels[..., :3] * (light + pixels[..., 4:])
+        return PaintingTexture(np.concatenate([radiance, pixels[..., 3:4]], 2))
+
+    @cached_property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Least and largest azimuth and polar angle that it spans, in radians."""
+        corner, across, down = self._outline
+        step = np.linspace(0, 1, 65)[:, None]
+        path = [corner + step * across, corner + across + step * down]
+        path += [corner + down + across - step * across, corner + down - step * down]
+        x, y, z = np.concatenate(path).T
+        turns = np.unwrap(np.arctan2(x, -z))
+        polar = np.arctan2(np.hypot(x, z), y)
+        if abs(turns[-1] - turns[0]) > 3:  # the outline runs around a pole
+            return 0, 2 * np.pi, *((0, polar.max()) if y[0] > 0 else (polar.min(), np.pi))
+        return turns.min(), turns.max(), polar.min() - 0.03, polar.max() + 0.03
+
+
+@dataclass(frozen=True)
+class Glow:
+    """A small round light: its angular radius is far below what a map resolves, its energy is not."""
+
+    position: Floats
+    radius: float
+    """Metres, at the distance of the position."""
+    radiance: Colour
+
+
+@dataclass(frozen=True)
+class ProceduralWorld:
+    """What surrounds the viewer."""
+
+    quads: Sequence[Quad]
+    glows: Sequence[Glow]
+    sky: Callable[[Floats, float], Floats]
+    """Radiance (h, w, 3) in unit directions (h, w, 3) where no surface is; the texel's angle comes second."""
+    turn: float
+    """Azimuth of the world's -z axis in the map, in radians."""
+
+
+def render(world: ProceduralWorld, height: int) -> NDArray[np.float32]:
+    """The lat-long map (height, 2 height, 3) of a world, at four rays a texel, in strips that fit a cache."""
+    strips = [_strip(world, height, top) for top in range(0, height, _STRIP_ROWS)]
+    picture: NDArray[np.float32] = np.concatenate(strips).astype(np.float32)
+    for glow in world.glows:
+        if not _hidden(world, glow.position):
+            _add_glow(picture, glow, world.turn)
+    return picture
+
+
+def _strip(world: ProceduralWorld, height: int, top: int) -> Floats:
+    rows = min(_STRIP_ROWS, height - top)
+    polar = (np.arange(2 * top, 2 * (top + rows)) + 0.5) * (np.pi / (2 * height))
+    closeness = np.zeros((2 * rows, 4 * height), np.float32)
+    colours = np.zeros((*closeness.shape, 3), np.float32)
+    for quad in world.quads:
+        low, high = quad.bounds[2:]
+        inside = np.flatnonzero((polar >= low) & (polar <= high))
+        if inside.size:
+            chosen = slice(inside[0], inside[-1] + 1)
+            for columns in _columns(quad, world.turn, 4 * height):
+                _cast(quad, world.turn, polar[chosen], (columns, closeness[chosen], colours[chosen]))
+    blocks = colours.reshape(rows, 2, 2 * height, 2, 3)
+    solid = blocks[:, 0, :, 0] + blocks[:, 0, :, 1] + blocks[:, 1, :, 0] + blocks[:, 1, :, 1]
+    free = (closeness == 0).reshape(rows, 2, 2 * height, 2).mean((1, 3), dtype=np.float32)[..., None]
+    radiance: Floats = solid * 0.25
+    if free.any():
+        radiance = radiance + free * world.sky(directions(height, world.turn, top, rows), np.pi / height)
+    return radiance
+
+
+def directions(height: int, turn: float, top: int, rows: int) -> Floats:
+    """Unit directions (rows, 2 height, 3), in a world turned by `turn`, of the texel centres from row `top`."""
+    polar = (np.arange(top, top + rows) + 0.5)[:, None] * (np.pi / height)
+    azimuth = (np.arange(2 * height) + 0.5) * (np.pi / height) - turn
+    parts = np.sin(polar) * np.sin(azimuth), np.cos(polar) + 0 * azimuth, -np.sin(polar) * np.cos(azimuth)
+    return np.stack(parts, 2).astype(np.float32)
+
+
+def _columns(quad: Quad, turn: float, width: int) -> list[slice]:
+    """The columns of samples that a quad may touch: one range, or two where it crosses the seam."""
+    low, high = ((angle + turn) * width / (2 * np.pi) for angle in quad.bounds[:2])
+    first, count = int(np.floor(low)) % width, int(np.ceil(high) - np.floor(low)) + 1
+    if count >= width:
+        return [slice(0, width)]
+    return [
+        slice(first, min(width, first + count)),
+        *([slice(0, over)] if (over := first + count - width) > 0 else []),
+    ]
+
+
+def _cast(quad: Quad, turn: float, polar: Floats, target: tuple[slice, Floats, Floats]) -> None:
+    """Draws a quad on the samples of some rows and columns wherever it is closer than what is there."""
+    columns, closeness, colours = target[0], target[1][:, target[0]], target[2][:, target[0]]
+    width = target[1].shape[1]
+    azimuth = (np.arange(columns.start, columns.stop) + 0.5) * (2 * np.pi / width) - turn
+    heading = np.stack([np.sin(azimuth), -np.cos(azimuth)]).astype(np.float32)
+    level, rise = np.sin(polar).astype(np.float32)[:, None], np.cos(polar).astype(np.float32)[:, None]
+    across, down, near = (
+        level * (form[0] * heading[0] + form[2] * heading[1]) + rise * form[1] for form in quad.forms
+    )
+    hit = (near > closeness) & (across >= 0) & (across < near) & (down >= 0) & (down < near)
+    across, down, near = across[hit], down[hit], near[hit]
+    if not near.size:
+        return
+    # A ray's spot grows with distance, and once more where the surface is seen at a flat angle.
+    spot = quad.density * 2 * np.pi / width / near * np.maximum(near * quad.distance, 0.01) ** -0.6
+    texels = quad.texture.sample(across / near, down / near, spot)
+    opaque = texels[:, 3] > 0.5
+    if not opaque.all():
+        hit[hit], texels, near = opaque, texels[opaque], near[opaque]
+    closeness[hit] = near
+    colours[hit] = texels[:, :3]
+
+
+def _hidden(world: ProceduralWorld, position: Floats) -> bool:
+    for quad in world.quads:
+        across, down, near = quad.forms @ position
+        if near > 1.05 and 0 <= across < near and 0 <= down < near:
+            place = np.array([[across / near], [down / near]], np.float32)
+            if quad.texture.sample(place[0], place[1], np.ones(1, np.float32))[0, 3] > 0.5:
+                return True
+    return False
+
+
+def _add_glow(picture: Floats, glow: Glow, turn: float) -> None:
+    """Adds a disc of at least three texels that sends exactly the glow's energy."""
+    height, texel = picture.shape[0], np.pi / picture.shape[0]
+    distance = float(np.linalg.norm(glow.position))
+    aim, radius = glow.position / distance, glow.radius / distance
+    wide = max(radius, 1.5 * texel)
+    polar = float(np.arccos(np.clip(aim[1], -1, 1)))
+    top = max(0, int((polar - wide) / texel) - 2)
+    rows = min(height, int((polar + wide) / texel) + 3) - top
+    chord = np.linalg.norm(directions(height, turn, top, rows) - aim, axis=2)
+    weight = np.clip((wide - chord) / texel + 0.5, 0, 1)
+    solid_angle = np.sin((np.arange(top, top + rows) + 0.5) * texel)[:, None] * texel**2
+    energy = np.pi * radius**2 / (weight * solid_angle).sum()
+    picture[top : top + rows] += (weight * energy)[..., None] * np.asarray(glow.radiance, np.float32)

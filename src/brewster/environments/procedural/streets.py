@@ -1,0 +1,381 @@
+"""A street between two rows of houses, by day or by night, as a `ProceduralWorld` that `surfaces.render` shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.random import Generator
+
+from brewster.environments.procedural.canvas import (
+    Canvas,
+    Floats,
+    Glow,
+    PaintingTexture,
+    ProceduralWorld,
+    Quad,
+    fractal,
+    tint,
+    unit,
+    vector,
+)
+from brewster.environments.procedural.paintings import figure, painting, tree
+from brewster.environments.procedural.props import (
+    UP,
+    Lamp,
+    SceneLighting,
+    box,
+    car,
+    facade,
+    flat,
+    plain,
+    upright,
+)
+
+_END: Final = 90.0
+"""How far the houses reach, in metres either way."""
+_SUN_RADIUS: Final = 0.00465
+
+
+@dataclass(frozen=True)
+class _Sky:
+    """The dome: a gradient, clouds and, by day, the light around the sun."""
+
+    zenith: Floats
+    horizon: Floats
+    cloud: Floats
+    cover: float
+    """Threshold of the cloud noise: -2 is overcast, 2 is clear."""
+    sun: Floats
+    """Unit direction."""
+    sunlight: Floats
+    """Irradiance / pi (3,) on a surface that faces the sun; 0 when clouds hide it."""
+    noise: PaintingTexture
+
+    def __call__(self, ways: Floats, texel: float) -> Floats:
+        """Radiance (h, w, 3) in unit directions."""
+        rise = np.maximum(ways[..., 1:2], 0)
+        radiance = self.zenith + (self.horizon - self.zenith) * np.exp(-5 * rise)
+        nearness = np.maximum(ways @ self.sun, 0)[..., None]
+        halo = 0.03 * nearness**8 + 0.12 * nearness**64 + 0.6 * nearness**800
+        radiance = radiance + self.sunlight * halo
+        thickness = self._thickness(ways, rise[..., 0], texel)
+        veil = np.clip(thickness * 1.5, 0, 1) * np.clip(rise * 8, 0, 1)
+        dark = np.clip(1.25 - 0.45 * thickness, 0.5, 1.2)
+        lit = self.cloud * dark + self.sunlight * halo * np.exp(-3 * thickness)
+        result: Floats = radiance + (lit - radiance) * veil
+        return result
+
+    def _thickness(self, ways: Floats, rise: Floats, texel: float) -> Floats:
+        """How much cloud (h, w, 1) lies in each direction: a flat layer that bends down at the horizon."""
+        height = rise + 0.1
+        places = [(ways[..., axis] / height * 0.35 % 1).ravel() for axis in (0, 2)]
+        spot = (texel * 0.35 * 512 / height**1.5).ravel()
+        return np.maximum(
+            self.noise.sample(places[0], places[1], spot).reshape(*rise.shape, 1) - self.cover, 0
+        )
+
+
+def _day_sky(random: Generator) -> _Sky:
+    height, azimuth = random.uniform(0.25, 1.2), random.uniform(0, 2 * np.pi)
+    sun = vector(np.cos(height) * np.sin(azimuth), np.sin(height), np.cos(height) * np.cos(azimuth))
+    low = np.exp(-height * 4)
+    hidden = random.uniform() < 0.25
+    warmth = vector(1, 0.93 - 0.3 * low, 0.85 - 0.6 * low)
+    blue = vector(0.3, 0.5, 1) * random.uniform(0.4, 0.8)
+    grey = vector(0.95, 0.97, 1) * random.uniform(0.6, 1.2)
+    haze = vector(0.9, 0.95, 1) * random.uniform(0.7, 1.3) + (warmth - 0.8) * low
+    return _Sky(
+        zenith=grey * 0.9 if hidden else blue,
+        horizon=grey if hidden else haze,
+        cloud=grey if hidden else warmth * random.uniform(1.1, 1.8),
+        cover=random.uniform(-1.2, -0.3) if hidden else random.uniform(-0.1, 1.8),
+        sun=sun,
+        sunlight=warmth * (0.0 if hidden else random.uniform(3, 6.5) * (1 - 0.5 * low)),
+        noise=PaintingTexture(fractal(random, 512, 512, 3, 7)[..., None]),
+    )
+
+
+def _night_sky(random: Generator) -> _Sky:
+    town = vector(1, 0.65, 0.4) * random.uniform(0.005, 0.04)
+    return _Sky(
+        zenith=vector(0.3, 0.4, 1) * random.uniform(0.002, 0.01),
+        horizon=town,
+        cloud=town * 0.7,
+        cover=random.uniform(-0.5, 1.8),
+        sun=UP,
+        sunlight=vector(0, 0, 0),
+        noise=PaintingTexture(fractal(random, 512, 512, 3, 7)[..., None]),
+    )
+
+
+class _Street:
+    """The layout of one street, the light in it, and everything that stands in it so far."""
+
+    def __init__(self, random: Generator, *, night: bool) -> None:
+        self.random, self.night = random, night
+        self.ground = -float(random.choice([1.6, 1.6, random.uniform(3, 8)]))
+        self.reach = {side: random.uniform(6, 16) for side in (-1, 1)}
+        self.pavement = random.uniform(2.4, 3.6)
+        self.sky = _night_sky(random) if night else _day_sky(random)
+        ambient = vector(0.04, 0.04, 0.05) if night else 0.5 * (self.sky.zenith + self.sky.horizon)
+        self.lamps = SceneLighting(ambient, self.ground)
+        self.roofs = {side: np.full(256, -99, np.float32) for side in (-1, 1)}
+        self.crowns: list[tuple[Floats, float]] = []
+        self.quads: list[Quad] = []
+        self.glows: list[Glow] = []
+
+    def light(self, points: Floats, normal: Floats) -> Floats:
+        """Lamps and sky, less of it deep in the street, and the sun where houses and trees let it through."""
+        depth = np.clip((points[..., 1:2] - self.ground) / 12, 0, 1)
+        total = self.lamps(points, normal) * (1 if self.night else 0.65 + 0.35 * depth)
+        facing = float(normal @ self.sky.sun)
+        if facing > 0 and self.sky.sunlight.any():
+            total += (
+                self._sunlit(points)[..., None]
+                * self.lamps.shade(points, normal)
+                * facing
+                * self.sky.sunlight
+            )
+        haze = 0 if self.night else np.clip(np.linalg.norm(points, axis=2, keepdims=True) / 400, 0, 0.3)
+        result: Floats = total * (1 - haze) + haze * self.sky.horizon * 1.5
+        return result
+
+    def _sunlit(self, points: Floats) -> Floats:
+        x, y, z = np.moveaxis(points, 2, 0)
+        sun = self.sky.sun
+        side = 1 if sun[0] > 0 else -1
+        way = (side * self.reach[side] - x) / (sun[0] + 1e-6 * side)
+        place = np.clip((z + way * sun[2] + 128).astype(np.int32), 0, 255)
+        above = y + way * sun[1] - self.roofs[side][place]
+        lit = np.where(way < 0.3, 1, np.clip(above * 1.5 + 0.5, 0, 1))
+        for crown, radius in self.crowns:
+            offset = crown - points
+            along = offset @ sun
+            aside = np.einsum("hwc,hwc->hw", offset, offset) - along * along
+            lit *= 1 - 0.85 * (np.clip(1.3 - aside / radius**2, 0, 0.5) * 2) * (along > 0)
+        return lit
+
+
+def street_world(random: Generator, *, night: bool) -> ProceduralWorld:
+    """A street with houses, trees, cars, people and lamps."""
+    street = _Street(random, night=night)
+    if night:
+        _light_lamps(street)
+    planted = random.uniform() < 0.6
+    for side in (-1, 1):
+        park = random.uniform() < 0.15
+        if not park:
+            _row_of_houses(street, side)
+        if planted or park:
+            _trees(street, side, park=park)
+        _poles(street, side)
+    _cars(street)
+    _people(street)
+    _ends(street)
+    _paving(street)
+    if not night and street.sky.sunlight.any():
+        radiance = street.sky.sunlight / _SUN_RADIUS**2
+        street.glows.append(Glow(street.sky.sun * 1000, _SUN_RADIUS * 1000, radiance))
+    return ProceduralWorld(street.quads, street.glows, street.sky, random.uniform(0, 2 * np.pi))
+
+
+def _row_of_houses(street: _Street, side: int) -> None:
+    random, z = street.random, -_END
+    typical = random.uniform(2, 7)
+    while z < _END:
+        if random.uniform() < 0.12:
+            z += random.uniform(3, 9)
+        wide = random.uniform(8, 22)
+        floors = max(1, round(typical * random.uniform(0.6, 1.5)))
+        back = street.reach[side] + random.choice([0, 0, random.uniform(0.3, 2)])
+        foot = vector(side * back, street.ground, z + wide / 2)
+        _house(street, foot, wide, floors)
+        z += wide
+
+
+def _house(street: _Street, foot: Floats, wide: float, floors: int) -> None:
+    random, side = street.random, 1 if foot[0] > 0 else -1
+    towards = vector(-side, 0, 0)
+    near = float(np.hypot(foot[0], max(0, abs(foot[2]) - wide / 2)))
+    front = facade(
+        random,
+        wide,
+        floors,
+        density=float(np.clip(170 / near, 4, 26)),
+        night=street.night,
+        sky=street.sky.horizon,
+    )
+    street.quads.append(upright(front, foot, towards, street.light))
+    start = int(foot[2] - wide / 2 + 128)
+    street.roofs[side][start : start + round(wide)] = foot[1] + front.height
+    gable = Canvas(12, front.height, 8, front.colour)
+    for index in range(floors):
+        gable.rect(
+            (random.uniform(1, 10), front.height - 2.5 - 3.2 * index, 0.9, 1.3), vector(0.04, 0.05, 0.06)
+        )
+    gable.roughen(random, 0.15)
+    end = -np.sign(foot[2])  # the end that the viewer sees
+    corner = foot + vector(side * 6, 0, end * wide / 2)
+    if abs(foot[2]) > wide / 2:
+        street.quads.append(upright(gable, corner, vector(0, 0, end), street.light))
+    if random.uniform() < 0.45:
+        _roof(street, foot + UP * front.height, wide, side)
+
+
+def _roof(street: _Street, eave: Floats, wide: float, side: int) -> None:
+    """A slope of tiles with skylights, up from the eave."""
+    random = street.random
+    slope = vector(-side * random.uniform(3, 5), -random.uniform(2, 4), 0)
+    canvas = Canvas(wide, float(np.linalg.norm(slope)), 12, tint(random, 0.12, 0.3) + vector(0.06, 0.01, 0))
+    canvas.pixels[::3, :, :3] *= 0.7
+    canvas.roughen(random, 0.25, 12)
+    for left in np.arange(1.5, wide - 1.5, random.uniform(2.5, 5)):
+        canvas.rect((left, 1.2, 0.9, 1.3), vector(0.5, 0.55, 0.6), glow=0)
+    across = vector(0, 0, side) * wide
+    street.quads.append(Quad(canvas, eave - slope - across / 2, (across, slope), street.light))
+
+
+def _paving(street: _Street) -> None:
+    """Road, kerbs, pavements and marks: fine close by, coarse far off and a little lower."""
+    random = street.random
+    asphalt, slabs = random.uniform(0.05, 0.12), tint(random, random.uniform(0.2, 0.4), 0.06)
+    stripes = random.uniform() < 0.4
+    for long, density in ((44.0, 20.0), (2 * _END + 40, 5.0)):
+        wide = street.reach[-1] + street.reach[1] + 30
+        canvas = Canvas(wide, long, density, slabs)
+        middle = 15 + street.reach[-1]
+        canvas.pixels[:: max(2, round(density * 0.6)), :, :3] *= 0.75
+        canvas.pixels[:, :: max(2, round(density * 0.6)), :3] *= 0.75
+        left, right = middle - street.reach[-1] + street.pavement, middle + street.reach[1] - street.pavement
+        canvas.rect((left - 0.2, 0, right - left + 0.4, long), vector(0.3, 0.3, 0.29))
+        canvas.rect((left, 0, right - left, long), vector(1, 1, 1.03) * asphalt)
+        for start in np.arange(0.5, long, 6):
+            canvas.rect(((left + right) / 2 - 0.08, start, 0.16, 3), vector(0.55, 0.55, 0.52))
+        if stripes and long < 50:
+            for start in np.arange(left + 0.4, right - 0.4, 1.0):
+                canvas.rect((start, long / 2 - 11, 0.5, 3.5), vector(0.6, 0.6, 0.58))
+        canvas.roughen(random, 0.06, long / 3, 3)
+        canvas.roughen(random, 0.1, long * 6, 2)
+        centre = vector(
+            (street.reach[1] - street.reach[-1]) / 2, street.ground - (0.04 if long > 50 else 0), 0
+        )
+        street.quads.append(flat(canvas, centre, street.light))
+
+
+def _ends(street: _Street) -> None:
+    """What closes the street: a house across it, or hills."""
+    random = street.random
+    for end in (-1, 1):
+        foot = vector(random.uniform(-10, 10), street.ground, end * (_END + random.uniform(5, 40)))
+        if random.uniform() < 0.6:
+            canvas = facade(
+                random, 60, int(random.integers(3, 9)), density=5, night=street.night, sky=street.sky.horizon
+            )
+        else:
+            canvas = Canvas(300, 30, 3, vector(0.1, 0.12, 0.08))
+            canvas.roughen(random, 0.4, 5)
+            ridge = 30 + 25 * fractal(random, 4, canvas.pixels.shape[1], 1, 6)[0]
+            canvas.pixels[..., 3] = np.arange(canvas.pixels.shape[0])[:, None] > ridge
+        street.quads.append(upright(canvas, foot, vector(0, 0, -end), street.light))
+
+
+def _trees(street: _Street, side: int, *, park: bool) -> None:
+    random = street.random
+    typical = random.uniform(5, 10)
+    first = street.reach[side] - street.pavement + 0.6
+    rows = [first, first + 7, first + 16] if park else [first]
+    for row in rows:
+        for z in np.arange(-60, 60, random.uniform(8, 15)):
+            foot = vector(side * (row + random.uniform(-0.3, 0.3)), street.ground, z + random.uniform(-2, 2))
+            near = float(np.hypot(foot[0], foot[2]))
+            if near > 3:
+                canvas = tree(random, typical * random.uniform(0.7, 1.3), float(np.clip(170 / near, 4, 28)))
+                street.quads.append(upright(canvas, foot, None, street.light))
+                street.crowns.append((foot + UP * canvas.height * 0.6, canvas.height * 0.3))
+
+
+def _light_lamps(street: _Street) -> None:
+    """Street lamps of one kind along both kerbs, their light first so that all else receives it."""
+    random = street.random
+    tall, gap = random.uniform(5, 8), random.uniform(16, 26)
+    colour = vector(1, random.uniform(0.5, 0.9), random.uniform(0.15, 0.8)) * random.uniform(100, 250)
+    start = random.uniform(0, gap)
+    for index, z in enumerate(np.arange(-60 + start, 60, gap)):
+        side = 1 if index % 2 else -1
+        place = vector(side * (street.reach[side] - street.pavement - 0.5), street.ground + tall, z)
+        street.lamps.lamps.append(Lamp(place, colour, -UP))
+        street.glows.append(Glow(place - UP * 0.12, 0.16, colour / (np.pi * 0.16**2)))
+        street.quads += box(plain(random, vector(0.1, 0.1, 0.1)), place, (0.9, 0.12, 0.35), street.light)
+
+
+def _poles(street: _Street, side: int) -> None:
+    """Lamp posts, road signs on posts, and signs that hang out from the houses."""
+    random = street.random
+    kerb = street.reach[side] - street.pavement + 0.3
+    for z in np.arange(-55 + random.uniform(0, 15), 60, random.uniform(12, 20)):
+        foot = vector(side * kerb, street.ground, z)
+        tall = random.uniform(2.5, 6)
+        street.quads.append(
+            upright(Canvas(0.12, tall, 30, vector(0.15, 0.16, 0.16)), foot, None, street.light)
+        )
+        face = Canvas(0.7, 0.7, 90, tint(random, 0.4, 1))
+        face.rect((0.06, 0.06, 0.58, 0.58), vector(0.8, 0.8, 0.8))
+        face.write(random, (0.1, 0.2, 0.5, 0.28), tint(random, 0.05, 1))
+        towards = vector(0, 0, -np.sign(z))
+        street.quads.append(upright(face, foot + UP * (tall - 0.6) + towards * 0.08, towards, street.light))
+        if random.uniform() < 0.6:
+            _hanging_sign(
+                street, vector(side * (street.reach[side] - 0.6), street.ground + random.uniform(3, 5), z + 4)
+            )
+
+
+def _hanging_sign(street: _Street, foot: Floats) -> None:
+    random, colour = street.random, tint(street.random, 0.5, 1)
+    glow = random.uniform(5, 40) if street.night else 0
+    tall = random.uniform(0.6, 2.5)
+    canvas = Canvas(1.1, tall, 60, colour * (0.1 if glow else 1))
+    ink = colour if glow else vector(0.9, 0.9, 0.85)
+    canvas.rect((0.05, 0.05, 1, 0.05), ink, glow=glow)
+    canvas.rect((0.05, tall - 0.1, 1, 0.05), ink, glow=glow)
+    for top in np.arange(0.18, tall - 0.5, 0.5):
+        canvas.write(random, (0.12, top, 0.86, 0.36), ink, glow=glow)
+    towards = vector(0, 0, -np.sign(foot[2]))
+    street.quads.append(upright(canvas, foot, towards, street.light))
+    if glow:
+        street.lamps.lamps.append(Lamp(foot + UP * tall / 2, colour * glow * 0.4))
+
+
+def _cars(street: _Street) -> None:
+    random = street.random
+    for side in (-1, 1):
+        if (x := street.reach[side] - street.pavement - 1.1) < 2.4 and street.ground > -3:
+            continue
+        for z in np.arange(-45, 45, 6.0):
+            if random.uniform() < 0.45:
+                foot = vector(side * x, street.ground, z + random.uniform(-0.5, 0.5))
+                away = bool((side > 0) == (z < 0))
+                street.lamps.contacts.append((float(foot[0]), float(foot[2]), 0.85, 2))
+                street.quads += car(random, foot, away, street.light, night=street.night)
+                if street.night and not away and random.uniform() < 0.5:
+                    nose = foot - vector(0, 0, np.sign(z) * 2.6) + UP * 0.7
+                    for offset in (-0.65, 0.65):
+                        place = nose + vector(offset, 0, 0)
+                        street.glows.append(Glow(place, 0.07, vector(1, 0.93, 0.8) * 4000))
+
+
+def _people(street: _Street) -> None:
+    random = street.random
+    for _ in range(random.integers(3, 12)):
+        side = random.choice([-1, 1])
+        x = street.reach[side] - random.uniform(0.5, street.pavement - 0.3)
+        foot = vector(side * x, street.ground, random.uniform(-30, 30))
+        street.quads.append(upright(figure(random, random.uniform(1.55, 1.9), 60), foot, None, street.light))
+    for _ in range(4):  # posters on a column
+        side = random.choice([-1, 1])
+        foot = vector(side * (street.reach[side] - 0.8), street.ground, random.uniform(-20, 20))
+        picture = painting(int(random.integers(1 << 30)), 96, 144)
+        canvas = Canvas(1.2, 2.2, 80, vector(0.1, 0.1, 0.1))
+        canvas.paste(picture, (0.08, 0.08, 1.04, 1.6), glow=6 if street.night else 0)
+        street.quads.append(upright(canvas, foot, unit(vector(-side, 0, -np.sign(foot[2]))), street.light))

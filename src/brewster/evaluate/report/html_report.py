@@ -1,0 +1,341 @@
+"""The visual report: one HTML page that needs no other file, with every number, every picture and its errors.
+
+    write_report(json.loads(Path("results.json").read_text()), shown, Path("report.html"))
+
+page.html beside this file is the page without its content: look, controls and the flicker comparison. What is
+filled in here works without them. Pictures are taken one by one, so that memory does not grow with their number.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any, Final
+
+from brewster.evaluate.methods import NOTHING
+from brewster.evaluate.report.images import (
+    BRIGHTEST_ERROR,
+    LONGEST,
+    RAMP,
+    CaseImages,
+    answer_tiles,
+    photo_tiles,
+)
+from brewster.evaluate.report.tables import is_complete, ranking, remarks
+from brewster.files import arriving
+
+__all__ = ["CaseImages", "write_report"]
+
+Results = Mapping[str, Any]
+
+_TEMPLATE: Final = Path(__file__).with_name("page.html")
+_DASH: Final = "&ndash;"
+
+
+def write_report(results: Results, shown: Iterable[CaseImages], path: Path) -> None:
+    """Writes the page, whole or not at all, in the place of an older one. The same input gives the same bytes.
+
+    Args:
+        results: the content of results.json.
+        shown: the cases to show, each taken once and let go before the next; scores come from `results`.
+
+    Raises:
+        TargetError: it cannot be written.
+    """
+    with (
+        arriving(path) as part,
+        part.open("x", encoding="utf-8", errors="replace", newline="\n") as file,
+    ):
+        file.writelines(_page(results, shown))
+
+
+def _page(results: Results, shown: Iterable[CaseImages]) -> Iterator[str]:
+    """The template's text with each <!--part--> in its place; the data come last, when every case has passed."""
+    scores: list[Any] = []
+    parts = {
+        "results": _results(results),
+        "cases": _cases(results, shown, scores),
+        "data": _data(results, scores),
+    }
+    for place, text in enumerate(re.split(r"<!--(\w+)-->", _TEMPLATE.read_text("utf-8"))):
+        if place % 2:
+            yield from parts[text]
+        else:
+            yield text
+
+
+def _data(results: Results, scores: list[Any]) -> Iterator[str]:
+    """What the page sorts by, as JSON that cannot end its own script element."""
+    data = {
+        "metrics": {
+            name: {"title": metric["title"], "unit": metric["unit"], "higher": metric["higher_is_better"]}
+            | {"digits": metric["digits"]}
+            for name, metric in results["metrics"].items()
+        },
+        "methods": [*results["methods"]],
+        "benchmarks": {name: benchmark["title"] for name, benchmark in results["benchmarks"].items()},
+        "nothing": NOTHING,
+        "scores": scores,
+    }
+    yield json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+
+
+# --- numbers
+
+
+def _results(results: Results) -> Iterator[str]:
+    pictures, methods = results["pictures"], results["methods"]
+    benchmarks, protocol = results["benchmarks"], results["protocol"]
+    yield (
+        f"<p class=lede>{_count(len(methods), 'method')} on {_count(len(pictures), 'picture')} of "
+        f"{_count(len(benchmarks), 'benchmark')}: size {escape(str(protocol['size']))}, quality "
+        f"{escape(str(protocol['quality']))}, brewster {escape(results['brewster'])}.</p>\n"
+    )
+    yield from _problems(results)
+    yield _means(results)
+    yield _differences(results)
+    yield from _how(results)
+
+
+def _problems(results: Results) -> Iterator[str]:
+    """What did not go as it should, said before any number."""
+    pictures, benchmarks = results["pictures"], results["benchmarks"].values()
+    failed = [
+        (f"{one['benchmark']}/{one['name']}", *error) for one in pictures for error in one["errors"].items()
+    ]
+    counts = Counter(method for _, method, _ in failed)
+    said = ", ".join(
+        f"{method} on {count} of {_count(len(pictures), 'picture')}" for method, count in counts.items()
+    )
+    yield _noted(f"Failed: {said}", [f"{name}, {method}: {error}" for name, method, error in failed])
+    refused, said_of_sets = (
+        [f"{benchmark['title']}: {point}" for benchmark in benchmarks for point in benchmark[kind]]
+        for kind in ("refused", "remarks")
+    )
+    points = said_of_sets + remarks(results)
+    yield _noted(_count(len(refused), "file refused"), refused)
+    yield _noted(_count(len(points), "remark"), points)
+    if not failed:
+        yield "<p>No method failed on any picture.</p>\n"
+
+
+def _noted(said: str, points: Sequence[str]) -> str:
+    """A few points stand in the open, many can be opened, none is no note."""
+    if not points:
+        return ""
+    is_open = " open" if len(points) <= 5 else ""
+    return f"<details class=note{is_open}><summary>{escape(said)}</summary>{_list(points)}</details>\n"
+
+
+def _list(points: Iterable[str]) -> str:
+    return f"<ul>{''.join(f'<li>{escape(point)}</li>' for point in points)}</ul>"
+
+
+def _count(number: int, noun: str) -> str:
+    """A number and its noun, whose first word takes the plural."""
+    first, *rest = noun.split()
+    return " ".join([f"{number:,}", first if number == 1 else f"{first}s", *rest])
+
+
+def _used(results: Results) -> dict[str, Any]:
+    """The metrics that have a value anywhere."""
+    rows = [row for table in results["tables"].values() for row in table.values()]
+    return {name: metric for name, metric in results["metrics"].items() if any(row.get(name) for row in rows)}
+
+
+def _title(results: Results, name: str) -> str:
+    return str(results["selections"][name]["title"])
+
+
+def _table(caption: str, metrics: Results, bodies: Iterable[str]) -> str:
+    columns = "".join(
+        f"<th scope=col>{escape(metric['title'])} <small>{escape(metric['unit'] or '')} "
+        f"{'&uarr;' if metric['higher_is_better'] else '&darr;'}</small></th>"
+        for metric in metrics.values()
+    )
+    return (
+        f"<p class=caption>{escape(caption)}</p>\n<div class=scroll tabindex=0 role=region aria-label='{escape(caption)}'>"
+        f"<table>\n<thead><tr><th scope=col>Method</th>{columns}</tr></thead>\n{''.join(bodies)}</table></div>\n"
+    )
+
+
+def _body(title: str, metrics: Results, rows: Iterable[tuple[str, Iterable[str]]]) -> str:
+    lines = (f"<tr><th scope=row>{escape(name)}</th>{''.join(cells)}</tr>\n" for name, cells in rows)
+    span = len(metrics) + 1
+    return f"<tbody><tr><th scope=rowgroup colspan={span}><span>{title}</span></th></tr>\n{''.join(lines)}</tbody>\n"
+
+
+def _means(results: Results) -> str:
+    metrics = _used(results)
+    bodies = []
+    for name, table in results["tables"].items():
+        best = {metric: next(iter(ranking(table, metric, about)), None) for metric, about in metrics.items()}
+        pictures = results["selections"][name]["pictures"]
+        rows = (
+            (
+                method,
+                [
+                    _mean(
+                        row.get(metric),
+                        metrics[metric],
+                        best[metric] if is_complete(table, method, metric) else None,
+                        pictures,
+                    )
+                    for metric in metrics
+                ],
+            )
+            for method, row in table.items()
+        )
+        counted = f" <small>{_count(pictures, 'picture')}</small>"
+        bodies.append(_body(escape(_title(results, name)) + counted, metrics, rows))
+    return _table("Means and their 95 % intervals; a star marks the best of a column", metrics, bodies)
+
+
+def _mean(estimate: Results | None, about: Results, best: str | None, pictures: int) -> str:
+    if not estimate:
+        return f"<td>{_DASH}</td>"
+    mean, wins = _number(estimate["mean"], about), f"{estimate['mean']:.{about['digits']}f}" == best
+    is_best = " class=best" if wins else ""
+    star = "<span class=star>&starf;<span class=hidden> best </span></span>" if wins else ""
+    some = f"<small>{estimate['count']} of {pictures}</small>" if estimate["count"] != pictures else ""
+    return f"<td{is_best}>{star}<b>{mean}</b>{_interval(estimate, about)}{some}</td>"
+
+
+def _interval(estimate: Results, about: Results, sign: str = "") -> str:
+    if estimate["low"] is None or estimate["high"] is None:
+        return ""
+    ends = [_number(estimate[end], about, sign) for end in ("low", "high")]
+    return f"<small>{ends[0]} to {ends[1]}</small>"
+
+
+def _number(value: float | None, about: Results, sign: str = "") -> str:
+    if value is None:
+        return _DASH
+    return f"{value:{sign}.{about['digits']}f}".replace("-", "&minus;")
+
+
+def _differences(results: Results) -> str:
+    """Against doing nothing in the open; between methods, where there are several, to be opened."""
+    to_nothing, between = (_pairs(results, is_nothing) for is_nothing in (True, False))
+    said = "Mean change, its 95 % interval, and on how many pictures it is for the better"
+    first = _table(f"Against doing nothing. {said}", _used(results), to_nothing) if to_nothing else ""
+    if not between:
+        return first
+    second = _table(f"Between methods. {said}", _used(results), between)
+    return f"{first}<details><summary>Differences between methods</summary>{second}</details>\n"
+
+
+def _pairs(results: Results, is_nothing: bool) -> list[str]:
+    metrics, bodies = _used(results), []
+    for name, differences in results["differences"].items():
+        rows: dict[str, dict[str, Results]] = {}
+        for row in differences:
+            if (row["than"] == NOTHING) == is_nothing:
+                pair = row["method"] if is_nothing else f"{row['method']} against {row['than']}"
+                rows.setdefault(pair, {})[row["metric"]] = row
+        cells = (
+            (pair, [_change(row.get(metric), metrics[metric]) for metric in metrics])
+            for pair, row in rows.items()
+        )
+        if rows:
+            bodies.append(_body(escape(_title(results, name)), metrics, cells))
+    return bodies
+
+
+def _change(row: Results | None, about: Results) -> str:
+    if not row:
+        return f"<td>{_DASH}</td>"
+    is_open = row["low"] is None or row["low"] <= 0 <= row["high"]
+    is_better = (row["mean"] > 0) == about["higher_is_better"]
+    verdict, mark = (
+        ("open", "") if is_open else ("better", "&#9650; ") if is_better else ("worse", "&#9660; ")
+    )
+    return (
+        f"<td class={verdict}>{mark}<span class=hidden>{verdict}: </span><b>{_number(row['mean'], about, '+')}</b>"
+        f"{_interval(row, about, '+')}<small>{row['better']} of {row['count']}</small></td>"
+    )
+
+
+def _how(results: Results) -> Iterator[str]:
+    yield f"<details><summary>How it was measured</summary>{_list(results['protocol']['choices'])}<dl>"
+    for name, metric in results["metrics"].items():
+        better = "higher is better" if metric["higher_is_better"] else "lower is better"
+        yield f"<dt>{escape(metric['title'])} <code>{escape(name)}</code></dt><dd>{escape(metric['about'])} ({better})</dd>\n"
+    yield "</dl></details>\n<details><summary>Methods</summary><dl>"
+    for name, method in results["methods"].items():
+        facts = (f"{key} {value}" for key, value in method.items())
+        yield f"<dt>{escape(name)}</dt><dd>{escape(', '.join(facts))}</dd>\n"
+    yield "</dl></details>\n"
+
+
+# --- pictures
+
+
+def _cases(results: Results, shown: Iterable[CaseImages], scores: list[Any]) -> Iterator[str]:
+    known = {(picture["benchmark"], picture["name"]): picture for picture in results["pictures"]}
+    steps = (f"<i style='background:rgb({red},{green},{blue})'></i>" for red, green, blue in RAMP)
+    yield (
+        f"<p class=legend>Errors, of 255: 0 <span>{''.join(steps)}</span> {BRIGHTEST_ERROR} and more. "
+        f"Pictures are embedded with at most {LONGEST} px on the longer side.</p>\n"
+    )
+    for case in shown:
+        picture = known.get((case.benchmark, case.name), {"scores": {}, "errors": {}})
+        scores.append(picture["scores"])
+        yield _case(results, case, picture)
+    if len(scores) < len(known):
+        yield (
+            f"<p>{len(scores):,} of {_count(len(known), 'picture')} are on this page: of each benchmark those that the "
+            "first method that does something failed on, then its worst by the first metric.</p>\n"
+        )
+
+
+def _case(results: Results, case: CaseImages, picture: Results) -> str:
+    facts = [
+        escape(_title(results, case.benchmark)),
+        f"{case.photo.shape[1]} &times; {case.photo.shape[0]} px",
+    ]
+    if (share := picture.get("region_share")) is not None:
+        facts.append(f"region {share:.0%}")
+    others = [name for name in results["methods"] if name != NOTHING]
+    rows = [_row(results, picture, NOTHING, photo_tiles(case))]
+    rows += [_row(results, picture, method, answer_tiles(case, method)) for method in others]
+    return (
+        f'<article data-benchmark="{escape(case.benchmark)}" data-name="{escape(case.name)}">\n'
+        f"<h3>{escape(case.name)}</h3><p>{' &middot; '.join(facts)} <span class=key></span></p>\n{''.join(rows)}</article>\n"
+    )
+
+
+def _row(results: Results, picture: Results, method: str, tiles: str) -> str:
+    error = picture["errors"].get(method)
+    failure = f"<p class=failure>Failed: {escape(error)}</p>" if error else ""
+    title = "photo, doing nothing" if method == NOTHING else method
+    return (
+        f"<section><div><h4>{escape(title)}</h4>{failure}{_scores(results, picture['scores'], method)}</div>"
+        f"<div class=tiles>{tiles}</div></section>\n"
+    )
+
+
+def _scores(results: Results, scores: Results, method: str) -> str:
+    """A method's scores on one picture, and their change to doing nothing."""
+    mine, nothing = scores.get(method, {}), scores.get(NOTHING, {})
+    lines = []
+    for name, about in results["metrics"].items():
+        if all(row.get(name) is None for row in scores.values()) or method not in scores:
+            continue
+        value, before = mine.get(name), nothing.get(name)
+        has_change = method != NOTHING and value is not None and before is not None and value != before
+        change = _gain(value - before, about) if has_change else ""
+        lines.append(
+            f"<tr><th scope=row>{escape(about['title'])}</th><td>{_number(value, about)}</td><td>{change}</td></tr>"
+        )
+    return f"<table>{''.join(lines)}</table>" if lines else ""
+
+
+def _gain(change: float, about: Results) -> str:
+    is_better = (change > 0) == about["higher_is_better"]
+    verdict, mark = ("better", "&#9650;") if is_better else ("worse", "&#9660;")
+    return f"<span class={verdict}>{_number(change, about, '+')} {mark}<span class=hidden>{verdict}</span></span>"

@@ -1,0 +1,128 @@
+"""Turns a model file and a device name into a `Backend`: the only file that imports ONNX Runtime."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final, final
+
+import numpy as np
+import onnxruntime as ort
+
+from brewster.errors import DeviceError, ModelError
+from brewster.inference.tiles import Picture
+
+_STRIDE: Final = 32
+"""Networks take sides that are multiples of this; pictures are mirrored outwards to reach it."""
+
+# device name: (ONNX Runtime's provider, the line that installs it), the preferred ones first
+_PROVIDERS: Final = {
+    "cuda": ("CUDAExecutionProvider", "pip install onnxruntime-gpu"),
+    "rocm": ("ROCMExecutionProvider", "pip install onnxruntime-rocm"),
+    "directml": ("DmlExecutionProvider", "pip install onnxruntime-directml"),
+    "coreml": ("CoreMLExecutionProvider", "pip install onnxruntime (on macOS)"),
+    "cpu": ("CPUExecutionProvider", "pip install onnxruntime"),
+}
+DEVICES: Final = ("auto", *_PROVIDERS)
+
+
+def available_devices() -> list[str]:
+    """Names of the devices that the installed ONNX Runtime can use, the preferred one first."""
+    installed = ort.get_available_providers()
+    return [device for device, (provider, _) in _PROVIDERS.items() if provider in installed]
+
+
+@final
+class OnnxBackend:
+    """A `Backend` from an ONNX file: input `photo` (1, 3, H, W), outputs `transmission` and `reflection`.
+
+    Safe to call from many threads at once.
+    """
+
+    def __init__(self, model: Path, device: str = "auto") -> None:
+        data = _read(model)
+        for candidate in _candidates(device):
+            session = _start(model, data, candidate)
+            if session.get_providers()[0] == _PROVIDERS[candidate][0]:
+                self.device, self._session = candidate, session
+                self._check_names(model)
+                return
+        raise DeviceError(
+            f"device {device} is installed but does not start",
+            "a driver and libraries that fit it",
+            "use --device auto, or see what ONNX Runtime says with --device cpu",
+        )
+
+    def __call__(self, tile: Picture) -> tuple[Picture, Picture]:
+        """Separates one tile (H, W, 3), linear light in 0..1, of any size."""
+        height, width, _ = tile.shape
+        margins = [(0, -side % _STRIDE) for side in (height, width)]
+        padded = np.pad(tile, [*margins, (0, 0)], mode="symmetric")
+        feed = {"photo": np.ascontiguousarray(padded.transpose(2, 0, 1)[None], dtype=np.float32)}
+        try:
+            answers = self._session.run(["transmission", "reflection"], feed)
+        except Exception as error:
+            raise ModelError(
+                f"the model failed on a tile of {width}x{height} pixels ({_first_line(error)})",
+                "a model that takes any size that is a multiple of 32",
+                "check it with brewster models verify, or try --device cpu",
+            ) from error
+        transmission, reflection = (layer[0, :, :height, :width].transpose(1, 2, 0) for layer in answers)
+        return transmission, reflection
+
+    def _check_names(self, model: Path) -> None:
+        inputs = [value.name for value in self._session.get_inputs()]
+        outputs = {value.name for value in self._session.get_outputs()}
+        if inputs != ["photo"] or not outputs >= {"transmission", "reflection"}:
+            raise ModelError(
+                f"{model} maps {inputs} to {sorted(outputs)}",
+                "a model with input photo and outputs transmission and reflection",
+                "export it with brewster train",
+            )
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+
+
+def _read(model: Path) -> bytes:
+    try:
+        return model.read_bytes()
+    except OSError as error:
+        raise ModelError(
+            f"{model} cannot be read ({error.strerror})",
+            "a model file",
+            "brewster models list names what is there",
+        ) from error
+
+
+def _start(model: Path, data: bytes, device: str) -> ort.InferenceSession:
+    """A session on the device, or on the CPU where the device's own libraries do not load."""
+    options = ort.SessionOptions()
+    options.log_severity_level = 3
+    providers = dict.fromkeys([_PROVIDERS[device][0], "CPUExecutionProvider"])
+    try:
+        return ort.InferenceSession(data, options, list(providers), enable_fallback=0)
+    except Exception as error:
+        raise ModelError(
+            f"{model} is not a model that ONNX Runtime can load on {device}",
+            "an .onnx file exported by brewster train",
+            f"check the file ({_first_line(error)})",
+        ) from error
+
+
+def _candidates(device: str) -> list[str]:
+    """The devices to try, the preferred one first; a device named by the user is the only one."""
+    available = available_devices()
+    if device == "auto":
+        return available
+    if device not in _PROVIDERS:
+        raise DeviceError(
+            f"there is no device {device!r}", f"one of {', '.join(DEVICES)}", "use --device auto"
+        )
+    if device not in available:
+        raise DeviceError(
+            f"device {device} is not available to the installed ONNX Runtime",
+            f"one of {', '.join(available)}",
+            f"{_PROVIDERS[device][1]}, or use --device auto",
+        )
+    return [device]

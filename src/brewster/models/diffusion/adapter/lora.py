@@ -1,0 +1,265 @@
+"""What training adds to a backbone: low-rank changes to its blocks (Hu et al. 2021), in a file of their own.
+
+    add_lora(backbone, rank=16, alpha=16, seed=0)
+    save_lora(folder, backbone, prompt, task)     # stock diffusers: pipe.load_lora_weights(folder)
+    card, prompt = load_lora(folder, backbone)
+
+The paper names the rank, 16 (Experimental Setup); alpha 16 and every linear layer of the blocks are the common
+recipe behind it. A LoRA is float32 on a base of any precision: bf16 would round most of Adam's steps away.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Final, final
+
+import torch
+from pydantic import Field, TypeAdapter
+from torch import Tensor, nn
+
+from brewster.errors import ModelError, RecipeError
+from brewster.models.diffusion.families.family import Backbone
+from brewster.models.diffusion.lazy_imports import library
+from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding, load_prompt
+from brewster.models.diffusion.task import DecompositionTask
+from brewster.models.diffusion.tensors import read_tensors, write_tensors
+from brewster.options import Quantisation
+
+LORA_FILE: Final = "pytorch_lora_weights.safetensors"
+"""The name that stock diffusers looks for."""
+_PREFIX: Final = "transformer."
+_OURS: Final = "brewster"
+_STOCK: Final = "lora_adapter_metadata"
+_ADAPTER: Final = "default"
+
+
+@final
+@dataclass(frozen=True)
+class LoraCard:
+    """What a LoRA was made for: the backbone and how it was stored, the LoRA's size, its task, and the prompt's digest.
+
+    `base` is a hub id, a folder, or a name in the table of backbones.
+    """
+
+    backbone: str
+    base: str
+    quantise: Quantisation | None
+    rank: Annotated[int, Field(ge=1)]
+    alpha: Annotated[int, Field(ge=1)]
+    task: DecompositionTask
+    prompt_sha256: str
+
+    def to_json(self) -> str:
+        """One line of JSON."""
+        return json.dumps(asdict(self), sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str) -> LoraCard:
+        """Reads `to_json`.
+
+        Raises:
+            ModelError: not such a line.
+        """
+        try:
+            return _cards().validate_json(text, strict=True, extra="forbid")
+        except (ValueError, RecipeError) as error:
+            raise ModelError(
+                f"the card of the LoRA cannot be read: {error}",
+                "one that brewster wrote",
+                "save the LoRA again",
+            ) from error
+
+
+@cache
+def _cards() -> TypeAdapter[LoraCard]:
+    return TypeAdapter(LoraCard)
+
+
+def add_lora(backbone: Backbone, *, rank: int = 16, alpha: int = 16, seed: int = 0) -> list[nn.Parameter]:
+    """Adds a LoRA that changes nothing yet to every linear layer of the blocks; gives what is to be trained.
+
+    Raises:
+        ModelError: the backbone has one already, or the rank is not positive.
+        MissingExtra: peft is not installed.
+    """
+    if rank < 1:
+        raise ModelError(f"the rank is {rank}", "at least 1", "the paper takes 16")
+    if has_lora(backbone):
+        raise ModelError("the backbone has a LoRA already", "one at a time", "remove_lora first")
+    peft = library("peft")
+    config = peft.LoraConfig(r=rank, lora_alpha=alpha, target_modules=backbone.lora_targets())
+    with torch.random.fork_rng(devices=_devices(backbone)):
+        torch.manual_seed(seed)
+        backbone.transformer.add_adapter(config, adapter_name=_ADAPTER)
+    # On a bf16 base the LoRA is bf16, too, until it is cast.
+    library("diffusers.training_utils").cast_training_params(backbone.transformer, torch.float32)
+    return lora_parameters(backbone)
+
+
+def remove_lora(backbone: Backbone) -> None:
+    """Gives the plain backbone back; nothing happens where there is no LoRA."""
+    if has_lora(backbone):
+        backbone.transformer.unload_lora()
+
+
+def has_lora(backbone: Backbone) -> bool:
+    """Whether the backbone carries a LoRA."""
+    return bool(getattr(backbone.transformer, "peft_config", None))
+
+
+def lora_parameters(backbone: Backbone) -> list[nn.Parameter]:
+    """The LoRA's weights, the only ones that are trained, always in the same order."""
+    return [parameter for parameter in backbone.transformer.parameters() if parameter.requires_grad]
+
+
+def lora_state(backbone: Backbone) -> dict[str, Tensor]:
+    """The LoRA's weights by name, such as transformer_blocks.0.attn.to_q.lora_A.weight; empty without a LoRA."""
+    if not has_lora(backbone):
+        return {}
+    state = library("peft").get_peft_model_state_dict(backbone.transformer, adapter_name=_ADAPTER)
+    return dict(sorted(state.items()))
+
+
+def load_lora_state(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
+    """Puts weights that `lora_state` gave back into a backbone with a LoRA of the same shape.
+
+    Raises:
+        ModelError: no LoRA to fill, or weights of another backbone or rank.
+    """
+    _refuse_other_weights(lora_state(backbone), state)
+    library("peft").set_peft_model_state_dict(backbone.transformer, dict(state), adapter_name=_ADAPTER)
+
+
+def save_lora(
+    folder: Path,
+    backbone: Backbone,
+    prompt: PromptEmbedding,
+    task: DecompositionTask,
+    *,
+    base: str = "",
+    quantise: Quantisation | None = None,
+) -> LoraCard:
+    """Writes the LoRA in the file that stock diffusers loads, and the prompt beside it; same LoRA, same bytes.
+
+    `base` is the backbone's own hub id unless it is named.
+
+    Raises:
+        ModelError: no LoRA, or a prompt of another backbone.
+        TargetError: the folder cannot be written.
+    """
+    if not has_lora(backbone):
+        raise ModelError("the backbone has no LoRA", "one to save", "add_lora first")
+    if prompt.backbone != backbone.name:
+        raise ModelError(
+            f"the prompt was encoded for {prompt.backbone}", f"{backbone.name}", "encode it for this backbone"
+        )
+    config = backbone.transformer.peft_config[_ADAPTER]
+    card = LoraCard(
+        backbone.name,
+        base or backbone.hub_id,
+        quantise,
+        config.r,
+        config.lora_alpha,
+        task,
+        prompt.sha256,
+    )
+    tensors = {_PREFIX + name: tensor for name, tensor in lora_state(backbone).items()}
+    prompt.save(folder / PROMPT_FILE)
+    write_tensors(folder / LORA_FILE, tensors, {_OURS: card.to_json(), _STOCK: _stock_settings(config)})
+    return card
+
+
+def read_card(folder: Path) -> LoraCard:
+    """What the LoRA in this folder was made for, so that its backbone can be loaded.
+
+    Raises:
+        ModelError: no LoRA, a damaged one, or one that brewster did not write.
+    """
+    return _read(folder)[1]
+
+
+def read_prompt(folder: Path, card: LoraCard) -> PromptEmbedding:
+    """The prompt of the LoRA in this folder.
+
+    Raises:
+        ModelError: missing, damaged, or not the one that the LoRA was trained with.
+    """
+    prompt = load_prompt(folder / PROMPT_FILE, card.backbone)
+    if prompt.sha256 != card.prompt_sha256:
+        raise ModelError(
+            f"{folder / PROMPT_FILE} is not the prompt that the LoRA was trained with",
+            f"SHA-256 {card.prompt_sha256[:12]}...",
+            "copy the whole folder again",
+        )
+    return prompt
+
+
+def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraCard, PromptEmbedding]:
+    """Adds the LoRA of a folder to its backbone, and gives its card and its prompt.
+
+    Raises:
+        ModelError: a LoRA of another backbone, of a rank that its weights do not have, a damaged file, a prompt
+            that does not belong to it, or a backbone that carries a LoRA already.
+    """
+    state, card = _read(folder)
+    if card.backbone != backbone.name:
+        raise ModelError(
+            f"{folder} is a LoRA of {card.backbone}",
+            f"one of {backbone.name}",
+            f"load the backbone {card.backbone} for it",
+        )
+    prompt = read_prompt(folder, card)
+    add_lora(backbone, rank=card.rank, alpha=card.alpha)
+    try:
+        load_lora_state(backbone, state)
+    except ModelError:
+        remove_lora(backbone)
+        raise
+    return card, prompt
+
+
+def _read(folder: Path) -> tuple[dict[str, Tensor], LoraCard]:
+    tensors, about = read_tensors(folder / LORA_FILE)
+    if _OURS not in about:
+        raise ModelError(
+            f"{folder / LORA_FILE} was not written by brewster",
+            "a LoRA with its card, which names backbone, layout and prompt",
+            "use one that brewster train wrote",
+        )
+    card = LoraCard.from_json(about[_OURS])
+    return {name.removeprefix(_PREFIX): tensor for name, tensor in tensors.items()}, card
+
+
+def _refuse_other_weights(wanted: Mapping[str, Tensor], found: Mapping[str, Tensor]) -> None:
+    astray = sorted(set(wanted) ^ set(found))
+    if astray:
+        raise ModelError(
+            f"{len(astray)} weights of the LoRA are too few or too many, {astray[0]} among them",
+            "one pair for each linear layer of the blocks",
+            "use the backbone that it was trained on",
+        )
+    for name, tensor in sorted(found.items()):
+        if tensor.shape != wanted[name].shape:
+            raise ModelError(
+                f"{name} has the shape {tuple(tensor.shape)}",
+                f"{tuple(wanted[name].shape)}",
+                "use the rank and the backbone that it was trained with",
+            )
+
+
+def _stock_settings(config: Any) -> str:  # noqa: ANN401 - peft's configuration
+    """What stock diffusers reads: without it, alpha would be taken for the rank."""
+    settings = {
+        "r": config.r,
+        "lora_alpha": config.lora_alpha,
+        "target_modules": sorted(config.target_modules),
+    }
+    return json.dumps({_PREFIX + name: value for name, value in settings.items()}, sort_keys=True)
+
+
+def _devices(backbone: Backbone) -> list[torch.device]:
+    return [backbone.device] if backbone.device.type == "cuda" else []

@@ -1,0 +1,312 @@
+"""What every large backbone can do, whatever its family: see, show, predict, and name what a LoRA may change.
+
+Latents are grids (N, C, H/16, W/16): the VAE's latents with each 2 x 2 patch packed into the channels, so that a
+grid cell is a token, a panel is a block of whole cells, and one cell stands for 16 x 16 pixels.
+"""
+
+from __future__ import annotations
+
+import inspect
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Final, final
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from brewster.errors import ModelError
+from brewster.models.diffusion.lazy_imports import quiet, stock_class
+from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+PATCH: Final = 2
+"""VAE cells per token side; every family packs 2 x 2."""
+_BLOCKS: Final = ("transformer_blocks", "single_transformer_blocks")
+_LORA_PARTS: Final = ("lora_A", "lora_B")
+
+Architecture = Mapping[str, Mapping[str, Any]]
+"""The settings of the three parts "transformer", "vae" and "scheduler"."""
+
+
+@final
+@dataclass(frozen=True)
+class Licence:
+    """The terms of a base, which are those of every LoRA on it."""
+
+    title: str
+    hub: Mapping[str, str]
+    """Its entries in the front matter of a model card on the hub."""
+    is_commercial: bool = True
+
+
+APACHE_2: Final = Licence("Apache-2.0", {"license": "apache-2.0"})
+
+
+@final
+@dataclass(frozen=True)
+class StockCall:
+    """How the card of a LoRA calls the stock pipeline so that it makes the same composite, as Python source."""
+
+    parts: str
+    """Arguments of `from_pretrained` that leave out the text encoders."""
+    options: str
+    """Arguments of the call; {area} stands for the pixels of the composite, `words` for the encoded prompt."""
+    caution: str
+    """What the pipeline does unless it is called so, one sentence."""
+
+
+class Backbone(ABC):
+    """A flow-matching transformer that generates a picture beside a conditioning picture, its VAE and scheduler.
+
+    Time is sigma: 1 is noise, 0 is the picture, and the transformer predicts velocity = noise - picture.
+    """
+
+    name: ClassVar[str]
+    hub_id: ClassVar[str]
+    licence: ClassVar[Licence]
+    stock_use: ClassVar[StockCall | str]
+    """For the card: how to call the stock pipeline, or why it cannot make the same picture, "but ..."."""
+    classes: ClassVar[Mapping[str, str]]
+    """Names in diffusers of the "pipeline", "transformer", "vae" and "scheduler"."""
+    real: ClassVar[Architecture]
+    tiny: ClassVar[Architecture]
+    guided_by_embedding: ClassVar[bool]
+    """Whether guidance is a number that the transformer reads, or a second prediction (classifier-free)."""
+    words_need: ClassVar[tuple[str, ...]] = ()
+    """Libraries beyond the extra `large` that its text encoders are loaded with."""
+    multiple: ClassVar[int] = 16
+    """Sides of a panel are multiples of this many pixels."""
+
+    def __init__(self, transformer: Any, vae: Any, scheduler: Any, *, distilled: bool = False) -> None:  # noqa: ANN401
+        self.transformer = transformer.eval().requires_grad_(False)
+        self.vae = vae.eval().requires_grad_(False)
+        self.scheduler = scheduler
+        self.distilled = distilled
+
+    @property
+    def device(self) -> torch.device:
+        """Where the transformer is."""
+        device = self.transformer.device
+        assert isinstance(device, torch.device)
+        return device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """The precision in which the transformer computes."""
+        dtype = self.transformer.dtype
+        assert isinstance(dtype, torch.dtype)
+        return dtype
+
+    @property
+    def channels(self) -> int:
+        """Channels of a latent grid: numbers per token."""
+        return int(self.transformer.config.in_channels)
+
+    @torch.no_grad()
+    def encode(self, picture: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c h/16 w/16"]:
+        """Pictures in [-1, 1] as normal latent grids, float32: the mean of the VAE's distribution, without noise.
+
+        Encode the whole composite: panels encoded apart differ at the seams and, through GroupNorm, everywhere.
+
+        Raises:
+            ModelError: sides that are not multiples of 16.
+        """
+        self._refuse_off_grid(picture.shape[-1], picture.shape[-2])
+        mean, deviation = self.statistics()
+        seen = self._see(picture.to(self.vae.device, self.vae.dtype))
+        return (functional.pixel_unshuffle(seen, PATCH).float() - mean) / deviation
+
+    @torch.no_grad()
+    def decode(self, latents: Float[Tensor, "n c h w"]) -> Float[Tensor, "n 3 16*h 16*w"]:
+        """Latent grids as pictures, about [-1, 1], not clamped, float32."""
+        mean, deviation = self.statistics()
+        grid = latents.to(self.vae.device).float() * deviation + mean
+        return self._show(functional.pixel_shuffle(grid, PATCH).to(self.vae.dtype)).float()
+
+    @abstractmethod
+    def statistics(self) -> tuple[Tensor, Tensor]:
+        """Mean and deviation of the packed latents over natural pictures, (1, C, 1, 1) each, float32."""
+
+    @abstractmethod
+    def predict(
+        self,
+        latents: Float[Tensor, "n c h w"],
+        condition: Float[Tensor, "n c p q"],
+        sigma: Float[Tensor, " n"],
+        prompt: PromptEmbedding,
+        guidance: float,
+    ) -> Float[Tensor, "n c h w"]:
+        """The velocity noise - picture at time sigma, float32; carries gradients where the caller wants them.
+
+        Raises:
+            ModelError: a prompt that lacks what this guidance needs.
+        """
+
+    @abstractmethod
+    def positions(self, latents: Tensor, condition: Tensor) -> Any:  # noqa: ANN401 - each family has its own kind
+        """Where each token stands, generated ones first, and which of the two pictures it belongs to."""
+
+    @classmethod
+    @abstractmethod
+    def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a stock pipeline
+        """The prompt through the text encoders of a stock pipeline."""
+
+    @classmethod
+    @abstractmethod
+    def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a stock transformer
+        """Random numbers of a prompt's shape, for twins that have no text encoder."""
+
+    def noise(self, size: tuple[int, int], seed: int) -> Float[Tensor, "1 c h w"]:
+        """Where the stock pipeline starts for a composite of this (width, height) and seed; always from the CPU.
+
+        Raises:
+            ModelError: sides that are not multiples of 16.
+        """
+        self._refuse_off_grid(*size)
+        width, height = (side // self.multiple * PATCH for side in size)
+        shape = (1, self.channels // PATCH**2, height, width)
+        return functional.pixel_unshuffle(_normal(shape, seed), PATCH)
+
+    def shift(self, tokens: int, steps: int) -> float:  # noqa: ARG002 - one family's shift counts the steps
+        """The schedule's shift mu for a composite of this many generated tokens (condition not counted).
+
+        Linear in the tokens between the scheduler's two anchors (Esser et al. 2024; FLUX).
+        """
+        config = self.scheduler.config
+        low, high = config.base_image_seq_len, config.max_image_seq_len
+        slope = (config.max_shift - config.base_shift) / (high - low)
+        return float(config.base_shift + slope * (tokens - low))
+
+    def shifted(self, sigma: Tensor, tokens: int, steps: int = 20) -> Tensor:
+        """Times in (0, 1] moved towards noise as the schedule moves them, for training."""
+        scheduler = self.scheduler
+        if scheduler.config.use_dynamic_shifting:
+            moved = scheduler.time_shift(self.shift(tokens, steps), 1.0, sigma)
+            assert isinstance(moved, Tensor)
+            return moved
+        return scheduler.shift * sigma / (1 + (scheduler.shift - 1) * sigma)  # type: ignore[no-any-return]
+
+    def schedule(self, tokens: int, steps: int) -> Float[Tensor, " sigmas"]:
+        """The sigmas from 1 to 0, by the stock scheduler itself: steps + 1 values, falling."""
+        if steps == 1:  # any shift leaves 1 where it is, but a stretched end would divide 0 by 0
+            return torch.tensor([1.0, 0.0])
+        scheduler = type(self.scheduler).from_config(self.scheduler.config)
+        dynamic = {"mu": self.shift(tokens, steps)} if scheduler.config.use_dynamic_shifting else {}
+        scheduler.set_timesteps(sigmas=np.linspace(1.0, 1 / steps, steps), **dynamic)
+        sigmas = scheduler.sigmas
+        assert isinstance(sigmas, Tensor)
+        return sigmas
+
+    def lora_targets(self) -> list[str]:
+        """Full names of every linear layer in the blocks; suffixes would hit the top-level proj_out, too."""
+        return [
+            name.removesuffix(".base_layer")
+            for name, module in self.transformer.named_modules()
+            if isinstance(module, nn.Linear)
+            and name.split(".")[0] in _BLOCKS
+            and not set(name.split(".")) & set(_LORA_PARTS)
+        ]
+
+    def pipeline(self) -> Any:  # noqa: ANN401 - a stock pipeline
+        """The stock pipeline around the same transformer, VAE and scheduler, without text encoders.
+
+        Raises:
+            MissingExtra: diffusers is not installed.
+        """
+        kind = stock_class(self.classes["pipeline"])
+        parts = {"transformer": self.transformer, "vae": self.vae, "scheduler": self.scheduler}
+        wanted = inspect.signature(kind.__init__).parameters
+        absent = {
+            name: None
+            for name, parameter in wanted.items()
+            if name not in {"self", *parts} and parameter.default is parameter.empty
+        }
+        distilled = {"is_distilled": self.distilled} if "is_distilled" in wanted else {}
+        return kind(**parts, **absent, **distilled)
+
+    def save(self, folder: Path) -> None:
+        """Writes the folder that `load_backbone` and stock diffusers read."""
+        pipeline = self.pipeline()
+        with quiet():  # a warning for each text encoder that is not there
+            pipeline.save_pretrained(folder)
+
+    def _refuse_off_grid(self, width: int, height: int) -> None:
+        if width % self.multiple or height % self.multiple:
+            raise ModelError(
+                f"the picture has {width} x {height} pixels",
+                f"sides that are multiples of {self.multiple}",
+                "pad it with panels.fit_panel",
+            )
+
+    def _see(self, picture: Tensor) -> Tensor:
+        return self.vae.encode(picture).latent_dist.mode()  # type: ignore[no-any-return]
+
+    def _show(self, latent: Tensor) -> Tensor:
+        return self.vae.decode(latent, return_dict=False)[0]  # type: ignore[no-any-return]
+
+    def _tokens(self, latents: Tensor, condition: Tensor) -> Float[Tensor, "n t c"]:
+        """Generated tokens, then conditioning tokens, row by row, as the transformer takes them."""
+        grids = [latents, condition.expand(len(latents), -1, -1, -1)]
+        return torch.cat([grid.flatten(2).mT for grid in grids], dim=1).to(self.device, self.dtype)
+
+
+class ClassifierFreeBackbone(Backbone):
+    """A backbone whose guidance is classifier-free (Ho & Salimans 2022): above 1 it predicts a second time."""
+
+    guided_by_embedding = False
+
+    def predict(
+        self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float
+    ) -> Tensor:
+        """See Backbone; a distilled model takes no guidance.
+
+        Raises:
+            ModelError: guidance above 1 and a prompt without its empty counterpart.
+        """
+        wanted = self._velocity(latents, condition, sigma, prompt.embeds)
+        if guidance <= 1 or self.distilled:
+            return wanted
+        empty = self._velocity(latents, condition, sigma, _empty(prompt))
+        return self._guided(wanted, empty, guidance)
+
+    @abstractmethod
+    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, words: Tensor) -> Tensor:
+        """What the transformer predicts when it is told these words, (1, tokens, width)."""
+
+    def _guided(self, wanted: Tensor, empty: Tensor, guidance: float) -> Tensor:
+        """Away from what the empty prompt predicts."""
+        return empty + guidance * (wanted - empty)
+
+
+def grid_of(tokens: Float[Tensor, "n t c"], like: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
+    """The generated tokens, the first ones, on their grid again, float32."""
+    generated = tokens[:, : like.shape[2] * like.shape[3]].mT.float()
+    return generated.reshape(like.shape)
+
+
+def random_prompt(backbone: str, seed: int, **shapes: tuple[int, ...]) -> PromptEmbedding:
+    """The paper's words with random numbers for their meaning: `embeds` and what else has a shape."""
+    tensors = {
+        name: _normal(shape, seed + index) for index, (name, shape) in enumerate(sorted(shapes.items()))
+    }
+    return PromptEmbedding(backbone, PROMPT, **tensors)
+
+
+def _empty(prompt: PromptEmbedding) -> Tensor:
+    if prompt.negative is None:
+        raise ModelError(
+            f"the prompt for {prompt.backbone} has no empty counterpart",
+            "one, for a guidance above 1",
+            "encode the prompt again or set the guidance to 1",
+        )
+    return prompt.negative
+
+
+def _normal(shape: tuple[int, ...], seed: int) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))

@@ -1,0 +1,126 @@
+"""FLUX.2 klein base-4B: 3.9 billion parameters, small enough for bf16 training on a 24 GB card."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Final, final
+
+import torch
+from torch import Tensor
+
+from brewster.models.diffusion.families.family import (
+    APACHE_2,
+    ClassifierFreeBackbone,
+    StockCall,
+    grid_of,
+    random_prompt,
+)
+from brewster.models.diffusion.prompt import PromptEmbedding
+
+_SCHEDULER: Final = {
+    "shift": 3.0, "use_dynamic_shifting": True, "base_shift": 0.5, "max_shift": 1.15,
+    "base_image_seq_len": 256, "max_image_seq_len": 4096,
+}  # fmt: skip
+_CONDITION_TIME: Final = 10
+"""Generated tokens stand at time 0; the first reference picture stands at 10, a second one would at 20."""
+
+
+@final
+class Klein(ClassifierFreeBackbone):
+    """FLUX.2 klein (Black Forest Labs 2026), the base model: guidance is classifier-free.
+
+    The distilled models of the same family load, too; they take no guidance.
+    """
+
+    name = "klein"
+    hub_id = "black-forest-labs/FLUX.2-klein-base-4B"
+    licence = APACHE_2
+    stock_use = StockCall(
+        "text_encoder=None, tokenizer=None",
+        'negative_prompt_embeds=words["negative"],',
+        "A condition of more than 1024 x 1024 pixels would be rescaled in silence.",
+    )
+    classes: ClassVar = {
+        "pipeline": "Flux2KleinPipeline", "transformer": "Flux2Transformer2DModel",
+        "vae": "AutoencoderKLFlux2", "scheduler": "FlowMatchEulerDiscreteScheduler",
+    }  # fmt: skip
+    real: ClassVar = {
+        "transformer": {
+            "guidance_embeds": False, "num_layers": 5, "num_single_layers": 20, "num_attention_heads": 24,
+            "joint_attention_dim": 7680,
+        },
+        "vae": {},
+        "scheduler": _SCHEDULER,
+    }  # fmt: skip
+    tiny: ClassVar = {
+        "transformer": {
+            "guidance_embeds": False, "num_layers": 2, "num_single_layers": 2, "attention_head_dim": 16,
+            "num_attention_heads": 2, "joint_attention_dim": 32, "timestep_guidance_channels": 32,
+            "axes_dims_rope": (4, 4, 4, 4),
+        },
+        "vae": {"block_out_channels": (8, 8, 16, 16), "layers_per_block": 1, "norm_num_groups": 4},
+        "scheduler": _SCHEDULER,
+    }  # fmt: skip
+
+    def statistics(self) -> tuple[Tensor, Tensor]:
+        """The running statistics of the VAE's batch norm, one pair for each packed channel."""
+        norm = self.vae.bn
+        deviation = (norm.running_var.float() + self.vae.config.batch_norm_eps).sqrt()
+        return norm.running_mean.float().view(1, -1, 1, 1), deviation.view(1, -1, 1, 1)
+
+    def noise(self, size: tuple[int, int], seed: int) -> Tensor:
+        """Drawn on the packed grid, unlike the other families'.
+
+        Raises:
+            ModelError: sides that are not multiples of 16.
+        """
+        self._refuse_off_grid(*size)
+        width, height = (side // self.multiple for side in size)
+        return torch.randn(1, self.channels, height, width, generator=torch.Generator().manual_seed(seed))
+
+    def shift(self, tokens: int, steps: int) -> float:
+        """Black Forest Labs' empirical fit: a line in the steps between its values at 10 and at 200."""
+        at_200 = 0.00016927 * tokens + 0.45666666
+        if tokens > 4300:
+            return at_200
+        at_10 = 8.73809524e-05 * tokens + 1.89833333
+        return at_200 + (at_200 - at_10) / 190 * (steps - 200)
+
+    def positions(self, latents: Tensor, condition: Tensor) -> Tensor:
+        """(tokens, 4): time (0 generated, 10 conditioning), row, column, place in the text (0)."""
+        return torch.cat([_ids(latents, 0), _ids(condition, _CONDITION_TIME)]).to(self.device)
+
+    @classmethod
+    def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a stock pipeline
+        """Three layers of Qwen3 for the prompt, and for the empty one."""
+        embeds, _ = pipeline.encode_prompt(prompt=text)
+        negative, _ = pipeline.encode_prompt(prompt="")
+        return PromptEmbedding(cls.name, text, embeds.detach(), negative=negative.detach())
+
+    @classmethod
+    def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a stock transformer
+        """Eight random tokens, and eight for the empty prompt."""
+        shape = (1, 8, transformer.config.joint_attention_dim)
+        return random_prompt(cls.name, seed, embeds=shape, negative=shape)
+
+    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, words: Tensor) -> Tensor:
+        told = words.to(self.device, self.dtype).expand(len(latents), -1, -1)
+        tokens = self.transformer(
+            hidden_states=self._tokens(latents, condition),
+            encoder_hidden_states=told,
+            timestep=sigma.to(self.device, self.dtype),
+            guidance=None,
+            txt_ids=_text_ids(told).to(self.device),
+            img_ids=self.positions(latents, condition),
+            return_dict=False,
+        )[0]
+        return grid_of(tokens, latents)
+
+
+def _ids(grid: Tensor, time: int) -> Tensor:
+    rows, columns = (torch.arange(side) for side in grid.shape[2:])
+    return torch.cartesian_prod(torch.tensor([time]), rows, columns, torch.arange(1))
+
+
+def _text_ids(words: Tensor) -> Tensor:
+    zero = torch.arange(1)
+    return torch.cartesian_prod(zero, zero, zero, torch.arange(words.shape[1]))

@@ -1,0 +1,117 @@
+"""FLUX.1 Kontext [dev], the paper's backbone: 11.9 billion parameters, guidance distilled into the transformer."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Final, final
+
+import torch
+from torch import Tensor
+
+from brewster.errors import ModelError
+from brewster.models.diffusion.families.family import Backbone, Licence, StockCall, grid_of, random_prompt
+from brewster.models.diffusion.prompt import PromptEmbedding
+
+_SCHEDULER: Final = {
+    "shift": 3.0, "use_dynamic_shifting": True, "base_shift": 0.5, "max_shift": 1.15,
+    "base_image_seq_len": 256, "max_image_seq_len": 4096,
+}  # fmt: skip
+_VAE: Final = {
+    "down_block_types": ("DownEncoderBlock2D",) * 4, "up_block_types": ("UpDecoderBlock2D",) * 4,
+    "latent_channels": 16, "scaling_factor": 0.3611, "shift_factor": 0.1159,
+    "use_quant_conv": False, "use_post_quant_conv": False,
+}  # fmt: skip
+
+
+@final
+class Kontext(Backbone):
+    """FLUX.1 Kontext [dev] (Black Forest Labs 2025)."""
+
+    name = "kontext"
+    hub_id = "black-forest-labs/FLUX.1-Kontext-dev"
+    licence = Licence(
+        "FLUX.1 [dev] Non-Commercial License",
+        {
+            "license": "other",
+            "license_name": "flux-1-dev-non-commercial-license",
+            "license_link": "https://huggingface.co/black-forest-labs/FLUX.1-Kontext-dev/blob/main/LICENSE.md",
+        },
+        is_commercial=False,
+    )
+    stock_use = StockCall(
+        "text_encoder=None, text_encoder_2=None, tokenizer=None, tokenizer_2=None",
+        'pooled_prompt_embeds=words["pooled"], max_area={area}, _auto_resize=False,',
+        "Without `max_area` and `_auto_resize=False` the pipeline rescales both pictures in silence.",
+    )
+    classes: ClassVar = {
+        "pipeline": "FluxKontextPipeline", "transformer": "FluxTransformer2DModel",
+        "vae": "AutoencoderKL", "scheduler": "FlowMatchEulerDiscreteScheduler",
+    }  # fmt: skip
+    real: ClassVar = {
+        "transformer": {"guidance_embeds": True},
+        "vae": {**_VAE, "block_out_channels": (128, 256, 512, 512), "layers_per_block": 2},
+        "scheduler": _SCHEDULER,
+    }
+    tiny: ClassVar = {
+        "transformer": {
+            "guidance_embeds": True, "num_layers": 2, "num_single_layers": 2, "attention_head_dim": 16,
+            "num_attention_heads": 2, "joint_attention_dim": 32, "pooled_projection_dim": 16,
+            "axes_dims_rope": (4, 6, 6),
+        },
+        "vae": {**_VAE, "block_out_channels": (8, 8, 16, 16), "layers_per_block": 1, "norm_num_groups": 4},
+        "scheduler": _SCHEDULER,
+    }  # fmt: skip
+    guided_by_embedding = True
+
+    def statistics(self) -> tuple[Tensor, Tensor]:
+        """One number each: FLUX.1's VAE has a common shift and scale."""
+        config = self.vae.config
+        mean = torch.tensor(config.shift_factor, device=self.vae.device)
+        deviation = 1 / torch.tensor(config.scaling_factor, device=self.vae.device)
+        return mean.view(1, 1, 1, 1), deviation.view(1, 1, 1, 1)
+
+    def positions(self, latents: Tensor, condition: Tensor) -> Tensor:
+        """(tokens, 3): 0 for generated and 1 for conditioning tokens, row, column."""
+        return torch.cat([_ids(latents, 0), _ids(condition, 1)]).to(self.device)
+
+    def predict(
+        self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float
+    ) -> Tensor:
+        """See Backbone; guidance is a number that the transformer reads.
+
+        Raises:
+            ModelError: a prompt without its summary vector.
+        """
+        if prompt.pooled is None:
+            raise ModelError("the prompt has no pooled vector", "one, from CLIP", "encode the prompt again")
+        count, words = len(latents), prompt.to(self.device, self.dtype)
+        assert words.pooled is not None
+        embeds = self.transformer.config.guidance_embeds
+        tokens = self.transformer(
+            hidden_states=self._tokens(latents, condition),
+            encoder_hidden_states=words.embeds.expand(count, -1, -1),
+            pooled_projections=words.pooled.expand(count, -1),
+            timestep=sigma.to(self.device, self.dtype),
+            guidance=torch.full((count,), guidance, device=self.device) if embeds else None,
+            txt_ids=torch.zeros(words.embeds.shape[1], 3, device=self.device),
+            img_ids=self.positions(latents, condition).float(),
+            return_dict=False,
+        )[0]
+        return grid_of(tokens, latents)
+
+    @classmethod
+    def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a stock pipeline
+        """T5's tokens and CLIP's summary of the prompt."""
+        embeds, pooled, _ = pipeline.encode_prompt(prompt=text, prompt_2=text)
+        return PromptEmbedding(cls.name, text, embeds.detach(), pooled.detach())
+
+    @classmethod
+    def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a stock transformer
+        """Eight random tokens and a random summary."""
+        config = transformer.config
+        shapes = {"embeds": (1, 8, config.joint_attention_dim), "pooled": (1, config.pooled_projection_dim)}
+        return random_prompt(cls.name, seed, **shapes)
+
+
+def _ids(grid: Tensor, picture: int) -> Tensor:
+    rows, columns = (torch.arange(side) for side in grid.shape[2:])
+    return torch.cartesian_prod(torch.tensor([picture]), rows, columns)

@@ -1,0 +1,106 @@
+"""Qwen-Image-Edit: 20 billion parameters, Apache-2.0, the backbone of the strongest published peer (WindowSeat)."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Final, final
+
+import torch
+from torch import Tensor
+
+from brewster.models.diffusion.families.family import (
+    APACHE_2,
+    PATCH,
+    ClassifierFreeBackbone,
+    grid_of,
+    random_prompt,
+)
+from brewster.models.diffusion.prompt import PromptEmbedding
+
+_SCHEDULER: Final = {
+    "shift": 1.0, "use_dynamic_shifting": True, "base_shift": 0.5, "max_shift": 0.9,
+    "base_image_seq_len": 256, "max_image_seq_len": 8192, "shift_terminal": 0.02,
+}  # fmt: skip
+_GREY_SIDE_PX: Final = 448
+
+
+@final
+class Qwen(ClassifierFreeBackbone):
+    """Qwen-Image-Edit (Qwen team 2025); guidance is classifier-free and keeps each token's length.
+
+    Its stock pipeline resizes the condition to a megapixel; here it is seen as it is. Its text encoder looks at the
+    picture, too; here the prompt is encoded once, beside a plain grey picture.
+    """
+
+    name = "qwen"
+    hub_id = "Qwen/Qwen-Image-Edit"
+    licence = APACHE_2
+    stock_use = "but resizes what it is shown to a megapixel, so that its panels are not the ones learnt"
+    words_need = ("torchvision",)
+    classes: ClassVar = {
+        "pipeline": "QwenImageEditPipeline", "transformer": "QwenImageTransformer2DModel",
+        "vae": "AutoencoderKLQwenImage", "scheduler": "FlowMatchEulerDiscreteScheduler",
+    }  # fmt: skip
+    real: ClassVar = {"transformer": {}, "vae": {}, "scheduler": _SCHEDULER}
+    tiny: ClassVar = {
+        "transformer": {
+            "num_layers": 2, "attention_head_dim": 16, "num_attention_heads": 2, "joint_attention_dim": 32,
+            "axes_dims_rope": (4, 6, 6),
+        },
+        "vae": {"base_dim": 8, "num_res_blocks": 1},
+        "scheduler": _SCHEDULER,
+    }  # fmt: skip
+
+    def statistics(self) -> tuple[Tensor, Tensor]:
+        """One pair for each channel of the VAE, the same for the four cells of a patch."""
+        config, device = self.vae.config, self.vae.device
+        mean = torch.tensor(config.latents_mean, device=device).repeat_interleave(PATCH**2)
+        deviation = torch.tensor(config.latents_std, device=device).repeat_interleave(PATCH**2)
+        return mean.view(1, -1, 1, 1), deviation.view(1, -1, 1, 1)
+
+    def positions(self, latents: Tensor, condition: Tensor) -> list[list[tuple[int, int, int]]]:
+        """(frames, rows, columns) of the generated and of the conditioning picture, for each sample.
+
+        The transformer itself turns them into rotary angles, centred on each picture.
+        """
+        shapes = [(1, int(grid.shape[2]), int(grid.shape[3])) for grid in (latents, condition)]
+        return [shapes] * len(latents)
+
+    @classmethod
+    def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a stock pipeline
+        """Qwen2.5-VL's last layer for the prompt beside a grey picture, and for an empty one."""
+        grey = torch.full((3, _GREY_SIDE_PX, _GREY_SIDE_PX), 128, dtype=torch.uint8)
+        embeds, _ = pipeline.encode_prompt(prompt=text, image=grey)
+        negative, _ = pipeline.encode_prompt(prompt=" ", image=grey)
+        return PromptEmbedding(cls.name, text, embeds.detach(), negative=negative.detach())
+
+    @classmethod
+    def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a stock transformer
+        """Eight random tokens, and six for the empty prompt."""
+        width = transformer.config.joint_attention_dim
+        return random_prompt(cls.name, seed, embeds=(1, 8, width), negative=(1, 6, width))
+
+    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, words: Tensor) -> Tensor:
+        tokens = self.transformer(
+            hidden_states=self._tokens(latents, condition),
+            encoder_hidden_states=words.to(self.device, self.dtype).expand(len(latents), -1, -1),
+            timestep=sigma.to(self.device, self.dtype),
+            img_shapes=self.positions(latents, condition),
+            return_dict=False,
+        )[0]
+        return grid_of(tokens, latents)
+
+    def _guided(self, wanted: Tensor, empty: Tensor, guidance: float) -> Tensor:
+        """The direction of the guided prediction, the length of the wanted one, token by token."""
+        combined = super()._guided(wanted, empty, guidance)
+        return combined * (_length(wanted) / _length(combined))
+
+    def _see(self, picture: Tensor) -> Tensor:
+        return self.vae.encode(picture[:, :, None]).latent_dist.mode()[:, :, 0]  # type: ignore[no-any-return]
+
+    def _show(self, latent: Tensor) -> Tensor:
+        return self.vae.decode(latent[:, :, None], return_dict=False)[0][:, :, 0]  # type: ignore[no-any-return]
+
+
+def _length(grid: Tensor) -> Tensor:
+    length: Tensor = torch.linalg.vector_norm(grid, dim=1, keepdim=True)
+    return length

@@ -1,0 +1,119 @@
+"""The one prompt, encoded once and shipped, so that no text encoder is ever loaded again.
+
+"We embed the prompt into the model as a feature specific to the task" (paper, Text-to-image Model Fine-tuning):
+4.8 billion parameters of text encoder are spared at training and at inference.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, final
+
+import torch
+from torch import Tensor
+
+from brewster.errors import ModelError
+from brewster.models.diffusion.tensors import read_tensors, write_tensors
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+PROMPT: Final = (
+    "This set of three images showcases an image decomposition task; "
+    "[IMAGE1] captures an image looking through a transparent glass, both the scene behind the glass and the"
+    " reflection of the glass could be seen; "
+    "[IMAGE2] displays the transmission of glass with reflection removed; "
+    "[IMAGE3] shows only the reflection of glass without transmission; "
+    "[IMAGE1] could be decomposed to [IMAGE2] and [IMAGE3]."
+)
+"""The paper's prompt, word for word (Experimental Setup, box PROMPT); its paragraphs are joined by a space."""
+
+PROMPTS: Final[dict[str, str]] = {
+    "paper": PROMPT,
+    "generic": "Remove the reflection.",
+    "detailed": (
+        "This photograph was taken through a pane of glass. Remove everything that is mirrored in the glass: lamps,"
+        " windows, people and bright haze in front of it. Show only the scene behind the glass, as if the pane were"
+        " not there, with the same framing, sharpness, colours and brightness, and change nothing else."
+    ),
+}
+"""Prompts by name. "generic" and "detailed" are for a backbone without a LoRA (paper, Comparing to original Flux
+model): the paper shows their results and not their words, so that these are ours."""
+
+PROMPT_FILE: Final = "prompt.safetensors"
+_FORMAT: Final = "brewster prompt 1"
+
+
+@final
+@dataclass(frozen=True, eq=False)
+class PromptEmbedding:
+    """A prompt as one backbone's transformer reads it.
+
+    `embeds` (1, tokens, width); `pooled` (1, width) where the backbone wants a summary vector; `negative`
+    (1, tokens, width) is the empty prompt, where guidance needs a second prediction.
+    """
+
+    backbone: str
+    text: str
+    embeds: Float[Tensor, "1 l d"]
+    pooled: Float[Tensor, "1 p"] | None = None
+    negative: Float[Tensor, "1 m d"] | None = None
+
+    @property
+    def tensors(self) -> dict[str, Tensor]:
+        """The tensors by name, those that there are."""
+        named = {"embeds": self.embeds, "negative": self.negative, "pooled": self.pooled}
+        return {name: tensor for name, tensor in named.items() if tensor is not None}
+
+    @property
+    def sha256(self) -> str:
+        """The digest of backbone, text and tensors, whatever file and device they are on."""
+        return _digest(self.backbone, self.text, self.tensors)
+
+    def to(self, device: torch.device | str, dtype: torch.dtype) -> PromptEmbedding:
+        """The same prompt where, and in what precision, the transformer computes."""
+        moved = {name: tensor.to(device, dtype) for name, tensor in self.tensors.items()}
+        return PromptEmbedding(self.backbone, self.text, **moved)
+
+    def save(self, path: Path) -> None:
+        """Writes a safetensors file; the same prompt gives the same bytes.
+
+        Raises:
+            TargetError: the file cannot be written.
+        """
+        about = {"kind": _FORMAT, "backbone": self.backbone, "text": self.text, "sha256": self.sha256}
+        write_tensors(path, self.tensors, about)
+
+
+def load_prompt(path: Path, backbone: str) -> PromptEmbedding:
+    """Reads what `PromptEmbedding.save` wrote, for this backbone.
+
+    Raises:
+        ModelError: missing, damaged, not a prompt, or another backbone's.
+    """
+    tensors, about = read_tensors(path)
+    is_one = about.get("kind") == _FORMAT and {"backbone", "text", "sha256"} <= about.keys()
+    if not (is_one and {"embeds"} <= set(tensors) <= {"embeds", "pooled", "negative"}):
+        raise ModelError(f"{path} is not an encoded prompt", f"a file of kind {_FORMAT!r}", "encode it again")
+    if about["backbone"] != backbone:
+        raise ModelError(
+            f"{path} was encoded for {about['backbone']}",
+            f"a prompt for {backbone}",
+            f"encode it with {backbone}'s text encoder",
+        )
+    if _digest(about["backbone"], about["text"], tensors) != about["sha256"]:
+        raise ModelError(
+            f"{path} does not have the digest that it names", f"{about['sha256'][:12]}...", "copy it again"
+        )
+    return PromptEmbedding(about["backbone"], about["text"], **tensors)
+
+
+def _digest(backbone: str, text: str, tensors: Mapping[str, Tensor]) -> str:
+    digest = hashlib.sha256(f"{backbone}\0{text}".encode())
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"\0{name} {tensor.dtype} {tuple(tensor.shape)}\0".encode())
+        digest.update(tensor.detach().cpu().contiguous().view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()

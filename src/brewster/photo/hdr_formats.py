@@ -1,0 +1,273 @@
+"""Pictures of floats: OpenEXR through its own package, Radiance HDR through a small reader and writer.
+
+Both hold linear light. What else their headers say is kept and written back.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import types
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brewster.errors import MissingExtra, PhotoTooLarge, UnreadablePhoto, UnsupportedPhoto
+from brewster.photo.file_info import FileInfo
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class HdrPixels:
+    """Pixels (H, W, 1|3) float32 of linear light, alpha (H, W) or None, and where they come from."""
+
+    pixels: Float32
+    alpha: Float32 | None
+    origin: FileInfo
+
+
+def too_large(width: int, height: int, most: int) -> PhotoTooLarge:
+    """The error for a picture of more pixels than the limit."""
+    return PhotoTooLarge(
+        f"the picture has {width} x {height} pixels ({width * height / 1e6:.3g} million)",
+        f"the limit is {most / 1e6:g} million",
+        "raise --max-pixels (in Python max_pixels) if you trust it",
+    )
+
+
+def _triangle(stated: Sequence[float | str]) -> tuple[float, ...] | None:
+    """Chromaticities if they span colours; None if they are missing or, as some writers put it, all zero."""
+    try:
+        points = np.array(stated, np.float64).reshape(4, 2)
+    except ValueError:
+        return None
+    red, green, blue, _ = points
+    area = np.linalg.det([green - red, blue - red])
+    spans = np.isfinite(points).all() and points[:, 1].all() and abs(area) > 1e-6
+    return tuple(points.ravel().tolist()) if spans else None
+
+
+# --- OpenEXR
+
+
+def _openexr() -> types.ModuleType:
+    try:
+        import OpenEXR  # noqa: PLC0415  (an extra: only who has EXR files needs it)
+    except ImportError as error:
+        raise MissingExtra(
+            "EXR needs the OpenEXR package", "it is not installed", "run: pip install 'brewster[exr]'"
+        ) from error
+    return OpenEXR  # type: ignore[no-any-return]
+
+
+def read_exr(data: bytes, most: int) -> HdrPixels:
+    """An EXR's first part: R, G, B or Y, and A. Further channels, such as depth, are not carried.
+
+    Raises MissingExtra, PhotoTooLarge, UnreadablePhoto, or UnsupportedPhoto for channels that are no picture.
+    """
+    header = _exr_part(data, header_only=True).header
+    low, high = header["dataWindow"]
+    width, height = (int(side) for side in np.array(high) - np.array(low) + 1)
+    if width * height > most:
+        raise too_large(width, height, most)
+    part = _exr_part(data, header_only=False)
+    return _exr_floats({name: channel.pixels for name, channel in part.channels.items()}, dict(part.header))
+
+
+def _exr_part(data: bytes, *, header_only: bool) -> Any:  # noqa: ANN401  (OpenEXR has no types)
+    exr = _openexr()
+    try:
+        return exr.File(io.BytesIO(data), separate_channels=True, header_only=header_only).parts[0]
+    except (RuntimeError, ValueError, TypeError, IndexError) as error:
+        raise UnreadablePhoto(
+            f"the exr cannot be read whole ({error})", "a whole file is needed", "export it again"
+        ) from error
+
+
+def _exr_floats(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> HdrPixels:
+    names = ["R", "G", "B"] if {"R", "G", "B"} <= channels.keys() else ["Y"]
+    if not set(names) <= channels.keys() or "RY" in channels:
+        raise UnsupportedPhoto(
+            f"the EXR has the channels {', '.join(sorted(channels))}",
+            "a picture has R, G, B or Y, and perhaps A",
+            "export it with these names",
+        )
+    is_half = all(channels[name].dtype == np.float16 for name in names)
+    kept = {key: value for key, value in header.items() if key not in ("channels", "tiles", "type")}
+    return HdrPixels(
+        np.stack([channels[name].astype(np.float32) for name in names], axis=2),
+        channels["A"].astype(np.float32) if "A" in channels else None,
+        FileInfo(
+            container="exr",
+            bits=16 if is_half else 32,
+            primaries=_triangle(header.get("chromaticities", ())),
+            header=kept,
+        ),
+    )
+
+
+def write_exr(floats: HdrPixels) -> bytes:
+    """An EXR of halfs or floats, as the origin's bits say, with the attributes it came with."""
+    exr = _openexr()
+    names = "RGB" if floats.pixels.shape[2] == 3 else "Y"
+    planes = {name: floats.pixels[..., i] for i, name in enumerate(names)}
+    if floats.alpha is not None:
+        planes["A"] = floats.alpha
+    kind: type[np.floating[Any]] = np.float16 if floats.origin.bits == 16 else np.float32
+    most = float(np.finfo(kind).max)
+    channels = {name: plane.clip(-most, most).astype(kind) for name, plane in planes.items()}
+    header = {"compression": exr.ZIP_COMPRESSION, **(floats.origin.header or {}), "type": exr.scanlineimage}
+    file = io.BytesIO()
+    exr.File(header, channels).write(file)
+    return file.getvalue()
+
+
+# --- OpenEXR of several pictures
+
+_LAYER_CHANNELS = ("R", "G", "B")
+_RESERVED = {"channels", "chunkCount", "compression", "dataWindow", "lineOrder", "tiles", "type", "version"}
+"""Attributes that OpenEXR keeps for itself: text under some of these names is dropped without a word."""
+
+
+def write_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -> bytes:
+    """One EXR of several pictures (H, W, 3) of equal size, as halfs, with text attributes beside them.
+
+    Channels are called "photo.R" for the layer "photo", as programs for compositing expect ("Technical
+    Introduction to OpenEXR", layers). Light beyond a half's range, 65504, is clipped. Raises MissingExtra,
+    or UnsupportedPhoto for attributes named as EXR's own.
+    """
+    exr = _openexr()
+    if taken := _RESERVED & header.keys():
+        raise UnsupportedPhoto(
+            f"attributes are called {', '.join(sorted(taken))}", "EXR keeps these names", "choose others"
+        )
+    most = float(np.finfo(np.float16).max)
+    halfs = {name: layer.clip(-most, most).astype(np.float16) for name, layer in layers.items()}
+    channels = {
+        f"{name}.{channel}": np.ascontiguousarray(half[..., i])
+        for name, half in halfs.items()
+        for i, channel in enumerate(_LAYER_CHANNELS)
+    }
+    file = io.BytesIO()
+    said = {**header, "compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
+    exr.File(said, channels).write(file)
+    return file.getvalue()
+
+
+def read_layers(data: bytes) -> dict[str, Float32]:
+    """The pictures (H, W, 3) of an EXR by layer, in the order of their names; other channels are passed over.
+
+    Raises MissingExtra, or UnreadablePhoto if it is no whole EXR or has no layer of R, G and B.
+    """
+    channels = _exr_part(data, header_only=False).channels
+    stems = sorted(name.removesuffix(".R") for name in channels if name.endswith(".R"))
+    names = {stem: [f"{stem}.{channel}" for channel in _LAYER_CHANNELS] for stem in stems}
+    layers = {
+        stem: np.stack([channels[name].pixels.astype(np.float32) for name in three], axis=2)
+        for stem, three in names.items()
+        if channels.keys() >= set(three)
+    }
+    if not layers:
+        raise UnreadablePhoto(
+            f"the EXR has the channels {', '.join(sorted(channels))}",
+            'layers have the channels "name.R", "name.G" and "name.B"',
+            "open it as a photo, or write it again",
+        )
+    return layers
+
+
+# --- Radiance HDR (G. Ward, "Real Pixels", Graphics Gems II; the RADIANCE reference manual)
+
+
+def read_hdr(data: bytes, most: int) -> HdrPixels:
+    """A Radiance picture: red, green and blue with a common exponent.
+
+    Raises PhotoTooLarge, UnreadablePhoto if it is empty or ends early, UnsupportedPhoto for XYZ or turned
+    scan lines.
+    """
+    head, blank, rest = data.partition(b"\n\n")
+    size, _, body = rest.partition(b"\n")
+    sides = re.fullmatch(rb"-Y (\d{1,9}) \+X (\d{1,9})\s*", size)
+    lines = head.decode("latin-1").splitlines()[1:]
+    if not blank or sides is None or any("xyze" in line for line in lines):
+        raise UnsupportedPhoto(
+            f"the HDR picture's header ends in {size[:40]!r}",
+            "brewster reads RGBE pictures with lines from top to bottom, '-Y height +X width'",
+            "export it so",
+        )
+    height, width = int(sides[1]), int(sides[2])
+    if width * height == 0:
+        raise UnreadablePhoto(
+            f"the HDR picture has {width} x {height} pixels", "a picture has at least one", "export it again"
+        )
+    if width * height > most:
+        raise too_large(width, height, most)
+    return HdrPixels(_from_rgbe(_scan_lines(body, width, height)), None, _hdr_origin(lines))
+
+
+def _hdr_origin(lines: list[str]) -> FileInfo:
+    header = dict(line.split("=", 1) for line in lines if "=" in line and not line.startswith("FORMAT"))
+    return FileInfo(
+        container="hdr", bits=32, header=header, primaries=_triangle(header.get("PRIMARIES", "").split())
+    )
+
+
+def _scan_lines(body: bytes, width: int, height: int) -> NDArray[np.uint8]:
+    """Bytes (H, W, 4) of run-length coded or flat lines; lines of 2**15 pixels and more are always flat."""
+    is_coded = width < 1 << 15 and body.startswith(b"\2\2" + width.to_bytes(2, "big"))
+    try:
+        if is_coded:
+            planes = np.frombuffer(_unpacked(body, width, height), np.uint8)
+            return planes.reshape(height, 4, width).swapaxes(1, 2)
+        return np.frombuffer(body, np.uint8, height * width * 4).reshape(height, width, 4)
+    except (IndexError, ValueError) as error:
+        raise UnreadablePhoto(
+            "the hdr cannot be read whole (it ends early)",
+            f"{height} lines were promised",
+            "copy it again from where it came",
+        ) from error
+
+
+def _unpacked(body: bytes, width: int, height: int) -> bytes:
+    """Run-length coded lines: a lead of four bytes; runs of (128 + length, value), (length, values...)."""
+    planes, at = bytearray(), 0
+    for line in range(height):
+        at += 4
+        end = 4 * width * (line + 1)
+        while len(planes) < end:
+            run = body[at]
+            planes += body[at + 1 : at + 2] * (run - 128) if run > 128 else body[at + 1 : at + 1 + run]
+            at += 2 if run > 128 else 1 + run
+    return bytes(planes)
+
+
+def _from_rgbe(rgbe: NDArray[np.uint8]) -> Float32:
+    exponent = rgbe[..., 3].astype(np.int32)
+    scale = np.where(exponent > 0, np.ldexp(np.float32(1), exponent - 136), np.float32(0))
+    pixels: Float32 = rgbe[..., :3].astype(np.float32) * scale[..., None].astype(np.float32)
+    return pixels
+
+
+def _to_rgbe(pixels: Float32) -> NDArray[np.uint8]:
+    """The inverse of `_from_rgbe`, exact for what it made; negative light becomes black."""
+    light = np.fmax(pixels, 0)
+    _, exponent = np.frexp(light.max(axis=2))
+    exponent = np.clip(exponent, -127, 127)
+    mantissa = np.floor(np.ldexp(light, (8 - exponent)[..., None]) + 0.5).clip(0, 255)
+    rgbe = np.concatenate([mantissa, (exponent + 128)[..., None]], axis=2).astype(np.uint8)
+    rgbe[mantissa.max(axis=2) == 0] = 0
+    return rgbe
+
+
+def write_hdr(floats: HdrPixels) -> bytes:
+    """A Radiance picture with flat lines, which every reader takes; grey becomes three equal channels."""
+    height, width = floats.pixels.shape[:2]
+    kept = [f"{key}={value}" for key, value in (floats.origin.header or {}).items()]
+    lines = ["#?RADIANCE", "FORMAT=32-bit_rle_rgbe", *kept]
+    head = "\n".join(lines) + f"\n\n-Y {height} +X {width}\n"
+    pixels = np.broadcast_to(floats.pixels, (height, width, 3))
+    return head.encode("latin-1") + _to_rgbe(pixels).tobytes()

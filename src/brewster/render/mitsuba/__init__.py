@@ -1,0 +1,1 @@
+"""The reference renderer, Mitsuba: against it the analytic renderer is compared."""

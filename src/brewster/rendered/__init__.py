@@ -1,0 +1,1 @@
+"""Rendered samples on disk: the store that reads and writes them, and their generation by many processes."""

@@ -1,0 +1,137 @@
+"""A set seen from above: index.parquet, a row a sample to choose them by, and preview.png, a sheet of the first."""
+
+from __future__ import annotations
+
+import tomllib
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.nn import functional
+
+from brewster.files import arriving, write_atomically
+from brewster.photo import Photo
+from brewster.render.sample import LAYERS
+from brewster.rendered.store import SCENE, STATISTICS, StoredSample, read_set
+
+INDEX, PREVIEW = "index.parquet", "preview.png"
+_ROWS_AT_ONCE: Final = 1000
+
+
+# --- the index
+
+COLUMNS: Final = {
+    "recipe": ("string", "recipe"),
+    "seed": ("int64", "seed"),
+    "orders": ("string", "orders"),
+    "width": ("int64", "camera.width"),
+    "height": ("int64", "camera.height"),
+    "thickness_mm": ("float64", "glass.panes.0.thickness_mm"),
+    "refractive_index": ("float64", "glass.panes.0.index"),
+    "roughness": ("float64", "glass.panes.0.roughness"),
+    "wedge_deg": ("float64", "glass.panes.0.wedge_deg"),
+    "absorption_red_per_m": ("float64", "glass.panes.0.absorption_per_m.0"),
+    "absorption_green_per_m": ("float64", "glass.panes.0.absorption_per_m.1"),
+    "absorption_blue_per_m": ("float64", "glass.panes.0.absorption_per_m.2"),
+    "gap_mm": ("float64", "glass.gap_mm"),
+    "glass_heading_deg": ("float64", "glass.heading_deg"),
+    "glass_pitch_deg": ("float64", "glass.pitch_deg"),
+    "fov_deg": ("float64", "camera.fov_deg"),
+    "aperture_mm": ("float64", "camera.aperture_mm"),
+    "focus_mm": ("float64", "camera.focus_mm"),
+    **{
+        f"{side}_{light}_{name}": (kind, f"{side}.{light}.{path}")
+        for side in ("behind", "front")
+        for light, more in (("map", "radius_mm"), ("plane", "distance_mm"))
+        for name, kind, path in (
+            ("file", "string", "source.file"),
+            ("luminance", "float64", "luminance"),
+            (more, "float64", more),
+        )
+    },
+    "jpeg_quality": ("int64", "development.jpeg_quality"),
+    "exposure_ev": ("float64", "outcome.exposure_ev"),
+    "mirror_exposure_ev": ("float64", "outcome.mirror_exposure_ev"),
+    **{name: ("float64", f"outcome.{name}") for name in STATISTICS},
+    "renderer": ("string", "outcome.renderer"),
+    "version": ("string", "outcome.version"),
+}
+"""A column of the index -> its type and where it stands in scene.toml; of panes, the one nearest to the camera."""
+
+
+def write_index(out: Path) -> None:
+    """Writes index.parquet: a row a sample, in order. Its bytes depend on the samples and their places alone.
+
+    Raises:
+        TargetError: it cannot be written; the disk may be full.
+    """
+    import pyarrow as pa  # noqa: PLC0415  (readers of a set do without it)
+    from pyarrow import parquet  # noqa: PLC0415
+
+    kinds = {"index": "int64", "place": "string", "panes": "int64"} | {
+        name: kind for name, (kind, _) in COLUMNS.items()
+    }
+    schema = pa.schema([(name, pa.type_for_alias(kind)) for name, kind in kinds.items()])
+    rows = map(_row, read_set(out))
+    with arriving(out / INDEX) as part, parquet.ParquetWriter(part, schema) as writer:
+        while some := list(islice(rows, _ROWS_AT_ONCE)):
+            writer.write_batch(pa.RecordBatch.from_pylist(some, schema=schema))
+
+
+def _row(entry: StoredSample) -> dict[str, Any]:
+    scene = tomllib.loads(entry.read(SCENE).decode())
+    own = {"index": entry.index, "place": entry.place.name, "panes": len(scene["glass"]["panes"])}
+    return own | {name: _at(scene, path.split(".")) for name, (_, path) in COLUMNS.items()}
+
+
+def _at(table: Any, path: list[str]) -> Any:  # noqa: ANN401  (what TOML holds)
+    """The value there, or None where the scene has no such part."""
+    for step in path:
+        if isinstance(table, dict) and step not in table:
+            return None
+        table = table[int(step) if isinstance(table, list) else step]
+    return table
+
+
+# --- the contact sheet
+
+_CELL: Final = (120, 160)
+_SHEET_ROWS, _SHEET_COLUMNS = 20, 2
+_WHITE: Final = 255
+
+
+def write_preview(out: Path) -> None:
+    """Writes preview.png: the first forty samples, the five photographs of each in a row.
+
+    Raises:
+        TargetError: it cannot be written.
+    """
+    strips = [_strip(entry) for entry in islice(read_set(out), _SHEET_ROWS * _SHEET_COLUMNS)]
+    columns = [np.concatenate(strips[at : at + _SHEET_ROWS]) for at in range(0, len(strips), _SHEET_ROWS)]
+    if columns:
+        tallest = len(columns[0])
+        padded = [
+            np.pad(column, ((0, tallest - len(column)), (0, 0), (0, 0)), constant_values=_WHITE)
+            for column in columns
+        ]
+        sheet = Photo.from_array(np.concatenate(padded, axis=1), encoding="srgb")
+        write_atomically(out / PREVIEW, sheet.encode("png"), overwrite=True)
+
+
+def _strip(entry: StoredSample) -> NDArray[np.uint8]:
+    return np.concatenate([_cell(entry.read(f"{layer}.jpg")) for layer in LAYERS], axis=1)
+
+
+def _cell(data: bytes) -> NDArray[np.uint8]:
+    """A photograph made small, in the middle of a white cell (120, 160, 3)."""
+    pixels = torch.from_numpy(Photo.open(data).pixels.copy()).permute(2, 0, 1)[None].float()
+    scale = min((cell - 4) / side for cell, side in zip(_CELL, pixels.shape[2:], strict=True))
+    height, width = (max(1, round(side * scale)) for side in pixels.shape[2:])
+    small = functional.interpolate(pixels, (height, width), mode="area")[0].permute(1, 2, 0).round()
+    cell = np.full((*_CELL, 3), _WHITE, np.uint8)
+    top, left = (_CELL[0] - height) // 2, (_CELL[1] - width) // 2
+    cell[top : top + height, left : left + width] = small.byte().numpy()
+    return cell

@@ -1,0 +1,127 @@
+"""The same work on many machines, by Ray: each node writes what it renders into the folder that all of them share.
+
+No pixel passes through the head: it sends indices and gets back what became of them.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import socket
+from types import ModuleType, TracebackType
+from typing import Any, Final, Self, final
+
+from brewster.errors import DeviceError, MissingExtra
+from brewster.rendered.generation.job import RenderJob, RenderResult, RenderTask
+from brewster.rendered.generation.workers import TRIES, TaskRunner
+from brewster.worker_setup import one_thread
+
+LOCAL: Final = "local"
+_PATIENCE_S: Final = 10.0
+_AHEAD: Final = 2
+"""Tasks under way for each processor, so that none waits for the head."""
+
+
+@final
+class RayExecutor:
+    """The crew of a Ray cluster at an address, or of one on this machine alone ("local").
+
+    A task whose node is lost is tried on another.
+    """
+
+    chunk = 4
+
+    def __init__(self, job: RenderJob, address: str = LOCAL, workers: int | None = None) -> None:
+        self._job, self._address, self._workers = job, address, workers
+        self._tasks: dict[Any, RenderTask] = {}
+
+    def has_room(self) -> bool:
+        """Whether a processor may soon be idle; nodes come and go."""
+        processors = int(self._ray.cluster_resources().get("CPU", 1))
+        return len(self._tasks) < _AHEAD * max(1, processors)
+
+    def is_busy(self) -> bool:
+        """Whether any task is under way."""
+        return bool(self._tasks)
+
+    def submit(self, task: RenderTask) -> None:
+        """Sends a task to wherever there is place."""
+        self._tasks[self._perform.remote(self._sent_job, task)] = task
+
+    def wait(self) -> list[RenderResult]:
+        """The results of the next task that is done."""
+        (done, *_), _ = self._ray.wait(list(self._tasks), num_returns=1)
+        task = self._tasks.pop(done)
+        try:
+            results: list[RenderResult] = self._ray.get(done)
+        except self._ray.exceptions.RayError as error:
+            return self._blame(task, type(error).__name__)
+        return results
+
+    def _blame(self, task: RenderTask, why: str) -> list[RenderResult]:
+        """Of several numbers that were lost together, only one may be to blame: each is tried alone."""
+        if len(task.numbers) == 1:
+            return task.lost(f"its process or node was lost {TRIES} times ({why})")
+        for number in task.numbers:
+            self.submit(RenderTask(task.do, (number,)))
+        return []
+
+    def __enter__(self) -> Self:
+        """Joins the cluster, or starts one.
+
+        Raises:
+            MissingExtra: Ray is not installed.
+            DeviceError: no cluster answers at the address.
+        """
+        self._ray = _ray()
+        alone = {"num_cpus": self._workers, "include_dashboard": False} if self._address == LOCAL else {}
+        try:
+            _knock(self._address)
+            self._ray.init(self._address, log_to_driver=False, logging_level="error", **alone)
+        except (OSError, RuntimeError, ValueError) as error:
+            raise DeviceError(
+                f"there is no cluster at {self._address} ({error})",
+                "a Ray cluster that runs, HOST:PORT, or local",
+                "start one: ray start --head",
+            ) from error
+        self._perform = self._ray.remote(max_retries=TRIES - 1, num_cpus=1)(_perform)
+        self._sent_job = self._ray.put(self._job)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Leaves the cluster, which stops what it still does for us."""
+        self._tasks.clear()
+        self._ray.shutdown()
+
+
+def _ray() -> ModuleType:
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reads it when it is imported
+    try:
+        ray = importlib.import_module("ray")
+    except ImportError as error:
+        raise MissingExtra(
+            "a cluster needs the ray package", "it is not installed", "run: pip install 'brewster[cluster]'"
+        ) from error
+    # Ray tells of lost processes on standard output, which belongs to --json, and has no option for that.
+    importlib.import_module("ray._private.worker")._worker_logs_enabled = False  # type: ignore[attr-defined]
+    return ray
+
+
+def _knock(address: str) -> None:
+    """Raises OSError if nobody listens at HOST:PORT: Ray itself would ask there for many minutes."""
+    host, _, port = address.rpartition(":")
+    if host and port.isdigit() and "/" not in host:
+        socket.create_connection((host, int(port)), timeout=_PATIENCE_S).close()
+
+
+_hands: list[tuple[RenderJob, TaskRunner]] = []
+"""Of this process, which does many tasks of one job: the maps that it has read are read once."""
+
+
+def _perform(job: RenderJob, task: RenderTask) -> list[RenderResult]:
+    if not _hands or _hands[0][0] != job:
+        _hands[:] = [(job, TaskRunner(job))]
+    with one_thread():
+        return _hands[0][1](task)

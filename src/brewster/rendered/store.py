@@ -1,0 +1,248 @@
+"""A set of rendered samples on disk: each in a folder of its own or in a shard of a hundred, and an index of all.
+
+    for entry in read_set(Path("out/window")):
+        layers, scene = open_sample(entry)
+
+Everything arrives whole or not at all: it is written under a hidden name, reaches the disk, and is then renamed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import tarfile
+import tomllib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from io import BytesIO
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+import brewster
+from brewster.errors import RecipeError
+from brewster.files import HIDDEN, arriving, discard, hidden_beside, write_atomically
+from brewster.photo import read_layers, write_layers
+from brewster.render.analytic import ghost_distance_px
+from brewster.render.camera_response import DevelopedSample, develop, jpeg, luminance
+from brewster.render.sample import LAYERS, LightSample
+from brewster.scene.scene import Scene
+from brewster.scene.values import wrong_value
+
+Float32 = NDArray[np.float32]
+
+SHARD_SIZE: Final = 100
+LIGHT, SCENE = "layers.exr", "scene.toml"
+FILES: Final = (*(f"{layer}.jpg" for layer in LAYERS), LIGHT, SCENE)
+"""The files of a sample: five photographs, their linear light, and their cause."""
+
+_TRUTH_QUALITY: Final = 95
+_AGAIN: Final = "delete that sample and render the set again"
+
+
+# --- what is written of a sample
+
+
+def _reflection_to_transmission(sample: LightSample, _: DevelopedSample) -> float:
+    reflected, transmitted = (
+        luminance(layer.double().mean((1, 2))) for layer in (sample.reflection, sample.transmission)
+    )
+    return reflected / max(transmitted, 1e-12)
+
+
+STATISTICS: Final[dict[str, Callable[[LightSample, DevelopedSample], float]]] = {
+    "reflection_to_transmission": _reflection_to_transmission,
+    "overexposed": lambda _, developed: developed.overexposed,
+    "ghost_px": lambda sample, _: ghost_distance_px(sample.scene),
+}
+"""Numbers to choose samples by, in every scene.toml and the index: the ratio of mean luminances, the share of
+pixels that are white in any channel, and how far apart the first two mirror images are."""
+
+
+def statistics(sample: LightSample, developed: DevelopedSample) -> dict[str, float]:
+    """Every one of STATISTICS, to six digits."""
+    return {name: float(f"{measure(sample, developed):.6g}") for name, measure in STATISTICS.items()}
+
+
+SAMPLE_FORMAT: Final = 1
+"""Raised when the same job comes to give other samples, so that no set mixes the two; see test_house_formats."""
+
+
+def encode_sample(sample: LightSample, renderer: str) -> dict[str, bytes]:
+    """The files of a sample by name.
+
+    Raises:
+        MissingExtra: OpenEXR is not installed.
+    """
+    developed = develop(sample)
+    made = {"version": brewster.__version__, "renderer": renderer}
+    outcome = {**made, **developed.decisions(), **statistics(sample, developed)}
+    qualities = dict.fromkeys(LAYERS, _TRUTH_QUALITY) | {"photo": sample.scene.development.jpeg_quality}
+    files = {f"{name}.jpg": jpeg(layer, qualities[name]) for name, layer in developed.layers().items()}
+    light = {name: layer.permute(1, 2, 0).float().cpu().numpy() for name, layer in sample.layers().items()}
+    files[LIGHT] = write_layers(light, {"software": f"brewster {brewster.__version__}"})
+    files[SCENE] = sample.scene.to_toml(outcome=outcome).encode()
+    return files
+
+
+# --- folders
+
+
+def key(index: int) -> str:
+    """The name of a sample: its folder, and in a shard what its files' names begin with."""
+    return f"{index:06d}"
+
+
+def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Writes a sample's folder. If another process was faster, its folder stays: it holds the same.
+
+    Raises:
+        TargetError: it cannot be written; the disk may be full.
+    """
+    with arriving(folder) as part:
+        part.mkdir(parents=True)
+        for name, data in files.items():
+            write_atomically(part / name, data)
+
+
+def remove_leftovers(out: Path) -> None:
+    """Removes what killed runs have left half; nobody else may be writing there."""
+    for part in out.glob(f"{HIDDEN}*"):
+        discard(part)
+
+
+# --- shards
+
+
+def shard_name(block: int) -> str:
+    """The shard that holds the samples from 100 * block."""
+    return f"shard-{block:06d}.tar"
+
+
+def pack(out: Path, block: int) -> None:
+    """Moves the finished folders of a block into its shard, beside what that holds already.
+
+    The tar is named as WebDataset reads it (000007.photo.jpg), and its bytes depend on the samples alone.
+
+    Raises:
+        TargetError: it cannot be written; the disk may be full.
+    """
+    entries = list(read_block(out, block))
+    if any(not entry.spans for entry in entries):
+        with (
+            arriving(out / shard_name(block)) as part,
+            tarfile.open(part, "w", format=tarfile.USTAR_FORMAT) as tar,
+        ):
+            for entry in entries:
+                _add(tar, entry)
+    for folder in _folders(out, block):
+        _remove(folder)
+
+
+def has_folders(out: Path, block: int) -> bool:
+    """Whether samples of this block are in folders, finished or left over from packing."""
+    return next(_folders(out, block), None) is not None
+
+
+def _add(tar: tarfile.TarFile, entry: StoredSample) -> None:
+    for name in FILES:
+        data, member = entry.read(name), tarfile.TarInfo(f"{key(entry.index)}.{name}")
+        member.size = len(data)
+        tar.addfile(member, BytesIO(data))
+
+
+def _remove(folder: Path) -> None:
+    """Removes a sample's folder, which must not be seen half: it loses its name first."""
+    doomed = hidden_beside(folder)
+    with contextlib.suppress(OSError):  # another process was faster
+        folder.replace(doomed)
+        discard(doomed)
+
+
+# --- reading
+
+
+@dataclass(frozen=True)
+class StoredSample:
+    """A finished sample: `place` is its folder, or the shard that holds its files at `spans` (offset, length)."""
+
+    index: int
+    place: Path
+    spans: Mapping[str, tuple[int, int]] = field(default_factory=dict, repr=False)
+
+    def read(self, name: str) -> bytes:
+        """The bytes of one of FILES."""
+        if not self.spans:
+            return (self.place / name).read_bytes()
+        offset, length = self.spans[name]
+        with self.place.open("rb") as shard:
+            shard.seek(offset)
+            return shard.read(length)
+
+
+def read_set(out: Path) -> Iterator[StoredSample]:
+    """The finished samples of a set, in the order of their indices, from folders and shards alike."""
+    for block in _blocks(out):
+        yield from read_block(out, block)
+
+
+def read_block(out: Path, block: int) -> Iterator[StoredSample]:
+    """The finished samples of a hundred indices, in order; what is in the shard is not looked for elsewhere."""
+    entries = {int(folder.name): StoredSample(int(folder.name), folder) for folder in _folders(out, block)}
+    entries |= {entry.index: entry for entry in _members(out / shard_name(block))}
+    yield from (entry for _, entry in sorted(entries.items()))
+
+
+def open_sample(entry: StoredSample) -> tuple[dict[str, Float32], Scene]:
+    """The five linear pictures of a sample, (H, W, 3) each, by name, and its scene.
+
+    Raises:
+        MissingExtra: OpenEXR is not installed.
+        PhotoError, RecipeError: its files are damaged.
+    """
+    light = read_layers(entry.read(LIGHT))
+    return {name: light[name] for name in LAYERS}, read_cause(entry)
+
+
+def read_cause(entry: StoredSample) -> Scene:
+    """The scene of a sample.
+
+    Raises:
+        RecipeError: its file is damaged.
+    """
+    try:
+        table = tomllib.loads(entry.read(SCENE).decode())
+        return Scene.model_validate({name: table[name] for name in table if name != "outcome"})
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise RecipeError(f"the scene of {entry.place} is not TOML", "a sample's scene", _AGAIN) from error
+    except ValidationError as error:
+        raise wrong_value(f"the scene of {entry.place}", error, "brewster render --help") from error
+
+
+def _blocks(out: Path) -> list[int]:
+    """The blocks that have a finished sample; a hundred times fewer than samples."""
+    with os.scandir(out) as found:
+        names = (re.fullmatch(r"(?:shard-(\d{6,})\.tar|(\d{6,}))", item.name) for item in found)
+        return sorted({int(name[1]) if name[1] else int(name[2]) // SHARD_SIZE for name in names if name})
+
+
+def _folders(out: Path, block: int) -> Iterator[Path]:
+    for index in range(block * SHARD_SIZE, (block + 1) * SHARD_SIZE):
+        if (out / key(index)).is_dir():
+            yield out / key(index)
+
+
+def _members(shard: Path) -> Iterator[StoredSample]:
+    if not shard.is_file():
+        return
+    spans: dict[int, dict[str, tuple[int, int]]] = {}
+    with tarfile.open(shard, "r:") as tar:
+        for member in tar:
+            stem, _, name = member.name.partition(".")
+            spans.setdefault(int(stem), {})[name] = (member.offset_data, member.size)
+    for index, files in spans.items():
+        yield StoredSample(index, shard, files)

@@ -1,0 +1,52 @@
+"""8-bit mixtures of a rendered sample's own content: the baseline of the paper's ablation (Table 4, Figure 7).
+
+RDNet blends two tone-mapped pictures, I = alpha T + beta R - T o R. Here T is the background and R the mirrored
+scene of a sample, developed as they are, so that both kinds of data show the same two scenes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from random import Random
+from typing import Final
+
+from torch import Tensor
+
+from brewster.render.camera_response import DevelopedSample
+from brewster.scene.scene import Scene
+
+ALPHA: Final = (0.8, 1.0)
+BETA: Final = (0.4, 1.0)
+
+
+def blend(transmission_encoded: Tensor, reflection_encoded: Tensor, alpha: float, beta: float) -> Tensor:
+    """I = alpha T + beta R - T o R of encoded pictures of one shape, rounded to 8 bits, in 0..1 (RDNet)."""
+    t, r = (_eight_bits(layer) for layer in (transmission_encoded, reflection_encoded))
+    return _eight_bits(alpha * t + beta * r - t * r)
+
+
+def blended(developed: DevelopedSample) -> DevelopedSample:
+    """The same content mixed in 8 bits: background for T, beta times the mirrored scene for R, and their blend."""
+    photo, transmission, reflection = blended_layers(
+        developed.background_encoded, developed.mirror_encoded, developed.scene
+    )
+    return replace(
+        developed, photo_encoded=photo, transmission_encoded=transmission, reflection_encoded=reflection
+    )
+
+
+def blended_layers(
+    background_encoded: Tensor, mirror_encoded: Tensor, scene: Scene
+) -> tuple[Tensor, Tensor, Tensor]:
+    """I, T and R of a scene's mixture in 8 bits, (3, H, W) each in 0..1, from its encoded B and MR.
+
+    alpha and beta are drawn by the scene's seed and index, uniform in 0.8..1 and 0.4..1.
+    """
+    dice = Random(f"blend/{scene.seed}/{scene.index}")  # noqa: S311  (data, not secrets)
+    alpha, beta = dice.uniform(*ALPHA), dice.uniform(*BETA)
+    background, mirror = _eight_bits(background_encoded), _eight_bits(mirror_encoded)
+    return blend(background, mirror, alpha, beta), background, _eight_bits(beta * mirror)
+
+
+def _eight_bits(encoded: Tensor) -> Tensor:
+    return (encoded.clamp(0, 1) * 255).round() / 255

@@ -1,0 +1,170 @@
+"""Optical effects of a mixture, on pictures (3, H, W) in linear light: defocus, ghosts, lamps, signs, shadows, windows.
+
+Masks are (1, size, size) in 0..1. All randomness comes from the `SampleRng` that is passed in.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from brewster.training.data.sample_rng import SampleRng
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    Picture = Float[Tensor, "3 h w"]
+    Mask = Float[Tensor, "1 s s"]
+
+
+def blur(picture: Picture, radius_px: float, *, disc: bool) -> Picture:
+    """Defocus: a gaussian of this standard deviation, or a lens's disc of the same spread."""
+    if disc:
+        return _filter(picture, _disc(min(2 * radius_px, 6.0)))
+    reach = max(1, round(3 * radius_px))
+    line = torch.exp(-((torch.arange(-reach, reach + 1) / max(radius_px, 0.1)) ** 2) / 2)
+    line = line / line.sum()
+    return _filter(_filter(picture, line[:, None]), line[None])
+
+
+def ghost(rng: SampleRng, picture: Picture, weight: float, reach_px: float) -> Picture:
+    """Adds the second surface's copy, displaced by whole pixels; the mean stays."""
+    reach = max(1, round(reach_px))
+    down, right = rng.randint(2 * reach + 1), rng.randint(2 * reach + 1)
+    padded = functional.pad(picture[None], (reach,) * 4, mode="replicate")[0]
+    copy = padded[:, down : down + picture.shape[1], right : right + picture.shape[2]]
+    return (picture + weight * copy) / (1 + weight)
+
+
+def lamps(rng: SampleRng, size: int) -> Picture:
+    """One to six small lamps, each a disc with the glow that the lens scatters around it; black elsewhere."""
+    count = 1 + rng.randint(6)
+    x, y = rng.uniform_tensor(2, count, 1, 1) * size
+    rows, columns = _pixels(size)
+    distance = torch.hypot(columns - x, rows - y)
+    radius = torch.exp(math.log(0.004) + math.log(8) * rng.uniform_tensor(count, 1, 1)) * size
+    core = (radius + 0.5 - distance).clamp(0, 1)
+    glow = 0.04 * torch.exp(-distance / (3 * radius))
+    colour = (torch.tensor([0.3, 0, -0.4]) * rng.uniform((-0.5, 1)) + 0.1 * rng.normal(count, 3)).exp()
+    light = rng.log_uniform((3, 60)) * (0.3 + rng.uniform_tensor(count, 1, 1)) * (core + glow)
+    return torch.einsum("nc,nhw->chw", colour, light)
+
+
+def sign(rng: SampleRng, picture: Picture) -> Picture:
+    """Adds rows of random glyphs, as letters of light on the picture, or dark on a lit panel; edges are sharp."""
+    size = picture.shape[-1]
+    rows, columns = 1 + rng.randint(3), 3 + rng.randint(9)
+    glyphs = (rng.uniform_tensor(rows, 5, columns, 3) < 0.55).float()
+    lines = functional.pad(functional.pad(glyphs, (0, 1)).flatten(2), (1, 0, 1, 1)).flatten(0, 1)
+    angle, scale = rng.uniform((-0.4, 0.4)), rng.log_uniform((1.2, 5.0))
+    wide = lines.shape[1] / lines.shape[0]
+    turn = scale * torch.tensor([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+    turn[1] *= wide * rng.uniform((0.6, 1.2))
+    shift = rng.uniform_tensor(2, 1) * 2 - 1
+    grid = functional.affine_grid(torch.cat([turn, shift], 1)[None], [1, 1, size, size], align_corners=False)
+    texture = torch.stack([lines, torch.ones_like(lines)])[None]
+    letters, panel = functional.grid_sample(texture, grid, align_corners=False)[0]
+    letters, panel = (torch.sigmoid(20 * (mask - 0.5)) for mask in (letters, panel))
+    lit = letters if rng.bernoulli(0.6) else panel * (1 - letters)
+    colour = (0.8 * rng.normal(3, 1, 1)).exp()
+    return picture * (1 - 0.7 * panel) + rng.log_uniform((0.8, 6.0)) * colour * lit
+
+
+def falloff(rng: SampleRng, size: int) -> Mask:
+    """A smooth field: where the mirrored side is lit, and where it is dark."""
+    return torch.sigmoid(
+        rng.uniform((1, 6)) * (_noise(rng, size, 2 + rng.randint(4)) + rng.uniform((-0.5, 0.5)))
+    )
+
+
+def edge(rng: SampleRng, size: int) -> Mask:
+    """A half-plane: the reflection ends at a line, such as a frame or a dark body in front of the glass."""
+    return torch.sigmoid(rng.log_uniform((4, 100)) * _line(rng, size))
+
+
+def window(rng: SampleRng, size: int) -> Mask:
+    """Where there is glass: the intersection of one to four half-planes with edges of about a pixel."""
+    inside = torch.stack([_line(rng, size) + 0.3 for _ in range(1 + rng.randint(4))]).amin(dim=0)
+    return torch.sigmoid(size * inside)
+
+
+def shadow(rng: SampleRng, size: int) -> Mask:
+    """A factor on light: hard shadows with straight edges, or those of leaves."""
+    if rng.bernoulli(0.5):
+        lit = torch.stack([_line(rng, size) for _ in range(1 + rng.randint(3))]).amin(dim=0)
+    else:
+        lit = _noise(rng, size, 4 + rng.randint(12)) + 0.7 * _noise(rng, size, 2 + rng.randint(4))
+    lit = torch.sigmoid(rng.log_uniform((10, 2 * size)) * lit)
+    darkest = rng.uniform((0.08, 0.5))
+    return darkest + (1 - darkest) * lit
+
+
+def jpeg(encoded: Picture, quality: int) -> Picture:
+    """An encoded picture after JPEG's loss at this quality, 1..100: 8x8 cosine transform, quantisation, 8 bits.
+
+    Wallace, The JPEG still picture compression standard, CACM 34 (1991), tables K.1 and K.2, colour at full resolution;
+    without the lossless coding, so that it takes a tenth of a codec's time.
+    """
+    scale = 50 / quality if quality < 50 else 2 - quality / 50
+    luma, chroma = (_JPEG_TABLES * scale + 0.5).floor().clamp(1, 255)
+    planes = torch.einsum("yc,chw->yhw", _TO_YCBCR, encoded * 255 - 128).round()
+    rows, columns = planes.shape[1] // 8, planes.shape[2] // 8
+    blocks = planes.view(3, rows, 8, columns, 8).transpose(2, 3)
+    steps = torch.stack([luma, chroma, chroma])[:, None, None]
+    levels = (_COSINES @ blocks @ _COSINES.T / steps).round() * steps
+    planes = (_COSINES.T @ levels @ _COSINES).transpose(2, 3).reshape(planes.shape)
+    decoded = torch.einsum("cy,yhw->chw", _TO_YCBCR.inverse(), planes.round()) + 128
+    return decoded.round().clamp(0, 255) / 255
+
+
+_TO_YCBCR: Final = torch.tensor([
+    [0.299, 0.587, 0.114],
+    [-0.168736, -0.331264, 0.5],
+    [0.5, -0.418688, -0.081312],
+])  # fmt: skip
+_JPEG_TABLES: Final = torch.tensor([
+    [16, 11, 10, 16, 24, 40, 51, 61, 12, 12, 14, 19, 26, 58, 60, 55, 14, 13, 16, 24, 40, 57, 69, 56,
+     14, 17, 22, 29, 51, 87, 80, 62, 18, 22, 37, 56, 68, 109, 103, 77, 24, 35, 55, 64, 81, 104, 113, 92,
+     49, 64, 78, 87, 103, 121, 120, 101, 72, 92, 95, 98, 112, 100, 103, 99],
+    [17, 18, 24, 47, 99, 99, 99, 99, 18, 21, 26, 66, 99, 99, 99, 99, 24, 26, 56, 99, 99, 99, 99, 99,
+     47, 66, 99, 99, 99, 99, 99, 99, *[99] * 32],
+]).view(2, 8, 8)  # fmt: skip
+_COSINES: Final = torch.cat([torch.full((1, 8), math.sqrt(1 / 8)), 0.5 * torch.cos(
+    torch.arange(1, 8)[:, None] * (2 * torch.arange(8)[None] + 1) * math.pi / 16
+)])  # fmt: skip
+"""The orthonormal discrete cosine transform of eight values."""
+
+
+def _pixels(size: int) -> tuple[Tensor, Tensor]:
+    """Row and column numbers of pixel centres."""
+    centres = torch.arange(size) + 0.5
+    return centres[:, None], centres[None]
+
+
+def _line(rng: SampleRng, size: int) -> Mask:
+    """Signed distance to a random line, in half pictures."""
+    angle, offset = rng.uniform((0, 2 * math.pi)), rng.uniform((-0.5, 0.5))
+    rows, columns = (2 * centres / size - 1 for centres in _pixels(size))
+    return (columns * math.cos(angle) + rows * math.sin(angle) + offset)[None]
+
+
+def _noise(rng: SampleRng, size: int, cells: int) -> Mask:
+    """Smooth noise of unit variance at its `cells` x `cells` nodes."""
+    return functional.interpolate(rng.normal(1, 1, cells, cells), (size, size), mode="bicubic")[0]
+
+
+def _disc(radius_px: float) -> Tensor:
+    reach = max(1, math.ceil(radius_px))
+    y, x = torch.meshgrid(*[torch.arange(-reach, reach + 1.0)] * 2, indexing="ij")
+    disc = (radius_px + 0.5 - torch.hypot(x, y)).clamp(0, 1)
+    return disc / disc.sum()
+
+
+def _filter(picture: Picture, kernel: Tensor) -> Picture:
+    rows, columns = (side // 2 for side in kernel.shape)
+    padded = functional.pad(picture[None], (columns, columns, rows, rows), mode="replicate")
+    return functional.conv2d(padded.transpose(0, 1), kernel[None, None]).transpose(0, 1)[0]

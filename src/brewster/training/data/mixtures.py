@@ -1,0 +1,328 @@
+"""Linear-light mixtures of photographs: training data without a renderer, live and without end.
+
+    stream = Mixtures(read_photos([Path("photos")]), read_maps([Path("hdri")]), MixRecipe(), seed=7)
+    batch = stream(step=0, count=8, size=192)
+
+Each sample is a function of (seed, step, slot) alone. In linear light photo = T + R + veil with T = t B: the
+transmission T is the background B behind a pane of transmittance t.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, Final, Literal, Protocol
+
+import torch
+from pydantic import Field
+from torch import Tensor
+from torch.nn import functional
+
+from brewster.scene.values import FrozenModel, LogRange, Range, Share
+from brewster.srgb import to_encoded, to_linear
+from brewster.training.data import effects
+from brewster.training.data.sample_rng import SampleRng
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+
+    Picture = Float[Tensor, "3 h w"]
+
+_REFERENCE_SIZE: Final = 256
+"""Lengths in a recipe are pixels of a picture of this size, and scale with the size asked for."""
+
+
+@dataclass(frozen=True)
+class TrainingBatch:
+    """Encoded pictures, each (N, 3, S, S) in 0..1, and how far each reflection truth is to be trusted, (N,)."""
+
+    photo_encoded: Tensor
+    transmission_encoded: Tensor
+    reflection_encoded: Tensor
+    reflection_weight: Tensor
+
+    @classmethod
+    def of(cls, layers: Tensor) -> TrainingBatch:
+        """Samples whose truths are certain, from (N, 9, S, S): photo, transmission and reflection as channels."""
+        photo, transmission, reflection = layers.chunk(3, dim=1)
+        return cls(photo, transmission, reflection, torch.ones(len(layers), device=layers.device))
+
+    def to(self, device: torch.device) -> TrainingBatch:
+        """The same batch on another device."""
+        return TrainingBatch(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+
+    def split(self, most: int) -> list[TrainingBatch]:
+        """The same samples in batches of at most so many."""
+        parts = zip(*(getattr(self, name).split(most) for name in self.__dataclass_fields__), strict=True)
+        return [TrainingBatch(*tensors) for tensors in parts]
+
+
+class Stream(Protocol):
+    """Where training data comes from: a function of the step, so that a resumed run sees the same data."""
+
+    def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
+        """The batch of this step: `count` samples of `size` px a side."""
+        ...
+
+
+Target = Literal["background", "transmission"]
+"""What a network learns to find behind the glass: the background B, photographed with the glass taken away, or the
+transmission T, which is what the pane lets through of it: photo = T + R in linear light."""
+
+
+class MixRecipe(FrozenModel):
+    """The distributions of a mixture; ranges are uniform, `_log` ranges uniform in the logarithm.
+
+    The defaults are those that the shipped model learns from; a recipe names what it changes. Luminances are linear,
+    lengths in pixels are those of a picture of 256 px.
+    """
+
+    target: Target = "transmission"
+    crop: Range = (0.35, 1.0)
+    """Side of the crop over the photo's shorter side."""
+    temperature: Range = (-0.35, 0.35)
+    background_map_probability: Share = 0.2
+    """Share of backgrounds that are views of an HDR map instead of a photo."""
+    background_level_log: LogRange = (0.03, 0.5)
+    """Mean luminance of the background before the camera's exposure."""
+    highlight_boost: Range = (0.0, 6.0)
+    """How many times brighter the white parts of a photo become: their true luminance was clipped."""
+    shadow_probability: Share = 0.15
+    """Share of backgrounds with a hard shadow."""
+
+    absent_probability: Share = 0.12
+    """Share of samples without glass, from which a network learns to leave plain photos alone."""
+    partial_probability: Share = 0.12
+    """Share of samples whose glass covers a part of the picture only."""
+    transmittance: Range = (0.85, 1.0)
+    veil_probability: Share = 0.1
+    veil: Range = (0.0, 0.1)
+    """Scattered light of the pane, uniform, over the mean of the photo."""
+
+    reflection_map_probability: Share = 0.4
+    reflection_ratio_log: LogRange = (0.04, 2.0)
+    """Mean of the reflection, its lamps left out, over the mean of the background."""
+    reflection_contrast_log: LogRange = (0.8, 1.8)
+    """Exponent on the reflected scene's luminance: the unlit side of the glass mirrors little but its lights."""
+    lamp_probability: Share = 0.15
+    sign_probability: Share = 0.08
+    sharp_probability: Share = 0.45
+    blur_px_log: LogRange = (0.3, 5.0)
+    ghost_probability: Share = 0.4
+    ghost_weight: Range = (0.4, 0.95)
+    ghost_px: float = 6.0
+    falloff_probability: Share = 0.5
+    edge_probability: Share = 0.3
+
+    exposure: Range = (0.2, 0.55)
+    """The largest mean luminance of the exposed photo."""
+    overexposed_probability: Share = 0.2
+    """Share of photos that are exposed so long that a part of the background is white."""
+    overexposed_share: Range = (0.005, 0.15)
+    gamma_log: LogRange = (0.8, 1.25)
+    contrast: Range = (-0.3, 0.5)
+    noise: Range = (0.0, 0.012)
+    jpeg_probability: Share = 0.3
+    jpeg_quality: tuple[Annotated[int, Field(ge=1, le=100)], Annotated[int, Field(ge=1, le=100)]] = (60, 97)
+
+
+class Mixtures:
+    """A `Stream` of mixtures of photos (uint8, (H, W, 3), sRGB) and HDR maps (half, (3, H, 2 H), linear).
+
+    `weights` are the relative frequencies of the photos; by default all are equal.
+    """
+
+    def __init__(
+        self,
+        photos: Sequence[Tensor],
+        maps: Sequence[Tensor],
+        recipe: MixRecipe,
+        *,
+        seed: int,
+        weights: Sequence[float] | None = None,
+    ) -> None:
+        self._photos, self._maps, self._recipe, self._seed = photos, maps, recipe, seed
+        self._cumulative = torch.tensor(weights or [1.0] * len(photos), dtype=torch.float64).cumsum(0)
+
+    def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
+        """The batch of this step: `count` samples of `size` px a side."""
+        samples = [self._sample(SampleRng(self._seed, step, slot), size) for slot in range(count)]
+        photo, transmission, reflection = (torch.stack(layer) for layer in zip(*samples, strict=True))
+        return TrainingBatch(photo, transmission, reflection, torch.ones(count))
+
+    def _sample(self, rng: SampleRng, size: int) -> tuple[Tensor, Tensor, Tensor]:
+        recipe = self._recipe
+        background = self._background(rng, size)
+        reflection = self._reflection(rng, size) * background.mean()
+        if rng.bernoulli(recipe.absent_probability):
+            return _photograph(rng, recipe, background, background, torch.zeros_like(background))
+        glass = effects.window(rng, size) if rng.bernoulli(recipe.partial_probability) else torch.ones(1)
+        transmittance = rng.uniform(recipe.transmittance) * (1 + 0.02 * rng.normal(3, 1, 1))
+        transmission, reflection = background * (1 + glass * (transmittance - 1)), reflection * glass
+        photo = transmission + reflection
+        if rng.bernoulli(recipe.veil_probability):
+            photo = photo + glass * rng.uniform(recipe.veil) * photo.mean(dim=(1, 2), keepdim=True)
+        target = transmission if recipe.target == "transmission" else background
+        return _photograph(rng, recipe, photo, target, reflection)
+
+    def _background(self, rng: SampleRng, size: int) -> Picture:
+        recipe = self._recipe
+        view = self._view(rng, size, recipe.background_map_probability)
+        if rng.bernoulli(recipe.shadow_probability):
+            view = view * effects.shadow(rng, size)
+        level = rng.log_uniform(recipe.background_level_log)
+        return view * _temperature(rng, recipe.temperature) * (level / _mean_without_lamps(view))
+
+    def _reflection(self, rng: SampleRng, size: int) -> Picture:
+        """A reflection for a background of mean 1: blurred, doubled, fading and cut off, in linear light."""
+        recipe, scale = self._recipe, size / _REFERENCE_SIZE
+        view = self._view(rng, size, recipe.reflection_map_probability)
+        view = view / _mean_without_lamps(view)
+        view = view * (view.mean(dim=0) + 1e-4) ** (rng.log_uniform(recipe.reflection_contrast_log) - 1)
+        view = view / _mean_without_lamps(view) * _temperature(rng, recipe.temperature)
+        if rng.bernoulli(recipe.sign_probability):
+            view = effects.sign(rng, view)
+        if not rng.bernoulli(recipe.sharp_probability):
+            view = effects.blur(view, rng.log_uniform(recipe.blur_px_log) * scale, disc=rng.bernoulli(0.5))
+        if rng.bernoulli(recipe.lamp_probability):
+            view = view + effects.lamps(rng, size)
+        if rng.bernoulli(recipe.ghost_probability):
+            view = effects.ghost(rng, view, rng.uniform(recipe.ghost_weight), recipe.ghost_px * scale)
+        if rng.bernoulli(recipe.falloff_probability):
+            view = view * effects.falloff(rng, size)
+        if rng.bernoulli(recipe.edge_probability):
+            view = view * effects.edge(rng, size)
+        return view * rng.log_uniform(recipe.reflection_ratio_log)
+
+    def _view(self, rng: SampleRng, size: int, map_probability: float) -> Picture:
+        if self._maps and rng.bernoulli(map_probability):
+            return _look_into(rng, self._maps[rng.randint(len(self._maps))], size)
+        crop = random_crop(rng, self._photos[self._choose_photo(rng)], self._recipe.crop, size)
+        bright = ((crop.amax(dim=0, keepdim=True) - 0.8) / 0.2).clamp(0, 1)
+        return crop * (1 + rng.uniform(self._recipe.highlight_boost) * bright**2)
+
+    def _choose_photo(self, rng: SampleRng) -> int:
+        point = rng.uniform((0, float(self._cumulative[-1])))
+        return min(int(torch.searchsorted(self._cumulative, point, right=True)), len(self._photos) - 1)
+
+
+class Pairs:
+    """A `Stream` of aligned real pairs (uint8, (H, W, 3), sRGB): photo and the same view without glass."""
+
+    reflection_weight = 0.3  # its truth is only what photo - transmission leaves
+
+    def __init__(self, pairs: Sequence[tuple[Tensor, Tensor]], crop: Range, *, seed: int) -> None:
+        self._pairs, self._crop, self._seed = pairs, crop, seed
+
+    def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
+        """The batch of this step: `count` samples of `size` px a side."""
+        samples = [self._sample(SampleRng(self._seed, step, slot), size) for slot in range(count)]
+        photo, transmission = (torch.stack(layer) for layer in zip(*samples, strict=True))
+        reflection = (photo - transmission).clamp(min=0)
+        weight = torch.full((count,), self.reflection_weight)
+        return TrainingBatch(to_encoded(photo), to_encoded(transmission), to_encoded(reflection), weight)
+
+    def _sample(self, rng: SampleRng, size: int) -> tuple[Tensor, Tensor]:
+        both = torch.cat(self._pairs[rng.randint(len(self._pairs))], dim=2)
+        crop = random_crop(rng, both, self._crop, size)
+        return crop[:3], crop[3:]
+
+
+class InterleavedStream:
+    """A `Stream` that takes a share of each batch from one stream and the rest from another; blends may nest.
+
+    A batch comes on the accelerator if any part does, as what was rendered there should not travel twice.
+    """
+
+    def __init__(self, first: Stream, second: Stream, first_share: float) -> None:
+        self._first, self._second, self._share = first, second, first_share
+
+    def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
+        """The batch of this step: `count` samples of `size` px a side."""
+        first_count = round(count * self._share)
+        counts = (self._first, first_count), (self._second, count - first_count)
+        parts = [stream(step, some, size) for stream, some in counts if some]
+        device = max((part.photo_encoded.device for part in parts), key=lambda device: device.type != "cpu")
+        names = TrainingBatch.__dataclass_fields__
+        return TrainingBatch(
+            *(torch.cat([getattr(part.to(device), name) for part in parts]) for name in names)
+        )
+
+
+def _photograph(rng: SampleRng, recipe: MixRecipe, *layers: Picture) -> tuple[Picture, Picture, Picture]:
+    """One exposure and one tone curve for photo, target and reflection; noise, JPEG and 8 bits for the photo."""
+    exposure = min(1.0, rng.uniform(recipe.exposure) / layers[0].clamp(max=1).mean().item())
+    if rng.bernoulli(recipe.overexposed_probability):
+        white = _quantile(layers[1].amax(dim=0), 1 - rng.uniform(recipe.overexposed_share))
+        exposure = max(exposure, 1 / (white + 1e-3))
+    gamma, contrast = rng.log_uniform(recipe.gamma_log), rng.uniform(recipe.contrast)
+
+    def develop(linear: Picture) -> Picture:
+        encoded = to_encoded((linear * exposure).clamp(0, 1)) ** gamma
+        return encoded + contrast * (encoded * encoded * (3 - 2 * encoded) - encoded)
+
+    photo, target, reflection = (develop(layer) for layer in layers)
+    noise = rng.uniform(recipe.noise) * rng.normal(*photo.shape)
+    photo = ((photo + noise).clamp(0, 1) * 255).round() / 255
+    if rng.bernoulli(recipe.jpeg_probability):
+        low, high = recipe.jpeg_quality
+        photo = effects.jpeg(photo, low + rng.randint(high - low + 1))
+    return photo, target, reflection
+
+
+def random_crop(rng: SampleRng, picture: Tensor, fraction: Range, size: int) -> Tensor:
+    """A random window, maybe mirrored, in linear light: (H, W, C) sRGB uint8 to (C, size, size).
+
+    `fraction` is the range of the window's side over the picture's shorter one.
+    """
+    height, width, _ = picture.shape
+    side = min(height, width) * rng.uniform(fraction)
+    stretch = math.sqrt(rng.log_uniform((0.85, 1.18)))
+    rows, columns = (max(8, min(limit, round(length))) for limit, length in (
+        (height, side * stretch), (width, side / stretch)))  # fmt: skip
+    top, left = rng.randint(height - rows + 1), rng.randint(width - columns + 1)
+    window = _light_of(picture[top : top + rows, left : left + columns]).permute(2, 0, 1)
+    if rng.bernoulli(0.5):
+        window = window.flip(2)
+    return functional.interpolate(window[None], (size, size), mode="bilinear", antialias=True)[0].clamp(min=0)
+
+
+_LINEAR_OF_BYTE: Final = to_linear(torch.arange(256) / 255)
+
+
+def _light_of(encoded: Tensor) -> Tensor:
+    """Linear light of sRGB bytes, by a table; in one row, as torch looks up a row much faster than a picture."""
+    return _LINEAR_OF_BYTE.index_select(0, encoded.reshape(-1).int()).view(encoded.shape)
+
+
+def _look_into(rng: SampleRng, lat_long: Tensor, size: int) -> Picture:
+    """A perspective view into a lat-long map (3, H, 2 H): any heading, level within 20 degrees."""
+    half = math.tan(math.radians(rng.uniform((50, 100))) / 2)
+    heading, pitch = rng.uniform((-math.pi, math.pi)), math.radians(rng.uniform((-20, 20)))
+    down, right = torch.meshgrid(*[torch.linspace(-half, half, size)] * 2, indexing="ij")
+    y = -down * math.cos(pitch) + math.sin(pitch)
+    z = down * math.sin(pitch) + math.cos(pitch)
+    longitude = torch.remainder(torch.atan2(right, z) + heading + math.pi, 2 * math.pi) / math.pi - 1
+    latitude = torch.atan2(-y, torch.hypot(right, z)) / (math.pi / 2)
+    grid = torch.stack([longitude, latitude], dim=-1)[None]
+    view = functional.grid_sample(lat_long[None].float(), grid, align_corners=False, padding_mode="border")
+    return view[0].clamp(min=0)
+
+
+def _mean_without_lamps(picture: Picture) -> Tensor:
+    """The mean of what is not brighter than the 95th percentile, so that a lamp does not set the exposure."""
+    return picture.clamp(max=_quantile(picture, 0.95)).mean() + 1e-4
+
+
+def _quantile(picture: Tensor, share: float) -> float:
+    """Estimated from every 29th value: a full sort would take as long as all the rest of a sample."""
+    values = picture.flatten()[::29]
+    return values.kthvalue(max(1, round(share * len(values)))).values.item()
+
+
+def _temperature(rng: SampleRng, bounds: Range) -> Tensor:
+    """Gains of a warmer or colder light, (3, 1, 1)."""
+    warmth = rng.uniform(bounds)
+    gains = torch.tensor([warmth, 0, -warmth]) + 0.05 * rng.normal(3)
+    return gains.exp()[:, None, None]

@@ -1,0 +1,47 @@
+"""What a run tells TensorBoard beside its log: `tensorboard --logdir OUT`; nothing where tensorboard is not installed."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, final
+
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from jaxtyping import Float
+    from torch.utils.tensorboard import SummaryWriter
+
+PICTURE = "samples"
+
+
+@final
+class TensorBoardLog:
+    """Event files in a folder, from the step on that a run goes on from: what was told of later steps is forgotten."""
+
+    def __init__(self, folder: Path, begun: int) -> None:
+        self._folder, self._begun = folder, begun
+
+    def tell(self, step: int, numbers: Mapping[str, float], encoded: Float[Tensor, "h w 3"]) -> None:
+        """Writes each number as a scalar, and the picture, sRGB-encoded in 0..1."""
+        if self._writer:
+            for name, value in numbers.items():
+                self._writer.add_scalar(name, value, step)
+            self._writer.add_image(PICTURE, encoded.clamp(0, 1), step, dataformats="HWC")
+            self._writer.flush()
+
+    def close(self) -> None:
+        """Nothing more is told."""
+        if "_writer" in vars(self) and self._writer:
+            self._writer.close()
+
+    @cached_property
+    def _writer(self) -> SummaryWriter | None:
+        """Opened when there is something to tell, so that a run that has ended leaves no empty file."""
+        if not importlib.util.find_spec("tensorboard"):
+            return None
+        from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  (wakes tensorboard)
+
+        return SummaryWriter(self._folder, purge_step=self._begun + 1)

@@ -1,0 +1,262 @@
+"""From answers to results, in plain values that JSON keeps for good; and the files of a report.
+
+    results = summarise(study, people(store.everything()), Rule())
+    write(results, Path("report"))
+
+Everything is told twice: of those whom the rule keeps, and of everyone.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+import brewster
+from brewster.errors import BrewsterError
+from brewster.files import write_atomically
+from brewster.user_study.report.bradley_terry import strengths
+from brewster.user_study.report.figure import plot
+from brewster.user_study.report.krippendorff import alpha
+from brewster.user_study.report.participants import OUTCOMES, ExclusionRule, ParticipantAnswers
+from brewster.user_study.report.statistics import (
+    correlation,
+    interval,
+    least,
+    rates,
+    resampled,
+    summed,
+    widened,
+)
+from brewster.user_study.report.tables import to_csv, to_latex, to_markdown
+from brewster.user_study.study import Study
+
+AVERAGES: Final = {
+    "/average": "Average",
+    "/datasets": "Mean of the datasets",
+    "/answers": "All answers together",
+}
+"""The rows below the datasets. No dataset is called so, with a slash.
+
+The first weights each dataset by its number of pictures, as the paper does."""
+_DIGITS: Final = 6
+_EQUAL: Final = 1e-6
+
+Results = dict[str, Any]
+"""What report.json holds: see docs/study.md."""
+Floats = NDArray[np.float64]
+
+
+def summarise(study: Study, people: Sequence[ParticipantAnswers], rule: ExclusionRule) -> Results:
+    """The results of a study.
+
+    Raises:
+        BrewsterError: nobody has answered yet.
+    """
+    if not any(person.votes for person in people):
+        raise BrewsterError(
+            f"{study.folder} has no answers yet",
+            "a report needs some",
+            "send out the address that `brewster study serve` prints",
+        )
+    reasons = [rule.reason(person) for person in people]
+    kept = [person for person, reason in zip(people, reasons, strict=True) if reason is None]
+    description = study.description
+    return {
+        "brewster": brewster.__version__,
+        "study": {
+            "seed": description.seed,
+            "methods": list(description.methods),
+            "datasets": {name: _titled(name) for name in description.datasets},
+            "comparisons": len(description.comparisons),
+            "pairs": description.pairs,
+            "catches": description.catches,
+        },
+        "rule": str(rule),
+        "excluded": {reason: reasons.count(reason) for reason in ("failed", "fast")},
+        "left_out": {
+            str(person.number): reason
+            for person, reason in zip(people, reasons, strict=True)
+            if reason is not None
+        },
+        "kept": _group(study, kept),
+        "everyone": _group(study, people),
+    }
+
+
+def _titled(dataset: str) -> str:
+    if dataset in AVERAGES.values():
+        return f"{dataset} (dataset)"
+    return dataset or "All pictures"
+
+
+def _group(study: Study, people: Sequence[ParticipantAnswers]) -> dict[str, Any]:
+    """All that is said about some of the participants."""
+    people = [person for person in people if person.votes]
+    told = {
+        "participants": len(people),
+        "complete": sum(person.is_complete for person in people),
+        "answers": sum(len(person.votes) for person in people),
+        "catches": sum(person.catches for person in people),
+        "failed": sum(person.failed for person in people),
+        "tables": [],
+        "strengths": {},
+        "agreement": None,
+    }
+    if not people:
+        return told
+    counts, pictures = _counts(study, people), _pictures(study)
+    times = resampled(len(people))
+    agreement = alpha(_ratings(study, people))
+    return told | {
+        "tables": _tables(study, counts, pictures, times),
+        "strengths": _strengths(study, counts, times),
+        "agreement": None if agreement is None else round(agreement, _DIGITS),
+    }
+
+
+# --- counting
+
+
+def _counts(study: Study, people: Sequence[ParticipantAnswers]) -> Floats:
+    """How often the first method won, tied, lost: (participants, pairs of methods, datasets, 3)."""
+    places = _places(study)
+    shape = len(study.pairs_of_methods), len(study.description.datasets), len(OUTCOMES)
+    counts = np.zeros((len(people), *shape))
+    for i, person in enumerate(people):
+        for comparison, outcome in person.votes.items():
+            counts[i, *places[comparison], outcome] += 1
+    return counts
+
+
+def _places(study: Study) -> list[tuple[int, int]]:
+    """Of each comparison, the numbers of its pair of methods and of its dataset."""
+    pairs = {pair: i for i, pair in enumerate(study.pairs_of_methods)}
+    datasets = {name: i for i, name in enumerate(study.description.datasets)}
+    return [(pairs[row.methods], datasets[row.dataset]) for row in study.description.comparisons]
+
+
+def _pictures(study: Study) -> Floats:
+    """How many pictures each pair of methods has of each dataset."""
+    pictures = np.zeros((len(study.pairs_of_methods), len(study.description.datasets)))
+    np.add.at(pictures, tuple(np.array(_places(study)).T), 1)
+    return pictures
+
+
+def _ratings(study: Study, people: Sequence[ParticipantAnswers]) -> Floats:
+    """How often each comparison was given each outcome."""
+    ratings = np.zeros((len(study.description.comparisons), len(OUTCOMES)))
+    for person in people:
+        np.add.at(ratings, (list(person.votes), list(person.votes.values())), 1)
+    return ratings
+
+
+# --- estimating
+
+
+def _tables(study: Study, counts: Floats, pictures: Floats, times: Floats) -> list[dict[str, Any]]:
+    """A table for each pair of methods: a row for each dataset, then the averages."""
+    means = rates(counts.sum(axis=0), pictures)
+    ends = interval(rates(summed(times, counts), pictures), len(counts))
+    lows, highs = widened(means, ends, least(counts, pictures))
+    titles = {name: _titled(name) for name in study.description.datasets} | AVERAGES
+    answers = counts.sum(axis=(0, 3))
+    return [
+        {
+            "first": first,
+            "second": second,
+            "correlation": _rounded(correlation(counts[:, i].sum(axis=1))),
+            "rows": [
+                {
+                    "key": key,
+                    "title": title,
+                    "pictures": int(pictures[i, j] if j < answers.shape[1] else pictures[i].sum()),
+                    "answers": int(answers[i, j] if j < answers.shape[1] else answers[i].sum()),
+                    **{
+                        name: _estimate(*(part[i, j, k] for part in (means, lows, highs)))
+                        for k, name in enumerate((*OUTCOMES, "difference"))
+                    },
+                }
+                for j, (key, title) in enumerate(titles.items())
+            ],
+        }
+        for i, (first, second) in enumerate(study.pairs_of_methods)
+    ]
+
+
+def _strengths(study: Study, counts: Floats, times: Floats) -> dict[str, Any]:
+    """Of each method; without an interval where a resample has a method that only won or lost, or all are alike."""
+    wins = _wins(study, counts)
+    means = strengths(wins.sum(axis=0))
+    draws = strengths(summed(times, wins))
+    lows, highs = (
+        interval(draws, len(counts))
+        if np.isfinite(draws).all() and np.ptp(draws, axis=0).min() > _EQUAL
+        else np.full((2, len(means)), math.nan)
+    )
+    return {
+        method: _estimate(*(part[i] for part in (means, lows, highs)))
+        for i, method in enumerate(study.description.methods)
+    }
+
+
+def _wins(study: Study, counts: Floats) -> Floats:
+    """How often each method beat each other one, a tie being half a win for both: (participants, m, m)."""
+    methods = study.description.methods
+    wins = np.zeros((len(counts), len(methods), len(methods)))
+    for i, (first, second) in enumerate(study.pairs_of_methods):
+        won, tied, lost = np.moveaxis(counts[:, i].sum(axis=1), -1, 0)
+        a, b = methods.index(first), methods.index(second)
+        wins[:, a, b] += won + tied / 2
+        wins[:, b, a] += lost + tied / 2
+    return wins
+
+
+def _estimate(mean: float, low: float, high: float) -> dict[str, float | None]:
+    return {"mean": _rounded(mean), "low": _rounded(low), "high": _rounded(high)}
+
+
+def _rounded(value: float | None) -> float | None:
+    """None for what has no value."""
+    return None if value is None or not math.isfinite(value) else round(float(value), _DIGITS)
+
+
+# --- writing
+
+
+def write(results: Results, study: Study, people: Sequence[ParticipantAnswers], out: Path) -> None:
+    """Writes all files of a report, over those of an earlier one.
+
+    Raises:
+        TargetError: one cannot be written.
+    """
+    files = {
+        "report.json": f"{json.dumps(results, indent=1, ensure_ascii=False)}\n".encode(),
+        "report.md": to_markdown(results).encode(),
+        "table.tex": to_latex(results).encode(),
+        "table.csv": to_csv(results).encode(),
+        "answers.csv": _answers_csv(results, study, people).encode(),
+        "plot.png": plot(results),
+    }
+    for name, data in files.items():
+        write_atomically(out / name, data, overwrite=True)
+
+
+def _answers_csv(results: Results, study: Study, people: Sequence[ParticipantAnswers]) -> str:
+    """A line for each answer about a comparison, for other people's statistics; `left_out` says by what rule, if so."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["participant", "dataset", "name", "first", "second", "outcome", "left_out"])
+    for person in people:
+        reason = results["left_out"].get(str(person.number), "")
+        for number, outcome in sorted(person.votes.items()):
+            row = study.description.comparisons[number]
+            table.writerow([person.number, row.dataset, row.name, *row.methods, OUTCOMES[outcome], reason])
+    return text.getvalue()

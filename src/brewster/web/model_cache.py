@@ -1,0 +1,79 @@
+"""The models that a server knows: those named when it was started and those of the zoo, each loaded once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from threading import Lock
+from typing import final
+
+from pydantic import BaseModel
+
+from brewster.errors import ModelError
+from brewster.inference import Separator
+from brewster.models import zoo
+
+
+@final
+class ModelRow(BaseModel):
+    """A model that can be asked for."""
+
+    name: str
+    licence: str
+    sha256: str | None
+    card: str | None
+    """Markdown: what it was trained on, what it scores, where it fails."""
+
+
+@final
+class ModelCache:
+    """Models by name, the default first. A client names a model, never a path."""
+
+    def __init__(self, models: Sequence[str] = (), *, device: str = "auto") -> None:
+        self._sources: dict[str, str] = {}
+        for source in dict.fromkeys((*models, *zoo.MODELS)):
+            self._add(source)
+        self._device, self._lock = device, Lock()
+        self._loaded: dict[str, Separator] = {}
+
+    def _add(self, source: str) -> None:
+        name = Path(source).name if zoo.is_large(source) else zoo.find_model(source).name
+        if name in self._sources:
+            raise ModelError(
+                f"{source} and {self._sources[name]} are both called {name}",
+                "clients choose models by name",
+                "rename the file",
+            )
+        self._sources[name] = source
+
+    @property
+    def names(self) -> list[str]:
+        """What can be asked for, the default first."""
+        return list(self._sources)
+
+    def rows(self) -> list[ModelRow]:
+        """What there is to know of each model."""
+        return [_row(name, source) for name, source in self._sources.items()]
+
+    def separator(self, name: str) -> Separator:
+        """The separator of a model, loaded when it is first asked for; safe to call from many threads.
+
+        Raises:
+            ModelError: its file is damaged.
+            DeviceError: the server's device is not available.
+        """
+        with self._lock:
+            if name not in self._loaded:
+                self._loaded[name] = Separator.load(self._sources[name], device=self._device)
+            return self._loaded[name]
+
+
+def _row(name: str, source: str) -> ModelRow:
+    if zoo.is_large(source):
+        return ModelRow(name=name, licence="that of its base", sha256=None, card=None)
+    model = zoo.find_model(source)
+    try:
+        card = model.card()
+    except ModelError:  # a user's own file needs none
+        card = None
+    return ModelRow(name=name, licence=model.licence, sha256=model.sha256, card=card)

@@ -1,0 +1,147 @@
+"""Studies: one value, several choices, trained and measured alike."""
+
+import io
+import os
+import shutil
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmark_folders import paint
+from brewster.benchmarks.registry import read_benchmark
+from brewster.errors import RecipeError
+from brewster.evaluate import ablation as module
+from brewster.evaluate.ablation import ablate, read_study
+from brewster.training.recipe import read_recipe, with_value
+from front_door import as_user
+
+RECIPES = Path(__file__).parents[1] / "recipes" / "ablations"
+STUDIES = [path for path in sorted(RECIPES.glob("*.toml")) if "base" in tomllib.loads(path.read_text())]
+
+
+def names(paths):
+    return [path.stem for path in paths]
+
+
+TINY = {"prompt": "backbone-tiny.toml"}
+"""Another tiny base than tiny.toml, by study."""
+
+
+def test_every_ablation_of_the_paper_is_ready():
+    assert names(STUDIES) == ["mixing", "orders", "pairs", "prompt", "size"]
+
+
+@pytest.mark.parametrize("path", STUDIES, ids=names(STUDIES))
+def test_a_study_changes_one_value_of_both_the_full_and_the_tiny_recipe(path):
+    study = read_study(path)
+    for base in (read_recipe(study.base), read_recipe(RECIPES / TINY.get(path.stem, "tiny.toml"))):
+        recipes = [with_value(base, study.value, choice) for choice in study.choices]
+        assert base in recipes
+        assert len({recipe.model_dump_json() for recipe in recipes}) == len(study.choices)
+
+
+def test_the_training_sizes_are_the_papers():
+    assert read_study(RECIPES / "size.toml").choices == [0, 10, 50, 100, 300, 1000]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("value = 'seed'\nchoices = [1, 2]\nbenchmarks = { real20 = 'x' }", "base"),
+        ("base = 'b'\nvalue = 'seed'\nchoices = [1]\nbenchmarks = { real20 = 'x' }", "choices"),
+        ("base = 'b'\nvalue = 'seed'\nchoices = [1, 2]\nbenchmarks = {}", "benchmarks"),
+        ("base = 'b'\nvalue = 'seed'\nchoice = 3", "choice"),
+        ("base =", "TOML"),
+    ],
+)
+def test_a_study_that_does_not_say_what_it_must_is_refused(text, said, tmp_path):
+    (tmp_path / "study.toml").write_text(text)
+    with pytest.raises(RecipeError, match=said):
+        read_study(tmp_path / "study.toml")
+
+
+@pytest.fixture
+def quick(monkeypatch, model):
+    """Training that takes no time: every network is a pane."""
+
+    def trained(recipe, folder, tell):
+        tell(1, 1, {"loss": 0.5}, True)
+        folder.mkdir(parents=True, exist_ok=True)
+        return Path(shutil.copy(model, folder / "model.onnx"))
+
+    monkeypatch.setattr(module, "_trained", trained)
+
+
+@pytest.fixture
+def pairs(tmp_path):
+    for name in ("1", "2"):
+        paint(tmp_path / "real20" / "blended" / f"{name}.png", int(name), size=(96, 80), noise=20)
+        paint(tmp_path / "real20" / "transmission" / f"{name}.png", int(name), size=(96, 80))
+    return read_benchmark("real20", tmp_path / "real20")
+
+
+def test_choices_are_compared_with_the_first_and_numbers_are_drawn(quick, pairs, data, tmp_path, monkeypatch):
+    monkeypatch.setenv("BREWSTER_DATA", str(data))
+    told = []
+    results = ablate(
+        read_study(RECIPES / "size.toml"),
+        pairs,
+        tmp_path / "out",
+        report=lambda *now: told.append(now),
+    )
+    labels = [f"count {count}" for count in (0, 10, 50, 100, 300, 1000)]
+    assert list(results["methods"]) == ["doing nothing", *labels]
+    assert [now[0] for now in told] == labels
+    compared = {(row["method"], row["than"]) for row in results["differences"]["real20"]}
+    assert ("count 300", "count 0") in compared
+    plot = np.asarray(Image.open(io.BytesIO((tmp_path / "out" / "plot.png").read_bytes())).convert("L"))
+    assert plot.shape[1] > plot.shape[0] > 300
+    assert 0.005 < (plot < 128).mean() < 0.5
+
+
+def test_words_are_not_drawn(quick, pairs, data, tmp_path, monkeypatch):
+    monkeypatch.setenv("BREWSTER_DATA", str(data))
+    ablate(read_study(RECIPES / "mixing.toml"), pairs, tmp_path / "out")
+    assert not (tmp_path / "out" / "plot.png").exists()
+    assert (tmp_path / "out" / "mixing-8-bit" / "model.onnx").is_file()
+
+
+def test_prompts_are_compared_on_a_backbone_that_nobody_has_trained(pairs, data, tmp_path, monkeypatch):
+    monkeypatch.setenv("BREWSTER_DATA", str(data))
+    study = read_study(RECIPES / "prompt.toml").model_copy(update={"base": RECIPES / "backbone-tiny.toml"})
+    results = ablate(study, pairs, tmp_path / "out")
+    assert list(results["methods"]) == ["doing nothing", "prompt generic", "prompt detailed"]
+    assert not (tmp_path / "out" / "prompt-generic" / "checkpoint.pt").exists()
+    means = [row["psnr"]["mean"] for row in results["tables"]["real20"].values()]
+    assert len(set(means)) == 3
+
+
+@pytest.fixture
+def little_data(data, tmp_path):
+    """A few of the pairs that studies learn from and are measured on."""
+    for place, count in (("real/train", 4), ("real/dev/nature", 2), ("real/dev/real", 2)):
+        for photo in sorted((data / place / "blended").iterdir())[:count]:
+            for role in ("blended", "transmission"):
+                link = tmp_path / "data" / place / role / photo.name
+                link.parent.mkdir(parents=True, exist_ok=True)
+                link.symlink_to(data / place / role / photo.name)
+    (tmp_path / "data" / "weights").symlink_to(data / "weights")
+    return tmp_path / "data"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", STUDIES, ids=names(STUDIES))
+def test_every_study_runs_end_to_end_at_tiny_size(path, little_data, tmp_path):
+    """Real rendering, real training, real measuring, on four real pairs."""
+    environment = {**os.environ, "BREWSTER_DATA": str(little_data)}
+    base = RECIPES / TINY.get(path.stem, "tiny.toml")
+    done = as_user("ablate", path, "--base", base, "-o", tmp_path / "out", env=environment)
+    assert done.returncode == 0, done.stderr.decode()
+    text = done.stdout.decode()
+    for choice in read_study(path).choices:
+        assert f" {choice} " in text
+    assert (tmp_path / "out" / "report.html").is_file()
+    assert (tmp_path / "out" / "plot.png").is_file() == (path.stem in {"size", "pairs"})

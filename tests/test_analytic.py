@@ -1,0 +1,383 @@
+"""The pane renderer: its pictures add up, equal closed forms where there are any, and lie where geometry says."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from brewster.errors import RecipeError
+from brewster.render import analytic
+from brewster.render.analytic import render
+from brewster.render.rays.layered_glass import all_orders, paper_orders
+from brewster.scene.glass import Glazing, Pane
+from brewster.scene.world import Side
+from worlds_of_one import WORLDS, Worlds, a_scene, around, at, board, looks, scenes, soft, sun, where
+
+unshrunk = settings(phases=[Phase.explicit, Phase.generate], deadline=None, database=None)
+some, few = (settings(unshrunk, max_examples=count) for count in (25, 10))
+SMOOTH = {"far": around(), "dome": around(radius_mm=3000.0), "near": board()}
+
+
+def closed_form(scene, form=all_orders):
+    """The shares at the centre of every pixel, (3, H, W) or (1, H, W)."""
+    cosine = torch.from_numpy(-looks(scene.camera) @ np.array([0, 0, 1]))
+    shares = form(scene.glass, cosine)
+    return [share.reshape(-1, *cosine.shape).float() for share in (shares.transmitted, shares.reflected)]
+
+
+# --- light adds up
+
+
+@some
+@given(scenes(orders="all"))
+def test_the_photo_is_the_sum_of_its_two_layers(scene):
+    sample = render(scene, WORLDS)
+    layers = sample.layers().values()
+    assert all(layer.shape == (3, 16, 16) and layer.dtype == torch.float32 for layer in layers)
+    assert all(torch.isfinite(layer).all() and (layer >= 0).all() for layer in layers)
+    torch.testing.assert_close(
+        sample.transmission + sample.reflection,
+        sample.photo,
+        rtol=1e-6,
+        atol=1e-7 * float(sample.photo.max()),
+    )
+
+
+@few
+@given(scenes(orders="all"))
+def test_the_choice_of_orders_changes_the_layers_and_not_the_photo(scene):
+    whole, paper = (
+        render(scene.model_copy(update={"orders": orders}), WORLDS) for orders in ("all", "paper")
+    )
+    for name in ("photo", "background", "mirror"):
+        assert torch.equal(getattr(whole, name), getattr(paper, name))
+    little = 1e-6 * float(whole.photo.max()) + 1e-9
+    for name in ("transmission", "reflection"):
+        assert (getattr(paper, name) <= getattr(whole, name) + little).all()
+    assert paper.reflection.sum() < whole.reflection.sum() or (not scene.front.map and not scene.front.plane)
+
+
+@few
+@given(scenes(front=Side()))
+def test_a_black_room_is_mirrored_black(scene):
+    sample = render(scene, WORLDS)
+    assert not sample.reflection.any()
+    assert not sample.mirror.any()
+
+
+@few
+@given(scenes(behind=Side(), orders="all"))
+def test_before_a_black_world_the_photo_is_its_reflection(scene):
+    sample = render(scene, WORLDS)
+    assert not sample.transmission.any()
+    assert not sample.background.any()
+    assert torch.equal(sample.photo, sample.reflection)
+
+
+@pytest.mark.parametrize("side", ["far", "dome", "near"])
+@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("aperture_mm", [0.0, 20.0])
+def test_glass_that_does_not_refract_is_not_there(side, count, aperture_mm):
+    sides = {
+        "far": around("mottled"),
+        "dome": around("mottled", radius_mm=2000.0),
+        "near": board("mottled", width_mm=500),
+    }
+    scene = a_scene(
+        camera=at(15, 5, aperture_mm=aperture_mm),
+        panes=[{"index": 1.0, "thickness_mm": 20.0}] * count,
+        behind=sides[side],
+        front=sides[side],
+        samples=4,
+    )
+    sample = render(scene, WORLDS)
+    torch.testing.assert_close(sample.transmission, sample.background, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(sample.photo, sample.background, rtol=1e-4, atol=1e-4)
+    assert sample.mirror.any()
+    assert not sample.reflection.any()
+
+
+@pytest.mark.parametrize("side", sorted(SMOOTH))
+@pytest.mark.parametrize("aperture_mm", [0.0, 20.0])
+@pytest.mark.parametrize("orders", ["all", "paper"])
+def test_in_an_even_world_every_pixel_has_its_closed_form(side, aperture_mm, orders):
+    panes = [
+        {"thickness_mm": 6.0, "absorption_per_m": (4.0, 1.5, 20.0)},
+        {"index": 1.7, "absorption_per_m": (2.0, 9.0, 1.0)},
+    ]
+    scene = a_scene(
+        camera=at(30, aperture_mm=aperture_mm, focus_mm=800),
+        panes=panes,
+        behind=SMOOTH[side],
+        front=SMOOTH[side],
+        orders=orders,
+        samples=16,
+    )
+    sample = render(scene, WORLDS)
+    through, back = closed_form(scene, all_orders if orders == "all" else paper_orders)
+    torch.testing.assert_close(sample.transmission, through, rtol=2e-3, atol=0)
+    torch.testing.assert_close(sample.reflection, back, rtol=1e-2, atol=0)
+    assert float(sample.reflection.mean() / back.mean()) == pytest.approx(1, abs=2e-3)
+    for bare in (sample.background, sample.mirror):
+        torch.testing.assert_close(bare, torch.ones_like(bare), rtol=1e-5, atol=0)
+
+
+def test_far_light_has_no_ghost_in_parallel_glass():
+    """However rich the world, R is MR times a factor of the angle alone: all orders leave in one direction."""
+    scene = a_scene(
+        camera=at(40, 10, width=25, height=25),
+        panes=[{"thickness_mm": 30.0}, {}],
+        front=around("mottled"),
+        behind=around("mottled", heading_deg=90),
+        samples=1,
+    )
+    sample = render(scene, WORLDS)
+    through, back = closed_form(scene)
+    torch.testing.assert_close(sample.reflection, sample.mirror * back, rtol=1e-4, atol=1e-7)
+    torch.testing.assert_close(sample.transmission, sample.background * through, rtol=1e-4, atol=1e-7)
+
+
+def test_a_thick_pane_brings_what_is_behind_it_nearer_by_a_third_of_its_thickness():
+    """The share of an image is its area: (distance / (distance - t (1 - 1 / n)))^2."""
+    scene = a_scene(
+        camera=at(0, distance_mm=1000, fov_deg=10, width=48, height=48),
+        panes=[{"thickness_mm": 90.0}],
+        behind=board("mottled", distance_mm=500, width_mm=100),
+        orders="paper",
+    )
+    sample = render(scene, WORLDS)
+    magnified = float(sample.transmission.sum() / sample.background.sum()) / 0.96**2
+    assert magnified == pytest.approx((1500 / 1470) ** 2, rel=2e-3)
+
+
+def test_a_wedge_bends_the_view_by_half_its_angle():
+    light = Worlds(sun=sun(256, 128, 0))
+    scene = a_scene(
+        camera={"fov_deg": 10}, panes=[{"wedge_deg": 2.0}], behind=around("sun"), orders="paper", samples=64
+    )
+    sample = render(scene, light)
+    (bent, _), (straight, _) = where(sample.transmission), where(sample.background)
+    assert abs(bent - straight) * 10 / 24 == pytest.approx(1, rel=0.03)
+
+
+def test_a_very_small_wedge_is_none():
+    scenes_ = (
+        a_scene(
+            camera=at(25),
+            panes=[{"wedge_deg": wedge_deg}],
+            behind=around("soft", heading_deg=40),
+            front=around("soft"),
+            samples=256,
+        )
+        for wedge_deg in (0.0, 1e-6)
+    )
+    parallel, wedged = (render(scene, WORLDS) for scene in scenes_)
+    for layer in parallel.layers():
+        torch.testing.assert_close(getattr(wedged, layer), getattr(parallel, layer), rtol=1e-3, atol=0)
+
+
+# --- where things are
+
+
+def test_the_bright_right_of_a_map_is_on_the_right_and_its_top_on_top():
+    right, top = (
+        render(a_scene(behind=around(name, heading_deg=180)), WORLDS).background for name in ("right", "top")
+    )
+    assert right[:, :, 15:].min() == top[:, :9].min() == 1
+    assert right[:, :, :9].max() == top[:, 15:].max() == 0
+
+
+@pytest.mark.parametrize("heading_deg", [0, 90, -120])
+def test_a_camera_that_turns_right_sees_a_map_move_left(heading_deg):
+    """A sun at a heading of its own stands in the middle for a camera with that heading; 5 degrees are 4 pixels."""
+    light = Worlds(sun=sun(64, 32, 0))
+    glass = Glazing(heading_deg=heading_deg)
+    places = []
+    for turn in (0, 5):
+        camera = at(heading_deg + turn, fov_deg=30)
+        scene = a_scene(camera=camera, glass=glass, behind=around("sun", heading_deg=heading_deg), samples=16)
+        places.append(where(render(scene, light).background))
+    half_texel = 360 / 128 / 2
+    pixels_a_degree = 24 / math.degrees(2 * math.tan(math.radians(15)))
+    assert places[0][0] == pytest.approx(12 + half_texel * pixels_a_degree, abs=0.1)
+    assert places[0][1] == pytest.approx(12 + half_texel * pixels_a_degree, abs=0.1)
+    assert places[0][0] - places[1][0] == pytest.approx(5 * pixels_a_degree, rel=0.03)
+
+
+def test_a_picture_before_the_glass_is_mirrored_and_one_behind_is_not():
+    picture = np.zeros((32, 32, 3), np.float32)
+    picture[:8, 24:] = 1  # its upper right
+    scene = a_scene(behind=board("corner", width_mm=300), front=board("corner", width_mm=300))
+    sample = render(scene, Worlds(corner=picture))
+    right, upper = where(sample.background)
+    assert right > 14
+    assert upper < 10
+    left, also_upper = where(sample.reflection)
+    assert left == pytest.approx(24 - right, abs=0.05)
+    assert also_upper == pytest.approx(upper, abs=0.05)
+
+
+def test_a_map_before_the_glass_is_mirrored_too():
+    right_of_who_looks_back = around("right", heading_deg=0)
+    mirror = render(a_scene(front=right_of_who_looks_back), WORLDS).mirror
+    assert mirror[:, :, :9].min() == 1
+    assert mirror[:, :, 15:].max() == 0
+
+
+PLACES = st.fixed_dictionaries(
+    {
+        "distance_mm": st.floats(100, 3000),
+        "offset": st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4)),
+        "turn_deg": st.tuples(st.floats(-60, 60), st.floats(-20, 20)),
+        "glass_deg": st.tuples(st.floats(-180, 180), st.floats(-20, 20)),
+        "camera_deg": st.tuples(st.floats(-30, 30), st.floats(-10, 10)),
+        "is_behind": st.booleans(),
+    }
+)
+
+
+def projected(scene, place, glass_axes):
+    """Where a pinhole sees a point that is given in the glass's frame."""
+    in_world = place @ glass_axes + np.array(scene.glass.position_mm) - np.array(scene.camera.position_mm)
+    right, up, back = map(np.array, analytic.axes(scene.camera.heading_deg, scene.camera.pitch_deg))
+    scale = scene.camera.width / 2 / scene.camera.half_width / -(in_world @ back)
+    return scene.camera.width / 2 + in_world @ right * scale, scene.camera.height / 2 - in_world @ up * scale
+
+
+@some
+@given(PLACES)
+def test_a_plane_is_where_pinhole_geometry_projects_it(drawn):
+    """A small plane: its centroid, and for one that faces the glass its area, as a mirror image when in front."""
+    heading, pitch = drawn["glass_deg"]
+    axes = np.array(analytic.axes(heading, pitch))
+    camera = at(
+        heading + drawn["camera_deg"][0], pitch + drawn["camera_deg"][1], fov_deg=40, width=48, height=48
+    )
+    position = np.array([30.0, -20.0, 70.0])
+    camera["position_mm"] = tuple(np.array(camera["position_mm"]) + position)
+    bare = a_scene(
+        camera=camera, glass=Glazing(heading_deg=heading, pitch_deg=pitch, position_mm=tuple(position))
+    )
+    eye = axes @ (np.array(bare.camera.position_mm) - position)
+    away = drawn["distance_mm"] + 4
+    middle = axes @ looks(bare.camera)[23:25, 23:25].mean((0, 1))
+    reach = (eye[2] + away) / -middle[2]
+    offset = (eye + middle * reach)[:2] + np.array(drawn["offset"]) * reach * bare.camera.half_width
+    plane = {
+        "distance_mm": away,
+        "width_mm": reach * 0.06,
+        "offset_mm": tuple(offset),
+        "heading_deg": drawn["turn_deg"][0],
+        "pitch_deg": drawn["turn_deg"][1],
+    }
+    which = "behind" if drawn["is_behind"] else "front"
+    scene = bare.model_copy(update={"behind": Side(), "front": Side(), which: board("square", **plane)})
+    sample = render(scene, Worlds(square=np.ones((16, 16, 3), np.float32)))
+    picture = sample.background if drawn["is_behind"] else sample.mirror
+    image = projected(scene, np.array([*offset, -away]), axes)
+    assert where(picture) == pytest.approx(image, abs=0.25)
+
+
+@pytest.mark.parametrize("is_behind", [True, False])
+def test_a_plane_is_as_large_as_pinhole_geometry_says(is_behind):
+    which = "behind" if is_behind else "front"
+    scene = a_scene(
+        **{which: board("wide", distance_mm=700, width_mm=310)}, camera={"width": 40, "height": 40}
+    )
+    sample = render(scene, Worlds(wide=np.ones((16, 32, 3), np.float32)))
+    picture = sample.background if is_behind else sample.mirror
+    width = 310 / 1200 / (2 * math.tan(math.radians(15))) * 40
+    assert float(picture[0].sum()) == pytest.approx(width * width / 2, rel=0.01)
+
+
+# --- steadiness
+
+
+@pytest.mark.parametrize("texels", [0.5, 1, 1.3])
+def test_a_sun_of_one_texel_does_not_sparkle(texels):
+    """As the camera turns by tenths of a pixel that spans this many texels, the picture keeps the sun's energy."""
+    light, fov_deg = Worlds(sun=sun(256, 128, 0)), 360 / 512 * texels * 32
+    energies = []
+    for tenth in range(10):
+        turn = tenth / 10 * fov_deg / 32
+        camera = at(turn, turn / 2, fov_deg=fov_deg, width=32, height=32)
+        sample = render(a_scene(camera=camera, behind=around("sun"), samples=36), light)
+        energies.append(float(sample.background.sum()))
+    assert max(energies) / min(energies) < 1.01
+
+
+KINDS = {
+    "far": {"front": around("soft")},
+    "near": {"front": around("soft", radius_mm=3000.0), "behind": board("mottled")},
+    "lens": {"front": around("soft", radius_mm=3000.0), "camera": {"aperture_mm": 10}},
+    "wedge": {"front": around("soft"), "panes": [{"wedge_deg": 0.5}]},
+    "rough": {"front": around("soft"), "panes": [{"roughness": 0.1}]},
+}
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_the_same_scene_gives_the_same_bytes(kind):
+    one, other = (render(a_scene(**KINDS[kind], samples=4), WORLDS) for _ in range(2))
+    for first, second in zip(one.layers().values(), other.layers().values(), strict=True):
+        assert first.numpy().tobytes() == second.numpy().tobytes()
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+def test_it_does_not_matter_how_many_rays_are_worked_on_at_once(kind, monkeypatch):
+    whole = render(a_scene(**KINDS[kind], samples=4), WORLDS)
+    monkeypatch.setattr(analytic, "_STRIP", 100)
+    strips = render(a_scene(**KINDS[kind], samples=4), WORLDS)
+    for first, second in zip(whole.layers().values(), strips.layers().values(), strict=True):
+        if kind == "rough":  # which orders are worth following is decided by the mean of a strip
+            assert float(first.mean()) == pytest.approx(float(second.mean()), rel=2e-3)
+        else:
+            torch.testing.assert_close(first, second, rtol=1e-5, atol=1e-6)
+
+
+def test_another_index_is_other_chance_with_the_same_means():
+    scene = a_scene(panes=[{"wedge_deg": 0.5}], behind=around("mottled"), samples=16)
+    one, other = (render(scene.model_copy(update={"index": index}), WORLDS).background for index in (0, 1))
+    assert not torch.equal(one, other)
+    assert float(one.mean()) == pytest.approx(float(other.mean()), rel=2e-3)
+
+
+@pytest.mark.parametrize(
+    "glass",
+    [
+        Glazing(frame_mm=(500.0, 400.0)),
+        Glazing(panes=(Pane(thickness_mm=20),), radii_mm=(300.0, -300.0), frame_mm=(80.0, 80.0)),
+    ],
+    ids=["framed", "curved"],
+)
+def test_framed_and_curved_glass_is_left_to_the_tracer(glass):
+    with pytest.raises(RecipeError, match="--renderer tracer"):
+        render(a_scene(glass=glass), WORLDS)
+
+
+def test_a_dome_and_a_map_at_infinity_agree_when_the_dome_is_large():
+    far, dome = (
+        render(a_scene(camera=at(20), behind=around("soft", radius_mm=radius)), Worlds(soft=soft(64)))
+        for radius in (math.inf, 1e7)
+    )
+    torch.testing.assert_close(far.transmission, dome.transmission, rtol=1e-3, atol=0)
+
+
+# --- ghosts
+
+
+def test_the_ghost_of_a_scene_is_the_formula_over_what_a_pixel_spans():
+    scene = a_scene(
+        camera=at(30, distance_mm=1000 / math.cos(math.radians(30))), front=around(radius_mm=3000.0)
+    )
+    inside = math.asin(math.sin(math.radians(30)) / 1.5)
+    apart = 2 * 4 * math.tan(inside) * math.cos(math.radians(30))
+    assert analytic.ghost_distance_px(scene) == pytest.approx(
+        apart / (scene.camera.pixel_rad * 4000), rel=1e-3
+    )
+
+
+def test_far_content_has_no_ghost():
+    assert analytic.ghost_distance_px(a_scene(camera=at(30))) == 0

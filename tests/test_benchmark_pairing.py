@@ -1,0 +1,322 @@
+"""What belongs together in a folder is told by names alone; whatever else is there is named."""
+
+import random
+import tempfile
+import unicodedata
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from benchmark_folders import postcard, repacked, solidobject, wildscene, write
+from brewster.benchmarks.pairing import (
+    ROLES,
+    FolderListing,
+    entries,
+    find_roles,
+    find_split,
+    find_subsets,
+    listed,
+    natural,
+    read_folders,
+    read_tree,
+)
+from brewster.errors import PhotoError, RecipeError
+from brewster.training.data.image_loading import read_pairs
+
+STEMS = st.sets(st.sampled_from(["1", "2", "02", "10", "a-1", "a-10", "a_1", "ä", "x.y", "m"]), min_size=1)
+
+
+def names(found):
+    return [trio.name for trio in found.trios]
+
+
+# --- a folder for each role
+
+
+@pytest.mark.parametrize(
+    "roles",
+    [
+        ("blended", "transmission_layer", "reflection_layer"),
+        ("I", "T", "R"),
+        ("Input", "GT", "Reflection"),
+        ("With Reflection", "Ground-Truth", "reflection"),
+    ],
+)
+def test_roles_are_known_by_their_folders(tmp_path, roles):
+    repacked(tmp_path, ["1", "2"], roles)
+    found = read_folders(tmp_path)
+    assert names(found) == ["1", "2"]
+    assert found == FolderListing(found.trios)
+    for trio in found.trios:
+        pictures = (trio.photo, trio.transmission, trio.reflection)
+        assert pictures == tuple(tmp_path / role / f"{trio.name}.png" for role in roles)
+
+
+def test_every_name_of_a_role_is_its_own():
+    every = [name for names in ROLES.values() for name in names]
+    assert len(every) == len(set(every))
+    assert every == [name.lower() for name in every]
+
+
+@settings(max_examples=40)
+@given(photos=STEMS, truths=STEMS, mirrored=STEMS, order=st.randoms())
+def test_only_equal_names_make_a_pair_and_all_others_are_named(photos, truths, mirrored, order):
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        wanted = {"blended": photos, "gt": truths, "reflection": mirrored}
+        places = [f"{role}/{stem}.png" for role, stems in wanted.items() for stem in stems]
+        order.shuffle(places)
+        write(root, *places)
+        found = read_folders(root)
+        assert set(names(found)) == photos & truths
+        assert names(found) == sorted(photos & truths, key=natural)
+        for trio in found.trios:
+            assert trio.photo.stem == trio.transmission.stem == trio.name
+            assert (trio.reflection is not None) == (trio.name in mirrored)
+        for stem in (photos | truths | mirrored) - (photos & truths):
+            assert any(f"/{stem}.png" in line and "no partner" in line for line in found.refused)
+        assert len(found.refused) == len((photos | truths | mirrored) - (photos & truths))
+
+
+def test_suffixes_may_differ(tmp_path):
+    write(tmp_path, "blended/a.JPG", "gt/a.png", "blended/b.tif", "gt/b.webp")
+    assert names(read_folders(tmp_path)) == ["a", "b"]
+
+
+@pytest.mark.parametrize("role", ["blended", "gt", "reflection"])
+def test_two_pictures_of_one_name_and_role_are_refused_both(tmp_path, role):
+    repacked(tmp_path, ["a", "b"], ("blended", "gt", "reflection"))
+    write(tmp_path, f"{role}/a.jpg")
+    found = read_folders(tmp_path)
+    assert names(found) == ["b"]
+    assert len(found.refused) == 1
+    assert found.refused[0].startswith(f"{role}/a.jpg and {role}/a.png are ambiguous")
+
+
+def test_a_name_is_the_same_in_both_spellings_of_unicode(tmp_path):
+    write(tmp_path, f"blended/{unicodedata.normalize('NFC', 'café')}.png")
+    write(tmp_path, f"gt/{unicodedata.normalize('NFD', 'café')}.png")
+    assert len(read_folders(tmp_path).trios) == 1
+
+
+def test_what_systems_leave_is_passed_over_in_silence_and_other_files_aloud(tmp_path):
+    repacked(tmp_path, ["a"])
+    quiet = (
+        "blended/._a.png",
+        "blended/.DS_Store",
+        "gt/Thumbs.db",
+        "blended/thumbs.db",
+        ".hidden/x.png",
+        "__MACOSX/a.png",
+    )
+    write(tmp_path, *quiet[:2], *quiet[3:])
+    assert read_folders(tmp_path).remarks == ()
+    write(tmp_path, "blended/README.txt", "transmission_layer/old/a.png", "licence.md")
+    (remark,) = read_folders(tmp_path).remarks
+    assert remark == "passed over blended/README.txt, transmission_layer/old and licence.md"
+    assert names(read_folders(tmp_path)) == ["a"]
+
+
+def test_two_folders_for_one_role_are_an_error_that_names_both(tmp_path):
+    repacked(tmp_path, ["a"], ("blended", "gt", "transmission_layer"))
+    with pytest.raises(PhotoError, match=r"two folders for transmission, gt and transmission_layer; .*; .*"):
+        read_folders(tmp_path)
+
+
+def test_a_missing_or_empty_folder_of_a_role_is_an_error(tmp_path):
+    with pytest.raises(PhotoError, match=r"no folder for the photo; .*blended.*; "):
+        read_folders(tmp_path)
+    write(tmp_path, "blended/notes.txt")
+    with pytest.raises(PhotoError, match=r"no pictures in .*blended; .*\.png.*; "):
+        read_folders(tmp_path)
+    write(tmp_path, "blended/a.png")
+    with pytest.raises(PhotoError, match=r"no folder for the transmission; "):
+        read_folders(tmp_path)
+
+
+def test_what_cannot_be_listed_is_an_error(tmp_path):
+    write(tmp_path, "file.png")
+    with pytest.raises(PhotoError, match=r"gone cannot be read \(No such file or directory\); .*; "):
+        read_folders(tmp_path / "gone")
+    with pytest.raises(PhotoError, match=r"file.png cannot be read \(Not a directory\)"):
+        read_folders(tmp_path / "file.png")
+
+
+def test_links_are_followed(tmp_path):
+    repacked(tmp_path / "there", ["a"])
+    here = tmp_path / "here"
+    here.mkdir()
+    for role in ("blended", "transmission_layer"):
+        (here / role).symlink_to(tmp_path / "there" / role)
+    assert names(read_folders(here)) == ["a"]
+
+
+def test_a_split_is_the_folder_itself_or_the_only_one_in_it(tmp_path):
+    repacked(tmp_path / "val", ["a"])
+    (tmp_path / "other").mkdir()
+    assert find_split(tmp_path) == find_split(tmp_path / "val") == tmp_path / "val"
+    repacked(tmp_path / "test", ["a"])
+    with pytest.raises(PhotoError, match=r"has pairs in test and val; .*; point at one, for example .*test"):
+        find_split(tmp_path)
+
+
+# --- trees
+
+
+def test_the_original_trees_are_joined_shot_by_shot(tmp_path):
+    found = read_tree(postcard(tmp_path / "p", ["ab", "ba"]), "postcard")
+    assert names(found)[:4] == ["ab-Focus-11", "ab-Focus-13", "ab-Focus-16", "ab-Focus-19"]
+    assert names(found)[7:10] == ["ab-Thick-3", "ab-Thick-5", "ab-Thick-10"]
+    assert {trio.scene for trio in found.trios} == {"ab", "ba"}
+    thick = next(trio for trio in found.trios if trio.name == "ab-Thick-10")
+    there = tmp_path / "p" / "Thick" / "ab" / "10"
+    assert (thick.photo, thick.transmission) == (there / "ab-10-m-3.png", there / "ab-10-g-3.png")
+    found = read_tree(solidobject(tmp_path / "s", [2, 10]), "solidobject")
+    assert names(found)[::10] == ["2-Focus-11", "10-Focus-11"]
+    found = read_tree(wildscene(tmp_path / "w", 8), "wildscene")
+    assert names(found) == ["1s", "2", "3", "4s", "5", "6", "7s", "8"]
+    assert all(trio.scene == trio.name for trio in found.trios)
+    for trio in found.trios:
+        assert [path.stem for path in (trio.photo, trio.transmission, trio.reflection)] == ["m", "g", "r"]
+        assert len({trio.photo.parent, trio.transmission.parent, trio.reflection.parent}) == 1
+
+
+def test_two_triplets_in_a_folder_are_told_apart_by_their_names(tmp_path):
+    write(tmp_path, *(f"Focus/ab/11/ab-{k}-{letter}-11.png" for k in (3, 5) for letter in "mgr"))
+    found = read_tree(tmp_path, "postcard")
+    assert names(found) == ["ab-Focus-11-ab-3-11", "ab-Focus-11-ab-5-11"]
+    assert all(trio.photo.name.split("-")[1] == trio.transmission.name.split("-")[1] for trio in found.trios)
+
+
+def test_a_triplet_without_truth_is_refused_and_one_without_reflection_is_not(tmp_path):
+    write(tmp_path, "1/m.jpg", "1/r.jpg", "2/m.jpg", "2/g.jpg", "3/g.jpg", "3/r.jpg")
+    found = read_tree(tmp_path, "wildscene")
+    assert names(found) == ["2"]
+    assert [line.split(" ")[0] for line in found.refused] == ["1/m.jpg", "3/g.jpg"]
+    assert all("no partner" in line for line in found.refused)
+
+
+def test_a_letter_stands_alone_in_either_case(tmp_path):
+    write(
+        tmp_path,
+        "1/M.JPG",
+        "1/G.JPG",
+        "2/img_m.png",
+        "2/img_g.png",
+        "2/big.png",
+        "3/m-g.png",
+        "3/grm.png",
+        "3/m.png",
+    )
+    found = read_tree(tmp_path, "wildscene")
+    assert names(found) == ["1", "2"]
+    assert found.remarks == ("passed over 2/big.png", "passed over 3/grm.png and 3/m-g.png")
+    assert len(found.refused) == 1
+
+
+def test_shots_of_one_name_in_two_folders_are_refused_both(tmp_path):
+    write(
+        tmp_path, *(f"{kind}/ab/11/ab-3-{letter}-11.png" for kind in ("Focus", "focus") for letter in "mgr")
+    )
+    if len(entries(tmp_path)[0]) < 2:
+        pytest.skip("this file system does not tell Focus from focus")
+    found = read_tree(tmp_path, "postcard")
+    assert found.trios == ()
+    assert len(found.refused) == 2
+    assert all("ambiguous" in line for line in found.refused)
+
+
+def test_other_files_in_a_tree_are_passed_over_aloud(tmp_path):
+    wildscene(tmp_path, 2)
+    write(tmp_path, "README.txt", "1s/notes.txt", "1s/.DS_Store")
+    assert read_tree(tmp_path, "wildscene").remarks == ("passed over 1s/notes.txt", "passed over README.txt")
+
+
+@pytest.mark.parametrize("subset", ["postcard", "solidobject", "wildscene"])
+def test_a_folder_without_a_tree_is_an_error_that_draws_it(tmp_path, subset):
+    write(tmp_path, "a.png")
+    with pytest.raises(PhotoError, match=rf"is no {subset} set; .*<scene>.*; "):
+        read_tree(tmp_path, subset)
+
+
+def test_subsets_are_known_by_their_first_letters(tmp_path):
+    for name in ("Postcard Dataset", "Solid_Object-2", "WildSceneDataset", "others"):
+        (tmp_path / name).mkdir()
+    assert {subset: path.name for subset, path in find_subsets(tmp_path).items()} == {
+        "postcard": "Postcard Dataset",
+        "solidobject": "Solid_Object-2",
+        "wildscene": "WildSceneDataset",
+    }
+    (tmp_path / "postcard").mkdir()
+    with pytest.raises(PhotoError, match=r"two folders for postcard, Postcard Dataset and postcard"):
+        find_subsets(tmp_path)
+
+
+# --- both
+
+
+@settings(max_examples=15)
+@given(order=st.randoms())
+def test_a_permuted_listing_gives_the_same(order):
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        pairs = repacked(Path(folder) / "pairs", ["1", "2", "02", "10"])
+        write(pairs, "blended/x.png", "gt.txt", "blended/2.jpg")
+        tree = postcard(Path(folder) / "tree", ["ab"])
+        before = read_folders(pairs), read_tree(tree, "postcard"), find_roles(pairs)
+        listing = Path.iterdir
+        patch.setattr(Path, "iterdir", lambda path: iter(shuffled(listing(path), order)))
+        assert (read_folders(pairs), read_tree(tree, "postcard"), find_roles(pairs)) == before
+
+
+def shuffled(items, order: random.Random):
+    items = list(items)
+    order.shuffle(items)
+    return items
+
+
+@given(st.sets(st.text(min_size=1)), st.randoms())
+def test_natural_order_is_total_and_puts_2_before_10(some, order):
+    assert sorted(shuffled(some, order), key=natural) == sorted(some, key=natural)
+    assert sorted(["a10", "a2", "10", "2", "a"], key=natural) == ["2", "10", "a", "a2", "a10"]
+
+
+def test_long_lists_are_cut():
+    assert listed(["a"]) == "a"
+    assert listed(["a", "b", "c"], " or ") == "a, b or c"
+    assert listed([str(number) for number in range(100)]) == "0, 1, 2, 3, 4 and 95 more"
+
+
+# --- training
+
+
+def test_training_pairs_are_joined_by_the_same_rule(tmp_path):
+    for size, name in (((8, 6), "2"), ((6, 8), "10")):
+        repacked(tmp_path, [name], ("blended", "transmission"), size=size)
+    assert [tuple(photo.shape) for photo, _ in read_pairs([tmp_path])] == [(8, 6, 3), (6, 8, 3)]
+    write(tmp_path, "transmission/10.jpg")
+    with pytest.raises(
+        RecipeError, match=r"transmission/10.jpg and transmission/10.png are ambiguous.*; .*; "
+    ):
+        read_pairs([tmp_path])
+
+
+def test_a_training_pair_of_two_sizes_is_an_error_that_names_both(tmp_path):
+    write(tmp_path, "blended/a.png")
+    write(tmp_path, "gt/a.png", size=(4, 3))
+    with pytest.raises(RecipeError, match=r"blended/a.png and .*gt/a.png differ in size; "):
+        read_pairs([tmp_path])
+
+
+def test_training_pairs_that_are_not_there_are_an_error_of_the_recipe(tmp_path):
+    with pytest.raises(
+        RecipeError, match=r"gone cannot be read \(No such file or directory\); .*BREWSTER_DATA"
+    ):
+        read_pairs([tmp_path / "gone"])
+
+
+def test_a_folder_with_a_semicolon_in_its_name_is_named_whole(tmp_path):
+    with pytest.raises(RecipeError) as raised:
+        read_pairs([tmp_path / "window; north"])
+    assert raised.value.happened == f"{tmp_path}/window; north cannot be read (No such file or directory)"

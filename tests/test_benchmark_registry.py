@@ -1,0 +1,413 @@
+"""The field's benchmarks are read whole, in either form, and nothing that does not fit is taken."""
+
+import pickle
+import random
+import shutil
+
+import pytest
+
+from benchmark_folders import (
+    POSTCARD_SCENES,
+    picture,
+    postcard,
+    repacked,
+    sir2,
+    wildscene,
+    write,
+)
+from brewster.benchmarks import registry
+from brewster.benchmarks.pairing import natural
+from brewster.benchmarks.registry import (
+    BENCHMARKS,
+    PAPER_SEED,
+    Benchmark,
+    Case,
+    PictureFile,
+    paper_draw,
+    read_benchmark,
+)
+from brewster.errors import PhotoError, UnreadablePhoto
+from brewster.photo import Photo
+from picture_files import exif_block, file_of, smooth
+from set_folders import make
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory):
+    return sir2(tmp_path_factory.mktemp("benchmarks") / "SIR2")
+
+
+@pytest.fixture(scope="module")
+def whole(original):
+    return {benchmark.name: benchmark for benchmark in read_benchmark("sir2", original)}
+
+
+def only(name, folder) -> Benchmark:
+    (benchmark,) = read_benchmark(name, folder)
+    return benchmark
+
+
+def names(cases):
+    return [case.name for case in cases]
+
+
+# --- what is read
+
+
+@pytest.mark.parametrize("name", ["real20", "nature20"])
+def test_twenty_pairs_are_read_under_the_name_of_their_benchmark(tmp_path, name):
+    read = only(name, repacked(tmp_path, map(str, range(20, 0, -1))))
+    assert (read.name, read.title.lower(), read.expected) == (name, name, (20,))
+    assert names(read.cases) == [str(number) for number in range(1, 21)]
+    assert read.remarks == read.refused == ()
+    assert read.cases[1] == Case(
+        benchmark=name,
+        name="2",
+        scene="2",
+        place="blended/2",
+        photo=PictureFile(tmp_path / "blended" / "2.png"),
+        transmission=PictureFile(tmp_path / "transmission_layer" / "2.png"),
+    )
+
+
+def test_the_original_sir2_has_199_and_200_and_101_triplets(whole):
+    assert {name: len(read.cases) for name, read in whole.items()} == {
+        "postcard": 199,
+        "solidobject": 200,
+        "wildscene": 101,
+    }
+    for name, read in whole.items():
+        assert read.remarks == read.refused == ()
+        assert all(case.reflection for case in read.cases)
+        assert {case.benchmark for case in read.cases} == {name}
+        assert len({case.place for case in read.cases}) == len(set(names(read.cases))) == len(read.cases)
+    assert len({case.scene for case in whole["postcard"].cases}) == 20
+    assert len({case.scene for case in whole["solidobject"].cases}) == 20
+    assert len({case.scene for case in whole["wildscene"].cases}) == 101
+
+
+def test_a_place_is_where_the_photo_lies_below_the_folder_given(whole, original):
+    places = {case.name: case.place for read in whole.values() for case in read.cases}
+    assert places["ab-Thick-10"] == "Postcard Dataset/Thick/ab/10/ab-10-m-3"
+    assert places["1-Focus-11"] == "SolidObjectDataset/1/Focus/11/m"
+    assert places["7s"] == "Wildscene/7s/m"
+    alone = only("solidobject", original / "SolidObjectDataset")
+    assert alone.cases[0].place == "1/Focus/11/m"
+
+
+@pytest.mark.parametrize("subset", ["postcard", "solidobject", "wildscene"])
+def test_a_set_of_sir2_is_read_from_its_own_folder_and_from_the_one_above(whole, original, subset):
+    above = only(subset, original)
+    alone = only(
+        subset, whole[subset].cases[0].photo.path.parents[{"postcard": 3, "solidobject": 3}.get(subset, 1)]
+    )
+    assert above == whole[subset]
+    assert [(case.name, case.scene, case.photo) for case in alone.cases] == [
+        (case.name, case.scene, case.photo) for case in above.cases
+    ]
+
+
+def test_sir2_may_be_repacked_in_part_and_what_is_missing_is_said(tmp_path):
+    repacked(tmp_path / "postcard", ["ab-3-32", "ab-5-32", "ba-1-2"])
+    wildscene(tmp_path / "WildSceneDataset", 55)
+    cards, wild = read_benchmark("sir2", tmp_path)
+    assert names(cards.cases) == ["ab-3-32", "ab-5-32", "ba-1-2"]
+    assert [case.scene for case in cards.cases] == ["ab", "ab", "ba"]
+    assert cards.cases[0].place == "postcard/blended/ab-3-32"
+    assert cards.remarks == (
+        f"SIR2 SolidObject is not in {tmp_path}",
+        "3 pictures, where SIR2 Postcard has 199",
+    )
+    assert (len(wild.cases), wild.remarks) == (55, ())
+
+
+def test_one_split_below_an_openrr_folder_is_taken(tmp_path):
+    repacked(tmp_path / "val_100", ["1", "2"], ("Input", "GT"))
+    read = only("openrr", tmp_path)
+    assert (read.name, read.expected, read.remarks) == ("openrr", (), ())
+    assert read.cases[0].place == "val_100/Input/1"
+    assert names(only("openrr", tmp_path / "val_100").cases) == ["1", "2"]
+
+
+@pytest.mark.parametrize(
+    ("folder", "name"),
+    [
+        ("my window", "my-window"),
+        ("..odd/", "odd"),
+        ("写真", "pairs"),
+        ("v1.0_b", "v1.0_b"),
+        ("real20", "pairs-real20"),
+        ("average", "pairs-average"),
+        ("pairs", "pairs"),
+    ],
+)
+def test_a_folder_of_pairs_is_called_by_its_own_name_but_never_passes_for_a_known_set(tmp_path, folder, name):
+    read = only("pairs", repacked(tmp_path / folder, ["a"]))
+    assert (read.name, read.title) == (name, folder.rstrip("/"))
+    assert read.cases[0].benchmark == name
+
+
+def test_a_folder_is_called_by_its_name_from_inside_too(tmp_path, monkeypatch):
+    monkeypatch.chdir(repacked(tmp_path / "mine", ["a"]))
+    assert only("pairs", registry.Path()).name == "mine"
+
+
+@pytest.mark.parametrize("shards", [False, True])
+def test_a_rendered_set_gives_its_background_and_its_reflection(tmp_path, shards):
+    make(tmp_path / "set", count=3, shards=shards)
+    read = only("rendered", tmp_path / "set")
+    assert (read.name, read.title, read.remarks, read.refused) == ("set", "set", (), ())
+    assert names(read.cases) == ["000000", "000001", "000002"]
+    for case in read.cases:
+        assert case.rendered
+        assert (case.scene, case.place) == (case.name, f"{case.name}/photo")
+        assert Photo.open(case.photo.read()).size == (24, 16)
+    make(tmp_path / "again", count=3)
+    for case, file in ((read.cases[1], "background"), (read.cases[2], "background")):
+        assert case.transmission.read() == (tmp_path / "again" / case.name / f"{file}.jpg").read_bytes()
+        assert case.reflection.read() == (tmp_path / "again" / case.name / "reflection.jpg").read_bytes()
+
+
+def test_a_rendered_sample_that_is_not_whole_is_refused(tmp_path):
+    make(tmp_path, count=2)
+    (tmp_path / "000001" / "background.jpg").unlink()
+    read = only("rendered", tmp_path)
+    assert names(read.cases) == ["000000"]
+    assert read.refused == ("000001 is not whole: photo.jpg, background.jpg, reflection.jpg are needed",)
+
+
+def test_the_dev_pairs_are_ten_each(data):
+    for name in ("nature", "real"):
+        read = only("pairs", data / "real" / "dev" / name)
+        assert (read.name, len(read.cases), read.remarks, read.refused) == (name, 10, (), ())
+    assert only("nature20", data / "real" / "dev" / "nature").remarks == (
+        "10 pictures, where Nature20 has 20",
+    )
+
+
+# --- the same, however it is listed
+
+
+def test_neither_the_order_of_writing_nor_that_of_listing_matters(tmp_path, monkeypatch):
+    stems = [f"{number}-{shot}" for number in range(1, 6) for shot in (1, 2, 10)]
+    there = repacked(tmp_path / "a" / "set", stems)
+    before = only("pairs", there)
+    shutil.rmtree(there)
+    random.Random(3).shuffle(stems)
+    repacked(there, stems, ("transmission_layer", "blended"))
+    listing = registry.Path.iterdir
+    monkeypatch.setattr(registry.Path, "iterdir", lambda path: iter(sorted(listing(path), key=hash)))
+    assert only("pairs", there) == before
+    assert names(before.cases) == sorted(stems, key=natural)
+
+
+# --- what is not taken
+
+
+def test_what_has_no_partner_or_two_is_named_and_the_rest_is_read(tmp_path):
+    repacked(tmp_path, ["a", "b", "c", "d"])
+    write(
+        tmp_path,
+        "blended/lonely.png",
+        "transmission_layer/b.jpg",
+        "blended/c.jpg",
+        "transmission_layer/x.png",
+    )
+    read = only("pairs", tmp_path)
+    assert names(read.cases) == ["a", "d"]
+    for line, (named, why) in zip(
+        read.refused,
+        [
+            ("transmission_layer/b.jpg and transmission_layer/b.png", "ambiguous"),
+            ("blended/c.jpg and blended/c.png", "ambiguous"),
+            ("blended/lonely.png", "no partner"),
+            ("transmission_layer/x.png", "no partner"),
+        ],
+        strict=True,
+    ):
+        assert line.startswith(named)
+        assert why in line
+
+
+@pytest.mark.parametrize(
+    ("size", "told"),
+    [
+        ((600, 400), "photo 1200x800, truth 600x400: the truth is at half the scale"),
+        ((300, 200), "photo 1200x800, truth 300x200: the truth is at a quarter of the scale"),
+        ((2400, 1600), "photo 1200x800, truth 2400x1600: the truth is at twice the scale"),
+        ((420, 280), "photo 1200x800, truth 420x280: the truth is at 0.35 times the scale"),
+        ((420, 279), "photo 1200x800, truth 420x279: the truth is at 0.35 times the scale"),
+        ((800, 1200), "photo 1200x800, truth 800x1200: one of them is turned"),
+        ((1199, 800), "photo 1200x800, truth 1199x800: they must be equal"),
+        ((600, 800), "photo 1200x800, truth 600x800: they must be equal"),
+    ],
+)
+def test_a_truth_of_another_size_is_refused_and_another_scale_is_told(tmp_path, size, told):
+    write(tmp_path, "blended/a.png", size=(1200, 800))
+    write(tmp_path, "gt/a.png", size=size)
+    read = only("pairs", tmp_path)
+    assert read.cases == ()
+    assert read.refused == (f"blended/a: {told}",)
+
+
+def test_a_reflection_of_another_size_is_refused_too(tmp_path):
+    repacked(tmp_path, ["a"])
+    write(tmp_path, "reflection/a.png", size=(4, 3))
+    (line,) = only("pairs", tmp_path).refused
+    assert line == "blended/a: photo 8x6, reflection 4x3: the reflection is at half the scale"
+
+
+def test_sizes_are_those_of_upright_pictures(tmp_path):
+    write(tmp_path, "blended/a.jpg", data=file_of(smooth(6, 8), "JPEG", exif=exif_block(orientation=6)))
+    write(tmp_path, "gt/a.png", size=(6, 8))
+    assert names(only("pairs", tmp_path).cases) == ["a"]
+
+
+@pytest.mark.parametrize(
+    ("role", "called"),
+    [("blended", "photo"), ("transmission_layer", "truth"), ("reflection_layer", "reflection")],
+)
+@pytest.mark.parametrize(("bad", "why"), [(b"", "is empty"), (b"no picture", "no picture brewster knows")])
+def test_an_unreadable_picture_is_refused_by_name(tmp_path, role, called, bad, why):
+    repacked(tmp_path, ["a", "b"], ("blended", "transmission_layer", "reflection_layer"))
+    (tmp_path / role / "a.png").write_bytes(bad)
+    read = only("pairs", tmp_path)
+    assert names(read.cases) == ["b"]
+    assert read.refused[0].startswith(f"blended/a: the {called} cannot be used: ")
+    assert why in read.refused[0]
+
+
+def test_a_dangling_link_is_refused_by_name(tmp_path):
+    repacked(tmp_path, ["a", "b"])
+    (tmp_path / "blended" / "a.png").unlink()
+    (tmp_path / "blended" / "a.png").symlink_to(tmp_path / "nowhere.png")
+    read = only("pairs", tmp_path)
+    assert names(read.cases) == ["b"]
+    assert "the photo cannot be used" in read.refused[0]
+
+
+# --- what is said aloud
+
+
+def test_a_count_that_is_not_the_known_one_is_said(tmp_path):
+    assert only("real20", repacked(tmp_path / "r", ["a"])).remarks == ("1 picture, where Real20 has 20",)
+    wild = only("wildscene", wildscene(tmp_path / "w", 56))
+    assert wild.remarks == ("56 pictures, where SIR2 Wildscene has 101 or 55",)
+    assert only("wildscene", wildscene(tmp_path / "x", 55)).remarks == ()
+
+
+def test_pictures_without_a_reflection_are_named_where_others_have_one(tmp_path):
+    repacked(tmp_path, ["a", "b", "c"])
+    assert only("pairs", tmp_path).remarks == ()
+    write(tmp_path, "reflection/b.png")
+    assert only("pairs", tmp_path).remarks == ("without a reflection to compare with: a and c",)
+
+
+# --- what is refused as a whole
+
+
+@pytest.mark.parametrize("name", BENCHMARKS)
+def test_an_empty_or_missing_folder_or_a_file_is_an_error_in_three_beats(tmp_path, name):
+    (tmp_path / "empty").mkdir()
+    write(tmp_path, "a.png")
+    for place in ("empty", "gone", "a.png"):
+        with pytest.raises(PhotoError, match=rf"{place}.*; .*; .*\.$"):
+            read_benchmark(name, tmp_path / place)
+
+
+def test_a_damaged_shard_is_an_error(tmp_path):
+    write(tmp_path, "shard-000000.tar", data=b"no tar" * 200)
+    with pytest.raises(PhotoError, match=r"is no rendered set \(.*\); .*; "):
+        read_benchmark("rendered", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("asked", "cure"),
+    [("nature", "did you mean nature20?"), ("SIR2", "did you mean sir2?"), ("xyz", "say pairs=FOLDER")],
+)
+def test_an_unknown_benchmark_is_an_error_that_knows_the_nearest(tmp_path, asked, cure):
+    with pytest.raises(PhotoError) as error:
+        read_benchmark(asked, tmp_path)
+    assert str(error.value).startswith(f"there is no benchmark {asked!r}; brewster reads real20, ")
+    assert cure in str(error.value)
+
+
+# --- files
+
+
+def test_a_file_is_read_where_it_lies_and_travels(tmp_path):
+    write(tmp_path, "a.png")
+    whole, span = PictureFile(tmp_path / "a.png"), PictureFile(tmp_path / "a.png", (1, 3))
+    assert whole.read() == picture()
+    assert span.read() == b"PNG"
+    assert pickle.loads(pickle.dumps(span)) == span
+    assert str(whole) == str(tmp_path / "a.png")
+    assert str(span) == f"{tmp_path / 'a.png'} from byte 1"
+
+
+def test_a_file_that_is_gone_or_too_short_is_an_error_in_three_beats(tmp_path):
+    write(tmp_path, "a.png")
+    for file, why in (
+        (PictureFile(tmp_path / "b.png"), "b.png cannot be read .No such file"),
+        (PictureFile(tmp_path), "cannot be read .Is a directory"),
+        (PictureFile(tmp_path / "a.png", (len(picture()) - 2, 5)), "cannot be read .2 of 5 bytes are there"),
+    ):
+        with pytest.raises(UnreadablePhoto, match=f"{why}.*; .*; .*"):
+            file.read()
+
+
+# --- the paper's draw
+
+
+def test_the_draw_takes_one_shot_of_each_scene(whole):
+    for name in ("postcard", "solidobject"):
+        drawn = paper_draw(whole[name])
+        assert len(drawn) == len({case.scene for case in drawn}) == 20
+        assert set(drawn) <= set(whole[name].cases)
+        assert [case.scene for case in drawn] == sorted((case.scene for case in drawn), key=natural)
+        assert drawn != paper_draw(whole[name], seed=PAPER_SEED + 1)
+    assert paper_draw(whole["wildscene"]) == whole["wildscene"].cases
+
+
+def test_the_published_draw_never_changes(whole):
+    solid = {case.scene: case.name for case in paper_draw(whole["solidobject"])}
+    assert " ".join(solid[str(scene)].split("-", 1)[1] for scene in range(1, 11)) == (
+        "Focus-16 Focus-19 Focus-11 Focus-11 Thick-10 Thick-10 Focus-22 Focus-11 Focus-32 Thick-3"
+    )
+
+
+def test_the_draw_of_a_scene_depends_on_no_other_scene(whole, tmp_path):
+    full = {case.scene: case.name for case in paper_draw(whole["postcard"])}
+    few = paper_draw(only("postcard", postcard(tmp_path, POSTCARD_SCENES[3:6])))
+    assert {case.scene: case.name for case in few} == {scene: full[scene] for scene in POSTCARD_SCENES[3:6]}
+
+
+def test_the_draw_does_not_depend_on_the_order_of_cases(whole, original, monkeypatch):
+    listing = registry.Path.iterdir
+    monkeypatch.setattr(registry.Path, "iterdir", lambda path: iter(sorted(listing(path), reverse=True)))
+    assert paper_draw(only("solidobject", original)) == paper_draw(whole["solidobject"])
+
+
+def test_a_repacked_set_whose_names_tell_the_scenes_can_be_drawn(tmp_path):
+    read = only("solidobject", repacked(tmp_path, ["1-Focus-11", "1-Focus-13", "12_Thick_3", "2-x"]))
+    assert [case.scene for case in read.cases] == ["1", "1", "2", "12"]
+    assert [case.scene for case in paper_draw(read)] == ["1", "2", "12"]
+
+
+@pytest.mark.parametrize("stems", [["ab-1", "7"], ["1", "2"], [f"{number}-m" for number in range(21)]])
+@pytest.mark.parametrize("name", ["postcard", "solidobject"])
+def test_a_repacked_set_whose_names_do_not_tell_cannot_be_drawn(tmp_path, name, stems):
+    read = only(name, repacked(tmp_path, stems))
+    assert [case.scene for case in read.cases] == names(read.cases)
+    assert (
+        "scenes cannot be told from the names, so the paper's draw is impossible with this form"
+        in read.remarks
+    )
+    with pytest.raises(PhotoError, match=r"scenes of SIR2 .* cannot be told .*; .*; .*"):
+        paper_draw(read)
+
+
+def test_other_benchmarks_are_drawn_whole(tmp_path):
+    for name, folder in (("real20", "r"), ("pairs", "mine"), ("pairs", "postcard")):
+        read = only(name, repacked(tmp_path / folder, ["a", "b"]))
+        assert paper_draw(read) == read.cases

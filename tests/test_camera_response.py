@@ -1,0 +1,314 @@
+"""Light becomes photographs: one exposure, one balance and one curve for all layers, and they are on record."""
+
+import tomllib
+
+import numpy as np
+import pytest
+import tomli_w
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from brewster.errors import UnsupportedPhoto
+from brewster.photo import Photo
+from brewster.render.camera_response import develop, jpeg, to_bytes, with_jpeg
+from brewster.render.sample import LAYERS, LightSample
+from brewster.scene.scene import Development, Scene
+from brewster.srgb import REC709_LUMINANCE, to_encoded, to_linear
+
+some = settings(max_examples=60, deadline=None, database=None)
+SHAPE = st.tuples(st.just(3), st.integers(1, 9), st.integers(1, 9))
+LIGHT = st.one_of(st.just(0.0), st.floats(-25, 25).map(lambda ev: 2.0**ev), st.floats(0, 1, width=32))
+PICTURES = arrays.arrays(np.float32, SHAPE, elements=LIGHT, fill=st.nothing()) | arrays.arrays(
+    np.float32, SHAPE, elements=LIGHT
+)
+BALANCES = ["grey-world", "white-patch", "grey-edge"]
+WISHES = st.builds(
+    Development,
+    exposure=st.floats(0.01, 1),
+    white_balance=st.sampled_from(["none", *BALANCES]),
+    white_balance_strength=st.floats(0, 1),
+    contrast=st.floats(-0.5, 0.9),
+)
+
+
+def sample_of(photo, reflection=None, mirror=None, seed=0, index=0, **wishes):
+    photo = torch.as_tensor(photo, dtype=torch.float32)
+    reflection = photo * 0.25 if reflection is None else torch.as_tensor(reflection)
+    return LightSample(
+        Scene(seed=seed, index=index, development=Development(**wishes)),
+        photo=photo,
+        transmission=photo - reflection,
+        background=(photo - reflection) / 0.9,
+        reflection=reflection,
+        mirror=photo * 8 if mirror is None else mirror,
+    )
+
+
+def noise(shape=(3, 40, 56), low=0.02, high=0.5):
+    return torch.rand(shape, generator=torch.Generator().manual_seed(3)) * (high - low) + low
+
+
+def seen(light, developed, ev=None):
+    """Light after the recorded decisions, before it is clipped."""
+    gains = torch.tensor(developed.white_balance).view(3, 1, 1)
+    return light * gains * 2 ** (developed.exposure_ev if ev is None else ev)
+
+
+def mean_luminance(light):
+    return float(light.double().clamp(0, 1).mean((1, 2)) @ torch.tensor(REC709_LUMINANCE).double())
+
+
+# --- exposure
+
+
+@some
+@given(PICTURES, st.floats(0.01, 1), st.sampled_from(["none", *BALANCES]))
+def test_the_mean_of_any_picture_is_as_wanted_wherever_it_can_be(picture, wanted, balance):
+    sample = sample_of(picture, exposure=wanted, white_balance=balance)
+    developed = develop(sample)
+    layers = (("photo", developed.exposure_ev), ("mirror", developed.mirror_exposure_ev))
+    for name, ev in layers:
+        light = getattr(sample, name)
+        most = mean_luminance(seen(light, developed, 32))
+        assert mean_luminance(seen(light, developed, ev)) == pytest.approx(min(wanted, most), rel=0.01)
+
+
+def test_a_black_picture_stays_black_and_is_not_exposed():
+    for balance in ("none", *BALANCES):
+        developed = develop(sample_of(torch.zeros(3, 4, 5), white_balance=balance))
+        assert developed.exposure_ev == developed.mirror_exposure_ev == developed.overexposed == 0
+        assert developed.white_balance == (1, 1, 1)
+        assert not any(layer.any() for layer in developed.layers().values())
+
+
+def test_lamps_do_not_darken_the_room():
+    room = torch.full((3, 20, 20), 0.1)
+    lit = room.clone()
+    lit[:, 0, :4] = 1e6
+    exposures = [develop(sample_of(picture, exposure=0.4)).exposure_ev for picture in (room, lit)]
+    assert exposures == pytest.approx([2, 2], abs=0.03)
+
+
+def test_light_that_cannot_fill_the_picture_is_not_pushed_without_end():
+    half_black = torch.zeros(3, 4, 4)
+    half_black[:, :2] = 0.5
+    developed = develop(sample_of(half_black, exposure=0.9))
+    assert developed.exposure_ev == pytest.approx(1, abs=0.02)
+
+
+def test_the_overexposed_share_counts_pixels_that_are_white_in_any_channel():
+    picture = torch.full((3, 10, 10), 0.01)
+    picture[0, :2] = 100
+    picture[1, 1:3] = 100
+    assert develop(sample_of(picture, exposure=0.25)).overexposed == 0.3
+
+
+# --- one treatment
+
+
+@some
+@given(PICTURES, WISHES)
+def test_the_same_light_has_the_same_value_in_every_layer(picture, wish):
+    sample = sample_of(picture, **wish.model_dump())
+    alike = LightSample(sample.scene, *[sample.photo] * 5)
+    layers = develop(alike).layers()
+    assert list(layers) == list(LAYERS)
+    for layer in layers.values():
+        assert layer.dtype == torch.float32
+        assert layer.shape == picture.shape
+        assert layer.min() >= 0
+        assert layer.max() <= 1
+        assert torch.equal(layer, layers["photo"])
+
+
+@some
+@given(PICTURES, WISHES)
+def test_the_record_reproduces_the_pictures(picture, wish):
+    sample = sample_of(picture, **wish.model_dump())
+    developed = develop(sample)
+    outcome = tomllib.loads(tomli_w.dumps(developed.decisions()))
+    assert outcome["white_balance"] == list(developed.white_balance)
+    for name in LAYERS:
+        ev = outcome["mirror_exposure_ev" if name == "mirror" else "exposure_ev"]
+        encoded = to_encoded(seen(getattr(sample, name), developed, ev).clamp(0, 1))
+        smooth = encoded**2 * (3 - 2 * encoded)
+        expected = encoded + wish.contrast * (smooth - encoded)
+        torch.testing.assert_close(developed.layers()[name], expected, atol=2e-6, rtol=0)
+    assert outcome["overexposed"] == pytest.approx(
+        (seen(sample.photo, developed) >= 1).any(0).float().mean().item(), abs=1e-6
+    )
+
+
+@some
+@given(PICTURES, st.floats(0, 1), st.sampled_from(["none", *BALANCES]))
+def test_the_layers_of_a_photograph_add_up_where_nothing_clips(picture, share, balance):
+    sample = sample_of(picture, reflection=picture * np.float32(share), white_balance=balance)
+    developed = develop(sample)
+    photo, transmission, reflection = (
+        to_linear(getattr(developed, f"{name}_encoded")) for name in ("photo", "transmission", "reflection")
+    )
+    inside = seen(sample.photo, developed) < 1
+    torch.testing.assert_close((transmission + reflection)[inside], photo[inside], atol=1e-5, rtol=0)
+
+
+def test_contrast_darkens_the_dark_brightens_the_bright_and_keeps_black_middle_and_white():
+    ramp = to_linear(torch.linspace(0, 1, 101)).expand(3, 4, 101).clone()
+    plain, firm, soft = (develop(sample_of(ramp, contrast=c)).photo_encoded[0, 0] for c in (0, 0.9, -0.5))
+    torch.testing.assert_close(plain, firm, atol=0.1, rtol=0)
+    assert firm[0] == soft[0] == 0
+    for curve in (plain, firm, soft):
+        assert (curve.diff() >= 0).all()
+        assert curve[-1] == pytest.approx(1, abs=1e-6)
+    dark, bright = (plain > 0.05) & (plain < 0.45), (plain > 0.55) & (plain < 0.95)
+    assert (firm < plain)[dark].all()
+    assert (firm > plain)[bright].all()
+    assert (soft > plain)[dark].all()
+    assert (soft < plain)[bright].all()
+
+
+# --- white balance
+
+CAST = torch.tensor([1.4, 1.0, 0.6]).view(3, 1, 1)
+
+
+@some
+@given(st.floats(0.5, 1.9), st.floats(0.5, 1.9), st.integers(0, 99))
+def test_grey_world_makes_the_means_equal_and_keeps_luminance(red, blue, seed):
+    picture = torch.rand((3, 12, 12), generator=torch.Generator().manual_seed(seed)) * 0.5 + 0.25
+    picture *= torch.tensor([red, 1, blue]).view(3, 1, 1)
+    sample = sample_of(picture, white_balance="grey-world", exposure=0.1)
+    developed = develop(sample)
+    assert max(developed.white_balance) < 3
+    balanced = to_linear(developed.photo_encoded).mean((1, 2))
+    torch.testing.assert_close(balanced, balanced.mean().expand(3), atol=0, rtol=1e-3)
+    gains = torch.tensor(developed.white_balance).view(3, 1, 1)
+    assert mean_luminance(picture / 4 * gains) == pytest.approx(mean_luminance(picture / 4), rel=1e-3)
+
+
+@pytest.mark.parametrize("balance", BALANCES)
+def test_every_white_balance_takes_away_a_cast(balance):
+    grey = noise((1, 40, 56)).expand(3, 40, 56)
+    developed = develop(sample_of(grey * CAST, white_balance=balance, exposure=0.2))
+    gains = torch.tensor(developed.white_balance).view(3, 1, 1)
+    torch.testing.assert_close(gains * CAST / (gains * CAST)[1], torch.ones(3, 1, 1), atol=1e-3, rtol=0)
+
+
+@pytest.mark.parametrize("strength", [0.25, 0.5, 1.0])
+def test_white_balance_of_any_strength_keeps_luminance(strength):
+    picture = noise((3, 40, 56)) * CAST
+    developed = develop(
+        sample_of(picture, white_balance="grey-world", white_balance_strength=strength, exposure=0.01)
+    )
+    gains = torch.tensor(developed.white_balance).view(3, 1, 1)
+    assert mean_luminance(picture * gains) == pytest.approx(mean_luminance(picture), rel=1e-3)
+
+
+@pytest.mark.parametrize("balance", BALANCES)
+def test_half_the_strength_goes_half_the_way_in_stops(balance):
+    full, half, none = (
+        np.log2(
+            develop(sample_of(noise() * CAST, white_balance=balance, white_balance_strength=s)).white_balance
+        )
+        for s in (1, 0.5, 0)
+    )
+    assert not none.any()
+    assert np.abs(full).max() > 0.1
+    np.testing.assert_allclose(2 * np.diff(half), np.diff(full), atol=2e-3)
+
+
+@pytest.mark.parametrize("balance", BALANCES)
+def test_clipped_lamps_have_no_say_in_the_white_balance(balance):
+    picture = noise()
+    lit = picture.clone()
+    lit[2, 3:5, 3:5] = 1e5
+    lit[:, 10:14, 10:20] = 1e5
+    plain, with_lamps = (
+        develop(sample_of(each, white_balance=balance, exposure=0.3)).white_balance for each in (picture, lit)
+    )
+    assert plain == pytest.approx(with_lamps, abs=0.01)
+
+
+@some
+@given(PICTURES, st.sampled_from(BALANCES), st.floats(0, 1))
+def test_white_balance_stays_within_three(picture, balance, strength):
+    developed = develop(sample_of(picture, white_balance=balance, white_balance_strength=strength))
+    assert all(0.3333 <= gain <= 3 for gain in developed.white_balance)
+
+
+# --- noise
+
+
+def flat(level, **wishes):
+    return sample_of(torch.full((3, 200, 200), level), exposure=level, **wishes)
+
+
+@pytest.mark.parametrize("level", [0.2, 0.6])
+def test_noise_has_the_asked_deviation_and_is_in_the_photo_alone(level):
+    developed = develop(flat(level, shot_noise=0.03, read_noise=0.01))
+    quiet = develop(flat(level))
+    deviation = (to_linear(developed.photo_encoded) - level).std().item()
+    assert deviation == pytest.approx((0.03**2 * level + 0.01**2) ** 0.5, rel=0.02)
+    for name in LAYERS[1:]:
+        assert torch.equal(developed.layers()[name], quiet.layers()[name])
+
+
+def test_noise_belongs_to_seed_and_index():
+    first, again, other_seed, other_index, swapped = (
+        develop(flat(0.3, seed=seed, index=index, read_noise=0.05)).photo_encoded
+        for seed, index in [(5, 9), (5, 9), (6, 9), (5, 9 + 2**32), (9, 5)]
+    )
+    assert torch.equal(first, again)
+    for other in (other_seed, other_index, swapped):
+        assert abs(np.corrcoef(first.ravel(), other.ravel())[0, 1]) < 0.02
+
+
+def test_developing_twice_gives_the_same_bits():
+    for balance in BALANCES:
+        one, two = (
+            develop(sample_of(noise(), white_balance=balance, shot_noise=0.1, contrast=0.3)) for _ in range(2)
+        )
+        assert one.decisions() == two.decisions()
+        assert all(torch.equal(one.layers()[name], two.layers()[name]) for name in LAYERS)
+
+
+# --- bytes
+
+
+@some
+@given(arrays.arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3))))
+def test_eight_bits_survive_the_way_to_a_tensor_and_back(pixels):
+    assert np.array_equal(to_bytes(torch.from_numpy(pixels).permute(2, 0, 1) / 255), pixels)
+
+
+def test_jpegs_are_the_same_bytes_again_and_grow_with_quality():
+    files = [jpeg(noise(), quality) for quality in (1, 30, 60, 90, 95, 100)]
+    assert files == [jpeg(noise(), quality) for quality in (1, 30, 60, 90, 95, 100)]
+    sizes = [len(file) for file in files]
+    assert sizes == sorted(set(sizes))
+
+
+def test_a_jpeg_says_its_quality_keeps_its_chroma_and_carries_nothing_else():
+    photo = Photo.open(jpeg(noise(), 83))
+    assert (photo.origin.container, photo.origin.jpeg_quality) == ("jpeg", 83)
+    assert photo.origin.subsampling == "4:4:4"
+    assert photo.size == (56, 40)
+    assert {photo.origin.icc, photo.origin.exif, photo.origin.xmp, photo.origin.iptc} == {None}
+
+
+def test_a_picture_too_wide_for_a_jpeg_is_refused():
+    with pytest.raises(UnsupportedPhoto, match="jpeg"):
+        jpeg(torch.zeros(3, 1, 65536), 95)
+
+
+def test_live_training_sees_the_photo_as_it_comes_back_from_its_jpeg():
+    ramp = torch.linspace(0.01, 0.6, 56).expand(3, 40, 56).clone()
+    developed = develop(sample_of(ramp, jpeg_quality=40))
+    lived = with_jpeg(developed)
+    decoded = Photo.open(jpeg(developed.photo_encoded, 40)).pixels
+    assert np.array_equal(to_bytes(lived.photo_encoded), decoded)
+    assert lived.photo_encoded.dtype == torch.float32
+    assert 0.001 < (lived.photo_encoded - developed.photo_encoded).abs().mean() < 0.05
+    for name in LAYERS[1:]:
+        assert torch.equal(lived.layers()[name], developed.layers()[name])

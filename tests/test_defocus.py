@@ -1,0 +1,119 @@
+"""The thin lens over far content: a convolution that equals what chance finds."""
+
+import math
+
+import pytest
+import torch
+
+from brewster.render.analytic import render
+from brewster.render.rays.defocus import _disc, blurred, margin_px
+from brewster.scene.camera import Camera
+from worlds_of_one import WORLDS, Worlds, a_scene, around, at, board, sun, where
+
+
+def lens(aperture_mm, focus_mm=500.0, **more):
+    return Camera(
+        **{"width": 32, "height": 32, "fov_deg": 40, **more}, aperture_mm=aperture_mm, focus_mm=focus_mm
+    )
+
+
+def test_without_an_aperture_the_camera_is_a_pinhole():
+    picture = torch.rand(3, 32, 32)
+    assert margin_px(lens(0.0)) == 0
+    assert blurred(picture, lens(0.0), 0) is picture
+
+
+def test_a_tiny_aperture_is_a_pinhole_too():
+    scenes = (a_scene(camera={"aperture_mm": a}, behind=around("mottled")) for a in (0.0, 0.1))
+    pinhole, tiny = (render(scene, WORLDS).photo for scene in scenes)
+    assert torch.equal(pinhole, tiny)
+
+
+@pytest.mark.parametrize("radius_px", [0.1, 0.5, 1.3, 4.0, 9.7])
+def test_the_disc_sums_to_one_and_has_its_own_radius(radius_px):
+    reach = math.ceil(radius_px + 0.5)
+    disc = _disc(radius_px, reach)
+    assert disc.shape == (2 * reach + 1, 2 * reach + 1)
+    assert float(disc.sum()) == pytest.approx(1, abs=1e-9)
+    assert torch.equal(disc, disc.T)
+    assert torch.equal(disc, disc.flip(0))
+    if radius_px > 1:
+        middle = float(disc[reach, reach])
+        assert 1 / middle == pytest.approx(math.pi * radius_px**2, rel=0.04)
+
+
+@pytest.mark.parametrize("aperture_mm", [20.0, 55.0, 100.0])
+def test_a_point_is_seen_as_a_disc_of_half_the_aperture_over_the_focus(aperture_mm):
+    camera = lens(aperture_mm)
+    margin, radius = margin_px(camera), aperture_mm / (2 * 500) / camera.pixel_rad
+    point = torch.zeros(1, 32 + 2 * margin, 32 + 2 * margin)
+    point[0, margin + 14, margin + 18] = 1
+    picture = blurred(point, camera, margin)
+    assert float(picture.sum()) == pytest.approx(1, abs=1e-5)
+    assert where(picture) == pytest.approx((18.5, 14.5), abs=1e-4)
+    assert float(1 / picture.max()) == pytest.approx(math.pi * radius**2, rel=0.05)
+    across = torch.arange(32) - 18
+    spread = float((picture[0].sum(0) * across**2).sum())
+    assert spread == pytest.approx(radius**2 / 4 + 1 / 12, abs=0.06)  # a disc's, and a pixel's
+    assert float(picture[0, 14, across.abs() > radius + 1].max()) < 1e-6
+
+
+def test_the_sun_through_a_lens_keeps_its_place_and_energy():
+    light = Worlds(sun=sun(128, 64, 0))
+    scenes = (
+        a_scene(camera=at(0, width=48, height=48, aperture_mm=a, focus_mm=600.0), behind=around("sun"))
+        for a in (0.0, 40.0)
+    )
+    sharp, soft = (render(scene, light).background for scene in scenes)
+    assert float(soft.sum()) == pytest.approx(float(sharp.sum()), rel=1e-3)
+    assert where(soft) == pytest.approx(where(sharp), abs=0.05)
+    assert soft.max() < sharp.max() / 2
+
+
+def test_what_lies_outside_the_picture_is_blurred_into_it():
+    """Light just beyond the right edge reaches in by the disc's radius."""
+    camera = lens(60.0)
+    margin = margin_px(camera)
+    picture = torch.zeros(1, 32 + 2 * margin, 32 + 2 * margin)
+    picture[:, :, margin + 32 :] = 1
+    edge = blurred(picture, camera, margin)[0, 16]
+    assert 0.3 < edge[31] < 0.5
+    assert edge[: 32 - margin].max() < 1e-6
+
+
+@pytest.mark.parametrize("incidence_deg", [0, 30])
+def test_a_lens_over_far_light_equals_rays_by_chance(incidence_deg):
+    """A wedge of nearly nothing makes the renderer throw dice."""
+    by_convolution, by_chance = (
+        render(
+            a_scene(
+                camera=at(incidence_deg, aperture_mm=40, focus_mm=800, fov_deg=40),
+                panes=[{"wedge_deg": wedge_deg}],
+                behind=around("soft", heading_deg=60),
+                front=around("soft"),
+                samples=196,
+            ),
+            WORLDS,
+        )
+        for wedge_deg in (0.0, 1e-9)
+    )
+    for name, most in (("background", 3e-3), ("transmission", 3e-3), ("mirror", 3e-3), ("reflection", 0.01)):
+        one, other = getattr(by_convolution, name), getattr(by_chance, name)
+        assert float(((one - other).abs() / one.mean()).max()) < most, name
+        assert float(one.mean()) == pytest.approx(float(other.mean()), rel=2e-3)
+
+
+def test_a_near_picture_is_sharp_where_the_lens_is_set_on_it():
+    pictures = [
+        render(
+            a_scene(
+                camera=at(0, aperture_mm=60, focus_mm=focus_mm),
+                behind=board("line", distance_mm=504, width_mm=1600),
+                samples=64,
+            ),
+            WORLDS,
+        ).background
+        for focus_mm in (650, 1004, 3500)
+    ]
+    peaks = [float(picture.mean((0, 1)).max()) for picture in pictures]
+    assert peaks[1] > 1.1 * max(peaks[0], peaks[2])

@@ -1,0 +1,299 @@
+"""A large model behind the Separator: twins where the machinery matters, and a model that is known where the answer does."""
+
+import json
+import shutil
+from types import SimpleNamespace
+
+import huggingface_hub
+import numpy as np
+import pytest
+import torch
+
+from brewster import Photo, Separator
+from brewster.errors import DeviceError, DownloadError, ModelError, PhotoError
+from brewster.inference.diffusion_predictor import DiffusionPredictor
+from brewster.inference.separator import RECONSTRUCTION_ERROR_LIMIT
+from brewster.models.diffusion.adapter.lora import LORA_FILE, add_lora, lora_parameters, save_lora
+from brewster.models.diffusion.backbones import TINY, tiny
+from brewster.models.diffusion.panels import PanelLayout
+from brewster.models.diffusion.pipeline import fingerprint, open_decomposer
+from brewster.models.diffusion.task import DecompositionTask
+from brewster.models.diffusion.tensors import read_tensors, write_tensors
+from brewster.srgb import to_encoded, to_linear
+
+SMALL = 3 * 48 * 32
+
+
+class Oracle:
+    """A model that splits every photo alike, T = 0.7 I and R = 0.3 I, and draws all its panels in a tint of its own."""
+
+    backbone = SimpleNamespace(multiple=16)
+
+    def __init__(self, tint=0.0, panels=("I", "T", "R"), budget_px=3 * 96 * 96):
+        self.task = DecompositionTask(PanelLayout(panels), budget_px)
+        self.tint, self.calls = tint, []
+
+    def __call__(self, photo, *, steps, seeds, tell):
+        self.calls.append((tuple(photo.shape[-2:]), steps, len(seeds)))
+        light = to_linear((photo + 1) / 2)
+        shares = {"I": 1.0, "T": 0.7, "R": 0.3}
+        for step in range(steps):
+            tell(step + 1, steps)
+        return {name: self.draw(shares[name] * light, len(seeds)) for name in self.task.layout.panels}
+
+    def draw(self, light, count):
+        return (2 * (to_encoded(light) + self.tint) - 1).clamp(-1, 1).expand(count, -1, -1, -1)
+
+
+def smooth(width, height, seed=1):
+    """A photo of soft colours, never near black or white."""
+    coarse = np.random.default_rng(seed).uniform(0.15, 0.6, (4, 5, 3)).astype(np.float32)
+    rows, columns = np.linspace(0, 2.99, height), np.linspace(0, 3.99, width)
+    picture = coarse[rows.astype(int)][:, columns.astype(int)]
+    for axis, where in ((0, rows), (1, columns)):
+        part = (where % 1).reshape([-1 if i == axis else 1 for i in range(3)]).astype(np.float32)
+        later = coarse[np.minimum(rows.astype(int) + (axis == 0), 3)][
+            :, np.minimum(columns.astype(int) + (axis == 1), 4)
+        ]
+        picture = picture * (1 - part) + later * part
+    return Photo.from_array(picture.astype(np.float32), encoding="linear")
+
+
+@pytest.fixture(scope="module")
+def lora(tmp_path_factory):
+    """A LoRA that changes something, on a toy twin of the paper's backbone."""
+    folder = tmp_path_factory.mktemp("kontext") / "lora"
+    backbone, prompt = tiny("kontext")
+    add_lora(backbone, rank=2, alpha=2)
+    with torch.no_grad():
+        for parameter in lora_parameters(backbone):
+            parameter.normal_(0, 0.1, generator=torch.Generator().manual_seed(3))
+    save_lora(folder, backbone, prompt, DecompositionTask(budget_px=SMALL), base=f"{TINY}kontext")
+    return folder
+
+
+@pytest.mark.parametrize("tint", [-0.1, 0.0, 0.08])
+def test_the_colours_that_a_model_draws_amiss_do_not_reach_the_layers(tint):
+    photo = smooth(300, 200)
+    result = Separator(DiffusionPredictor(Oracle(tint)))(photo)
+    off = np.abs(result.transmission.linear() - 0.7 * photo.linear()).mean()
+    believed = np.abs(to_linear(to_encoded(0.7 * photo.linear()) + tint) - 0.7 * photo.linear()).mean()
+    assert off < max(0.004, believed / 2)
+    assert result.reconstruction_error == pytest.approx(abs(tint), abs=0.004)
+    assert result.doubtful == (abs(tint) > RECONSTRUCTION_ERROR_LIMIT)
+
+
+def test_confidence_falls_with_the_drift():
+    photo = smooth(120, 90)
+    sure, doubtful = (
+        Separator(DiffusionPredictor(Oracle(tint)))(photo).confidence.pixels.mean() for tint in (0, 0.1)
+    )
+    assert sure > 245
+    assert doubtful < 100
+
+
+def test_strength_nought_is_the_photo_and_half_is_half_the_way():
+    photo = Photo.from_array(
+        np.random.default_rng(2).integers(0, 256, (160, 240, 3), np.uint8), encoding="srgb"
+    )
+    separator = Separator(DiffusionPredictor(Oracle()))
+    assert (separator(photo, strength=0).transmission.pixels == photo.pixels).all()
+    none, half, whole = (separator(photo, strength=share).transmission.linear() for share in (0, 0.5, 1))
+    np.testing.assert_allclose(half, (none + whole) / 2, atol=0.01)
+
+
+def test_the_photos_own_detail_is_kept_unless_the_plain_drawing_is_asked_for():
+    rows = np.linspace(0.2, 0.5, 400, dtype=np.float32)[:, None, None]
+    photo = Photo.from_array(np.broadcast_to(rows, (400, 400, 3)).copy(), encoding="linear")
+    fine = photo.linear()
+    fine[::2] *= 1.1  # lines of one pixel, which no panel of 96 px can show
+    photo = Photo.from_array(fine, encoding="linear")
+    kept, plain = (
+        Separator(DiffusionPredictor(Oracle(), plain=plain))(photo).transmission.linear()
+        for plain in (False, True)
+    )
+    contrast = [np.abs(np.diff(layer[100:-100], axis=0)).mean() / np.abs(np.diff(fine[100:-100], axis=0)).mean()
+                for layer in (kept, plain)]  # fmt: skip
+    assert contrast[0] > 0.6
+    assert contrast[1] < 0.1
+
+
+def test_drafts_take_few_steps_and_close_looks_see_tiles():
+    calls = {}
+    for quality in ("draft", "standard", "best"):
+        oracle = Oracle()
+        Separator(DiffusionPredictor(oracle, average=2))(smooth(400, 300), quality=quality)
+        calls[quality] = oracle.calls
+    assert calls["draft"] == [((80, 112), 4, 2)]
+    assert calls["standard"] == [((80, 112), 20, 2)]
+    assert calls["best"][0] == calls["standard"][0]
+    assert set(calls["best"][1:]) == {((96, 96), 20, 2)}
+    assert len(calls["best"]) == 1 + 6
+
+
+@pytest.mark.parametrize(("width", "height"), [(16, 16), (17, 40), (30, 20), (90, 21), (171, 16), (1000, 60)])
+def test_photos_of_any_shape_come_back_in_their_size(width, height):
+    result = Separator(DiffusionPredictor(Oracle(budget_px=3 * 128 * 128)))(smooth(width, height))
+    assert result.transmission.size == result.reflection.size == (width, height)
+    np.testing.assert_allclose(result.transmission.linear(), 0.7 * result.photo.linear(), atol=0.02)
+
+
+def test_a_photo_that_is_smaller_than_a_token_is_refused_with_the_size_it_takes():
+    with pytest.raises(PhotoError, match=r"15 x 40 pixels; at least 16 a side, .* or use the compact model"):
+        Separator(DiffusionPredictor(Oracle()))(smooth(15, 40))
+
+
+def test_a_model_that_draws_no_reflection_leaves_what_it_took_away():
+    photo = smooth(100, 80)
+    result = Separator(DiffusionPredictor(Oracle(panels=("T",), budget_px=96 * 96)))(photo)
+    np.testing.assert_allclose(result.reflection.linear(), 0.3 * photo.linear(), atol=0.02)
+    assert result.reconstruction_error is None
+    assert not result.doubtful
+    assert not result.confidence.pixels.any()  # nothing tells how sure it is
+
+
+def test_a_model_that_draws_numbers_that_are_none_is_refused():
+    class Broken(Oracle):
+        def draw(self, light, count):
+            return super().draw(light * float("nan"), count)
+
+    with pytest.raises(ModelError, match="numbers that are none; finite ones"):
+        Separator(DiffusionPredictor(Broken()))(smooth(60, 40))
+
+
+def test_light_that_the_photo_could_not_hold_is_no_drift():
+    photo = Photo.from_array(np.full((64, 64, 3), 1.0, np.float32), encoding="linear")
+
+    class Bright(Oracle):
+        def draw(self, light, count):
+            return super().draw(light + 0.4, count)
+
+    assert Separator(DiffusionPredictor(Bright(panels=("T", "R"))))(photo).reconstruction_error < 0.004
+
+
+def test_the_share_that_is_done_rises_tile_by_tile_and_step_by_step():
+    told = []
+    Separator(DiffusionPredictor(Oracle()))(smooth(400, 300), quality="best", tell=told.append)
+    assert told == sorted(told)
+    assert told[-1] == 1
+    assert len(told) > 7 * 20
+
+
+@pytest.mark.parametrize("effort", [{"steps": 0}, {"average": 0}])
+def test_no_step_and_no_answer_are_refused(effort):
+    with pytest.raises(ModelError, match="at least 1 of each"):
+        DiffusionPredictor(Oracle(), **effort)
+
+
+def test_a_lora_goes_through_the_separator_by_its_folder(lora):
+    separator = Separator.load(str(lora), steps=2)
+    first, again = separator(smooth(90, 60)), Separator.load(str(lora), steps=2)(smooth(90, 60))
+    assert (separator.name, separator.device, len(separator.sha256)) == ("lora", "cpu", 64)
+    assert (first.transmission.pixels == again.transmission.pixels).all()
+    assert (first.transmission.pixels != first.photo.pixels).any()
+    assert first.reconstruction_error is not None
+    other = Separator.load(str(lora), steps=3)(smooth(90, 60))
+    assert (first.transmission.pixels != other.transmission.pixels).any()
+
+
+def test_a_backbone_without_a_lora_is_asked_for_the_transmission_alone():
+    decomposer = open_decomposer("tiny:klein")
+    assert decomposer.task.layout.panels == ("T",)
+    generic = open_decomposer("tiny:klein", prompt="generic")
+    assert generic.prompt.text == "Remove the reflection."
+    assert generic.sha256 != decomposer.sha256
+    result = Separator(DiffusionPredictor(decomposer, steps=1))(smooth(40, 40))
+    assert result.transmission.size == (40, 40)
+
+
+def test_what_a_lora_is_opened_with_is_checked(lora, tmp_path):
+    with pytest.raises(ModelError, match="is a LoRA of kontext; its base, not a klein"):
+        open_decomposer(str(lora), base="tiny:klein")
+    with pytest.raises(ModelError, match="is a base itself"):
+        open_decomposer("tiny:klein", base="tiny:kontext")
+    with pytest.raises(DeviceError, match="do not run on coreml; one of auto, cuda, rocm, cpu"):
+        open_decomposer(str(lora), device="coreml")
+    with pytest.raises(ModelError, match=f"holds no model; a LoRA .{LORA_FILE}"):
+        open_decomposer(str(tmp_path))
+    (tmp_path / LORA_FILE).write_bytes(b"torn")
+    with pytest.raises(ModelError):
+        open_decomposer(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"rank": "4"}, "card of the LoRA cannot be read"),
+        ({"alpha": 0}, "card of the LoRA cannot be read"),
+        ({"base": None}, "card of the LoRA cannot be read"),
+        ({"quantise": "int3"}, "card of the LoRA cannot be read"),
+        ({"prompt_sha256": None}, "card of the LoRA cannot be read"),
+        ({"more": 1}, "card of the LoRA cannot be read"),
+        ({"task": {"objective": "two"}}, "card of the LoRA cannot be read"),
+        ({"task": {"budget_px": "18432"}}, "card of the LoRA cannot be read"),
+        ({"task": {"layout": {"panels": ["I", "R"], "direction": "stacked"}}}, "T among them"),
+        ({"task": {"layout": {"panels": ["T", "T"], "direction": "stacked"}}}, "each once"),
+    ],
+)
+def test_a_damaged_card_ends_in_a_sentence(lora, tmp_path, change, words):
+    tensors, about = read_tensors(lora / LORA_FILE)
+    card = json.loads(about["brewster"])
+    card |= change | {"task": card["task"] | change.get("task", {})}
+    write_tensors(tmp_path / LORA_FILE, tensors, about | {"brewster": json.dumps(card)})
+    with pytest.raises(ModelError, match=words):
+        Separator.load(str(tmp_path))
+
+
+def test_another_base_has_another_digest(lora, tmp_path):
+    for seed in (0, 1):
+        tiny("kontext", seed)[0].save(tmp_path / str(seed))
+    digests = [fingerprint(str(lora)), *(fingerprint(str(lora), base=str(tmp_path / name)) for name in "01")]
+    assert len(set(digests)) == 3
+    assert fingerprint(str(tmp_path / "0")) != fingerprint(str(tmp_path / "1"))
+    assert Separator.load(str(lora), base=str(tmp_path / "1")).sha256 == digests[2]
+
+
+@pytest.mark.parametrize("folder", ["compact", "kontext", "models"])
+def test_folders_here_do_not_stand_in_for_models(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / folder).mkdir()
+    assert Separator.load("compact").name == "compact"
+    with pytest.raises(ModelError, match="there is no model 'models/mine'" if folder == "models" else "."):
+        Separator.load(f"{folder}/mine")
+
+
+def test_a_base_that_has_moved_can_be_named(tmp_path):
+    backbone, prompt = tiny("kontext")
+    add_lora(backbone, rank=1, alpha=1)
+    save_lora(tmp_path / "lora", backbone, prompt, DecompositionTask(budget_px=SMALL), base="/gone/kontext")
+    with pytest.raises(ModelError, match=r"the base of .* was /gone/kontext, which is not there.*--base"):
+        Separator.load(str(tmp_path / "lora"))
+    assert Separator.load(str(tmp_path / "lora"), base="tiny:kontext").name == "lora"
+
+
+def test_one_step_takes_neither_steps_nor_averages():
+    one_step = Oracle()
+    one_step.task = DecompositionTask(PanelLayout(), SMALL, "one_step", 1.0)
+    with pytest.raises(ModelError, match="answers in one step"):
+        DiffusionPredictor(one_step, steps=4)
+    with pytest.raises(ModelError, match="answers in one step"):
+        DiffusionPredictor(one_step, average=2)
+
+
+def test_options_of_large_models_are_not_forgotten_by_small_ones():
+    with pytest.raises(ModelError, match="steps, plain was asked of compact"):
+        Separator.load("compact", steps=3, plain=True)
+
+
+def test_a_lora_is_opened_by_its_name_on_the_hub_from_the_cache(lora, tmp_path, monkeypatch):
+    repository = tmp_path / "models--me--glass"
+    shutil.copytree(lora, repository / "snapshots" / ("1" * 40))
+    (repository / "refs").mkdir()
+    (repository / "refs" / "main").write_text("1" * 40)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
+    separator = Separator.load("me/glass", steps=1)
+    assert separator.name == "glass"
+    assert separator.sha256 == Separator.load(str(lora)).sha256
+    with pytest.raises(DownloadError, match="me/other is not in the cache"):
+        Separator.load("me/other")

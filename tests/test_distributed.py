@@ -1,0 +1,91 @@
+"""Processes that learn as one: how many there are, what they add up, and launches that went wrong."""
+
+import os
+import subprocess
+import sys
+
+import accelerate
+import pytest
+import torch
+
+from brewster.errors import DeviceError
+from brewster.training import distributed
+
+LAUNCHED = {"RANK": "0", "LOCAL_RANK": "0", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29555"}
+
+
+@pytest.fixture(autouse=True)
+def _not_launched(monkeypatch):
+    for name in ("WORLD_SIZE", "ACCELERATE_MIXED_PRECISION", *LAUNCHED):
+        monkeypatch.delenv(name, raising=False)
+
+
+def python(code, *launcher, **variables):
+    """A program, maybe under a launcher: what it printed, what it said, and its exit code."""
+    here = {name: value for name, value in os.environ.items() if name not in {"WORLD_SIZE", *LAUNCHED}}
+    done = subprocess.run(
+        [sys.executable, *launcher, *([] if launcher else ["-c"]), str(code)],
+        env=here | {"OMP_NUM_THREADS": "1"} | variables,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    return done.stdout, done.stderr, done.returncode
+
+
+def test_one_process_leads_itself_adds_up_nothing_and_needs_no_accelerate():
+    code = """
+import sys, torch
+sys.modules["accelerate"] = None
+from brewster.training import crew
+crew.initialize()
+alone = torch.ones(3)
+crew.all_reduce_sum([alone])
+print(crew.world_size(), crew.rank(), crew.is_main_process(), alone.tolist())
+"""
+    assert python(code) == ("1 0 True [1.0, 1.0, 1.0]\n", "", 0)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(torch.cuda.is_available(), reason="two processes would want two GPUs")
+def test_two_processes_know_each_other_and_add_up_each_tensor(tmp_path):
+    (tmp_path / "two.py").write_text(
+        """
+import pathlib, torch
+from brewster.training import crew
+crew.initialize()
+assert crew.world_size() == 2 and crew.is_main_process() == (crew.rank() == 0) and crew.best_device() == torch.device("cpu")
+tensors = [torch.full((2,), 1.0 + crew.rank()), torch.tensor(10.0 * crew.rank())]
+crew.all_reduce_sum(tensors)
+assert [tensor.tolist() for tensor in tensors] == [[3.0, 3.0], 10.0]
+pathlib.Path(__file__).with_name(f"rank {crew.rank()}").touch()
+"""
+    )
+    torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
+    _, said, code = python(tmp_path / "two.py", *torchrun)
+    assert code == 0, said
+    assert sorted(path.name for path in tmp_path.glob("rank *")) == ["rank 0", "rank 1"]
+
+
+def test_a_world_that_nobody_launched_is_told_so(monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(DeviceError, match=r"WORLD_SIZE is 2, and RANK, .* not set; .*torchrun"):
+        distributed.initialize()
+
+
+def test_processes_that_did_not_come_are_missed(monkeypatch):
+    accelerate.PartialState(cpu=True)  # as a library does that was imported before the crew has met
+    for name, value in (LAUNCHED | {"WORLD_SIZE": "2"}).items():
+        monkeypatch.setenv(name, value)
+    with pytest.raises(DeviceError, match=r"1 processes have met; the 2 that WORLD_SIZE names; .*torchrun"):
+        distributed.initialize()
+    accelerate.PartialState._reset_state()
+
+
+def test_a_launcher_that_quietly_started_one_of_several_processes_is_caught(tmp_path):
+    (tmp_path / "one.py").write_text("from brewster.training import crew\ncrew.assemble()\n")
+    launch = ["-m", "accelerate.commands.launch", "--cpu", "--num_processes", "2"]
+    _, said, code = python(tmp_path / "one.py", *launch)
+    assert code == 1
+    assert "accelerate launch was asked for several processes and has started one" in said

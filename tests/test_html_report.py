@@ -1,0 +1,409 @@
+import base64
+import json
+import re
+import weakref
+from copy import deepcopy
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from brewster.errors import TargetError
+from brewster.evaluate.report.html_report import Shown, write_report
+from brewster.evaluate.report.images import BRIGHTEST_ERROR, LONGEST, RAMP, error_map
+from brewster.photo import Photo
+
+VOID = {"meta", "img", "input", "br", "link"}
+
+
+class Page(HTMLParser):
+    """The elements of a page as (tag, attributes), its visible text, and its scripts; refuses tags that do not match."""
+
+    def __init__(self, source):
+        super().__init__()
+        self.elements, self.text, self.scripts, self.open = [], "", [], []
+        self.feed(source)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+        assert len(attrs) == len(dict(attrs))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open[-1:] == ["script"]:
+            self.scripts.append(data)
+        elif self.open[-1:] != ["style"]:
+            self.text += data
+
+    def all(self, tag, **wanted):
+        return [has for name, has in self.elements if name == tag and wanted.items() <= has.items()]
+
+    def data(self):
+        return json.loads(self.scripts[0])
+
+
+def metric(title="PSNR", *, unit="dB", higher=True, digits=2):
+    about = f"{title} of it all."
+    return {"title": title, "unit": unit, "higher_is_better": higher, "digits": digits, "about": about}
+
+
+def estimate(mean, low=None, high=None, count=2):
+    return {"mean": mean, "low": low, "high": high, "count": count}
+
+
+def results(names=("a", "b"), method="compact", errors=None):
+    scores = {
+        "doing nothing": {"psnr": 20.0, "psnr_region": None},
+        method: {"psnr": 21.5, "psnr_region": None},
+    }
+    pictures = [
+        {"benchmark": "nature20", "name": name, "scene": name, "width": 60, "height": 40}
+        | {"region_share": 0.25, "scores": scores, "errors": errors or {}}
+        for name in names
+    ]
+    table = {"doing nothing": {"psnr": estimate(20.0, 19, 21)}, method: {"psnr": estimate(21.5, 20, 23)}}
+    change = {"method": method, "than": "doing nothing", "metric": "psnr", "better": 2}
+    return {
+        "brewster": "0.1.0",
+        "protocol": {
+            "size": "native",
+            "quality": "standard",
+            "region_thresholds": [0.1],
+            "choices": ["Nothing is resized."],
+        },
+        "metrics": {"psnr": metric(), "psnr_region": metric("PSNR in the region")},
+        "benchmarks": {
+            "nature20": {"title": "Nature20", "pictures": len(names), "expected": [20]}
+            | {"remarks": ["2 pictures, where Nature20 has 20"], "refused": ["c.png has no partner"]}
+        },
+        "unmeasured": [],
+        "selections": {
+            "nature20": {"title": "Nature20", "pictures": len(names)},
+            "average": {"title": "Average", "pictures": len(names)},
+        },
+        "methods": {"doing nothing": {"kind": "baseline"}, method: {"kind": "model", "sha256": "7adb"}},
+        "pictures": pictures,
+        "tables": {"nature20": table, "average": deepcopy(table)},
+        "differences": {"nature20": [change | estimate(1.5, 0.5, 2.5)]},
+    }
+
+
+def shown(name="a", method="compact", size=(40, 60), **changes):
+    photo = np.full((*size, 3), 90, np.uint8)
+    photo[: size[0] // 2] = 200  # bright above, dark below: an upright picture
+    region = np.zeros(size, bool)
+    region[: size[0] // 2] = True
+    given = {"photo": photo, "truth": photo // 2, "region": region, "answers": {method: photo}}
+    return Shown("nature20", name, **(given | {"reflections": {method: photo // 4}} | changes))
+
+
+@pytest.fixture
+def page(tmp_path):
+    """Writes a report and reads it."""
+
+    def page(given=None, cases=None):
+        path = tmp_path / "report.html"
+        write_report(given or results(), cases or [shown("a"), shown("b")], path)
+        return Page(path.read_text("utf-8"))
+
+    return page
+
+
+def pictures(page):
+    """The alternative text and the photo of each embedded picture."""
+    prefix = "data:image/webp;base64,"
+    images = page.all("img")
+    assert all(image["src"].startswith(prefix) for image in images)
+    return {image["alt"]: Photo.open(base64.b64decode(image["src"].removeprefix(prefix))) for image in images}
+
+
+# --- the page
+
+
+def test_the_page_needs_no_other_file(page, tmp_path):
+    made, source = page(), (tmp_path / "report.html").read_text()
+    assert "http" not in re.sub(r"http-equiv", "", source)
+    assert not made.all("link")
+    assert not re.search(r"\bimport\b|@import|url\(", source)
+    assert all("src" not in has for has in made.all("script"))
+    policy = made.all("meta", **{"http-equiv": "Content-Security-Policy"})[0]["content"]
+    assert "default-src 'none'" in policy
+    assert "img-src data:" in policy
+
+
+def test_every_case_and_method_appears_with_its_scores_and_their_change(page):
+    made = page()
+    assert [has["data-name"] for has in made.all("article")] == ["a", "b"]
+    for said in (
+        "photo, doing nothing",
+        "compact",
+        "21.50",
+        "+1.50 ▲",
+        "region 25%",
+        "60 \N{MULTIPLICATION SIGN} 40 px",
+        "Nature20",
+    ):
+        assert said in made.text
+    assert made.data()["scores"][1]["compact"] == {"psnr": 21.5, "psnr_region": None}
+
+
+def test_every_picture_can_be_opened_and_says_what_it_is(page):
+    made = page(cases=[shown("a", reflection_truth=np.zeros((40, 60, 3), np.uint8))])
+    kinds = [has["data-kind"] for has in made.all("button", type="button") if "data-kind" in has]
+    assert len(kinds) == len(made.all("img")) == 8
+    assert [has["alt"] for has in made.all("img")] == [
+        "photo, a",
+        "error of the photo, a",
+        "truth, a",
+        "reflection region, a",
+        "true reflection, a",
+        "compact, a",
+        "error of compact, a",
+        "reflection by compact, a",
+    ]
+
+
+def test_controls_have_labels_and_what_scrolls_can_be_reached_by_keyboard(page):
+    made = page()
+    assert len(made.all("label")) == len(made.all("select")) + len(made.all("input"))
+    scrolling = [has for has in made.all("div") if has.get("class") == "scroll"]
+    assert all(has["tabindex"] == "0" and has["aria-label"] for has in scrolling)
+
+
+def test_the_same_input_gives_the_same_bytes(tmp_path):
+    for name in ("one", "two"):
+        write_report(results(), iter([shown("a"), shown("b")]), tmp_path / name)
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["<script>alert(1)</script>", "\"&' onerror=alert(1) ", "<!--data-->", "</article>", "\udcff", "ä/日本"],
+)
+def test_hostile_names_are_harmless(page, name):
+    given = results([name], method=name, errors={name: name})
+    given["benchmarks"]["nature20"] |= {"title": name, "remarks": [name], "refused": [name]}
+    given["metrics"]["psnr"] |= {"title": name, "about": name}
+    made, plain = (
+        page(given, [shown(name, name)]),
+        page(results(["a"], errors={"compact": "a"}), [shown("a")]),
+    )
+    assert [tag for tag, _ in made.elements] == [tag for tag, _ in plain.elements]
+    assert [set(has) for _, has in made.elements] == [set(has) for _, has in plain.elements]
+    assert made.all("article")[0]["data-name"] == name.replace("\udcff", "?")
+    assert made.data()["methods"] == ["doing nothing", name]
+
+
+# --- numbers
+
+
+def test_the_best_of_a_column_is_marked_by_more_than_colour(page):
+    assert re.search(r"doing nothing\s*20.00", page().text)
+    assert re.search(r"★ best 21.50\s*20.00 to 23.00", page().text)
+
+
+def test_equal_means_are_all_the_best(page):
+    given = results()
+    given["tables"]["nature20"]["compact"]["psnr"]["mean"] = 20.001
+    assert page(given).text.count("★ best 20.00") == 2
+
+
+def test_for_a_metric_that_should_be_low_the_lowest_is_the_best_and_a_fall_is_better(page):
+    given = results()
+    given["metrics"]["psnr"]["higher_is_better"] = False
+    text = page(given).text
+    assert "★ best 20.00" in text
+    assert "▼ worse: +1.50" in text
+    assert "+1.50 ▼worse" in text
+
+
+def test_a_difference_whose_interval_holds_zero_is_called_open(page):
+    given = results()
+    given["differences"]["nature20"][0] |= {"low": -0.5}
+    assert "open: +1.50\N{MINUS SIGN}0.50 to +2.502 of 2" in page(given).text
+
+
+def test_differences_between_methods_stand_apart_from_those_to_doing_nothing(page):
+    given = results()
+    row = given["differences"]["nature20"][0]
+    given["methods"]["RDNet"] = {"kind": "predictions"}
+    given["differences"]["nature20"].append(
+        row | {"method": "RDNet", "than": "compact", "low": -3, "high": -1, "mean": -2}
+    )
+    text = page(given).text
+    assert "RDNet against compact▼ worse: \N{MINUS SIGN}2.00" in text
+    assert "Between methods" in text
+    assert "Between methods" not in page().text
+
+
+def test_no_score_is_a_dash_and_a_metric_without_any_takes_no_column(page):
+    given = results()
+    assert "PSNR in the region" in page(given).text  # its meaning is told all the same
+    assert "PSNR in the region dB" not in page(given).text
+    given["pictures"][0]["scores"]["compact"] = {"psnr": None, "psnr_region": None}
+    given["tables"]["nature20"]["compact"]["psnr"] = None
+    assert re.search("compact\\s*\N{EN DASH}", page(given).text)
+
+
+def test_an_estimate_over_fewer_pictures_says_so_and_may_have_no_interval(page):
+    given = results()
+    given["tables"]["nature20"]["compact"]["psnr"] = estimate(21.5, count=1)
+    text = page(given).text
+    assert "21.501 of 2" in text
+    assert "★ best 21.501 of 2" not in text
+
+
+def test_choices_meanings_remarks_and_refused_files_are_said(page):
+    text = page().text
+    for said in (
+        "Nothing is resized.",
+        "PSNR of it all. (higher is better)",
+        "2 pictures, where Nature20 has 20",
+    ):
+        assert said in text
+    assert "1 file refused" in text
+    assert "c.png has no partner" in text
+    assert "sha256 7adb" in text
+    assert "No method failed on any picture." in text
+    given = results()
+    given["methods"]["compact"]["remark"] = "its answer is the truth itself on 2 pictures"
+    assert "compact: its answer is the truth itself" in page(given).text
+
+
+def test_failures_are_counted_and_told_at_the_top_and_at_their_picture(page):
+    given = results()
+    given["pictures"][0] |= {
+        "scores": {"doing nothing": {"psnr": 20.0}},
+        "errors": {"compact": "no prediction"},
+    }
+    made = page(given, [shown("a", answers={}, reflections={}), shown("b")])
+    assert "Failed: compact on 1 of 2 pictures" in made.text
+    assert "nature20/a, compact: no prediction" in made.text
+    assert "Failed: no prediction" in made.text
+    assert "compact, a" not in [has["alt"] for has in made.all("img")]
+
+
+def test_many_failures_are_folded_away_behind_their_number(page):
+    given = results([f"{number}" for number in range(9)], errors={"compact": "no prediction"})
+    made = page(given, [shown("0")])
+    assert "Failed: compact on 9 of 9 pictures" in made.text
+    assert [has for has in made.all("details") if has.get("class") == "note" and "open" not in has]
+    assert (
+        "1 of 9 pictures are on this page: of each benchmark those that the first method that does something failed on"
+        in made.text
+    )
+
+
+# --- pictures
+
+
+@pytest.mark.parametrize(
+    ("size", "kept"),
+    [((40, 60), (60, 40)), ((600, 1200), (480, 240)), ((960, 320), (160, 480)), ((1, 2000), (480, 1))],
+)
+def test_pictures_are_reduced_together_to_480_px_and_never_enlarged(page, size, kept):
+    made = page(cases=[shown("a", size=size)])
+    assert {photo.size for photo in pictures(made).values()} == {kept}
+    assert {(has["width"], has["height"]) for has in made.all("img")} == {tuple(map(str, kept))}
+    assert max(kept) <= LONGEST
+
+
+def test_pictures_stay_upright_and_keep_their_values(page):
+    photo = pictures(page(cases=[shown("a", size=(700, 500))]))["photo, a"].pixels
+    assert abs(photo[:200].astype(int) - 200).max() <= 6
+    assert abs(photo[-200:].astype(int) - 90).max() <= 6
+
+
+def test_pictures_are_reduced_as_a_photo_reduces_itself(page, random):
+    photo = random.integers(0, 255, (501, 733, 3)).astype(np.uint8)
+    expected = Photo.from_array(Photo.from_array(photo, encoding="srgb").small(480, 328), encoding="linear")
+    made = pictures(page(cases=[shown("a", size=(501, 733), photo=photo)]))["photo, a"]
+    apart = abs(made.pixels.astype(int) - Photo.open(expected.encode("webp")).pixels)
+    assert apart.mean() < 1  # roundings apart, then WebP; averages of encoded values would be some 10 apart
+
+
+def test_the_region_is_a_tint_over_its_pixels_and_clear_elsewhere(page):
+    tint = pictures(page(cases=[shown("a", size=(800, 600))]))["reflection region, a"]
+    assert tint.alpha[:239].min() > 50
+    assert tint.alpha[241:].max() == 0
+
+
+def test_an_error_map_has_the_colour_of_the_largest_channels_difference():
+    truth = np.zeros((4, 4, 3), np.uint8)
+    answer = truth.copy()
+    answer[0, 0] = (0, BRIGHTEST_ERROR // 2, 3)
+    answer[0, 1] = 255
+    colours = error_map(answer, truth)
+    assert (colours[0, 0] == RAMP[len(RAMP) // 2]).all()
+    assert (colours[0, 1] == RAMP[-1]).all()
+    assert (colours[1:] == RAMP[0]).all()
+    assert (error_map(truth, answer) == colours).all()
+
+
+def test_an_error_map_averages_errors_when_it_is_reduced():
+    truth = np.zeros((960, 960, 3), np.uint8)
+    answer = truth.copy()
+    answer[::2] = 48  # every other row: cancelled by nothing, halved by the mean
+    assert (error_map(answer, truth) == RAMP[24 * len(RAMP) // BRIGHTEST_ERROR]).all()
+
+
+def test_error_maps_are_embedded_without_loss(page, random):
+    truth, photo = random.integers(0, 255, (2, 40, 60, 3)).astype(np.uint8)
+    made = pictures(page(cases=[shown("a", photo=photo, truth=truth)]))
+    assert (made["error of the photo, a"].pixels == error_map(photo, truth)).all()
+
+
+def test_the_ramp_grows_evenly_lighter_so_that_it_needs_no_colour_to_be_read():
+    lightness = np.sqrt(RAMP.astype(float) @ (0.2126, 0.7152, 0.0722))
+    assert (np.diff(lightness) > 0).all()
+
+
+# --- the file
+
+
+def test_cases_are_taken_one_by_one_and_let_go(tmp_path):
+    alive = []
+
+    def cases():
+        for number in range(6):
+            assert sum(case() is not None for case in alive) <= 1  # the one that was just written
+            case = shown(f"{number}")
+            alive.append(weakref.ref(case))
+            yield case
+            del case
+
+    write_report(results(), cases(), tmp_path / "report.html")
+    assert len(alive) == 6
+
+
+def test_a_report_takes_the_place_of_an_older_one_whole_or_not_at_all(tmp_path):
+    def broken():
+        yield shown("a")
+        raise ValueError
+
+    path = tmp_path / "new" / "report.html"
+    write_report(results(), [shown("a")], path)
+    before = path.read_bytes()
+    with pytest.raises(ValueError):  # noqa: PT011
+        write_report(results(), broken(), path)
+    assert path.read_bytes() == before
+    write_report(results(), [shown("b")], path)
+    assert path.read_bytes() != before
+    assert [file.name for file in path.parent.iterdir()] == ["report.html"]
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "report.html").mkdir()
+    with pytest.raises(TargetError, match=r"report\.html was not written \(.*\); .* run again"):
+        write_report(results(), [shown("a")], tmp_path / "report.html")
+    assert not list(tmp_path.glob(".brewster-*"))
+
+
+def test_a_case_that_the_results_do_not_know_is_shown_without_scores(page):
+    assert page(cases=[shown("stranger")]).data()["scores"] == [{}]

@@ -1,0 +1,78 @@
+"""The door to the stock libraries: opened late, in silence, and with its errors told plainly."""
+
+import subprocess
+import sys
+
+import huggingface_hub
+import pytest
+from huggingface_hub import errors as hub_errors
+
+from brewster.errors import DownloadError, MissingExtra
+from brewster.models.diffusion.backbones import encode_prompt, load_backbone
+from brewster.models.diffusion.lazy_imports import library
+
+
+def hub_error(kind, status, **headers):
+    """An error as huggingface_hub raises it for an answer of the hub."""
+    httpx = sys.modules[hub_errors.Response.__module__.split(".")[0]]
+    request = httpx.Request("GET", "https://huggingface.co/api/models/owner/name")
+    return kind(f"{status} Client Error.", response=httpx.Response(status, request=request, headers=headers))
+
+
+def caused_by(answer):
+    """As snapshot_download raises it where nothing is in the cache, either."""
+    error = hub_errors.LocalEntryNotFoundError("Got: HfHubHTTPError")
+    error.__cause__ = answer
+    return error
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (
+            hub_error(hub_errors.GatedRepoError, 401),
+            "is gated and no valid token was sent.*agree to the licence",
+        ),
+        (
+            hub_error(hub_errors.GatedRepoError, 403),
+            "is gated and your account has no access.*open that page",
+        ),
+        (hub_error(hub_errors.RepositoryNotFoundError, 401), "the hub shows no model .*hf auth login"),
+        (hub_error(hub_errors.HfHubHTTPError, 401), "refused the token.*settings/tokens"),
+        (hub_error(hub_errors.HfHubHTTPError, 503), "answered HTTP 503.*try again later"),
+        (caused_by(hub_error(hub_errors.HfHubHTTPError, 503)), "answered HTTP 503.*try again later"),
+        (OSError(28, "No space left on device"), "No space left on device.*HF_HOME"),
+        (hub_errors.LocalEntryNotFoundError("no network"), "not in the cache and the hub cannot be reached"),
+        (hub_errors.OfflineModeIsEnabled("HF_HUB_OFFLINE"), "the hub cannot be reached.*give the folder"),
+    ],
+)
+@pytest.mark.parametrize("load", [load_backbone, encode_prompt])
+def test_what_the_hub_refuses_is_told_plainly(monkeypatch, error, words, load):
+    def refuse(*_, **__):
+        raise error
+
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", refuse)
+    with pytest.raises(DownloadError, match=words) as told:
+        load("kontext")
+    assert "black-forest-labs/FLUX.1-Kontext-dev" in str(told.value)
+
+
+def test_a_missing_library_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "bitsandbytes", None)
+    with pytest.raises(MissingExtra, match=r"pip install 'brewster\[large\]'"):
+        library("bitsandbytes")
+
+
+def test_the_room_wakes_no_stock_library_until_a_model_is_built_and_then_keeps_its_silence(tmp_path):
+    code = f"""
+import sys
+from pathlib import Path
+from brewster.models.diffusion import sampling
+from brewster.models.diffusion.adapter import lora
+from brewster.models.diffusion.backbones import load_backbone, tiny
+assert not {{'diffusers', 'transformers', 'peft', 'safetensors', 'huggingface_hub'}} & set(sys.modules)
+tiny('kontext')[0].save(Path({str(tmp_path)!r}))
+load_backbone({str(tmp_path)!r})
+"""
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")

@@ -1,0 +1,295 @@
+"""LoRAs learnt on toy twins: what a run keeps, what it leaves, and what stops it."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tomli_w
+import torch
+
+import brewster.training.lora.trainer as module
+from brewster.errors import ModelError, RecipeError
+from brewster.models.diffusion.adapter.lora import LORA_FILE, load_lora, lora_state
+from brewster.models.diffusion.backbones import tiny
+from brewster.models.diffusion.panels import condition, split
+from brewster.models.diffusion.sampling import GUIDANCE, STEPS, sample
+from brewster.models.diffusion.tensors import read_tensors
+from brewster.photo import Photo
+from brewster.training import distributed
+from brewster.training.checkpoint import Checkpoint
+from brewster.training.data.sample_rng import SampleRng
+from brewster.training.loop import run
+from brewster.training.lora.trainer import LoraTrainer
+from brewster.training.recipe import LoraRecipe
+from brewster.training.trainers import open_trainer
+from set_folders import make
+
+RECIPE = {
+    "backbone": "tiny:kontext", "rank": 2, "alpha": 2, "budget_px": 3 * 32 * 16,
+    "seed": 1, "steps": 6, "batch": 2, "learning_rate": 1e-2, "warmup_steps": 2, "weight_decay": 1e-4,
+    "report_every": 6, "checkpoint_every": 2,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    make(tmp_path_factory.mktemp("sets") / "tiny", count=3)
+    return next(tmp_path_factory.getbasetemp().glob("sets*/tiny"))
+
+
+@pytest.fixture
+def recipe(folder, monkeypatch):
+    monkeypatch.setattr(module, "_SHOWN", 1)
+    return lambda **changes: LoraRecipe.model_validate(
+        RECIPE | {"data": {"rendered": {"sets": [folder], "target": "transmission"}}} | changes
+    )
+
+
+@pytest.fixture
+def begun(recipe):
+    def begin(**changes):
+        learner = LoraTrainer(recipe(**changes))
+        learner.begin()
+        return learner
+
+    return begin
+
+
+class Killed(Exception):
+    pass
+
+
+def die_after(last):
+    def report(step, steps, numbers, logged):
+        if step == last:
+            raise Killed
+
+    return report
+
+
+def train(recipe, out, last=None):
+    learner = open_trainer(recipe)
+    run(learner, out, die_after(last))
+    return learner
+
+
+def photo(width=48, height=32):
+    return torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(3)) * 2 - 1
+
+
+def test_a_killed_run_ends_with_the_same_lora_to_the_last_bit(recipe, folder, tmp_path):
+    pairs = tmp_path / "pairs"
+    for role in ("blended", "transmission", "reflection"):
+        (pairs / role).mkdir(parents=True)
+        pixels = np.random.default_rng(len(role)).integers(0, 256, (32, 48, 3), dtype=np.uint8)
+        Photo.from_array(pixels, encoding="srgb").save(pairs / role / "a.png")
+    rendered = {"sets": [folder], "target": "transmission"}
+    wanted = recipe(crops=2, data={"pairs": [pairs], "pairs_share": 0.5, "rendered": rendered})
+    undisturbed = train(wanted, tmp_path / "one").export(tmp_path / "one")
+    with pytest.raises(Killed):
+        train(wanted, tmp_path / "two", last=5)
+    resumed = train(wanted, tmp_path / "two").export(tmp_path / "two")
+    assert (undisturbed / LORA_FILE).read_bytes() == (resumed / LORA_FILE).read_bytes()
+    ends = [Checkpoint.read(tmp_path / name / "checkpoint.pt").state for name in ("one", "two")]
+    moments = [state["optimizer"]["state"] for state in ends]
+    for index, values in moments[0].items():
+        assert all(torch.equal(value, moments[1][index][name]) for name, value in values.items())
+
+
+def test_a_run_leaves_a_log_pictures_and_a_folder_for_stock_diffusers(recipe, tmp_path):
+    place = train(recipe(), tmp_path).export(tmp_path)
+    assert {path.name for path in place.iterdir()} == {
+        LORA_FILE, "prompt.safetensors", "recipe.json", "README.md",
+    }  # fmt: skip
+    assert json.loads((place / "recipe.json").read_text())["backbone"] == "tiny:kontext"
+    (line,) = (tmp_path / "log.jsonl").read_text().splitlines()
+    assert json.loads(line).keys() == {
+        "step", "loss", "panel_I", "panel_T", "panel_R", "gain_db_training", "seconds",
+    }  # fmt: skip
+    assert Photo.open(tmp_path / "samples.png").size == (6 * 240, 160)
+
+
+def test_a_checkpoint_holds_the_lora_and_nothing_of_its_base(begun):
+    state = begun().state()
+    assert state.keys() == {"lora", "optimizer", "prompt"}
+    assert all("lora_" in name and tensor.dtype == torch.float32 for name, tensor in state["lora"].items())
+
+
+@pytest.mark.parametrize("backbone", ["kontext", "klein", "qwen"])
+@pytest.mark.parametrize("objective", ["flow", "one_step"])
+def test_learning_lowers_the_loss_of_a_step_taken_again_and_again(begun, backbone, objective):
+    learner = begun(backbone=f"tiny:{backbone}", objective=objective, batch=1, rank=4, learning_rate=5e-2)
+    losses = [learner.advance(0)["loss"] for _ in range(15)]
+    assert losses[-1] < 0.9 * losses[0]
+
+
+def test_the_exported_lora_makes_the_same_picture_in_another_backbone(begun, tmp_path):
+    learner = begun(warmup_steps=1)
+    for step in range(3):
+        learner.advance(step)
+    made = learner.separate(photo())
+    backbone, _ = tiny("kontext")
+    shown = condition(photo(), learner.recipe.layout)
+    plain = split(sample(backbone, shown, learner.prompt, size=(144, 32)), learner.recipe.layout)
+    card, prompt = load_lora(learner.export(tmp_path), backbone)
+    again = split(
+        sample(backbone, shown, prompt, size=(144, 32), steps=STEPS, guidance=GUIDANCE), card.task.layout
+    )
+    assert made.keys() == again.keys() == {"I", "T", "R"}
+    for name, panel in made.items():
+        torch.testing.assert_close(again[name], panel, atol=1e-5, rtol=0)
+        assert not torch.allclose(plain[name], panel, atol=1e-3)
+
+
+def test_one_step_goes_from_the_photo_in_every_panel_to_what_it_lacks(begun):
+    learner = begun(objective="one_step", panels=["T", "R"])
+    see, prompt = learner.backbone.encode, learner.prompt
+    start = see(torch.cat([photo(), photo()], dim=3))
+    with torch.no_grad():
+        lack = learner.backbone.predict(start, see(photo()), torch.ones(1), prompt, 1.0)
+        expected = learner.backbone.decode(start - lack).clamp(-1, 1)
+    made = learner.separate(photo())
+    torch.testing.assert_close(torch.cat([made["T"], made["R"]], dim=3), expected)
+
+
+def test_small_pictures_to_validate_on_are_seen_in_small_panels(begun, tmp_path, monkeypatch):
+    monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
+    for role in ("blended", "transmission"):
+        (tmp_path / "small" / role).mkdir(parents=True)
+        Photo.from_array(np.full((16, 16, 3), 99, np.uint8), encoding="srgb").save(
+            tmp_path / "small" / role / "a.png"
+        )
+    learner = begun()
+    data = learner.recipe.data.model_copy(update={"validate_on": (Path("small"),)})
+    scores, picture = begun(data=data, panels=["T", "R"], budget_px=2 * 32 * 16).validate()
+    assert scores.keys() == {"gain_db_small"}
+    assert picture.shape == (160, 5 * 240, 3)
+
+
+def test_a_panel_that_does_not_count_has_no_loss_and_the_others_share_its_weight(begun):
+    equal, uneven = begun(), begun(panel_weights={"I": 0, "T": 3, "R": 1})
+    before, after = equal.advance(0), uneven.advance(0)
+    assert after["panel_I"] == 0
+    assert after["panel_T"] == pytest.approx(before["panel_T"] * 3 * 3 / 4)
+    assert after["panel_R"] == pytest.approx(before["panel_R"] * 3 / 4)
+    assert after["loss"] == pytest.approx(after["panel_T"] + after["panel_R"])
+
+
+def test_a_batch_is_the_mean_of_its_samples(begun):
+    learner = begun(batch=2)
+    alone = [learner._losses(SampleRng(1, 0, slot)) for slot in range(2)]
+    expected = sum(part.item() for parts in alone for part in parts.values()) / 2
+    assert learner.advance(0)["loss"] == pytest.approx(expected)
+
+
+TORCHRUN = ["torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
+ACCELERATE = ["accelerate.commands.launch", "--multi_gpu", "--num_processes", "2", "--main_process_port", "0"]
+
+
+def as_two(launcher, path, out):
+    """The command line under a launcher: its exit code and what it said."""
+    done = subprocess.run(
+        [sys.executable, "-m", *launcher, "-m", "brewster", "train", str(path), "-o", str(out)],
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    return done.returncode, done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", [TORCHRUN, ACCELERATE], ids=["torchrun", "accelerate launch"])
+def test_two_processes_learn_what_one_learns_from_the_whole_batch(recipe, tmp_path, launcher):
+    (tmp_path / "recipe.toml").write_text(tomli_w.dumps(recipe().model_dump(mode="json", exclude_none=True)))
+    code, told = as_two(launcher, tmp_path / "recipe.toml", tmp_path / "two")
+    assert code == 0, told
+    assert told.count("step 6 of 6") == 1
+    alone = train(recipe(), tmp_path / "one").export(tmp_path / "one")
+    ends = [read_tensors(place / LORA_FILE)[0] for place in (alone, tmp_path / "two" / "lora")]
+    for name, tensor in ends[0].items():
+        torch.testing.assert_close(ends[1][name], tensor, atol=1e-6, rtol=0)
+    one, two = (json.loads((tmp_path / place / "log.jsonl").read_text()) for place in ("one", "two"))
+    assert one["loss"] == pytest.approx(two["loss"], abs=2e-5)
+
+
+def test_a_batch_that_cannot_be_divided_is_refused(recipe, monkeypatch):
+    monkeypatch.setattr(distributed, "size", lambda: 2)
+    with pytest.raises(RecipeError, match=r"batch = 1 is to be divided among 2 processes; .*; raise batch"):
+        LoraTrainer(recipe(batch=1))
+
+
+def test_a_loss_that_is_not_a_number_stops_the_run_and_keeps_the_last_good_checkpoint(
+    recipe, tmp_path, monkeypatch
+):
+    losses = LoraTrainer._losses
+    monkeypatch.setattr(
+        LoraTrainer,
+        "_losses",
+        lambda self, rng: {
+            name: loss * (float("nan") if self.broken else 1) for name, loss in losses(self, rng).items()
+        },
+    )
+    learner = open_trainer(recipe())
+    learner.broken = False
+
+    def break_after_2(step, steps, numbers, logged):
+        learner.broken = step == 2
+
+    with pytest.raises(ModelError, match="the loss is nan at step 2; a finite loss; resume from the last"):
+        run(learner, tmp_path, break_after_2)
+    saved = Checkpoint.read(tmp_path / "checkpoint.pt")
+    assert saved.step == 2
+    for name, tensor in lora_state(learner.backbone).items():
+        assert torch.equal(tensor, saved.state["lora"][name])
+
+
+def test_a_gradient_that_is_not_a_number_leaves_the_lora_as_it_was(begun):
+    learner = begun()
+    before = {name: tensor.clone() for name, tensor in lora_state(learner.backbone).items()}
+    learner._parameters[0].register_hook(lambda gradient: gradient * float("inf"))
+    with pytest.raises(ModelError, match=r"the gradient is (inf|nan) at step 0"):
+        learner.advance(0)
+    assert all(torch.equal(tensor, before[name]) for name, tensor in lora_state(learner.backbone).items())
+
+
+def test_a_prompt_that_is_named_is_used_if_it_is_this_backbones(recipe, tmp_path):
+    for name in ("kontext", "klein"):
+        tiny(name, seed=5)[1].save(tmp_path / f"{name}.safetensors")
+    learner = LoraTrainer(recipe(prompt=str(tmp_path / "kontext.safetensors")))
+    learner.begin()
+    assert learner.prompt.sha256 == tiny("kontext", seed=5)[1].sha256
+    with pytest.raises(ModelError, match="encoded for klein; a prompt for kontext"):
+        LoraTrainer(recipe(prompt=str(tmp_path / "klein.safetensors"))).begin()
+
+
+@pytest.mark.parametrize("quantise", [None, "int8"])
+def test_a_backbone_in_a_folder_learns_the_same_way_quantised_or_not(recipe, tmp_path, quantise):
+    backbone, prompt = tiny("kontext")
+    backbone.save(tmp_path / "base")
+    prompt.save(tmp_path / "prompt.safetensors")
+    learner = LoraTrainer(
+        recipe(
+            backbone=str(tmp_path / "base"), prompt=str(tmp_path / "prompt.safetensors"), quantise=quantise
+        )
+    )
+    learner.begin()
+    twin = LoraTrainer(recipe())
+    twin.begin()
+    assert learner.advance(0)["loss"] == pytest.approx(
+        twin.advance(0)["loss"], rel=0.05 if quantise else 1e-6
+    )
+    assert learner.advance(1)["loss"] > 0
+    changed = lora_state(learner.backbone)
+    assert any(tensor.any() for name, tensor in changed.items() if "lora_B" in name)
+
+
+def test_a_twin_of_nothing_is_named():
+    data = {"data": {"pairs": ["x"], "pairs_share": 0.0, "rendered": {"sets": ["x"], "count": 0}}}
+    with pytest.raises(ModelError, match="there is no backbone 'contekst'"):
+        LoraTrainer(LoraRecipe.model_validate(RECIPE | data | {"backbone": "tiny:contekst"}))

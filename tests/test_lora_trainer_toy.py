@@ -1,0 +1,52 @@
+"""Learning that is seen to be learning: toys behind glass that no twin has met before."""
+
+import pytest
+import torch
+
+from brewster.training.loop import run
+from brewster.training.recipe import LoraRecipe
+from brewster.training.trainers import open_trainer
+from toy_world import SIDE_PX, STRONG, pretrain, psnr, scenes, write_pairs
+
+
+def answers(learner, photos):
+    """T of each photo."""
+    return torch.cat([learner.separate(photo[None])["T"] for photo in photos])
+
+
+def scores(tmp_path, name, *, vae_steps, pretraining, steps, held=96):
+    """PSNR of T in dB on toys that were not learnt from: of the photo itself, of the mean T of those that were, of the
+    base, and with the LoRA."""
+    prompt = pretrain(name, tmp_path / "base", vae_steps=vae_steps, steps=pretraining)
+    learnt, unseen = scenes(2, 64, "blob", STRONG), scenes(3, held, "blob", STRONG)
+    write_pairs(tmp_path / "pairs", learnt)
+    recipe = LoraRecipe.model_validate({
+        "backbone": str(tmp_path / "base"), "prompt": str(prompt), "objective": "one_step", "seed": 1,
+        "flip": False, "rank": 16, "alpha": 16, "budget_px": 3 * SIDE_PX**2, "steps": steps, "batch": 2,
+        "learning_rate": 1e-2, "warmup_steps": 5, "panel_weights": {"I": 0.1, "R": 0.1}, "weight_decay": 1e-4,
+        "report_every": steps, "checkpoint_every": steps,
+        "data": {"pairs": [tmp_path / "pairs"], "pairs_share": 1.0},
+    })  # fmt: skip
+    learner = open_trainer(recipe)
+    learner.begin()
+    made = {"copy": unseen["I"], "mean": learnt["T"].mean(0).expand_as(unseen["T"])}
+    made["base"] = answers(learner, unseen["I"])
+    run(learner, tmp_path / "run", lambda *_: None)
+    made["LoRA"] = answers(learner, unseen["I"])
+    return {key: psnr(pictures, unseen["T"]) for key, pictures in made.items()}
+
+
+def test_a_lora_brings_a_pretrained_twin_nearer_to_toys_that_it_has_not_seen(tmp_path):
+    """After a minute; how much better than copying the photo that is, the slow test below says."""
+    found = scores(tmp_path, "kontext", vae_steps=110, pretraining=100, steps=60)
+    assert found["LoRA"] > found["base"] + 0.1, found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["kontext", "klein", "qwen"])
+def test_longer_training_beats_the_mean_of_what_was_learnt_in_every_family(tmp_path, name, capsys):
+    found = scores(tmp_path, name, vae_steps=400, pretraining=400, steps=200)
+    with capsys.disabled():
+        print(f"\n{name}: " + ", ".join(f"{key} {value:.2f} dB" for key, value in found.items()))
+    assert found["LoRA"] > found["copy"] + 1.5, found
+    assert found["LoRA"] > found["mean"], found

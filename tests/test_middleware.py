@@ -1,0 +1,268 @@
+import asyncio
+import string
+
+import httpx
+import pytest
+from fastapi import APIRouter, Request
+from hypothesis import given
+from hypothesis import strategies as st
+
+from brewster.web.application import application
+from brewster.web.middleware import RequestLimits, is_loopback
+from glass_server import ask, client
+
+TOKEN = "a-token-nobody-guesses"
+
+
+def app_with(guard):
+    router = APIRouter()
+
+    @router.post("/length")
+    async def length(request: Request) -> int:
+        return len(await request.body())
+
+    return application(router, guard=guard)
+
+
+@pytest.fixture
+def app():
+    return app_with(RequestLimits(max_bytes=100))
+
+
+@pytest.fixture
+def locked():
+    return app_with(RequestLimits(token=TOKEN))
+
+
+def post(app, **what):
+    return ask(app, "POST", "/length", **what)
+
+
+# --- by which name
+
+
+@pytest.mark.parametrize("host", ["localhost", "localhost:8417", "127.0.0.1:9", "[::1]:8417", "LOCALHOST"])
+def test_this_machines_own_names_are_let_in(app, host):
+    assert ask(app, "GET", "/", headers={"host": host}).status_code == 200
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        "evil.com",
+        "evil.com:8417",
+        "localhost.evil.com",
+        "127.0.0.1.evil.com",
+        "127.0.0.1:8417.evil.com",
+        "evil.com@127.0.0.1",
+        "127.0.0.1#.evil.com",
+        "127.0.0.1?.evil.com",
+        "127.0.0.1/.evil.com",
+        "127.0.0.1:",
+        "127.0.0.1:123456",
+        "[::1].evil.com",
+        "[",
+        "8.8.8.8",
+        "",
+        "::1",
+    ],
+)
+def test_a_foreign_host_is_refused_whatever_it_asks(app, host):
+    for method in ("GET", "POST"):
+        answer = ask(app, method, "/", headers={"host": host})
+        assert answer.status_code == 421
+        assert "name" in answer.json()["error"]
+
+
+@given(name=st.text(string.ascii_lowercase + string.digits + ".-", min_size=1))
+def test_no_name_but_the_known_ones_is_known(name):
+    assert RequestLimits().knows(name) == (name in {"localhost", "127.0.0.1"})
+
+
+def test_a_server_for_a_network_answers_to_its_address_and_to_no_strange_name():
+    guard = RequestLimits.at("192.168.1.5")
+    assert guard.knows("192.168.1.5:8417")
+    assert not guard.knows("192.168.1.6:8417")
+    everywhere = RequestLimits.at("0.0.0.0")
+    assert everywhere.knows("192.168.1.6:8417")
+    assert not everywhere.knows("evil.com")
+
+
+@pytest.mark.parametrize(
+    ("host", "is_near"),
+    [
+        ("127.0.0.1", True),
+        ("127.3.2.1", True),
+        ("::1", True),
+        ("localhost", True),
+        ("0.0.0.0", False),
+        ("::", False),
+        ("192.168.1.5", False),
+        ("example.org", False),
+    ],
+)
+def test_only_loopback_counts_as_this_machine(host, is_near):
+    assert is_loopback(host) is is_near
+    assert RequestLimits.at(host).any_address is (host in {"0.0.0.0", "::"})
+
+
+# --- from where
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"origin": "http://evil.com"},
+        {"origin": "null"},
+        {"origin": "http://[::1"},
+        {"origin": "http://localhost:9999"},
+        {"origin": "http://localhost"},
+        {"sec-fetch-site": "cross-site"},
+        {"sec-fetch-site": "same-site"},
+    ],
+)
+def test_a_post_from_another_site_is_refused(app, headers):
+    answer = post(app, headers=headers)
+    assert answer.status_code == 403
+    assert "another site" in answer.json()["error"]
+
+
+@pytest.mark.parametrize(
+    "headers", [{}, {"origin": "http://localhost:8417"}, {"sec-fetch-site": "same-origin"}]
+)
+def test_a_post_from_here_or_from_no_page_at_all_is_let_in(app, headers):
+    assert post(app, content=b"abc", headers=headers).json() == 3
+
+
+def test_there_is_no_cors(app):
+    origin = {"origin": "http://evil.com", "access-control-request-method": "POST"}
+    for method in ("GET", "OPTIONS"):
+        answer = ask(app, method, "/length", headers=origin)
+        assert not [name for name in answer.headers if name.startswith("access-control")]
+        assert answer.status_code == 405
+
+
+def test_a_bug_says_it_too():
+    router = APIRouter()
+
+    @router.get("/bug")
+    def bug() -> None:
+        raise ZeroDivisionError
+
+    async def once():
+        app = application(router, guard=RequestLimits())
+        transport = httpx.ASGITransport(app, raise_app_exceptions=False)
+        async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as asking:
+            return await asking.get("/bug")
+
+    answer = asyncio.run(once())
+    assert answer.status_code == 500
+    assert "default-src 'none'" in answer.headers["content-security-policy"]
+
+
+def test_every_answer_says_what_a_browser_may_do_with_it(app):
+    for answer in (
+        ask(app, "GET", "/"),
+        ask(app, "GET", "/", headers={"host": "evil.com"}),
+        ask(app, "GET", "/none"),
+    ):
+        policy = answer.headers["content-security-policy"]
+        assert "default-src 'none'" in policy
+        assert "frame-ancestors 'none'" in policy
+        assert "unsafe" not in policy
+        assert answer.headers["x-content-type-options"] == "nosniff"
+        assert answer.headers["referrer-policy"] == "no-referrer"
+
+
+# --- with which token
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {},
+        {"authorization": "Bearer wrong"},
+        {"authorization": TOKEN},
+        {"cookie": f"{RequestLimits(token=TOKEN).cookie}=wrong"},
+        {"authorization": "Bearer \xe9"},
+    ],
+)
+def test_without_the_token_nobody_is_let_in(locked, headers):
+    for method, path in (("GET", "/"), ("GET", "/openapi.json"), ("POST", "/length")):
+        answer = ask(
+            locked, method, path, headers={name: value.encode("latin-1") for name, value in headers.items()}
+        )
+        assert answer.status_code == 401
+        assert "token" in answer.json()["error"]
+    assert ask(locked, "GET", "/?token=wrong").status_code == 401
+
+
+def test_the_token_opens_as_a_bearer(locked):
+    assert post(locked, headers={"authorization": f"Bearer {TOKEN}"}).json() == 0
+
+
+def test_a_link_with_the_token_gives_a_cookie_once_and_leaves_the_address():
+    async def visit():
+        async with client(app_with(RequestLimits(token=TOKEN))) as visitor:
+            entrance = await visitor.get(f"/page/index.html?token={TOKEN}")
+            return entrance, await visitor.get("/"), await visitor.post("/length", content=b"abc")
+
+    entrance, home, posted = asyncio.run(visit())
+    assert {"HttpOnly", "SameSite=strict"} <= set(entrance.headers["set-cookie"].split("; "))
+    assert entrance.headers["refresh"] == "0; url=/page/index.html"
+    assert home.status_code == 200
+    assert "set-cookie" not in home.headers
+    assert posted.json() == 3
+
+
+@pytest.mark.parametrize(
+    "path", ["//evil.com/", "/%0d%0aSet-Cookie:x=y", "/%22%3E%3Cscript%3E", "/\\evil.com"]
+)
+def test_the_way_on_from_the_link_stays_on_this_server(locked, path):
+    answer = ask(locked, "GET", httpx.URL(f"http://localhost:8417{path}", params={"token": TOKEN}))
+    way = answer.headers["refresh"].removeprefix("0; url=")
+    assert way.startswith("/")
+    assert not way.startswith("//")
+    assert not set(way) & set('\r\n"<>\\')
+    assert len(answer.headers.get_list("set-cookie")) == 1
+
+
+# --- how much
+
+
+def pieces(count, size=30):
+    async def give():
+        for _ in range(count):
+            yield b"x" * size
+
+    return give()
+
+
+def test_a_body_up_to_the_limit_is_let_in(app):
+    assert post(app, content=b"x" * 100).json() == 100
+    assert post(app, content=pieces(3)).json() == 90
+
+
+@pytest.mark.parametrize("content", [lambda: b"x" * 101, lambda: pieces(4), lambda: pieces(1000)])
+def test_a_longer_body_is_refused_whether_it_tells_its_length_or_not(app, content):
+    answer = post(app, content=content())
+    assert answer.status_code == 413
+    assert answer.json()["error"] == "the upload is longer than 0.0001 MB; send a smaller one"
+
+
+@pytest.mark.parametrize("length", ["-1", "1e3", "\u00b2", "9" * 20, "9" * 5000])
+def test_a_length_that_is_none_is_refused(app, length):
+    headers = {"content-length": length.encode()}
+    assert post(app, content=b"x", headers=headers).status_code == 413
+
+
+def test_a_body_that_takes_too_long_is_given_up():
+    waiting = asyncio.Event
+
+    async def slow():
+        yield b"x"
+        await waiting().wait()
+
+    answer = post(app_with(RequestLimits(body_seconds=0.01)), content=slow())
+    assert answer.status_code == 408
+    assert "longer than 0.01 seconds" in answer.json()["error"]

@@ -1,0 +1,137 @@
+"""Which LLVM compiles Mitsuba's kernels, and what happens without one; each import in a process of its own."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from brewster.errors import MissingExtra
+from brewster.render.mitsuba import variant
+
+TRACED = """
+import warnings
+from brewster.render.mitsuba.renderer import trace
+from test_tracer import Pictures, a_scene
+
+with warnings.catch_warnings(record=True) as told:
+    warnings.simplefilter("always")
+    scene = a_scene(camera={"width": 16, "height": 16})
+    light = float(trace(scene, Pictures(), noise=0.01, most_samples=64).photo.mean())
+assert abs(light - 1) < 0.01, light
+import mitsuba
+from brewster.errors import DeviceError
+from brewster.render import llvm
+loaded = {line.split()[-1].rpartition("/")[2] for line in open("/proc/self/maps") if "libLLVM" in line}
+print(llvm.probe().variant, *loaded)
+print(*{str(warning.message) for warning in told})
+try:
+    trace(scene, Pictures(), most_samples=4, polarised=True)
+except DeviceError as error:
+    print(error)
+"""
+
+
+def in_a_process(program, **settings):
+    """What a program prints that has this environment beside ours."""
+    folders = os.pathsep.join((os.path.dirname(__file__), os.environ.get("PYTHONPATH", "")))  # noqa: PTH120
+    return subprocess.run(
+        [sys.executable, "-c", program],
+        env={**os.environ, "PYTHONPATH": folders, **settings},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def test_importing_the_tracer_wakes_no_mitsuba():
+    code = "import brewster.render.mitsuba.renderer, sys; assert not {'mitsuba', 'drjit'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("name", ["/nonexistent", "libm.so.6"])
+def test_without_an_llvm_that_works_the_scalar_variant_renders_and_none_is_loaded(mitsuba, name):
+    done = in_a_process(TRACED, DRJIT_LIBLLVM_PATH=name)
+    assert done.returncode == 0, done.stderr
+    loaded, warning, refused = done.stdout.splitlines()
+    assert loaded == "scalar_rgb"
+    assert "no LLVM works" in warning
+    assert name in warning
+    assert variant.INSTALL_LLVM in warning
+    assert variant.INSTALL_LLVM in refused
+
+
+def test_the_llvm_of_the_pip_package_comes_first_and_compiles(compiled):
+    packaged = variant._of_the_package()
+    if not packaged:
+        pytest.skip(f"no LLVM of pip: {variant.INSTALL_LLVM}")
+    unnamed = {name: value for name, value in os.environ.items() if name != variant.LIBRARY}
+    done = subprocess.run(
+        [sys.executable, "-c", "from brewster.render import llvm; print(llvm._candidates()[0])"],
+        env=unnamed,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert [done.stdout.strip()] == packaged
+    done = in_a_process(TRACED, DRJIT_LIBLLVM_PATH=packaged[0])
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == ["llvm_ad_rgb", os.path.basename(packaged[0])]  # noqa: PTH119
+
+
+def test_an_exception_of_another_library_is_still_caught_next_to_the_llvm_of_the_package(compiled):
+    """With the C++ runtime of the package in the global scope, the process ends instead."""
+    program = """
+import numpy
+from brewster.render import llvm
+mitsuba = llvm.load()
+mitsuba.set_variant(llvm.probe().variant)
+import OpenEXR
+for fails in (lambda: mitsuba.load_dict({"type": "nonsense"}), lambda: OpenEXR.File("/nonexistent.exr")):
+    try:
+        fails()
+    except RuntimeError:
+        print("caught")
+"""
+    assert in_a_process(program).stdout.split() == ["caught", "caught"]
+
+
+def test_an_llvm_that_aborts_costs_no_more_than_a_line(monkeypatch):
+    monkeypatch.setattr(variant, "_PICTURE", "import os; os.abort()")
+    assert "ends the process" in variant._fails(None)
+    monkeypatch.setattr(variant, "_PICTURE", "raise ValueError('no kernel')")
+    assert variant._fails(None) == "ValueError: no kernel"
+
+
+def test_known_good_llvm_versions_are_tried_first(tmp_path, monkeypatch):
+    monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
+    monkeypatch.delitem(sys.modules, "drjit", raising=False)
+    monkeypatch.setattr(variant, "_FOLDERS", [str(tmp_path)])
+    monkeypatch.setattr(variant, "_PACKAGE", "no-such-package")
+    for name in ("libLLVM-14.so.1", "libLLVM-18.so.1", "libLLVM.so.19.1", "libLLVM.so.21.0"):
+        (tmp_path / name).touch()
+    names = [path and path.rpartition("/")[2] for path in variant._candidates()]
+    assert names == ["libLLVM.so.19.1", "libLLVM-18.so.1", "libLLVM.so.21.0", None]
+
+
+def test_an_imported_drjit_has_loaded_its_llvm_so_that_no_other_is_tried(monkeypatch):
+    monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
+    monkeypatch.setitem(sys.modules, "drjit", None)
+    assert variant._candidates() == [None]
+
+
+def test_a_missing_mitsuba_is_named_with_its_cure(monkeypatch):
+    variant.probe.cache_clear()
+    monkeypatch.setitem(sys.modules, "mitsuba", None)
+    with pytest.raises(MissingExtra, match=r"brewster\[render\]"):
+        variant.load()
+
+
+def test_a_missing_libatomic_is_named_with_the_line_that_installs_it(mitsuba, tmp_path):
+    (tmp_path / "libatomic.so.1").touch()  # is found first, and is no library
+    program = "from brewster.render import llvm; llvm.load()"
+    done = in_a_process(program, LD_LIBRARY_PATH=str(tmp_path))
+    told = done.stderr.splitlines()[-1]
+    assert "MissingExtra: mitsuba cannot be imported" in told
+    assert "libatomic.so.1" in told
+    assert told.endswith("run: apt install libatomic1.")

@@ -1,0 +1,257 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from brewster.srgb import to_linear
+from brewster.training.data.mixtures import InterleavedStream, MixRecipe, Mixtures, Pairs, TrainingBatch
+from brewster.training.data.sample_rng import SampleRng
+
+QUIET = MixRecipe(
+    crop=(1, 1), temperature=(0, 0), background_map_probability=0, background_level_log=(0.1, 0.1),
+    highlight_boost=(0, 0), shadow_probability=0, absent_probability=0, partial_probability=0, transmittance=(1, 1),
+    veil_probability=0, reflection_map_probability=0, reflection_ratio_log=(0.5, 0.5),
+    reflection_contrast_log=(1, 1), lamp_probability=0, sign_probability=0, sharp_probability=1,
+    ghost_probability=0, falloff_probability=0, edge_probability=0, exposure=(1, 1), overexposed_probability=0,
+    gamma_log=(1, 1), contrast=(0, 0), noise=(0, 0), jpeg_probability=0,
+)  # fmt: skip
+WILD = MixRecipe(
+    background_map_probability=0.5, shadow_probability=0.5, partial_probability=0.5, veil_probability=0.5,
+    reflection_map_probability=0.5, lamp_probability=0.5, sign_probability=0.5, sharp_probability=0.3,
+    ghost_probability=0.5, falloff_probability=0.5, edge_probability=0.5, overexposed_probability=0.5, jpeg_probability=0.5,
+)  # fmt: skip
+
+
+@pytest.fixture
+def photos(random):
+    smooth = [np.kron(random.integers(20, 200, (6, 8, 3)), np.ones((16, 16, 1))) for _ in range(4)]
+    return [torch.from_numpy(picture.astype(np.uint8)) for picture in smooth]
+
+
+@pytest.fixture
+def maps(random):
+    return [torch.from_numpy(random.random((3, 32, 64), np.float32) * 4).half() for _ in range(2)]
+
+
+def test_light_adds_up_in_linear_light(photos):
+    batch = Mixtures(photos, [], QUIET, seed=1)(0, 4, 64)
+    photo, transmission, reflection = (
+        to_linear(layer)
+        for layer in (batch.photo_encoded, batch.transmission_encoded, batch.reflection_encoded)
+    )
+    inside = photo < 0.95
+    torch.testing.assert_close((transmission + reflection)[inside], photo[inside], atol=0.02, rtol=0)
+
+
+def test_the_reflection_has_the_asked_strength(photos):
+    recipe = QUIET.model_copy(update={"reflection_ratio_log": (0.25, 0.25)})
+    batch = Mixtures(photos, [], recipe, seed=1)(0, 8, 64)
+    ratio = to_linear(batch.reflection_encoded).mean() / to_linear(batch.transmission_encoded).mean()
+    assert ratio.item() == pytest.approx(0.25, rel=0.15)
+
+
+def test_a_veil_adds_even_light_the_asked_share_of_the_photos_mean(photos):
+    recipe = QUIET.model_copy(update={"veil_probability": 1.0, "veil": (0.3, 0.3)})
+    batch = Mixtures(photos, [], recipe, seed=1)(0, 4, 64)
+    photo, transmission, reflection = (
+        to_linear(layer)
+        for layer in (batch.photo_encoded, batch.transmission_encoded, batch.reflection_encoded)
+    )
+    both = transmission + reflection
+    veil = 0.3 * both.mean(dim=(2, 3), keepdim=True).expand_as(photo)
+    inside = photo < 0.95
+    torch.testing.assert_close((photo - both)[inside], veil[inside], atol=0.02, rtol=0)
+    assert veil.mean() > 0.03
+
+
+def layers_of(photos, maps=(), **changes):
+    """Photo, transmission and reflection of four samples, encoded; the same numbers are drawn whatever changes."""
+    batch = Mixtures(photos, list(maps), QUIET.model_copy(update=changes), seed=1)(0, 4, 64)
+    return batch.photo_encoded, batch.transmission_encoded, batch.reflection_encoded
+
+
+@pytest.mark.parametrize("effect", ["falloff_probability", "edge_probability"])
+def test_a_reflection_that_fades_or_ends_is_darker_somewhere_and_brighter_nowhere(photos, effect):
+    _, behind, mirrored = layers_of(photos)
+    _, same, faded = layers_of(photos, **{effect: 1.0})
+    assert (same - behind).abs().max() < 0.04  # the pane's own tint is drawn anew
+    assert (faded <= mirrored + 1e-6).all()
+    assert faded.mean() < 0.95 * mirrored.mean()
+
+
+def test_lamps_are_added_to_the_reflection_alone(photos):
+    _, behind, mirrored = layers_of(photos)
+    _, same, lit = layers_of(photos, lamp_probability=1.0)
+    assert (same - behind).abs().max() < 0.04  # the pane's own tint is drawn anew
+    assert (lit >= mirrored - 1e-6).all()
+    assert lit.amax(dim=(1, 2, 3)).min() > mirrored.amax()
+
+
+def test_a_reflection_that_is_not_sharp_is_blurred_and_keeps_its_light(photos):
+    _, _, mirrored = layers_of(photos)
+    _, _, blurred = layers_of(photos, sharp_probability=0.0, blur_px_log=(4.0, 4.0))
+    edges = [layer.diff(dim=3).square().mean() for layer in (mirrored, blurred)]
+    assert edges[1] < edges[0] / 2
+    assert to_linear(blurred).mean().item() == pytest.approx(to_linear(mirrored).mean().item(), rel=0.1)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"ghost_probability": 1.0}, {"sign_probability": 1.0}, {"reflection_contrast_log": (1.6, 1.6)}],
+    ids=lambda changes: next(iter(changes)),
+)
+def test_ghosts_signs_and_contrast_change_the_reflection_alone(photos, changes):
+    _, behind, mirrored = layers_of(photos)
+    _, same, changed = layers_of(photos, **changes)
+    assert (same - behind).abs().max() < 0.04  # the pane's own tint is drawn anew
+    assert (changed - mirrored).abs().mean() > 0.005
+
+
+@pytest.mark.parametrize("changes", [{"shadow_probability": 1.0}, {"highlight_boost": (5.0, 5.0)}], ids=str)
+def test_shadows_and_highlights_change_the_background(photos, changes):
+    bright = [photo + 55 for photo in photos]
+    _, behind, _ = layers_of(bright)
+    _, changed, _ = layers_of(bright, **changes)
+    assert (changed - behind).abs().mean() > 0.01
+
+
+def test_a_warmer_light_has_more_red_and_less_blue(photos):
+    _, plain, _ = layers_of(photos, reflection_ratio_log=(1e-6, 1e-6))
+    _, warm, _ = layers_of(photos, reflection_ratio_log=(1e-6, 1e-6), temperature=(0.3, 0.3))
+    inside = (warm < 0.95).all(dim=1) & (plain > 0.05).all(dim=1)
+    for channel, gain in enumerate((math.exp(0.3), 1, math.exp(-0.3))):
+        ratio = to_linear(warm[:, channel][inside]) / to_linear(plain[:, channel][inside])
+        torch.testing.assert_close(ratio, torch.full_like(ratio, gain), atol=0.01, rtol=0)
+
+
+def test_exposure_is_the_photos_mean_at_most(photos):
+    photo, behind, mirrored = layers_of(photos, exposure=(0.05, 0.05))
+    plain = layers_of(photos)
+    assert to_linear(photo).mean(dim=(1, 2, 3)).tolist() == pytest.approx([0.05] * 4, rel=0.03)
+    for dark, layer in zip((behind, mirrored), plain[1:], strict=True):
+        ratio = to_linear(dark).sum(dim=(1, 2, 3)) / to_linear(layer).sum(dim=(1, 2, 3))
+        torch.testing.assert_close(ratio, 0.05 / to_linear(plain[0]).mean(dim=(1, 2, 3)), atol=0.02, rtol=0)
+
+
+def test_the_tone_curve_is_a_power_then_an_s_and_the_same_for_all_layers(photos):
+    power = layers_of(photos, gamma_log=(1.2, 1.2))
+    s_shaped = layers_of(photos, contrast=(0.4, 0.4))
+    for plain, by_power, by_s in zip(layers_of(photos)[1:], power[1:], s_shaped[1:], strict=True):
+        torch.testing.assert_close(by_power, plain**1.2, atol=1e-5, rtol=0)
+        torch.testing.assert_close(
+            by_s, plain + 0.4 * (3 * plain**2 - 2 * plain**3 - plain), atol=1e-5, rtol=0
+        )
+
+
+def test_noise_and_jpeg_are_in_the_photo_alone(photos):
+    plain = layers_of(photos)
+    for changes, low, high in (
+        ({"noise": (0.02, 0.02)}, 0.018, 0.022),
+        ({"jpeg_probability": 1.0}, 0.002, 0.05),
+    ):
+        changed = layers_of(photos, **changes)
+        assert low < (changed[0] - plain[0]).std() < high
+        assert all(torch.equal(one, other) for one, other in zip(plain[1:], changed[1:], strict=True))
+
+
+def test_maps_are_seen_as_often_as_the_recipe_says(photos):
+    red = torch.zeros(3, 32, 64)
+    red[0] = 1
+    for layer, name in ((1, "background"), (2, "reflection")):
+        changes = {f"{name}_map_probability": 1.0}
+        seen = layers_of(photos, [red.half()], **changes)[layer]
+        assert seen[:, 0].min() > 0
+        assert not seen[:, 1:].any()
+        assert layers_of(photos, [red.half()])[layer][:, 1:].any()
+
+
+def test_the_target_is_what_the_pane_lets_through_or_what_is_behind_it(photos):
+    light = {
+        target: to_linear(
+            Mixtures(
+                photos, [], QUIET.model_copy(update={"transmittance": (0.8, 0.8), "target": target}), seed=1
+            )(0, 4, 64).transmission_encoded
+        ).mean()
+        for target in ("transmission", "background")
+    }
+    assert (light["transmission"] / light["background"]).item() == pytest.approx(0.8, rel=0.05)
+
+
+def test_glass_that_covers_a_part_leaves_the_rest_as_it_was(photos):
+    recipe = QUIET.model_copy(update={"partial_probability": 1.0, "transmittance": (0.5, 0.5)})
+    batch = Mixtures(photos, [], recipe, seed=1)(0, 8, 64)
+    same = (batch.photo_encoded - batch.transmission_encoded).abs().amax(dim=1) < 2 / 255
+    assert (batch.reflection_encoded.amax(dim=1)[same] < 0.1).all()
+    assert 0.05 < same.float().mean() < 0.95
+
+
+def test_an_overexposed_background_is_white_in_photo_and_target(photos):
+    recipe = QUIET.model_copy(update={"overexposed_probability": 1.0, "overexposed_share": (0.2, 0.2)})
+    batch = Mixtures(photos, [], recipe, seed=1)(0, 8, 64)
+    white = batch.transmission_encoded.amax(dim=1) > 0.99
+    assert white.float().mean().item() == pytest.approx(0.2, abs=0.07)
+    assert (batch.photo_encoded.amax(dim=1)[white] > 0.99).all()
+
+
+def test_photos_are_drawn_as_often_as_their_weights_say(photos):
+    stream = Mixtures(photos, [], QUIET, seed=1, weights=[0, 1, 0, 3])
+    drawn = [stream._choose_photo(SampleRng(1, 0, slot)) for slot in range(400)]
+    assert set(drawn) == {1, 3}
+    assert drawn.count(3) == pytest.approx(300, abs=40)
+
+
+def test_absent_reflections_leave_the_photo_as_it_was(photos):
+    recipe = QUIET.model_copy(update={"absent_probability": 1.0})
+    batch = Mixtures(photos, [], recipe, seed=1)(0, 4, 64)
+    assert not batch.reflection_encoded.any()
+    rounding = 0.5 / 255 + 1e-6
+    torch.testing.assert_close(batch.photo_encoded, batch.transmission_encoded, atol=rounding, rtol=0)
+
+
+@settings(max_examples=15)
+@given(st.integers(0, 10**6), st.sampled_from([32, 64, 96]))
+def test_every_sample_is_a_picture_and_depends_on_seed_and_step_alone(step, size):
+    generator = np.random.default_rng(3)
+    photos = [torch.from_numpy(generator.integers(0, 256, (70, 90, 3), np.uint8)) for _ in range(3)]
+    maps = [torch.from_numpy(generator.random((3, 16, 32), np.float32) * 50).half()]
+    first, again = (Mixtures(photos, maps, WILD, seed=5)(step, 3, size) for _ in range(2))
+    for name in TrainingBatch.__dataclass_fields__:
+        values = getattr(first, name)
+        assert torch.equal(values, getattr(again, name))
+        assert values.isfinite().all()
+        assert 0 <= values.min() <= values.max() <= 1
+    other = Mixtures(photos, maps, WILD, seed=5)(step + 1, 3, size)
+    assert not torch.equal(first.photo_encoded, other.photo_encoded)
+
+
+def test_real_pairs_stay_aligned(photos):
+    shadowed = [(photo, photo // 2) for photo in photos]
+    batch = Pairs(shadowed, (0.4, 0.9), seed=3)(0, 8, 48)
+    torch.testing.assert_close(batch.transmission_encoded, batch.photo_encoded / 2, atol=0.03, rtol=0)
+    assert (batch.reflection_weight < 1).all()
+
+
+def test_a_blend_takes_its_share_of_each_stream(photos):
+    mixtures, pairs = Mixtures(photos, [], QUIET, seed=1), Pairs([(photos[0], photos[0])], (1, 1), seed=1)
+    batch = InterleavedStream(pairs, mixtures, 0.25)(0, 8, 32)
+    assert (batch.reflection_weight < 1).sum() == 2
+    assert batch.photo_encoded.shape == (8, 3, 32, 32)
+
+
+def test_a_blend_asks_for_nothing_where_a_stream_gets_no_sample(photos):
+    def never(step, count, size):
+        raise AssertionError
+
+    batch = InterleavedStream(never, Mixtures(photos, [], QUIET, seed=1), 0.25)(0, 1, 32)
+    assert batch.photo_encoded.shape == (1, 3, 32, 32)
+
+
+def test_a_batch_of_layers_trusts_every_truth():
+    layers = torch.rand(2, 9, 8, 8)
+    batch = TrainingBatch.of(layers)
+    pictures = [batch.photo_encoded, batch.transmission_encoded, batch.reflection_encoded]
+    assert torch.equal(torch.cat(pictures, dim=1), layers)
+    assert (batch.reflection_weight == 1).all()

@@ -1,0 +1,178 @@
+"""The card of a LoRA: what the hub reads of it, what its words promise, and whether its Python makes the picture."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from huggingface_hub import ModelCard
+from PIL import Image
+
+from brewster.errors import ModelError
+from brewster.models.diffusion.adapter.lora import add_lora, lora_parameters, save_lora
+from brewster.models.diffusion.backbones import BACKBONES, tiny
+from brewster.models.diffusion.panels import PanelLayout, condition, split
+from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
+from brewster.models.diffusion.sampling import sample
+from brewster.models.diffusion.task import DecompositionTask
+from brewster.training.lora.model_card import card_text, with_measured, write_card
+from brewster.training.recipe import LoraRecipe, read_recipe
+from set_folders import make
+
+RECIPES = Path(__file__).parents[1] / "recipes" / "train"
+
+
+def card(name="kontext", scores=None, **changes):
+    recipe = read_recipe(RECIPES / f"{name}.toml")
+    changed = LoraRecipe.model_validate(recipe.model_dump(exclude_unset=True) | changes)
+    family = BACKBONES[name] if name in BACKBONES else BACKBONES["kontext"]
+    return card_text(changed, scores=scores or {}, base=family)
+
+
+@pytest.mark.parametrize(
+    ("name", "licence"), [("kontext", "other"), ("klein", "apache-2.0"), ("qwen", "apache-2.0")]
+)
+def test_the_hub_reads_base_and_licence(name, licence):
+    read = ModelCard(card(name))
+    told = read.data.to_dict()
+    assert told["base_model"] == BACKBONES[name].hub_id
+    assert (told["base_model_relation"], told["license"]) == ("adapter", licence)
+    assert (told["library_name"], told["pipeline_tag"]) == ("diffusers", "image-to-image")
+    assert "lora" in told["tags"]
+    assert PROMPT in read.text
+
+
+def test_a_non_commercial_licence_is_named_linked_and_said():
+    text = card("kontext")
+    told = ModelCard(text).data.to_dict()
+    assert told["license_name"] == "flux-1-dev-non-commercial-license"
+    assert told["license_link"].endswith("FLUX.1-Kontext-dev/blob/main/LICENSE.md")
+    assert "**Not for commercial use.**" in text
+    assert "Not for commercial use" not in card("klein")
+
+
+def test_a_finetune_of_a_base_is_named_and_a_folder_is_not():
+    assert ModelCard(card(backbone="some-body/finetune.2")).data.base_model == "some-body/finetune.2"
+    text = card(backbone="/home/somebody/kontext")
+    assert ModelCard(text).data.base_model == BACKBONES["kontext"].hub_id
+    assert "somebody" not in text
+
+
+def test_a_toy_is_said_to_be_one_and_names_no_base():
+    text = card("large-tiny")
+    assert "**This is a toy.**" in text
+    assert "base_model" not in ModelCard(text).data.to_dict()
+    assert "**This is a toy.**" not in card()
+
+
+def test_sets_are_told_with_their_scenes_and_without_their_place(tmp_path, monkeypatch):
+    make(tmp_path / "sets" / "window", count=3)
+    monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
+    told = "`sets/window` (3 samples of the scenes `tiny`, orders all)"
+    assert told in card()
+    elsewhere = {"rendered": {"sets": [str(tmp_path / "sets" / "window")]}}
+    assert "`window` (3 samples" in card(data=elsewhere)
+    assert str(tmp_path) not in card(data=elsewhere)
+    monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "sets"))
+    assert "saw: `sets/window`." in card()
+
+
+def test_pairs_and_their_share_are_told():
+    text = card(
+        reflections="difference",
+        data={"pairs": ["real/train"], "pairs_share": 0.25, "rendered": {"sets": ["a"], "count": 7}},
+    )
+    assert "75% of what it saw: the first 7 samples of `a`." in text
+    assert "Real pairs, 25% of what it saw: real/train." in text
+    assert "what photo minus transmission leaves" in text
+
+
+def test_settings_and_scores_are_told():
+    text = card(scores={"step": 4000, "loss": 0.25, "panel_T": 0.1, "gain_db_nature": -1.234, "seconds": 9.9})
+    assert "| steps, batch | 4000, 1 |" in text
+    assert "| PSNR gained over the photo itself, nature, dB | -1.234 |" in text
+    assert "| loss, panel T | 0.1 |" in text
+    assert "9.9" not in text
+
+
+def test_what_was_measured_takes_its_place_again_and_again():
+    once = with_measured(card(), "| a | 1 |\n")
+    twice = with_measured(once, "### Real20\n\n| b | 2 |")
+    assert "\n## Measured\n\n| a | 1 |\n\n## Limits\n" in once
+    assert "\n## Measured\n\n### Real20\n\n| b | 2 |\n\n## Limits\n" in twice
+    assert twice.partition("## Measured")[0] == card().partition("## Measured")[0]
+    with pytest.raises(ModelError, match="has no part for scores; '## Measured'"):
+        with_measured("# somebody else's", "| a | 1 |")
+
+
+def test_what_stock_pipelines_cannot_do_is_not_promised():
+    assert "max_area" in card()
+    assert "starts from noise" in card(objective="one_step")
+    assert "resizes what it is shown to a megapixel" in card("qwen")
+    assert all("from diffusers" not in text for text in (card(objective="one_step"), card("qwen")))
+
+
+@pytest.fixture
+def exported(tmp_path):
+    """Writes a base and a LoRA on it, with its card, for a layout; what brewster makes of a photo with them."""
+
+    def export(name, layout):
+        backbone, prompt = tiny(name, seed=1)
+        backbone.save(tmp_path / "base")
+        add_lora(backbone, rank=2, alpha=2)
+        generator = torch.Generator().manual_seed(4)
+        with torch.no_grad():
+            for parameter in lora_parameters(backbone):
+                parameter.add_(0.05 * torch.randn(parameter.shape, generator=generator))
+        save_lora(tmp_path / "lora", backbone, prompt, DecompositionTask(layout))
+        changes = {"panels": list(layout.panels), "direction": layout.direction, "budget_px": 64 * 64 * 3}
+        recipe = read_recipe(RECIPES / f"{name}.toml").model_copy(update=changes)
+        write_card(tmp_path / "lora", recipe, {}, BACKBONES[name])
+        picture = torch.randint(0, 256, (64, 64, 3), generator=generator, dtype=torch.uint8)
+        Image.fromarray(picture.numpy()).save(tmp_path / "photo.png")
+        photo = picture.permute(2, 0, 1)[None] / 127.5 - 1
+        size = layout.composite_size((64, 64))
+        return split(sample(backbone, condition(photo, layout), prompt, size=size), layout)["T"]
+
+    return export
+
+
+@pytest.mark.parametrize(
+    ("name", "layout"),
+    [
+        ("kontext", PanelLayout()),
+        ("kontext", PanelLayout(("T", "I", "R"), "stacked")),
+        ("klein", PanelLayout(("T", "R"))),
+    ],
+)
+def test_the_python_in_the_card_makes_the_same_picture(exported, tmp_path, monkeypatch, name, layout):
+    expected = exported(name, layout)
+    text = (tmp_path / "lora" / "README.md").read_text()
+    (code,) = (block for block in re.findall(r"```python\n(.*?)```", text, re.S) if "diffusers" in block)
+    here = {BACKBONES[name].hub_id: "base", "cuda": "cpu", "bfloat16": "float32", "photo.jpg": "photo.png"}
+    for there, local in here.items():
+        assert there in code
+        code = code.replace(there, local)
+    monkeypatch.chdir(tmp_path)
+    made = {}
+    exec(compile(code, "README.md", "exec"), made)
+    picture = torch.from_numpy(np.array(made["transmission"])).permute(2, 0, 1)[None] / 127.5 - 1
+    torch.testing.assert_close(picture, expected, atol=1.1 / 255, rtol=0)
+    assert expected.std() > 0.01
+
+
+def test_the_card_has_the_words_that_the_lora_was_trained_with(exported, tmp_path):
+    exported("klein", PanelLayout())
+    assert PROMPT in (tmp_path / "lora" / "README.md").read_text()
+    told = PromptEmbedding("klein", "Take the glass away.", **tiny("klein")[1].tensors)
+    told.save(tmp_path / "lora" / "prompt.safetensors")
+    recipe = read_recipe(RECIPES / "klein.toml")
+    for _ in range(2):
+        write_card(tmp_path / "lora", recipe, {"loss": 1.0}, BACKBONES["klein"])
+    text = (tmp_path / "lora" / "README.md").read_text()
+    assert "> Take the glass away." in text
+    assert PROMPT not in text
+    assert text == card_text(recipe, scores={"loss": 1.0}, base=BACKBONES["klein"], prompt=told.text)
+    with pytest.raises(ModelError, match="encoded for klein"):
+        write_card(tmp_path / "lora", recipe, {}, BACKBONES["qwen"])

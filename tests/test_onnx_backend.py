@@ -1,0 +1,109 @@
+import threading
+
+import numpy as np
+import pytest
+import torch
+
+from brewster.errors import DeviceError, ModelError
+from brewster.inference import onnx_backend
+from brewster.inference.onnx_backend import OnnxBackend, available_devices
+from brewster.models.compact import STRIDE, LinearSeparator, with_imagenet_features
+from brewster.training.compact.export import export_onnx
+
+
+@pytest.fixture(scope="module")
+def network():
+    torch.manual_seed(1)
+    network = with_imagenet_features().eval()
+    torch.nn.init.normal_(network.head.weight, std=0.1)
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.copy_(parameter.half())  # the file's precision
+    return network
+
+
+@pytest.fixture(scope="module")
+def exported(network, tmp_path_factory):
+    path = tmp_path_factory.mktemp("model") / "model.onnx"
+    export_onnx(network, path, STRIDE)
+    return path
+
+
+@pytest.mark.parametrize("size", [(64, 96), (160, 32), (320, 448)])
+def test_the_exported_model_equals_the_network_at_any_size(network, exported, size):
+    tile = np.random.default_rng(1).random((*size, 3), np.float32)
+    with torch.no_grad():
+        expected = LinearSeparator(network)(torch.from_numpy(tile).permute(2, 0, 1)[None])
+    for layer, truth in zip(OnnxBackend(exported, "cpu")(tile), expected, strict=True):
+        np.testing.assert_allclose(layer, truth[0].permute(1, 2, 0).numpy(), atol=2e-4)
+
+
+def test_the_file_holds_two_bytes_a_weight(network, exported):
+    weights = sum(parameter.numel() for parameter in network.parameters())
+    assert 2 * weights < exported.stat().st_size < 2 * weights + 5e5
+
+
+@pytest.mark.parametrize("size", [(1, 1), (33, 31), (5, 200)])
+def test_sides_that_are_no_multiple_of_the_stride_come_back_as_they_were(exported, size):
+    for layer in OnnxBackend(exported, "cpu")(np.full((*size, 3), 0.5, np.float32)):
+        assert layer.shape == (*size, 3)
+        assert np.isfinite(layer).all()
+
+
+def test_threads_that_share_a_backend_get_the_same_answers(exported):
+    backend = OnnxBackend(exported, "cpu")
+    tiles = [np.random.default_rng(seed).random((64, 64, 3), np.float32) for seed in range(4)]
+    expected = [backend(tile)[0] for tile in tiles]
+    answers = [None] * 4
+    threads = [
+        threading.Thread(target=lambda i=i: answers.__setitem__(i, backend(tiles[i])[0])) for i in range(4)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for answer, truth in zip(answers, expected, strict=True):
+        assert (answer == truth).all()
+
+
+def test_a_device_that_is_not_there_is_an_error_with_the_line_that_installs_it(exported):
+    missing = "cuda" if "cuda" not in available_devices() else "coreml"
+    with pytest.raises(DeviceError, match="pip install onnxruntime"):
+        OnnxBackend(exported, missing)
+    with pytest.raises(DeviceError, match="one of auto"):
+        OnnxBackend(exported, "toaster")
+
+
+def test_auto_finds_a_device(exported):
+    assert OnnxBackend(exported).device == available_devices()[0]
+
+
+def test_a_device_that_is_installed_but_does_not_start_is_an_error_and_auto_goes_on(exported, monkeypatch):
+    """As with onnxruntime-gpu where there is no driver: the provider is listed, and its session is the CPU's."""
+    monkeypatch.setitem(
+        onnx_backend._PROVIDERS, "cuda", ("AzureExecutionProvider", "pip install onnxruntime-gpu")
+    )
+    monkeypatch.setattr(
+        onnx_backend.ort,
+        "get_available_providers",
+        lambda: ["AzureExecutionProvider", "CPUExecutionProvider"],
+    )
+    monkeypatch.setattr(
+        onnx_backend.ort.InferenceSession, "get_providers", lambda self: ["CPUExecutionProvider"]
+    )
+    with pytest.raises(DeviceError, match="does not start"):
+        OnnxBackend(exported, "cuda")
+    assert OnnxBackend(exported, "auto").device == "cpu"
+
+
+def test_a_file_that_is_no_model_is_named(tmp_path):
+    (tmp_path / "text.onnx").write_text("hello")
+    with pytest.raises(ModelError, match=r"text\.onnx"):
+        OnnxBackend(tmp_path / "text.onnx")
+    with pytest.raises(ModelError, match=r"missing\.onnx"):
+        OnnxBackend(tmp_path / "missing.onnx")
+
+
+def test_a_model_that_fails_while_it_runs_is_an_error_of_the_model(exported):
+    with pytest.raises(ModelError, match="tile of 0x0"):
+        OnnxBackend(exported, "cpu")(np.zeros((0, 0, 3), np.float32))

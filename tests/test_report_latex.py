@@ -1,0 +1,72 @@
+"""The LaTeX table, from results whose numbers are known."""
+
+import re
+
+import pytest
+
+from brewster.evaluate.report.latex import to_latex
+from known_results import entry, known_results
+
+
+@pytest.fixture
+def results():
+    return known_results()
+
+
+def test_it_has_the_papers_layout(results):
+    text = to_latex(results)
+    assert r"\begin{tabular}{l|cc|cc|cc|cc|cc|cc}" in text
+    assert r"\multicolumn{6}{c|}{SIR$^2$ (60)}" in text
+    assert r"\cline{6-11}" in text
+    assert r"A\_b|c & \textbf{21.50} & \textbf{0.123}" in text
+    body = [line for line in text.splitlines() if line.endswith(r"\\")]
+    widths = [
+        sum(int(n) - 1 for n in re.findall(r"multicolumn\{(\d+)\}", line)) + line.count("&") for line in body
+    ]
+    assert widths == [12] * 5
+
+
+def test_the_average_has_one_digit_more(results):
+    row = next(line for line in to_latex(results).splitlines() if line.startswith("A"))
+    assert row.endswith(r"& \textbf{21.500} & \textbf{0.1234} \\")
+
+
+def test_the_best_three_are_marked_but_never_the_last(results):
+    means = {"A_b|c": 21.5, "doing nothing": 20.0, "third": 19.0, "fourth": 18.0, "as bad": 18.0}
+    results["methods"] = {key: {} for key in means}
+    results["tables"] = {
+        key: {name: {"psnr": entry(mean)} for name, mean in means.items()} for key in results["tables"]
+    }
+    text = to_latex(results)
+    assert r"A\_b|c & \textbf{21.50}" in text
+    assert r"doing nothing & \underline{20.00}" in text
+    assert r"third & \uuline{19.00}" in text
+    assert "fourth & 18.00" in text
+    assert "as bad & 18.00" in text
+
+
+def test_means_over_fewer_pictures_have_a_dagger_that_is_explained_and_no_mark(results):
+    assert "dagger" not in to_latex(results)
+    results["tables"]["real20"] = {
+        "doing nothing": {"psnr": entry(20.0), "lpips": entry(0.2)},
+        "A_b|c": {"psnr": entry(21.5, count=10), "lpips": entry(0.1, count=10)},
+    }
+    text = to_latex(results)
+    assert r"A\_b|c & 21.50$^\dagger$" in text
+    assert r"\multicolumn{13}{l}{$^\dagger$ over fewer pictures" in text
+
+
+def test_it_takes_the_papers_draw_where_there_is_one(results):
+    for part in ("selections", "tables", "differences"):
+        results[part]["postcard:paper"] = results[part]["postcard"]
+    results["selections"]["postcard:paper"] = {"title": "Postcard, the paper's draw", "pictures": 7}
+    text = to_latex(results)
+    assert "Postcard (7)" in text
+    assert "Postcard (20)" not in text
+
+
+def test_without_sir2_it_has_one_line_of_heads(results):
+    for part in ("selections", "tables", "differences"):
+        results[part] = {key: results[part][key] for key in ("real20", "average")}
+    assert "SIR" not in to_latex(results)
+    assert r"\multicolumn{2}{c|}{Real20 (20)}" in to_latex(results)

@@ -1,0 +1,212 @@
+import asyncio
+import string
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+
+from brewster.errors import BrewsterError
+from brewster.options import Options
+from brewster.web.request_schema import FIELDS, SeparationRequest, form_schema, read_form, safe_name
+
+MODELS = ("compact", "mine")
+HEAD = b'--x\r\nContent-Disposition: form-data; name="%b"%b\r\n\r\n'
+
+
+def body(*parts):
+    """A form of (name, value) and (name, value, file name)."""
+    rows = [
+        HEAD % (name.encode(), b'; filename="%b"' % more[0].encode() if more else b"") + value + b"\r\n"
+        for name, value, *more in parts
+    ]
+    return b"".join([*rows, b"--x--\r\n"])
+
+
+def read(data, kind=b"multipart/form-data; boundary=x", cut=False):
+    messages = [{"type": "http.request", "body": data, "more_body": cut}, {"type": "http.disconnect"}]
+
+    async def receive():
+        return messages.pop(0)
+
+    request = Request({"type": "http", "method": "POST", "headers": [(b"content-type", kind)]}, receive)
+    return asyncio.run(read_form(request, MODELS, 1000))
+
+
+def asked(**fields):
+    return read(
+        body(("photo", b"bytes", "a.jpg"), *((name, value.encode()) for name, value in fields.items()))
+    )
+
+
+def refused(data, **how):
+    with pytest.raises(HTTPException) as error:
+        read(data, **how)
+    return error.value.status_code, error.value.detail
+
+
+@pytest.mark.parametrize("charset", [b"undefined", b"punycode"])
+def test_a_charset_that_is_no_text_is_a_broken_form(charset):
+    status, said = refused(
+        body(("photo", b"", "a.jpg"), ("strength", b"\xff-1")),
+        kind=b"multipart/form-data; boundary=x; charset=" + charset,
+    )
+    assert status == 400
+    assert "UTF-8" in said
+
+
+# --- values
+
+
+def test_a_photo_alone_is_asked_for_as_on_the_command_line():
+    made = asked()
+    assert (made.photo, made.name) == (b"bytes", "a.jpg")
+    assert made.options == Options(max_pixels=1000)
+
+
+def test_every_option_that_a_client_may_choose_is_read():
+    made = asked(
+        strength="0.5", quality="best", format="tiff", additive="true", model="mine", layers="reflection"
+    )
+    assert made.options == Options(
+        strength=0.5,
+        quality="best",
+        format="tiff",
+        additive=True,
+        model="mine",
+        layers=("reflection",),
+        max_pixels=1000,
+    )
+
+
+@pytest.mark.parametrize("layers", ["confidence,transmission", "transmission,confidence,transmission"])
+def test_layers_come_each_once_and_in_the_known_order(layers):
+    assert asked(layers=layers).options.layers == ("transmission", "confidence")
+    repeated = [("layers", layer.encode()) for layer in layers.split(",")]
+    assert read(body(("photo", b"", "a.jpg"), *repeated)).options.layers == ("transmission", "confidence")
+
+
+def test_an_empty_field_is_one_that_was_left_out():
+    assert asked(format="", strength="", model="").options == Options(max_pixels=1000)
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"strength": "1.5"}, "strength is '1.5'"),
+        ({"strength": "nan"}, "strength is 'nan'"),
+        ({"strength": "-1"}, "strength is '-1'"),
+        ({"strength": "a lot"}, "strength is 'a lot'"),
+        ({"quality": "fine"}, "'draft', 'standard' or 'best'"),
+        ({"format": "gif"}, "format is 'gif'"),
+        ({"layers": "transmission,glass"}, "is 'glass'"),
+        ({"layers": ""}, "layers.0 is ''"),
+        ({"additive": "perhaps"}, "additive is 'perhaps'"),
+        ({"model": "../../etc/passwd"}, "choose compact or mine"),
+        ({"model": "/models/mine.onnx"}, "choose compact or mine"),
+        ({"device": "cuda"}, "there is no field 'device'"),
+        ({"max_pixels": "1"}, "there is no field 'max_pixels'"),
+        ({"quality": "x" * 500}, "'" + "x" * 40 + "'"),
+    ],
+)
+def test_a_wrong_value_is_named_in_a_sentence(fields, said):
+    data = body(("photo", b"bytes", "a.jpg"), *((name, value.encode()) for name, value in fields.items()))
+    status, sentence = refused(data)
+    assert status == 422
+    assert said in sentence
+    assert len(sentence) < 300
+
+
+def test_values_that_do_not_go_together_are_the_options_own_error():
+    with pytest.raises(BrewsterError, match="fit only into TIFF and EXR"):
+        asked(additive="true", format="png")
+
+
+@pytest.mark.parametrize(
+    ("data", "status"),
+    [
+        (body(("strength", b"1")), 422),
+        (body(("photo", b"not a file")), 422),
+        (body(("picture", b"bytes", "a.jpg")), 422),
+        (body(("photo", b"one", "a.jpg"), ("photo", b"two", "b.jpg")), 400),
+        (body(("photo", b"", "a.jpg"), *[("strength", b"1")] * 40), 400),
+        (body(("photo", b"", "a.jpg"), ("model", b"x" * 2_000_000)), 400),
+        (b"", 422),
+        (b"--x\r\nContent-Disposition: form-data\r\n\r\n\r\n--x--", 400),
+        (b"no form at all", 400),
+    ],
+)
+def test_a_form_that_is_none_is_refused(data, status):
+    assert refused(data)[0] == status
+
+
+@pytest.mark.parametrize(
+    "kind", [b"application/json", b"", b"multipart/form-data", b"multipart/form-data; boundary="]
+)
+def test_another_kind_of_body_is_refused(kind):
+    assert refused(body(("photo", b"", "a.jpg")), kind=kind)[0] in (400, 415)
+
+
+def test_the_schema_holds_the_options_words_and_limits():
+    fields = form_schema(MODELS)["properties"]
+    assert set(fields) == {"photo", *FIELDS}
+    assert (fields["strength"]["minimum"], fields["strength"]["maximum"]) == (0, 1)
+    assert fields["model"]["enum"] == ["compact", "mine"]
+    about = Options.__dataclass_fields__
+    for name in set(FIELDS) - {"model"}:
+        assert fields[name]["description"] == about[name].metadata["description"]
+
+
+# --- names
+
+
+@given(name=st.text())
+def test_a_name_is_never_a_path_and_fits_every_disk(name):
+    safe = safe_name(name)
+    assert safe.strip(". ") == safe != ""
+    assert safe.isprintable()
+    assert not set(safe) & set('/\\<>:"|?*')
+    assert PurePosixPath(safe).name == PureWindowsPath(safe).name == safe
+    assert len(SeparationRequest(b"", safe, Options()).target("transmission", "jpeg").encode()) < 200
+    assert safe_name(safe) == safe
+
+
+@given(stem=st.text(string.ascii_letters + string.digits + "äöü日本 -_()", min_size=1).filter(str.strip))
+def test_a_harmless_name_stays_as_it_is(stem):
+    name = f"{stem.strip()[:30].strip()}.jpg"
+    assert safe_name(name) == name
+
+
+@pytest.mark.parametrize(
+    ("name", "safe"),
+    [
+        ("../../etc/passwd", "passwd"),
+        ("C:\\photos\\a.png", "a.png"),
+        ("a\r\nSet-Cookie: x.jpg", "a__Set-Cookie_ x.jpg"),
+        ("", "photo"),
+        ("..", "photo"),
+        ("folder/", "photo"),
+        ("\N{RIGHT-TO-LEFT OVERRIDE}gpj.exe", "_gpj.exe"),
+        ("x" * 1000 + ".JPG", "x" * 120 + ".JPG"),
+    ],
+)
+def test_hostile_names_are_disarmed(name, safe):
+    assert safe_name(name) == safe
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "target"),
+    [
+        ("a.JPG", Options(), "a.transmission.JPG"),
+        ("a.png", Options(format="jpeg"), "a.transmission.jpg"),
+        ("a.gif", Options(), "a.transmission.png"),
+        ("a.jpg", Options(additive=True), "a.transmission.tiff"),
+        ("blob", Options(), "blob.transmission.webp"),
+        ("a.b", Options(), "a.b.transmission.webp"),
+    ],
+)
+def test_layers_are_named_as_the_command_line_names_them(name, options, target):
+    assert SeparationRequest(b"", name, options).target("transmission", "webp") == target
+    assert Path(SeparationRequest(b"", name, options).target("confidence", "webp")).suffix == ".png"

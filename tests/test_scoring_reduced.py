@@ -1,0 +1,17 @@
+"""Photos are reduced to a shorter side before they are compared."""
+
+import numpy as np
+import pytest
+
+from brewster import Photo
+from brewster.evaluate.scoring import reduced
+
+
+@pytest.mark.parametrize(
+    ("size", "small"), [((60, 40), (30, 20)), ((40, 60), (20, 30)), ((50, 18), (50, 18))]
+)
+def test_a_photo_is_reduced_to_its_shorter_side_and_never_enlarged(size, small):
+    width, height = size
+    photo = Photo.from_array(np.zeros((height, width, 3), np.uint8), encoding="srgb")
+    assert reduced(photo, 20).size == small
+    assert reduced(photo, None) is photo

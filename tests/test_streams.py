@@ -1,0 +1,165 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from brewster.environments.assets import Assets
+from brewster.environments.catalog import BUILTIN_CATALOG
+from brewster.errors import RecipeError, UnsupportedPhoto
+from brewster.photo import Photo
+from brewster.scene.recipe import read_scene_recipe
+from brewster.training.data.image_loading import source_weights
+from brewster.training.data.online import OnlineRendered
+from brewster.training.data.rendered import RenderedSets
+from brewster.training.recipe import DataRecipe, read_recipe, with_value
+from brewster.training.streams import open_stream, validation_pairs
+from front_door import picture
+from set_folders import make
+
+TINY = Path(__file__).parents[1] / "recipes/ablations/tiny.toml"
+
+
+@pytest.fixture
+def recipe():
+    return read_recipe(TINY)
+
+
+@pytest.fixture(scope="module")
+def worlds():
+    return Assets()
+
+
+@pytest.fixture
+def builtin(worlds, monkeypatch):
+    """Builtin worlds that all tests share, and no data folder."""
+    monkeypatch.setattr("brewster.training.streams.Assets", lambda folders: worlds)
+    monkeypatch.delenv("BREWSTER_DATA", raising=False)
+    return worlds
+
+
+@pytest.fixture
+def root(tmp_path, monkeypatch):
+    """A data folder: photos, pairs and an empty one."""
+    for name in ("photos", "real/blended", "real/transmission", "empty/blended"):
+        (tmp_path / name).mkdir(parents=True)
+    for name in ("photos/a.jpg", "real/blended/a.jpg", "real/transmission/a.jpg"):
+        (tmp_path / name).write_bytes(picture())
+    monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
+    return tmp_path
+
+
+def learning_from(recipe, **data):
+    return recipe.model_copy(update={"data": DataRecipe.model_validate(data)})
+
+
+def same(one, other):
+    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in one.__dataclass_fields__)
+
+
+@pytest.mark.parametrize("kind", ["photos", "maps", "pairs"])
+def test_a_folder_that_is_missing_or_without_pictures_is_named(recipe, root, kind):
+    for folder, complaint in (
+        ("empty", "no pictures in .*empty"),
+        ("gone", r"gone.* cannot be read \(No such"),
+    ):
+        data = {"photos": ["photos"], "pairs_share": float(kind == "pairs"), kind: [folder]}
+        with pytest.raises(RecipeError, match=complaint):
+            open_stream(learning_from(recipe, **data))
+
+
+def test_a_data_folder_that_nobody_named_is_an_error(recipe, monkeypatch):
+    monkeypatch.delenv("BREWSTER_DATA", raising=False)
+    with pytest.raises(RecipeError, match="BREWSTER_DATA"):
+        open_stream(learning_from(recipe, photos=["photos"]))
+
+
+def test_sets_are_found_below_the_data_folder_or_by_their_whole_path(recipe, root):
+    make(root / "set", count=3)
+    below, absolute = (
+        open_stream(learning_from(recipe, rendered={"sets": [folder], "count": 2}))
+        for folder in ("set", root / "set")
+    )
+    assert isinstance(below, RenderedSets)
+    assert len(below) == 2
+    assert same(below(3, 2, 32), absolute(3, 2, 32))
+
+
+def test_live_samples_of_builtin_worlds_need_no_data_folder(recipe, builtin):
+    endless = with_value(recipe, "data.rendered.count", None)
+    plain = OnlineRendered(read_scene_recipe("tiny"), BUILTIN_CATALOG, builtin, seed=recipe.seed)
+    assert same(open_stream(endless)(1, 2, 32), plain(1, 2, 32))
+
+
+def test_orders_and_seed_of_a_recipe_reach_the_scenes(recipe, builtin):
+    endless = with_value(recipe, "data.rendered.count", None)
+    whole, paper, other = (
+        open_stream(with_value(endless, f"data.rendered.{name}", value))(0, 1, 32)
+        for name, value in (("orders", "all"), ("orders", "paper"), ("seed", 2))
+    )
+    assert torch.equal(whole.photo_encoded, paper.photo_encoded)
+    assert paper.reflection_encoded.mean() < whole.reflection_encoded.mean()
+    assert not torch.equal(whole.photo_encoded, other.photo_encoded)
+
+
+def test_each_batch_is_divided_as_the_shares_say(recipe, root):
+    make(root / "set", count=2)
+    data = {"photos": ["photos"], "pairs": ["real"], "rendered": {"sets": ["set"], "share": 0.25}}
+    blend = open_stream(learning_from(recipe, **data, pairs_share=0.5))
+    batch = blend(0, 8, 32)
+    assert batch.photo_encoded.shape == (8, 3, 32, 32)
+    assert (batch.reflection_weight < 1).tolist() == 4 * [True] + 4 * [False]
+    rendered = open_stream(learning_from(recipe, rendered={"sets": ["set"]}))(0, 1, 32)
+    assert torch.equal(batch.photo_encoded[4:5], rendered.photo_encoded)
+    mixtures = open_stream(learning_from(recipe, photos=["photos"]))(0, 3, 32)
+    assert torch.equal(batch.photo_encoded[5:], mixtures.photo_encoded)
+
+
+def test_pairs_alone_may_fill_a_batch(recipe, root):
+    batch = open_stream(learning_from(recipe, pairs=["real"], pairs_share=1.0))(0, 4, 32)
+    assert (batch.reflection_weight < 1).all()
+
+
+def test_what_has_no_share_is_not_read(recipe, root):
+    gone = {"pairs": ["gone"], "pairs_share": 0.0, "rendered": {"sets": ["gone"], "share": 0.0}}
+    only = open_stream(learning_from(recipe, photos=["photos"]))
+    assert same(
+        open_stream(learning_from(recipe, photos=["photos"], **gone))(0, 2, 32),
+        only(0, 2, 32),
+    )
+
+
+def test_a_stream_of_nothing_says_what_to_raise(recipe):
+    stream = open_stream(with_value(recipe, "data.rendered.count", 0))
+    with pytest.raises(RecipeError, match=r"nothing to learn from; .*raise data\.rendered\.count"):
+        stream(0, 1, 32)
+
+
+def test_a_map_that_cannot_light_a_scene_is_named_unless_it_is_excluded(recipe, root):
+    good, clipped = torch.rand(16, 32, 3).numpy(), torch.ones(16, 32, 3).numpy()
+    (root / "hdri").mkdir()
+    for name, texels in (("good.exr", good), ("clipped.exr", clipped)):
+        Photo.from_array(texels, encoding="linear").save(root / "hdri" / name)
+    wanted = {"rendered": {"recipe": "tiny", "maps": ["hdri"]}}
+    with pytest.raises(UnsupportedPhoto, match=r"clipped\.exr"):
+        open_stream(learning_from(recipe, **wanted))
+    open_stream(learning_from(recipe, **wanted, exclude=["clip*"]))
+
+
+def test_the_photos_of_a_source_weigh_together_as_the_root_of_their_number(recipe, root):
+    for name in ("many_1", "many_2", "many_3", "many_4", "few-1"):
+        Photo.from_array(np.zeros((8, 8, 3), np.uint8), encoding="srgb").save(
+            root / "sources" / f"{name}.png"
+        )
+    assert source_weights([root / "sources"]) == [1, 0.5, 0.5, 0.5, 0.5]
+    assert source_weights([root / "sources"], ["few*"]) == [0.5] * 4
+
+
+def test_pairs_to_validate_on_are_evenly_spaced_in_order_of_name(recipe, root):
+    for number in range(7):
+        grey = np.full((8, 8, 3), 30 * number, np.uint8)
+        for role in ("blended", "transmission"):
+            Photo.from_array(grey, encoding="srgb").save(root / "many" / role / f"{number}.png")
+    data = recipe.data.model_copy(update={"validate_on": (Path("many"),), "validate_at_most": 3})
+    seen = [int(photo[0, 0, 0]) // 30 for photo, _ in validation_pairs(data)["many"]]
+    assert seen == [0, 2, 4]

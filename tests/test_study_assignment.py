@@ -1,0 +1,106 @@
+"""The draw: balanced, blind, without repeats, and the same for ever."""
+
+from collections import Counter
+from itertools import islice
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from brewster.user_study.assignment import draw, walk
+from small_studies import described
+
+SIZES = st.integers(1, 60).flatmap(lambda count: st.tuples(st.just(count), st.integers(1, count)))
+
+
+def shown(count, pairs, seed, people):
+    row = list(islice(walk(count, pairs, seed), people * pairs))
+    return [row[i * pairs : (i + 1) * pairs] for i in range(people)]
+
+
+@given(SIZES, st.integers(0, 2**32), st.integers(1, 30))
+def test_nobody_sees_a_pair_twice_and_every_pair_is_seen_equally_often_within_one(sizes, seed, people):
+    count, pairs = sizes
+    seen = Counter(dict.fromkeys(range(count), 0))
+    for own in shown(count, pairs, seed, people):
+        numbers = [comparison for comparison, _ in own]
+        assert len(set(numbers)) == pairs
+        seen.update(numbers)
+        assert max(seen.values()) - min(seen.values()) <= 1
+
+
+@given(SIZES, st.integers(0, 2**32), st.integers(1, 30))
+def test_each_comparison_has_its_first_method_left_and_right_equally_often_within_one(sizes, seed, people):
+    balance = Counter()
+    for own in shown(*sizes, seed, people):
+        balance.update({comparison: 1 if flipped else -1 for comparison, flipped in own})
+        assert all(abs(value) <= 1 for value in balance.values())
+
+
+@given(SIZES, st.integers(0, 2**32), st.integers(1, 30))
+def test_no_participant_sees_one_method_much_more_often_on_one_side(sizes, seed, people):
+    for own in shown(*sizes, seed, people):
+        right = sum(flipped for _, flipped in own)
+        assert abs(2 * right - len(own)) <= 4
+
+
+def test_the_paper_s_study_is_balanced_to_a_hair():
+    """100 participants, 40 of 2 x 181 pairs."""
+    people = shown(362, 40, 1, 100)
+    rights = [sum(flipped for _, flipped in own) for own in people]
+    assert min(rights) >= 18
+    assert max(rights) <= 22
+    assert set(Counter(comparison for own in people for comparison, _ in own).values()) == {11, 12}
+
+
+def test_a_draw_depends_on_seed_and_number_only_and_differs_between_both():
+    study = described()
+    trials = [draw(study, number) for number in range(6)]
+    assert trials == [draw(study, number) for number in range(6)]
+    assert len(set(trials)) == 6
+    assert draw(described(seed=8), 0) != trials[0]
+
+
+def test_a_draw_of_this_version_is_the_draw_of_every_version():
+    """Links are sent out, and a study may last longer than an installation."""
+    first = [
+        (trial.comparison, trial.flipped) for trial in draw(described(pictures=4, pairs=4, catches=0), 0)
+    ]
+    assert first == [(4, False), (1, True), (5, False), (7, True)]
+
+
+def test_sides_and_pictures_agree_with_what_the_trial_says():
+    study = described()
+    for trial in draw(study, 3):
+        if trial.comparison is not None:
+            row = study.comparisons[trial.comparison]
+            assert row.photo == trial.photo
+            assert row.outputs == ((trial.right, trial.left) if trial.flipped else (trial.left, trial.right))
+
+
+def test_catch_trials_are_of_both_kinds_and_on_photos_that_are_not_the_participant_s_own():
+    study = described(catches=4)
+    for number in range(20):
+        trials = draw(study, number)
+        catches = [trial for trial in trials if trial.expected]
+        assert Counter("equal" if trial.left == trial.right else "spoilt" for trial in catches) == {
+            "equal": 2,
+            "spoilt": 2,
+        }
+        assert not {trial.photo for trial in catches} & {
+            trial.photo for trial in trials if not trial.expected
+        }
+        for trial in catches:
+            pressed = {"left": trial.left, "right": trial.right, "similar": trial.left}[trial.expected]
+            assert pressed == "good"
+            assert (trial.expected == "similar") == (trial.left == trial.right)
+
+
+def test_the_order_does_not_tell_the_catch_trials():
+    places = Counter(
+        place
+        for number in range(120)
+        for place, trial in enumerate(draw(described(), number))
+        if trial.expected
+    )
+    assert len(places) == 10
+    assert min(places.values()) > 10

@@ -1,0 +1,59 @@
+"""How many participants it takes: the formula, and studies of that size that were simulated."""
+
+import numpy as np
+import pytest
+
+from brewster.errors import BrewsterError
+from brewster.user_study.power_analysis import plan
+from brewster.user_study.report.statistics import interval, rates, resampled, summed
+
+
+def shown(dice, participants, pairs, chances, correlation, studies):
+    """The share of simulated studies whose interval of the difference does not hold 0."""
+    own = dice.dirichlet(np.array(chances) * (1 / correlation - 1), (participants, studies))
+    counts = dice.multinomial(pairs, own)[:, :, None].astype(float)
+    draws = rates(summed(resampled(participants, 1000), counts), np.ones((studies, 1)))
+    lows, highs = interval(draws, participants)[..., 0, 3]
+    return ((lows > 0) | (highs < 0)).mean()
+
+
+@pytest.mark.parametrize(
+    ("difference", "tie", "pairs", "correlation"),
+    [(0.1, 0.25, 40, 0.05), (0.15, 0.4, 20, 0.02), (0.1, 0.1, 40, 0.15)],
+)
+def test_a_study_of_the_planned_size_shows_the_difference_with_the_stated_power(
+    difference, tie, pairs, correlation
+):
+    answer = plan(difference=difference, tie=tie, pairs=pairs, correlation=correlation)
+    dice = np.random.default_rng(6)
+    power = shown(dice, answer.participants, pairs, (answer.win, tie, answer.lose), correlation, 400)
+    assert power == pytest.approx(0.8, abs=3 * np.sqrt(0.8 * 0.2 / 400))
+
+
+def test_without_a_difference_five_percent_show_one():
+    same = (1 - 0.25) / 2
+    assert shown(np.random.default_rng(7), 100, 40, (same, 0.25, same), 0.05, 400) == pytest.approx(
+        0.05, abs=0.03
+    )
+
+
+def test_the_formula_by_hand():
+    """(1.95996 + 0.84162)^2 x 0.74 x 2.95 / (40 x 0.01) + 1.95996^2 / 2 = 42.84 + 1.92."""
+    answer = plan(difference=0.1, tie=0.25)
+    assert (answer.participants, answer.answers) == (45, 1800)
+    assert answer.design_effect == pytest.approx(2.95)
+    assert (answer.win, answer.lose) == pytest.approx((0.425, 0.325))
+
+
+def test_smaller_differences_and_people_more_alike_need_more_participants():
+    base = plan(difference=0.1, tie=0.25).participants
+    assert plan(difference=0.05, tie=0.25).participants > 3 * base
+    assert plan(difference=0.1, tie=0.25, correlation=0.2).participants > 2 * base
+    assert plan(difference=0.1, tie=0.25, power=0.9).participants > base
+    assert plan(difference=0.1, tie=0.6).participants < base
+
+
+@pytest.mark.parametrize(("difference", "tie"), [(0, 0.2), (-0.1, 0.2), (0.9, 0.2), (0.1, 1)])
+def test_rates_that_cannot_be_are_refused(difference, tie):
+    with pytest.raises(BrewsterError, match="a difference above 0"):
+        plan(difference=difference, tie=tie)

@@ -1,0 +1,86 @@
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+
+from brewster.environments.assets import Assets
+from brewster.environments.catalog import BUILTIN_CATALOG
+from brewster.photo import Photo
+from brewster.render.camera_response import jpeg
+from brewster.scene.recipe import read_scene_recipe
+from brewster.training.data.online import OnlineRendered
+
+
+@pytest.fixture(scope="module")
+def assets():
+    return Assets()
+
+
+def stream(assets, **options):
+    catalog = BUILTIN_CATALOG.model_copy(update={"maps": BUILTIN_CATALOG.maps[:2]})
+    return OnlineRendered(read_scene_recipe("tiny"), catalog, assets, seed=7, **options)
+
+
+def same(one, other):
+    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in one.__dataclass_fields__)
+
+
+def test_a_batch_is_a_function_of_seed_and_step_alone(assets):
+    one = stream(assets)
+    second = one(1, 2, 32)
+    assert same(second, stream(assets)(1, 2, 32))
+    assert not torch.equal(second.photo_encoded, one(0, 2, 32).photo_encoded)
+
+
+def test_a_batch_has_square_encoded_pictures(assets):
+    batch = stream(assets)(0, 3, 32)
+    assert batch.photo_encoded.shape == batch.transmission_encoded.shape == (3, 3, 32, 32)
+    assert batch.photo_encoded.min() >= 0
+    assert batch.photo_encoded.max() <= 1
+
+
+def test_iterating_gives_the_samples_in_order_at_the_recipes_size(assets):
+    live = stream(assets)
+    first = next(iter(live))
+    assert first.photo_encoded.shape == (3, 64, 96)
+    assert torch.equal(first.photo_encoded, live.sample(0).photo_encoded)
+
+
+@pytest.mark.parametrize("mixing", ["light", "8-bit"])
+def test_the_photo_has_been_through_its_jpeg_and_no_truth_has(assets, mixing):
+    """A second JPEG of the same quality changes next to nothing."""
+    sample = stream(assets, mixing=mixing).sample(0)
+
+    def change(encoded):
+        decoded = Photo.open(jpeg(encoded, sample.scene.development.jpeg_quality)).pixels.copy()
+        return (torch.from_numpy(decoded).permute(2, 0, 1) / 255 - encoded).abs().mean()
+
+    assert change(sample.photo_encoded) < 1e-3
+    assert change(sample.background_encoded) > 5e-3
+
+
+def test_the_target_is_the_background_or_the_transmission(assets):
+    background = stream(assets)(0, 1, 32).transmission_encoded
+    transmission = stream(assets, target="transmission")(0, 1, 32).transmission_encoded
+    assert transmission.mean() < background.mean()
+
+
+def test_both_kinds_of_data_show_the_same_background(assets):
+    light, mixed = (stream(assets, mixing=mixing).sample(3) for mixing in ("light", "8-bit"))
+    assert (light.background_encoded - mixed.transmission_encoded).abs().max() <= 0.5 / 255 + 1e-6
+    assert not torch.equal(light.photo_encoded, mixed.photo_encoded)
+
+
+def test_layers_are_photo_target_and_reflection_of_the_batch(assets):
+    live = stream(assets)
+    batch, layers = live(0, 2, 32), live.layers(1, 32)
+    pictures = batch.photo_encoded[1], batch.transmission_encoded[1], batch.reflection_encoded[1]
+    assert torch.equal(layers, torch.cat(pictures))
+
+
+def test_threads_that_share_a_stream_get_what_one_would_get(assets):
+    alone = [stream(assets)(step, 1, 32) for step in range(4)]
+    shared = stream(Assets())
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda step: shared(step, 1, 32), range(4)))
+    assert all(map(same, alone, together))

@@ -1,0 +1,184 @@
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+import brewster.training.data.rendered as kept
+from brewster.errors import PhotoError, RecipeError
+from brewster.photo import Photo
+from brewster.render.camera_response import jpeg
+from brewster.rendered.store import read_cause, read_set
+from brewster.training.data.alpha_blend import blended_layers
+from brewster.training.data.rendered import CachedRendered, RenderedSets
+from set_folders import make
+
+
+@pytest.fixture
+def folder(tmp_path):
+    make(tmp_path / "set", count=3)
+    return tmp_path / "set"
+
+
+def same(one, other):
+    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in one.__dataclass_fields__)
+
+
+def pixels(data):
+    return torch.from_numpy(Photo.open(data).pixels.copy())
+
+
+class Live:
+    """Stands in for a live stream, and counts what it is asked for."""
+
+    def __init__(self):
+        self.asked = []
+
+    def layers(self, index, size):
+        self.asked.append((index, size))
+        return torch.rand(9, size, size, generator=torch.Generator().manual_seed(index))
+
+
+def test_a_sample_is_its_photo_its_target_and_its_reflection(folder):
+    for target in ("background", "transmission"):
+        stream = RenderedSets([folder], seed=1, target=target)
+        for number, entry in enumerate(read_set(folder)):
+            pictures = [pixels(entry.read(f"{name}.jpg")) for name in ("photo", target, "reflection")]
+            assert torch.equal(stream.sample(number), torch.cat(pictures, dim=2))
+
+
+def test_an_8_bit_sample_is_the_blend_of_its_own_background_and_mirror(folder):
+    stream = RenderedSets([folder], seed=1, mixing="8-bit")
+    for number, entry in enumerate(read_set(folder)):
+        scene = read_cause(entry)
+        behind, mirror = (
+            pixels(entry.read(f"{name}.jpg")).permute(2, 0, 1) / 255 for name in ("background", "mirror")
+        )
+        photo, *layers = blended_layers(behind, mirror, scene)
+        found = stream.sample(number).permute(2, 0, 1) / 255
+        torch.testing.assert_close(found[3:], torch.cat(layers))
+        seen = pixels(jpeg(photo, scene.development.jpeg_quality)).permute(2, 0, 1) / 255
+        torch.testing.assert_close(found[:3], seen)
+
+
+def test_windows_of_photo_and_truths_show_the_same_place(folder):
+    for sample in folder.glob("0*"):
+        for name in ("background", "reflection"):
+            shutil.copy(sample / "photo.jpg", sample / f"{name}.jpg")
+    batch = RenderedSets([folder], seed=1)(0, 8, 32)
+    assert torch.equal(batch.photo_encoded, batch.transmission_encoded)
+    assert torch.equal(batch.photo_encoded, batch.reflection_encoded)
+    assert (batch.reflection_weight == 1).all()
+    assert batch.photo_encoded.shape == (8, 3, 32, 32)
+
+
+def test_a_batch_from_disk_depends_on_seed_and_step_alone(folder):
+    one, other = RenderedSets([folder], seed=1), RenderedSets([folder], seed=1)
+    late = one(7, 4, 32)
+    other(0, 2, 64)
+    assert same(late, other(7, 4, 32))
+    assert not torch.equal(late.photo_encoded, one(8, 4, 32).photo_encoded)
+    assert not torch.equal(late.photo_encoded, RenderedSets([folder], seed=2)(7, 4, 32).photo_encoded)
+
+
+def test_shards_and_folders_hold_the_same_samples(folder, tmp_path):
+    make(tmp_path / "shards", count=3, shards=True)
+    assert list((tmp_path / "shards").glob("*.tar"))
+    one, other = (RenderedSets([place], seed=1, mixing="8-bit") for place in (folder, tmp_path / "shards"))
+    assert same(one(0, 4, 32), other(0, 4, 32))
+
+
+def test_only_the_first_samples_are_used_where_a_count_is_given(folder):
+    shutil.rmtree(folder / "000002")
+    (folder / "000002").mkdir()
+    stream = RenderedSets([folder], seed=1, count=2)
+    assert len(stream) == 2
+    stream(0, 20, 32)
+
+
+def test_sets_follow_one_another(folder, tmp_path):
+    make(tmp_path / "more", count=2, seed=8)
+    both = RenderedSets([folder, tmp_path / "more"], seed=1)
+    assert len(both) == 5
+    assert torch.equal(both.sample(3), RenderedSets([tmp_path / "more"], seed=1).sample(0))
+
+
+def test_more_samples_than_there_are_cannot_be_asked_for(folder):
+    with pytest.raises(RecipeError, match=r"set: 3 rendered samples; .* learns from 4; .* lower"):
+        RenderedSets([folder], seed=1, count=4)
+
+
+def test_a_folder_that_is_missing_empty_or_no_set_is_named(tmp_path):
+    with pytest.raises(RecipeError, match=r"gone cannot be read \(No such"):
+        RenderedSets([tmp_path / "gone"], seed=1)
+    with pytest.raises(RecipeError, match=r"0 rendered samples; .* at least one"):
+        RenderedSets([tmp_path], seed=1)
+    (tmp_path / "shard-000000.tar").write_bytes(b"no tar" * 200)
+    with pytest.raises(RecipeError, match="cannot be read"):
+        RenderedSets([tmp_path], seed=1)
+
+
+@pytest.mark.parametrize("name", ["mirror.jpg", "scene.toml"])
+def test_a_file_that_is_gone_is_named_with_its_sample(folder, name):
+    (folder / "000001" / name).unlink()
+    with pytest.raises(RecipeError, match=f"{name} of sample 000001 .*; .*; .* again"):
+        RenderedSets([folder], seed=1, mixing="8-bit").sample(1)
+
+
+def test_a_damaged_picture_is_named_with_its_sample(folder):
+    photo = folder / "000001" / "photo.jpg"
+    photo.write_bytes(photo.read_bytes()[:200])
+    with pytest.raises(PhotoError, match=r"photo\.jpg of sample 000001"):
+        RenderedSets([folder], seed=1).sample(1)
+
+
+def test_what_was_read_is_kept_while_there_is_room(folder, monkeypatch):
+    roomy = RenderedSets([folder], seed=1)
+    monkeypatch.setattr(kept, "KEPT_BYTES", 16 * 24 * 9)
+    narrow = RenderedSets([folder], seed=1)
+    first = [stream(0, 20, 32) for stream in (roomy, narrow)]
+    assert same(*first)
+    shutil.rmtree(folder)
+    assert same(roomy(0, 20, 32), first[0])
+    with pytest.raises(RecipeError):
+        narrow(0, 20, 32)
+
+
+def test_a_live_sample_is_rendered_once_for_each_size():
+    live = Live()
+    stream = CachedRendered(live, 3, seed=1)
+    for step in range(10):
+        stream(step, 4, 8)
+        stream(step, 4, 16)
+    assert sorted(live.asked) == [(index, size) for index in range(3) for size in (8, 16)]
+
+
+def test_a_batch_from_memory_depends_on_seed_and_step_alone():
+    one, other = (CachedRendered(Live(), 3, seed=1) for _ in range(2))
+    late = one(7, 4, 16)
+    other(0, 9, 16)
+    assert same(late, other(7, 4, 16))
+    assert same(late, one(7, 4, 16))
+
+
+def test_a_kept_sample_is_shown_as_it_is_or_mirrored():
+    batch = CachedRendered(Live(), 1, seed=1)(0, 16, 8)
+    whole = Live().layers(0, 8)
+    for photo, target in zip(batch.photo_encoded, batch.transmission_encoded, strict=True):
+        straight = (photo - whole[:3]).abs().max() < 0.003
+        expected = whole if straight else whole.flip(2)
+        torch.testing.assert_close(torch.cat([photo, target]), expected[:6], atol=0.51 / 255, rtol=0)
+    assert len({photo.numpy().tobytes() for photo in batch.photo_encoded}) == 2
+
+
+def test_memory_that_is_full_changes_nothing_but_the_time():
+    live = Live()
+    narrow = CachedRendered(live, 4, seed=1, most_bytes=2 * 9 * 8 * 8)
+    roomy = CachedRendered(Live(), 4, seed=1)
+    assert all(same(narrow(step, 4, 8), roomy(step, 4, 8)) for step in range(10))
+    assert len(live.asked) > 4
+
+
+def test_a_set_may_be_named_by_a_relative_path(folder, monkeypatch):
+    monkeypatch.chdir(folder.parent)
+    assert len(RenderedSets([Path(folder.name)], seed=1)) == 3

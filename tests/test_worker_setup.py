@@ -1,0 +1,17 @@
+"""What processes owe to each other; that workers end with their parent is tested with those who have workers."""
+
+import contextlib
+
+import torch
+
+from brewster.worker_setup import one_thread
+
+
+def test_torch_has_one_thread_inside_and_as_many_as_before_afterwards():
+    torch.set_num_threads(2)
+    with contextlib.suppress(ZeroDivisionError), one_thread():
+        inside = torch.get_num_threads()
+        raise ZeroDivisionError
+    after = torch.get_num_threads()
+    torch.set_num_threads(1)
+    assert (inside, after) == (1, 2)
