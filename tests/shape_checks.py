@@ -14,7 +14,8 @@ from beartype import beartype
 from jaxtyping import AbstractArray, _import_hook
 
 _CHECKED = tuple(
-    f"brewster.{package}." for package in ("dataset", "evaluate", "models", "render", "separate", "train")
+    f"brewster.{package}."
+    for package in ("evaluate", "inference", "models", "render", "rendered", "training")
 )
 """Metrics and studies are left out: they refuse arrays of other shapes themselves, which their tests try."""
 

@@ -26,7 +26,7 @@ from brewster.user_study.folders import Key, find_pictures, listed
 from brewster.user_study.study import (
     PICTURES,
     CatchTrial,
-    Comparison,
+    PairedComparison,
     Study,
     StudyDescription,
     StudyPicture,
@@ -219,11 +219,11 @@ class _Copier:
 
 def _comparisons(
     found: _StudyFiles, pairs: Sequence[tuple[str, str]], copier: _Copier
-) -> Iterator[Comparison]:
+) -> Iterator[PairedComparison]:
     for key, photo in found.inputs.items():
         for first, second in pairs:
             outputs = (copier.copy(found.outputs[first][key]), copier.copy(found.outputs[second][key]))
-            yield Comparison(*key, (first, second), copier.copy(photo), outputs)
+            yield PairedComparison(*key, (first, second), copier.copy(photo), outputs)
 
 
 def _catch_pool(found: _StudyFiles, copier: _Copier, dice: Random) -> Iterator[CatchTrial]:

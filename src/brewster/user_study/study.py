@@ -46,7 +46,7 @@ class StudyPicture:
 
 @final
 @dataclass(frozen=True)
-class Comparison:
+class PairedComparison:
     """Two methods on one photo, with the names of the three pictures."""
 
     dataset: str
@@ -84,7 +84,7 @@ class StudyDescription:
     methods: tuple[str, ...]
     datasets: tuple[str, ...]
     pictures: tuple[StudyPicture, ...]
-    comparisons: tuple[Comparison, ...]
+    comparisons: tuple[PairedComparison, ...]
     catch_pool: tuple[CatchTrial, ...]
     format: int = FORMAT
 
