@@ -33,7 +33,9 @@ def main(data: Path, count: int = 500) -> None:
             max(some) / 2**20 for some in (memory[: len(memory) // 4], memory[-len(memory) // 4 :])
         )
         rate = count / seconds[workers]
-        print(f"{workers} workers: {rate:.2f} pictures a second, all metrics, doing nothing and one folder")
+        print(
+            f"{workers} workers: {rate:.2f} pictures a second, all metrics, the unprocessed input and one folder"
+        )
         print(f"  memory of all processes: {first:.2f} GiB in the first quarter, {last:.2f} GiB in the last")
     print(f"two workers are {seconds[1] / seconds[2]:.2f} times as fast as one")
     same = (OUT / "workers-1/results.json").read_bytes() == (OUT / "workers-2/results.json").read_bytes()

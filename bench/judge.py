@@ -1,4 +1,4 @@
-"""The pane renderer beside Mitsuba: the same scenes, means and errors, with Mitsuba's own noise told apart.
+"""The analytic renderer beside Mitsuba: the same scenes, means and errors, with Mitsuba's own noise told apart.
 
     python bench/judge.py [SAMPLES]
 

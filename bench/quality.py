@@ -1,4 +1,4 @@
-"""The shipped model on the development pairs, full pictures, beside doing nothing and beside fast-reflection-removal
+"""The shipped model on the development pairs, full pictures, beside the unprocessed input and beside fast-reflection-removal
 1.1 (Yang et al. 2019), which runs in an environment of its own.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/quality.py

@@ -1,4 +1,4 @@
-"""The pane renderer against Mitsuba at equal error, in CPU-seconds of one run; and whole sets a second.
+"""The analytic renderer against Mitsuba at equal error, in CPU-seconds of one run; and whole sets a second.
 
     python bench/render.py
 
@@ -110,7 +110,7 @@ def sets_a_second() -> None:
     print("| sets | CPU-s a set |\n|---|---|")
     for count in (10, 30, 90):
         with tempfile.TemporaryDirectory() as folder:
-            job = RenderJob(Path(folder) / "set", recipe, BUILTIN_CATALOG, 7, "pane", ())
+            job = RenderJob(Path(folder) / "set", recipe, BUILTIN_CATALOG, 7, "analytic", ())
             start = time.process_time()
             build(job, range(count), SerialExecutor(job), shards=False, report=lambda _: None)
             print(f"| {count} | {(time.process_time() - start) / count:.2f} |", flush=True)

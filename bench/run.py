@@ -1,4 +1,4 @@
-"""What `make bench` plays: quality on the development pairs beside doing nothing and beside a peer, what happens
+"""What `make bench` plays: quality on the development pairs beside the unprocessed input and beside a peer, what happens
 to photographs without any reflection, the cost of a 12-megapixel photograph, metrics beside their peers, a large
 evaluation, the renderer beside Mitsuba, and both servers under load.
 

@@ -40,7 +40,7 @@ brewster train recipes/train/kontext.toml -o "$out"
 # 5. Separate.   est. 35 s for each look of 20 steps
 brewster tests/pictures/mixture-coffee-rocket.jpg --model "$out/lora" -o "$out/separated" --overwrite
 
-# 6. Measure: 540 pictures, est. 5-6 hours of looking. Doing nothing and the compact model stand beside.
+# 6. Measure: 540 pictures, est. 5-6 hours of looking. The unprocessed input and the compact model stand beside.
 brewster evaluate --benchmark "real20=$real20" --benchmark "nature20=$nature20" --benchmark "sir2=$sir2" \
     --model compact --model "lora=$out/lora" --paper -o "$out/evaluate"
 

@@ -20,7 +20,7 @@ brewster train recipes/train/large-tiny.toml -o "$out"
 # 3. Separate a photograph, through the same tiles, colours and detail as every other model.
 brewster tests/pictures/mixture-coffee-rocket.jpg --model "$out/lora" --quality draft -o "$out/separated" --overwrite
 
-# 4. Measure it beside the compact model and beside doing nothing.
+# 4. Measure it beside the compact model and beside the unprocessed input.
 brewster evaluate --benchmark "rendered=$out/sets/judged" --model compact --model "lora=$out/lora" \
     --quality draft --metrics psnr,ssim -o "$out/evaluate"
 

@@ -75,8 +75,8 @@ def sir2(root: Path):
 
 def paint(path, seed, size=(24, 16), *, noise=0):
     """Writes a picture that the seed decides, with noise of so many levels."""
-    dice = np.random.default_rng(seed)
-    pixels = dice.integers(0, 200, (size[1] // 4, size[0] // 4, 3)).repeat(4, 0).repeat(4, 1)
-    pixels = np.clip(pixels + dice.normal(0, noise, pixels.shape), 0, 255).astype(np.uint8)
+    rng = np.random.default_rng(seed)
+    pixels = rng.integers(0, 200, (size[1] // 4, size[0] // 4, 3)).repeat(4, 0).repeat(4, 1)
+    pixels = np.clip(pixels + rng.normal(0, noise, pixels.shape), 0, 255).astype(np.uint8)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(Photo.from_array(pixels, encoding="srgb").encode("png"))

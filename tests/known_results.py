@@ -15,10 +15,10 @@ def known_results():
     selections = {key: {"title": key.title(), "pictures": 20} for key in SETS}
     selections["average"] = {"title": "Average", "pictures": 100}
     table = {
-        "doing nothing": {"psnr": entry(20.0, low=18.5, high=21.25), "lpips": entry(0.2)},
+        "input (unprocessed)": {"psnr": entry(20.0, low=18.5, high=21.25), "lpips": entry(0.2)},
         "A_b|c": {"psnr": entry(21.5), "lpips": entry(0.1234)},
     }
-    apart = {"method": "A_b|c", "than": "doing nothing"}
+    apart = {"method": "A_b|c", "than": "input (unprocessed)"}
     rows = [
         apart | {"metric": "psnr", "mean": 1.5, "low": -0.25, "high": 3.0, "better": 15, "count": 20},
         apart | {"metric": "lpips", "mean": -0.0766, "low": None, "high": None, "better": 20, "count": 20},
@@ -30,7 +30,7 @@ def known_results():
         "benchmarks": {
             "real20": {"title": "Real20", "remarks": ["20 of 20"], "refused": ["x.png has no partner"]}
         },
-        "methods": {"doing nothing": {}, "A_b|c": {"remark": "2 pictures answer no case"}},
+        "methods": {"input (unprocessed)": {}, "A_b|c": {"remark": "2 pictures answer no case"}},
         "unmeasured": ["removed_white"],
         "pictures": [{"errors": {"A_b|c": "A_b|c failed on real20/3"}}],
         "tables": dict.fromkeys(selections, table),

@@ -12,11 +12,11 @@ def job(out, renderer="render", seed=7, recipe="tiny"):
     return RenderJob(out, read_scene_recipe(recipe), BUILTIN_CATALOG, seed, f"fake_renderer:{renderer}")
 
 
-def make(out, count=4, first=0, crew=SerialExecutor, shards=False, **of_job):
+def make(out, count=4, first=0, executor=SerialExecutor, shards=False, **of_job):
     """Builds a set; what became of its samples."""
     results = []
     asked = job(out, **of_job)
-    build(asked, range(first, first + count), crew(asked), shards=shards, report=results.append)
+    build(asked, range(first, first + count), executor(asked), shards=shards, report=results.append)
     return results
 
 

@@ -4,7 +4,14 @@ import numpy as np
 
 from brewster import Photo
 from brewster.user_study.create import StudyOptions, create
-from brewster.user_study.study import PICTURES, CatchTrial, Comparison, Study, StudyDescription, StudyPicture
+from brewster.user_study.study import (
+    PICTURES,
+    CatchTrial,
+    PairedComparison,
+    Study,
+    StudyDescription,
+    StudyPicture,
+)
 
 
 def described(
@@ -13,7 +20,7 @@ def described(
     """A description without pictures: `pictures` of each dataset, the first method against each other one."""
     photos = [(dataset, str(i)) for dataset in datasets for i in range(pictures)]
     comparisons = [
-        Comparison(
+        PairedComparison(
             dataset,
             name,
             (methods[0], other),
@@ -48,11 +55,11 @@ def empty(folder, **asked):
 def write_pictures(
     folder, names=("real/1", "real/2", "real/10", "nature/1"), *, size=(24, 18), suffix=".png", seed=0
 ):
-    dice = np.random.default_rng(seed)
+    rng = np.random.default_rng(seed)
     for name in names:
         path = folder / f"{name}{suffix}"
         path.parent.mkdir(parents=True, exist_ok=True)
-        picture = np.kron(dice.integers(0, 256, (3, 4, 3)), np.ones((size[1] // 3, size[0] // 4, 1)))
+        picture = np.kron(rng.integers(0, 256, (3, 4, 3)), np.ones((size[1] // 3, size[0] // 4, 1)))
         Photo.from_array(picture.astype(np.uint8), encoding="srgb").save(path, overwrite=True)
     return folder
 

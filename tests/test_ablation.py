@@ -93,7 +93,7 @@ def test_choices_are_compared_with_the_first_and_numbers_are_drawn(quick, pairs,
         report=lambda *now: told.append(now),
     )
     labels = [f"count {count}" for count in (0, 10, 50, 100, 300, 1000)]
-    assert list(results["methods"]) == ["doing nothing", *labels]
+    assert list(results["methods"]) == ["input (unprocessed)", *labels]
     assert [now[0] for now in told] == labels
     compared = {(row["method"], row["than"]) for row in results["differences"]["real20"]}
     assert ("count 300", "count 0") in compared
@@ -113,7 +113,7 @@ def test_prompts_are_compared_on_a_backbone_that_nobody_has_trained(pairs, data,
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     study = read_study(RECIPES / "prompt.toml").model_copy(update={"base": RECIPES / "backbone-tiny.toml"})
     results = ablate(study, pairs, tmp_path / "out")
-    assert list(results["methods"]) == ["doing nothing", "prompt generic", "prompt detailed"]
+    assert list(results["methods"]) == ["input (unprocessed)", "prompt generic", "prompt detailed"]
     assert not (tmp_path / "out" / "prompt-generic" / "checkpoint.pt").exists()
     means = [row["psnr"]["mean"] for row in results["tables"]["real20"].values()]
     assert len(set(means)) == 3

@@ -1,4 +1,4 @@
-"""The pane renderer: its pictures add up, equal closed forms where there are any, and lie where geometry says."""
+"""The analytic renderer: its pictures add up, equal closed forms where there are any, and lie where geometry says."""
 
 import math
 
@@ -353,7 +353,7 @@ def test_another_index_is_other_chance_with_the_same_means():
     ids=["framed", "curved"],
 )
 def test_framed_and_curved_glass_is_left_to_the_tracer(glass):
-    with pytest.raises(RecipeError, match="--renderer tracer"):
+    with pytest.raises(RecipeError, match="--renderer mitsuba"):
         render(a_scene(glass=glass), WORLDS)
 
 

@@ -104,9 +104,9 @@ def test_what_is_no_http_is_answered_and_forgotten(rubbish):
 SERVING = """
 from fastapi import APIRouter
 from brewster.web.application import application, serve
-from brewster.web.middleware import Guard
+from brewster.web.middleware import RequestLimits
 try:
-    serve(application(APIRouter(), guard=Guard()), host="127.0.0.1", port=0, tell=lambda url: print(url, flush=True))
+    serve(application(APIRouter(), guard=RequestLimits()), host="127.0.0.1", port=0, on_ready=lambda url: print(url, flush=True))
 except KeyboardInterrupt:
     print("interrupted")
 finally:

@@ -291,10 +291,10 @@ def test_jpegs_are_the_same_bytes_again_and_grow_with_quality():
 
 def test_a_jpeg_says_its_quality_keeps_its_chroma_and_carries_nothing_else():
     photo = Photo.open(jpeg(noise(), 83))
-    assert (photo.origin.container, photo.origin.jpeg_quality) == ("jpeg", 83)
-    assert photo.origin.subsampling == "4:4:4"
+    assert (photo.file_info.container, photo.file_info.jpeg_quality) == ("jpeg", 83)
+    assert photo.file_info.subsampling == "4:4:4"
     assert photo.size == (56, 40)
-    assert {photo.origin.icc, photo.origin.exif, photo.origin.xmp, photo.origin.iptc} == {None}
+    assert {photo.file_info.icc, photo.file_info.exif, photo.file_info.xmp, photo.file_info.iptc} == {None}
 
 
 def test_a_picture_too_wide_for_a_jpeg_is_refused():

@@ -140,7 +140,7 @@ def test_another_container_may_be_asked_for(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(picture())
     assert run("a.jpg", "--format", "webp", "--layers", "transmission,confidence", "-o", "x")[0] == 0
     assert tree(tmp_path / "x") == ["a.confidence.png", "a.transmission.webp"]
-    assert Photo.open(tmp_path / "x" / "a.transmission.webp").origin.container == "webp"
+    assert Photo.open(tmp_path / "x" / "a.transmission.webp").file_info.container == "webp"
 
 
 def test_the_suffix_of_the_photo_stays_when_its_container_is_asked_for(run, tmp_path):
@@ -162,7 +162,7 @@ def test_a_picture_named_as_the_output_takes_the_transmission(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(picture())
     assert run("a.jpg", "-o", "new/clear.png")[0] == 0
     assert tree(tmp_path / "new") == ["clear.png"]
-    assert Photo.open(tmp_path / "new" / "clear.png").origin.container == "png"
+    assert Photo.open(tmp_path / "new" / "clear.png").file_info.container == "png"
 
 
 def test_a_folder_may_be_called_like_a_picture(run, tmp_path):
@@ -179,7 +179,7 @@ def test_a_folder_may_be_called_like_a_picture(run, tmp_path):
 @pytest.mark.parametrize("container", ["jpeg", "png", "tiff", "webp"])
 def test_standard_input_goes_to_standard_output_in_its_container(run, container):
     code, out, err = run("-", stdin=picture(container=container))
-    assert (code, Photo.open(out).origin.container) == (0, container)
+    assert (code, Photo.open(out).file_info.container) == (0, container)
     assert "- -> -" in err
 
 
@@ -189,7 +189,7 @@ def test_standard_output_takes_another_layer_and_container_on_demand(run):
     assert confidence[2] == ""
     assert Photo.open(confidence[1]).pixels.shape == (40, 60, 1)
     exr = Photo.open(run("-", "--additive", "--format", "exr", stdin=picture())[1])
-    assert exr.origin.container == "exr"
+    assert exr.file_info.container == "exr"
 
 
 def test_a_file_may_go_to_standard_output_and_standard_input_to_a_file(run, tmp_path):

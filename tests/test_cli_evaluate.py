@@ -33,8 +33,8 @@ def test_tables_go_to_standard_output_and_all_else_into_a_folder(bare, pairs, mo
     )
     assert code == 0, err
     text = out.decode()
-    assert text.count("| doing nothing") == 2
-    assert "theirs \N{MINUS SIGN} doing nothing" in text
+    assert text.count("| input (unprocessed)") == 2
+    assert "theirs \N{MINUS SIGN} input (unprocessed)" in text
     assert "3 pictures, where Real20 has 20" in err
     assert (tmp_path / "out" / "report.html").is_file()
     assert (tmp_path / "out" / "predictions" / "pane" / "real20" / "3.reflection.png").is_file()
@@ -125,11 +125,11 @@ def test_thresholds_are_swept_and_sizes_reduced(bare, pairs):
 
 
 def test_the_dev_pairs_score_what_scikit_image_says(bare, data, tmp_path):
-    """Doing nothing on the ten Nature pairs; computed here with scikit-image and PIL, and stated as measured."""
+    """The unprocessed input on the ten Nature pairs; computed here with scikit-image and PIL, and stated as measured."""
     folder = data / "real/dev/nature"
     code, out, _ = bare("evaluate", "--benchmark", f"nature20={folder}", "--json", *QUICK)
     assert code == 0
-    table = json.loads(out)["tables"]["nature20"]["doing nothing"]
+    table = json.loads(out)["tables"]["nature20"]["input (unprocessed)"]
     pairs = [
         [
             np.asarray(Image.open(folder / role / path.name).convert("RGB"))

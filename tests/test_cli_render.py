@@ -25,14 +25,14 @@ FAKED = """
 import sys
 from brewster.cli import main
 from brewster.rendered.generation import workers
-workers.RENDERERS["pane"] = "fake_renderer:{}"
+workers.RENDERERS["analytic"] = "fake_renderer:{}"
 sys.exit(main(sys.argv[1:]))
 """
 
 
 @pytest.fixture
 def fake(monkeypatch):
-    monkeypatch.setitem(workers.RENDERERS, "pane", "fake_renderer:render")
+    monkeypatch.setitem(workers.RENDERERS, "analytic", "fake_renderer:render")
 
 
 def faked(*args, renderer="render", **how):
@@ -82,7 +82,7 @@ def test_quiet_says_nothing(bare, fake):
 
 
 def test_a_sample_that_fails_is_named_and_the_exit_code_says_so(bare, monkeypatch):
-    monkeypatch.setitem(workers.RENDERERS, "pane", "fake_renderer:picky")
+    monkeypatch.setitem(workers.RENDERERS, "analytic", "fake_renderer:picky")
     code, _, err = bare("render", "set", "--recipe", "tiny", "--count", 3, "--workers", 0, "--quiet")
     assert code == 1
     assert errors(err) == ["error: sample 1: sample 1 is odd; it should be even; count by two."]

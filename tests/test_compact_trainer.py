@@ -33,7 +33,7 @@ def silent(step, steps, numbers, logged):
 
 def checkpoint(recipe):
     """The state that a run begins with."""
-    return Checkpoint(0, recipe.model_dump_json(), CompactTrainer(recipe).state())
+    return Checkpoint(0, recipe.model_dump_json(), CompactTrainer(recipe).state_dict())
 
 
 def test_nothing_to_learn_from_leaves_the_network_as_it_starts(rendered, tmp_path):
@@ -63,17 +63,17 @@ def test_pairs_that_became_worse_are_counted():
 def test_training_lowers_the_loss_on_a_batch_seen_again_and_again(recipe):
     stream = open_stream(recipe)
     longer = recipe.model_copy(update={"steps": 40})
-    learner = CompactTrainer(longer, lambda step, count, size: stream(0, 2, 64))
-    losses = [learner.advance(step)["loss"] for step in range(30)]
+    trainer = CompactTrainer(longer, lambda step, count, size: stream(0, 2, 64))
+    losses = [trainer.training_step(step)["loss"] for step in range(30)]
     assert losses[-1] < 0.8 * losses[0]
 
 
 def test_shares_of_a_batch_on_two_cores_make_the_step_of_plain_adamw(recipe):
     batch = open_stream(recipe)(0, 3, 64)
     with two_threads():
-        learner = CompactTrainer(recipe, lambda step, count, size: batch)
-    torch.nn.init.normal_(learner.network.head.weight, std=0.1)
-    plain = copy.deepcopy(learner.network)
+        trainer = CompactTrainer(recipe, lambda step, count, size: batch)
+    torch.nn.init.normal_(trainer.network.head.weight, std=0.1)
+    plain = copy.deepcopy(trainer.network)
     encoder = list(plain.encoder.parameters())
     rest = list(plain.parameters())[len(encoder) :]
     warm = 1 / recipe.warmup_steps
@@ -84,31 +84,31 @@ def test_shares_of_a_batch_on_two_cores_make_the_step_of_plain_adamw(recipe):
         eps=1e-3,
         fused=False,
     )
-    learner.optimizer.param_groups[0]["eps"] = learner.optimizer.param_groups[1]["eps"] = 1e-3
+    trainer.optimizer.param_groups[0]["eps"] = trainer.optimizer.param_groups[1]["eps"] = 1e-3
     sum(separation_loss(plain(batch.photo_encoded), batch).values()).backward()
     torch.nn.utils.clip_grad_norm_(plain.parameters(), 1.0)
     optimizer.step()
-    learner.advance(0)
-    for (name, ours), theirs in zip(learner.network.named_parameters(), plain.parameters(), strict=True):
+    trainer.training_step(0)
+    for (name, ours), theirs in zip(trainer.network.named_parameters(), plain.parameters(), strict=True):
         torch.testing.assert_close(ours, theirs, atol=1e-6, rtol=1e-4, msg=name)
 
 
 def test_a_loss_that_is_not_a_number_stops_the_run_and_keeps_the_weights(recipe):
     batch = open_stream(recipe)(0, 2, 64)
     batch.transmission_encoded.fill_(float("nan"))
-    learner = CompactTrainer(recipe, lambda step, count, size: batch)
-    before = {name: value.clone() for name, value in learner.network.state_dict().items()}
+    trainer = CompactTrainer(recipe, lambda step, count, size: batch)
+    before = {name: value.clone() for name, value in trainer.network.state_dict().items()}
     with pytest.raises(ModelError, match="finite"):
-        learner.advance(0)
-    assert all(torch.equal(value, before[name]) for name, value in learner.network.state_dict().items())
+        trainer.training_step(0)
+    assert all(torch.equal(value, before[name]) for name, value in trainer.network.state_dict().items())
 
 
 def test_a_batch_whose_gradient_is_infinite_is_skipped(recipe):
-    learner = CompactTrainer(recipe, open_stream(recipe))
-    before = copy.deepcopy(learner.network.state_dict())
-    next(learner.network.parameters()).register_hook(lambda gradient: gradient / 0)
-    assert math.isfinite(learner.advance(0)["loss"])
-    assert all(torch.equal(value, before[name]) for name, value in learner.network.state_dict().items())
+    trainer = CompactTrainer(recipe, open_stream(recipe))
+    before = copy.deepcopy(trainer.network.state_dict())
+    next(trainer.network.parameters()).register_hook(lambda gradient: gradient / 0)
+    assert math.isfinite(trainer.training_step(0)["loss"])
+    assert all(torch.equal(value, before[name]) for name, value in trainer.network.state_dict().items())
 
 
 def test_a_run_starts_from_the_mean_of_the_averaged_weights_of_others(recipe, tmp_path):
@@ -117,7 +117,7 @@ def test_a_run_starts_from_the_mean_of_the_averaged_weights_of_others(recipe, tm
         same = {name: torch.full_like(weights, value) for name, weights in given.state["average"].items()}
         replace(given, state=given.state | {"average": same}).write(path)
     for start_from, mean in ((starts[:1], 1), (starts, 2)):
-        learner = CompactTrainer(recipe.model_copy(update={"start_from": start_from}))
-        learner.begin()
-        assert all((value == mean).all() for value in learner.network.state_dict().values())
-        assert all((value == mean).all() for value in learner.average.values())
+        trainer = CompactTrainer(recipe.model_copy(update={"start_from": start_from}))
+        trainer.initialize()
+        assert all((value == mean).all() for value in trainer.network.state_dict().values())
+        assert all((value == mean).all() for value in trainer.average.values())

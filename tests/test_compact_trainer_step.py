@@ -23,8 +23,8 @@ def far_from_the_truth(step, count, size):
 
 
 @pytest.fixture
-def learner(recipe):
-    """Builds the compact network's learner: 64 px, no weight decay, no warm-up unless a test says otherwise."""
+def trainer(recipe):
+    """Builds the compact network's trainer: 64 px, no weight decay, no warm-up unless a test says otherwise."""
 
     def build(**changes):
         plain = {"steps": 100, "sizes": [(0.0, 64)], "weight_decay": 0.0, "warmup_steps": 1}
@@ -41,12 +41,12 @@ def norm(gradients):
     return float(torch.cat([gradient.flatten() for gradient in gradients]).norm())
 
 
-def test_the_encoder_learns_at_its_own_rate(learner):
+def test_the_encoder_learns_at_its_own_rate(trainer):
     """AdamW's first step moves a weight by the learning rate, whatever the gradient."""
-    one = learner(learning_rate=1e-3, encoder_learning_rate=1e-4)
+    one = trainer(learning_rate=1e-3, encoder_learning_rate=1e-4)
     torch.nn.init.normal_(one.network.head.weight, std=1e-3)  # zeros let no gradient through to the encoder
     before = copy_of(one.network)
-    one.advance(0)
+    one.training_step(0)
     moved = {name: float((v - before[name]).abs().max()) for name, v in copy_of(one.network).items()}
     encoder = [change for name, change in moved.items() if name.startswith("encoder.")]
     rest = [change for name, change in moved.items() if not name.startswith("encoder.")]
@@ -59,25 +59,25 @@ def test_the_encoder_learns_at_its_own_rate(learner):
     [(0, 1.0, 1), (50, 1.0, 0.5), (75, 1.0, 0.1464), (50, 0.5, 1), (75, 0.5, 0.5), (99, 0.5, 0.00099)],
 )
 def test_the_learning_rate_falls_along_a_cosine_over_the_last_share_of_the_run(
-    learner, step, decay_share, share
+    trainer, step, decay_share, share
 ):
-    one = learner(learning_rate=1e-3, encoder_learning_rate=1e-4, decay_share=decay_share)
-    one.advance(step)
+    one = trainer(learning_rate=1e-3, encoder_learning_rate=1e-4, decay_share=decay_share)
+    one.training_step(step)
     rates = [group["lr"] for group in one.optimizer.param_groups]
     assert rates == pytest.approx([1e-4 * share, 1e-3 * share], rel=0.01)
 
 
-def test_the_learning_rate_rises_evenly_while_it_warms_up(learner):
-    one = learner(learning_rate=1e-3, warmup_steps=4, decay_share=0.0)
+def test_the_learning_rate_rises_evenly_while_it_warms_up(trainer):
+    one = trainer(learning_rate=1e-3, warmup_steps=4, decay_share=0.0)
     rates = []
     for step in range(5):
-        one.advance(step)
+        one.training_step(step)
         rates.append(one.optimizer.param_groups[1]["lr"])
     assert rates == pytest.approx([0.25e-3, 0.5e-3, 0.75e-3, 1e-3, 1e-3])
 
 
-def test_a_long_gradient_is_shortened_to_length_one(learner):
-    one, seen = learner(), []
+def test_a_long_gradient_is_shortened_to_length_one(trainer):
+    one, seen = trainer(), []
     batch = far_from_the_truth(0, 2, 64)
     loss = sum(separation_loss(one.network(batch.photo_encoded), batch).values())
     raw = torch.autograd.grad(loss, tuple(one.network.parameters()))
@@ -85,31 +85,31 @@ def test_a_long_gradient_is_shortened_to_length_one(learner):
     one.optimizer.register_step_pre_hook(
         lambda *_: seen.append(norm(parameter.grad for parameter in one.network.parameters()))
     )
-    one.advance(0)
+    one.training_step(0)
     assert seen == [pytest.approx(1, rel=1e-3)]
 
 
 @pytest.mark.parametrize(("step", "kept"), [(0, 2 / 11), (99, 0.75)])
-def test_the_average_keeps_the_share_that_the_recipe_says_less_at_first(learner, step, kept):
+def test_the_average_keeps_the_share_that_the_recipe_says_less_at_first(trainer, step, kept):
     """After n steps it keeps (n + 1) / (n + 10) of itself, at most `average_decay`."""
-    one = learner(average_decay=0.75, decay_share=0.0, learning_rate=0.1, encoder_learning_rate=0.1)
+    one = trainer(average_decay=0.75, decay_share=0.0, learning_rate=0.1, encoder_learning_rate=0.1)
     before = {name: value.clone() for name, value in one.average.items()}
-    one.advance(step)
+    one.training_step(step)
     for name, new in copy_of(one.network).items():
         expected = kept * before[name] + (1 - kept) * new
         torch.testing.assert_close(one.average[name], expected, atol=1e-6, rtol=1e-6)
 
 
-def test_the_network_that_users_get_has_the_averaged_weights(learner):
-    one = learner(learning_rate=0.1, encoder_learning_rate=0.1)
-    one.advance(0)
+def test_the_network_that_users_get_has_the_averaged_weights(trainer):
+    one = trainer(learning_rate=0.1, encoder_learning_rate=0.1)
+    one.training_step(0)
     exported, trained = copy_of(one.averaged_network()), copy_of(one.network)
     assert all(value.equal(one.average[name]) for name, value in exported.items())
     assert not any(value.equal(trained[name]) for name, value in exported.items() if "head" in name)
 
 
-def test_the_loss_is_the_sum_of_its_parts(learner):
-    told = learner().advance(0)
+def test_the_loss_is_the_sum_of_its_parts(trainer):
+    told = trainer().training_step(0)
     assert told["edges"] > 0
     assert told["loss"] == pytest.approx(
         sum(told[name] for name in ("transmission", "reflection", "edges", "psnr")), rel=1e-5
@@ -121,7 +121,7 @@ def test_the_loss_is_the_sum_of_its_parts(learner):
 
 @pytest.fixture
 def lora(tmp_path):
-    """Builds a LoRA's learner on the toy twin of kontext."""
+    """Builds a LoRA's trainer on the toy twin of kontext."""
     make(tmp_path / "tiny", count=1)
 
     def build(**changes):
@@ -131,16 +131,16 @@ def lora(tmp_path):
             "checkpoint_every": 6, "data": {"rendered": {"sets": [tmp_path / "tiny"], "target": "transmission"}},
         }  # fmt: skip
         one = LoraTrainer(LoraRecipe.model_validate(values | changes))
-        one.begin()
+        one.initialize()
         return one
 
     return build
 
 
-def logits(learner, count=150):
+def logits(trainer, count=150):
     """The times that it learns at, as log(t / (1 - t))."""
-    encoded = learner._data(SampleRng(1, 0, 0))
-    times = [learner._begun(SampleRng(2, number, 0), encoded)[1] for number in range(count)]
+    encoded = trainer._data(SampleRng(1, 0, 0))
+    times = [trainer._begun(SampleRng(2, number, 0), encoded)[1] for number in range(count)]
     return torch.cat(times).double().logit()
 
 
@@ -160,7 +160,7 @@ def test_a_loras_long_gradient_is_shortened_and_its_rate_warms_up(lora):
     one._optimizer.register_step_pre_hook(lambda *_: seen.append(norm(p.grad for p in one._parameters)))
     rates = []
     for step in range(5):
-        one.advance(step)
+        one.training_step(step)
         rates.append(one._optimizer.param_groups[0]["lr"])
     np.testing.assert_allclose(seen, 1, rtol=1e-3)
     assert rates == pytest.approx([0.25e-3, 0.5e-3, 0.75e-3, 1e-3, 1e-3])
@@ -197,7 +197,7 @@ def test_the_gradients_of_earlier_steps_are_forgotten(lora):
     for parameter in one._parameters:
         parameter.register_hook(lambda gradient: gradient * 1e-4)  # too short to be clipped
     one._optimizer.register_step_pre_hook(lambda *_: seen.append(norm(p.grad for p in one._parameters)))
-    one.advance(0)
-    one.advance(0)
+    one.training_step(0)
+    one.training_step(0)
     assert 0 < seen[0] < 1
     assert seen[1] == pytest.approx(seen[0], rel=1e-3)

@@ -83,7 +83,7 @@ def test_what_lies_outside_the_picture_is_blurred_into_it():
 
 @pytest.mark.parametrize("incidence_deg", [0, 30])
 def test_a_lens_over_far_light_equals_rays_by_chance(incidence_deg):
-    """A wedge of nearly nothing makes the renderer throw dice."""
+    """A wedge of nearly nothing makes the renderer throw rng."""
     by_convolution, by_chance = (
         render(
             a_scene(

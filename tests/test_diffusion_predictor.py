@@ -33,12 +33,12 @@ class Oracle:
         self.task = DecompositionTask(PanelLayout(panels), budget_px)
         self.tint, self.calls = tint, []
 
-    def __call__(self, photo, *, steps, seeds, tell):
+    def __call__(self, photo, *, steps, seeds, on_progress):
         self.calls.append((tuple(photo.shape[-2:]), steps, len(seeds)))
         light = to_linear((photo + 1) / 2)
         shares = {"I": 1.0, "T": 0.7, "R": 0.3}
         for step in range(steps):
-            tell(step + 1, steps)
+            on_progress(step + 1, steps)
         return {name: self.draw(shares[name] * light, len(seeds)) for name in self.task.layout.panels}
 
     def draw(self, light, count):
@@ -173,7 +173,7 @@ def test_light_that_the_photo_could_not_hold_is_no_drift():
 
 def test_the_share_that_is_done_rises_tile_by_tile_and_step_by_step():
     told = []
-    Separator(DiffusionPredictor(Oracle()))(smooth(400, 300), quality="best", tell=told.append)
+    Separator(DiffusionPredictor(Oracle()))(smooth(400, 300), quality="best", on_progress=told.append)
     assert told == sorted(told)
     assert told[-1] == 1
     assert len(told) > 7 * 20

@@ -38,11 +38,11 @@ def test_one_process_leads_itself_adds_up_nothing_and_needs_no_accelerate():
     code = """
 import sys, torch
 sys.modules["accelerate"] = None
-from brewster.training import crew
-crew.initialize()
+from brewster.training import distributed
+distributed.initialize()
 alone = torch.ones(3)
-crew.all_reduce_sum([alone])
-print(crew.world_size(), crew.rank(), crew.is_main_process(), alone.tolist())
+distributed.all_reduce_sum([alone])
+print(distributed.world_size(), distributed.rank(), distributed.is_main_process(), alone.tolist())
 """
     assert python(code) == ("1 0 True [1.0, 1.0, 1.0]\n", "", 0)
 
@@ -53,13 +53,13 @@ def test_two_processes_know_each_other_and_add_up_each_tensor(tmp_path):
     (tmp_path / "two.py").write_text(
         """
 import pathlib, torch
-from brewster.training import crew
-crew.initialize()
-assert crew.world_size() == 2 and crew.is_main_process() == (crew.rank() == 0) and crew.best_device() == torch.device("cpu")
-tensors = [torch.full((2,), 1.0 + crew.rank()), torch.tensor(10.0 * crew.rank())]
-crew.all_reduce_sum(tensors)
+from brewster.training import distributed
+distributed.initialize()
+assert distributed.world_size() == 2 and distributed.is_main_process() == (distributed.rank() == 0) and distributed.best_device() == torch.device("cpu")
+tensors = [torch.full((2,), 1.0 + distributed.rank()), torch.tensor(10.0 * distributed.rank())]
+distributed.all_reduce_sum(tensors)
 assert [tensor.tolist() for tensor in tensors] == [[3.0, 3.0], 10.0]
-pathlib.Path(__file__).with_name(f"rank {crew.rank()}").touch()
+pathlib.Path(__file__).with_name(f"rank {distributed.rank()}").touch()
 """
     )
     torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
@@ -75,7 +75,7 @@ def test_a_world_that_nobody_launched_is_told_so(monkeypatch):
 
 
 def test_processes_that_did_not_come_are_missed(monkeypatch):
-    accelerate.PartialState(cpu=True)  # as a library does that was imported before the crew has met
+    accelerate.PartialState(cpu=True)  # as a library does that was imported before the processes have met
     for name, value in (LAUNCHED | {"WORLD_SIZE": "2"}).items():
         monkeypatch.setenv(name, value)
     with pytest.raises(DeviceError, match=r"1 processes have met; the 2 that WORLD_SIZE names; .*torchrun"):
@@ -84,7 +84,7 @@ def test_processes_that_did_not_come_are_missed(monkeypatch):
 
 
 def test_a_launcher_that_quietly_started_one_of_several_processes_is_caught(tmp_path):
-    (tmp_path / "one.py").write_text("from brewster.training import crew\ncrew.assemble()\n")
+    (tmp_path / "one.py").write_text("from brewster.training import distributed\ndistributed.initialize()\n")
     launch = ["-m", "accelerate.commands.launch", "--cpu", "--num_processes", "2"]
     _, said, code = python(tmp_path / "one.py", *launch)
     assert code == 1

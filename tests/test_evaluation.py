@@ -87,7 +87,9 @@ def test_who_rightly_changes_nothing_is_not_accused(tmp_path):
 
 def test_without_a_model_the_page_shows_the_worst_photos(real20, tmp_path):
     results = evaluate(real20, [IdentityBaseline()], QUICK, tmp_path / "out", shown=1)
-    scores = {picture["name"]: picture["scores"]["doing nothing"]["psnr"] for picture in results["pictures"]}
+    scores = {
+        picture["name"]: picture["scores"]["input (unprocessed)"]["psnr"] for picture in results["pictures"]
+    }
     page = (tmp_path / "out" / "report.html").read_text()
     assert f'data-name="{min(scores, key=scores.get)}"' in page
 
@@ -112,7 +114,7 @@ def test_a_folder_of_truths_is_said_to_be_one(real20, tmp_path):
         real20, [IdentityBaseline(), PredictionFolder("self", tmp_path / "real20")], QUICK, tmp_path / "out"
     )
     assert "the truth itself on 2 pictures" in results["methods"]["self"]["remark"]
-    assert "remark" not in results["methods"]["doing nothing"]
+    assert "remark" not in results["methods"]["input (unprocessed)"]
 
 
 def test_reduced_photos_are_left_for_those_who_answer_elsewhere(real20, tmp_path):
@@ -123,7 +125,7 @@ def test_reduced_photos_are_left_for_those_who_answer_elsewhere(real20, tmp_path
         real20, [IdentityBaseline(), PredictionFolder("copied", inputs)], small, tmp_path / "out"
     )
     table = results["tables"]["real20"]
-    assert table["copied"] == table["doing nothing"]
+    assert table["copied"] == table["input (unprocessed)"]
     assert Photo.open(inputs / "real20" / "1.png").size == (12, 8)
 
 

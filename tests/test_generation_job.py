@@ -34,7 +34,7 @@ def small_shards(monkeypatch):
 
 
 class Stops(SerialExecutor):
-    """A crew that is interrupted before its fourth task."""
+    """An executor that is interrupted before its fourth task."""
 
     left = 3
 
@@ -62,7 +62,7 @@ def test_a_set_can_grow_in_both_directions(four, tmp_path):
 def test_an_interrupted_set_ends_as_an_undisturbed_one(tmp_path, small_shards, shards):
     make(tmp_path / "undisturbed", count=8, shards=shards)
     with pytest.raises(KeyboardInterrupt):
-        make(tmp_path / "set", count=8, crew=Stops, shards=shards)
+        make(tmp_path / "set", count=8, executor=Stops, shards=shards)
     assert not list((tmp_path / "set").glob(".brewster-*"))
     assert 3 > len(list(store.read_set(tmp_path / "set"))) - 1 >= 1
     make(tmp_path / "set", count=8, shards=shards)
@@ -86,7 +86,7 @@ def test_shards_are_packed_as_they_become_complete_and_grow_with_the_set(tmp_pat
             super().submit(task)
 
     out = tmp_path / "set"
-    make(out, count=7, shards=True, crew=Watches)
+    make(out, count=7, shards=True, executor=Watches)
     assert seen["render", 4] == ["000003"]
     assert sorted(path.name for path in out.iterdir() if path.name[0] == "s") == [
         "set.toml",

@@ -72,7 +72,7 @@ def test_large_image_models_have_one_door():
         for library in re.findall(r'\b(?:library|stock_class)\("?(\w+)', path.read_text())
     }
     outside = {library for room, library in opened if room != ("models", "diffusion")}
-    assert outside == {"accelerate"}  # train/crew
+    assert outside == {"accelerate"}  # training/distributed
 
 
 def test_separating_a_photo_needs_no_torch():

@@ -45,7 +45,7 @@ def test_the_tiny_play_renders_learns_separates_and_measures(tmp_path):
     told = play("tiny.sh", tmp_path)
     scores = {
         method: [float(score) for score in cells(told)[method][0].split(" / ")]
-        for method in ("doing nothing", "compact", "lora")
+        for method in ("input (unprocessed)", "compact", "lora")
     }
     assert all(psnr > 5 and ssim > 0 for psnr, ssim in scores.values())
     assert len(set(map(tuple, scores.values()))) == 3

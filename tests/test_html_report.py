@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from brewster.errors import TargetError
-from brewster.evaluate.report.html_report import Shown, write_report
+from brewster.evaluate.report.html_report import CaseImages, write_report
 from brewster.evaluate.report.images import BRIGHTEST_ERROR, LONGEST, RAMP, error_map
 from brewster.photo import Photo
 
@@ -59,7 +59,7 @@ def estimate(mean, low=None, high=None, count=2):
 
 def results(names=("a", "b"), method="compact", errors=None):
     scores = {
-        "doing nothing": {"psnr": 20.0, "psnr_region": None},
+        "input (unprocessed)": {"psnr": 20.0, "psnr_region": None},
         method: {"psnr": 21.5, "psnr_region": None},
     }
     pictures = [
@@ -67,8 +67,11 @@ def results(names=("a", "b"), method="compact", errors=None):
         | {"region_share": 0.25, "scores": scores, "errors": errors or {}}
         for name in names
     ]
-    table = {"doing nothing": {"psnr": estimate(20.0, 19, 21)}, method: {"psnr": estimate(21.5, 20, 23)}}
-    change = {"method": method, "than": "doing nothing", "metric": "psnr", "better": 2}
+    table = {
+        "input (unprocessed)": {"psnr": estimate(20.0, 19, 21)},
+        method: {"psnr": estimate(21.5, 20, 23)},
+    }
+    change = {"method": method, "than": "input (unprocessed)", "metric": "psnr", "better": 2}
     return {
         "brewster": "0.1.0",
         "protocol": {
@@ -87,7 +90,7 @@ def results(names=("a", "b"), method="compact", errors=None):
             "nature20": {"title": "Nature20", "pictures": len(names)},
             "average": {"title": "Average", "pictures": len(names)},
         },
-        "methods": {"doing nothing": {"kind": "baseline"}, method: {"kind": "model", "sha256": "7adb"}},
+        "methods": {"input (unprocessed)": {"kind": "baseline"}, method: {"kind": "model", "sha256": "7adb"}},
         "pictures": pictures,
         "tables": {"nature20": table, "average": deepcopy(table)},
         "differences": {"nature20": [change | estimate(1.5, 0.5, 2.5)]},
@@ -100,7 +103,7 @@ def shown(name="a", method="compact", size=(40, 60), **changes):
     region = np.zeros(size, bool)
     region[: size[0] // 2] = True
     given = {"photo": photo, "truth": photo // 2, "region": region, "answers": {method: photo}}
-    return Shown("nature20", name, **(given | {"reflections": {method: photo // 4}} | changes))
+    return CaseImages("nature20", name, **(given | {"reflections": {method: photo // 4}} | changes))
 
 
 @pytest.fixture
@@ -141,7 +144,7 @@ def test_every_case_and_method_appears_with_its_scores_and_their_change(page):
     made = page()
     assert [has["data-name"] for has in made.all("article")] == ["a", "b"]
     for said in (
-        "photo, doing nothing",
+        "photo, input (unprocessed)",
         "compact",
         "21.50",
         "+1.50 ▲",
@@ -197,14 +200,14 @@ def test_hostile_names_are_harmless(page, name):
     assert [tag for tag, _ in made.elements] == [tag for tag, _ in plain.elements]
     assert [set(has) for _, has in made.elements] == [set(has) for _, has in plain.elements]
     assert made.all("article")[0]["data-name"] == name.replace("\udcff", "?")
-    assert made.data()["methods"] == ["doing nothing", name]
+    assert made.data()["methods"] == ["input (unprocessed)", name]
 
 
 # --- numbers
 
 
 def test_the_best_of_a_column_is_marked_by_more_than_colour(page):
-    assert re.search(r"doing nothing\s*20.00", page().text)
+    assert re.search(r"input \(unprocessed\)\s*20.00", page().text)
     assert re.search(r"★ best 21.50\s*20.00 to 23.00", page().text)
 
 
@@ -279,7 +282,7 @@ def test_choices_meanings_remarks_and_refused_files_are_said(page):
 def test_failures_are_counted_and_told_at_the_top_and_at_their_picture(page):
     given = results()
     given["pictures"][0] |= {
-        "scores": {"doing nothing": {"psnr": 20.0}},
+        "scores": {"input (unprocessed)": {"psnr": 20.0}},
         "errors": {"compact": "no prediction"},
     }
     made = page(given, [shown("a", answers={}, reflections={}), shown("b")])

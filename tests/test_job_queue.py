@@ -15,12 +15,12 @@ class Busy:
     def __init__(self):
         self.started, self.go, self.ended = Event(), Event(), []
 
-    def __call__(self, tell):
+    def __call__(self, on_progress):
         self.started.set()
-        tell(0.25)
+        on_progress(0.25)
         self.go.wait(30)
         try:
-            tell(0.5)
+            on_progress(0.5)
         except JobCancelled:
             self.ended.append("stopped")
             raise
@@ -59,7 +59,7 @@ def test_work_is_answered_and_leaves_its_place():
 
 
 def test_what_the_work_raises_comes_out():
-    def fails(tell):
+    def fails(on_progress):
         raise KeyError("mine")
 
     with pytest.raises(KeyError, match="mine"):

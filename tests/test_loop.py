@@ -40,17 +40,17 @@ class Counting:
     def __init__(self, recipe):
         self.recipe, self.steps, self.begun = recipe, [], False
 
-    def begin(self):
+    def initialize(self):
         self.begun = True
 
-    def advance(self, step):
+    def training_step(self, step):
         self.steps.append(step)
         return {"loss": 1.0 / (1 + step)}
 
-    def state(self):
+    def state_dict(self):
         return {"steps": self.steps}
 
-    def restore(self, state):
+    def load_state_dict(self, state):
         self.steps = list(state["steps"])
 
     def validate(self):
@@ -62,7 +62,7 @@ class Counting:
 
 def checkpoint(recipe):
     """The state that a run begins with."""
-    return Checkpoint(0, recipe.model_dump_json(), CompactTrainer(recipe).state())
+    return Checkpoint(0, recipe.model_dump_json(), CompactTrainer(recipe).state_dict())
 
 
 def logged_steps(out):
@@ -70,10 +70,10 @@ def logged_steps(out):
 
 
 def test_the_loop_knows_no_network(recipe, tmp_path):
-    told, learner = [], Counting(recipe)
-    run(learner, tmp_path, lambda step, steps, numbers, logged: told.append((step, steps, logged)))
-    assert learner.begun
-    assert learner.steps == list(range(6))
+    told, trainer = [], Counting(recipe)
+    run(trainer, tmp_path, lambda step, steps, numbers, logged: told.append((step, steps, logged)))
+    assert trainer.begun
+    assert trainer.steps == list(range(6))
     assert told == [(step, 6, step in {3, 6}) for step in range(1, 7)]
     assert json.loads((tmp_path / "log.jsonl").read_text().splitlines()[0]).keys() == {
         "step", "loss", "gain", "seconds",
@@ -81,7 +81,7 @@ def test_the_loop_knows_no_network(recipe, tmp_path):
     again = Counting(recipe)
     run(again, tmp_path, silent)
     assert not again.begun
-    assert again.steps == learner.steps
+    assert again.steps == trainer.steps
 
 
 def test_tensorboard_is_told_what_the_log_is_told(recipe, tmp_path):

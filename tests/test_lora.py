@@ -89,9 +89,9 @@ def test_the_seed_decides_the_lora_and_leaves_torchs_own_dice_alone(kontext):
     backbone, _ = kontext
     states = []
     for seed in (7, 7, 8):
-        dice = torch.get_rng_state()
+        rng = torch.get_rng_state()
         add_lora(backbone, rank=4, seed=seed)
-        assert torch.equal(torch.get_rng_state(), dice)
+        assert torch.equal(torch.get_rng_state(), rng)
         states.append(lora_state(backbone))
         remove_lora(backbone)
     name = next(name for name in states[0] if "lora_A" in name)

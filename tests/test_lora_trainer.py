@@ -52,9 +52,9 @@ def recipe(folder, monkeypatch):
 @pytest.fixture
 def begun(recipe):
     def begin(**changes):
-        learner = LoraTrainer(recipe(**changes))
-        learner.begin()
-        return learner
+        trainer = LoraTrainer(recipe(**changes))
+        trainer.initialize()
+        return trainer
 
     return begin
 
@@ -72,9 +72,9 @@ def die_after(last):
 
 
 def train(recipe, out, last=None):
-    learner = open_trainer(recipe)
-    run(learner, out, die_after(last))
-    return learner
+    trainer = open_trainer(recipe)
+    run(trainer, out, die_after(last))
+    return trainer
 
 
 def photo(width=48, height=32):
@@ -114,7 +114,7 @@ def test_a_run_leaves_a_log_pictures_and_a_folder_for_stock_diffusers(recipe, tm
 
 
 def test_a_checkpoint_holds_the_lora_and_nothing_of_its_base(begun):
-    state = begun().state()
+    state = begun().state_dict()
     assert state.keys() == {"lora", "optimizer", "prompt"}
     assert all("lora_" in name and tensor.dtype == torch.float32 for name, tensor in state["lora"].items())
 
@@ -122,20 +122,20 @@ def test_a_checkpoint_holds_the_lora_and_nothing_of_its_base(begun):
 @pytest.mark.parametrize("backbone", ["kontext", "klein", "qwen"])
 @pytest.mark.parametrize("objective", ["flow", "one_step"])
 def test_learning_lowers_the_loss_of_a_step_taken_again_and_again(begun, backbone, objective):
-    learner = begun(backbone=f"tiny:{backbone}", objective=objective, batch=1, rank=4, learning_rate=5e-2)
-    losses = [learner.advance(0)["loss"] for _ in range(15)]
+    trainer = begun(backbone=f"tiny:{backbone}", objective=objective, batch=1, rank=4, learning_rate=5e-2)
+    losses = [trainer.training_step(0)["loss"] for _ in range(15)]
     assert losses[-1] < 0.9 * losses[0]
 
 
 def test_the_exported_lora_makes_the_same_picture_in_another_backbone(begun, tmp_path):
-    learner = begun(warmup_steps=1)
+    trainer = begun(warmup_steps=1)
     for step in range(3):
-        learner.advance(step)
-    made = learner.separate(photo())
+        trainer.training_step(step)
+    made = trainer.separate(photo())
     backbone, _ = tiny("kontext")
-    shown = condition(photo(), learner.recipe.layout)
-    plain = split(sample(backbone, shown, learner.prompt, size=(144, 32)), learner.recipe.layout)
-    card, prompt = load_lora(learner.export(tmp_path), backbone)
+    shown = condition(photo(), trainer.recipe.layout)
+    plain = split(sample(backbone, shown, trainer.prompt, size=(144, 32)), trainer.recipe.layout)
+    card, prompt = load_lora(trainer.export(tmp_path), backbone)
     again = split(
         sample(backbone, shown, prompt, size=(144, 32), steps=STEPS, guidance=GUIDANCE), card.task.layout
     )
@@ -146,13 +146,13 @@ def test_the_exported_lora_makes_the_same_picture_in_another_backbone(begun, tmp
 
 
 def test_one_step_goes_from_the_photo_in_every_panel_to_what_it_lacks(begun):
-    learner = begun(objective="one_step", panels=["T", "R"])
-    see, prompt = learner.backbone.encode, learner.prompt
+    trainer = begun(objective="one_step", panels=["T", "R"])
+    see, prompt = trainer.backbone.encode, trainer.prompt
     start = see(torch.cat([photo(), photo()], dim=3))
     with torch.no_grad():
-        lack = learner.backbone.predict(start, see(photo()), torch.ones(1), prompt, 1.0)
-        expected = learner.backbone.decode(start - lack).clamp(-1, 1)
-    made = learner.separate(photo())
+        lack = trainer.backbone.predict(start, see(photo()), torch.ones(1), prompt, 1.0)
+        expected = trainer.backbone.decode(start - lack).clamp(-1, 1)
+    made = trainer.separate(photo())
     torch.testing.assert_close(torch.cat([made["T"], made["R"]], dim=3), expected)
 
 
@@ -163,8 +163,8 @@ def test_small_pictures_to_validate_on_are_seen_in_small_panels(begun, tmp_path,
         Photo.from_array(np.full((16, 16, 3), 99, np.uint8), encoding="srgb").save(
             tmp_path / "small" / role / "a.png"
         )
-    learner = begun()
-    data = learner.recipe.data.model_copy(update={"validate_on": (Path("small"),)})
+    trainer = begun()
+    data = trainer.recipe.data.model_copy(update={"validate_on": (Path("small"),)})
     scores, picture = begun(data=data, panels=["T", "R"], budget_px=2 * 32 * 16).validate()
     assert scores.keys() == {"gain_db_small"}
     assert picture.shape == (160, 5 * 240, 3)
@@ -172,7 +172,7 @@ def test_small_pictures_to_validate_on_are_seen_in_small_panels(begun, tmp_path,
 
 def test_a_panel_that_does_not_count_has_no_loss_and_the_others_share_its_weight(begun):
     equal, uneven = begun(), begun(panel_weights={"I": 0, "T": 3, "R": 1})
-    before, after = equal.advance(0), uneven.advance(0)
+    before, after = equal.training_step(0), uneven.training_step(0)
     assert after["panel_I"] == 0
     assert after["panel_T"] == pytest.approx(before["panel_T"] * 3 * 3 / 4)
     assert after["panel_R"] == pytest.approx(before["panel_R"] * 3 / 4)
@@ -180,10 +180,10 @@ def test_a_panel_that_does_not_count_has_no_loss_and_the_others_share_its_weight
 
 
 def test_a_batch_is_the_mean_of_its_samples(begun):
-    learner = begun(batch=2)
-    alone = [learner._losses(SampleRng(1, 0, slot)) for slot in range(2)]
+    trainer = begun(batch=2)
+    alone = [trainer._losses(SampleRng(1, 0, slot)) for slot in range(2)]
     expected = sum(part.item() for parts in alone for part in parts.values()) / 2
-    assert learner.advance(0)["loss"] == pytest.approx(expected)
+    assert trainer.training_step(0)["loss"] == pytest.approx(expected)
 
 
 TORCHRUN = ["torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
@@ -219,7 +219,7 @@ def test_two_processes_learn_what_one_learns_from_the_whole_batch(recipe, tmp_pa
 
 
 def test_a_batch_that_cannot_be_divided_is_refused(recipe, monkeypatch):
-    monkeypatch.setattr(distributed, "size", lambda: 2)
+    monkeypatch.setattr(distributed, "world_size", lambda: 2)
     with pytest.raises(RecipeError, match=r"batch = 1 is to be divided among 2 processes; .*; raise batch"):
         LoraTrainer(recipe(batch=1))
 
@@ -235,37 +235,37 @@ def test_a_loss_that_is_not_a_number_stops_the_run_and_keeps_the_last_good_check
             name: loss * (float("nan") if self.broken else 1) for name, loss in losses(self, rng).items()
         },
     )
-    learner = open_trainer(recipe())
-    learner.broken = False
+    trainer = open_trainer(recipe())
+    trainer.broken = False
 
     def break_after_2(step, steps, numbers, logged):
-        learner.broken = step == 2
+        trainer.broken = step == 2
 
     with pytest.raises(ModelError, match="the loss is nan at step 2; a finite loss; resume from the last"):
-        run(learner, tmp_path, break_after_2)
+        run(trainer, tmp_path, break_after_2)
     saved = Checkpoint.read(tmp_path / "checkpoint.pt")
     assert saved.step == 2
-    for name, tensor in lora_state(learner.backbone).items():
+    for name, tensor in lora_state(trainer.backbone).items():
         assert torch.equal(tensor, saved.state["lora"][name])
 
 
 def test_a_gradient_that_is_not_a_number_leaves_the_lora_as_it_was(begun):
-    learner = begun()
-    before = {name: tensor.clone() for name, tensor in lora_state(learner.backbone).items()}
-    learner._parameters[0].register_hook(lambda gradient: gradient * float("inf"))
+    trainer = begun()
+    before = {name: tensor.clone() for name, tensor in lora_state(trainer.backbone).items()}
+    trainer._parameters[0].register_hook(lambda gradient: gradient * float("inf"))
     with pytest.raises(ModelError, match=r"the gradient is (inf|nan) at step 0"):
-        learner.advance(0)
-    assert all(torch.equal(tensor, before[name]) for name, tensor in lora_state(learner.backbone).items())
+        trainer.training_step(0)
+    assert all(torch.equal(tensor, before[name]) for name, tensor in lora_state(trainer.backbone).items())
 
 
 def test_a_prompt_that_is_named_is_used_if_it_is_this_backbones(recipe, tmp_path):
     for name in ("kontext", "klein"):
         tiny(name, seed=5)[1].save(tmp_path / f"{name}.safetensors")
-    learner = LoraTrainer(recipe(prompt=str(tmp_path / "kontext.safetensors")))
-    learner.begin()
-    assert learner.prompt.sha256 == tiny("kontext", seed=5)[1].sha256
+    trainer = LoraTrainer(recipe(prompt=str(tmp_path / "kontext.safetensors")))
+    trainer.initialize()
+    assert trainer.prompt.sha256 == tiny("kontext", seed=5)[1].sha256
     with pytest.raises(ModelError, match="encoded for klein; a prompt for kontext"):
-        LoraTrainer(recipe(prompt=str(tmp_path / "klein.safetensors"))).begin()
+        LoraTrainer(recipe(prompt=str(tmp_path / "klein.safetensors"))).initialize()
 
 
 @pytest.mark.parametrize("quantise", [None, "int8"])
@@ -273,19 +273,19 @@ def test_a_backbone_in_a_folder_learns_the_same_way_quantised_or_not(recipe, tmp
     backbone, prompt = tiny("kontext")
     backbone.save(tmp_path / "base")
     prompt.save(tmp_path / "prompt.safetensors")
-    learner = LoraTrainer(
+    trainer = LoraTrainer(
         recipe(
             backbone=str(tmp_path / "base"), prompt=str(tmp_path / "prompt.safetensors"), quantise=quantise
         )
     )
-    learner.begin()
+    trainer.initialize()
     twin = LoraTrainer(recipe())
-    twin.begin()
-    assert learner.advance(0)["loss"] == pytest.approx(
-        twin.advance(0)["loss"], rel=0.05 if quantise else 1e-6
+    twin.initialize()
+    assert trainer.training_step(0)["loss"] == pytest.approx(
+        twin.training_step(0)["loss"], rel=0.05 if quantise else 1e-6
     )
-    assert learner.advance(1)["loss"] > 0
-    changed = lora_state(learner.backbone)
+    assert trainer.training_step(1)["loss"] > 0
+    changed = lora_state(trainer.backbone)
     assert any(tensor.any() for name, tensor in changed.items() if "lora_B" in name)
 
 

@@ -9,9 +9,9 @@ from brewster.training.trainers import open_trainer
 from toy_world import SIDE_PX, STRONG, pretrain, psnr, scenes, write_pairs
 
 
-def answers(learner, photos):
+def answers(trainer, photos):
     """T of each photo."""
-    return torch.cat([learner.separate(photo[None])["T"] for photo in photos])
+    return torch.cat([trainer.separate(photo[None])["T"] for photo in photos])
 
 
 def scores(tmp_path, name, *, vae_steps, pretraining, steps, held=96):
@@ -27,12 +27,12 @@ def scores(tmp_path, name, *, vae_steps, pretraining, steps, held=96):
         "report_every": steps, "checkpoint_every": steps,
         "data": {"pairs": [tmp_path / "pairs"], "pairs_share": 1.0},
     })  # fmt: skip
-    learner = open_trainer(recipe)
-    learner.begin()
+    trainer = open_trainer(recipe)
+    trainer.initialize()
     made = {"copy": unseen["I"], "mean": learnt["T"].mean(0).expand_as(unseen["T"])}
-    made["base"] = answers(learner, unseen["I"])
-    run(learner, tmp_path / "run", lambda *_: None)
-    made["LoRA"] = answers(learner, unseen["I"])
+    made["base"] = answers(trainer, unseen["I"])
+    run(trainer, tmp_path / "run", lambda *_: None)
+    made["LoRA"] = answers(trainer, unseen["I"])
     return {key: psnr(pictures, unseen["T"]) for key, pictures in made.items()}
 
 

@@ -114,11 +114,11 @@ def test_doing_nothing_is_the_photo_and_black(case):
 
 def test_a_model_answers_as_the_separator_does_and_keeps_its_answer(case, model, tmp_path):
     ours = ModelMethod("pane", str(model), tmp_path / "kept")
-    assert ours.kept(case) is None
+    assert ours.cached(case) is None
     photo = Photo.open(case.photo.read())
     answer = ours.answer(case, photo)
     assert answer.seconds > 0
-    kept = ours.kept(case)
+    kept = ours.cached(case)
     assert np.array_equal(kept.transmission.srgb_8bit(), answer.transmission.srgb_8bit())
     assert np.array_equal(kept.reflection.srgb_8bit(), answer.reflection.srgb_8bit())
     assert PredictionFolder("again", tmp_path / "kept").files(case).keys() == {"transmission", "reflection"}
@@ -128,7 +128,7 @@ def test_what_is_kept_of_a_deep_wide_photo_is_what_is_scored(case, model, tmp_pa
     pixels = np.random.default_rng(1).integers(0, 1 << 16, (6, 8, 3), np.uint16)
     photo = Photo(pixels, None, FileInfo(bits=16, icc=bytes(pyvips.Image.profile_load("p3"))))
     ours = ModelMethod("pane", str(model), tmp_path / "kept")
-    answer, kept = ours.answer(case, photo), ours.kept(case)
+    answer, kept = ours.answer(case, photo), ours.cached(case)
     assert np.array_equal(kept.transmission.srgb_8bit(), answer.transmission.srgb_8bit())
 
 
@@ -152,8 +152,8 @@ def test_no_method_at_all_is_refused():
 
 
 def test_two_methods_of_one_name_are_refused(tmp_path):
-    with pytest.raises(BrewsterError, match="2 methods are called 'doing nothing'"):
-        refuse_names([IdentityBaseline(), PredictionFolder("doing nothing", tmp_path)])
+    with pytest.raises(BrewsterError, match=r"2 methods are called 'input \(unprocessed\)'"):
+        refuse_names([IdentityBaseline(), PredictionFolder("input (unprocessed)", tmp_path)])
 
 
 @pytest.mark.parametrize("name", ["../out", "a/b", "a\\b", "..", ".", "", "two\nlines", "\udcff"])

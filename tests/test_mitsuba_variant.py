@@ -12,7 +12,7 @@ from brewster.render.mitsuba import variant
 TRACED = """
 import warnings
 from brewster.render.mitsuba.renderer import trace
-from test_tracer import Pictures, a_scene
+from test_mitsuba_renderer import Pictures, a_scene
 
 with warnings.catch_warnings(record=True) as told:
     warnings.simplefilter("always")
@@ -21,9 +21,9 @@ with warnings.catch_warnings(record=True) as told:
 assert abs(light - 1) < 0.01, light
 import mitsuba
 from brewster.errors import DeviceError
-from brewster.render import llvm
+from brewster.render.mitsuba import variant
 loaded = {line.split()[-1].rpartition("/")[2] for line in open("/proc/self/maps") if "libLLVM" in line}
-print(llvm.probe().variant, *loaded)
+print(variant.probe().variant, *loaded)
 print(*{str(warning.message) for warning in told})
 try:
     trace(scene, Pictures(), most_samples=4, polarised=True)
@@ -67,7 +67,11 @@ def test_the_llvm_of_the_pip_package_comes_first_and_compiles(compiled):
         pytest.skip(f"no LLVM of pip: {variant.INSTALL_LLVM}")
     unnamed = {name: value for name, value in os.environ.items() if name != variant.LIBRARY}
     done = subprocess.run(
-        [sys.executable, "-c", "from brewster.render import llvm; print(llvm._candidates()[0])"],
+        [
+            sys.executable,
+            "-c",
+            "from brewster.render.mitsuba import variant; print(variant._candidates()[0])",
+        ],
         env=unnamed,
         capture_output=True,
         text=True,
@@ -83,9 +87,9 @@ def test_an_exception_of_another_library_is_still_caught_next_to_the_llvm_of_the
     """With the C++ runtime of the package in the global scope, the process ends instead."""
     program = """
 import numpy
-from brewster.render import llvm
-mitsuba = llvm.load()
-mitsuba.set_variant(llvm.probe().variant)
+from brewster.render.mitsuba import variant
+mitsuba = variant.load()
+mitsuba.set_variant(variant.probe().variant)
 import OpenEXR
 for fails in (lambda: mitsuba.load_dict({"type": "nonsense"}), lambda: OpenEXR.File("/nonexistent.exr")):
     try:
@@ -129,7 +133,7 @@ def test_a_missing_mitsuba_is_named_with_its_cure(monkeypatch):
 
 def test_a_missing_libatomic_is_named_with_the_line_that_installs_it(mitsuba, tmp_path):
     (tmp_path / "libatomic.so.1").touch()  # is found first, and is no library
-    program = "from brewster.render import llvm; llvm.load()"
+    program = "from brewster.render.mitsuba import variant; variant.load()"
     done = in_a_process(program, LD_LIBRARY_PATH=str(tmp_path))
     told = done.stderr.splitlines()[-1]
     assert "MissingExtra: mitsuba cannot be imported" in told

@@ -59,23 +59,23 @@ def test_a_recipe_without_a_network_trains_the_default_one(recipe):
 def test_a_recipe_trains_and_exports_the_network_that_it_names(recipe, small, tmp_path):
     recipe = with_value(recipe, "network", small)
     assert isinstance(train(recipe, tmp_path, silent), Small)
-    learner = CompactTrainer(recipe)
-    learner.restore(Checkpoint.read(tmp_path / "checkpoint.pt").state)
-    backend = OnnxBackend(learner.export(tmp_path), "cpu")
+    trainer = CompactTrainer(recipe)
+    trainer.load_state_dict(Checkpoint.read(tmp_path / "checkpoint.pt").state)
+    backend = OnnxBackend(trainer.export(tmp_path), "cpu")
     photo = torch.rand(8, 20, 3).numpy()
     transmission, reflection = backend(photo)
     assert transmission.shape == reflection.shape == photo.shape
 
 
 def test_a_run_of_one_network_does_not_start_from_a_checkpoint_of_another(recipe, small, tmp_path):
-    learner = CompactTrainer(recipe)
-    Checkpoint(0, recipe.model_dump_json(), learner.state()).write(tmp_path / "start.pt")
+    trainer = CompactTrainer(recipe)
+    Checkpoint(0, recipe.model_dump_json(), trainer.state_dict()).write(tmp_path / "start.pt")
     other = with_value(recipe, "network", small).model_copy(update={"start_from": (tmp_path / "start.pt",)})
     with pytest.raises(
         ModelError,
         match=r"start.pt holds the network lite2-unet; a checkpoint of small, .*; train the recipe",
     ):
-        CompactTrainer(other).begin()
+        CompactTrainer(other).initialize()
 
 
 def test_a_run_of_one_network_is_not_resumed_with_another(recipe, small, tmp_path):
@@ -85,12 +85,14 @@ def test_a_run_of_one_network_is_not_resumed_with_another(recipe, small, tmp_pat
 
 
 def test_checkpoints_older_than_the_choice_of_network_hold_the_default_one(recipe, tmp_path):
-    learner = CompactTrainer(recipe)
+    trainer = CompactTrainer(recipe)
     older = recipe.model_dump_json(exclude={"network"})
     assert "network" not in older
-    average = {name: torch.full_like(value, 2.0) for name, value in learner.average.items()}
-    checkpoint = replace(Checkpoint(0, older, learner.state()), state=learner.state() | {"average": average})
+    average = {name: torch.full_like(value, 2.0) for name, value in trainer.average.items()}
+    checkpoint = replace(
+        Checkpoint(0, older, trainer.state_dict()), state=trainer.state_dict() | {"average": average}
+    )
     checkpoint.write(tmp_path / "start.pt")
     started = CompactTrainer(recipe.model_copy(update={"start_from": (tmp_path / "start.pt",)}))
-    started.begin()
+    started.initialize()
     assert all((value == 2).all() for value in started.network.state_dict().values())

@@ -89,7 +89,7 @@ def test_a_gif_of_one_picture_is_read_and_written_as_png() -> None:
     file = io.BytesIO()
     image.save(file, "GIF")
     photo = Photo.open(file.getvalue())
-    assert photo.origin.container == "png"
+    assert photo.file_info.container == "png"
     assert np.array_equal(np.asarray(pil(photo.encode()).convert("RGB")), np.asarray(image.convert("RGB")))
 
 
@@ -146,7 +146,7 @@ def test_radiance_pictures_come_back_bit_equal_and_run_lengths_are_read() -> Non
     for photo in (flat, coded):
         again = Photo.open(photo.encode())
         assert np.array_equal(again.pixels, photo.pixels)
-        assert again.origin.header == {"EXPOSURE": "2"}
+        assert again.file_info.header == {"EXPOSURE": "2"}
 
 
 @pytest.mark.parametrize("width", [1 << 15, 1 << 16])
@@ -185,8 +185,8 @@ def test_heic_keeps_profile_exif_and_pixels() -> None:
     photo = Photo(smooth(), None, FileInfo(icc=P3, exif=exif_block(1).removeprefix(b"Exif\0\0")))
     for depth in DEPTHS["heic"]:
         again = Photo.open(photo.encode("heic", depth=depth))
-        assert (again.origin.container, again.origin.bits) == ("heic", depth)
-        assert (again.origin.icc, again.origin.exif) == (P3, photo.origin.exif)
+        assert (again.file_info.container, again.file_info.bits) == ("heic", depth)
+        assert (again.file_info.icc, again.file_info.exif) == (P3, photo.file_info.exif)
         assert np.abs(again.linear() - photo.linear()).mean() < 0.01
 
 
@@ -255,8 +255,8 @@ def test_pil_images_are_taken_as_they_are(mode: str) -> None:
 def test_a_pil_image_brings_its_profile_exif_and_orientation() -> None:
     image = pil(file_of(smooth(), "JPEG", exif=exif_block(), icc_profile=P3))
     photo = Photo.open(image)
-    assert photo.origin.icc == P3
-    assert photo.origin.exif == exif_block(1).removeprefix(b"Exif\0\0")
+    assert photo.file_info.icc == P3
+    assert photo.file_info.exif == exif_block(1).removeprefix(b"Exif\0\0")
     assert np.array_equal(photo.pixels, np.asarray(ImageOps.exif_transpose(image)))
 
 
@@ -354,4 +354,4 @@ def test_sixteen_bits_become_the_nearest_of_eight():
 
 def test_a_jpeg_of_what_had_no_quality_has_95():
     photo = Photo.from_array(np.full((16, 16, 3), 99, np.uint8), encoding="srgb")
-    assert Photo.open(photo.encode("jpeg")).origin.jpeg_quality == 95
+    assert Photo.open(photo.encode("jpeg")).file_info.jpeg_quality == 95

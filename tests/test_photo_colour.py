@@ -310,9 +310,9 @@ def test_a_profile_of_tables_gives_its_colours_and_they_survive(container, kind,
     photo = Photo.open(data)
     assert photo.pixels.dtype == kind
     np.testing.assert_allclose(photo.linear(), light_by_table(random), atol=tolerance)
-    assert photo.origin.icc == PROFILES["Display P3"]
+    assert photo.file_info.icc == PROFILES["Display P3"]
     again = Photo.open(photo.with_linear(photo.linear()).encode())
-    assert again.origin.container == container
+    assert again.file_info.container == container
     assert np.array_equal(again.pixels, photo.pixels)
     assert read_size(data) == (24, 24)
 

@@ -36,21 +36,21 @@ FILES = {
 }
 
 
-def mutated(data, dice):
+def mutated(data, rng):
     """The bytes with a few of them changed, left out, doubled, or the end cut off."""
     changed = bytearray(data)
     header = min(len(data), 600)  # half of the changes are where a file says what it is
-    for _ in range(dice.integers(1, 5)):
-        place = int(dice.integers(0, header if dice.integers(2) else max(1, len(changed))))
-        how = dice.choice(["set", "flip", "drop", "double", "cut"], p=[0.4, 0.3, 0.1, 0.1, 0.1])
+    for _ in range(rng.integers(1, 5)):
+        place = int(rng.integers(0, header if rng.integers(2) else max(1, len(changed))))
+        how = rng.choice(["set", "flip", "drop", "double", "cut"], p=[0.4, 0.3, 0.1, 0.1, 0.1])
         if how == "set":
-            changed[place : place + 1] = [dice.choice([0, 1, 127, 128, 255])]
+            changed[place : place + 1] = [rng.choice([0, 1, 127, 128, 255])]
         elif how == "flip":
-            changed[place : place + 1] = [data[place % len(data)] ^ (1 << int(dice.integers(8)))]
+            changed[place : place + 1] = [data[place % len(data)] ^ (1 << int(rng.integers(8)))]
         elif how == "drop":
-            del changed[place : place + int(dice.integers(1, 9))]
+            del changed[place : place + int(rng.integers(1, 9))]
         elif how == "double":
-            changed[place:place] = changed[place : place + int(dice.integers(1, 9))]
+            changed[place:place] = changed[place : place + int(rng.integers(1, 9))]
         else:
             del changed[max(place, 1) :]
     return bytes(changed)
@@ -59,12 +59,12 @@ def mutated(data, dice):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
 def test_a_mutated_file_is_read_or_refused_and_nothing_is_printed(name, capfd):
-    data, dice = FILES[name](), np.random.default_rng(list(name.encode()))
+    data, rng = FILES[name](), np.random.default_rng(list(name.encode()))
     outcomes = {"read": 0, "refused": 0}
     with standard_output.reserved():
         for number in range(MUTATIONS):
             try:
-                photo = Photo.open(mutated(data, dice), max_pixels=10_000)
+                photo = Photo.open(mutated(data, rng), max_pixels=10_000)
                 light = photo.linear()
                 photo.with_linear(light).encode("png")
             except PhotoError:

@@ -33,7 +33,7 @@ def test_jpeg_quality_and_chroma_are_no_worse_than_the_source(
     source = file_of(smooth(), "JPEG", quality=quality, subsampling=subsampling)
     photo = Photo.open(source)
     written = photo.encode()
-    assert (photo.origin.jpeg_quality, photo.origin.subsampling) == (quality, word)
+    assert (photo.file_info.jpeg_quality, photo.file_info.subsampling) == (quality, word)
     assert metadata.jpeg_subsampling(written) == ("4:2:0" if word == "4:2:0" else "4:4:4")
     theirs, ours = pil(source).quantization, pil(written).quantization
     assert all(sum(ours[table]) <= sum(theirs[table]) for table in theirs)
@@ -49,16 +49,16 @@ def test_odd_quantisation_tables_are_matched_from_below() -> None:
 
 def test_a_grey_jpeg_keeps_its_quality() -> None:
     photo = Photo.open(file_of(smooth()[..., 0], "JPEG", quality=81))
-    assert photo.origin.jpeg_quality == 81
+    assert photo.file_info.jpeg_quality == 81
     assert pil(photo.encode()).mode == "L"
 
 
 @pytest.mark.parametrize("container", ["webp", "avif"])
 def test_lossless_webp_and_avif_stay_lossless(container: str) -> None:
     pixels = np.random.default_rng(0).integers(0, 256, (24, 40, 3), np.uint8)
-    origin = FileInfo(container=container, lossless=True)
-    photo = Photo.open(Photo(pixels, None, origin).encode())
-    assert photo.origin.lossless
+    file_info = FileInfo(container=container, lossless=True)
+    photo = Photo.open(Photo(pixels, None, file_info).encode())
+    assert photo.file_info.lossless
     assert np.array_equal(photo.pixels, pixels)
     assert np.array_equal(Photo.open(photo.encode()).pixels, pixels)
 
@@ -66,7 +66,7 @@ def test_lossless_webp_and_avif_stay_lossless(container: str) -> None:
 def test_lossy_webp_and_avif_stay_lossy_and_close() -> None:
     for container in ("webp", "avif"):
         photo = Photo.open(file_of(smooth(), container))
-        assert not photo.origin.lossless
+        assert not photo.file_info.lossless
         assert np.abs(Photo.open(photo.encode()).pixels.astype(int) - photo.pixels).mean() < 2
 
 
@@ -77,7 +77,7 @@ def test_white_is_white_whatever_the_bits(container: str, bits: int) -> None:
     white = np.full((32, 32, 3), 65535, np.uint16)
     photo = Photo.open(Photo(white, None, FileInfo(container=container, bits=bits, lossless=True)).encode())
     assert np.array_equal(photo.pixels, white)
-    assert photo.origin.bits == bits
+    assert photo.file_info.bits == bits
 
 
 @pytest.mark.parametrize("bits", [10, 12])
@@ -85,7 +85,7 @@ def test_avif_of_ten_and_twelve_bits_keeps_them_and_its_white(bits: int) -> None
     levels = np.linspace(0, 2**bits - 1, 2**bits).round().astype(np.uint16)
     shifted = np.repeat((levels << (16 - bits)).reshape(32, -1, 1), 3, axis=2)
     photo = Photo.open(Photo(shifted, None, FileInfo(container="avif", bits=bits, lossless=True)).encode())
-    assert photo.origin.bits == bits
+    assert photo.file_info.bits == bits
     assert photo.pixels.max() == 65535
     assert np.array_equal(photo.pixels >> (16 - bits), shifted >> (16 - bits))
     assert np.array_equal(Photo.open(photo.encode()).pixels, photo.pixels)
@@ -112,15 +112,15 @@ def test_exif_profile_and_xmp_are_kept_byte_for_byte(container: str) -> None:
     exif, upright = exif_block(), exif_block(1)
     data = file_of(smooth(), container, exif=exif, icc_profile=P3)
     photo = Photo.open(data)
-    photo = Photo(photo.pixels, None, FileInfo(**{**vars(photo.origin), "xmp": UPRIGHT_XMP}))
+    photo = Photo(photo.pixels, None, FileInfo(**{**vars(photo.file_info), "xmp": UPRIGHT_XMP}))
     written = pil(photo.encode())
     found = written.info["exif"].removeprefix(b"Exif\0\0")
     if container != "avif":  # whose orientation Pillow has taken out before
         assert found == upright.removeprefix(b"Exif\0\0")
-    assert found == photo.origin.exif
+    assert found == photo.file_info.exif
     assert written.info["icc_profile"] == P3
-    again = Photo.open(photo.encode()).origin
-    assert (again.exif, again.icc, again.xmp) == (photo.origin.exif, P3, UPRIGHT_XMP)
+    again = Photo.open(photo.encode()).file_info
+    assert (again.exif, again.icc, again.xmp) == (photo.file_info.exif, P3, UPRIGHT_XMP)
 
 
 def test_a_tiff_keeps_its_cameras_tags() -> None:
@@ -130,7 +130,7 @@ def test_a_tiff_keeps_its_cameras_tags() -> None:
     assert written.get_ifd(34665)[33434] == (1, 125)
     assert written.get_ifd(34665)[37500] == b"maker\0note\xff"
     assert written.get_ifd(34853)[2] == (48.0, 8.0, 0.0)
-    assert Photo.open(Photo.open(data).encode()).origin.icc == P3
+    assert Photo.open(Photo.open(data).encode()).file_info.icc == P3
 
 
 @pytest.mark.parametrize("container", ["jpeg", "png", "tiff", "webp", "avif"])
@@ -155,7 +155,7 @@ def test_a_tiff_keeps_its_kind_of_compression(kind: str) -> None:
 
 def test_xmp_orientation_is_reset_with_the_other() -> None:
     photo = Photo.open(file_of(smooth(), "JPEG", xmp=XMP, exif=exif_block()))
-    assert photo.origin.xmp == UPRIGHT_XMP
+    assert photo.file_info.xmp == UPRIGHT_XMP
 
 
 @quick
@@ -172,7 +172,7 @@ def test_display_p3_stated_by_number_gets_its_profile() -> None:
     data = file_of(smooth(), "PNG")
     sized = struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
     photo = Photo.open(data[:33] + sized + data[33:])
-    assert photo.origin.icc == P3
+    assert photo.file_info.icc == P3
     assert np.array_equal(photo.pixels, smooth())
 
 

@@ -170,7 +170,7 @@ def test_floats_that_are_no_light_are_refused(container: str, value: float) -> N
     whole = Photo.from_array(pixels, encoding="linear")
     broken = pixels.copy()
     broken[2, 1, 0] = value
-    bad = Photo(broken, None, whole.origin)
+    bad = Photo(broken, None, whole.file_info)
     if container == "tiff" or np.isnan(value):
         refused(bad.encode(container, depth=32), UnsupportedPhoto, "1 pixels")
     with pytest.raises(UnsupportedPhoto, match="finite"):

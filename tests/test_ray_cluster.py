@@ -18,9 +18,9 @@ TESTS = Path(__file__).parent
 LOCAL = """
 import sys
 from pathlib import Path
-from brewster.rendered.generation.ray_cluster import Cluster
+from brewster.rendered.generation.ray_cluster import RayExecutor
 from set_folders import make
-results = make(Path(sys.argv[1]), count=9, crew=lambda job: Cluster(job, "local", 2), renderer=sys.argv[2])
+results = make(Path(sys.argv[1]), count=9, executor=lambda job: RayExecutor(job, "local", 2), renderer=sys.argv[2])
 print([(result.index, result.status) for result in sorted(results, key=lambda result: result.index)])
 """
 
@@ -30,7 +30,7 @@ os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
 from pathlib import Path
 from ray.cluster_utils import Cluster as Nodes
 from brewster.rendered.generation.job import build
-from brewster.rendered.generation.ray_cluster import Cluster
+from brewster.rendered.generation.ray_cluster import RayExecutor
 from set_folders import job
 nodes = Nodes(initialize_head=True, head_node_args={"num_cpus": 1, "include_dashboard": False})
 doomed = nodes.add_node(num_cpus=1)
@@ -65,7 +65,7 @@ def offline(code, *args):
 def test_without_ray_the_line_that_installs_it_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingExtra, match=r"pip install 'brewster\[cluster\]'"):
-        make(tmp_path / "set", crew=ray_cluster.RayExecutor)
+        make(tmp_path / "set", executor=ray_cluster.RayExecutor)
 
 
 def test_making_a_crew_wakes_no_ray(tmp_path):
@@ -109,4 +109,4 @@ def test_an_address_where_nobody_answers_is_named(tmp_path, monkeypatch, address
 
     monkeypatch.setattr(socket, "create_connection", refuse)
     with pytest.raises(DeviceError, match=f"no cluster at {address}"):
-        make(tmp_path / "set", crew=partial(ray_cluster.RayExecutor, address=address))
+        make(tmp_path / "set", executor=partial(ray_cluster.RayExecutor, address=address))

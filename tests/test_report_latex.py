@@ -32,14 +32,14 @@ def test_the_average_has_one_digit_more(results):
 
 
 def test_the_best_three_are_marked_but_never_the_last(results):
-    means = {"A_b|c": 21.5, "doing nothing": 20.0, "third": 19.0, "fourth": 18.0, "as bad": 18.0}
+    means = {"A_b|c": 21.5, "input (unprocessed)": 20.0, "third": 19.0, "fourth": 18.0, "as bad": 18.0}
     results["methods"] = {key: {} for key in means}
     results["tables"] = {
         key: {name: {"psnr": entry(mean)} for name, mean in means.items()} for key in results["tables"]
     }
     text = to_latex(results)
     assert r"A\_b|c & \textbf{21.50}" in text
-    assert r"doing nothing & \underline{20.00}" in text
+    assert r"input (unprocessed) & \underline{20.00}" in text
     assert r"third & \uuline{19.00}" in text
     assert "fourth & 18.00" in text
     assert "as bad & 18.00" in text
@@ -48,7 +48,7 @@ def test_the_best_three_are_marked_but_never_the_last(results):
 def test_means_over_fewer_pictures_have_a_dagger_that_is_explained_and_no_mark(results):
     assert "dagger" not in to_latex(results)
     results["tables"]["real20"] = {
-        "doing nothing": {"psnr": entry(20.0), "lpips": entry(0.2)},
+        "input (unprocessed)": {"psnr": entry(20.0), "lpips": entry(0.2)},
         "A_b|c": {"psnr": entry(21.5, count=10), "lpips": entry(0.1, count=10)},
     }
     text = to_latex(results)

@@ -43,7 +43,7 @@ def test_a_table_has_as_many_cells_in_every_line_whatever_names_hold(results):
 
 def test_a_method_that_failed_somewhere_shows_how_many_pictures_it_is_judged_on(results):
     results["tables"]["real20"] = {
-        "doing nothing": {"psnr": entry(20.0)},
+        "input (unprocessed)": {"psnr": entry(20.0)},
         "A_b|c": {"psnr": entry(21.5, count=19)},
     }
     assert "21.50 / - (0 to 19 of 20)" in to_markdown(results)
@@ -56,16 +56,16 @@ def test_csv_has_a_line_for_every_mean_and_every_difference(results):
     first = rows[0]
     assert (first["set"], first["method"], first["metric"], first["mean"]) == (
         "real20",
-        "doing nothing",
+        "input (unprocessed)",
         "psnr",
         "20.0",
     )
-    assert [row["than"] for row in rows if row["set"] == "average"].count("doing nothing") == 2
+    assert [row["than"] for row in rows if row["set"] == "average"].count("input (unprocessed)") == 2
 
 
 def test_a_method_that_failed_somewhere_is_never_the_best(results):
     table = {
-        "doing nothing": {"psnr": entry(20.0), "lpips": entry(0.2)},
+        "input (unprocessed)": {"psnr": entry(20.0), "lpips": entry(0.2)},
         "A_b|c": {"psnr": entry(21.5, count=10), "lpips": entry(0.1, count=10)},
     }
     assert ranking(table, "psnr", METRICS["psnr"]) == []
@@ -77,7 +77,7 @@ def test_means_of_fewer_pictures_are_said_not_to_be_compared(results):
     said = "is not to be compared"
     assert said not in overview(results)
     results["tables"]["real20"] = {
-        "doing nothing": {"psnr": entry(20.0)},
+        "input (unprocessed)": {"psnr": entry(20.0)},
         "A_b|c": {"psnr": entry(21.5, count=19)},
     }
     assert said in overview(results)
@@ -86,5 +86,5 @@ def test_means_of_fewer_pictures_are_said_not_to_be_compared(results):
 def test_a_cell_with_many_counts_tells_the_least_and_the_most(results):
     results["metrics"]["ssim"] = METRICS["psnr"]
     counts = {"psnr": entry(20.0, count=5), "ssim": entry(0.9, count=3), "lpips": entry(0.2, count=1)}
-    results["tables"]["real20"] = {"doing nothing": counts, "A_b|c": counts}
+    results["tables"]["real20"] = {"input (unprocessed)": counts, "A_b|c": counts}
     assert "(1 to 5 of 20)" in overview(results)

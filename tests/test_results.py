@@ -60,7 +60,12 @@ def test_differences_are_to_every_method_named_before(methods):
     parts = [benchmark("a", 4)]
     told = rows(parts, methods, lambda case, method: int(case.name) + 0.5 * (method.name == "theirs"))
     (row,) = summarise(parts, methods, PSNR, told)["differences"]["a"]
-    assert (row["method"], row["than"], row["mean"], row["better"]) == ("theirs", "doing nothing", 0.5, 4)
+    assert (row["method"], row["than"], row["mean"], row["better"]) == (
+        "theirs",
+        "input (unprocessed)",
+        0.5,
+        4,
+    )
     assert (row["low"], row["high"]) == (0.5, 0.5)
 
 

@@ -46,7 +46,7 @@ class Fake:
             raise answer
         return answer
 
-    def kept(self, case):
+    def cached(self, case):
         return None
 
 
@@ -65,7 +65,7 @@ def numbers(rows):
 def test_every_method_is_scored_on_every_case_in_order(real20, tmp_path):
     rows = score(real20, [IdentityBaseline(), Fake()], QUICK, tmp_path / "out")
     assert [row.place[1:] for row in rows] == [
-        (case, method) for case in NAMES for method in ("doing nothing", "fake")
+        (case, method) for case in NAMES for method in ("input (unprocessed)", "fake")
     ]
     assert rows[0].scores == rows[1].scores
     assert (rows[0].width, rows[0].height) == (24, 16)
@@ -170,7 +170,7 @@ class Deadly:
     def answer(self, case, photo):
         os._exit(1)
 
-    def kept(self, case):
+    def cached(self, case):
         return None
 
 
@@ -190,7 +190,7 @@ class Endless:
         (self.begun / case.name).touch()
         time.sleep(1000)
 
-    def kept(self, case):
+    def cached(self, case):
         return None
 
 
@@ -209,10 +209,10 @@ if __name__ == "__main__":
         [sys.executable, tmp_path / "run.py"], env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
     ) as run:
         wait_for(lambda: len(list((tmp_path / "begun").iterdir())) == 2, run)
-        crew = children(run)
+        workers = children(run)
         run.kill()
-    wait_for(lambda: not any(map(is_alive, crew)))
-    assert len(crew) >= 2
+    wait_for(lambda: not any(map(is_alive, workers)))
+    assert len(workers) >= 2
 
 
 def test_kept_layers_score_exactly_as_fresh_ones(real20, model, tmp_path):
@@ -259,8 +259,8 @@ def test_a_picture_that_cannot_be_decoded_fails_for_all_methods(real20, tmp_path
 
 
 def test_grey_alpha_and_sixteen_bits_are_measured_as_what_they_show(tmp_path):
-    dice = np.random.default_rng(3)
-    grey = dice.integers(0, 256, (16, 24, 1), np.uint8)
+    rng = np.random.default_rng(3)
+    grey = rng.integers(0, 256, (16, 24, 1), np.uint8)
     alpha = np.concatenate([grey.repeat(3, 2), np.full_like(grey, 9)], axis=2)
     deep = grey.repeat(3, 2).astype(np.uint16) * 257
     for role, pixels in (("blended", grey), ("transmission_layer", alpha), ("reflection_layer", deep)):

@@ -131,7 +131,9 @@ def test_training_times_are_moved_as_the_schedule_moves_them(twin):
 @pytest.mark.parametrize("steps", [1, 2])
 def test_few_steps_are_allowed_and_every_step_is_told(twin, steps):
     told = []
-    ours(twin, eight_bit_picture(*SIZE), steps=steps, seeds=[1, 2], tell=lambda *step: told.append(step))
+    ours(
+        twin, eight_bit_picture(*SIZE), steps=steps, seeds=[1, 2], on_progress=lambda *step: told.append(step)
+    )
     assert told == [(done, 2 * steps) for done in range(1, 2 * steps + 1)]
 
 

@@ -95,10 +95,10 @@ def test_the_same_photo_gives_the_same_bytes(app):
 
 
 def test_a_photo_keeps_its_profile_and_its_camera(app):
-    photo = file_of(smooth(), "jpeg", exif=exif_block(6), icc_profile=Photo.open(SMALL).origin.icc)
+    photo = file_of(smooth(), "jpeg", exif=exif_block(6), icc_profile=Photo.open(SMALL).file_info.icc)
     layer = Photo.open(separate(app, photo, "a.jpg", layers="transmission").content)
     assert layer.size == (48, 64)
-    assert b"Sextant" in layer.origin.exif
+    assert b"Sextant" in layer.file_info.exif
 
 
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -51,11 +51,11 @@ def test_what_the_backend_leaves_alone_comes_back_bit_equal(height, width, chann
 @pytest.mark.parametrize("profile", ["srgb", "p3"])
 def test_strength_nought_returns_the_photo_and_no_reflection_whatever_the_profile(profile):
     icc = bytes(pyvips.Image.profile_load(profile))
-    photo = Photo(picture(300, 500), origin=FileInfo(icc=icc))
+    photo = Photo(picture(300, 500), file_info=FileInfo(icc=icc))
     result = Separator(glass)(photo, strength=0)
     assert (result.transmission.pixels == photo.pixels).all()
     assert not result.reflection.pixels.any()
-    assert result.transmission.origin.icc == icc
+    assert result.transmission.file_info.icc == icc
 
 
 def test_light_above_white_and_below_black_is_left_alone_too():
@@ -225,7 +225,9 @@ def test_the_shipped_model_hardly_changes_photographs_without_glass(separator, d
 @pytest.mark.parametrize("quality", QUALITIES)
 def test_the_share_that_is_done_rises_to_one(quality):
     told = []
-    Separator(glass)(Photo.from_array(picture(600, 900), encoding="srgb"), quality=quality, tell=told.append)
+    Separator(glass)(
+        Photo.from_array(picture(600, 900), encoding="srgb"), quality=quality, on_progress=told.append
+    )
     assert told == sorted(told)
     assert (told[0], told[-1]) == (0, 1)
     assert len(told) > 4
@@ -245,6 +247,6 @@ def test_what_tell_raises_stops_the_work(patience):
         return glass(tile)
 
     with pytest.raises(TimeoutError):
-        Separator(counting)(Photo.from_array(picture(600, 900), encoding="srgb"), tell=give_up)
+        Separator(counting)(Photo.from_array(picture(600, 900), encoding="srgb"), on_progress=give_up)
     assert len(told) == patience
     assert len(tiles) <= patience

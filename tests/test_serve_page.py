@@ -91,7 +91,7 @@ def test_a_photo_is_uploaded_compared_weakened_and_downloaded_as_the_command_lin
 ):
     whole = Photo.open(MIXTURE)
     photo = tmp_path / "window.jpg"
-    photo.write_bytes(Photo(whole.pixels[:150, :200].copy(), None, whole.origin).encode())
+    photo.write_bytes(Photo(whole.pixels[:150, :200].copy(), None, whole.file_info).encode())
     page = visit()
     upload(page, (photo.name, photo.read_bytes()))
     page.get_by_label("Model").select_option("compact")

@@ -41,12 +41,12 @@ def created(bare, folders, tmp_path):
     return read_study(tmp_path / "study")
 
 
-def answer_all(study, people, dice):
+def answer_all(study, people, rng):
     store = AnswerStore(study)
     for _ in range(people):
         person = store.participant(store.admit())
         for number, trial in enumerate(person.trials):
-            choice = trial.expected or choice_for(trial, dice.choice(3, p=[0.6, 0.2, 0.2]))
+            choice = trial.expected or choice_for(trial, rng.choice(3, p=[0.6, 0.2, 0.2]))
             store.answer(person, number, choice, seconds=4)
     store.close()
 

@@ -8,10 +8,10 @@ from brewster.user_study.power_analysis import plan
 from brewster.user_study.report.statistics import interval, rates, resampled, summed
 
 
-def shown(dice, participants, pairs, chances, correlation, studies):
+def shown(rng, participants, pairs, chances, correlation, studies):
     """The share of simulated studies whose interval of the difference does not hold 0."""
-    own = dice.dirichlet(np.array(chances) * (1 / correlation - 1), (participants, studies))
-    counts = dice.multinomial(pairs, own)[:, :, None].astype(float)
+    own = rng.dirichlet(np.array(chances) * (1 / correlation - 1), (participants, studies))
+    counts = rng.multinomial(pairs, own)[:, :, None].astype(float)
     draws = rates(summed(resampled(participants, 1000), counts), np.ones((studies, 1)))
     lows, highs = interval(draws, participants)[..., 0, 3]
     return ((lows > 0) | (highs < 0)).mean()
@@ -25,8 +25,8 @@ def test_a_study_of_the_planned_size_shows_the_difference_with_the_stated_power(
     difference, tie, pairs, correlation
 ):
     answer = plan(difference=difference, tie=tie, pairs=pairs, correlation=correlation)
-    dice = np.random.default_rng(6)
-    power = shown(dice, answer.participants, pairs, (answer.win, tie, answer.lose), correlation, 400)
+    rng = np.random.default_rng(6)
+    power = shown(rng, answer.participants, pairs, (answer.win, tie, answer.lose), correlation, 400)
     assert power == pytest.approx(0.8, abs=3 * np.sqrt(0.8 * 0.2 / 400))
 
 

@@ -46,13 +46,13 @@ TABLE_3 = {  # the paper's: Real, Nature, Postcard, SolidObject, Wildscene, Aver
 PICTURES = np.array([20.0, 20, 20, 20, 101])
 
 
-def simulated(dice, people, studies, *, pairs=40, correlation=0.05):
+def simulated(rng, people, studies, *, pairs=40, correlation=0.05):
     """Counts (people, studies, 1, 3): everybody has chances of their own about the TRUTH, alike by this correlation.
 
     Of Dirichlet chances with concentration a, every score's intraclass correlation is 1 / (1 + a).
     """
-    chances = dice.dirichlet(TRUTH * (1 / correlation - 1), (people, studies))
-    return dice.multinomial(pairs, chances)[:, :, None].astype(float)
+    chances = rng.dirichlet(TRUTH * (1 / correlation - 1), (people, studies))
+    return rng.multinomial(pairs, chances)[:, :, None].astype(float)
 
 
 # --- the paper's Table 3
@@ -208,17 +208,17 @@ def test_the_rule_leaves_out_who_does_not_look_and_nobody_else(about, reason):
     assert ExclusionRule().reason(person(**about)) == reason
 
 
-def answered(description, number, dice, chances, *, catches=1.0, seconds=6.0, trials=None):
+def answered(description, number, rng, chances, *, catches=1.0, seconds=6.0, trials=None):
     """A participant whose wishes have these chances, who passes this share of the catch trials."""
     row = draw(description, number)
     answers = {}
     for i, trial in enumerate(row[:trials]):
         if trial.expected is None:
-            choice = choice_for(trial, dice.choice(3, p=chances))
+            choice = choice_for(trial, rng.choice(3, p=chances))
         else:
             wrong = "left" if trial.expected != "left" else "right"
-            choice = trial.expected if dice.random() < catches else wrong
-        answers[i] = StoredAnswer(choice, seconds * dice.uniform(0.5, 2))
+            choice = trial.expected if rng.random() < catches else wrong
+        answers[i] = StoredAnswer(choice, seconds * rng.uniform(0.5, 2))
     return Participant(number, row), answers
 
 
@@ -226,12 +226,12 @@ def answered(description, number, dice, chances, *, catches=1.0, seconds=6.0, tr
 def hundred(tmp_path_factory):
     """100 participants x 40 pairs of three methods; five of them never look, and five are in haste."""
     description = described(pictures=50, methods=("ours", "R&D_Net", "DSIT"), pairs=40, catches=4)
-    dice = np.random.default_rng(4)
+    rng = np.random.default_rng(4)
     everybody = [
         answered(
             description,
             number,
-            dice,
+            rng,
             TRUTH if number >= 10 else [0, 0, 1],
             catches=0.95 if number >= 5 else 0.0,
             seconds=0.6 if 5 <= number < 10 else 6.0,
@@ -246,7 +246,7 @@ def hundred(tmp_path_factory):
 
 def test_a_hundred_simulated_people_are_understood(hundred):
     _, _, results = hundred
-    kept, everyone = results["kept"], results["everyone"]
+    kept, everyone = results["included"], results["everyone"]
     assert results["excluded"] == {"failed": 6, "fast": 4}
     assert (kept["participants"], everyone["participants"], kept["complete"]) == (90, 100, 89)
     assert everyone["answers"] == kept["answers"] + 400
@@ -268,8 +268,8 @@ def test_results_are_plain_json_and_the_same_in_any_order(hundred):
     study, who, results = hundred
     assert json.loads(json.dumps(results, allow_nan=False)) == results
     assert (
-        summarise(study, who[::-1], ExclusionRule())["kept"]["tables"][0]["rows"][0]["win"]["mean"]
-        == (results["kept"]["tables"][0]["rows"][0]["win"]["mean"])
+        summarise(study, who[::-1], ExclusionRule())["included"]["tables"][0]["rows"][0]["win"]["mean"]
+        == (results["included"]["tables"][0]["rows"][0]["win"]["mean"])
     )
 
 
@@ -307,7 +307,7 @@ def test_markdown_says_all_and_csv_has_a_line_for_each_number(hundred):
         assert told in text
     lines = list(csv.DictReader(io.StringIO(to_csv(results))))
     assert len(lines) == 2 * 2 * 5 * 4
-    assert {line["group"] for line in lines} == {"kept", "everyone"}
+    assert {line["group"] for line in lines} == {"included", "everyone"}
 
 
 def test_without_answers_there_is_no_report(hundred):
@@ -318,7 +318,7 @@ def test_without_answers_there_is_no_report(hundred):
 
 def test_one_person_gives_rates_without_intervals(hundred):
     study, who, _ = hundred
-    row = summarise(study, who[20:21], ExclusionRule())["kept"]["tables"][0]["rows"][-1]
+    row = summarise(study, who[20:21], ExclusionRule())["included"]["tables"][0]["rows"][-1]
     assert row["win"]["mean"] is not None
     assert row["win"]["low"] is None
 
@@ -326,7 +326,7 @@ def test_one_person_gives_rates_without_intervals(hundred):
 def test_a_rule_that_leaves_nobody_still_tells_of_everyone(hundred):
     study, who, _ = hundred
     results = summarise(study, who[:5], ExclusionRule())
-    assert results["kept"]["participants"] == 0
+    assert results["included"]["participants"] == 0
     assert to_latex(results).startswith("% the rule leaves nobody")
     assert plot(results)[1:4] == b"PNG"
     assert "## Everyone" in to_markdown(results)
@@ -337,8 +337,8 @@ def test_a_rule_that_leaves_nobody_still_tells_of_everyone(hundred):
 
 def named(tmp_path, datasets, methods):
     description = described(pictures=3, datasets=datasets, methods=methods, catches=0)
-    dice, study = np.random.default_rng(5), Study(tmp_path, description)
-    return study, people([answered(description, number, dice, TRUTH) for number in range(6)])
+    rng, study = np.random.default_rng(5), Study(tmp_path, description)
+    return study, people([answered(description, number, rng, TRUTH) for number in range(6)])
 
 
 def test_a_dataset_that_is_called_average_is_told_from_the_average(tmp_path):
@@ -358,9 +358,9 @@ def test_the_plot_has_a_bar_for_each_row_and_takes_names_as_they_are(tmp_path, m
     monkeypatch.setattr(figure, "_bars", lambda axis, *rest: (axes.append(axis), draw_bars(axis, *rest)))
     study, who = named(tmp_path, ("$x^$", "\u96e8"), ("$a_{b$", "RDNet"))
     results = summarise(study, who, ExclusionRule())
-    for row in results["kept"]["tables"][0]["rows"]:
+    for row in results["included"]["tables"][0]["rows"]:
         row["title"] = "alike" if row["key"] in ("\u96e8", "/average") else row["title"]
-    results["kept"]["tables"][0]["second"] = "\u96e8"
+    results["included"]["tables"][0]["second"] = "\u96e8"
     assert plot(results)[1:4] == b"PNG"
     (axis,) = axes
     assert [label.get_text() for label in axis.get_yticklabels()] == ["$x^$", "alike", "alike"]
@@ -391,5 +391,5 @@ def test_answers_csv_says_who_is_left_out_and_why(hundred, tmp_path):
 def test_strengths_that_are_alike_in_all_resamples_have_no_interval(hundred):
     study, *_ = hundred
     tied = [person(number=i, votes={0: 1, 1: 1}) for i in range(5)]
-    worth = summarise(study, tied, ExclusionRule())["kept"]["strengths"]["ours"]
+    worth = summarise(study, tied, ExclusionRule())["included"]["strengths"]["ours"]
     assert worth == {"mean": pytest.approx(0), "low": None, "high": None}

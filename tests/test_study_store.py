@@ -119,10 +119,10 @@ def test_a_file_that_is_no_database_is_told_in_one_sentence(tmp_path):
 WRITER = """
 import sys
 from pathlib import Path
-from brewster.user_study.store import Store
+from brewster.user_study.store import AnswerStore
 from brewster.user_study.study import read_study
 
-store = Store(read_study(Path(sys.argv[1])))
+store = AnswerStore(read_study(Path(sys.argv[1])))
 while True:
     token = store.admit()
     person = store.participant(token)

@@ -18,7 +18,7 @@ def read(folder):
 def test_numbers_and_the_picture_are_read_back_at_their_steps(tmp_path):
     board = TensorBoardLog(tmp_path, 0)
     for step in (3, 6):
-        board.tell(step, {"loss": 1 / step, "gain_db_real/dev": -2.5}, torch.full((4, 6, 3), 0.5))
+        board.log(step, {"loss": 1 / step, "gain_db_real/dev": -2.5}, torch.full((4, 6, 3), 0.5))
     events = read(tmp_path)
     assert [(event.step, event.value) for event in events.Scalars("loss")] == [
         (3, pytest.approx(1 / 3)),
@@ -33,11 +33,11 @@ def test_a_run_that_goes_on_forgets_what_was_told_of_later_steps(tmp_path):
     picture = torch.zeros(4, 6, 3)
     killed = TensorBoardLog(tmp_path, 0)
     for step in (1, 2, 3):
-        killed.tell(step, {"loss": 10.0}, picture)
+        killed.log(step, {"loss": 10.0}, picture)
     time.sleep(1.1)  # files are told apart, and ordered, by the second in which they begin
     resumed = TensorBoardLog(tmp_path, 1)
     for step in (2, 3, 4):
-        resumed.tell(step, {"loss": 5.0}, picture)
+        resumed.log(step, {"loss": 5.0}, picture)
     events = read(tmp_path)
     assert [(event.step, event.value) for event in events.Scalars("loss")] == [
         (1, 10.0), (2, 5.0), (3, 5.0), (4, 5.0),
@@ -53,5 +53,5 @@ def test_a_run_with_nothing_to_tell_leaves_no_file(tmp_path):
 def test_without_tensorboard_nothing_is_told_and_nothing_breaks(tmp_path, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    TensorBoardLog(tmp_path, 0).tell(1, {"loss": 1.0}, torch.zeros(4, 6, 3))
+    TensorBoardLog(tmp_path, 0).log(1, {"loss": 1.0}, torch.zeros(4, 6, 3))
     assert not list(tmp_path.iterdir())

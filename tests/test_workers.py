@@ -13,6 +13,7 @@ import torch
 from brewster.errors import DeviceError, RecipeError, TargetError
 from brewster.rendered import store
 from brewster.rendered.generation import workers
+from brewster.rendered.generation.job import RenderTask
 from brewster.rendered.generation.workers import ProcessExecutor, SerialExecutor, render_again
 from other_processes import children, is_alive, started, wait_for
 from set_folders import hashes, job, make, names, statuses
@@ -28,9 +29,9 @@ def in_a_process(out, count):
     """A run with a worker that never finishes sample 2, in a process that can be killed."""
     code = f"""
 from pathlib import Path
-from brewster.rendered.generation.workers import Workers
+from brewster.rendered.generation.workers import ProcessExecutor
 from set_folders import make
-make(Path({str(out)!r}), {count}, renderer="waits", crew=lambda job: ProcessExecutor(job, 1))
+make(Path({str(out)!r}), {count}, renderer="waits", executor=lambda job: ProcessExecutor(job, 1))
 """
     waiting = {**os.environ, "FAKE_WAIT": "1"}
     return started([sys.executable, "-c", code], cwd=TESTS, stderr=subprocess.PIPE, env=waiting)
@@ -38,7 +39,7 @@ make(Path({str(out)!r}), {count}, renderer="waits", crew=lambda job: ProcessExec
 
 def test_two_workers_make_what_one_process_makes_even_if_one_of_them_dies(tmp_path, monkeypatch):
     monkeypatch.setenv("FAKE_MARK", str(tmp_path / "mark"))
-    results = make(tmp_path / "two", count=5, renderer="deadly_once", crew=two)
+    results = make(tmp_path / "two", count=5, renderer="deadly_once", executor=two)
     assert (tmp_path / "mark").exists()
     assert statuses(results) == dict.fromkeys(range(5), "rendered")
     make(tmp_path / "one", count=5, renderer="deadly_once")
@@ -49,10 +50,10 @@ def test_a_run_killed_in_the_middle_takes_its_workers_along_and_is_resumed(tmp_p
     out, count = tmp_path / "set", 4
     with in_a_process(out, count) as run:
         wait_for(lambda: len(list(out.glob("0*"))) == 2, run)
-        crew = children(run)
+        workers = children(run)
         run.kill()
         run.communicate()
-    wait_for(lambda: not any(map(is_alive, crew)))
+    wait_for(lambda: not any(map(is_alive, workers)))
     assert sorted(folder.name for folder in out.glob("0*")) == ["000000", "000001"]
     assert all(names(folder) == set(store.FILES) for folder in out.glob("0*"))
     results = make(out, count=count, renderer="waits")
@@ -65,18 +66,18 @@ def test_ctrl_c_stops_all_at_once_and_leaves_nothing_half(tmp_path):
     out = tmp_path / "set"
     with in_a_process(out, 4) as run:
         wait_for(lambda: len(list(out.glob("0*"))) == 2, run)
-        crew = children(run)
-        for pid in [*map(int, crew), run.pid]:  # a terminal sends it to everybody
+        workers = children(run)
+        for pid in [*map(int, workers), run.pid]:  # a terminal sends it to everybody
             os.kill(pid, signal.SIGINT)
         _, err = run.communicate()
     assert err.count(b"KeyboardInterrupt") == 1
-    wait_for(lambda: not any(map(is_alive, crew)))
+    wait_for(lambda: not any(map(is_alive, workers)))
     assert not list(out.glob(".brewster-*"))
 
 
 def test_a_sample_that_kills_every_worker_is_named_and_the_rest_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr(workers, "TRIES", 1)
-    results = make(tmp_path / "set", renderer="deadly", crew=partial(ProcessExecutor, count=1))
+    results = make(tmp_path / "set", renderer="deadly", executor=partial(ProcessExecutor, count=1))
     assert statuses(results) == {0: "rendered", 1: "rendered", 2: "failed", 3: "rendered"}
     assert "its worker died 1 times (exit code -9)" in next(
         result.error for result in results if result.error
@@ -85,7 +86,7 @@ def test_a_sample_that_kills_every_worker_is_named_and_the_rest_goes_on(tmp_path
 
 def test_what_ends_the_run_ends_it_from_another_process_too(tmp_path):
     with pytest.raises(DeviceError, match=r"^there is no light; a lamp; or two; buy one\.$"):
-        make(tmp_path / "set", renderer="deviceless", crew=partial(ProcessExecutor, count=1))
+        make(tmp_path / "set", renderer="deviceless", executor=partial(ProcessExecutor, count=1))
 
 
 def test_rendering_here_leaves_the_threads_of_torch_as_they_were(tmp_path):
@@ -126,7 +127,7 @@ def test_every_renderer_is_there():
 def test_an_unfinished_task_is_done_only_where_it_is_not(tmp_path):
     asked = job(tmp_path)
     hand = workers.TaskRunner(asked)
-    task = workers.Task("render", (0, 1))
+    task = RenderTask("render", (0, 1))
     hand(task)
     before = (tmp_path / "000000").stat().st_ino
     assert [result.status for result in hand(task)] == ["rendered", "rendered"]

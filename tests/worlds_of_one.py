@@ -130,7 +130,7 @@ KINDS = ["smooth", "smooth", "wedge"]
 
 @st.composite
 def scenes(draw, **fixed):
-    """Scenes of every kind that the pane renderer takes: panes, tints, wedges, roughness, sides, lenses."""
+    """Scenes of every kind that the analytic renderer takes: panes, tints, wedges, roughness, sides, lenses."""
     kind = draw(st.sampled_from(KINDS))
     panes = draw(st.integers(1, 2))
     tint = draw(st.sampled_from([(0.0, 0.0, 0.0), (20.0, 0.0, 5.0)]))

@@ -172,8 +172,8 @@ def paper_draw(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ...]
             "the paper's protocol draws one picture of each scene",
             "point at SIR2's original tree, or score the whole set",
         )
-    dice = {scene: Random(f"{seed}/{benchmark.name}/{scene}") for scene in sorted(scenes, key=natural)}  # noqa: S311
-    return tuple(dice[scene].choice(scenes[scene]) for scene in dice)
+    rng = {scene: Random(f"{seed}/{benchmark.name}/{scene}") for scene in sorted(scenes, key=natural)}  # noqa: S311
+    return tuple(rng[scene].choice(scenes[scene]) for scene in rng)
 
 
 # --- the readers

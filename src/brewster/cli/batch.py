@@ -163,7 +163,7 @@ class SeparationBatch:
         with progress(len(tasks), shown=not self.quiet and not talks_over_bar) as advance:
             for task in tasks:
                 advance(len(entries), task.name)
-                self._tell_share = partial(_tell_share, advance, len(entries), task.name)
+                self._show_progress = partial(_show_progress, advance, len(entries), task.name)
                 entry = self._do(task, bugs)
                 if entry.error:
                     interrupts.heed()  # a dropped Ctrl-C may be all that was wrong
@@ -234,12 +234,12 @@ class SeparationBatch:
 
     def _separate(self, source: Path | None, targets: dict[str, Path | None], entry: BatchResult) -> None:
         photo = source or sys.stdin.buffer.read()
-        separation = self._separator(photo, tell=self._tell_share, **self.options.call())
+        separation = self._separator(photo, on_progress=self._show_progress, **self.options.call())
         entry.seconds, entry.residual = dict(separation.seconds), separation.residual
         entry.reconstruction_error, entry.doubtful = separation.reconstruction_error, separation.doubtful
         started = time.perf_counter()
         for layer, target in targets.items():
-            own = separation.photo.origin.container
+            own = separation.photo.file_info.container
             container = SUFFIXES[target.suffix.lower()] if target else self.options.container(layer, own)
             data = getattr(separation, layer).encode(container)
             interrupts.heed()
@@ -279,7 +279,7 @@ class SeparationBatch:
                 complain(entry.error if is_named else f"{entry.source}: {entry.error}")
 
 
-def _tell_share(advance: Advance, before: int, name: str, share: float) -> None:
+def _show_progress(advance: Advance, before: int, name: str, share: float) -> None:
     """A large model takes minutes for a photo: the bar moves between two of them, too, and Ctrl-C is heeded."""
     interrupts.heed()
     advance(before + share, name)

@@ -176,7 +176,7 @@ class _Size(click.ParamType[int]):
 )
 @click.pass_context
 def evaluate(context: click.Context, /, *, dry_run: bool, **asked: Any) -> None:  # noqa: ANN401  (the fields of _Order)
-    """Measure models and other methods' pictures on benchmarks, doing nothing beside them.
+    """Measure models and other methods' pictures on benchmarks, with the unprocessed input as baseline.
 
     The tables go to standard output; results.json (every picture), tables.md, table.tex, table.csv and report.html (a
     page to look at) into the folder named with -o. A run that was stopped goes on from there.

@@ -80,8 +80,8 @@ class _Size(click.ParamType[tuple[int, int]]):
 )
 @click.option(
     "--renderer",
-    type=click.Choice(["pane", "tracer"]),
-    help="Analytic for flat glass, or a path tracer for all glass. By default pane, or what --scene names.",
+    type=click.Choice(["analytic", "mitsuba"]),
+    help="Analytic for flat glass, or a path tracer for all glass. By default analytic, or what --scene names.",
 )
 @click.option(
     "--maps",
@@ -193,7 +193,7 @@ class _RenderRequest:
                 interrupts.heed()
 
             indices = range(self.first, self.first + self.count)
-            build(job, indices, self._crew(job), shards=self.shards, report=report)
+            build(job, indices, self._executor(job), shards=self.shards, report=report)
         if self.preview:
             write_preview(self.out)
         told.sum_up(self.out)
@@ -208,7 +208,7 @@ class _RenderRequest:
         for error in left_out:
             complain(f"left out: {error}")
         folders = tuple(folder.resolve() for folder in (*self.maps, *self.photos))
-        return RenderJob(self.out.resolve(), recipe, catalog, self.seed, self.renderer or "pane", folders)
+        return RenderJob(self.out.resolve(), recipe, catalog, self.seed, self.renderer or "analytic", folders)
 
     def _recipe(self) -> SceneRecipe:
         """The recipe with the size and orders that were asked for instead of its own."""
@@ -221,7 +221,7 @@ class _RenderRequest:
             recipe = recipe.model_copy(update={"camera": camera})
         return recipe.model_copy(update={"orders": self.orders}) if self.orders else recipe
 
-    def _crew(self, job: RenderJob) -> Executor:
+    def _executor(self, job: RenderJob) -> Executor:
         from brewster.rendered.generation.workers import ProcessExecutor, SerialExecutor  # noqa: PLC0415
 
         if self.cluster:

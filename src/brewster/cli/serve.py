@@ -154,5 +154,5 @@ def serve(
     router = separation(shelf, JobQueue(queue=queue, seconds=timeout), max_pixels=max_pixels)
     app = web.application(router, guard=RequestLimits.at(host, token=token, max_bytes=max_bytes))
     with contextlib.suppress(KeyboardInterrupt):  # the usual end
-        web.serve(app, host=host, port=port, tell=lambda url: invite(url, token, opens=opens))
+        web.serve(app, host=host, port=port, on_ready=lambda url: invite(url, token, opens=opens))
     say("stopped")

@@ -183,7 +183,7 @@ def serve(
     store = AnswerStore(made)
     app = web.application(participants(made, store, most=most, token=token), guard=guard, home="study.html")
     with contextlib.closing(store), contextlib.suppress(KeyboardInterrupt):  # the usual end
-        web.serve(app, host=host, port=port, tell=lambda url: invite(url, token))
+        web.serve(app, host=host, port=port, on_ready=lambda url: invite(url, token))
     say("stopped; all answers are kept")
 
 

@@ -55,7 +55,7 @@ def train(*, recipe: Path, out: Path | None, plan: bool, card: str | None, quiet
     from brewster.training.loop import run  # noqa: PLC0415
     from brewster.training.trainers import open_trainer  # noqa: PLC0415
 
-    learner = open_trainer(read)
+    trainer = open_trainer(read)
     quiet = quiet or not is_main_process()
     with progress(read.steps, shown=not quiet) as advance:
 
@@ -66,9 +66,9 @@ def train(*, recipe: Path, out: Path | None, plan: bool, card: str | None, quiet
                 told = ", ".join(f"{name} {value:.4g}" for name, value in numbers.items())
                 say(f"step {step} of {steps}: {told}")
 
-        run(learner, out, report)
+        run(trainer, out, report)
     if is_main_process():
-        model = learner.export(out)
+        model = trainer.export(out)
         if not quiet:
             say(f"the model is {model}")
 

@@ -125,9 +125,9 @@ def ablate(
 
 def _trained(recipe: CompactRecipe | LoraRecipe, folder: Path, tell: loop.Report) -> Path:
     """The model of this recipe, in memory no longer than it learns."""
-    learner = open_trainer(recipe)
-    loop.run(learner, folder, tell)
-    return learner.export(folder)
+    trainer = open_trainer(recipe)
+    loop.run(trainer, folder, tell)
+    return trainer.export(folder)
 
 
 def _plot(study: AblationStudy, numbers: Sequence[float], results: Results) -> bytes:

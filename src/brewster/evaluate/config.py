@@ -97,7 +97,7 @@ _VALUES: Final = (
 _PAIRS: Final = (
     "Pictures are paired by name. A prediction of another size than the truth is a failure, never resized."
 )
-_NOTHING: Final = '"doing nothing" is the photo itself as transmission, and black as reflection.'
+_NOTHING: Final = '"input (unprocessed)" is the photo itself as transmission, and black as reflection.'
 _IDENTICAL: Final = f"The PSNR of identical pictures, which is infinite, counts as {IDENTICAL_DB:g} dB."
 _REGION: Final = (
     "The reflection region is where photo and truth differ by more than {} of the full scale (the largest channel's "

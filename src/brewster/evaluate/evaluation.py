@@ -49,7 +49,7 @@ def evaluate(
 
     Args:
         benchmarks: as `read_benchmark` gives them.
-        methods: in the order of the tables; "doing nothing" belongs first.
+        methods: in the order of the tables; "input (unprocessed)" belongs first.
         protocol: the choices of the run.
         out: a folder of this evaluation's own; a run that was stopped goes on from what lies there.
         workers: processes that score at once.

@@ -1,4 +1,4 @@
-"""What is measured: doing nothing, our models, and folders of pictures that any other method has left.
+"""What is measured: the unprocessed input, our models, and folders of pictures that any other method has left.
 
 Every method answers a case with a transmission and perhaps a reflection. `key` says all that the answer depends on
 beside the photo, so that an answer made once need not be made again.
@@ -27,7 +27,7 @@ from brewster.models.zoo import find_model, is_large
 from brewster.options import Device, Quality
 from brewster.photo import Photo
 
-NOTHING: Final = "doing nothing"
+NOTHING: Final = "input (unprocessed)"
 ANSWER_FORMAT: Final = 1
 """Raised when the same model comes to answer differently, so that kept answers are made again; see test_house_formats."""
 
@@ -39,13 +39,13 @@ _ENDINGS: Final = {"transmission": ("_t", "_l"), "reflection": ("_r",)}
 class MethodOutput:
     """The layers that a method gives for a photo.
 
-    `seconds` is the wall time that this took it, if it was seen; `kept` the digest of the files that keep the answer.
+    `seconds` is the wall time that this took it, if it was seen; `digest` the digest of the files that keep the answer.
     """
 
     transmission: Photo
     reflection: Photo | None = None
     seconds: float | None = None
-    kept: str | None = None
+    digest: str | None = None
 
     @classmethod
     def read(cls, files: Mapping[str, Path]) -> MethodOutput:
@@ -56,7 +56,7 @@ class MethodOutput:
         """
         data = {layer: _read(path) for layer, path in files.items()}
         photos = {layer: Photo.open(picture) for layer, picture in data.items()}
-        return cls(photos["transmission"], photos.get("reflection"), kept=_digest(data.values()))
+        return cls(photos["transmission"], photos.get("reflection"), digest=_digest(data.values()))
 
 
 class Method(Protocol):
@@ -84,7 +84,7 @@ class Method(Protocol):
         """Its layers for the photo of this case."""
         ...
 
-    def kept(self, case: Case) -> MethodOutput | None:
+    def cached(self, case: Case) -> MethodOutput | None:
         """The answer as it lies on the disk, if it does."""
         ...
 
@@ -109,7 +109,7 @@ class IdentityBaseline:
         """The photo and black."""
         return MethodOutput(photo, photo.with_pixels(np.zeros_like(photo.pixels)))
 
-    def kept(self, case: Case) -> MethodOutput | None:  # noqa: ARG002
+    def cached(self, case: Case) -> MethodOutput | None:  # noqa: ARG002
         """Nothing is kept: it costs nothing."""
         return None
 
@@ -157,7 +157,7 @@ class ModelMethod:
             write_atomically(path, data, overwrite=True)
         return replace(MethodOutput.read(files), seconds=seconds)  # what is kept is what is scored
 
-    def kept(self, case: Case) -> MethodOutput | None:
+    def cached(self, case: Case) -> MethodOutput | None:
         """The layers that were kept.
 
         Raises:
@@ -225,7 +225,7 @@ class PredictionFolder:
         """
         return MethodOutput.read(self.files(case))
 
-    def kept(self, case: Case) -> MethodOutput | None:
+    def cached(self, case: Case) -> MethodOutput | None:
         """What `answer` gives, and raises."""
         return MethodOutput.read(self.files(case))
 

@@ -42,7 +42,7 @@ class ScoreRow:
     """What became of one method's answer to one case.
 
     `key` is a digest of all that the scores depend on, `answer_key` of all that the answer does: where it is equal,
-    nothing need be done again. `kept` is the digest of the answer's files, where it lies on the disk.
+    nothing need be done again. `digest` is the digest of the answer's files, where it lies on the disk.
     """
 
     benchmark: str
@@ -53,7 +53,7 @@ class ScoreRow:
     scores: dict[str, float | None] = field(default_factory=dict)
     error: str | None = None
     seconds: float | None = None
-    kept: str | None = None
+    digest: str | None = None
     width: int = 0
     height: int = 0
     region_share: float = 0.0
@@ -67,7 +67,7 @@ class ScoreRow:
 @final
 @dataclass(frozen=True)
 class _ScoringTask:
-    """A case, and the rows that are to be filled; `kept` of a row says which answer on the disk is the right one."""
+    """A case, and the rows that are to be filled; `digest` of a row says which answer on the disk is the right one."""
 
     case: Case
     rows: tuple[ScoreRow, ...]
@@ -134,7 +134,7 @@ def _rows(
         row = ScoreRow(case.benchmark, case.name, method.name, answer_key, key)
         before = known.get(row.place)
         is_answered = before and before.answer_key == answer_key
-        yield replace(row, kept=before.kept) if before and is_answered else row
+        yield replace(row, digest=before.digest) if before and is_answered else row
 
 
 def _tasks(cases: Mapping[tuple[str, str], Case], todo: Sequence[ScoreRow]) -> Iterator[_ScoringTask]:
@@ -177,7 +177,7 @@ def _scored(row: ScoreRow, truth: GroundTruth, judge: Scorer, method: Method) ->
         row,
         scores=judge.score(answer),
         seconds=answer.seconds,
-        kept=answer.kept,
+        digest=answer.digest,
         width=width,
         height=height,
         region_share=judge.region_share,
@@ -190,8 +190,8 @@ def find_answer(truth: GroundTruth, method: Method, row: ScoreRow) -> MethodOutp
     Raises:
         BrewsterError: what the method raises.
     """
-    kept = method.kept(truth.case) if row.kept else None
-    return kept if kept and kept.kept == row.kept else method.answer(truth.case, truth.photo)
+    kept = method.cached(truth.case) if row.digest else None
+    return kept if kept and kept.digest == row.digest else method.answer(truth.case, truth.photo)
 
 
 def _failed(row: ScoreRow, error: str) -> ScoreRow:

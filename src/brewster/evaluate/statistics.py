@@ -75,8 +75,8 @@ def _draw(stratum: Stratum) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     sums, counts = (np.zeros((len(names), stratum.values.shape[1])) for _ in range(2))
     np.add.at(sums, owner, np.nan_to_num(stratum.values))
     np.add.at(counts, owner, np.isfinite(stratum.values))
-    dice = np.random.default_rng([SEED, zlib.crc32(stratum.name.encode())])
-    times = dice.multinomial(len(names), np.full(len(names), 1 / len(names)), RESAMPLES).astype(float)
+    rng = np.random.default_rng([SEED, zlib.crc32(stratum.name.encode())])
+    times = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), RESAMPLES).astype(float)
     return times @ sums, times @ counts
 
 

@@ -81,7 +81,9 @@ class DiffusionPredictor(Predictor):
             return [whole]
         return [whole, (round(scale * whole[0]), round(scale * whole[1]))]
 
-    def __call__(self, copies: Sequence[Floats], quality: Quality, tell: ProgressCallback) -> Prediction:
+    def __call__(
+        self, copies: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
+    ) -> Prediction:
         """The mean of the looks; the reconstruction_error is that of the look at the whole."""
         size = copies[-1].shape[:2]
         sides = [max(copies[0].shape), *(self._tile_px for _ in copies[1:])]
@@ -89,7 +91,7 @@ class DiffusionPredictor(Predictor):
             len(tiles_of(copy.shape[:2], **_cut(side))) for copy, side in zip(copies, sides, strict=True)
         ]
         steps = self._steps or (_DRAFT_STEPS if quality == "draft" else STEPS)
-        count = _ProgressCounter(tell, sum(tiles))
+        count = _ProgressCounter(on_progress, sum(tiles))
         looks = []
         with self._one_at_a_time:  # two at once would need twice the memory of the card
             for copy, side in zip(copies, sides, strict=True):
@@ -130,7 +132,9 @@ class DiffusionPredictor(Predictor):
         height, width, _ = tile.shape
         fit = PanelFit((width, height), _up((width, height), self._decomposer.backbone.multiple))
         shown = torch.from_numpy(2 * to_encoded(tile) - 1).permute(2, 0, 1)[None]
-        panels = self._decomposer(fit.pad(shown), steps=steps, seeds=self._seeds, tell=count.within_tile)
+        panels = self._decomposer(
+            fit.pad(shown), steps=steps, seeds=self._seeds, on_progress=count.within_tile
+        )
         count.tile_done()
         _refuse_broken(panels)
         light = {name: _light(fit.cut(panel)) for name, panel in panels.items()}
@@ -151,12 +155,12 @@ class DiffusionPredictor(Predictor):
 class _ProgressCounter:
     """Tells how far a look is, tile by tile and step by step."""
 
-    tell: ProgressCallback
+    on_progress: ProgressCallback
     tiles: int
     done: int = 0
 
     def within_tile(self, step: int, steps: int) -> None:
-        self.tell((self.done + step / steps) / self.tiles)
+        self.on_progress((self.done + step / steps) / self.tiles)
 
     def tile_done(self) -> None:
         self.done += 1

@@ -66,7 +66,9 @@ class Predictor(ABC):
         """Width and height of the copies that it wants of a photo of this size, smallest first, each once."""
 
     @abstractmethod
-    def __call__(self, copies: Sequence[Floats], quality: Quality, tell: ProgressCallback) -> Prediction:
+    def __call__(
+        self, copies: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
+    ) -> Prediction:
         """Looks at these copies, (h, w, 3) each, linear light in 0..1."""
 
 
@@ -87,7 +89,12 @@ class MultiScalePredictor(Predictor):
             sizes.append((max(1, round(width * scale)), max(1, round(height * scale))))
         return list(dict.fromkeys(sizes))
 
-    def __call__(self, copies: Sequence[Floats], quality: Quality, tell: ProgressCallback) -> Prediction:  # noqa: ARG002
+    def __call__(
+        self,
+        copies: Sequence[Floats],
+        quality: Quality,  # noqa: ARG002
+        on_progress: ProgressCallback,
+    ) -> Prediction:
         """The mean of all views; it is sure where they agree."""
         size = copies[-1].shape[:2]
         changes, reflections = [], []
@@ -95,7 +102,7 @@ class MultiScalePredictor(Predictor):
             for transmission, reflection in self._both_ways(copy):
                 changes.append(enlarge_rows(transmission - copy, 0, size[0], size))
                 reflections.append(enlarge_rows(reflection, 0, size[0], size))
-                tell(len(changes) / (2 * len(copies)))
+                on_progress(len(changes) / (2 * len(copies)))
         seen = to_encoded(np.maximum(copies[-1] + np.stack(changes), 0))
         return Prediction(
             np.mean(changes, axis=0),

@@ -156,7 +156,7 @@ class Separator:
         additive: bool = False,
         encoding: Encoding | None = None,
         max_pixels: int = DEFAULT_MAX_PIXELS,
-        tell: ProgressCallback = lambda _share: None,
+        on_progress: ProgressCallback = lambda _share: None,
     ) -> Separation:
         """Separates a photograph; safe to call from many threads at once.
 
@@ -167,7 +167,7 @@ class Separator:
             additive: layers of 32-bit floats that sum to the photo exactly in linear light, for compositing.
             encoding: what an array's numbers mean, "srgb" or "linear".
             max_pixels: larger pictures are refused before they are decoded.
-            tell: called with the share that is done, 0 to 1; an exception that it raises stops the work.
+            on_progress: called with the share that is done, 0 to 1; an exception that it raises stops the work.
 
         Raises:
             PhotoError: the source cannot be read, or is too large.
@@ -180,12 +180,14 @@ class Separator:
             copies = [photo.small(*size) for size in self._look.sizes(photo.size, quality)]
             white = np.float32(max(1.0, float(np.percentile(copies[-1], _WHITE_PERCENTILE))))
             copies = [np.clip(copy / white, 0, 1) for copy in copies]
-        tell(0.0)
+        on_progress(0.0)
         with _clock(seconds, "network"):
-            seen = self._look(copies, quality, lambda done: tell(_LOOKING * done))
+            seen = self._look(copies, quality, lambda done: on_progress(_LOOKING * done))
         with _clock(seconds, "detail"):
             transfer = _transfer(copies[-1], seen, strength, white)
-            whole, mirrored, residual = _at_full_size(photo, transfer, additive=additive, tell=tell)
+            whole, mirrored, residual = _at_full_size(
+                photo, transfer, additive=additive, on_progress=on_progress
+            )
         made_by = self.name, self.sha256, self.device
         return Separation(
             photo,
@@ -239,7 +241,7 @@ def _transfer(copy: Floats, seen: Prediction, strength: float, white: np.float32
 
 
 def _at_full_size(
-    photo: Photo, transfer: GuidedUpsampler, *, additive: bool, tell: ProgressCallback
+    photo: Photo, transfer: GuidedUpsampler, *, additive: bool, on_progress: ProgressCallback
 ) -> tuple[Photo, Photo, float]:
     """Both layers, stored as the photo is or as exact floats, and the mean unexplained residual."""
     store = _as_floats(photo) if additive else photo
@@ -259,21 +261,21 @@ def _at_full_size(
     with ThreadPoolExecutor(_WORKERS) as pool:
         for done, part in enumerate(pool.map(fill, strips), 1):
             unexplained += part
-            tell(_LOOKING + (1 - _LOOKING) * done / len(strips))
+            on_progress(_LOOKING + (1 - _LOOKING) * done / len(strips))
     transmission, reflection = (store.with_pixels(canvas) for canvas in canvases)
     return transmission, reflection, unexplained / (math.prod(photo.size) * 3)
 
 
 def _as_floats(photo: Photo) -> Photo:
     """The photo's like, black, in 32-bit floats of linear light, to be filled; alpha and EXIF are kept."""
-    origin = replace(
-        photo.origin, container="tiff", bits=32, compression=None, icc=None, primaries=None, header=None
+    file_info = replace(
+        photo.file_info, container="tiff", bits=32, compression=None, icc=None, primaries=None, header=None
     )
     alpha = photo.alpha
     if alpha is not None and alpha.dtype.kind == "u":
         alpha = alpha / np.float32(np.iinfo(alpha.dtype).max)
     black = np.broadcast_to(np.float32(0), photo.pixels.shape)
-    return Photo(black, alpha, origin)
+    return Photo(black, alpha, file_info)
 
 
 def _summing_exactly(photo: Floats, transmission: Floats) -> list[Floats]:

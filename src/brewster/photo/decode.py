@@ -37,7 +37,7 @@ class Decoded:
 
     pixels: Stored
     alpha: Stored | None
-    origin: FileInfo
+    file_info: FileInfo
 
 
 def decode(data: bytes, max_pixels: int) -> Decoded:
@@ -45,7 +45,7 @@ def decode(data: bytes, max_pixels: int) -> Decoded:
     container = _container(data)
     if container in ("exr", "hdr"):
         floats = (read_exr if container == "exr" else read_hdr)(data, max_pixels)
-        decoded = Decoded(floats.pixels, floats.alpha, floats.origin)
+        decoded = Decoded(floats.pixels, floats.alpha, floats.file_info)
     elif container == "heic":
         decoded = _decode_heic(data, max_pixels)
     else:
@@ -131,12 +131,12 @@ _TYPES = {"uchar": np.uint8, "ushort": np.uint16, "float": np.float32}
 def _decode_vips(data: bytes, container: str, max_pixels: int) -> Decoded:
     image = _open_vips(data, container, max_pixels)
     try:
-        origin = _origin(image, data, container)
+        file_info = _origin(image, data, container)
         array = np.frombuffer(image.write_to_memory(), _TYPES[image.format])
     except pyvips.Error as error:
         raise _unreadable(container, error) from error
-    array = _full_scale(array.reshape(image.height, image.width, image.bands), origin.bits)
-    return split(upright(array, _orientation(image, container)), origin)
+    array = _full_scale(array.reshape(image.height, image.width, image.bands), file_info.bits)
+    return split(upright(array, _orientation(image, container)), file_info)
 
 
 def _open_vips(data: bytes, container: str, max_pixels: int) -> pyvips.Image:
@@ -219,7 +219,7 @@ def _origin(image: pyvips.Image, data: bytes, container: str) -> FileInfo:
     icc, exif, xmp, iptc = (image.get(name) if image.get_typeof(name) else None for name in names)
     bits = {"float": 32, "uchar": 8}.get(image.format, 16)
     has_resolution = (image.xres, image.yres) != (1.0, 1.0)
-    origin = FileInfo(
+    file_info = FileInfo(
         container="png" if container == "gif" else container,
         bits=image.get("bits-per-sample") if container == "avif" else bits,
         icc=icc or _profile_of(data, container),
@@ -228,7 +228,7 @@ def _origin(image: pyvips.Image, data: bytes, container: str) -> FileInfo:
         iptc=iptc,
         resolution=(image.xres, image.yres) if has_resolution else None,
     )
-    return replace(origin, **_MORE[container](data)) if container in _MORE else origin
+    return replace(file_info, **_MORE[container](data)) if container in _MORE else file_info
 
 
 def _profile_of(data: bytes, container: str) -> bytes | None:
@@ -326,14 +326,14 @@ def _decode_heic(data: bytes, max_pixels: int) -> Decoded:
     except _HEIC_ERRORS as error:
         raise _unreadable("heic", error) from error
     exif, xmp = heif.info.get("exif"), heif.info.get("xmp")
-    origin = FileInfo(
+    file_info = FileInfo(
         container="heic",
         bits=heif.info.get("bit_depth", 8),
         icc=_heic_profile(heif, data),
         exif=metadata.upright_exif(exif) if exif else None,
         xmp=metadata.upright_xmp(xmp) if xmp else None,
     )
-    return split(_full_scale(array.reshape(*array.shape[:2], -1), origin.bits), origin)
+    return split(_full_scale(array.reshape(*array.shape[:2], -1), file_info.bits), file_info)
 
 
 # --- arrays
@@ -357,9 +357,9 @@ def upright(array: Stored, orientation: int) -> Stored:
     return array
 
 
-def split(array: Stored, origin: FileInfo) -> Decoded:
+def split(array: Stored, file_info: FileInfo) -> Decoded:
     """Colour and alpha apart, each whole in memory."""
     has_alpha = array.shape[2] in (2, 4)
     colours = array.shape[2] - has_alpha
     alpha = np.ascontiguousarray(array[..., colours]) if has_alpha else None
-    return Decoded(np.ascontiguousarray(array[..., :colours]), alpha, origin)
+    return Decoded(np.ascontiguousarray(array[..., :colours]), alpha, file_info)

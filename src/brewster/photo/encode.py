@@ -1,4 +1,4 @@
-"""Stored pixels to the bytes of a file, in the container and at the depth that the origin names."""
+"""Stored pixels to the bytes of a file, in the container and at the depth that the file_info names."""
 
 from __future__ import annotations
 
@@ -24,49 +24,49 @@ _FINE_AVIF = 90  # AV1's scale differs
 _PLAIN_RESOLUTION = (72 / 25.4, 72 / 25.4)
 
 
-def encode(pixels: Stored, alpha: Stored | None, origin: FileInfo) -> bytes:
-    """The file. `pixels` (H, W, 1|3) and `alpha` (H, W) have the type that the origin's bits ask for.
+def encode(pixels: Stored, alpha: Stored | None, file_info: FileInfo) -> bytes:
+    """The file. `pixels` (H, W, 1|3) and `alpha` (H, W) have the type that the file_info's bits ask for.
 
     Raises UnsupportedPhoto where the container cannot hold the picture, MissingExtra for EXR and HEIC.
     """
-    if alpha is not None and origin.container in _OPAQUE:
+    if alpha is not None and file_info.container in _OPAQUE:
         raise UnsupportedPhoto(
-            f"the picture has an alpha channel, and {origin.container} holds none",
+            f"the picture has an alpha channel, and {file_info.container} holds none",
             "nothing is dropped unasked",
             "write PNG, TIFF, WebP, AVIF or EXR",
         )
-    if origin.container == "exr":
-        return write_exr(HdrPixels(pixels, alpha, origin))
-    if origin.container == "hdr":
-        return write_hdr(HdrPixels(pixels, alpha, origin))
+    if file_info.container == "exr":
+        return write_exr(HdrPixels(pixels, alpha, file_info))
+    if file_info.container == "hdr":
+        return write_hdr(HdrPixels(pixels, alpha, file_info))
     array = pixels if alpha is None else np.concatenate([pixels, alpha[..., None]], axis=2)
-    if origin.container == "heic":
-        return _encode_heic(array, origin)
-    return _with_exif(_encode_vips(array, origin), array, origin)
+    if file_info.container == "heic":
+        return _encode_heic(array, file_info)
+    return _with_exif(_encode_vips(array, file_info), array, file_info)
 
 
-def _encode_vips(array: Stored, origin: FileInfo) -> bytes:
+def _encode_vips(array: Stored, file_info: FileInfo) -> bytes:
     height, width, bands = array.shape
-    across, down = origin.resolution or _PLAIN_RESOLUTION
+    across, down = file_info.resolution or _PLAIN_RESOLUTION
     contiguous = np.ascontiguousarray(array)
     kind = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}[array.dtype.name]
     image = pyvips.Image.new_from_memory(contiguous.data, width, height, bands, kind)
     image = image.copy(interpretation=_interpretation(array), xres=across, yres=down)
     image.set_type(pyvips.GValue.gstr_type, "resolution-unit", "in")
-    blobs = {"icc-profile-data": origin.icc, "xmp-data": origin.xmp, "iptc-data": origin.iptc}
-    if origin.container == "avif":
-        blobs["exif-data"] = origin.exif
+    blobs = {"icc-profile-data": file_info.icc, "xmp-data": file_info.xmp, "iptc-data": file_info.iptc}
+    if file_info.container == "avif":
+        blobs["exif-data"] = file_info.exif
     for name, blob in blobs.items():
         if blob is not None:
             image.set_type(pyvips.GValue.blob_type, name, blob)
-    kept = _KEPT_IN_AVIF if origin.container == "avif" else _KEPT
-    saver, options = _saver(origin, array.dtype)
+    kept = _KEPT_IN_AVIF if file_info.container == "avif" else _KEPT
+    saver, options = _saver(file_info, array.dtype)
     try:
         return bytes(getattr(image, saver)(keep=kept, **options))
     except pyvips.Error as error:
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         raise UnsupportedPhoto(
-            f"{width} x {height} pixels cannot be written as {origin.container} ({lines[-1]})",
+            f"{width} x {height} pixels cannot be written as {file_info.container} ({lines[-1]})",
             "the container must be able to hold them",
             "write PNG or TIFF",
         ) from error
@@ -81,22 +81,27 @@ def _interpretation(array: Stored) -> str:
     )
 
 
-def _saver(origin: FileInfo, dtype: np.dtype[Any]) -> tuple[str, dict[str, Any]]:
+def _saver(file_info: FileInfo, dtype: np.dtype[Any]) -> tuple[str, dict[str, Any]]:
     """libvips' saver for a container and its options; chroma is subsampled only where the source's was."""
-    match origin.container:
+    match file_info.container:
         case "jpeg":
-            mode = "on" if origin.subsampling == "4:2:0" else "off"
-            quality = origin.jpeg_quality or _FINE
+            mode = "on" if file_info.subsampling == "4:2:0" else "off"
+            quality = file_info.jpeg_quality or _FINE
             return "jpegsave_buffer", {"Q": quality, "subsample_mode": mode, "optimize_coding": True}
         case "png":
             return "pngsave_buffer", {}
         case "webp":
-            return "webpsave_buffer", {"Q": _FINE, "lossless": origin.lossless, "exact": True}
+            return "webpsave_buffer", {"Q": _FINE, "lossless": file_info.lossless, "exact": True}
         case "avif":
-            fidelity = {"Q": _FINE_AVIF, "lossless": origin.lossless, "subsample_mode": "off"}
+            fidelity = {"Q": _FINE_AVIF, "lossless": file_info.lossless, "subsample_mode": "off"}
             # effort 1 takes a seventh of the default's time for an eighth more bytes
-            return "heifsave_buffer", {"compression": "av1", "bitdepth": origin.bits, "effort": 1, **fidelity}
-    compression = origin.compression or "deflate"
+            return "heifsave_buffer", {
+                "compression": "av1",
+                "bitdepth": file_info.bits,
+                "effort": 1,
+                **fidelity,
+            }
+    compression = file_info.compression or "deflate"
     if compression == "jpeg" and dtype != np.uint8:
         compression = "deflate"
     predictor = "float" if dtype.kind == "f" else "horizontal"
@@ -104,24 +109,24 @@ def _saver(origin: FileInfo, dtype: np.dtype[Any]) -> tuple[str, dict[str, Any]]
     return "tiffsave_buffer", options
 
 
-def _with_exif(data: bytes, array: Stored, origin: FileInfo) -> bytes:
-    if origin.container == "jpeg":
-        per_inch = origin.resolution and (25.4 * origin.resolution[0], 25.4 * origin.resolution[1])
-        return metadata.with_jpeg_head(data, origin.exif, per_inch)
-    if origin.exif is None:
+def _with_exif(data: bytes, array: Stored, file_info: FileInfo) -> bytes:
+    if file_info.container == "jpeg":
+        per_inch = file_info.resolution and (25.4 * file_info.resolution[0], 25.4 * file_info.resolution[1])
+        return metadata.with_jpeg_head(data, file_info.exif, per_inch)
+    if file_info.exif is None:
         return data
-    match origin.container:
+    match file_info.container:
         case "png":
-            return metadata.with_png_exif(data, origin.exif)
+            return metadata.with_png_exif(data, file_info.exif)
         case "webp":
             size = (array.shape[1], array.shape[0])
-            return metadata.with_webp_exif(data, origin.exif, size, has_alpha=array.shape[2] in (2, 4))
+            return metadata.with_webp_exif(data, file_info.exif, size, has_alpha=array.shape[2] in (2, 4))
         case "avif":
-            return metadata.with_avif_exif(data, origin.exif)
-    return metadata.with_tiff_exif(data, origin.exif)
+            return metadata.with_avif_exif(data, file_info.exif)
+    return metadata.with_tiff_exif(data, file_info.exif)
 
 
-def _encode_heic(array: Stored, origin: FileInfo) -> bytes:
+def _encode_heic(array: Stored, file_info: FileInfo) -> bytes:
     try:
         import pillow_heif  # noqa: PLC0415  (an extra, for the patents on HEVC)
     except ImportError as error:
@@ -129,9 +134,13 @@ def _encode_heic(array: Stored, origin: FileInfo) -> bytes:
             "HEIC needs the pillow-heif package", "it is not installed", "run: pip install 'brewster[heic]'"
         ) from error
     height, width, bands = array.shape
-    mode = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}[bands] + (";16" if origin.bits > 8 else "")
+    mode = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}[bands] + (";16" if file_info.bits > 8 else "")
     heif = pillow_heif.from_bytes(mode, (width, height), np.ascontiguousarray(array).tobytes())
-    said = {"icc_profile": origin.icc, "exif": origin.exif and b"Exif\0\0" + origin.exif, "xmp": origin.xmp}
+    said = {
+        "icc_profile": file_info.icc,
+        "exif": file_info.exif and b"Exif\0\0" + file_info.exif,
+        "xmp": file_info.xmp,
+    }
     file = io.BytesIO()
     heif.save(file, quality=_FINE_AVIF, chroma=444, **{key: value for key, value in said.items() if value})
     return file.getvalue()

@@ -65,8 +65,8 @@ def container_of(path: Path) -> str:
     return container
 
 
-def depth_for(origin: FileInfo, container: str, asked: int | None) -> int:
-    """Bits per channel to write: those asked for, else those of the origin or the nearest below.
+def depth_for(file_info: FileInfo, container: str, asked: int | None) -> int:
+    """Bits per channel to write: those asked for, else those of the file_info or the nearest below.
 
     Raises UnsupportedPhoto for a container or a depth that cannot be written.
     """
@@ -76,5 +76,5 @@ def depth_for(origin: FileInfo, container: str, asked: int | None) -> int:
             f"brewster writes {', '.join(f'{name} {depths}' for name, depths in DEPTHS.items())}",
             "choose one of these",
         )
-    fitting = [bits for bits in DEPTHS[container] if bits <= origin.bits]
+    fitting = [bits for bits in DEPTHS[container] if bits <= file_info.bits]
     return asked or max(fitting, default=DEPTHS[container][0])

@@ -27,7 +27,7 @@ class HdrPixels:
 
     pixels: Float32
     alpha: Float32 | None
-    origin: FileInfo
+    file_info: FileInfo
 
 
 def too_large(width: int, height: int, most: int) -> PhotoTooLarge:
@@ -111,16 +111,20 @@ def _exr_floats(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> Hd
 
 
 def write_exr(floats: HdrPixels) -> bytes:
-    """An EXR of halfs or floats, as the origin's bits say, with the attributes it came with."""
+    """An EXR of halfs or floats, as the file_info's bits say, with the attributes it came with."""
     exr = _openexr()
     names = "RGB" if floats.pixels.shape[2] == 3 else "Y"
     planes = {name: floats.pixels[..., i] for i, name in enumerate(names)}
     if floats.alpha is not None:
         planes["A"] = floats.alpha
-    kind: type[np.floating[Any]] = np.float16 if floats.origin.bits == 16 else np.float32
+    kind: type[np.floating[Any]] = np.float16 if floats.file_info.bits == 16 else np.float32
     most = float(np.finfo(kind).max)
     channels = {name: plane.clip(-most, most).astype(kind) for name, plane in planes.items()}
-    header = {"compression": exr.ZIP_COMPRESSION, **(floats.origin.header or {}), "type": exr.scanlineimage}
+    header = {
+        "compression": exr.ZIP_COMPRESSION,
+        **(floats.file_info.header or {}),
+        "type": exr.scanlineimage,
+    }
     file = io.BytesIO()
     exr.File(header, channels).write(file)
     return file.getvalue()
@@ -266,7 +270,7 @@ def _to_rgbe(pixels: Float32) -> NDArray[np.uint8]:
 def write_hdr(floats: HdrPixels) -> bytes:
     """A Radiance picture with flat lines, which every reader takes; grey becomes three equal channels."""
     height, width = floats.pixels.shape[:2]
-    kept = [f"{key}={value}" for key, value in (floats.origin.header or {}).items()]
+    kept = [f"{key}={value}" for key, value in (floats.file_info.header or {}).items()]
     lines = ["#?RADIANCE", "FORMAT=32-bit_rle_rgbe", *kept]
     head = "\n".join(lines) + f"\n\n-Y {height} +X {width}\n"
     pixels = np.broadcast_to(floats.pixels, (height, width, 3))

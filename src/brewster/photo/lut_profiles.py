@@ -34,8 +34,8 @@ def has_only_tables(icc: bytes | None) -> bool:
     return bool(tags & _TABLES) and not tags >= _MATRIX
 
 
-def in_display_p3(pixels: NDArray[Any], origin: FileInfo) -> tuple[NDArray[Any], FileInfo]:
-    """Pixels (H, W, 3) of 8 or 16 bits, converted from a profile of tables (relative colorimetric), and their new origin.
+def in_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[NDArray[Any], FileInfo]:
+    """Pixels (H, W, 3) of 8 or 16 bits, converted from a profile of tables (relative colorimetric), and their new file_info.
 
     Raises:
         UnsupportedPhoto: the tables are damaged, or the pixels are grey or floats.
@@ -47,7 +47,7 @@ def in_display_p3(pixels: NDArray[Any], origin: FileInfo) -> tuple[NDArray[Any],
             "tables are read for RGB of 8 or 16 bits",
             "convert the picture to sRGB or Display P3 first",
         )
-    icc = origin.icc or b""
+    icc = file_info.icc or b""
     try:
         is_ignored = np.array_equal(
             _converted(_PROBE, icc), _converted(_PROBE, pyvips.Image.profile_load("srgb"))
@@ -57,7 +57,7 @@ def in_display_p3(pixels: NDArray[Any], origin: FileInfo) -> tuple[NDArray[Any],
         raise _damaged(icc, str(error).strip()) from error
     if is_ignored:
         raise _damaged(icc, "libvips takes sRGB instead")
-    return array, replace(origin, icc=bytes(pyvips.Image.profile_load("p3")))
+    return array, replace(file_info, icc=bytes(pyvips.Image.profile_load("p3")))
 
 
 _LEVELS = np.arange(0, 256, 51).astype(np.uint8)

@@ -37,12 +37,12 @@ class Photo:
     """A photograph: pixels as stored, alpha apart, and their file. Upright, immutable, thread-safe.
 
     `pixels` is (H, W, 1|3) and `alpha` (H, W) or None; both are uint8, uint16 or float32. Whole numbers are
-    encoded by the origin's profile (sRGB if it has none); floats without a profile are linear Rec.709 light.
+    encoded by the file_info's profile (sRGB if it has none); floats without a profile are linear Rec.709 light.
     """
 
     pixels: Stored = field(repr=False)
     alpha: Stored | None = field(default=None, repr=False)
-    origin: FileInfo = field(default_factory=FileInfo, repr=False)
+    file_info: FileInfo = field(default_factory=FileInfo, repr=False)
 
     def __post_init__(self) -> None:
         """Fix the arrays, so that photos can share them."""
@@ -82,10 +82,10 @@ class Photo:
 
     @classmethod
     def _of(cls, decoded: Decoded) -> Photo:
-        pixels, origin = decoded.pixels, decoded.origin
-        if has_only_tables(origin.icc):
-            pixels, origin = in_display_p3(pixels, origin)
-        photo = cls(pixels, decoded.alpha, origin)
+        pixels, file_info = decoded.pixels, decoded.file_info
+        if has_only_tables(file_info.icc):
+            pixels, file_info = in_display_p3(pixels, file_info)
+        photo = cls(pixels, decoded.alpha, file_info)
         photo.space()  # a profile we cannot use is an error now, not in the middle of the work
         return photo
 
@@ -144,13 +144,13 @@ class Photo:
         exif, icc = image.info.get("exif"), image.info.get("icc_profile")
         container = (image.format or "png").lower()
         array = np.asarray(image).reshape(image.height, image.width, -1)
-        origin = FileInfo(
+        file_info = FileInfo(
             container=container if container in DEPTHS else "png",
             bits=16 if image.mode == "I;16" else 8,
             icc=icc or None,
             exif=metadata.upright_exif(exif) if exif else None,
         )
-        return cls._of(split(upright(array, metadata.orientation_of(exif or b"")), origin))
+        return cls._of(split(upright(array, metadata.orientation_of(exif or b"")), file_info))
 
     @property
     def size(self) -> tuple[int, int]:
@@ -159,7 +159,7 @@ class Photo:
 
     def space(self) -> ColourSpace:
         """What light the stored numbers mean."""
-        return space_of(self.origin.icc, self.origin.primaries, self.pixels.dtype.kind == "f")
+        return space_of(self.file_info.icc, self.file_info.primaries, self.pixels.dtype.kind == "f")
 
     def linear(self) -> Float32:
         """Linear Rec.709 light, (H, W, 3) float32; below 0 and above 1 where the gamut or range is wider."""
@@ -232,15 +232,15 @@ class Photo:
         return out
 
     def encode(self, container: str | None = None, *, depth: int | None = None) -> bytes:
-        """The bytes of a file: the origin's container and depth unless others are asked for (see `DEPTHS`).
+        """The bytes of a file: the file_info's container and depth unless others are asked for (see `DEPTHS`).
 
         JPEG keeps the source's quality and chroma. Raises UnsupportedPhoto for what the container cannot
         hold.
         """
-        container = container or self.origin.container
-        bits = depth_for(self.origin, container, depth)
+        container = container or self.file_info.container
+        bits = depth_for(self.file_info, container, depth)
         stored = self._stored_as(container, bits)
-        return encode(stored.pixels, stored.alpha, replace(stored.origin, container=container, bits=bits))
+        return encode(stored.pixels, stored.alpha, replace(stored.file_info, container=container, bits=bits))
 
     def save(
         self, path: str | os.PathLike[str], *, depth: int | None = None, overwrite: bool = False
@@ -255,19 +255,19 @@ class Photo:
 
     def _stored_as(self, container: str, bits: int) -> Photo:
         """The pixels in the type that a container and its depth need, meaning the same light."""
-        was_linear, is_linear = self.origin.container in LINEAR, container in LINEAR
+        was_linear, is_linear = self.file_info.container in LINEAR, container in LINEAR
         kind = np.dtype(np.float32 if is_linear or bits == 32 else np.uint8 if bits == 8 else np.uint16)
-        moves = container != self.origin.container and (was_linear or is_linear)
+        moves = container != self.file_info.container and (was_linear or is_linear)
         if kind == self.pixels.dtype and not moves:
             return self
         alpha = None if self.alpha is None else _rescaled(self.alpha, kind)
-        has_profile = self.origin.icc is not None and not is_linear
+        has_profile = self.file_info.icc is not None and not is_linear
         if has_profile or (kind.kind == "u" and self.pixels.dtype.kind == "u"):
-            return Photo(_rescaled(self.pixels, kind), alpha, self.origin)
+            return Photo(_rescaled(self.pixels, kind), alpha, self.file_info)
         pixels, space = np.empty(self.pixels.shape, kind), space_of(None, None, kind.kind == "f")
         for rows in self.strips():
             pixels[rows] = space.to_stored(self.linear_rows(rows.start, rows.stop), pixels[rows])
-        return Photo(pixels, alpha, replace(self.origin, icc=None, primaries=None, header=None))
+        return Photo(pixels, alpha, replace(self.file_info, icc=None, primaries=None, header=None))
 
 
 _LEVELS = {"uint8": 255, "uint16": 65535, "float16": 1, "float32": 1, "float64": 1}

@@ -1,4 +1,4 @@
-"""The pane renderer: every camera ray is split into its transmitted and reflected orders, with exact weights.
+"""The analytic renderer: every camera ray is split into its transmitted and reflected orders, with exact weights.
 
     sample = render(scene, Assets([Path("hdri")]), device="cuda")
 
@@ -79,8 +79,8 @@ def render(scene: Scene, assets: Assets, device: Device = "cpu") -> LightSample:
     if not scene.glass.is_flat:
         raise RecipeError(
             "the glass is framed or curved",
-            "the pane renderer takes flat glass that fills the view",
-            "use --renderer tracer",
+            "the analytic renderer takes flat glass that fills the view",
+            "use --renderer mitsuba",
         )
     room = _furnish(scene, assets, device)
     with torch.no_grad():

@@ -108,7 +108,7 @@ def jpeg(encoded: Tensor, quality: int) -> bytes:
     Raises:
         UnsupportedPhoto: more than 65535 pixels a side.
     """
-    return Photo(to_bytes(encoded), origin=FileInfo(container="jpeg", jpeg_quality=quality)).encode()
+    return Photo(to_bytes(encoded), file_info=FileInfo(container="jpeg", jpeg_quality=quality)).encode()
 
 
 def with_jpeg(developed: DevelopedSample) -> DevelopedSample:

@@ -61,7 +61,7 @@ class Glazing(FrozenModel):
 
     @property
     def is_flat(self) -> bool:
-        """Whether the pane renderer can render it: flat, and filling the view."""
+        """Whether the analytic renderer can render it: flat, and filling the view."""
         return self.radii_mm is None and self.frame_mm is None
 
     @property

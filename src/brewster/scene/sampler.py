@@ -47,11 +47,11 @@ def draw(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) -> Scene:
     Raises:
         RecipeError: the recipe asks for maps or pictures that the catalog lacks, or for the impossible.
     """
-    dice = _NamedRng(f"{recipe.name}/{seed}/{index}")
+    rng = _NamedRng(f"{recipe.name}/{seed}/{index}")
     reason = ""
     for _ in range(_TRIES):
         try:
-            return _try(recipe, catalog, dice, seed, index)
+            return _try(recipe, catalog, rng, seed, index)
         except ValidationError as error:
             reason = error.errors()[0]["msg"].removeprefix("Value error, ")
     raise RecipeError(
@@ -81,18 +81,18 @@ class _NamedRng(Random):
 class _PartialScene:
     """What is settled when the sides are drawn."""
 
-    dice: _NamedRng
+    rng: _NamedRng
     catalog: Catalog
     glass: Glazing
     camera: Camera
 
 
-def _try(recipe: SceneRecipe, catalog: Catalog, dice: _NamedRng, seed: int, index: int) -> Scene:
-    glass = _glass(recipe.glass, dice)
-    behind_map = _choose_map(recipe.behind, recipe.camera, catalog, dice)
-    front_map = _choose_map(recipe.front, recipe.camera, catalog, dice)
-    camera = _camera(recipe, [(recipe.behind, behind_map), (recipe.front, front_map)], dice)
-    draft = _PartialScene(dice, catalog, glass, camera)
+def _try(recipe: SceneRecipe, catalog: Catalog, rng: _NamedRng, seed: int, index: int) -> Scene:
+    glass = _glass(recipe.glass, rng)
+    behind_map = _choose_map(recipe.behind, recipe.camera, catalog, rng)
+    front_map = _choose_map(recipe.front, recipe.camera, catalog, rng)
+    camera = _camera(recipe, [(recipe.behind, behind_map), (recipe.front, front_map)], rng)
+    draft = _PartialScene(rng, catalog, glass, camera)
     behind = _side(recipe.behind, behind_map, draft, glass.depth_mm)
     front = _side(recipe.front, front_map, draft, _camera_in_glass(camera, glass)[2])
     return Scene(
@@ -106,40 +106,40 @@ def _try(recipe: SceneRecipe, catalog: Catalog, dice: _NamedRng, seed: int, inde
         camera=_focused(recipe.camera, draft, behind, front),
         behind=behind,
         front=front,
-        development=_development(recipe.development, dice),
+        development=_development(recipe.development, rng),
     )
 
 
-def _glass(recipe: GlassRecipe, dice: _NamedRng) -> Glazing:
-    count = 2 if dice.chance(recipe.double_probability) else 1
-    structural = dice.chance(recipe.structural_probability)
-    tint, strength = dice.choice(recipe.tints), dice.within_log(recipe.tint_strength_log)
-    rough = dice.within_log(recipe.roughness_log) if dice.chance(recipe.rough_probability) else 0.0
-    wedged = dice.chance(recipe.wedge_probability)
+def _glass(recipe: GlassRecipe, rng: _NamedRng) -> Glazing:
+    count = 2 if rng.chance(recipe.double_probability) else 1
+    structural = rng.chance(recipe.structural_probability)
+    tint, strength = rng.choice(recipe.tints), rng.within_log(recipe.tint_strength_log)
+    rough = rng.within_log(recipe.roughness_log) if rng.chance(recipe.rough_probability) else 0.0
+    wedged = rng.chance(recipe.wedge_probability)
     red, green, blue = (_six(colour * strength) for colour in tint)
-    index = dice.within(recipe.index)
+    index = rng.within(recipe.index)
 
     def pane() -> Pane:
         return Pane(
-            thickness_mm=dice.within_log(recipe.structural_mm if structural else recipe.thickness_mm),
+            thickness_mm=rng.within_log(recipe.structural_mm if structural else recipe.thickness_mm),
             index=index,
             absorption_per_m=(red, green, blue),
             roughness=rough,
-            wedge_deg=dice.within_log(recipe.wedge_deg_log) * dice.choice((-1, 1)) if wedged else 0.0,
+            wedge_deg=rng.within_log(recipe.wedge_deg_log) * rng.choice((-1, 1)) if wedged else 0.0,
         )
 
     return Glazing(
         panes=tuple(pane() for _ in range(count)),
-        gap_mm=dice.within(recipe.gap_mm) if count > 1 else 0.0,
-        pitch_deg=dice.within(recipe.pitch_deg),
+        gap_mm=rng.within(recipe.gap_mm) if count > 1 else 0.0,
+        pitch_deg=rng.within(recipe.pitch_deg),
     )
 
 
-def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, dice: _NamedRng) -> Asset | None:
+def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng: _NamedRng) -> Asset | None:
     """A map that is sharp enough for the widest view that the recipe allows; None for a side of pictures."""
     wanted = [asset for asset in catalog.maps if not recipe.maps or asset.category in ("", *recipe.maps)]
     sharp = [asset for asset in wanted if _least_fov(asset, recipe, camera) <= camera.fov_deg[1]]
-    if not dice.chance(recipe.map_probability) or (not sharp and recipe.picture_probability > 0):
+    if not rng.chance(recipe.map_probability) or (not sharp and recipe.picture_probability > 0):
         return None
     if not sharp:
         raise RecipeError(
@@ -148,7 +148,7 @@ def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, dice
             f" at {camera.fov_deg[1]:g} degrees",
             "give other --maps, larger ones, or a smaller --size",
         )
-    return dice.choice(sharp)
+    return rng.choice(sharp)
 
 
 def _least_fov(asset: Asset, recipe: SideRecipe, camera: CameraRecipe) -> float:
@@ -156,19 +156,19 @@ def _least_fov(asset: Asset, recipe: SideRecipe, camera: CameraRecipe) -> float:
     return camera.width * 360 / asset.width / recipe.most_px_per_texel
 
 
-def _camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]], dice: _NamedRng) -> Camera:
+def _camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]], rng: _NamedRng) -> Camera:
     """A camera whose axis meets the glass near its middle; where it focuses is settled later."""
     wanted = recipe.camera
     least = max([wanted.fov_deg[0], *(_least_fov(asset, side, wanted) for side, asset in maps if asset)])
-    heading, pitch = dice.within(wanted.incidence_deg), dice.within(wanted.pitch_deg)
+    heading, pitch = rng.within(wanted.incidence_deg), rng.within(wanted.pitch_deg)
     _, _, back = axes(heading, pitch)
-    away = dice.within_log(wanted.distance_mm_log) / max(back[2], 0.1)
+    away = rng.within_log(wanted.distance_mm_log) / max(back[2], 0.1)
     x, y, z = (_six(away * part) for part in back)
     return Camera(
         position_mm=(x, y, z),
         heading_deg=heading,
         pitch_deg=pitch,
-        fov_deg=dice.within((least, wanted.fov_deg[1])),
+        fov_deg=rng.within((least, wanted.fov_deg[1])),
         width=wanted.width,
         height=wanted.height,
     )
@@ -176,19 +176,19 @@ def _camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]], di
 
 def _side(recipe: SideRecipe, asset: Asset | None, draft: _PartialScene, nearest_mm: float) -> Side:
     """A map, a picture, or both; the picture stands further from the glass than `nearest_mm`."""
-    dice = draft.dice
-    luminance = dice.within_log(recipe.luminance_log)
+    rng = draft.rng
+    luminance = rng.within_log(recipe.luminance_log)
     world = plane = None
     if asset:
-        is_dome = dice.chance(recipe.dome_probability)
+        is_dome = rng.chance(recipe.dome_probability)
         world = EnvironmentMap(
             source=asset.source,
-            heading_deg=dice.within((0, 360)),
+            heading_deg=rng.within((0, 360)),
             luminance=luminance,
-            radius_mm=dice.within_log(recipe.radius_mm_log) if is_dome else math.inf,
+            radius_mm=rng.within_log(recipe.radius_mm_log) if is_dome else math.inf,
         )
-    if dice.chance(recipe.picture_probability) or not asset:
-        plane = _plane(recipe, draft, luminance, nearest_mm + dice.within_log(recipe.distance_mm_log))
+    if rng.chance(recipe.picture_probability) or not asset:
+        plane = _plane(recipe, draft, luminance, nearest_mm + rng.within_log(recipe.distance_mm_log))
     return Side(map=world, plane=plane)
 
 
@@ -198,18 +198,18 @@ def _plane(recipe: SideRecipe, draft: _PartialScene, luminance: float, distance_
         raise RecipeError(
             "there are no pictures to draw from", "the recipe asks for them", "name a folder with --photos"
         )
-    dice, asset = draft.dice, draft.dice.choice(draft.catalog.pictures)
+    rng, asset = draft.rng, draft.rng.choice(draft.catalog.pictures)
     (left, right), (bottom, top) = _reach(draft.camera, draft.glass, distance_mm)
     cover = max(right - left, (top - bottom) * asset.width / asset.height)
     return Plane(
         source=asset.source,
         distance_mm=_six(distance_mm),
         offset_mm=(_six((left + right) / 2), _six((bottom + top) / 2)),
-        width_mm=_six(cover * dice.within(recipe.fill)),
-        heading_deg=dice.within(recipe.turn_deg),
-        pitch_deg=dice.within(recipe.turn_deg) / 2,
+        width_mm=_six(cover * rng.within(recipe.fill)),
+        heading_deg=rng.within(recipe.turn_deg),
+        pitch_deg=rng.within(recipe.turn_deg) / 2,
         luminance=luminance,
-        highlights=dice.within(recipe.highlights),
+        highlights=rng.within(recipe.highlights),
     )
 
 
@@ -239,9 +239,9 @@ def _reach(
 
 def _focused(recipe: CameraRecipe, draft: _PartialScene, behind: Side, front: Side) -> Camera:
     """The camera with its lens set on something of the scene."""
-    dice, camera = draft.dice, draft.camera
-    on = front if dice.chance(recipe.focus_on_front_probability) else behind
-    is_pinhole, aperture = dice.chance(recipe.pinhole_probability), dice.within_log(recipe.aperture_mm_log)
+    rng, camera = draft.rng, draft.camera
+    on = front if rng.chance(recipe.focus_on_front_probability) else behind
+    is_pinhole, aperture = rng.chance(recipe.pinhole_probability), rng.within_log(recipe.aperture_mm_log)
     away = _camera_in_glass(camera, draft.glass)[2] + on.distance_mm
     slant = _in_glass(axes(camera.heading_deg, camera.pitch_deg)[2], draft.glass)[2]
     return camera.model_copy(
@@ -252,13 +252,13 @@ def _focused(recipe: CameraRecipe, draft: _PartialScene, behind: Side, front: Si
     )
 
 
-def _development(recipe: DevelopmentRecipe, dice: _NamedRng) -> Development:
+def _development(recipe: DevelopmentRecipe, rng: _NamedRng) -> Development:
     return Development(
-        exposure=dice.within_log(recipe.exposure),
-        white_balance=dice.choice(recipe.white_balance),
-        white_balance_strength=dice.within(recipe.white_balance_strength),
-        contrast=dice.within(recipe.contrast),
-        shot_noise=dice.within(recipe.shot_noise),
-        read_noise=dice.within(recipe.read_noise),
-        jpeg_quality=dice.randint(*recipe.jpeg_quality),
+        exposure=rng.within_log(recipe.exposure),
+        white_balance=rng.choice(recipe.white_balance),
+        white_balance_strength=rng.within(recipe.white_balance_strength),
+        contrast=rng.within(recipe.contrast),
+        shot_noise=rng.within(recipe.shot_noise),
+        read_noise=rng.within(recipe.read_noise),
+        jpeg_quality=rng.randint(*recipe.jpeg_quality),
     )

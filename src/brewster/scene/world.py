@@ -37,7 +37,7 @@ class Plane(FrozenModel):
     """A picture on an upright plane, seen from the glass; its height follows from the picture's own shape.
 
     In front of the glass it is seen in the mirror alone: between glass and camera it belongs beside the view, since
-    the pane renderer does not show it directly.
+    the analytic renderer does not show it directly.
     """
 
     source: AssetSource

@@ -1,6 +1,6 @@
-"""The training loop, the only one: `run(learner, out, report)` runs or resumes, bit for bit, whatever learns.
+"""The training loop, the only one: `run(trainer, out, report)` runs or resumes, bit for bit, whatever learns.
 
-Every step depends on the learner's state and on (seed, step) alone: no hidden state, so on the CPU a killed run that
+Every step depends on the trainer's state and on (seed, step) alone: no hidden state, so on the CPU a killed run that
 resumes ends with the same weights, to the last bit, as one that never stopped (same machine, same number of threads).
 """
 
@@ -42,19 +42,19 @@ class Trainer(Protocol):
         """What it learns, and for how long."""
         ...
 
-    def begin(self) -> None:
+    def initialize(self) -> None:
         """Takes up what the recipe starts from; called where there is no run to go on with."""
         ...
 
-    def advance(self, step: int) -> dict[str, float]:
+    def training_step(self, step: int) -> dict[str, float]:
         """Learns from this step's batch; its loss, and the parts of it, by name."""
         ...
 
-    def state(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         """All that the next step depends on: tensors, numbers and words by name."""
         ...
 
-    def restore(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Goes on from what `state` gave."""
         ...
 
@@ -67,12 +67,12 @@ class Trainer(Protocol):
         ...
 
 
-def run(learner: Trainer, out: Path, report: Report) -> None:
+def run(trainer: Trainer, out: Path, report: Report) -> None:
     """Trains to the end of the recipe in folder `out`, from its checkpoint if there is one.
 
     Where several processes learn together, the first alone writes.
 
-    A recipe whose data are none (a count of 0) takes no step: the learner stays as it starts.
+    A recipe whose data are none (a count of 0) takes no step: the trainer stays as it starts.
 
     `out` receives `checkpoint.pt` and, at every report, a line in `log.jsonl`, `samples.png`, and both in a file for
     TensorBoard, where that is installed.
@@ -83,23 +83,23 @@ def run(learner: Trainer, out: Path, report: Report) -> None:
         TargetError: `out` cannot be written to.
     """
     out.mkdir(parents=True, exist_ok=True)
-    recipe = learner.recipe
-    begun = _take_up(learner, out / CHECKPOINT)
+    recipe = trainer.recipe
+    begun = _take_up(trainer, out / CHECKPOINT)
     if is_main_process():
         _forget_after(begun, out / LOG)
     started, steps = time.monotonic(), 0 if recipe.data.is_none else recipe.steps
     with closing(TensorBoardLog(out, begun)) as board:
         for step in range(begun + 1, 1 + steps):
-            numbers, last = learner.advance(step - 1), step == recipe.steps
+            numbers, last = trainer.training_step(step - 1), step == recipe.steps
             logged = is_main_process() and (last or step % recipe.report_every == 0)
             if logged:
-                scores, picture = learner.validate()
+                scores, picture = trainer.validate()
                 numbers |= scores | {"seconds": time.monotonic() - started}
                 _log(out / LOG, {"step": step, **numbers})
                 _write_picture(out / SAMPLES, picture)
-                board.tell(step, numbers, picture)
+                board.log(step, numbers, picture)
             if is_main_process() and (last or step % recipe.checkpoint_every == 0):
-                Checkpoint(step, recipe.model_dump_json(), learner.state()).write(out / CHECKPOINT)
+                Checkpoint(step, recipe.model_dump_json(), trainer.state_dict()).write(out / CHECKPOINT)
             report(step, recipe.steps, numbers, logged)
 
 
@@ -110,14 +110,14 @@ def last_numbers(folder: Path) -> dict[str, float]:
     return dict(json.loads(lines[-1])) if lines else {}
 
 
-def _take_up(learner: Trainer, saved: Path) -> int:
+def _take_up(trainer: Trainer, saved: Path) -> int:
     """Goes on with the run if it has begun, else begins it where its recipe says; how many steps are taken."""
     if not saved.exists():
-        learner.begin()
+        trainer.initialize()
         return 0
-    checkpoint = _of_this_recipe(Checkpoint.read(saved), learner.recipe, saved)
+    checkpoint = _of_this_recipe(Checkpoint.read(saved), trainer.recipe, saved)
     with fitting(saved, AFRESH):
-        learner.restore(checkpoint.state)
+        trainer.load_state_dict(checkpoint.state)
     return checkpoint.step
 
 

@@ -24,7 +24,7 @@ class TensorBoardLog:
     def __init__(self, folder: Path, begun: int) -> None:
         self._folder, self._begun = folder, begun
 
-    def tell(self, step: int, numbers: Mapping[str, float], encoded: Float[Tensor, "h w 3"]) -> None:
+    def log(self, step: int, numbers: Mapping[str, float], encoded: Float[Tensor, "h w 3"]) -> None:
         """Writes each number as a scalar, and the picture, sRGB-encoded in 0..1."""
         if self._writer:
             for name, value in numbers.items():

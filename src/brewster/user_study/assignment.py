@@ -44,10 +44,10 @@ def draw(description: StudyDescription, number: int) -> tuple[TrialDraw, ...]:
     count, pairs = len(description.comparisons), description.pairs
     row = walk(count, pairs, description.seed)
     own = list(itertools.islice(row, number * pairs, (number + 1) * pairs))
-    dice = Random(f"{description.seed}/participant/{number}")  # noqa: S311  (no secret: a published seed)
+    rng = Random(f"{description.seed}/participant/{number}")  # noqa: S311  (no secret: a published seed)
     trials = [_compared(description, comparison, flipped) for comparison, flipped in own]
-    trials += _catches(description, {comparison for comparison, _ in own}, dice)
-    dice.shuffle(trials)
+    trials += _catches(description, {comparison for comparison, _ in own}, rng)
+    rng.shuffle(trials)
     return tuple(trials)
 
 
@@ -60,10 +60,10 @@ def walk(count: int, pairs: int, seed: int) -> Iterator[tuple[int, bool]]:
     flips: dict[int, bool] = {}
     order: list[int] = []
     for turn in itertools.count():
-        dice = Random(f"{seed}/round/{turn}")  # noqa: S311
+        rng = Random(f"{seed}/round/{turn}")  # noqa: S311
         begun = turn * count % pairs  # of these pairs, the last round has given so many to somebody
         seen, missing = set(order[len(order) - begun :]), -begun % pairs
-        order = _spared(dice.sample(range(count), count), seen, missing)
+        order = _spared(rng.sample(range(count), count), seen, missing)
         if turn % 2:  # the sides are those of the round before, swapped; left and right by turns
             halves = [
                 _spared([c for c in order if flips[c] is flip], seen, missing // 2) for flip in (False, True)
@@ -71,7 +71,7 @@ def walk(count: int, pairs: int, seed: int) -> Iterator[tuple[int, bool]]:
             order = _spared(_by_turns(*halves), seen, missing)
             flips = {comparison: not flip for comparison, flip in flips.items()}
         else:
-            start = dice.random() < 0.5
+            start = rng.random() < 0.5
             flips = {comparison: start ^ bool(i % 2) for i, comparison in enumerate(order)}
         yield from ((comparison, flips[comparison]) for comparison in order)
 
@@ -94,17 +94,17 @@ def _compared(description: StudyDescription, number: int, flipped: bool) -> Tria
     return TrialDraw(comparison.photo, left, right, number, flipped)
 
 
-def _catches(description: StudyDescription, own: Collection[int], dice: Random) -> list[TrialDraw]:
+def _catches(description: StudyDescription, own: Collection[int], rng: Random) -> list[TrialDraw]:
     """As many as the study asks for, one half of each kind, on photos that are not the participant's own if possible."""
     photos = {description.comparisons[number].photo for number in own}
-    pool = dice.sample(description.catch_pool, len(description.catch_pool))
+    pool = rng.sample(description.catch_pool, len(description.catch_pool))
     pool.sort(key=lambda catch: catch.photo in photos)
-    return [_catch(catch, i, dice) for i, catch in enumerate(pool[: description.catches])]
+    return [_catch(catch, i, rng) for i, catch in enumerate(pool[: description.catches])]
 
 
-def _catch(catch: CatchTrial, i: int, dice: Random) -> TrialDraw:
+def _catch(catch: CatchTrial, i: int, rng: Random) -> TrialDraw:
     if i % 2 == 0:
         return TrialDraw(catch.photo, catch.good, catch.good, expected="similar")
-    if dice.random() < 0.5:
+    if rng.random() < 0.5:
         return TrialDraw(catch.photo, catch.good, catch.spoilt, expected="left")
     return TrialDraw(catch.photo, catch.spoilt, catch.good, expected="right")

@@ -74,11 +74,11 @@ def create(
     inputs: Path,
     methods: Mapping[str, Path],
     choices: StudyOptions = StudyOptions(),
-    tell: Callable[[int], None] = lambda _done: None,
+    on_progress: Callable[[int], None] = lambda _done: None,
 ) -> Study:
     """Makes a study of all pictures in the folder of inputs; the first method is compared with each other one.
 
-    `tell` is called with how many pictures are copied, after each.
+    `on_progress` is called with how many pictures are copied, after each.
 
     Raises:
         BrewsterError: fewer than two methods; names, sizes or files do not fit; more pairs than there are.
@@ -92,7 +92,7 @@ def create(
     shown = _fitting(choices.pairs, PAIRS, len(pairs) * len(found.inputs), "pairs")
     catches = _fitting(choices.catches, CATCHES, min(CATCH_POOL, len(found.inputs)), "catch trials")
     with arriving(out) as part:
-        copier = _Copier(part / PICTURES, Random(f"{seed}/names"), tell)  # noqa: S311  (a published seed)
+        copier = _Copier(part / PICTURES, Random(f"{seed}/names"), on_progress)  # noqa: S311  (a published seed)
         comparisons = tuple(_comparisons(found, pairs, copier))
         pool = tuple(_catch_pool(found, copier, Random(f"{seed}/catches")))  # noqa: S311
         description = StudyDescription(
@@ -184,11 +184,11 @@ def _refuse_taken(out: Path) -> None:
 @final
 @dataclass(frozen=True)
 class _Copier:
-    """Copies pictures, each once, under names drawn by the dice."""
+    """Copies pictures, each once, under names drawn by the rng."""
 
     folder: Path
-    dice: Random
-    tell: Callable[[int], None]
+    rng: Random
+    on_progress: Callable[[int], None]
     pictures: dict[Path, StudyPicture] = field(default_factory=dict)
 
     def copy(self, path: Path) -> str:
@@ -196,7 +196,7 @@ class _Copier:
         if path not in self.pictures:
             data = path.read_bytes()
             self.pictures[path] = self.write(Photo.open(data), hashlib.sha256(data).hexdigest())
-            self.tell(len(self.pictures))
+            self.on_progress(len(self.pictures))
         return self.pictures[path].name
 
     def copy_spoilt(self, path: Path) -> str:
@@ -204,14 +204,14 @@ class _Copier:
         place = path / "spoilt"  # no file, but a name of its own
         data = path.read_bytes()
         spoilt = Photo.from_array(
-            spoil(Photo.open(data).srgb_8bit(), self.dice.getrandbits(32)), encoding="srgb"
+            spoil(Photo.open(data).srgb_8bit(), self.rng.getrandbits(32)), encoding="srgb"
         )
         self.pictures[place] = self.write(spoilt, hashlib.sha256(data).hexdigest())
         return self.pictures[place].name
 
     def write(self, photo: Photo, source: str) -> StudyPicture:
         """Writes a picture without anything that tells where it comes from."""
-        name = f"{self.dice.getrandbits(64):016x}.png"
+        name = f"{self.rng.getrandbits(64):016x}.png"
         data = Photo.from_array(photo.srgb_8bit(), encoding="srgb").encode("png")
         write_atomically(self.folder / name, data)
         return StudyPicture(name, *photo.size, hashlib.sha256(data).hexdigest(), source)
@@ -226,10 +226,10 @@ def _comparisons(
             yield PairedComparison(*key, (first, second), copier.copy(photo), outputs)
 
 
-def _catch_pool(found: _StudyFiles, copier: _Copier, dice: Random) -> Iterator[CatchTrial]:
+def _catch_pool(found: _StudyFiles, copier: _Copier, rng: Random) -> Iterator[CatchTrial]:
     """Photos for catch trials, at most CATCH_POOL, each with an output of some method and that output spoilt."""
-    for key in dice.sample(list(found.inputs), min(CATCH_POOL, len(found.inputs))):
-        output = found.outputs[dice.choice(list(found.outputs))][key]
+    for key in rng.sample(list(found.inputs), min(CATCH_POOL, len(found.inputs))):
+        output = found.outputs[rng.choice(list(found.outputs))][key]
         yield CatchTrial(
             *key, copier.copy(found.inputs[key]), copier.copy(output), copier.copy_spoilt(output)
         )

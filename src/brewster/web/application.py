@@ -103,16 +103,16 @@ def serve(
     *,
     host: str,
     port: int,
-    tell: Callable[[str], None] = print,
+    on_ready: Callable[[str], None] = print,
 ) -> None:
-    """Serves until it is interrupted; `tell` is told the URL when browsers may come. For a main thread only.
+    """Serves until it is interrupted; `on_ready` is told the URL when browsers may come. For a main thread only.
 
     Raises:
         KeyboardInterrupt: the usual end, by Ctrl-C or SIGTERM.
         TargetError: the address cannot be had.
     """
     with _terminated_as_interrupted(), listen(host, port) as listening:
-        tell(address(listening))
+        on_ready(address(listening))
         server(app).run(sockets=[listening])
 
 

@@ -4,7 +4,7 @@
     with desk.place("a name") as job:
         answer = await desk.do(job, work, request.receive)
 
-`work(tell)` runs in a thread. It calls `tell(share done)` as often as it can: that is where it is stopped when the
+`work(on_progress)` runs in a thread. It calls `on_progress(share done)` as often as it can: that is where it is stopped when the
 client goes away or time is over.
 """
 
@@ -54,7 +54,7 @@ class SeparationJob:
     future: Future[Any] | None = None
     stopped: Event = field(default_factory=Event)
 
-    def tell(self, share: float) -> None:
+    def on_progress(self, share: float) -> None:
         """What the work calls."""
         if self.stopped.is_set():
             raise JobCancelled
@@ -62,9 +62,9 @@ class SeparationJob:
 
     def run(self, work: Callable[[ProgressCallback], Answer]) -> Answer:
         """The work, in its thread."""
-        self.tell(0)
+        self.on_progress(0)
         self.is_working = True
-        return work(self.tell)
+        return work(self.on_progress)
 
 
 @final

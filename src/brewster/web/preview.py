@@ -32,7 +32,9 @@ _FAINT: Final = 1 / 64
 """Strength asked for in place of 1: layers so faint are not clipped, and grow in proportion."""
 
 
-def preview(separator: Separator, photo: Photo, options: Options, tell: Callable[[float], None]) -> bytes:
+def preview(
+    separator: Separator, photo: Photo, options: Options, on_progress: Callable[[float], None]
+) -> bytes:
     """Four maps of one size after a line of JSON: `width`, `height`, `full` (the photo's own size), `range`, `doubtful`.
 
     Each goes row by row: the photo (3 bytes a pixel, sRGB), the transmission at strength 1 (3 little-endian 16-bit
@@ -45,7 +47,7 @@ def preview(separator: Separator, photo: Photo, options: Options, tell: Callable
     small = photo.small(width, height)
     asked = options.call() | {"strength": _FAINT, "additive": False}
     shown = Photo.from_array(small[..., : photo.pixels.shape[2]], encoding="linear")  # grey stays grey
-    layers = separator(shown, tell=tell, **asked)
+    layers = separator(shown, on_progress=on_progress, **asked)
     transmission = small + (layers.transmission.linear() - small) / np.float32(_FAINT)
     reflection = layers.reflection.linear() / np.float32(_FAINT)
     head = {"width": width, "height": height, "full": photo.size, "range": (LOWEST, HIGHEST)}

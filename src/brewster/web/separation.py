@@ -118,15 +118,15 @@ def separation(shelf: ModelCache, desk: JobQueue, *, max_pixels: int) -> APIRout
     return router
 
 
-def _separate(shelf: ModelCache, asked: SeparationRequest, tell: ProgressCallback) -> Response:
+def _separate(shelf: ModelCache, asked: SeparationRequest, on_progress: ProgressCallback) -> Response:
     """The layers as files."""
     started = time.perf_counter()
     options = asked.options
-    separation = shelf.separator(options.model)(asked.photo, tell=tell, **options.call())
+    separation = shelf.separator(options.model)(asked.photo, on_progress=on_progress, **options.call())
     files = {}
     for layer in options.layers:
-        tell(1)  # encoding takes a while, too, and may not be wanted any more
-        name = asked.target(layer, separation.photo.origin.container)
+        on_progress(1)  # encoding takes a while, too, and may not be wanted any more
+        name = asked.target(layer, separation.photo.file_info.container)
         files[name] = getattr(separation, layer).encode(SUFFIXES[Path(name).suffix.lower()])
     name, data = (
         next(iter(files.items())) if len(files) == 1 else (f"{Path(asked.name).stem}.zip", _zip(files))
@@ -147,9 +147,9 @@ def _separate(shelf: ModelCache, asked: SeparationRequest, tell: ProgressCallbac
     return Response(data, headers=headers, media_type=_media(name))
 
 
-def _preview(shelf: ModelCache, asked: SeparationRequest, tell: ProgressCallback) -> Response:
+def _preview(shelf: ModelCache, asked: SeparationRequest, on_progress: ProgressCallback) -> Response:
     photo = Photo.open(asked.photo, max_pixels=asked.options.max_pixels)
-    maps = preview(shelf.separator(asked.options.model), photo, asked.options, tell)
+    maps = preview(shelf.separator(asked.options.model), photo, asked.options, on_progress)
     return Response(maps, media_type="application/octet-stream")
 
 

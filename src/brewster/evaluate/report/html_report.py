@@ -219,10 +219,10 @@ def _number(value: float | None, about: Results, sign: str = "") -> str:
 
 
 def _differences(results: Results) -> str:
-    """Against doing nothing in the open; between methods, where there are several, to be opened."""
+    """Against the unprocessed input in the open; between methods, where there are several, to be opened."""
     to_nothing, between = (_pairs(results, is_nothing) for is_nothing in (True, False))
     said = "Mean change, its 95 % interval, and on how many pictures it is for the better"
-    first = _table(f"Against doing nothing. {said}", _used(results), to_nothing) if to_nothing else ""
+    first = _table(f"Against the unprocessed input. {said}", _used(results), to_nothing) if to_nothing else ""
     if not between:
         return first
     second = _table(f"Between methods. {said}", _used(results), between)
@@ -312,7 +312,7 @@ def _case(results: Results, case: CaseImages, picture: Results) -> str:
 def _row(results: Results, picture: Results, method: str, tiles: str) -> str:
     error = picture["errors"].get(method)
     failure = f"<p class=failure>Failed: {escape(error)}</p>" if error else ""
-    title = "photo, doing nothing" if method == NOTHING else method
+    title = "photo, input (unprocessed)" if method == NOTHING else method
     return (
         f"<section><div><h4>{escape(title)}</h4>{failure}{_scores(results, picture['scores'], method)}</div>"
         f"<div class=tiles>{tiles}</div></section>\n"
@@ -320,7 +320,7 @@ def _row(results: Results, picture: Results, method: str, tiles: str) -> str:
 
 
 def _scores(results: Results, scores: Results, method: str) -> str:
-    """A method's scores on one picture, and their change to doing nothing."""
+    """A method's scores on one picture, and their change to the unprocessed input."""
     mine, nothing = scores.get(method, {}), scores.get(NOTHING, {})
     lines = []
     for name, about in results["metrics"].items():

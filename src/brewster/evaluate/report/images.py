@@ -60,7 +60,7 @@ _TINT_ALPHA: Final = 115
 class CaseImages:
     """A case as the page shows it: uint8 sRGB (H, W, 3), region bool (H, W).
 
-    `answers` are methods' transmissions, without doing nothing; `reflections` their reflection layers, where there
+    `answers` are methods' transmissions, without the baseline; `reflections` their reflection layers, where there
     are any.
     """
 

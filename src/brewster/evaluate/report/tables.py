@@ -72,7 +72,7 @@ def _cell(results: Results, key: str, method: str, metrics: Iterable[str]) -> st
 
 
 def _details(results: Results, key: str) -> str:
-    """A selection: a row a metric; means with intervals, then differences to doing nothing and between the others."""
+    """A selection: a row a metric; means with intervals, then differences to the unprocessed input and between the others."""
     selection, table = results["selections"][key], results["tables"][key]
     methods, apart = list(results["methods"]), results["differences"][key]
     pairs = list(dict.fromkeys((row["method"], row["than"]) for row in apart))

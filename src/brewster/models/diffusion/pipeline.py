@@ -56,11 +56,11 @@ class DecompositionPipeline:
         *,
         steps: int = STEPS,
         seeds: Sequence[int] = (0,),
-        tell: Callable[[int, int], None] | None = None,
+        on_progress: Callable[[int, int], None] | None = None,
     ) -> Mapping[str, Float[Tensor, "seeds 3 h w"]]:
         """The panels by name, [-1, 1], float32, on the CPU, one of each for every seed.
 
-        Where one step is the task, `steps` and `seeds` change nothing: there is one answer. `tell(done, all)` is
+        Where one step is the task, `steps` and `seeds` change nothing: there is one answer. `on_progress(done, all)` is
         called after each step.
 
         Raises:
@@ -69,7 +69,7 @@ class DecompositionPipeline:
         """
         layout = self.task.layout
         if self.task.objective == "one_step":
-            return split(self._at_once(photo, tell), layout)
+            return split(self._at_once(photo, on_progress), layout)
         height, width = photo.shape[-2:]
         pictures = sample(
             self.backbone,
@@ -79,12 +79,12 @@ class DecompositionPipeline:
             steps=steps,
             guidance=self.task.guidance,
             seeds=seeds,
-            tell=tell,
+            on_progress=on_progress,
         )
         return split(pictures, layout)
 
     @torch.no_grad()
-    def _at_once(self, photo: Tensor, tell: Callable[[int, int], None] | None) -> Tensor:
+    def _at_once(self, photo: Tensor, on_progress: Callable[[int, int], None] | None) -> Tensor:
         backbone, layout = self.backbone, self.task.layout
         with within_memory(_LOWER):
             latents = euler(
@@ -96,8 +96,8 @@ class DecompositionPipeline:
                 guidance=self.task.guidance,
             )
             picture = backbone.decode(latents).clamp(-1, 1).cpu()
-        if tell:
-            tell(1, 1)
+        if on_progress:
+            on_progress(1, 1)
         return picture
 
 

@@ -39,12 +39,12 @@ def sample(
     guidance: float = GUIDANCE,
     seeds: Sequence[int] = (0,),
     batch: int = 1,
-    tell: Callable[[int, int], None] | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
 ) -> Float[Tensor, "seeds 3 h w"]:
     """One composite of this (width, height) for each seed, in [-1, 1], float32, on the CPU.
 
     The noise comes from the CPU, so a seed means the same on every device, and `batch` only says how many are
-    computed together; `.mean(0, keepdim=True)` averages them. `tell(done, all)` is called after each step.
+    computed together; `.mean(0, keepdim=True)` averages them. `on_progress(done, all)` is called after each step.
 
     Raises:
         ModelError: sides that are not multiples of 16, a prompt that guidance cannot use, or no steps, seeds or batch.
@@ -57,15 +57,15 @@ def sample(
     done = itertools.count(1)
 
     def told() -> None:
-        if tell:
-            tell(next(done), steps * len(groups))
+        if on_progress:
+            on_progress(next(done), steps * len(groups))
 
     pictures = []
     with within_memory(_CURE):
         shown = backbone.encode(condition)
         for group in groups:
             noise = torch.cat([backbone.noise(size, seed) for seed in group])
-            latents = euler(backbone, noise, shown, prompt, steps=steps, guidance=guidance, tell=told)
+            latents = euler(backbone, noise, shown, prompt, steps=steps, guidance=guidance, on_progress=told)
             pictures.append(backbone.decode(latents).clamp(-1, 1).cpu())
     return torch.cat(pictures)
 
@@ -78,19 +78,19 @@ def euler(
     *,
     steps: int,
     guidance: float,
-    tell: Callable[[], None] | None = None,
+    on_progress: Callable[[], None] | None = None,
 ) -> Float[Tensor, "n c h w"]:
     """The latents at sigma 0: x(next sigma) = x(sigma) + (next sigma - sigma) velocity, in float32.
 
-    `condition` is encoded; `tell()` is called after each step.
+    `condition` is encoded; `on_progress()` is called after each step.
     """
     latents = noise.to(backbone.device)
     sigmas = backbone.schedule(latents.shape[2] * latents.shape[3], steps).to(latents.device)
     for now, after in itertools.pairwise(sigmas):
         velocity = backbone.predict(latents, condition, now.expand(len(latents)), prompt, guidance)
         latents = latents + (after - now) * velocity
-        if tell:
-            tell()
+        if on_progress:
+            on_progress()
     return latents
 
 

@@ -46,7 +46,7 @@ class RenderJob:
     recipe: SceneRecipe
     catalog: Catalog
     seed: int = 0
-    renderer: str = "pane"
+    renderer: str = "analytic"
     folders: tuple[Path, ...] = ()
 
     def record(self) -> dict[str, Any]:
@@ -116,7 +116,12 @@ class Executor(AbstractContextManager[Any], Protocol):
 
 
 def build(
-    job: RenderJob, indices: range, crew: Executor, *, shards: bool = False, report: Report = lambda _: None
+    job: RenderJob,
+    indices: range,
+    executor: Executor,
+    *,
+    shards: bool = False,
+    report: Report = lambda _: None,
 ) -> None:
     """Renders the samples that are not there yet, moves them into shards if asked, and writes the index.
 
@@ -130,20 +135,20 @@ def build(
         _agree(job)
         store.remove_leftovers(job.out)
         try:
-            with crew:
-                _work(_Schedule(job.out, indices, crew.chunk, shards=shards, report=report), crew)
+            with executor:
+                _work(_Schedule(job.out, indices, executor.chunk, shards=shards, report=report), executor)
         finally:
             store.remove_leftovers(job.out)
         write_index(job.out)
 
 
-def _work(schedule: _Schedule, crew: Executor) -> None:
+def _work(schedule: _Schedule, executor: Executor) -> None:
     while True:
-        task = schedule.next() if crew.has_room() else None
+        task = schedule.next() if executor.has_room() else None
         if task:
-            crew.submit(task)
-        elif crew.is_busy():
-            for result in crew.wait():
+            executor.submit(task)
+        elif executor.is_busy():
+            for result in executor.wait():
                 if result.fatal:
                     raise result.fatal
                 schedule.note(result)

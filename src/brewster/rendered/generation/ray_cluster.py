@@ -24,7 +24,7 @@ _AHEAD: Final = 2
 
 @final
 class RayExecutor:
-    """The crew of a Ray cluster at an address, or of one on this machine alone ("local").
+    """The executor of a Ray cluster at an address, or of one on this machine alone ("local").
 
     A task whose node is lost is tried on another.
     """

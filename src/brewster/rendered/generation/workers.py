@@ -32,8 +32,8 @@ from brewster.worker_setup import end_with_parent, one_thread
 Renderer = Callable[[Scene, Assets], LightSample]
 
 RENDERERS: Final = {
-    "pane": "brewster.render.analytic:render",
-    "tracer": "brewster.render.mitsuba.renderer:trace",
+    "analytic": "brewster.render.analytic:render",
+    "mitsuba": "brewster.render.mitsuba.renderer:trace",
 }
 """What makes a sample of a scene -> the module and function that do it."""
 
@@ -107,7 +107,7 @@ def render_again(path: Path, folder: Path, folders: Sequence[Path] = (), rendere
 
 def _renderer_of(path: Path) -> str:
     """The renderer that a scene file names; one of ours, as a file may not choose what code is run."""
-    name = tomllib.loads(path.read_text("utf-8")).get("outcome", {}).get("renderer", "pane")
+    name = tomllib.loads(path.read_text("utf-8")).get("outcome", {}).get("renderer", "analytic")
     if name not in RENDERERS:
         raise RecipeError(
             f"{path} was rendered by {name!r}", f"one of {', '.join(RENDERERS)}", "choose it with --renderer"
@@ -120,7 +120,7 @@ def _renderer_of(path: Path) -> str:
 
 @final
 class SerialExecutor:
-    """A crew of one: this process."""
+    """Runs tasks in this process."""
 
     chunk = 1
 

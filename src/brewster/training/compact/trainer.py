@@ -1,4 +1,4 @@
-"""The compact network as a learner: its losses, optimiser and running average, on the GPU where there is one.
+"""The compact network as a trainer: its losses, optimiser and running average, on the GPU where there is one.
 
 network = train(read_recipe(Path("recipes/train/compact.toml")), Path("out/compact"), report)
 """
@@ -51,10 +51,10 @@ def train(recipe: CompactRecipe, out: Path, report: Report) -> nn.Module:
         PhotoError: a picture cannot be read.
         ModelError, TargetError: as `loop.run`.
     """
-    learner = CompactTrainer(recipe)
-    with one_thread():  # of the caller; the learner's own threads have one each
-        run(learner, out, report)
-    return learner.averaged_network()
+    trainer = CompactTrainer(recipe)
+    with one_thread():  # of the caller; the trainer's own threads have one each
+        run(trainer, out, report)
+    return trainer.averaged_network()
 
 
 class CompactTrainer:
@@ -94,7 +94,7 @@ class CompactTrainer:
         )
 
     @torch.no_grad()
-    def begin(self) -> None:
+    def initialize(self) -> None:
         """Begins with the averaged weights of other runs, if the recipe names any; of several, with their mean.
 
         The mean of runs that began alike is often better than each (Wortsman et al. 2022, model soups).
@@ -111,7 +111,7 @@ class CompactTrainer:
                 mine.lerp_(theirs.to(self.device), 1 / count)
         self._begin_average()
 
-    def state(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         """Weights, their average, and the optimiser's moments."""
         return {
             "network": self.network.state_dict(),
@@ -119,13 +119,13 @@ class CompactTrainer:
             "optimizer": self.optimizer.state_dict(),
         }
 
-    def restore(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Goes on from such a state."""
         self.network.load_state_dict(state["network"])
         self.average = {name: value.to(self.device) for name, value in state["average"].items()}
         self.optimizer.load_state_dict(state["optimizer"])
 
-    def advance(self, step: int) -> dict[str, float]:
+    def training_step(self, step: int) -> dict[str, float]:
         """One step of AdamW on one batch; returns the parts of the loss.
 
         Raises:

@@ -42,8 +42,8 @@ def blended_layers(
 
     alpha and beta are drawn by the scene's seed and index, uniform in 0.8..1 and 0.4..1.
     """
-    dice = Random(f"blend/{scene.seed}/{scene.index}")  # noqa: S311  (data, not secrets)
-    alpha, beta = dice.uniform(*ALPHA), dice.uniform(*BETA)
+    rng = Random(f"blend/{scene.seed}/{scene.index}")  # noqa: S311  (data, not secrets)
+    alpha, beta = rng.uniform(*ALPHA), rng.uniform(*BETA)
     background, mirror = _eight_bits(background_encoded), _eight_bits(mirror_encoded)
     return blend(background, mirror, alpha, beta), background, _eight_bits(beta * mirror)
 

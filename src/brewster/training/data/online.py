@@ -28,7 +28,7 @@ Mixing = Literal["light", "8-bit"]
 
 
 class OnlineRendered:
-    """A `Stream` of the pane renderer's samples, also an iterable of them; threads may share it.
+    """A `Stream` of the analytic renderer's samples, also an iterable of them; threads may share it.
 
     They render one at a time, as `Assets` serves one at a time; the rest of their work runs side by side.
     """

@@ -1,7 +1,7 @@
-"""A LoRA on a large backbone as a learner: flow matching on the latents of panels (paper, Text-to-image Model Fine-tuning).
+"""A LoRA on a large backbone as a trainer: flow matching on the latents of panels (paper, Text-to-image Model Fine-tuning).
 
-learner = LoraLearner(read_recipe(Path("recipes/train/kontext.toml")))
-run(learner, Path("out/kontext"), report)
+trainer = LoraLearner(read_recipe(Path("recipes/train/kontext.toml")))
+run(trainer, Path("out/kontext"), report)
 
 A batch is learnt one sample after another, so that each keeps its aspect ratio and a batch needs no more memory than
 a sample. Sample, noise and time are functions of (seed, step, slot) alone; several processes divide the slots.
@@ -82,7 +82,7 @@ class LoraTrainer:
         assert self._prompt, "begin or restore comes first"
         return self._prompt
 
-    def begin(self) -> None:
+    def initialize(self) -> None:
         """Takes up the recipe's prompt; a real backbone's text encoder is loaded for it, and forgotten.
 
         Raises:
@@ -90,20 +90,20 @@ class LoraTrainer:
         """
         self._prompt = _find_prompt(self.recipe, self.backbone)
 
-    def state(self) -> dict[str, Any]:
+    def state_dict(self) -> dict[str, Any]:
         """The LoRA, the optimiser's moments, and the prompt: nothing of the base."""
         prompt = {"text": self.prompt.text, **self.prompt.tensors}
         return {
             "lora": lora_state(self.backbone), "optimizer": self._optimizer.state_dict(), "prompt": prompt,
         }  # fmt: skip
 
-    def restore(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Goes on from such a state."""
         load_lora_state(self.backbone, state["lora"])
         self._optimizer.load_state_dict(state["optimizer"])
         self._prompt = PromptEmbedding(self.backbone.name, **state["prompt"])
 
-    def advance(self, step: int) -> dict[str, float]:
+    def training_step(self, step: int) -> dict[str, float]:
         """One step of AdamW on one batch; the loss, and each panel's part of it.
 
         Raises:

@@ -20,7 +20,7 @@ def plot(results: Mapping[str, Any]) -> bytes:
     """A PNG of the group that the rule keeps, or of everyone where it keeps nobody, which it says then."""
     from matplotlib.figure import Figure  # noqa: PLC0415  (an extra, and slow to wake)
 
-    kept = results["kept"]["tables"]
+    kept = results["included"]["tables"]
     tables = kept or results["everyone"]["tables"]
     shown = [_shown(results, table) for table in tables]
     heights = [len(rows) + 0.9 for rows in shown]

@@ -86,7 +86,7 @@ def summarise(study: Study, people: Sequence[ParticipantAnswers], rule: Exclusio
             for person, reason in zip(people, reasons, strict=True)
             if reason is not None
         },
-        "kept": _group(study, kept),
+        "included": _group(study, kept),
         "everyone": _group(study, people),
     }
 

@@ -28,8 +28,8 @@ def resampled(participants: int, resamples: int = RESAMPLES) -> Float64[Floats, 
     Cluster bootstrap (Davison and Hinkley 1997, section 3.8): as many participants as there are, drawn with
     replacement, each with all their answers; a fixed seed.
     """
-    dice = np.random.default_rng([SEED, participants])
-    return dice.multinomial(participants, np.full(participants, 1 / participants), resamples).astype(float)
+    rng = np.random.default_rng([SEED, participants])
+    return rng.multinomial(participants, np.full(participants, 1 / participants), resamples).astype(float)
 
 
 def summed(times: Floats, counts: Floats) -> Floats:

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from brewster.latex import escaped
 
-_GROUPS: Final = {"kept": "After the rule", "everyone": "Everyone"}
+_GROUPS: Final = {"included": "After the rule", "everyone": "Everyone"}
 _CHOICES: Final = """\
 Rates are shares of the answers about a pair of methods. Average weights each dataset by its number of pictures, as the \
 paper's Table 3 does; the plain mean of the datasets and the rates of all answers together stand below.
@@ -44,7 +44,7 @@ def to_markdown(results: Results) -> str:
 
 def overview(results: Results) -> str:
     """What a terminal shows: the group that the rule keeps."""
-    return f"{_group(results, 'kept', _GROUPS['kept'])}\n\n{_rule(results)}\n"
+    return f"{_group(results, 'included', _GROUPS['included'])}\n\n{_rule(results)}\n"
 
 
 def _rule(results: Results) -> str:
@@ -120,7 +120,7 @@ def to_latex(results: Results) -> str:
 
     A row a dataset and the average; for each pair of methods win, tie and lose. Needs the package booktabs.
     """
-    tables = results["kept"]["tables"]
+    tables = results["included"]["tables"]
     if not tables:
         return "% the rule leaves nobody\n"
     heads = [cell for table in tables for cell in (table["first"], "Tie", table["second"])]
