@@ -8,7 +8,7 @@ PHOTO ?= tests/pictures
 # (pyproject.toml) only ends a test that comes back to Python, eight seconds earlier.
 ENDS_RED := --max-worker-restart=0 -o faulthandler_timeout=118 -o faulthandler_exit_on_timeout=true
 
-.PHONY: demo test test-slow test-all test-system coverage check docs bench mutants dist clean
+.PHONY: demo test test-slow test-all test-system coverage check docs docs-site bench mutants dist clean
 
 demo: .venv/core
 	$(BIN)/python runs/demo.py "$(PHOTO)"
@@ -39,6 +39,10 @@ check: .venv/dev
 
 docs: .venv/dev
 	$(BIN)/python -m brewster.cli.reference > docs/reference.md
+
+# The site of the documentation in out/site; needs no network, and a broken link ends it.
+docs-site: .venv/dev
+	$(BIN)/mkdocs build --strict --quiet
 
 dist:
 	PYTHON=$(PYTHON) .ci/release

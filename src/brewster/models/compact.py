@@ -35,6 +35,8 @@ _SKIP_WIDTHS: Final = tuple(_STAGES[stage][3] for stage in _SKIP_STAGES)
 _DECODER_WIDTHS: Final = (32, 64, 128, 224)
 _BATCH_NORM_EPSILON: Final = 1e-3
 _FULL_WIDTH: Final = 16
+_LARGEST_GAIN: Final = 1.5
+"""Limit of the gain's logarithm: a factor of 4.5. Without a limit, one unusual batch ended a training run."""
 
 
 @final
@@ -164,7 +166,8 @@ class CompactNetwork(nn.Module):
         x = functional.interpolate(self.squeeze(x), scale_factor=2.0, mode="bilinear")
         x = _in_float32(self.head, _leaky(_in_float32(self.join, torch.cat([x, normal], dim=1))))
         added, gain, repair, other = x.chunk(4, dim=1)
-        transmission = to_encoded((to_linear(photo_encoded) - added) * gain.exp()) + repair
+        gain = (_LARGEST_GAIN * torch.tanh(gain / _LARGEST_GAIN)).exp()
+        transmission = to_encoded((to_linear(photo_encoded) - added) * gain) + repair
         return torch.cat([transmission, to_encoded(added + other)], dim=1)
 
 
