@@ -42,7 +42,7 @@ docs: .venv/dev
 
 # The site of the documentation in out/site; needs no network, and a broken link ends it.
 docs-site: .venv/dev
-	$(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 dist:
 	PYTHON=$(PYTHON) .ci/release

@@ -1,0 +1,52 @@
+"""The documentation site builds without a network, without a warning, and with every public name of the Python API."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import brewster
+from brewster import metrics
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    out = tmp_path_factory.mktemp("site")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(out)],
+        cwd=ROOT,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    return out
+
+
+def test_every_page_is_in_the_navigation(site):
+    start = (site / "index.html").read_text("utf-8")
+    pages = {path.stem for path in (ROOT / "docs").glob("*.md")} - {"index"}
+    assert {page for page in pages if f'href="{page}/"' not in start} == set()
+
+
+def test_the_python_reference_has_every_public_name(site):
+    page = (site / "api" / "index.html").read_text("utf-8")
+    names = [f"brewster.{name}" for name in brewster.__all__ if name not in ("__version__", "errors")]
+    names += [
+        f"brewster.metrics.{name}"
+        for name in metrics.__all__
+        if callable(getattr(metrics, name)) and name[0].islower()
+    ]
+    missing = {name for name in names if f'id="{name}"' not in page}
+    assert missing == set()
+
+
+def test_pages_request_nothing_from_other_servers(site):
+    page = (site / "index.html").read_text("utf-8")
+    assert 'src="http' not in page
+    assert 'rel="stylesheet" href="http' not in page
