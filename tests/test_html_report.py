@@ -10,7 +10,7 @@ import pytest
 
 from brewster.errors import TargetError
 from brewster.evaluate.report.html_report import CaseImages, write_report
-from brewster.evaluate.report.images import BRIGHTEST_ERROR, LONGEST, RAMP, error_map
+from brewster.evaluate.report.images import COLOUR_MAP, MAX_ERROR, MAX_SIDE_PX, error_map
 from brewster.photo import Photo
 
 VOID = {"meta", "img", "input", "br", "link"}
@@ -285,7 +285,7 @@ def test_failures_are_counted_and_told_at_the_top_and_at_their_picture(page):
         "scores": {"input (unprocessed)": {"psnr": 20.0}},
         "errors": {"compact": "no prediction"},
     }
-    made = page(given, [shown("a", answers={}, reflections={}), shown("b")])
+    made = page(given, [shown("a", predictions={}, reflections={}), shown("b")])
     assert "Failed: compact on 1 of 2 pictures" in made.text
     assert "nature20/a, compact: no prediction" in made.text
     assert "Failed: no prediction" in made.text
@@ -314,7 +314,7 @@ def test_pictures_are_reduced_together_to_480_px_and_never_enlarged(page, size, 
     made = page(cases=[shown("a", size=size)])
     assert {photo.size for photo in pictures(made).values()} == {kept}
     assert {(has["width"], has["height"]) for has in made.all("img")} == {tuple(map(str, kept))}
-    assert max(kept) <= LONGEST
+    assert max(kept) <= MAX_SIDE_PX
 
 
 def test_pictures_stay_upright_and_keep_their_values(page):
@@ -339,21 +339,21 @@ def test_the_region_is_a_tint_over_its_pixels_and_clear_elsewhere(page):
 
 def test_an_error_map_has_the_colour_of_the_largest_channels_difference():
     truth = np.zeros((4, 4, 3), np.uint8)
-    answer = truth.copy()
-    answer[0, 0] = (0, BRIGHTEST_ERROR // 2, 3)
-    answer[0, 1] = 255
-    colours = error_map(answer, truth)
-    assert (colours[0, 0] == RAMP[len(RAMP) // 2]).all()
-    assert (colours[0, 1] == RAMP[-1]).all()
-    assert (colours[1:] == RAMP[0]).all()
-    assert (error_map(truth, answer) == colours).all()
+    prediction = truth.copy()
+    prediction[0, 0] = (0, MAX_ERROR // 2, 3)
+    prediction[0, 1] = 255
+    colours = error_map(prediction, truth)
+    assert (colours[0, 0] == COLOUR_MAP[len(COLOUR_MAP) // 2]).all()
+    assert (colours[0, 1] == COLOUR_MAP[-1]).all()
+    assert (colours[1:] == COLOUR_MAP[0]).all()
+    assert (error_map(truth, prediction) == colours).all()
 
 
 def test_an_error_map_averages_errors_when_it_is_reduced():
     truth = np.zeros((960, 960, 3), np.uint8)
-    answer = truth.copy()
-    answer[::2] = 48  # every other row: cancelled by nothing, halved by the mean
-    assert (error_map(answer, truth) == RAMP[24 * len(RAMP) // BRIGHTEST_ERROR]).all()
+    prediction = truth.copy()
+    prediction[::2] = 48  # every other row: cancelled by nothing, halved by the mean
+    assert (error_map(prediction, truth) == COLOUR_MAP[24 * len(COLOUR_MAP) // MAX_ERROR]).all()
 
 
 def test_error_maps_are_embedded_without_loss(page, random):
@@ -363,7 +363,7 @@ def test_error_maps_are_embedded_without_loss(page, random):
 
 
 def test_the_ramp_grows_evenly_lighter_so_that_it_needs_no_colour_to_be_read():
-    lightness = np.sqrt(RAMP.astype(float) @ (0.2126, 0.7152, 0.0722))
+    lightness = np.sqrt(COLOUR_MAP.astype(float) @ (0.2126, 0.7152, 0.0722))
     assert (np.diff(lightness) > 0).all()
 
 

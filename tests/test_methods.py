@@ -11,7 +11,7 @@ from benchmark_folders import picture, repacked, write
 from brewster import Photo
 from brewster.benchmarks.registry import read_benchmark
 from brewster.errors import BrewsterError, PhotoError
-from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder, refuse_names
+from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder, check_names
 from brewster.photo import FileInfo
 
 
@@ -87,18 +87,18 @@ def test_one_picture_cannot_answer_two_cases(cases, tmp_path):
     repacked(tmp_path / "nature20", ["1"])
     (other,) = read_benchmark("nature20", tmp_path / "nature20")
     theirs = method(tmp_path, "1.png", "2.png")
-    theirs.refuse_wrong_pairing(cases)
+    theirs.check_pairing(cases)
     with pytest.raises(PhotoError, match="to real20/1 and to nature20/1"):
-        theirs.refuse_wrong_pairing([*cases, *other.cases])
+        theirs.check_pairing([*cases, *other.cases])
     sorted_out = method(tmp_path / "sorted", "real20/1.png", "nature20/1.png")
-    sorted_out.refuse_wrong_pairing([*cases, *other.cases])
+    sorted_out.check_pairing([*cases, *other.cases])
 
 
 def test_a_folder_in_which_no_name_fits_is_refused_at_once(cases, tmp_path):
     with pytest.raises(PhotoError, match="called like a case"):
-        method(tmp_path, "a.png", "b.png").refuse_wrong_pairing(cases)
+        method(tmp_path, "a.png", "b.png").check_pairing(cases)
     with pytest.raises(PhotoError, match="no folder"):
-        PredictionFolder("theirs", tmp_path / "nowhere").refuse_wrong_pairing(cases)
+        PredictionFolder("theirs", tmp_path / "nowhere").check_pairing(cases)
 
 
 def test_pictures_that_answer_no_case_are_counted(cases, tmp_path):
@@ -107,20 +107,20 @@ def test_pictures_that_answer_no_case_are_counted(cases, tmp_path):
 
 def test_doing_nothing_is_the_photo_and_black(case):
     photo = Photo.open(case.photo.read())
-    answer = IdentityBaseline().answer(case, photo)
-    assert answer.transmission is photo
-    assert not answer.reflection.pixels.any()
+    prediction = IdentityBaseline().predict(case, photo)
+    assert prediction.transmission is photo
+    assert not prediction.reflection.pixels.any()
 
 
 def test_a_model_answers_as_the_separator_does_and_keeps_its_answer(case, model, tmp_path):
     ours = ModelMethod("pane", str(model), tmp_path / "kept")
     assert ours.cached(case) is None
     photo = Photo.open(case.photo.read())
-    answer = ours.answer(case, photo)
-    assert answer.seconds > 0
+    prediction = ours.predict(case, photo)
+    assert prediction.seconds > 0
     kept = ours.cached(case)
-    assert np.array_equal(kept.transmission.srgb_8bit(), answer.transmission.srgb_8bit())
-    assert np.array_equal(kept.reflection.srgb_8bit(), answer.reflection.srgb_8bit())
+    assert np.array_equal(kept.transmission.srgb_8bit(), prediction.transmission.srgb_8bit())
+    assert np.array_equal(kept.reflection.srgb_8bit(), prediction.reflection.srgb_8bit())
     assert PredictionFolder("again", tmp_path / "kept").files(case).keys() == {"transmission", "reflection"}
 
 
@@ -128,8 +128,8 @@ def test_what_is_kept_of_a_deep_wide_photo_is_what_is_scored(case, model, tmp_pa
     pixels = np.random.default_rng(1).integers(0, 1 << 16, (6, 8, 3), np.uint16)
     photo = Photo(pixels, None, FileInfo(bits=16, icc=bytes(pyvips.Image.profile_load("p3"))))
     ours = ModelMethod("pane", str(model), tmp_path / "kept")
-    answer, kept = ours.answer(case, photo), ours.cached(case)
-    assert np.array_equal(kept.transmission.srgb_8bit(), answer.transmission.srgb_8bit())
+    prediction, kept = ours.predict(case, photo), ours.cached(case)
+    assert np.array_equal(kept.transmission.srgb_8bit(), prediction.transmission.srgb_8bit())
 
 
 def test_a_key_changes_with_all_that_the_answer_depends_on(case, model, tmp_path):
@@ -148,18 +148,18 @@ def test_methods_are_data_that_other_processes_can_take(model, tmp_path):
 
 def test_no_method_at_all_is_refused():
     with pytest.raises(BrewsterError, match="there is no method"):
-        refuse_names([])
+        check_names([])
 
 
 def test_two_methods_of_one_name_are_refused(tmp_path):
     with pytest.raises(BrewsterError, match=r"2 methods are called 'input \(unprocessed\)'"):
-        refuse_names([IdentityBaseline(), PredictionFolder("input (unprocessed)", tmp_path)])
+        check_names([IdentityBaseline(), PredictionFolder("input (unprocessed)", tmp_path)])
 
 
 @pytest.mark.parametrize("name", ["../out", "a/b", "a\\b", "..", ".", "", "two\nlines", "\udcff"])
 def test_names_that_are_no_names_of_folders_are_refused(name, tmp_path):
     with pytest.raises(BrewsterError, match="names become folders"):
-        refuse_names([PredictionFolder(name, tmp_path)])
+        check_names([PredictionFolder(name, tmp_path)])
 
 
 def test_a_folder_that_is_a_link_is_looked_into_and_a_loop_ends(case, tmp_path):

@@ -17,8 +17,8 @@ from brewster.benchmarks.pairing import (
     find_roles,
     find_split,
     find_subsets,
-    listed,
-    natural,
+    join_names,
+    natural_key,
     read_folders,
     read_tree,
 )
@@ -29,7 +29,7 @@ STEMS = st.sets(st.sampled_from(["1", "2", "02", "10", "a-1", "a-10", "a_1", "ä
 
 
 def names(found):
-    return [trio.name for trio in found.trios]
+    return [group.name for group in found.groups]
 
 
 # --- a folder for each role
@@ -48,10 +48,10 @@ def test_roles_are_known_by_their_folders(tmp_path, roles):
     repacked(tmp_path, ["1", "2"], roles)
     found = read_folders(tmp_path)
     assert names(found) == ["1", "2"]
-    assert found == FolderListing(found.trios)
-    for trio in found.trios:
-        pictures = (trio.photo, trio.transmission, trio.reflection)
-        assert pictures == tuple(tmp_path / role / f"{trio.name}.png" for role in roles)
+    assert found == FolderListing(found.groups)
+    for group in found.groups:
+        pictures = (group.photo, group.transmission, group.reflection)
+        assert pictures == tuple(tmp_path / role / f"{group.name}.png" for role in roles)
 
 
 def test_every_name_of_a_role_is_its_own():
@@ -71,10 +71,10 @@ def test_only_equal_names_make_a_pair_and_all_others_are_named(photos, truths, m
         write(root, *places)
         found = read_folders(root)
         assert set(names(found)) == photos & truths
-        assert names(found) == sorted(photos & truths, key=natural)
-        for trio in found.trios:
-            assert trio.photo.stem == trio.transmission.stem == trio.name
-            assert (trio.reflection is not None) == (trio.name in mirrored)
+        assert names(found) == sorted(photos & truths, key=natural_key)
+        for group in found.groups:
+            assert group.photo.stem == group.transmission.stem == group.name
+            assert (group.reflection is not None) == (group.name in mirrored)
         for stem in (photos | truths | mirrored) - (photos & truths):
             assert any(f"/{stem}.png" in line and "no partner" in line for line in found.refused)
         assert len(found.refused) == len((photos | truths | mirrored) - (photos & truths))
@@ -98,7 +98,7 @@ def test_two_pictures_of_one_name_and_role_are_refused_both(tmp_path, role):
 def test_a_name_is_the_same_in_both_spellings_of_unicode(tmp_path):
     write(tmp_path, f"blended/{unicodedata.normalize('NFC', 'café')}.png")
     write(tmp_path, f"gt/{unicodedata.normalize('NFD', 'café')}.png")
-    assert len(read_folders(tmp_path).trios) == 1
+    assert len(read_folders(tmp_path).groups) == 1
 
 
 def test_what_systems_leave_is_passed_over_in_silence_and_other_files_aloud(tmp_path):
@@ -169,25 +169,27 @@ def test_the_original_trees_are_joined_shot_by_shot(tmp_path):
     found = read_tree(postcard(tmp_path / "p", ["ab", "ba"]), "postcard")
     assert names(found)[:4] == ["ab-Focus-11", "ab-Focus-13", "ab-Focus-16", "ab-Focus-19"]
     assert names(found)[7:10] == ["ab-Thick-3", "ab-Thick-5", "ab-Thick-10"]
-    assert {trio.scene for trio in found.trios} == {"ab", "ba"}
-    thick = next(trio for trio in found.trios if trio.name == "ab-Thick-10")
+    assert {group.scene for group in found.groups} == {"ab", "ba"}
+    thick = next(group for group in found.groups if group.name == "ab-Thick-10")
     there = tmp_path / "p" / "Thick" / "ab" / "10"
     assert (thick.photo, thick.transmission) == (there / "ab-10-m-3.png", there / "ab-10-g-3.png")
     found = read_tree(solidobject(tmp_path / "s", [2, 10]), "solidobject")
     assert names(found)[::10] == ["2-Focus-11", "10-Focus-11"]
     found = read_tree(wildscene(tmp_path / "w", 8), "wildscene")
     assert names(found) == ["1s", "2", "3", "4s", "5", "6", "7s", "8"]
-    assert all(trio.scene == trio.name for trio in found.trios)
-    for trio in found.trios:
-        assert [path.stem for path in (trio.photo, trio.transmission, trio.reflection)] == ["m", "g", "r"]
-        assert len({trio.photo.parent, trio.transmission.parent, trio.reflection.parent}) == 1
+    assert all(group.scene == group.name for group in found.groups)
+    for group in found.groups:
+        assert [path.stem for path in (group.photo, group.transmission, group.reflection)] == ["m", "g", "r"]
+        assert len({group.photo.parent, group.transmission.parent, group.reflection.parent}) == 1
 
 
 def test_two_triplets_in_a_folder_are_told_apart_by_their_names(tmp_path):
     write(tmp_path, *(f"Focus/ab/11/ab-{k}-{letter}-11.png" for k in (3, 5) for letter in "mgr"))
     found = read_tree(tmp_path, "postcard")
     assert names(found) == ["ab-Focus-11-ab-3-11", "ab-Focus-11-ab-5-11"]
-    assert all(trio.photo.name.split("-")[1] == trio.transmission.name.split("-")[1] for trio in found.trios)
+    assert all(
+        group.photo.name.split("-")[1] == group.transmission.name.split("-")[1] for group in found.groups
+    )
 
 
 def test_a_triplet_without_truth_is_refused_and_one_without_reflection_is_not(tmp_path):
@@ -223,7 +225,7 @@ def test_shots_of_one_name_in_two_folders_are_refused_both(tmp_path):
     if len(entries(tmp_path)[0]) < 2:
         pytest.skip("this file system does not tell Focus from focus")
     found = read_tree(tmp_path, "postcard")
-    assert found.trios == ()
+    assert found.groups == ()
     assert len(found.refused) == 2
     assert all("ambiguous" in line for line in found.refused)
 
@@ -278,14 +280,14 @@ def shuffled(items, order: random.Random):
 
 @given(st.sets(st.text(min_size=1)), st.randoms())
 def test_natural_order_is_total_and_puts_2_before_10(some, order):
-    assert sorted(shuffled(some, order), key=natural) == sorted(some, key=natural)
-    assert sorted(["a10", "a2", "10", "2", "a"], key=natural) == ["2", "10", "a", "a2", "a10"]
+    assert sorted(shuffled(some, order), key=natural_key) == sorted(some, key=natural_key)
+    assert sorted(["a10", "a2", "10", "2", "a"], key=natural_key) == ["2", "10", "a", "a2", "a10"]
 
 
 def test_long_lists_are_cut():
-    assert listed(["a"]) == "a"
-    assert listed(["a", "b", "c"], " or ") == "a, b or c"
-    assert listed([str(number) for number in range(100)]) == "0, 1, 2, 3, 4 and 95 more"
+    assert join_names(["a"]) == "a"
+    assert join_names(["a", "b", "c"], " or ") == "a, b or c"
+    assert join_names([str(number) for number in range(100)]) == "0, 1, 2, 3, 4 and 95 more"
 
 
 # --- training

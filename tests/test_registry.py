@@ -16,7 +16,7 @@ from benchmark_folders import (
     write,
 )
 from brewster.benchmarks import registry
-from brewster.benchmarks.pairing import natural
+from brewster.benchmarks.pairing import natural_key
 from brewster.benchmarks.registry import (
     BENCHMARKS,
     PAPER_SEED,
@@ -198,7 +198,7 @@ def test_neither_the_order_of_writing_nor_that_of_listing_matters(tmp_path, monk
     listing = registry.Path.iterdir
     monkeypatch.setattr(registry.Path, "iterdir", lambda path: iter(sorted(listing(path), key=hash)))
     assert only("pairs", there) == before
-    assert names(before.cases) == sorted(stems, key=natural)
+    assert names(before.cases) == sorted(stems, key=natural_key)
 
 
 # --- what is not taken
@@ -364,7 +364,7 @@ def test_the_draw_takes_one_shot_of_each_scene(whole):
         drawn = paper_draw(whole[name])
         assert len(drawn) == len({case.scene for case in drawn}) == 20
         assert set(drawn) <= set(whole[name].cases)
-        assert [case.scene for case in drawn] == sorted((case.scene for case in drawn), key=natural)
+        assert [case.scene for case in drawn] == sorted((case.scene for case in drawn), key=natural_key)
         assert drawn != paper_draw(whole[name], seed=PAPER_SEED + 1)
     assert paper_draw(whole["wildscene"]) == whole["wildscene"].cases
 

@@ -86,8 +86,8 @@ def test_a_failed_picture_is_counted_out_and_named(methods):
 
 def test_metrics_that_nothing_was_measured_in_are_left_out(methods):
     parts = [benchmark("a", 2)]
-    protocol = EvaluationConfig(metrics=("psnr", "kept_reflection"))
-    results = summarise(parts, methods, protocol, rows(parts, methods, lambda *_: 1.0))
+    config = EvaluationConfig(metrics=("psnr", "kept_reflection"))
+    results = summarise(parts, methods, config, rows(parts, methods, lambda *_: 1.0))
     assert list(results["metrics"]) == ["psnr"]
     assert results["metrics"]["psnr"]["unit"] == "dB"
 
@@ -106,8 +106,8 @@ def test_the_papers_protocol_averages_over_181_pictures_and_reports_all_too(tmp_
     parts = [
         part for name in ("real20", "nature20", "sir2") for part in read_benchmark(name, tmp_path / name)
     ]
-    protocol = EvaluationConfig(metrics=("psnr",), paper=True)
-    results = summarise(parts, methods, protocol, rows(parts, methods, lambda *_: 1.0))
+    config = EvaluationConfig(metrics=("psnr",), paper=True)
+    results = summarise(parts, methods, config, rows(parts, methods, lambda *_: 1.0))
     pictures = {key: selection["pictures"] for key, selection in results["selections"].items()}
     assert pictures == {
         "real20": 20,
@@ -125,8 +125,8 @@ def test_the_papers_protocol_averages_over_181_pictures_and_reports_all_too(tmp_
 
 def test_the_papers_average_is_over_the_papers_sets_only_and_says_what_it_lacks(tmp_path, methods):
     parts = [benchmark("real20", 20), benchmark("nature20", 10), benchmark("mine", 7)]
-    protocol = EvaluationConfig(metrics=("psnr",), paper=True)
-    results = summarise(parts, methods, protocol, rows(parts, methods, lambda *_: 1.0))
+    config = EvaluationConfig(metrics=("psnr",), paper=True)
+    results = summarise(parts, methods, config, rows(parts, methods, lambda *_: 1.0))
     assert results["selections"]["average"]["pictures"] == 30
     assert (
         "over 181 pictures; this one is over 20 of real20, 10 of nature20"
@@ -136,8 +136,8 @@ def test_the_papers_average_is_over_the_papers_sets_only_and_says_what_it_lacks(
 
 def test_a_metric_that_was_asked_for_in_vain_is_told(methods):
     parts = [benchmark("a", 2)]
-    protocol = EvaluationConfig(metrics=("psnr", "kept_reflection"))
-    results = summarise(parts, methods, protocol, rows(parts, methods, lambda *_: 1.0))
+    config = EvaluationConfig(metrics=("psnr", "kept_reflection"))
+    results = summarise(parts, methods, config, rows(parts, methods, lambda *_: 1.0))
     assert results["unmeasured"] == ["kept_reflection"]
 
 

@@ -14,19 +14,19 @@ def stratum(values, scenes=None, name="set"):
 
 
 def only(strata):
-    (answer,) = estimate(strata)
-    return answer
+    (prediction,) = estimate(strata)
+    return prediction
 
 
 def test_the_mean_is_over_all_pictures_not_over_benchmarks():
-    answer = only([stratum([1.0, 1.0, 1.0], name="a"), stratum([5.0], name="b")])
-    assert answer.mean == 2.0
-    assert answer.count == 4
+    prediction = only([stratum([1.0, 1.0, 1.0], name="a"), stratum([5.0], name="b")])
+    assert prediction.mean == 2.0
+    assert prediction.count == 4
 
 
 def test_a_constant_is_certain():
-    answer = only([stratum([3.0] * 10)])
-    assert (answer.low, answer.mean, answer.high) == (3.0, 3.0, 3.0)
+    prediction = only([stratum([3.0] * 10)])
+    assert (prediction.low, prediction.mean, prediction.high) == (3.0, 3.0, 3.0)
 
 
 def test_one_scene_has_no_interval():
@@ -40,25 +40,25 @@ def test_a_region_that_one_picture_alone_has_has_no_interval():
 
 
 def test_missing_values_are_not_counted():
-    answer = only([stratum([1.0, np.nan, 3.0])])
-    assert (answer.mean, answer.count) == (2.0, 2)
+    prediction = only([stratum([1.0, np.nan, 3.0])])
+    assert (prediction.mean, prediction.count) == (2.0, 2)
     assert only([stratum([np.nan, np.nan])]) is None
 
 
 def test_intervals_agree_with_the_normal_ones_where_those_hold(random):
     values = random.normal(20, 3, 400)
-    answer = only([stratum(values)])
+    prediction = only([stratum(values)])
     half = 1.96 * values.std(ddof=1) / np.sqrt(400)
-    assert answer.high - answer.mean == pytest.approx(half, rel=0.06)
-    assert answer.mean - answer.low == pytest.approx(half, rel=0.06)
+    assert prediction.high - prediction.mean == pytest.approx(half, rel=0.06)
+    assert prediction.mean - prediction.low == pytest.approx(half, rel=0.06)
 
 
 def test_intervals_cover_the_truth_at_their_stated_rate(random):
     """95 % of intervals of means of 60 pictures; a percentile bootstrap is a little short of it at such sizes."""
     hits = 0
     for i in range(200):
-        answer = only([stratum(random.normal(0, 1, 60), name=str(i))])
-        hits += answer.low <= 0 <= answer.high
+        prediction = only([stratum(random.normal(0, 1, 60), name=str(i))])
+        hits += prediction.low <= 0 <= prediction.high
     assert 0.90 <= hits / 200 <= 0.99
 
 
@@ -80,9 +80,9 @@ def test_a_benchmarks_interval_does_not_depend_on_its_order_nor_on_its_neighbour
 
 @given(st.lists(st.floats(-100, 100), min_size=2, max_size=20))
 def test_the_mean_lies_in_its_interval_and_that_between_the_extremes(values):
-    answer = only([stratum(values)])
-    assert min(values) - 1e-9 <= answer.low <= answer.high <= max(values) + 1e-9
-    assert answer.mean == pytest.approx(np.mean(values), abs=1e-9)
+    prediction = only([stratum(values)])
+    assert min(values) - 1e-9 <= prediction.low <= prediction.high <= max(values) + 1e-9
+    assert prediction.mean == pytest.approx(np.mean(values), abs=1e-9)
 
 
 def test_differences_are_paired_and_surer_than_the_means_they_are_made_of(random):

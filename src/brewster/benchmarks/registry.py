@@ -22,14 +22,14 @@ from random import Random
 from typing import Final, final
 
 from brewster.benchmarks.pairing import (
-    TREES,
+    SIR2_TREES,
     FolderListing,
     PictureGroup,
     find_roles,
     find_split,
     find_subsets,
-    listed,
-    natural,
+    join_names,
+    natural_key,
     read_folders,
     read_tree,
 )
@@ -121,14 +121,13 @@ class Benchmark:
 @final
 @dataclass(frozen=True)
 class BenchmarkLayout:
-    """A row of BENCHMARKS: its title ("" is the folder's own name), the counts in papers, and how its folder looks.
+    """A row of BENCHMARKS: its title ("" is the folder's own name), the counts that papers report, and its reader.
 
     Where the paper draws one case of each scene, `scene` matches the part of a repacked name that tells it.
     """
 
     title: str
     expected: tuple[int, ...]
-    looks: str
     read: Callable[[str, Path], list[Benchmark]]
     scene: str = ""
 
@@ -172,7 +171,7 @@ def paper_draw(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ...]
             "the paper's protocol draws one picture of each scene",
             "point at SIR2's original tree, or score the whole set",
         )
-    rng = {scene: Random(f"{seed}/{benchmark.name}/{scene}") for scene in sorted(scenes, key=natural)}  # noqa: S311
+    rng = {scene: Random(f"{seed}/{benchmark.name}/{scene}") for scene in sorted(scenes, key=natural_key)}  # noqa: S311
     return tuple(rng[scene].choice(scenes[scene]) for scene in rng)
 
 
@@ -180,16 +179,16 @@ def paper_draw(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ...]
 
 
 def _read_pairs(name: str, folder: Path) -> list[Benchmark]:
-    return [_paired(name, folder, read_folders(folder))]
+    return [_from_listing(name, folder, read_folders(folder))]
 
 
 def _read_split(name: str, folder: Path) -> list[Benchmark]:
-    return [_paired(name, folder, read_folders(find_split(folder)))]
+    return [_from_listing(name, folder, read_folders(find_split(folder)))]
 
 
 def _read_subset(name: str, folder: Path) -> list[Benchmark]:
     place = find_subsets(folder).get(name, folder)
-    return [_paired(name, folder, read_folders(place) if find_roles(place) else read_tree(place, name))]
+    return [_from_listing(name, folder, read_folders(place) if find_roles(place) else read_tree(place, name))]
 
 
 def _read_sir2(_: str, folder: Path) -> list[Benchmark]:
@@ -201,24 +200,26 @@ def _read_sir2(_: str, folder: Path) -> list[Benchmark]:
             "name the folder above them, or say postcard=, solidobject= or wildscene= for one set alone",
         )
     first, *others = [
-        benchmark for name in TREES if name in subsets for benchmark in _read_subset(name, folder)
+        benchmark for name in SIR2_TREES if name in subsets for benchmark in _read_subset(name, folder)
     ]
-    missing = [f"{BENCHMARKS[name].title} is not in {folder}" for name in TREES if name not in subsets]
+    missing = [f"{BENCHMARKS[name].title} is not in {folder}" for name in SIR2_TREES if name not in subsets]
     return [replace(first, remarks=(*missing, *first.remarks)), *others]
 
 
 def _read_rendered(name: str, folder: Path) -> list[Benchmark]:
-    called, cases, refused = _called(name, folder), [], []
-    for key, files in _samples(folder):
+    benchmark_name, cases, refused = _benchmark_name(name, folder), [], []
+    for key, files in _rendered_samples(folder):
         if len(files) < len(_RENDERED):
             refused.append(f"{key} is not whole: {', '.join(_RENDERED)} are needed")
             continue
         photo, background, reflection = files
-        cases.append(Case(called, key, key, f"{key}/photo", photo, background, reflection, rendered=True))
+        cases.append(
+            Case(benchmark_name, key, key, f"{key}/photo", photo, background, reflection, rendered=True)
+        )
     return [_benchmark(name, folder, cases, FolderListing(refused=tuple(refused)))]
 
 
-def _samples(folder: Path) -> list[tuple[str, list[PictureFile]]]:
+def _rendered_samples(folder: Path) -> list[tuple[str, list[PictureFile]]]:
     """The names of a rendered set's samples, and those of the _RENDERED files that are there."""
     try:
         from brewster.rendered.store import key, read_set  # noqa: PLC0415  (torch: only who has rendered has it)
@@ -229,9 +230,9 @@ def _samples(folder: Path) -> list[tuple[str, list[PictureFile]]]:
             "torch is not installed", "sets are rendered with it", "run: pip install 'brewster[render]'"
         ) from error
     except (OSError, tarfile.TarError, ValueError) as error:
-        raise _no_set(folder, str(error)) from error
+        raise _not_a_rendered_set(folder, str(error)) from error
     if not entries:
-        raise _no_set(folder, "no samples")
+        raise _not_a_rendered_set(folder, "no samples")
     return [
         (
             key(entry.index),
@@ -246,7 +247,7 @@ def _samples(folder: Path) -> list[tuple[str, list[PictureFile]]]:
     ]
 
 
-def _no_set(folder: Path, reason: str) -> PhotoError:
+def _not_a_rendered_set(folder: Path, reason: str) -> PhotoError:
     return PhotoError(
         f"{folder} is no rendered set ({reason})",
         "000000/ and so on, or shard-000000.tar, as `brewster render` writes them",
@@ -257,82 +258,85 @@ def _no_set(folder: Path, reason: str) -> PhotoError:
 # --- from what was found to cases
 
 
-def _paired(name: str, folder: Path, found: FolderListing) -> Benchmark:
-    scenes, remarks = _scenes(BENCHMARKS[name], found.trios)
-    called = _called(name, folder)
-    cases = [_case(called, scene, trio, folder) for scene, trio in zip(scenes, found.trios, strict=True)]
+def _from_listing(name: str, folder: Path, found: FolderListing) -> Benchmark:
+    scenes, remarks = _scenes(BENCHMARKS[name], found.groups)
+    benchmark_name = _benchmark_name(name, folder)
+    cases = [
+        _to_case(benchmark_name, scene, group, folder)
+        for scene, group in zip(scenes, found.groups, strict=True)
+    ]
     return _benchmark(name, folder, cases, replace(found, remarks=(*found.remarks, *remarks)))
 
 
-def _case(called: str, scene: str, trio: PictureGroup, root: Path) -> Case:
+def _to_case(benchmark_name: str, scene: str, group: PictureGroup, root: Path) -> Case:
     return Case(
-        called,
-        trio.name,
+        benchmark_name,
+        group.name,
         scene,
-        trio.photo.relative_to(root).with_suffix("").as_posix(),
-        PictureFile(trio.photo),
-        PictureFile(trio.transmission),
-        PictureFile(trio.reflection) if trio.reflection else None,
+        group.photo.relative_to(root).with_suffix("").as_posix(),
+        PictureFile(group.photo),
+        PictureFile(group.transmission),
+        PictureFile(group.reflection) if group.reflection else None,
     )
 
 
-def _scenes(row: BenchmarkLayout, trios: Sequence[PictureGroup]) -> tuple[list[str], list[str]]:
+def _scenes(row: BenchmarkLayout, groups: Sequence[PictureGroup]) -> tuple[list[str], list[str]]:
     """A scene for each trio, and what is to be said about that: all are told by the names, or none is taken."""
-    if not row.scene or any(trio.scene for trio in trios):
-        return [trio.scene or trio.name for trio in trios], []
-    told = [match[0] for trio in trios if (match := re.match(row.scene, trio.name))]
-    if len(told) == len(trios) and len(set(told)) <= _SCENES:
-        return told, []
-    return [trio.name for trio in trios], [
+    if not row.scene or any(group.scene for group in groups):
+        return [group.scene or group.name for group in groups], []
+    matched = [match[0] for group in groups if (match := re.match(row.scene, group.name))]
+    if len(matched) == len(groups) and len(set(matched)) <= _SCENES:
+        return matched, []
+    return [group.name for group in groups], [
         "scenes cannot be told from the names, so the paper's draw is impossible with this form"
     ]
 
 
 def _benchmark(name: str, folder: Path, cases: Sequence[Case], found: FolderListing) -> Benchmark:
     row = BENCHMARKS[name]
-    misfits = {case.name: misfit for case in cases if (misfit := _misfit(case))}
-    kept = tuple(
-        case for case in sorted(cases, key=lambda case: natural(case.name)) if case.name not in misfits
+    mismatches = {case.name: mismatch for case in cases if (mismatch := _mismatch(case))}
+    valid = tuple(
+        case for case in sorted(cases, key=lambda case: natural_key(case.name)) if case.name not in mismatches
     )
-    title = row.title or _own_name(folder)
+    title = row.title or _folder_name(folder)
     return Benchmark(
-        _called(name, folder),
+        _benchmark_name(name, folder),
         title,
-        kept,
+        valid,
         row.expected,
-        (*_count(len(kept), title, row.expected), *_unmirrored(kept), *found.remarks),
-        (*found.refused, *misfits.values()),
+        (*_count_remark(len(valid), title, row.expected), *_missing_reflections(valid), *found.remarks),
+        (*found.refused, *mismatches.values()),
     )
 
 
-def _count(count: int, title: str, expected: Sequence[int]) -> list[str]:
+def _count_remark(count: int, title: str, expected: Sequence[int]) -> list[str]:
     if not expected or count in expected:
         return []
     known = " or ".join(map(str, expected))
     return [f"{count} {'picture' if count == 1 else 'pictures'}, where {title} has {known}"]
 
 
-def _unmirrored(cases: Sequence[Case]) -> list[str]:
+def _missing_reflections(cases: Sequence[Case]) -> list[str]:
     without = [case.name for case in cases if case.reflection is None]
     if not without or len(without) == len(cases):
         return []
-    return [f"without a reflection to compare with: {listed(without)}"]
+    return [f"without a reflection to compare with: {join_names(without)}"]
 
 
-def _called(name: str, folder: Path) -> str:
+def _benchmark_name(name: str, folder: Path) -> str:
     """A known set's own name; else the folder's, which never passes for a known set or the average of all."""
     if BENCHMARKS[name].title:
         return name
-    safe = re.sub(r"[^A-Za-z0-9_.-]+", "-", _own_name(folder)).strip("-.") or name
+    safe = re.sub(r"[^A-Za-z0-9_.-]+", "-", _folder_name(folder)).strip("-.") or name
     is_taken = safe == "average" or (safe in BENCHMARKS and BENCHMARKS[safe].title)
     return f"{name}-{safe}" if is_taken else safe
 
 
-def _own_name(folder: Path) -> str:
+def _folder_name(folder: Path) -> str:
     return Path(os.path.abspath(folder)).name  # noqa: PTH100  (links keep their names)
 
 
-def _misfit(case: Case) -> str:
+def _mismatch(case: Case) -> str:
     """Why a case cannot be scored, by the headers of its files, or ""."""
     files = {"photo": case.photo, "truth": case.transmission, "reflection": case.reflection}
     sizes: dict[str, tuple[int, int]] = {}
@@ -341,37 +345,32 @@ def _misfit(case: Case) -> str:
             sizes |= {role: read_size(file.read())} if file else {}
         except PhotoError as error:
             return f"{case.place}: the {role} cannot be used: {error}"
-    return next((_unequal(case.place, role, sizes) for role in sizes if sizes[role] != sizes["photo"]), "")
+    return next(
+        (_size_mismatch(case.place, role, sizes) for role in sizes if sizes[role] != sizes["photo"]), ""
+    )
 
 
-def _unequal(place: str, role: str, sizes: Mapping[str, tuple[int, int]]) -> str:
+def _size_mismatch(place: str, role: str, sizes: Mapping[str, tuple[int, int]]) -> str:
     photo, truth = sizes["photo"], sizes[role]
     across, down = truth[0] / photo[0], truth[1] / photo[1]
-    told = f"{place}: photo {photo[0]}x{photo[1]}, {role} {truth[0]}x{truth[1]}"
+    sizes_text = f"{place}: photo {photo[0]}x{photo[1]}, {role} {truth[0]}x{truth[1]}"
     if abs(across / down - 1) <= 0.01 < abs(across - 1):
         times = _SCALES.get(f"{across:.2g}", f"{across:.3g} times the scale")
-        return f"{told}: the {role} is at {times}"
-    return f"{told}: {'one of them is turned' if truth == photo[::-1] else 'they must be equal'}"
+        return f"{sizes_text}: the {role} is at {times}"
+    return f"{sizes_text}: {'one of them is turned' if truth == photo[::-1] else 'they must be equal'}"
 
 
 # --- the table
 
-_PAIRS: Final = "blended/ and transmission_layer/ with equal names in them, and perhaps reflection_layer/"
-_TREE: Final = "the set's folder or SIR2's, in the original tree or repacked as pairs"
-
 BENCHMARKS: Final[dict[str, BenchmarkLayout]] = {
-    "real20": BenchmarkLayout("Real20", (20,), _PAIRS, _read_pairs),
-    "nature20": BenchmarkLayout("Nature20", (20,), _PAIRS, _read_pairs),
-    "sir2": BenchmarkLayout(
-        "SIR2", (), "Postcard Dataset/, SolidObjectDataset/ and Wildscene/, original or repacked", _read_sir2
-    ),
-    "postcard": BenchmarkLayout("SIR2 Postcard", (199,), _TREE, _read_subset, r"[A-Za-z]{2}(?=[-_])"),
-    "solidobject": BenchmarkLayout("SIR2 SolidObject", (200,), _TREE, _read_subset, r"\d+(?=[-_].)"),
-    "wildscene": BenchmarkLayout("SIR2 Wildscene", (101, 55), _TREE, _read_subset),
-    "openrr": BenchmarkLayout(
-        "OpenRR", (), f"{_PAIRS}; or a folder with one such folder: train, val or test", _read_split
-    ),
-    "pairs": BenchmarkLayout("", (), _PAIRS, _read_pairs),
-    "rendered": BenchmarkLayout("", (), "a set of `brewster render`: folders or shards", _read_rendered),
+    "real20": BenchmarkLayout("Real20", (20,), _read_pairs),
+    "nature20": BenchmarkLayout("Nature20", (20,), _read_pairs),
+    "sir2": BenchmarkLayout("SIR2", (), _read_sir2),
+    "postcard": BenchmarkLayout("SIR2 Postcard", (199,), _read_subset, r"[A-Za-z]{2}(?=[-_])"),
+    "solidobject": BenchmarkLayout("SIR2 SolidObject", (200,), _read_subset, r"\d+(?=[-_].)"),
+    "wildscene": BenchmarkLayout("SIR2 Wildscene", (101, 55), _read_subset),
+    "openrr": BenchmarkLayout("OpenRR", (), _read_split),
+    "pairs": BenchmarkLayout("", (), _read_pairs),
+    "rendered": BenchmarkLayout("", (), _read_rendered),
 }
-"""What `read_benchmark` reads, by name."""
+"""What `read_benchmark` reads, by name. docs/evaluation.md describes the folders."""

@@ -27,7 +27,7 @@ from brewster.training.recipe import CompactRecipe, LoraRecipe, data_folder, rea
 from brewster.training.trainers import open_trainer
 
 Choice = str | int | float | bool
-Report = Callable[[str, int, int, Mapping[str, float], bool], None]
+AblationCallback = Callable[[str, int, int, Mapping[str, float], bool], None]
 """Called with (choice, step, steps, numbers, logged) after every step of training."""
 
 PLOT: Final = "plot.png"
@@ -85,7 +85,7 @@ def ablate(
     out: Path,
     *,
     workers: int = 1,
-    report: Report = lambda _choice, _step, _steps, _numbers, _logged: None,
+    on_progress: AblationCallback = lambda _choice, _step, _steps, _numbers, _logged: None,
 ) -> Results:
     """Trains and measures every choice; `out` receives a folder for each, and what `evaluate` writes.
 
@@ -108,11 +108,11 @@ def ablate(
     for label, recipe in recipes.items():
         folder = out / label.replace(" ", "-")
 
-        def tell(*told: Any, label: str = label) -> None:  # noqa: ANN401  (what train tells)
-            report(label, *told)
+        def on_step(*values: Any, label: str = label) -> None:  # noqa: ANN401  (what train tells)
+            on_progress(label, *values)
 
         models.append(
-            ModelMethod(label, str(_trained(recipe, folder, tell)), out / "predictions" / folder.name)
+            ModelMethod(label, str(_train(recipe, folder, on_step)), out / "predictions" / folder.name)
         )
     results = evaluate(benchmarks, [IdentityBaseline(), *models], EvaluationConfig(), out, workers=workers)
     numbers = [
@@ -123,10 +123,10 @@ def ablate(
     return results
 
 
-def _trained(recipe: CompactRecipe | LoraRecipe, folder: Path, tell: loop.Report) -> Path:
+def _train(recipe: CompactRecipe | LoraRecipe, folder: Path, on_step: loop.Report) -> Path:
     """The model of this recipe, in memory no longer than it learns."""
     trainer = open_trainer(recipe)
-    loop.run(trainer, folder, tell)
+    loop.run(trainer, folder, on_step)
     return trainer.export(folder)
 
 

@@ -16,15 +16,15 @@ from typing import Final
 from brewster.benchmarks.registry import Benchmark, Case
 from brewster.errors import BrewsterError, PhotoError
 from brewster.evaluate.config import EvaluationConfig
-from brewster.evaluate.methods import NOTHING, Method, MethodOutput, PredictionFolder, refuse_names
+from brewster.evaluate.methods import BASELINE, Method, MethodOutput, PredictionFolder, check_names
 from brewster.evaluate.report.html_report import CaseImages, write_report
 from brewster.evaluate.report.latex import to_latex
 from brewster.evaluate.report.published import read_published
 from brewster.evaluate.report.published import to_markdown as published_to_markdown
 from brewster.evaluate.report.tables import to_csv, to_markdown
-from brewster.evaluate.results import Results, draw, summarise
-from brewster.evaluate.runner import Place, Report, ScoreRow, find_answer, score
-from brewster.evaluate.scoring import GroundTruth, reduced
+from brewster.evaluate.results import Results, paper_draws, summarise
+from brewster.evaluate.runner import RowId, ScoreCallback, ScoreRow, get_prediction, score
+from brewster.evaluate.scoring import GroundTruth, downscale
 from brewster.files import write_atomically
 from brewster.metrics import IDENTICAL_DB
 from brewster.photo import Photo
@@ -36,12 +36,12 @@ PICTURES_SHOWN: Final = 50
 def evaluate(
     benchmarks: Sequence[Benchmark],
     methods: Sequence[Method],
-    protocol: EvaluationConfig,
+    config: EvaluationConfig,
     out: Path,
     *,
     workers: int = 1,
     shown: int = PICTURES_SHOWN,
-    report: Report = lambda _done, _of, _row: None,
+    on_progress: ScoreCallback = lambda _done, _of, _row: None,
 ) -> Results:
     """Scores and writes results.json, tables.md, table.tex, table.csv and report.html into `out`.
 
@@ -61,27 +61,27 @@ def evaluate(
             draw is impossible, or a part of brewster is missing.
         TargetError: `out` cannot be written.
     """
-    check(benchmarks, methods, protocol)
+    check(benchmarks, methods, config)
     cases = [case for part in benchmarks for case in part.cases]
-    if protocol.size:
-        _write_inputs(cases, protocol.size, out / INPUTS)
-    rows = score(benchmarks, methods, protocol, out, workers=workers, report=report)
-    results = summarise(benchmarks, methods, protocol, rows)
+    if config.size:
+        _write_inputs(cases, config.size, out / INPUTS)
+    rows = score(benchmarks, methods, config, out, workers=workers, on_progress=on_progress)
+    results = summarise(benchmarks, methods, config, rows)
     for method in methods:
-        if remarks := list(_remarks(method, cases, rows)):
+        if remarks := list(_method_remarks(method, cases, rows)):
             results["methods"][method.name]["remark"] = "; ".join(remarks)
     _write(results, out)
-    write_report(results, _shown(cases, methods, protocol, rows, shown), out / PAGE)
+    write_report(results, _page_cases(cases, methods, config, rows, shown), out / PAGE)
     return results
 
 
-def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], protocol: EvaluationConfig) -> None:
+def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: EvaluationConfig) -> None:
     """Refuses what cannot be measured as asked, before anything is.
 
     Raises:
         BrewsterError: see `evaluate`.
     """
-    refuse_names(methods)
+    check_names(methods)
     names = [part.name for part in benchmarks]
     for name in names:
         if names.count(name) > 1:
@@ -97,21 +97,21 @@ def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], protocol: 
             "a photo and its truth",
             "; ".join(refused[:5]) or "name a folder that has some",
         )
-    if protocol.paper:
-        draw(benchmarks)
+    if config.paper:
+        paper_draws(benchmarks)
     cases = [case for part in benchmarks for case in part.cases]
     for method in methods:
         if isinstance(method, PredictionFolder):
-            method.refuse_wrong_pairing(cases)
+            method.check_pairing(cases)
 
 
-def _remarks(method: Method, cases: Sequence[Case], rows: Sequence[ScoreRow]) -> Iterator[str]:
+def _method_remarks(method: Method, cases: Sequence[Case], rows: Sequence[ScoreRow]) -> Iterator[str]:
     """What is odd about a method's answers."""
     if not isinstance(method, PredictionFolder):
         return
     perfect = [row for row in rows if row.scores.get("psnr") == IDENTICAL_DB]
-    trivial = {row.place[:2] for row in perfect if row.method == NOTHING}
-    copied = [row for row in perfect if row.method == method.name and row.place[:2] not in trivial]
+    trivial = {row.id[:2] for row in perfect if row.method == BASELINE}
+    copied = [row for row in perfect if row.method == method.name and row.id[:2] not in trivial]
     if copied:
         yield f"its answer is the truth itself on {_pictures(len(copied))}: are these its own?"
     if unused := method.unused(cases):
@@ -126,7 +126,7 @@ def _write_inputs(cases: Sequence[Case], size: int, folder: Path) -> None:
     """The photos as methods see them, for those that answer elsewhere; what cannot be read is told when it is scored."""
     for case in cases:
         with suppress(PhotoError):
-            photo = reduced(Photo.open(case.photo.read()), size)
+            photo = downscale(Photo.open(case.photo.read()), size)
             photo.save(folder / case.benchmark / f"{case.name}.png", overwrite=True)
 
 
@@ -144,53 +144,57 @@ def _write(results: Results, out: Path) -> None:
 # --- what the page shows
 
 
-def _shown(
+def _page_cases(
     cases: Sequence[Case],
     methods: Sequence[Method],
-    protocol: EvaluationConfig,
+    config: EvaluationConfig,
     rows: Sequence[ScoreRow],
-    most: int,
+    limit: int,
 ) -> Iterator[CaseImages]:
     """The pictures, read again one case at a time."""
-    good = {row.place: row for row in rows if not row.error}
-    for case in _worst(cases, methods, protocol, good, most):
+    good = {row.id: row for row in rows if not row.error}
+    for case in _worst_cases(cases, methods, config, good, limit):
         try:
-            truth = GroundTruth.open(case, protocol)
+            truth = GroundTruth.open(case, config)
         except PhotoError:
             continue  # named in the tables already
-        answers = {
-            method.name: find_answer(truth, method, row)
+        predictions = {
+            method.name: get_prediction(truth, method, row)
             for method in methods
-            if method.name != NOTHING and (row := good.get((case.benchmark, case.name, method.name)))
+            if method.name != BASELINE and (row := good.get((case.benchmark, case.name, method.name)))
         }
-        yield _show(truth, answers, protocol)
+        yield _case_images(truth, predictions, config)
 
 
-def _show(truth: GroundTruth, answers: dict[str, MethodOutput], protocol: EvaluationConfig) -> CaseImages:
+def _case_images(
+    truth: GroundTruth, predictions: dict[str, MethodOutput], config: EvaluationConfig
+) -> CaseImages:
     return CaseImages(
         benchmark=truth.case.benchmark,
         name=truth.case.name,
         photo=truth.pictures["photo"],
         truth=truth.pictures["transmission"],
-        region=truth.region(protocol.thresholds[0]),
-        answers={name: answer.transmission.srgb_8bit() for name, answer in answers.items()},
+        region=truth.region(config.thresholds[0]),
+        predictions={name: prediction.transmission.srgb_8bit() for name, prediction in predictions.items()},
         reflections={
-            name: answer.reflection.srgb_8bit() for name, answer in answers.items() if answer.reflection
+            name: prediction.reflection.srgb_8bit()
+            for name, prediction in predictions.items()
+            if prediction.reflection
         },
         reflection_truth=truth.pictures.get("reflection"),
     )
 
 
-def _worst(
+def _worst_cases(
     cases: Sequence[Case],
     methods: Sequence[Method],
-    protocol: EvaluationConfig,
-    rows: Mapping[Place, ScoreRow],
-    most: int,
+    config: EvaluationConfig,
+    rows: Mapping[RowId, ScoreRow],
+    limit: int,
 ) -> list[Case]:
     """So many cases of each benchmark: what the first method that does something failed on, then its worst in the first metric."""
-    method = next((method.name for method in methods if method.name != NOTHING), NOTHING)
-    column, metric = next(iter(protocol.columns().items()))
+    method = next((method.name for method in methods if method.name != BASELINE), BASELINE)
+    column, metric = next(iter(config.columns().items()))
 
     def merit(case: Case) -> float:
         row = rows.get((case.benchmark, case.name, method))
@@ -202,5 +206,5 @@ def _worst(
 
     chosen = []
     for name in dict.fromkeys(case.benchmark for case in cases):
-        chosen += sorted((case for case in cases if case.benchmark == name), key=merit)[:most]
+        chosen += sorted((case for case in cases if case.benchmark == name), key=merit)[:limit]
     return chosen

@@ -27,11 +27,11 @@ from brewster.models.zoo import find_model, is_large
 from brewster.options import Device, Quality
 from brewster.photo import Photo
 
-NOTHING: Final = "input (unprocessed)"
-ANSWER_FORMAT: Final = 1
+BASELINE: Final = "input (unprocessed)"
+PREDICTION_FORMAT: Final = 1
 """Raised when the same model comes to answer differently, so that kept answers are made again; see test_house_formats."""
 
-_ENDINGS: Final = {"transmission": ("_t", "_l"), "reflection": ("_r",)}
+_STEM_SUFFIXES: Final = {"transmission": ("_t", "_l"), "reflection": ("_r",)}
 
 
 @final
@@ -80,7 +80,7 @@ class Method(Protocol):
         """All that its answer depends on, beside the photo."""
         ...
 
-    def answer(self, case: Case, photo: Photo) -> MethodOutput:
+    def predict(self, case: Case, photo: Photo) -> MethodOutput:
         """Its layers for the photo of this case."""
         ...
 
@@ -94,7 +94,7 @@ class Method(Protocol):
 class IdentityBaseline:
     """The photo itself as transmission and black as reflection: what every method must beat."""
 
-    name: str = NOTHING
+    name: str = BASELINE
     exclusive: Final = False
 
     def about(self) -> dict[str, str]:
@@ -105,7 +105,7 @@ class IdentityBaseline:
         """Nothing."""
         return "nothing"
 
-    def answer(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002
+    def predict(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002
         """The photo and black."""
         return MethodOutput(photo, photo.with_pixels(np.zeros_like(photo.pixels)))
 
@@ -139,15 +139,17 @@ class ModelMethod:
 
     def key(self, case: Case) -> str:  # noqa: ARG002  (it is the same for all)
         """The model's digest, its quality, and the format of the answers."""
-        return f"{self._sha256} {self.quality} {ANSWER_FORMAT}"
+        return f"{self._sha256} {self.quality} {PREDICTION_FORMAT}"
 
-    def answer(self, case: Case, photo: Photo) -> MethodOutput:
+    def predict(self, case: Case, photo: Photo) -> MethodOutput:
         """Separates the photo and keeps both layers.
 
         Raises:
             BrewsterError: the model or the photo cannot be used, or the layers cannot be written.
         """
-        separator = (_large if self.exclusive else _small)(self.model, self.device)
+        separator = (_load_exclusive_separator if self.exclusive else _load_separator)(
+            self.model, self.device
+        )
         started = time.perf_counter()
         separation = separator(photo, quality=self.quality)
         seconds = time.perf_counter() - started
@@ -180,21 +182,21 @@ class ModelMethod:
 
 
 @cache
-def _small(model: str, device: Device) -> Separator:
+def _load_separator(model: str, device: Device) -> Separator:
     """A model, loaded once a process."""
     return Separator.load(model, device=device)
 
 
-_held: dict[tuple[str, Device], Separator] = {}
+_exclusive_separators: dict[tuple[str, Device], Separator] = {}
 
 
-def _large(model: str, device: Device) -> Separator:
+def _load_exclusive_separator(model: str, device: Device) -> Separator:
     """A model that makes room for the next one before that is loaded."""
-    if (model, device) not in _held:
-        _held.clear()
+    if (model, device) not in _exclusive_separators:
+        _exclusive_separators.clear()
         gc.collect()
-        _held[model, device] = Separator.load(model, device=device)
-    return _held[model, device]
+        _exclusive_separators[model, device] = Separator.load(model, device=device)
+    return _exclusive_separators[model, device]
 
 
 @final
@@ -217,7 +219,7 @@ class PredictionFolder:
         except BrewsterError as error:
             return str(error)
 
-    def answer(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002  (it is answered already)
+    def predict(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002  (it is answered already)
         """Reads its pictures for this case.
 
         Raises:
@@ -258,7 +260,7 @@ class PredictionFolder:
         used = {path for case in cases for layer in layers for path in self._candidates(case, layer)}
         return sum(map(len, self._pictures.values())) - len(used)
 
-    def refuse_wrong_pairing(self, cases: Sequence[Case]) -> None:
+    def check_pairing(self, cases: Sequence[Case]) -> None:
         """Refuses a folder in which one picture would answer two cases, or none any.
 
         Raises:
@@ -294,21 +296,21 @@ class PredictionFolder:
         root = root if root.is_dir() else self.folder
         places = [root / f"{stem}.{layer}" for stem in (case.name, case.place)]
         places += [root / folder / case.name for folder in (layer, f"{layer}_layer")]
-        places += [root / case.name / name for name in self._own_names(root / case.name, layer)]
+        places += [root / case.name / name for name in self._suffixed_stems(root / case.name, layer)]
         if layer == "transmission":
             places += [root / case.name]
-        return {path for place in places for path in self._pictures.get(_plain(place), ())}
+        return {path for place in places for path in self._pictures.get(_normalised(place), ())}
 
-    def _own_names(self, folder: Path, layer: str) -> list[str]:
+    def _suffixed_stems(self, folder: Path, layer: str) -> list[str]:
         """Stems such as rdnet_t or dsrnet_l, where a method has left a folder for each picture."""
-        return [stem for stem in self._stems.get(folder, ()) if stem.endswith(_ENDINGS[layer])]
+        return [stem for stem in self._stems.get(folder, ()) if stem.endswith(_STEM_SUFFIXES[layer])]
 
     @cached_property
     def _pictures(self) -> dict[Path, list[Path]]:
         """The folder's pictures by their paths without suffix."""
         found: defaultdict[Path, list[Path]] = defaultdict(list)
         for path in filter(_is_picture, walk(self.folder, _is_picture)):
-            found[_plain(path.with_suffix(""))].append(path)
+            found[_normalised(path.with_suffix(""))].append(path)
         return dict(found)
 
     @cached_property
@@ -323,7 +325,7 @@ def _is_picture(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
-def _plain(path: Path) -> Path:
+def _normalised(path: Path) -> Path:
     """A path in one spelling: some systems write an accented letter as two characters."""
     return Path(unicodedata.normalize("NFC", str(path)))
 
@@ -344,7 +346,7 @@ def _digest(data: Iterable[bytes]) -> str:
     return hashlib.sha256(b"".join(hashlib.sha256(one).digest() for one in data)).hexdigest()
 
 
-def refuse_names(methods: Sequence[Method]) -> None:
+def check_names(methods: Sequence[Method]) -> None:
     """Refuses no method at all, two of one name, since tables could not tell them apart, and names that are no names of folders.
 
     Raises:

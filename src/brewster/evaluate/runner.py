@@ -22,7 +22,7 @@ from typing import Any, Final, final
 from brewster.benchmarks.registry import Benchmark, Case
 from brewster.errors import BrewsterError, TargetError
 from brewster.evaluate.config import EvaluationConfig
-from brewster.evaluate.methods import Method, MethodOutput, refuse_names
+from brewster.evaluate.methods import Method, MethodOutput, check_names
 from brewster.evaluate.scoring import GroundTruth, Scorer
 from brewster.worker_setup import end_with_parent, one_thread
 
@@ -30,10 +30,10 @@ SCORES: Final = "scores.jsonl"
 SCORE_FORMAT: Final = 2
 """Raised when the same answers come to score differently, so that they are scored again; see test_house_formats."""
 
-Report = Callable[[int, int, "ScoreRow"], None]
+ScoreCallback = Callable[[int, int, "ScoreRow"], None]
 """Called with (done, of how many, the row) after every answer that was scored."""
 
-Place = tuple[str, str, str]
+RowId = tuple[str, str, str]
 
 
 @final
@@ -59,7 +59,7 @@ class ScoreRow:
     region_share: float = 0.0
 
     @property
-    def place(self) -> Place:
+    def id(self) -> RowId:
         """Benchmark, case and method: where it stands in the results."""
         return self.benchmark, self.case, self.method
 
@@ -76,11 +76,11 @@ class _ScoringTask:
 def score(
     benchmarks: Sequence[Benchmark],
     methods: Sequence[Method],
-    protocol: EvaluationConfig,
+    config: EvaluationConfig,
     out: Path,
     *,
     workers: int = 1,
-    report: Report = lambda _done, _of, _row: None,
+    on_progress: ScoreCallback = lambda _done, _of, _row: None,
 ) -> list[ScoreRow]:
     """Has every method answer every case and scores the answers; those that `out` knows already are not made again.
 
@@ -92,59 +92,59 @@ def score(
         BrewsterError: methods' names are shared or unfit, a part of brewster is missing, or a worker died.
         TargetError: `out` cannot be written.
     """
-    refuse_names(methods)
-    known = _read(out / SCORES)
+    check_names(methods)
+    logged = _read_log(out / SCORES)
     cases = {(case.benchmark, case.name): case for part in benchmarks for case in part.cases}
-    wanted = [row for case in cases.values() for row in _rows(case, methods, protocol, known)]
-    rows = {row.place: known[row.place] for row in wanted if _is_scored(row, known)}
-    todo = [row for row in wanted if row.place not in rows]
+    wanted = [row for case in cases.values() for row in _rows(case, methods, config, logged)]
+    rows = {row.id: logged[row.id] for row in wanted if _is_scored(row, logged)}
+    pending = [row for row in wanted if row.id not in rows]
     exclusive = [method.name for method in methods if method.exclusive]
-    tasks = list(_tasks(cases, [row for row in todo if row.method not in exclusive]))
-    later = [
-        task for name in exclusive for task in _tasks(cases, [row for row in todo if row.method == name])
+    tasks = list(_tasks(cases, [row for row in pending if row.method not in exclusive]))
+    exclusive_tasks = [
+        task for name in exclusive for task in _tasks(cases, [row for row in pending if row.method == name])
     ]
-    for metric in protocol.columns().values() if todo else ():
+    for metric in config.columns().values() if pending else ():
         if metric.prepare:  # here, once: weights may have to be fetched, or be missing
             metric.prepare()
-    log = _Log(out / SCORES)
+    log = _ScoreLog(out / SCORES)
 
-    def take(made: Sequence[ScoreRow]) -> None:
-        for row in made:
+    def on_rows(new_rows: Sequence[ScoreRow]) -> None:
+        for row in new_rows:
             log.write(row)
-            rows[row.place] = row
-            report(len(rows), len(wanted), row)
+            rows[row.id] = row
+            on_progress(len(rows), len(wanted), row)
 
-    _run(tasks, methods, protocol, take, workers)
-    _run(later, methods, protocol, take, 1)
-    return [rows[row.place] for row in wanted]
+    _run_tasks(tasks, methods, config, on_rows, workers)
+    _run_tasks(exclusive_tasks, methods, config, on_rows, 1)
+    return [rows[row.id] for row in wanted]
 
 
 def _rows(
-    case: Case, methods: Sequence[Method], protocol: EvaluationConfig, known: Mapping[Place, ScoreRow]
+    case: Case, methods: Sequence[Method], config: EvaluationConfig, logged: Mapping[RowId, ScoreRow]
 ) -> Iterator[ScoreRow]:
     """Rows without scores; their keys are digests of all that they depend on."""
     photo, *truths = (
         hashlib.sha256(file.read()).hexdigest() if file else ""
         for file in (case.photo, case.transmission, case.reflection)
     )
-    asked = asdict(protocol) | {"paper": None, "quality": None}
+    settings = asdict(config) | {"paper": None, "quality": None}
     for method in methods:
-        answer_key = _digest(photo, protocol.size, method.key(case))
-        key = _digest(answer_key, truths, asked, case.rendered, SCORE_FORMAT)
+        answer_key = _digest(photo, config.size, method.key(case))
+        key = _digest(answer_key, truths, settings, case.rendered, SCORE_FORMAT)
         row = ScoreRow(case.benchmark, case.name, method.name, answer_key, key)
-        before = known.get(row.place)
+        before = logged.get(row.id)
         is_answered = before and before.answer_key == answer_key
         yield replace(row, digest=before.digest) if before and is_answered else row
 
 
-def _tasks(cases: Mapping[tuple[str, str], Case], todo: Sequence[ScoreRow]) -> Iterator[_ScoringTask]:
+def _tasks(cases: Mapping[tuple[str, str], Case], pending: Sequence[ScoreRow]) -> Iterator[_ScoringTask]:
     """Case by case."""
-    for place, rows in groupby(todo, lambda row: row.place[:2]):
-        yield _ScoringTask(cases[place], tuple(rows))
+    for pair, rows in groupby(pending, lambda row: row.id[:2]):
+        yield _ScoringTask(cases[pair], tuple(rows))
 
 
-def _is_scored(row: ScoreRow, known: Mapping[Place, ScoreRow]) -> bool:
-    return row.place in known and known[row.place].key == row.key
+def _is_scored(row: ScoreRow, logged: Mapping[RowId, ScoreRow]) -> bool:
+    return row.id in logged and logged[row.id].key == row.key
 
 
 def _digest(*parts: object) -> str:
@@ -154,78 +154,80 @@ def _digest(*parts: object) -> str:
 # --- one case
 
 
-def _do(task: _ScoringTask, methods: Mapping[str, Method], protocol: EvaluationConfig) -> list[ScoreRow]:
+def _score_case(
+    task: _ScoringTask, methods: Mapping[str, Method], config: EvaluationConfig
+) -> list[ScoreRow]:
     """Scores all answers to a case."""
     try:
-        truth = GroundTruth.open(task.case, protocol)
+        truth = GroundTruth.open(task.case, config)
     except BrewsterError as error:
         return [replace(row, error=f"{row.benchmark}/{row.case}: {error}") for row in task.rows]
-    judge = Scorer(truth, protocol)
-    return [_scored(row, truth, judge, methods[row.method]) for row in task.rows]
+    scorer = Scorer(truth, config)
+    return [_score_row(row, truth, scorer, methods[row.method]) for row in task.rows]
 
 
-def _scored(row: ScoreRow, truth: GroundTruth, judge: Scorer, method: Method) -> ScoreRow:
+def _score_row(row: ScoreRow, truth: GroundTruth, scorer: Scorer, method: Method) -> ScoreRow:
     try:
-        answer = find_answer(truth, method, row)
-        truth.check(answer, method.name)
+        prediction = get_prediction(truth, method, row)
+        truth.check(prediction, method.name)
     except BrewsterError as error:
-        return _failed(row, str(error))
+        return _failed_row(row, str(error))
     except Exception as error:  # noqa: BLE001  (a model that stumbles over one picture must not stop the others)
-        return _failed(row, f"{type(error).__name__}: {error}")
+        return _failed_row(row, f"{type(error).__name__}: {error}")
     width, height = truth.photo.size
     return replace(
         row,
-        scores=judge.score(answer),
-        seconds=answer.seconds,
-        digest=answer.digest,
+        scores=scorer.score(prediction),
+        seconds=prediction.seconds,
+        digest=prediction.digest,
         width=width,
         height=height,
-        region_share=judge.region_share,
+        region_share=scorer.region_share,
     )
 
 
-def find_answer(truth: GroundTruth, method: Method, row: ScoreRow) -> MethodOutput:
+def get_prediction(truth: GroundTruth, method: Method, row: ScoreRow) -> MethodOutput:
     """The answer that lies on the disk, if it is the one that the row knows; else a new one.
 
     Raises:
         BrewsterError: what the method raises.
     """
-    kept = method.cached(truth.case) if row.digest else None
-    return kept if kept and kept.digest == row.digest else method.answer(truth.case, truth.photo)
+    cached = method.cached(truth.case) if row.digest else None
+    return cached if cached and cached.digest == row.digest else method.predict(truth.case, truth.photo)
 
 
-def _failed(row: ScoreRow, error: str) -> ScoreRow:
+def _failed_row(row: ScoreRow, error: str) -> ScoreRow:
     return replace(row, error=f"{row.method} failed on {row.benchmark}/{row.case}: {error}")
 
 
 # --- all cases
 
-Take = Callable[[Sequence[ScoreRow]], None]
+RowsCallback = Callable[[Sequence[ScoreRow]], None]
 
 
-def _run(
+def _run_tasks(
     tasks: Sequence[_ScoringTask],
     methods: Sequence[Method],
-    protocol: EvaluationConfig,
-    take: Take,
+    config: EvaluationConfig,
+    on_rows: RowsCallback,
     workers: int,
 ) -> None:
     """Does the tasks here, or in so many processes, and hands their rows over as they come.
 
     Each process uses one thread for metrics, so that all give equal numbers.
     """
-    named = {method.name: method for method in methods}
+    by_name = {method.name: method for method in methods}
     if workers == 1:
         with one_thread():
             for task in tasks:
-                take(_do(task, named, protocol))
+                on_rows(_score_case(task, by_name, config))
         return
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (named, protocol))
-    waiting = {pool.submit(_do_here, task) for task in tasks}
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), _initialize_worker, (by_name, config))
+    futures = {pool.submit(_score_case_in_worker, task) for task in tasks}
     try:
-        for future in as_completed(set(waiting)):
-            waiting.remove(future)
-            take(future.result())
+        for future in as_completed(set(futures)):
+            futures.remove(future)
+            on_rows(future.result())
     except BrokenProcessPool as error:
         raise BrewsterError(
             "a worker process died",
@@ -234,8 +236,8 @@ def _run(
         ) from error
     except KeyboardInterrupt:
         pool.shutdown(cancel_futures=True)
-        for rows in _finished(waiting):
-            take(rows)
+        for rows in _finished(futures):
+            on_rows(rows)
         raise
     finally:
         pool.shutdown(cancel_futures=True)
@@ -245,25 +247,25 @@ def _finished(futures: set[Future[list[ScoreRow]]]) -> Iterator[list[ScoreRow]]:
     return (future.result() for future in futures if not future.cancelled() and not future.exception())
 
 
-_process: dict[str, Any] = {}
+_worker_state: dict[str, Any] = {}
 
 
-def _begin(methods: dict[str, Method], protocol: EvaluationConfig) -> None:
+def _initialize_worker(methods: dict[str, Method], config: EvaluationConfig) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which lets a case be finished
     end_with_parent()
-    _process.update(methods=methods, protocol=protocol)
+    _worker_state.update(methods=methods, config=config)
 
 
-def _do_here(task: _ScoringTask) -> list[ScoreRow]:
+def _score_case_in_worker(task: _ScoringTask) -> list[ScoreRow]:
     with one_thread():
-        return _do(task, _process["methods"], _process["protocol"])
+        return _score_case(task, _worker_state["methods"], _worker_state["protocol"])
 
 
 # --- the log
 
 
 @final
-class _Log:
+class _ScoreLog:
     """The file that a stopped run goes on from; it is made with the first row."""
 
     def __init__(self, path: Path) -> None:
@@ -294,7 +296,7 @@ class _Log:
         return b"" if file.read(1) == b"\n" else b"\n"
 
 
-def _read(path: Path) -> dict[Place, ScoreRow]:
+def _read_log(path: Path) -> dict[RowId, ScoreRow]:
     """The last row of earlier runs at each place; failures, half lines and lines of other versions are passed over."""
     rows = {}
     for line in path.read_text(errors="replace").splitlines() if path.is_file() else ():
@@ -303,5 +305,5 @@ def _read(path: Path) -> dict[Place, ScoreRow]:
         except (ValueError, TypeError):
             continue
         if not row.error:
-            rows[row.place] = row
+            rows[row.id] = row
     return rows

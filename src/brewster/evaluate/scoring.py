@@ -28,7 +28,7 @@ class GroundTruth:
     pictures: Mapping[str, Picture]
 
     @classmethod
-    def open(cls, case: Case, protocol: EvaluationConfig) -> GroundTruth:
+    def open(cls, case: Case, config: EvaluationConfig) -> GroundTruth:
         """Reads the pictures of a case, reduced as the protocol says.
 
         Raises:
@@ -36,7 +36,7 @@ class GroundTruth:
         """
         files = {"photo": case.photo, "transmission": case.transmission, "reflection": case.reflection}
         photos = {
-            role: reduced(Photo.open(file.read()), protocol.size) for role, file in files.items() if file
+            role: downscale(Photo.open(file.read()), config.size) for role, file in files.items() if file
         }
         for role, photo in photos.items():
             _refuse_size(
@@ -53,13 +53,16 @@ class GroundTruth:
             self.pictures["photo"], self.pictures["transmission"], threshold=threshold
         )
 
-    def check(self, answer: MethodOutput, name: str) -> None:
+    def check(self, prediction: MethodOutput, name: str) -> None:
         """Refuses an answer of another size.
 
         Raises:
             PhotoError: so it is.
         """
-        for layer, photo in (("transmission", answer.transmission), ("reflection", answer.reflection)):
+        for layer, photo in (
+            ("transmission", prediction.transmission),
+            ("reflection", prediction.reflection),
+        ):
             if photo:
                 _refuse_size(
                     f"{name}'s {layer} of {self.case.benchmark}/{self.case.name}",
@@ -73,8 +76,8 @@ class GroundTruth:
 class Scorer:
     """Scores answers to one case; what depends on the truth exclusive is computed once."""
 
-    def __init__(self, truth: GroundTruth, protocol: EvaluationConfig) -> None:
-        self._truth, self._protocol = truth, protocol
+    def __init__(self, truth: GroundTruth, config: EvaluationConfig) -> None:
+        self._truth, self._protocol = truth, config
         self._pictures = {role: CachedPicture(picture) for role, picture in truth.pictures.items()}
         self._regions: dict[float, Region] = {}
 
@@ -83,18 +86,18 @@ class Scorer:
         """The share of the picture that the reflection region takes, by the first threshold."""
         return round(float(self._region(self._protocol.thresholds[0]).mean()), _DIGITS)
 
-    def score(self, answer: MethodOutput) -> dict[str, float | None]:
+    def score(self, prediction: MethodOutput) -> dict[str, float | None]:
         """column -> score; None where it has no meaning: no region, no such layer, a picture too small."""
-        layers = {"transmission": CachedPicture(answer.transmission.srgb_8bit())}
-        if answer.reflection:
-            layers["reflection"] = CachedPicture(answer.reflection.srgb_8bit())
+        layers = {"transmission": CachedPicture(prediction.transmission.srgb_8bit())}
+        if prediction.reflection:
+            layers["reflection"] = CachedPicture(prediction.reflection.srgb_8bit())
         return {
             column: _or_none(lambda column=column, metric=metric: self._measure(column, metric, layers))  # type: ignore[misc]
             for column, metric in self._protocol.columns().items()
-            if self._has_meaning(metric, layers)
+            if self._applies(metric, layers)
         }
 
-    def _has_meaning(self, metric: Metric, layers: Mapping[str, CachedPicture]) -> bool:
+    def _applies(self, metric: Metric, layers: Mapping[str, CachedPicture]) -> bool:
         if metric.of == "rendered":
             return self._truth.case.rendered
         return metric.of in layers and metric.of in self._pictures
@@ -122,7 +125,7 @@ def _or_none(measure: Callable[[], float]) -> float | None:
         return None
 
 
-def reduced(photo: Photo, shorter: int | None) -> Photo:
+def downscale(photo: Photo, shorter: int | None) -> Photo:
     """The photo, its shorter side at most so many px, as 8-bit sRGB."""
     if shorter is None or min(photo.size) <= shorter:
         return photo

@@ -52,12 +52,12 @@ def estimate(strata: Sequence[Stratum]) -> list[Estimate | None]:
     Percentile bootstrap (Efron and Tibshirani 1993, chapter 13), 95 %, 10,000 resamples with a fixed seed: within
     each stratum as many scenes are drawn, with replacement, as it has, and each brings all its pictures.
     """
-    drawn = [_draw(stratum) for stratum in strata]
-    sums, counts = (np.sum([part[i] for part in drawn], axis=0) for i in range(2))
+    resampled = [_resample(stratum) for stratum in strata]
+    sums, counts = (np.sum([part[i] for part in resampled], axis=0) for i in range(2))
     values = np.concatenate([stratum.values for stratum in strata])
-    is_varied = np.any([_scenes(stratum) > 1 for stratum in strata], axis=0)
+    has_interval = np.any([_scenes(stratum) > 1 for stratum in strata], axis=0)
     return [
-        _estimate(values[:, i], sums[:, i], counts[:, i], is_varied=bool(is_varied[i]))
+        _estimate(values[:, i], sums[:, i], counts[:, i], has_interval=bool(has_interval[i]))
         for i in range(values.shape[1])
     ]
 
@@ -68,26 +68,26 @@ def _scenes(stratum: Stratum) -> NDArray[np.int64]:
     return np.array([len(set(names[has])) for has in np.isfinite(stratum.values).T])
 
 
-def _draw(stratum: Stratum) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _resample(stratum: Stratum) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Sums and numbers of values in each resample, (10,000, series) each."""
     names = {scene: i for i, scene in enumerate(sorted(set(stratum.scenes)))}
-    owner = np.array([names[scene] for scene in stratum.scenes], int)
+    scene_index = np.array([names[scene] for scene in stratum.scenes], int)
     sums, counts = (np.zeros((len(names), stratum.values.shape[1])) for _ in range(2))
-    np.add.at(sums, owner, np.nan_to_num(stratum.values))
-    np.add.at(counts, owner, np.isfinite(stratum.values))
+    np.add.at(sums, scene_index, np.nan_to_num(stratum.values))
+    np.add.at(counts, scene_index, np.isfinite(stratum.values))
     rng = np.random.default_rng([SEED, zlib.crc32(stratum.name.encode())])
     times = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), RESAMPLES).astype(float)
     return times @ sums, times @ counts
 
 
 def _estimate(
-    values: NDArray[np.float64], sums: NDArray[np.float64], counts: NDArray[np.float64], *, is_varied: bool
+    values: NDArray[np.float64], sums: NDArray[np.float64], counts: NDArray[np.float64], *, has_interval: bool
 ) -> Estimate | None:
     valid = values[np.isfinite(values)]
     if not valid.size:
         return None
     mean = math.fsum(valid) / valid.size
-    if not is_varied:
+    if not has_interval:
         return Estimate(mean, None, None, valid.size)
     low, high = np.percentile(sums[counts > 0] / counts[counts > 0], _PERCENTILES)
     return Estimate(mean, float(low), float(high), valid.size)
@@ -120,22 +120,23 @@ def differences(
     """
     place = {name: i for i, name in enumerate(series)}
     methods = list(dict.fromkeys(method for method, _ in series))
-    asked = [
+    comparisons = [
         (method, than, metric)
         for i, method in enumerate(methods)
         for than in methods[:i]
         for metric in directions
     ]
-    if not asked:
+    if not comparisons:
         return []
-    mine, others = ([place[row[i], row[2]] for row in asked] for i in range(2))
-    apart = [
-        replace(stratum, values=stratum.values[:, mine] - stratum.values[:, others]) for stratum in strata
+    columns, other_columns = ([place[row[i], row[2]] for row in comparisons] for i in range(2))
+    paired = [
+        replace(stratum, values=stratum.values[:, columns] - stratum.values[:, other_columns])
+        for stratum in strata
     ]
-    signs = [1 if directions[metric] else -1 for *_, metric in asked]
-    better = sum((stratum.values * signs > 0).sum(axis=0) for stratum in apart)
+    signs = [1 if directions[metric] else -1 for *_, metric in comparisons]
+    better = sum((stratum.values * signs > 0).sum(axis=0) for stratum in paired)
     return [
-        Difference(*row, answer, int(count))
-        for row, answer, count in zip(asked, estimate(apart), better, strict=True)
-        if answer
+        Difference(*row, prediction, int(count))
+        for row, prediction, count in zip(comparisons, estimate(paired), better, strict=True)
+        if prediction
     ]

@@ -16,13 +16,13 @@ from html import escape
 from pathlib import Path
 from typing import Any, Final
 
-from brewster.evaluate.methods import NOTHING
+from brewster.evaluate.methods import BASELINE
 from brewster.evaluate.report.images import (
-    BRIGHTEST_ERROR,
-    LONGEST,
-    RAMP,
+    COLOUR_MAP,
+    MAX_ERROR,
+    MAX_SIDE_PX,
     CaseImages,
-    answer_tiles,
+    method_tiles,
     photo_tiles,
 )
 from brewster.evaluate.report.tables import is_complete, ranking, remarks
@@ -78,7 +78,7 @@ def _data(results: Results, scores: list[Any]) -> Iterator[str]:
         },
         "methods": [*results["methods"]],
         "benchmarks": {name: benchmark["title"] for name, benchmark in results["benchmarks"].items()},
-        "nothing": NOTHING,
+        "nothing": BASELINE,
         "scores": scores,
     }
     yield json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
@@ -89,16 +89,16 @@ def _data(results: Results, scores: list[Any]) -> Iterator[str]:
 
 def _results(results: Results) -> Iterator[str]:
     pictures, methods = results["pictures"], results["methods"]
-    benchmarks, protocol = results["benchmarks"], results["protocol"]
+    benchmarks, config = results["benchmarks"], results["protocol"]
     yield (
         f"<p class=lede>{_count(len(methods), 'method')} on {_count(len(pictures), 'picture')} of "
-        f"{_count(len(benchmarks), 'benchmark')}: size {escape(str(protocol['size']))}, quality "
-        f"{escape(str(protocol['quality']))}, brewster {escape(results['brewster'])}.</p>\n"
+        f"{_count(len(benchmarks), 'benchmark')}: size {escape(str(config['size']))}, quality "
+        f"{escape(str(config['quality']))}, brewster {escape(results['brewster'])}.</p>\n"
     )
     yield from _problems(results)
     yield _means(results)
     yield _differences(results)
-    yield from _how(results)
+    yield from _method_notes(results)
 
 
 def _problems(results: Results) -> Iterator[str]:
@@ -111,19 +111,19 @@ def _problems(results: Results) -> Iterator[str]:
     said = ", ".join(
         f"{method} on {count} of {_count(len(pictures), 'picture')}" for method, count in counts.items()
     )
-    yield _noted(f"Failed: {said}", [f"{name}, {method}: {error}" for name, method, error in failed])
+    yield _note(f"Failed: {said}", [f"{name}, {method}: {error}" for name, method, error in failed])
     refused, said_of_sets = (
         [f"{benchmark['title']}: {point}" for benchmark in benchmarks for point in benchmark[kind]]
         for kind in ("refused", "remarks")
     )
     points = said_of_sets + remarks(results)
-    yield _noted(_count(len(refused), "file refused"), refused)
-    yield _noted(_count(len(points), "remark"), points)
+    yield _note(_count(len(refused), "file refused"), refused)
+    yield _note(_count(len(points), "remark"), points)
     if not failed:
         yield "<p>No method failed on any picture.</p>\n"
 
 
-def _noted(said: str, points: Sequence[str]) -> str:
+def _note(said: str, points: Sequence[str]) -> str:
     """A few points stand in the open, many can be opened, none is no note."""
     if not points:
         return ""
@@ -220,22 +220,24 @@ def _number(value: float | None, about: Results, sign: str = "") -> str:
 
 def _differences(results: Results) -> str:
     """Against the unprocessed input in the open; between methods, where there are several, to be opened."""
-    to_nothing, between = (_pairs(results, is_nothing) for is_nothing in (True, False))
+    to_baseline, between = (_pairs(results, is_baseline) for is_baseline in (True, False))
     said = "Mean change, its 95 % interval, and on how many pictures it is for the better"
-    first = _table(f"Against the unprocessed input. {said}", _used(results), to_nothing) if to_nothing else ""
+    first = (
+        _table(f"Against the unprocessed input. {said}", _used(results), to_baseline) if to_baseline else ""
+    )
     if not between:
         return first
     second = _table(f"Between methods. {said}", _used(results), between)
     return f"{first}<details><summary>Differences between methods</summary>{second}</details>\n"
 
 
-def _pairs(results: Results, is_nothing: bool) -> list[str]:
+def _pairs(results: Results, is_baseline: bool) -> list[str]:
     metrics, bodies = _used(results), []
     for name, differences in results["differences"].items():
         rows: dict[str, dict[str, Results]] = {}
         for row in differences:
-            if (row["than"] == NOTHING) == is_nothing:
-                pair = row["method"] if is_nothing else f"{row['method']} against {row['than']}"
+            if (row["than"] == BASELINE) == is_baseline:
+                pair = row["method"] if is_baseline else f"{row['method']} against {row['than']}"
                 rows.setdefault(pair, {})[row["metric"]] = row
         cells = (
             (pair, [_change(row.get(metric), metrics[metric]) for metric in metrics])
@@ -260,7 +262,7 @@ def _change(row: Results | None, about: Results) -> str:
     )
 
 
-def _how(results: Results) -> Iterator[str]:
+def _method_notes(results: Results) -> Iterator[str]:
     yield f"<details><summary>How it was measured</summary>{_list(results['protocol']['choices'])}<dl>"
     for name, metric in results["metrics"].items():
         better = "higher is better" if metric["higher_is_better"] else "lower is better"
@@ -277,10 +279,10 @@ def _how(results: Results) -> Iterator[str]:
 
 def _cases(results: Results, shown: Iterable[CaseImages], scores: list[Any]) -> Iterator[str]:
     known = {(picture["benchmark"], picture["name"]): picture for picture in results["pictures"]}
-    steps = (f"<i style='background:rgb({red},{green},{blue})'></i>" for red, green, blue in RAMP)
+    steps = (f"<i style='background:rgb({red},{green},{blue})'></i>" for red, green, blue in COLOUR_MAP)
     yield (
-        f"<p class=legend>Errors, of 255: 0 <span>{''.join(steps)}</span> {BRIGHTEST_ERROR} and more. "
-        f"Pictures are embedded with at most {LONGEST} px on the longer side.</p>\n"
+        f"<p class=legend>Errors, of 255: 0 <span>{''.join(steps)}</span> {MAX_ERROR} and more. "
+        f"Pictures are embedded with at most {MAX_SIDE_PX} px on the longer side.</p>\n"
     )
     for case in shown:
         picture = known.get((case.benchmark, case.name), {"scores": {}, "errors": {}})
@@ -300,9 +302,9 @@ def _case(results: Results, case: CaseImages, picture: Results) -> str:
     ]
     if (share := picture.get("region_share")) is not None:
         facts.append(f"region {share:.0%}")
-    others = [name for name in results["methods"] if name != NOTHING]
-    rows = [_row(results, picture, NOTHING, photo_tiles(case))]
-    rows += [_row(results, picture, method, answer_tiles(case, method)) for method in others]
+    others = [name for name in results["methods"] if name != BASELINE]
+    rows = [_row(results, picture, BASELINE, photo_tiles(case))]
+    rows += [_row(results, picture, method, method_tiles(case, method)) for method in others]
     return (
         f'<article data-benchmark="{escape(case.benchmark)}" data-name="{escape(case.name)}">\n'
         f"<h3>{escape(case.name)}</h3><p>{' &middot; '.join(facts)} <span class=key></span></p>\n{''.join(rows)}</article>\n"
@@ -312,7 +314,7 @@ def _case(results: Results, case: CaseImages, picture: Results) -> str:
 def _row(results: Results, picture: Results, method: str, tiles: str) -> str:
     error = picture["errors"].get(method)
     failure = f"<p class=failure>Failed: {escape(error)}</p>" if error else ""
-    title = "photo, input (unprocessed)" if method == NOTHING else method
+    title = "photo, input (unprocessed)" if method == BASELINE else method
     return (
         f"<section><div><h4>{escape(title)}</h4>{failure}{_scores(results, picture['scores'], method)}</div>"
         f"<div class=tiles>{tiles}</div></section>\n"
@@ -321,13 +323,13 @@ def _row(results: Results, picture: Results, method: str, tiles: str) -> str:
 
 def _scores(results: Results, scores: Results, method: str) -> str:
     """A method's scores on one picture, and their change to the unprocessed input."""
-    mine, nothing = scores.get(method, {}), scores.get(NOTHING, {})
+    mine, nothing = scores.get(method, {}), scores.get(BASELINE, {})
     lines = []
     for name, about in results["metrics"].items():
         if all(row.get(name) is None for row in scores.values()) or method not in scores:
             continue
         value, before = mine.get(name), nothing.get(name)
-        has_change = method != NOTHING and value is not None and before is not None and value != before
+        has_change = method != BASELINE and value is not None and before is not None and value != before
         change = _gain(value - before, about) if has_change else ""
         lines.append(
             f"<tr><th scope=row>{escape(about['title'])}</th><td>{_number(value, about)}</td><td>{change}</td></tr>"

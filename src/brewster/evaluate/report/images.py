@@ -17,10 +17,10 @@ from brewster.photo import FileInfo, Photo
 Pixels = NDArray[np.uint8]
 Float32 = NDArray[np.float32]
 
-LONGEST: Final = 480
+MAX_SIDE_PX: Final = 480
 """The longer side of an embedded picture in px, at most."""
 
-BRIGHTEST_ERROR: Final = 96
+MAX_ERROR: Final = 96
 """The error, of 255, from which on the brightest colour is given."""
 
 _INFERNO: Final = (
@@ -38,15 +38,15 @@ _INFERNO: Final = (
 _STEPS: Final = 16
 
 
-def _ramp() -> Pixels:
+def _colour_map() -> Pixels:
     anchors = np.array([[colour >> shift & 255 for shift in (16, 8, 0)] for colour in _INFERNO])
     at = np.linspace(0, 1, _STEPS)
     channels = [np.interp(at, np.linspace(0, 1, len(anchors)), anchors[:, channel]) for channel in range(3)]
-    ramp: Pixels = np.rint(np.stack(channels, axis=1)).astype(np.uint8)
-    return ramp
+    colours: Pixels = np.rint(np.stack(channels, axis=1)).astype(np.uint8)
+    return colours
 
 
-RAMP: Final = _ramp()
+COLOUR_MAP: Final = _colour_map()
 """Colours of errors (16, 3), sRGB: matplotlib's "inferno" (CC0), whose lightness grows evenly, so that grey prints
 tell as much. Each stands for a sixteenth of BRIGHTEST_ERROR: few enough for small files without loss."""
 
@@ -69,7 +69,7 @@ class CaseImages:
     photo: Pixels
     truth: Pixels
     region: NDArray[np.bool_]
-    answers: Mapping[str, Pixels]
+    predictions: Mapping[str, Pixels]
     reflections: Mapping[str, Pixels] = field(default_factory=dict)
     reflection_truth: Pixels | None = None
 
@@ -87,13 +87,13 @@ def photo_tiles(case: CaseImages) -> str:
     return "".join(tiles)
 
 
-def answer_tiles(case: CaseImages, method: str) -> str:
+def method_tiles(case: CaseImages, method: str) -> str:
     """What a method made of a case, as HTML: its transmission, the error of that, its reflection; empty where it failed."""
     tiles = []
-    if method in case.answers:
-        answer = case.answers[method]
-        tiles.append(_tile(case, "picture", method, webp(answer)))
-        tiles.append(_tile(case, "error", f"error of {method}", lossless(error_map(answer, case.truth))))
+    if method in case.predictions:
+        prediction = case.predictions[method]
+        tiles.append(_tile(case, "picture", method, webp(prediction)))
+        tiles.append(_tile(case, "error", f"error of {method}", lossless(error_map(prediction, case.truth))))
     if method in case.reflections:
         tiles.append(_tile(case, "reflection", f"reflection by {method}", webp(case.reflections[method])))
     return "".join(tiles)
@@ -112,7 +112,7 @@ def _tile(case: CaseImages, kind: str, said: str, data: bytes) -> str:
 def size_of(picture: NDArray[Any]) -> tuple[int, int]:
     """Width and height of an embedded picture."""
     height, width = picture.shape[:2]
-    scale = min(1, LONGEST / max(height, width))
+    scale = min(1, MAX_SIDE_PX / max(height, width))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
@@ -124,14 +124,14 @@ def webp(picture: Pixels) -> bytes:
     return Photo.from_array(picture, encoding="srgb").encode("webp")
 
 
-def error_map(answer: Pixels, truth: Pixels) -> Pixels:
+def error_map(prediction: Pixels, truth: Pixels) -> Pixels:
     """Where an answer (H, W, 3) is wrong: uint8 (h, w, 3) in the colours of the RAMP, reduced like the picture.
 
     The absolute difference of the largest channel, averaged over the area of each new pixel, then coloured.
     """
-    errors = np.abs(answer.astype(np.int16) - truth).max(axis=2)
+    errors = np.abs(prediction.astype(np.int16) - truth).max(axis=2)
     means = _area_means(errors.astype(np.float32)[..., None])[..., 0]
-    colours: Pixels = RAMP[(means / BRIGHTEST_ERROR * _STEPS).astype(int).clip(0, _STEPS - 1)]
+    colours: Pixels = COLOUR_MAP[(means / MAX_ERROR * _STEPS).astype(int).clip(0, _STEPS - 1)]
     return colours
 
 
@@ -154,11 +154,11 @@ def _area_means(values: Float32) -> Float32:
     What Photo.small does row by row, to save memory, is done here at once, to save time.
     """
     width, height = size_of(values)
-    rows = np.tensordot(_shares(values.shape[0], height), values, 1)
-    return np.tensordot(_shares(values.shape[1], width), rows, (1, 1)).transpose(1, 0, 2)
+    rows = np.tensordot(_area_weights(values.shape[0], height), values, 1)
+    return np.tensordot(_area_weights(values.shape[1], width), rows, (1, 1)).transpose(1, 0, 2)
 
 
-def _shares(old: int, new: int) -> Float32:
+def _area_weights(old: int, new: int) -> Float32:
     """The share of each of `old` pixels in the mean that is each of `new` ones, (new, old)."""
     edges, pixels = np.linspace(0, old, new + 1), np.arange(old)
     overlap = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)

@@ -13,7 +13,7 @@ MAIN: Final = ("psnr", "ssim", "lpips")
 """The metrics of an overview."""
 
 _ARROWS: Final = {True: "↑", False: "↓"}
-_UNFAIR: Final = "\n\nA mean over fewer pictures than the others is not to be compared with them; differences are over common pictures."
+_UNEQUAL_COUNTS: Final = "\n\nA mean over fewer pictures than the others is not to be compared with them; differences are over common pictures."
 _MINUS: Final = "\N{MINUS SIGN}"
 
 
@@ -25,7 +25,7 @@ def to_markdown(results: Results) -> str:
     parts = [
         _overview(results),
         *(_details(results, key) for key in results["selections"]),
-        _told(results),
+        _notes(results),
         _choices(results),
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
@@ -49,10 +49,10 @@ def _overview(results: Results) -> str:
         [method, *(_cell(results, key, method, metrics) for key in results["selections"])]
         for method in results["methods"]
     ]
-    return f"{titles}\n\n{_grid(rows)}{_UNFAIR if _some_failed(results, metrics) else ''}"
+    return f"{titles}\n\n{_grid(rows)}{_UNEQUAL_COUNTS if _has_unequal_counts(results, metrics) else ''}"
 
 
-def _some_failed(results: Results, metrics: Iterable[str]) -> bool:
+def _has_unequal_counts(results: Results, metrics: Iterable[str]) -> bool:
     """Whether a method has means over fewer pictures than another."""
     return any(
         metric in row and not is_complete(table, method, metric)
@@ -85,7 +85,11 @@ def _details(results: Results, key: str) -> str:
             _mean(results, metric, table[method].get(metric), selection["pictures"]) for method in methods
         ]
         rows.append(
-            [_heading(results, metric), *means, *(_apart(results, metric, found.get(pair)) for pair in pairs)]
+            [
+                _heading(results, metric),
+                *means,
+                *(_difference_cell(results, metric, found.get(pair)) for pair in pairs),
+            ]
         )
     return f"### {selection['title']} ({selection['pictures']} pictures)\n\n{_grid(rows)}"
 
@@ -97,7 +101,7 @@ def _mean(results: Results, metric: str, entry: Mapping[str, Any] | None, pictur
     return f"{_number(results, metric, entry['mean'])}{_interval(results, metric, entry)}{some}"
 
 
-def _apart(results: Results, metric: str, row: Mapping[str, Any] | None) -> str:
+def _difference_cell(results: Results, metric: str, row: Mapping[str, Any] | None) -> str:
     if row is None:
         return "-"
     mean, interval = (
@@ -114,7 +118,7 @@ def _interval(results: Results, metric: str, entry: Mapping[str, Any], *, sign: 
     return f" ({low} to {high})"
 
 
-def _told(results: Results) -> str:
+def _notes(results: Results) -> str:
     """What should be said aloud: remarks, files left out, failures."""
     lines = [
         f"- {part['title']}: {text}"
