@@ -32,7 +32,7 @@ def triplet(tmp_path):
 
 @pytest.fixture
 def rendered(tmp_path):
-    """A sample in which the right half mirrors a bright patch, as brewster render leaves it."""
+    """A sample as `brewster render` writes it, with a bright reflection in the right half."""
     make(tmp_path / "set", count=1)
     background = np.full((48, 64, 3), 0.3, np.float32)
     background[8:40, 4:28] = 0.05
@@ -48,7 +48,7 @@ def rendered(tmp_path):
     return tmp_path / "set"
 
 
-def test_doing_nothing_scores_what_scikit_image_says(triplet):
+def test_the_baseline_scores_agree_with_scikit_image(triplet):
     truth, scorer = open_case(triplet, EvaluationConfig(metrics=("psnr", "ssim", "ssim_gaussian")))
     photo, transmission = truth.pictures["photo"], truth.pictures["transmission"]
     scores = scorer.score(IdentityBaseline().predict(truth.case, truth.photo))
@@ -62,7 +62,7 @@ def test_doing_nothing_scores_what_scikit_image_says(triplet):
     }
 
 
-def test_the_reflection_is_measured_where_there_is_truth_and_an_answer(triplet):
+def test_the_reflection_is_scored_if_there_is_a_ground_truth_and_a_prediction(triplet):
     config = EvaluationConfig(metrics=("psnr", "psnr_reflection"))
     truth, scorer = open_case(triplet, config)
     mirrored = Photo.from_array(truth.pictures["reflection"], encoding="srgb")
@@ -97,9 +97,9 @@ def test_the_failure_cases_are_scored_on_rendered_pictures_only(triplet, rendere
     assert list(scorer.score(MethodOutput(truth.photo))) == ["psnr"]
     truth, scorer = open_case(rendered, config, "rendered")
     perfect = Photo.from_array(truth.pictures["transmission"], encoding="srgb")
-    kept, removed = scorer.score(MethodOutput(truth.photo)), scorer.score(MethodOutput(perfect))
+    unchanged, removed = scorer.score(MethodOutput(truth.photo)), scorer.score(MethodOutput(perfect))
     assert removed["kept_reflection"] == pytest.approx(0, abs=0.02)
-    assert kept["kept_reflection"] > 0.5
+    assert unchanged["kept_reflection"] > 0.5
     assert removed["removed_content"] == 0
 
 
@@ -133,7 +133,7 @@ def test_a_new_metric_is_one_row_with_its_function(triplet, tmp_path, monkeypatc
     monkeypatch.setitem(
         METRICS,
         "darkest",
-        a_metric("darkest", lambda case: float(case.predict.pixels.min()) - float(case.truth.pixels.min())),
+        a_metric("darkest", lambda case: float(case.answer.pixels.min()) - float(case.truth.pixels.min())),
     )
     config = EvaluationConfig(metrics=("darkest",))
     (row,) = score(read_benchmark("pairs", triplet), [IdentityBaseline()], config, tmp_path / "out")
@@ -164,7 +164,7 @@ def test_what_a_metric_needs_is_loaded_before_the_first_score(triplet, tmp_path,
 
 
 def test_features_are_computed_once_for_each_picture(triplet, monkeypatch):
-    """Two metrics share them, and the truth's serve every answer."""
+    """Two metrics share them, and those of the ground truth serve every prediction."""
     computed = []
 
     def compute(picture):
@@ -172,7 +172,7 @@ def test_features_are_computed_once_for_each_picture(triplet, monkeypatch):
         return float(picture.mean())
 
     def measure(case):
-        return case.predict.features(compute) - case.truth.features(compute)
+        return case.answer.features(compute) - case.truth.features(compute)
 
     for name in ("one", "two"):
         monkeypatch.setitem(METRICS, name, a_metric(name, measure))
@@ -212,7 +212,7 @@ def test_rows_of_rendered_samples_and_reflections_score_as_their_own_functions_s
     assert scores["removed_white"] is None  # nothing behind this glass is white
 
 
-def test_lpips_looks_at_each_picture_once(data, monkeypatch):
+def test_lpips_features_are_computed_once_for_each_picture(data, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     seen, features = [], Lpips.features
     monkeypatch.setattr(Lpips, "features", lambda self, picture: seen.append(1) or features(self, picture))

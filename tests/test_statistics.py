@@ -1,4 +1,4 @@
-"""Intervals must cover what they say, and depend on the pictures alone."""
+"""Intervals have their stated coverage and depend on the pictures alone."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def test_the_mean_is_over_all_pictures_not_over_benchmarks():
     assert prediction.count == 4
 
 
-def test_a_constant_is_certain():
+def test_the_interval_of_a_constant_has_no_width():
     prediction = only([stratum([3.0] * 10)])
     assert (prediction.low, prediction.mean, prediction.high) == (3.0, 3.0, 3.0)
 
@@ -33,7 +33,7 @@ def test_one_scene_has_no_interval():
     assert only([stratum([1.0, 2.0, 3.0], scenes=["x"] * 3)]).low is None
 
 
-def test_a_region_that_one_picture_alone_has_has_no_interval():
+def test_a_score_of_a_single_picture_has_no_interval():
     assert only([stratum([1.0, np.nan, np.nan])]).low is None
     assert only([stratum([1.0], name="a"), stratum([2.0], name="b")]).low is None
     assert only([stratum([1.0], name="a"), stratum([2.0, 3.0], name="b")]).low is not None
@@ -62,7 +62,7 @@ def test_intervals_cover_the_truth_at_their_stated_rate(random):
     assert 0.90 <= hits / 200 <= 0.99
 
 
-def test_ten_variants_of_a_scene_are_hardly_more_certain_than_one(random):
+def test_ten_variants_of_a_scene_hardly_narrow_the_interval(random):
     scenes = random.normal(0, 1, 20)
     one = only([stratum(scenes)])
     ten = only([stratum(np.repeat(scenes, 10), scenes=[str(i // 10) for i in range(200)])])
@@ -85,7 +85,7 @@ def test_the_mean_lies_in_its_interval_and_that_between_the_extremes(values):
     assert prediction.mean == pytest.approx(np.mean(values), abs=1e-9)
 
 
-def test_differences_are_paired_and_surer_than_the_means_they_are_made_of(random):
+def test_paired_differences_have_narrower_intervals_than_the_means(random):
     pictures = random.normal(22, 5, 50)
     values = np.stack([pictures, pictures + random.normal(0.5, 0.1, 50)], axis=1)
     series = [("nothing", "psnr"), ("ours", "psnr")]

@@ -1,8 +1,11 @@
-"""Which pictures in a folder belong together: by name, never by position, and nothing is guessed.
+"""Groups the pictures of a benchmark folder by name: photo, transmission and, if there is one, reflection.
 
-Benchmarks come in two forms. Repacked, a folder for each role with equal names in them: blended/a.png,
-transmission_layer/a.png. Or as SIR2's authors gave them, a folder for each shot, with a letter for each role: ab/3/ab-3-m-32.png,
-ab/3/ab-3-g-32.png. Either way, a name with one picture for each role is a `PictureGroup`, and every other is refused aloud.
+Pictures are paired by name only, never by sorted position. Two layouts are supported:
+
+- Pairs: one folder per role with equal file names: blended/a.png, transmission_layer/a.png.
+- The original SIR2 tree: one folder per shot, with one letter per role: ab/3/ab-3-m-32.png, ab/3/ab-3-g-32.png.
+
+A name with exactly one picture for each role becomes a `PictureGroup`. Every other name is refused with a reason.
 """
 
 from __future__ import annotations
@@ -23,14 +26,14 @@ ROLES: Final[dict[str, tuple[str, ...]]] = {
     "transmission": ("transmission_layer", "transmission", "gt", "ground_truth", "without_reflection", "t"),
     "reflection": ("reflection_layer", "reflection", "r"),
 }
-"""What the folder of a role is called, in lower case; the first is the usual name."""
+"""role -> accepted folder names, in lower case. The first one is the usual name."""
 
 SIR2_TREES: Final[dict[str, tuple[str, ...]]] = {
     "postcard": ("kind", "scene", "variant"),
     "solidobject": ("scene", "kind", "variant"),
     "wildscene": ("scene",),
 }
-"""SIR2's three sets, and what the folders on the way down to a shot mean."""
+"""SIR2's three subsets -> the meaning of each folder level from the subset's root to a shot."""
 
 _KINDS: Final = ("focus", "thick")
 _LETTERS: Final = {"m": "photo", "g": "transmission", "r": "reflection"}
@@ -43,7 +46,7 @@ _FilesByRole = Mapping[str, list[Path]]
 @final
 @dataclass(frozen=True)
 class PictureGroup:
-    """Pictures of one name: a photo, its truth, and perhaps what was mirrored; `scene` is "" where nobody tells."""
+    """Pictures of one name: photo, transmission (ground truth) and, if there is one, reflection. `scene` is "" if unknown."""
 
     name: str
     scene: str
@@ -55,7 +58,10 @@ class PictureGroup:
 @final
 @dataclass(frozen=True)
 class FolderListing:
-    """What a folder holds: trios in natural order, and lines about what was passed over and what was refused."""
+    """The content of a folder: groups in natural order of their names.
+
+    `remarks` are lines about ignored files, `refused` lines about files without a unique partner.
+    """
 
     groups: tuple[PictureGroup, ...] = ()
     remarks: tuple[str, ...] = ()
@@ -63,16 +69,16 @@ class FolderListing:
 
 
 def natural_key(name: str) -> tuple[list[str | int], str]:
-    """Sorts names as people do: 2 before 10."""
+    """Sort key for natural order: 2 before 10."""
     pieces = re.split(r"(\d+)", name)
     return [int(piece) if i % 2 else piece for i, piece in enumerate(pieces)], name
 
 
 def entries(folder: Path) -> tuple[list[Path], list[Path]]:
-    """The folders and the files in a folder, without hidden ones and what systems leave, in natural order.
+    """The folders and the files in a folder, each in natural order, without hidden files and files of the system.
 
     Raises:
-        PhotoError: it cannot be read.
+        PhotoError: the folder cannot be read.
     """
     kinds: tuple[list[Path], list[Path]] = ([], [])
     try:
@@ -82,8 +88,8 @@ def entries(folder: Path) -> tuple[list[Path], list[Path]]:
     except OSError as error:
         raise PhotoError(
             f"{folder} cannot be read ({error.strerror or error})",
-            "a benchmark is a folder with pictures",
-            "name the folder where your copy lies",
+            "a folder with pictures was expected",
+            "give the path of your copy of the benchmark",
         ) from error
     return kinds
 
@@ -92,20 +98,20 @@ def entries(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def find_roles(folder: Path) -> dict[str, Path]:
-    """The folders of ROLES that lie in a folder, by role.
+    """role -> subfolder that has one of the role's names (see ROLES).
 
     Raises:
-        PhotoError: it cannot be read, or has two folders for one role.
+        PhotoError: the folder cannot be read, or has two subfolders for one role.
     """
     roles = {name: role for role, names in ROLES.items() for name in names}
     return _find_labelled(folder, lambda name: roles.get(re.sub(r"[\s-]+", "_", name.lower()), ""))
 
 
 def find_split(folder: Path) -> Path:
-    """The folder itself if pairs lie in it, else the one folder in it where they do: train, val or test.
+    """The folder itself if it contains pairs, else its only subfolder that does: train, val or test.
 
     Raises:
-        PhotoError: there are several, or a folder cannot be read.
+        PhotoError: several subfolders contain pairs, or a folder cannot be read.
     """
     if "photo" in find_roles(folder):
         return folder
@@ -113,17 +119,17 @@ def find_split(folder: Path) -> Path:
     if len(splits) > 1:
         raise PhotoError(
             f"{folder} has pairs in {join_names([path.name for path in splits])}",
-            "a benchmark is one of them",
-            f"point at one, for example {splits[0]}",
+            "one split was expected",
+            f"give the path of one, for example {splits[0]}",
         )
     return splits[0] if splits else folder
 
 
 def read_folders(folder: Path) -> FolderListing:
-    """Trios from a folder for each role, joined by their stems, whatever their suffixes.
+    """Groups from one folder per role, matched by file stem; suffixes may differ.
 
     Raises:
-        PhotoError: a folder is missing, empty or unreadable, or two could have one role.
+        PhotoError: a folder is missing, empty or unreadable, or two folders have one role.
     """
     roles = find_roles(folder)
     by_name: dict[str, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
@@ -143,41 +149,43 @@ def _role_pictures(folder: Path, role: str, roles: Mapping[str, Path]) -> tuple[
             return [], []
         raise PhotoError(
             f"{folder} has no folder for the {role}",
-            f"pairs lie in folders beside each other, this one called {join_names(ROLES[role], ' or ')}",
-            "rename yours, or name the folder above them",
+            f"expected one folder per role, side by side, this one named {join_names(ROLES[role], ' or ')}",
+            "rename your folder, or give the path of its parent folder",
         )
     pictures, others = _pictures(roles[role])
     if not pictures:
         raise PhotoError(
-            f"no pictures in {roles[role]}", f"files ending in {', '.join(SUFFIXES)}", "name another folder"
+            f"no pictures in {roles[role]}",
+            f"expected files ending in {', '.join(SUFFIXES)}",
+            "give another folder",
         )
     return pictures, others
 
 
-# --- SIR2's own trees
+# --- the original SIR2 trees
 
 
 def find_subsets(folder: Path) -> dict[str, Path]:
-    """The folders of TREES that lie in a folder; only the first letters count: "Postcard Dataset", "postcard".
+    """subset of SIR2 -> its folder. Only the beginning of the name is compared: "Postcard Dataset", "postcard".
 
     Raises:
-        PhotoError: it cannot be read, or has two folders for one set.
+        PhotoError: the folder cannot be read, or has two folders for one subset.
     """
     return _find_labelled(folder, _subset_of)
 
 
 def read_tree(folder: Path, subset: str) -> FolderListing:
-    """Trios from a folder for each shot, joined by their names without the role's letter.
+    """Groups from one folder per shot, matched by file name without the letter of the role.
 
     Raises:
-        PhotoError: a folder cannot be read, or there is no shot in this tree.
+        PhotoError: a folder cannot be read, or the tree contains no shot.
     """
     found = _refuse_duplicates(folder, _merge(_read_branches(folder, folder, SIR2_TREES[subset], {})))
     if not found.groups and not found.refused:
         raise PhotoError(
-            f"{folder} is no {subset} set",
-            f"photos in {'/'.join(f'<{level}>' for level in SIR2_TREES[subset])}/*m*.*, or in {ROLES['photo'][0]}/",
-            "name the folder where your copy lies",
+            f"{folder} is not a {subset} set",
+            f"expected photos in {'/'.join(f'<{level}>' for level in SIR2_TREES[subset])}/*m*.*, or in {ROLES['photo'][0]}/",
+            "give the path of your copy",
         )
     return found
 
@@ -221,10 +229,10 @@ def _without_letter(stem: str) -> str:
 
 
 def _refuse_duplicates(root: Path, found: FolderListing) -> FolderListing:
-    """Folders that differ in case only can give two shots one name: then neither is taken."""
+    """Refuses all groups that share a name. Folders whose names differ only in case can cause this."""
     counts = Counter(group.name for group in found.groups)
     duplicates = tuple(
-        f"{_relative(root, group.photo)} is ambiguous: another photo would be called {group.name} too"
+        f"{_relative(root, group.photo)} is ambiguous: another photo has the name {group.name} too"
         for group in found.groups
         if counts[group.name] > 1
     )
@@ -232,11 +240,11 @@ def _refuse_duplicates(root: Path, found: FolderListing) -> FolderListing:
     return FolderListing(unique, found.remarks, (*found.refused, *duplicates))
 
 
-# --- both
+# --- both layouts
 
 
 def _make_group(root: Path, name: str, scene: str, parts: _FilesByRole) -> FolderListing:
-    """One trio, or the reason why there is none."""
+    """A listing with one group, or with the reason why there is none."""
     problem = _problem(root, parts)
     if problem:
         return FolderListing(refused=(problem,))
@@ -250,7 +258,7 @@ def _problem(root: Path, parts: _FilesByRole) -> str:
     for role, paths in parts.items():
         if len(paths) > 1:
             named = join_names([_relative(root, path) for path in paths])
-            return f"{named} are ambiguous: there must be one {role} of that name"
+            return f"{named} are ambiguous: expected one {role} of that name"
     for role in ("photo", "transmission"):
         if not parts.get(role):
             named = join_names([_relative(root, path) for paths in parts.values() for path in paths])
@@ -259,7 +267,7 @@ def _problem(root: Path, parts: _FilesByRole) -> str:
 
 
 def _pictures(folder: Path) -> tuple[list[Path], list[Path]]:
-    """The pictures by name, and whatever else is there."""
+    """The pictures of a folder in natural order, and all other entries."""
     folders, files = entries(folder)
     pictures = [path for path in files if path.suffix.lower() in SUFFIXES]
     return pictures, [*folders, *(path for path in files if path.suffix.lower() not in SUFFIXES)]
@@ -272,15 +280,15 @@ def _find_labelled(folder: Path, label: Callable[[str], str]) -> dict[str, Path]
         if role and found.setdefault(role, path) != path:
             raise PhotoError(
                 f"{folder} has two folders for {role}, {found[role].name} and {path.name}",
-                "one of each is wanted, and brewster does not choose",
-                "move one of them away",
+                "expected one of each",
+                "move or rename one of them",
             )
     return {role: path for role, path in found.items() if role}
 
 
 def _ignored(root: Path, others: Iterable[Path]) -> FolderListing:
     named = [_relative(root, path) for path in others]
-    return FolderListing(remarks=(f"passed over {join_names(named)}",) if named else ())
+    return FolderListing(remarks=(f"ignored {join_names(named)}",) if named else ())
 
 
 def _merge(pieces: Iterable[FolderListing]) -> FolderListing:
@@ -302,6 +310,6 @@ def _relative(root: Path, path: Path) -> str:
 
 
 def join_names(names: Sequence[str], last: str = " and ") -> str:
-    """Names in a sentence: "a, b and c", and where they are many, the first of them and how many more."""
+    """Names as text: "a, b and c". Of ten names or more, the first five and the number of the others."""
     shown = [*names] if len(names) < 10 else [*names[:5], f"{len(names) - 5} more"]
     return last.join(([", ".join(shown[:-1])] if len(shown) > 1 else []) + shown[-1:])

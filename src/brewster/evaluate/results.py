@@ -1,4 +1,4 @@
-"""From rows to results: means and differences with their intervals, in plain values that JSON keeps for good."""
+"""Aggregates score rows into results.json: means and paired differences with confidence intervals, as plain values."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from brewster.evaluate.statistics import Stratum, differences, estimate
 
 AVERAGE: Final = "average"
 PAPER: Final = {"real20": 20, "nature20": 20, "postcard": 20, "solidobject": 20, "wildscene": 101}
-"""The paper's sets, and of how many pictures its average takes of each."""
+"""The sets in the paper's average, with the number of pictures of each."""
 _DIGITS: Final = 6
-_AVERAGED: Final = "The average is over pictures, not over sets: each counts once, whatever set it is from."
+_AVERAGED: Final = "The average is over pictures, not over sets: each picture has the same weight."
 
 Results = dict[str, Any]
-"""What results.json holds: see docs/evaluation.md."""
+"""The content of results.json: see docs/evaluation.md."""
 
 
 @final
 @dataclass(frozen=True)
 class Selection:
-    """Pictures that a table is about: a whole benchmark, or the paper's draw from it."""
+    """The pictures of a table: a whole benchmark, or the paper's draw from it."""
 
     key: str
     title: str
@@ -41,10 +41,10 @@ def summarise(
     config: EvaluationConfig,
     rows: Sequence[ScoreRow],
 ) -> Results:
-    """The results of a run; the same for any order of rows.
+    """The content of results.json. The order of the rows does not matter.
 
     Raises:
-        BrewsterError: the paper's draw was asked for, and a benchmark does not tell its scenes.
+        BrewsterError: the paper's draw was requested, and the names of a benchmark do not identify its scenes.
     """
     by_id = {row.id: row for row in rows}
     method_names = [method.name for method in methods]
@@ -82,15 +82,15 @@ def summarise(
 
 
 def _unmeasured(config: EvaluationConfig, measured: set[str]) -> list[str]:
-    """Metrics that were asked for, and that no picture has the truth for."""
+    """Requested metrics without a score, because no picture has the ground truth that they need."""
     return [name for name in config.columns() if name not in measured]
 
 
 def paper_draws(benchmarks: Sequence[Benchmark]) -> list[Selection]:
-    """The paper's draws, of the benchmarks that it does not take whole.
+    """The paper's draws from the benchmarks that it does not use completely.
 
     Raises:
-        BrewsterError: a benchmark does not tell its scenes.
+        BrewsterError: the names of a benchmark do not identify its scenes.
     """
     draws = [(part, paper_draw(part)) for part in benchmarks if part.cases]
     return [
@@ -101,7 +101,7 @@ def paper_draws(benchmarks: Sequence[Benchmark]) -> list[Selection]:
 
 
 def _averaged(full: Sequence[Selection], drawn: Sequence[Selection]) -> list[Selection]:
-    """What the average is over: of each benchmark the draw, if there is one; nothing if there is only one."""
+    """The selections of the average: each benchmark's draw if there is one; empty for a single benchmark."""
     draws = {part.key.partition(":")[0]: part for part in drawn}
     return [draws.get(part.key, part) for part in full] if len(full) > 1 else []
 
@@ -112,12 +112,12 @@ def _titled(key: str, group: Sequence[Selection]) -> dict[str, Any]:
 
 
 def _choices(config: EvaluationConfig, together: Sequence[Selection]) -> list[str]:
-    """The protocol's, how the average comes about, and what the paper's lacks."""
+    """The settings as sentences, how the average is computed, and how it differs from the paper's."""
     choices = [*config.choices(), *([_AVERAGED] if together else [])]
     there = {part.key.partition(":")[0]: len(part.cases) for part in together}
     if not config.paper or there == PAPER:
         return choices
-    found = ", ".join(f"{count} of {name}" for name, count in there.items()) or "too few sets for one"
+    found = ", ".join(f"{count} of {name}" for name, count in there.items()) or "too few sets"
     return [
         *choices,
         f"The paper's average is over {sum(PAPER.values())} pictures; this one is over {found}.",
