@@ -14,19 +14,19 @@ def stratum(values, scenes=None, name="set"):
 
 
 def only(strata):
-    (prediction,) = estimate(strata)
-    return prediction
+    (estimated,) = estimate(strata)
+    return estimated
 
 
 def test_the_mean_is_over_all_pictures_not_over_benchmarks():
-    prediction = only([stratum([1.0, 1.0, 1.0], name="a"), stratum([5.0], name="b")])
-    assert prediction.mean == 2.0
-    assert prediction.count == 4
+    estimated = only([stratum([1.0, 1.0, 1.0], name="a"), stratum([5.0], name="b")])
+    assert estimated.mean == 2.0
+    assert estimated.count == 4
 
 
 def test_the_interval_of_a_constant_has_no_width():
-    prediction = only([stratum([3.0] * 10)])
-    assert (prediction.low, prediction.mean, prediction.high) == (3.0, 3.0, 3.0)
+    estimated = only([stratum([3.0] * 10)])
+    assert (estimated.low, estimated.mean, estimated.high) == (3.0, 3.0, 3.0)
 
 
 def test_one_scene_has_no_interval():
@@ -40,25 +40,25 @@ def test_a_score_of_a_single_picture_has_no_interval():
 
 
 def test_missing_values_are_not_counted():
-    prediction = only([stratum([1.0, np.nan, 3.0])])
-    assert (prediction.mean, prediction.count) == (2.0, 2)
+    estimated = only([stratum([1.0, np.nan, 3.0])])
+    assert (estimated.mean, estimated.count) == (2.0, 2)
     assert only([stratum([np.nan, np.nan])]) is None
 
 
 def test_intervals_agree_with_the_normal_ones_where_those_hold(random):
     values = random.normal(20, 3, 400)
-    prediction = only([stratum(values)])
+    estimated = only([stratum(values)])
     half = 1.96 * values.std(ddof=1) / np.sqrt(400)
-    assert prediction.high - prediction.mean == pytest.approx(half, rel=0.06)
-    assert prediction.mean - prediction.low == pytest.approx(half, rel=0.06)
+    assert estimated.high - estimated.mean == pytest.approx(half, rel=0.06)
+    assert estimated.mean - estimated.low == pytest.approx(half, rel=0.06)
 
 
 def test_intervals_cover_the_truth_at_their_stated_rate(random):
     """95 % of intervals of means of 60 pictures; a percentile bootstrap is a little short of it at such sizes."""
     hits = 0
     for i in range(200):
-        prediction = only([stratum(random.normal(0, 1, 60), name=str(i))])
-        hits += prediction.low <= 0 <= prediction.high
+        estimated = only([stratum(random.normal(0, 1, 60), name=str(i))])
+        hits += estimated.low <= 0 <= estimated.high
     assert 0.90 <= hits / 200 <= 0.99
 
 
@@ -80,9 +80,9 @@ def test_a_benchmarks_interval_does_not_depend_on_its_order_nor_on_its_neighbour
 
 @given(st.lists(st.floats(-100, 100), min_size=2, max_size=20))
 def test_the_mean_lies_in_its_interval_and_that_between_the_extremes(values):
-    prediction = only([stratum(values)])
-    assert min(values) - 1e-9 <= prediction.low <= prediction.high <= max(values) + 1e-9
-    assert prediction.mean == pytest.approx(np.mean(values), abs=1e-9)
+    estimated = only([stratum(values)])
+    assert min(values) - 1e-9 <= estimated.low <= estimated.high <= max(values) + 1e-9
+    assert estimated.mean == pytest.approx(np.mean(values), abs=1e-9)
 
 
 def test_paired_differences_have_narrower_intervals_than_the_means(random):

@@ -133,14 +133,14 @@ def read_folders(folder: Path) -> FolderListing:
     """
     roles = find_roles(folder)
     by_name: dict[str, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
-    others: list[Path] = []
+    ignored: list[Path] = []
     for role in ROLES:
         pictures, others = _role_pictures(folder, role, roles)
-        others += others
+        ignored += others
         for picture in pictures:
             by_name[unicodedata.normalize("NFC", picture.stem)][role].append(picture)
     pieces = [_make_group(folder, stem, "", by_name[stem]) for stem in sorted(by_name, key=natural_key)]
-    return _merge([*pieces, _ignored(folder, [*others, *entries(folder)[1]])])
+    return _merge([*pieces, _ignored_remark(folder, [*ignored, *entries(folder)[1]])])
 
 
 def _role_pictures(folder: Path, role: str, roles: Mapping[str, Path]) -> tuple[list[Path], list[Path]]:
@@ -206,7 +206,7 @@ def _read_branches(
     for path in kinds:
         step = path.name.capitalize() if levels[0] == "kind" else path.name
         yield from _read_branches(root, path, levels[1:], {**labels, levels[0]: step})
-    yield _ignored(root, [*files, *(path for path in folders if path not in kinds)])
+    yield _ignored_remark(root, [*files, *(path for path in folders if path not in kinds)])
 
 
 def _read_shot(root: Path, folder: Path, labels: Mapping[str, str]) -> FolderListing:
@@ -221,7 +221,7 @@ def _read_shot(root: Path, folder: Path, labels: Mapping[str, str]) -> FolderLis
     shot = "-".join(labels[level] for level in ("scene", "kind", "variant") if level in labels)
     names = {rest: shot if len(by_name) == 1 else f"{shot}-{rest}".rstrip("-") for rest in by_name}
     pieces = [_make_group(root, names[rest], labels["scene"], by_name[rest]) for rest in by_name]
-    return _merge([*pieces, _ignored(root, others)])
+    return _merge([*pieces, _ignored_remark(root, others)])
 
 
 def _without_letter(stem: str) -> str:
@@ -286,7 +286,7 @@ def _find_labelled(folder: Path, label: Callable[[str], str]) -> dict[str, Path]
     return {role: path for role, path in found.items() if role}
 
 
-def _ignored(root: Path, others: Iterable[Path]) -> FolderListing:
+def _ignored_remark(root: Path, others: Iterable[Path]) -> FolderListing:
     named = [_relative(root, path) for path in others]
     return FolderListing(remarks=(f"ignored {join_names(named)}",) if named else ())
 

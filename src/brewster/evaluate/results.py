@@ -143,9 +143,9 @@ def _score(row: ScoreRow, column: str) -> float:
 
 def _table(strata: Sequence[Stratum], series: Sequence[tuple[str, str]]) -> dict[str, dict[str, Any]]:
     table: dict[str, dict[str, Any]] = {method: {} for method, _ in series}
-    for (method, column), prediction in zip(series, estimate(strata), strict=True):
-        if prediction:
-            table[method][column] = _rounded(asdict(prediction))
+    for (method, column), mean in zip(series, estimate(strata), strict=True):
+        if mean:
+            table[method][column] = _rounded(asdict(mean))
     return table
 
 

@@ -119,7 +119,7 @@ def differences(
         series: (method, metric) of each column.
         directions: metric -> whether higher is better.
     """
-    place = {name: i for i, name in enumerate(series)}
+    column_of = {name: i for i, name in enumerate(series)}
     methods = list(dict.fromkeys(method for method, _ in series))
     comparisons = [
         (method, than, metric)
@@ -129,7 +129,7 @@ def differences(
     ]
     if not comparisons:
         return []
-    columns, other_columns = ([place[row[i], row[2]] for row in comparisons] for i in range(2))
+    columns, other_columns = ([column_of[row[i], row[2]] for row in comparisons] for i in range(2))
     paired = [
         replace(stratum, values=stratum.values[:, columns] - stratum.values[:, other_columns])
         for stratum in strata
@@ -137,7 +137,7 @@ def differences(
     signs = [1 if directions[metric] else -1 for *_, metric in comparisons]
     better = sum((stratum.values * signs > 0).sum(axis=0) for stratum in paired)
     return [
-        Difference(*row, prediction, int(count))
-        for row, prediction, count in zip(comparisons, estimate(paired), better, strict=True)
-        if prediction
+        Difference(*row, estimated, int(count))
+        for row, estimated, count in zip(comparisons, estimate(paired), better, strict=True)
+        if estimated
     ]
