@@ -42,7 +42,7 @@ def main(data: Path) -> None:
         [IdentityBaseline(), *models, PredictionFolder("fast-reflection-removal", OUT / "peer")],
         EvaluationConfig(),
         OUT,
-        report=lambda _done, _of, row: timed.setdefault(row.method, []).append(row),
+        on_progress=lambda _done, _of, row: timed.setdefault(row.method, []).append(row),
     )
     print(overview(results))
     for model in models:

@@ -1,4 +1,4 @@
-"""Tiny copies of the field's benchmarks, in every layout, for the tests that read or score them.
+"""Small copies of the public benchmarks, in every layout, for tests.
 
 Every picture is 8x6 pixels unless `size` says otherwise; the names, the folders and the counts are the real ones.
 """
@@ -40,7 +40,7 @@ def repacked(root: Path, names, roles=("blended", "transmission_layer"), suffix=
 
 
 def postcard(root: Path, scenes=POSTCARD_SCENES):
-    """SIR2's Postcard as its authors gave it: 10 shots of each scene, but 9 of the last of all 20."""
+    """SIR2's Postcard in its original tree: 10 shots of each scene, but 9 of the last of the 20 scenes."""
     for scene, (kind, variant) in product(scenes, POSTCARD_SHOTS):
         if (scene, variant) != (POSTCARD_SCENES[-1], 10):
             first, last = (variant, 32) if variant in (3, 5) else (variant, 3)
@@ -53,14 +53,14 @@ def postcard(root: Path, scenes=POSTCARD_SCENES):
 
 
 def solidobject(root: Path, scenes=range(1, 21)):
-    """SIR2's SolidObject as its authors gave it: 10 shots of each scene."""
+    """SIR2's SolidObject in its original tree: 10 shots of each scene."""
     for scene, (kind, variant) in product(scenes, POSTCARD_SHOTS):
         write(root, *(f"{scene}/{kind}/{variant}/{letter}.jpg" for letter in "mgr"))
     return root
 
 
 def wildscene(root: Path, count=101):
-    """SIR2's Wildscene as its authors gave it: every third folder is named like 7s."""
+    """SIR2's Wildscene in its original tree: every third folder has a name like 7s."""
     shots = [f"{number}s" if number % 3 == 1 else str(number) for number in range(1, count + 1)]
     return write(root, *(f"{shot}/{letter}.jpg" for shot in shots for letter in "mgr"))
 
@@ -74,7 +74,7 @@ def sir2(root: Path):
 
 
 def paint(path, seed, size=(24, 16), *, noise=0):
-    """Writes a picture that the seed decides, with noise of so many levels."""
+    """Writes a picture that depends on the seed; `noise` is a standard deviation in 8-bit levels."""
     rng = np.random.default_rng(seed)
     pixels = rng.integers(0, 200, (size[1] // 4, size[0] // 4, 3)).repeat(4, 0).repeat(4, 1)
     pixels = np.clip(pixels + rng.normal(0, noise, pixels.shape), 0, 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Results of an evaluation, such as results.json holds, whose numbers are known."""
+"""Evaluation results in the format of results.json, with known numbers."""
 
 METRICS = {
     "psnr": {"title": "PSNR", "unit": "dB", "higher_is_better": True, "digits": 2, "about": "PSNR is so."},
@@ -30,7 +30,7 @@ def known_results():
         "benchmarks": {
             "real20": {"title": "Real20", "remarks": ["20 of 20"], "refused": ["x.png has no partner"]}
         },
-        "methods": {"input (unprocessed)": {}, "A_b|c": {"remark": "2 pictures answer no case"}},
+        "methods": {"input (unprocessed)": {}, "A_b|c": {"remark": "2 pictures fit no case"}},
         "unmeasured": ["removed_white"],
         "pictures": [{"errors": {"A_b|c": "A_b|c failed on real20/3"}}],
         "tables": dict.fromkeys(selections, table),

@@ -67,12 +67,12 @@ def test_a_study_that_does_not_say_what_it_must_is_refused(text, said, tmp_path)
 def quick(monkeypatch, model):
     """Training that takes no time: every network is a pane."""
 
-    def trained(recipe, folder, tell):
-        tell(1, 1, {"loss": 0.5}, True)
+    def train(recipe, folder, on_step):
+        on_step(1, 1, {"loss": 0.5}, True)
         folder.mkdir(parents=True, exist_ok=True)
         return Path(shutil.copy(model, folder / "model.onnx"))
 
-    monkeypatch.setattr(module, "_trained", trained)
+    monkeypatch.setattr(module, "_train", train)
 
 
 @pytest.fixture
@@ -85,16 +85,16 @@ def pairs(tmp_path):
 
 def test_choices_are_compared_with_the_first_and_numbers_are_drawn(quick, pairs, data, tmp_path, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
-    told = []
+    calls = []
     results = ablate(
         read_study(RECIPES / "size.toml"),
         pairs,
         tmp_path / "out",
-        report=lambda *now: told.append(now),
+        on_progress=lambda *now: calls.append(now),
     )
     labels = [f"count {count}" for count in (0, 10, 50, 100, 300, 1000)]
     assert list(results["methods"]) == ["input (unprocessed)", *labels]
-    assert [now[0] for now in told] == labels
+    assert [now[0] for now in calls] == labels
     compared = {(row["method"], row["than"]) for row in results["differences"]["real20"]}
     assert ("count 300", "count 0") in compared
     plot = np.asarray(Image.open(io.BytesIO((tmp_path / "out" / "plot.png").read_bytes())).convert("L"))

@@ -86,7 +86,7 @@ def test_a_method_that_fails_on_a_picture_is_named_and_the_exit_code_is_one(bare
         (("--benchmark", "real20=pairs", "--metrics", "pnsr"), "did you mean psnr"),
         (("--benchmark", "real20=pairs", "--model", "compac"), "did you mean compact"),
         (("--benchmark", "real20=pairs", "--predictions", "theirs=nowhere"), "nowhere"),
-        (("--benchmark", "real20=pairs", "--predictions", "theirs=others"), "called like a case"),
+        (("--benchmark", "real20=pairs", "--predictions", "theirs=others"), "has the name of a case"),
     ],
 )
 def test_what_cannot_be_measured_is_said_in_a_sentence(wrong, said, bare, pairs, tmp_path):

@@ -1,6 +1,9 @@
-"""A whole evaluation, from folders to files."""
+"""A complete evaluation, from folders to files."""
 
+import io
 import json
+from collections import Counter
+from pathlib import Path
 
 import pytest
 
@@ -33,7 +36,7 @@ def methods(model, tmp_path):
     ]
 
 
-def test_an_evaluation_leaves_results_tables_and_a_page(real20, methods, tmp_path):
+def test_an_evaluation_writes_results_tables_and_a_report(real20, methods, tmp_path):
     results = evaluate(real20, methods, QUICK, tmp_path / "out")
     written = json.loads((tmp_path / "out" / "results.json").read_text())
     assert written == results
@@ -68,14 +71,14 @@ def test_the_page_shows_first_what_the_first_model_failed_on(real20, methods, tm
     assert page.count("<article") == 1
 
 
-def test_a_truth_that_cannot_be_read_takes_no_place_on_the_page(real20, methods, tmp_path):
+def test_a_case_with_an_unreadable_ground_truth_is_not_on_the_page(real20, methods, tmp_path):
     path = tmp_path / "real20" / "transmission_layer" / "2.png"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     evaluate(real20, [IdentityBaseline(), methods[2]], QUICK, tmp_path / "out", shown=1)
     assert 'data-name="1"' in (tmp_path / "out" / "report.html").read_text()
 
 
-def test_who_rightly_changes_nothing_is_not_accused(tmp_path):
+def test_an_unchanged_photo_that_equals_the_ground_truth_gives_no_remark(tmp_path):
     for place in ("real20/blended/1.png", "real20/transmission_layer/1.png", "theirs/1.png"):
         paint(tmp_path / place, 1)
     parts = read_benchmark("real20", tmp_path / "real20")
@@ -94,30 +97,30 @@ def test_without_a_model_the_page_shows_the_worst_photos(real20, tmp_path):
     assert f'data-name="{min(scores, key=scores.get)}"' in page
 
 
-def test_the_page_never_shows_another_models_answer(real20, methods, tmp_path):
+def test_a_lost_prediction_is_made_again_for_the_page(real20, methods, tmp_path):
     first = evaluate(real20, methods, QUICK, tmp_path / "out")
     page = (tmp_path / "out" / "report.html").read_bytes()
-    for kept in (tmp_path / "kept").rglob("1.*.png"):
-        kept.unlink()
+    for stored in (tmp_path / "kept").rglob("1.*.png"):
+        stored.unlink()
     assert evaluate(real20, methods, QUICK, tmp_path / "out") == first
     assert (tmp_path / "out" / "report.html").read_bytes() == page
 
 
-def test_pictures_without_a_case_are_said_aloud(real20, methods, tmp_path):
+def test_pictures_without_a_case_are_a_remark(real20, methods, tmp_path):
     paint(tmp_path / "theirs" / "other.png", 3)
     results = evaluate(real20, methods, QUICK, tmp_path / "out")
-    assert results["methods"]["theirs"]["remark"] == "no case is answered by 1 picture of its folder"
+    assert results["methods"]["theirs"]["remark"] == "1 picture of its folder fits no case"
 
 
-def test_a_folder_of_truths_is_said_to_be_one(real20, tmp_path):
+def test_a_folder_with_the_ground_truth_is_a_remark(real20, tmp_path):
     results = evaluate(
         real20, [IdentityBaseline(), PredictionFolder("self", tmp_path / "real20")], QUICK, tmp_path / "out"
     )
-    assert "the truth itself on 2 pictures" in results["methods"]["self"]["remark"]
+    assert "equals the ground truth on 2 pictures" in results["methods"]["self"]["remark"]
     assert "remark" not in results["methods"]["input (unprocessed)"]
 
 
-def test_reduced_photos_are_left_for_those_who_answer_elsewhere(real20, tmp_path):
+def test_downscaled_photos_are_written_for_methods_that_run_elsewhere(real20, tmp_path):
     small = EvaluationConfig(metrics=("psnr",), size=8)
     evaluate(real20, [IdentityBaseline()], small, tmp_path / "out")
     inputs = tmp_path / "out" / "inputs"
@@ -130,7 +133,7 @@ def test_reduced_photos_are_left_for_those_who_answer_elsewhere(real20, tmp_path
 
 
 def test_benchmarks_that_share_a_name_or_hold_no_pair_are_refused(real20, methods, tmp_path):
-    with pytest.raises(BrewsterError, match="2 benchmarks are called 'real20'"):
+    with pytest.raises(BrewsterError, match="2 benchmarks have the name 'real20'"):
         evaluate([*real20, *real20], methods, QUICK, tmp_path / "out")
     empty = Benchmark("real20", "Real20", (), refused=("a.png has no partner",))
     with pytest.raises(PhotoError, match=r"no pair in real20.*a\.png has no partner"):
@@ -143,3 +146,54 @@ def test_a_failed_prediction_is_missing_on_the_page_and_named_in_the_tables(real
     assert "no picture for real20/2" in results["pictures"][1]["errors"]["theirs"]
     assert "no picture for real20/2" in (tmp_path / "out" / "tables.md").read_text()
     assert "no picture for real20/2" in (tmp_path / "out" / "report.html").read_text()
+
+
+@pytest.fixture
+def opened(monkeypatch, tmp_path):
+    """Counts how often each picture below tmp_path is opened for reading."""
+    counts, io_open = Counter(), io.open
+
+    def counting(file, mode="r", *args, **kwargs):
+        path = Path(file) if not isinstance(file, int) else Path()
+        if mode == "rb" and path.suffix == ".png":
+            counts[path.relative_to(tmp_path).as_posix()] += 1
+        return io_open(file, mode, *args, **kwargs)
+
+    monkeypatch.setattr(io, "open", counting)
+    return counts
+
+
+def test_each_picture_is_opened_once_and_decoded_once(tmp_path, methods, real20, opened, monkeypatch):
+    decoded, open_photo = [], Photo.open
+    monkeypatch.setattr(
+        Photo, "open", lambda source, **more: decoded.append(source) or open_photo(source, **more)
+    )
+    evaluate(real20, methods, QUICK, tmp_path / "out")
+    folders = ("real20/blended", "real20/transmission_layer", "theirs")
+    assert opened == {f"{folder}/{name}.png": 1 for folder in folders for name in ("1", "2")}
+    layers = 2 * len(("transmission", "reflection"))  # of the model, decoded from the bytes that it stores
+    assert sum(isinstance(source, bytes) for source in decoded) == len(opened) + layers
+
+
+def test_a_benchmark_is_opened_once_to_compare_sizes(tmp_path, real20, opened):
+    read_benchmark("real20", tmp_path / "real20")
+    assert set(opened.values()) == {1}
+
+
+def test_a_resumed_run_decodes_only_what_the_page_shows(tmp_path, methods, real20, monkeypatch):
+    evaluate(real20, methods, QUICK, tmp_path / "out")
+    page = (tmp_path / "out" / "report.html").read_bytes()
+    monkeypatch.setattr(Photo, "open", lambda *_: pytest.fail("a picture was decoded"))
+    evaluate(real20, methods, QUICK, tmp_path / "out", shown=0)
+    monkeypatch.undo()
+    evaluate(real20, methods, QUICK, tmp_path / "out")
+    assert (tmp_path / "out" / "report.html").read_bytes() == page
+
+
+def test_the_page_is_the_same_whether_pictures_are_cached_or_read_again(tmp_path, methods, real20):
+    """The page shows the whole benchmark from the pictures in memory, and a part of it from the files."""
+    evaluate(real20, methods, QUICK, tmp_path / "whole")
+    evaluate(real20, methods, QUICK, tmp_path / "part", shown=1)
+    pages = [(tmp_path / name / "report.html").read_text() for name in ("whole", "part")]
+    _, article = pages[1].split("<article")
+    assert article.partition("</article>")[0] in pages[0]

@@ -1,4 +1,4 @@
-"""Every choice is stated, and an impossible one refused."""
+"""Every setting is printed, and invalid settings are refused."""
 
 import pytest
 

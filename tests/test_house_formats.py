@@ -18,7 +18,7 @@ from brewster.benchmarks.registry import Case
 from brewster.environments.catalog import BUILTIN_CATALOG
 from brewster.environments.procedural.rooms import WORLDS as WORLDS_BY_NAME
 from brewster.evaluate.config import EvaluationConfig
-from brewster.evaluate.methods import ANSWER_FORMAT, MethodOutput, ModelMethod
+from brewster.evaluate.methods import PREDICTION_FORMAT, MethodOutput, ModelMethod
 from brewster.evaluate.runner import SCORE_FORMAT
 from brewster.evaluate.scoring import GroundTruth, Scorer
 from brewster.inference import QUALITIES
@@ -214,12 +214,12 @@ def leaning(tmp_path_factory):
 def test_a_changed_answer_raises_the_format_of_answers(leaning, tmp_path):
     photo, made = Photo.from_array(picture(1, 720, 960), encoding="srgb"), {}
     for quality in QUALITIES:
-        answer = ModelMethod("leaning", str(leaning), tmp_path, quality=quality).answer(case(), photo)
+        answer = ModelMethod("leaning", str(leaning), tmp_path, quality=quality).predict(case(), photo)
         layers = np.concatenate(
             [layer.pixels[7::240, 9::240, 1] for layer in (answer.transmission, answer.reflection)]
         )
         made[quality] = layers.ravel().tolist()
-    same("evaluate.methods.ANSWER_FORMAT", ANSWER_FORMAT, ANSWERS, made, 1)
+    same("evaluate.methods.PREDICTION_FORMAT", PREDICTION_FORMAT, ANSWERS, made, 1)
 
 
 def scores(names):

@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 
 from brewster.errors import TargetError
-from brewster.evaluate.report.html_report import CaseImages, write_report
-from brewster.evaluate.report.images import BRIGHTEST_ERROR, LONGEST, RAMP, error_map
+from brewster.evaluate.report.html_report import write_report
+from brewster.evaluate.report.images import (
+    COLOUR_MAP,
+    MAX_ERROR,
+    MAX_SIDE_PX,
+    CaseImages,
+    error_map,
+    to_tiles,
+)
 from brewster.photo import Photo
 
 VOID = {"meta", "img", "input", "br", "link"}
@@ -102,8 +109,9 @@ def shown(name="a", method="compact", size=(40, 60), **changes):
     photo[: size[0] // 2] = 200  # bright above, dark below: an upright picture
     region = np.zeros(size, bool)
     region[: size[0] // 2] = True
-    given = {"photo": photo, "truth": photo // 2, "region": region, "answers": {method: photo}}
-    return CaseImages("nature20", name, **(given | {"reflections": {method: photo // 4}} | changes))
+    given = {"photo": photo, "truth": photo // 2, "region": region, "predictions": {method: photo}}
+    images = CaseImages("nature20", name, **(given | {"reflections": {method: photo // 4}} | changes))
+    return to_tiles(images)
 
 
 @pytest.fixture
@@ -226,13 +234,13 @@ def test_for_a_metric_that_should_be_low_the_lowest_is_the_best_and_a_fall_is_be
     assert "+1.50 ▼worse" in text
 
 
-def test_a_difference_whose_interval_holds_zero_is_called_open(page):
+def test_a_difference_whose_interval_contains_zero_is_inconclusive(page):
     given = results()
     given["differences"]["nature20"][0] |= {"low": -0.5}
-    assert "open: +1.50\N{MINUS SIGN}0.50 to +2.502 of 2" in page(given).text
+    assert "inconclusive: +1.50\N{MINUS SIGN}0.50 to +2.502 of 2" in page(given).text
 
 
-def test_differences_between_methods_stand_apart_from_those_to_doing_nothing(page):
+def test_differences_between_methods_are_separate_from_those_to_the_baseline(page):
     given = results()
     row = given["differences"]["nature20"][0]
     given["methods"]["RDNet"] = {"kind": "predictions"}
@@ -245,16 +253,16 @@ def test_differences_between_methods_stand_apart_from_those_to_doing_nothing(pag
     assert "Between methods" not in page().text
 
 
-def test_no_score_is_a_dash_and_a_metric_without_any_takes_no_column(page):
+def test_a_missing_score_is_a_dash_and_a_metric_without_scores_has_no_column(page):
     given = results()
-    assert "PSNR in the region" in page(given).text  # its meaning is told all the same
+    assert "PSNR in the region" in page(given).text  # its definition is listed nevertheless
     assert "PSNR in the region dB" not in page(given).text
     given["pictures"][0]["scores"]["compact"] = {"psnr": None, "psnr_region": None}
     given["tables"]["nature20"]["compact"]["psnr"] = None
     assert re.search("compact\\s*\N{EN DASH}", page(given).text)
 
 
-def test_an_estimate_over_fewer_pictures_says_so_and_may_have_no_interval(page):
+def test_an_estimate_over_fewer_pictures_shows_their_number_and_may_have_no_interval(page):
     given = results()
     given["tables"]["nature20"]["compact"]["psnr"] = estimate(21.5, count=1)
     text = page(given).text
@@ -262,7 +270,7 @@ def test_an_estimate_over_fewer_pictures_says_so_and_may_have_no_interval(page):
     assert "★ best 21.501 of 2" not in text
 
 
-def test_choices_meanings_remarks_and_refused_files_are_said(page):
+def test_settings_metrics_remarks_and_refused_files_are_listed(page):
     text = page().text
     for said in (
         "Nothing is resized.",
@@ -275,30 +283,30 @@ def test_choices_meanings_remarks_and_refused_files_are_said(page):
     assert "sha256 7adb" in text
     assert "No method failed on any picture." in text
     given = results()
-    given["methods"]["compact"]["remark"] = "its answer is the truth itself on 2 pictures"
-    assert "compact: its answer is the truth itself" in page(given).text
+    given["methods"]["compact"]["remark"] = "its prediction equals the ground truth on 2 pictures"
+    assert "compact: its prediction equals the ground truth" in page(given).text
 
 
-def test_failures_are_counted_and_told_at_the_top_and_at_their_picture(page):
+def test_failures_are_listed_at_the_top_and_at_their_picture(page):
     given = results()
     given["pictures"][0] |= {
         "scores": {"input (unprocessed)": {"psnr": 20.0}},
         "errors": {"compact": "no prediction"},
     }
-    made = page(given, [shown("a", answers={}, reflections={}), shown("b")])
+    made = page(given, [shown("a", predictions={}, reflections={}), shown("b")])
     assert "Failed: compact on 1 of 2 pictures" in made.text
     assert "nature20/a, compact: no prediction" in made.text
     assert "Failed: no prediction" in made.text
     assert "compact, a" not in [has["alt"] for has in made.all("img")]
 
 
-def test_many_failures_are_folded_away_behind_their_number(page):
+def test_many_failures_are_collapsed_behind_their_number(page):
     given = results([f"{number}" for number in range(9)], errors={"compact": "no prediction"})
     made = page(given, [shown("0")])
     assert "Failed: compact on 9 of 9 pictures" in made.text
     assert [has for has in made.all("details") if has.get("class") == "note" and "open" not in has]
     assert (
-        "1 of 9 pictures are on this page: of each benchmark those that the first method that does something failed on"
+        "1 of 9 pictures are on this page: of each benchmark those that the first method after the baseline failed on"
         in made.text
     )
 
@@ -307,14 +315,14 @@ def test_many_failures_are_folded_away_behind_their_number(page):
 
 
 @pytest.mark.parametrize(
-    ("size", "kept"),
+    ("size", "embedded"),
     [((40, 60), (60, 40)), ((600, 1200), (480, 240)), ((960, 320), (160, 480)), ((1, 2000), (480, 1))],
 )
-def test_pictures_are_reduced_together_to_480_px_and_never_enlarged(page, size, kept):
+def test_pictures_are_reduced_together_to_480_px_and_never_enlarged(page, size, embedded):
     made = page(cases=[shown("a", size=size)])
-    assert {photo.size for photo in pictures(made).values()} == {kept}
-    assert {(has["width"], has["height"]) for has in made.all("img")} == {tuple(map(str, kept))}
-    assert max(kept) <= LONGEST
+    assert {photo.size for photo in pictures(made).values()} == {embedded}
+    assert {(has["width"], has["height"]) for has in made.all("img")} == {tuple(map(str, embedded))}
+    assert max(embedded) <= MAX_SIDE_PX
 
 
 def test_pictures_stay_upright_and_keep_their_values(page):
@@ -339,21 +347,21 @@ def test_the_region_is_a_tint_over_its_pixels_and_clear_elsewhere(page):
 
 def test_an_error_map_has_the_colour_of_the_largest_channels_difference():
     truth = np.zeros((4, 4, 3), np.uint8)
-    answer = truth.copy()
-    answer[0, 0] = (0, BRIGHTEST_ERROR // 2, 3)
-    answer[0, 1] = 255
-    colours = error_map(answer, truth)
-    assert (colours[0, 0] == RAMP[len(RAMP) // 2]).all()
-    assert (colours[0, 1] == RAMP[-1]).all()
-    assert (colours[1:] == RAMP[0]).all()
-    assert (error_map(truth, answer) == colours).all()
+    prediction = truth.copy()
+    prediction[0, 0] = (0, MAX_ERROR // 2, 3)
+    prediction[0, 1] = 255
+    colours = error_map(prediction, truth)
+    assert (colours[0, 0] == COLOUR_MAP[len(COLOUR_MAP) // 2]).all()
+    assert (colours[0, 1] == COLOUR_MAP[-1]).all()
+    assert (colours[1:] == COLOUR_MAP[0]).all()
+    assert (error_map(truth, prediction) == colours).all()
 
 
 def test_an_error_map_averages_errors_when_it_is_reduced():
     truth = np.zeros((960, 960, 3), np.uint8)
-    answer = truth.copy()
-    answer[::2] = 48  # every other row: cancelled by nothing, halved by the mean
-    assert (error_map(answer, truth) == RAMP[24 * len(RAMP) // BRIGHTEST_ERROR]).all()
+    prediction = truth.copy()
+    prediction[::2] = 48  # every other row: the mean halves it
+    assert (error_map(prediction, truth) == COLOUR_MAP[24 * len(COLOUR_MAP) // MAX_ERROR]).all()
 
 
 def test_error_maps_are_embedded_without_loss(page, random):
@@ -362,15 +370,15 @@ def test_error_maps_are_embedded_without_loss(page, random):
     assert (made["error of the photo, a"].pixels == error_map(photo, truth)).all()
 
 
-def test_the_ramp_grows_evenly_lighter_so_that_it_needs_no_colour_to_be_read():
-    lightness = np.sqrt(RAMP.astype(float) @ (0.2126, 0.7152, 0.0722))
+def test_the_lightness_of_the_colour_map_increases():
+    lightness = np.sqrt(COLOUR_MAP.astype(float) @ (0.2126, 0.7152, 0.0722))
     assert (np.diff(lightness) > 0).all()
 
 
 # --- the file
 
 
-def test_cases_are_taken_one_by_one_and_let_go(tmp_path):
+def test_cases_are_consumed_and_freed_one_at_a_time(tmp_path):
     alive = []
 
     def cases():
@@ -385,7 +393,7 @@ def test_cases_are_taken_one_by_one_and_let_go(tmp_path):
     assert len(alive) == 6
 
 
-def test_a_report_takes_the_place_of_an_older_one_whole_or_not_at_all(tmp_path):
+def test_a_report_replaces_an_older_one_atomically(tmp_path):
     def broken():
         yield shown("a")
         raise ValueError

@@ -1,4 +1,4 @@
-"""Whose answer belongs to which case: by name, once, or not at all."""
+"""Predictions are paired with cases by name, uniquely."""
 
 import pickle
 import unicodedata
@@ -11,7 +11,7 @@ from benchmark_folders import picture, repacked, write
 from brewster import Photo
 from brewster.benchmarks.registry import read_benchmark
 from brewster.errors import BrewsterError, PhotoError
-from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder, refuse_names
+from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder, check_names
 from brewster.photo import FileInfo
 
 
@@ -63,12 +63,12 @@ def test_a_reflection_is_found_beside_it(case, tmp_path):
 
 
 @pytest.mark.parametrize("place", ["10.png", "01.png", "1_.png", "1.txt", ".1.png", "x1.png"])
-def test_a_name_that_is_merely_similar_is_no_prediction(place, case, tmp_path):
+def test_a_similar_name_is_not_a_prediction(place, case, tmp_path):
     with pytest.raises(PhotoError, match="no picture for real20/1"):
         method(tmp_path, place).files(case)
 
 
-def test_a_copy_of_the_photos_is_no_answer(case, tmp_path):
+def test_a_copy_of_the_photos_is_not_a_prediction(case, tmp_path):
     with pytest.raises(PhotoError, match="no picture"):
         method(tmp_path, "blended/1.png").files(case)
 
@@ -83,56 +83,56 @@ def test_an_accent_written_as_two_characters_is_the_same_name(cases, tmp_path):
     assert method(tmp_path, f"{apart}.png").files(cases[2])
 
 
-def test_one_picture_cannot_answer_two_cases(cases, tmp_path):
+def test_one_picture_cannot_be_the_prediction_for_two_cases(cases, tmp_path):
     repacked(tmp_path / "nature20", ["1"])
     (other,) = read_benchmark("nature20", tmp_path / "nature20")
     theirs = method(tmp_path, "1.png", "2.png")
-    theirs.refuse_wrong_pairing(cases)
-    with pytest.raises(PhotoError, match="to real20/1 and to nature20/1"):
-        theirs.refuse_wrong_pairing([*cases, *other.cases])
+    theirs.check_pairing(cases)
+    with pytest.raises(PhotoError, match="fits two cases of theirs, real20/1 and nature20/1"):
+        theirs.check_pairing([*cases, *other.cases])
     sorted_out = method(tmp_path / "sorted", "real20/1.png", "nature20/1.png")
-    sorted_out.refuse_wrong_pairing([*cases, *other.cases])
+    sorted_out.check_pairing([*cases, *other.cases])
 
 
 def test_a_folder_in_which_no_name_fits_is_refused_at_once(cases, tmp_path):
-    with pytest.raises(PhotoError, match="called like a case"):
-        method(tmp_path, "a.png", "b.png").refuse_wrong_pairing(cases)
-    with pytest.raises(PhotoError, match="no folder"):
-        PredictionFolder("theirs", tmp_path / "nowhere").refuse_wrong_pairing(cases)
+    with pytest.raises(PhotoError, match="has the name of a case"):
+        method(tmp_path, "a.png", "b.png").check_pairing(cases)
+    with pytest.raises(PhotoError, match="is not a folder"):
+        PredictionFolder("theirs", tmp_path / "nowhere").check_pairing(cases)
 
 
-def test_pictures_that_answer_no_case_are_counted(cases, tmp_path):
+def test_pictures_without_a_case_are_counted(cases, tmp_path):
     assert method(tmp_path, "1.png", "other.png", "another.png").unused(cases) == 2
 
 
-def test_doing_nothing_is_the_photo_and_black(case):
+def test_the_baseline_is_the_photo_and_black(case):
     photo = Photo.open(case.photo.read())
-    answer = IdentityBaseline().answer(case, photo)
-    assert answer.transmission is photo
-    assert not answer.reflection.pixels.any()
+    prediction = IdentityBaseline().predict(case, photo)
+    assert prediction.transmission is photo
+    assert not prediction.reflection.pixels.any()
 
 
-def test_a_model_answers_as_the_separator_does_and_keeps_its_answer(case, model, tmp_path):
+def test_a_model_predicts_as_the_separator_and_stores_its_prediction(case, model, tmp_path):
     ours = ModelMethod("pane", str(model), tmp_path / "kept")
     assert ours.cached(case) is None
     photo = Photo.open(case.photo.read())
-    answer = ours.answer(case, photo)
-    assert answer.seconds > 0
-    kept = ours.cached(case)
-    assert np.array_equal(kept.transmission.srgb_8bit(), answer.transmission.srgb_8bit())
-    assert np.array_equal(kept.reflection.srgb_8bit(), answer.reflection.srgb_8bit())
+    prediction = ours.predict(case, photo)
+    assert prediction.seconds > 0
+    stored = ours.cached(case)
+    assert np.array_equal(stored.transmission.srgb_8bit(), prediction.transmission.srgb_8bit())
+    assert np.array_equal(stored.reflection.srgb_8bit(), prediction.reflection.srgb_8bit())
     assert PredictionFolder("again", tmp_path / "kept").files(case).keys() == {"transmission", "reflection"}
 
 
-def test_what_is_kept_of_a_deep_wide_photo_is_what_is_scored(case, model, tmp_path):
+def test_the_stored_layers_of_a_16_bit_wide_gamut_photo_are_what_is_scored(case, model, tmp_path):
     pixels = np.random.default_rng(1).integers(0, 1 << 16, (6, 8, 3), np.uint16)
     photo = Photo(pixels, None, FileInfo(bits=16, icc=bytes(pyvips.Image.profile_load("p3"))))
     ours = ModelMethod("pane", str(model), tmp_path / "kept")
-    answer, kept = ours.answer(case, photo), ours.cached(case)
-    assert np.array_equal(kept.transmission.srgb_8bit(), answer.transmission.srgb_8bit())
+    prediction, stored = ours.predict(case, photo), ours.cached(case)
+    assert np.array_equal(stored.transmission.srgb_8bit(), prediction.transmission.srgb_8bit())
 
 
-def test_a_key_changes_with_all_that_the_answer_depends_on(case, model, tmp_path):
+def test_a_key_changes_with_everything_that_the_prediction_depends_on(case, model, tmp_path):
     draft = ModelMethod("pane", str(model), tmp_path, quality="draft")
     assert draft.key(case) != ModelMethod("pane", str(model), tmp_path).key(case)
     theirs = method(tmp_path, "1.png")
@@ -141,28 +141,28 @@ def test_a_key_changes_with_all_that_the_answer_depends_on(case, model, tmp_path
     assert PredictionFolder("theirs", tmp_path / "theirs").key(case) != before
 
 
-def test_methods_are_data_that_other_processes_can_take(model, tmp_path):
+def test_methods_can_be_pickled(model, tmp_path):
     for one in (IdentityBaseline(), ModelMethod("pane", str(model), tmp_path), method(tmp_path, "1.png")):
         assert pickle.loads(pickle.dumps(one)) == one
 
 
 def test_no_method_at_all_is_refused():
     with pytest.raises(BrewsterError, match="there is no method"):
-        refuse_names([])
+        check_names([])
 
 
 def test_two_methods_of_one_name_are_refused(tmp_path):
-    with pytest.raises(BrewsterError, match=r"2 methods are called 'input \(unprocessed\)'"):
-        refuse_names([IdentityBaseline(), PredictionFolder("input (unprocessed)", tmp_path)])
+    with pytest.raises(BrewsterError, match=r"2 methods have the name 'input \(unprocessed\)'"):
+        check_names([IdentityBaseline(), PredictionFolder("input (unprocessed)", tmp_path)])
 
 
 @pytest.mark.parametrize("name", ["../out", "a/b", "a\\b", "..", ".", "", "two\nlines", "\udcff"])
-def test_names_that_are_no_names_of_folders_are_refused(name, tmp_path):
-    with pytest.raises(BrewsterError, match="names become folders"):
-        refuse_names([PredictionFolder(name, tmp_path)])
+def test_names_that_are_not_valid_for_folders_are_refused(name, tmp_path):
+    with pytest.raises(BrewsterError, match="names are used for folders"):
+        check_names([PredictionFolder(name, tmp_path)])
 
 
-def test_a_folder_that_is_a_link_is_looked_into_and_a_loop_ends(case, tmp_path):
+def test_linked_folders_are_searched_and_loops_end(case, tmp_path):
     write(tmp_path / "elsewhere", "1.png")
     theirs = tmp_path / "theirs"
     theirs.mkdir()
@@ -172,7 +172,7 @@ def test_a_folder_that_is_a_link_is_looked_into_and_a_loop_ends(case, tmp_path):
     assert found == theirs / "real20" / "1.png"
 
 
-def test_folders_and_dangling_links_called_like_pictures_are_passed_over(cases, tmp_path):
+def test_folders_and_broken_links_with_names_of_pictures_are_ignored(cases, tmp_path):
     theirs = method(tmp_path, "2.png")
     (tmp_path / "theirs" / "1.png").mkdir()
     (tmp_path / "theirs" / "3.png").symlink_to("nowhere")

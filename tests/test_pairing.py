@@ -1,4 +1,4 @@
-"""What belongs together in a folder is told by names alone; whatever else is there is named."""
+"""Pictures are grouped by their names alone; all other files are reported."""
 
 import random
 import tempfile
@@ -17,8 +17,8 @@ from brewster.benchmarks.pairing import (
     find_roles,
     find_split,
     find_subsets,
-    listed,
-    natural,
+    join_names,
+    natural_key,
     read_folders,
     read_tree,
 )
@@ -29,7 +29,7 @@ STEMS = st.sets(st.sampled_from(["1", "2", "02", "10", "a-1", "a-10", "a_1", "ä
 
 
 def names(found):
-    return [trio.name for trio in found.trios]
+    return [group.name for group in found.groups]
 
 
 # --- a folder for each role
@@ -44,17 +44,17 @@ def names(found):
         ("With Reflection", "Ground-Truth", "reflection"),
     ],
 )
-def test_roles_are_known_by_their_folders(tmp_path, roles):
+def test_roles_are_recognised_by_the_names_of_their_folders(tmp_path, roles):
     repacked(tmp_path, ["1", "2"], roles)
     found = read_folders(tmp_path)
     assert names(found) == ["1", "2"]
-    assert found == FolderListing(found.trios)
-    for trio in found.trios:
-        pictures = (trio.photo, trio.transmission, trio.reflection)
-        assert pictures == tuple(tmp_path / role / f"{trio.name}.png" for role in roles)
+    assert found == FolderListing(found.groups)
+    for group in found.groups:
+        pictures = (group.photo, group.transmission, group.reflection)
+        assert pictures == tuple(tmp_path / role / f"{group.name}.png" for role in roles)
 
 
-def test_every_name_of_a_role_is_its_own():
+def test_no_folder_name_belongs_to_two_roles():
     every = [name for names in ROLES.values() for name in names]
     assert len(every) == len(set(every))
     assert every == [name.lower() for name in every]
@@ -62,7 +62,7 @@ def test_every_name_of_a_role_is_its_own():
 
 @settings(max_examples=40)
 @given(photos=STEMS, truths=STEMS, mirrored=STEMS, order=st.randoms())
-def test_only_equal_names_make_a_pair_and_all_others_are_named(photos, truths, mirrored, order):
+def test_only_equal_names_make_a_pair_and_all_others_are_refused(photos, truths, mirrored, order):
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         wanted = {"blended": photos, "gt": truths, "reflection": mirrored}
@@ -71,10 +71,10 @@ def test_only_equal_names_make_a_pair_and_all_others_are_named(photos, truths, m
         write(root, *places)
         found = read_folders(root)
         assert set(names(found)) == photos & truths
-        assert names(found) == sorted(photos & truths, key=natural)
-        for trio in found.trios:
-            assert trio.photo.stem == trio.transmission.stem == trio.name
-            assert (trio.reflection is not None) == (trio.name in mirrored)
+        assert names(found) == sorted(photos & truths, key=natural_key)
+        for group in found.groups:
+            assert group.photo.stem == group.transmission.stem == group.name
+            assert (group.reflection is not None) == (group.name in mirrored)
         for stem in (photos | truths | mirrored) - (photos & truths):
             assert any(f"/{stem}.png" in line and "no partner" in line for line in found.refused)
         assert len(found.refused) == len((photos | truths | mirrored) - (photos & truths))
@@ -98,10 +98,10 @@ def test_two_pictures_of_one_name_and_role_are_refused_both(tmp_path, role):
 def test_a_name_is_the_same_in_both_spellings_of_unicode(tmp_path):
     write(tmp_path, f"blended/{unicodedata.normalize('NFC', 'café')}.png")
     write(tmp_path, f"gt/{unicodedata.normalize('NFD', 'café')}.png")
-    assert len(read_folders(tmp_path).trios) == 1
+    assert len(read_folders(tmp_path).groups) == 1
 
 
-def test_what_systems_leave_is_passed_over_in_silence_and_other_files_aloud(tmp_path):
+def test_system_files_are_ignored_silently_and_other_files_with_a_remark(tmp_path):
     repacked(tmp_path, ["a"])
     quiet = (
         "blended/._a.png",
@@ -115,7 +115,7 @@ def test_what_systems_leave_is_passed_over_in_silence_and_other_files_aloud(tmp_
     assert read_folders(tmp_path).remarks == ()
     write(tmp_path, "blended/README.txt", "transmission_layer/old/a.png", "licence.md")
     (remark,) = read_folders(tmp_path).remarks
-    assert remark == "passed over blended/README.txt, transmission_layer/old and licence.md"
+    assert remark == "ignored blended/README.txt, transmission_layer/old and licence.md"
     assert names(read_folders(tmp_path)) == ["a"]
 
 
@@ -136,7 +136,7 @@ def test_a_missing_or_empty_folder_of_a_role_is_an_error(tmp_path):
         read_folders(tmp_path)
 
 
-def test_what_cannot_be_listed_is_an_error(tmp_path):
+def test_a_folder_that_cannot_be_listed_is_an_error(tmp_path):
     write(tmp_path, "file.png")
     with pytest.raises(PhotoError, match=r"gone cannot be read \(No such file or directory\); .*; "):
         read_folders(tmp_path / "gone")
@@ -158,39 +158,43 @@ def test_a_split_is_the_folder_itself_or_the_only_one_in_it(tmp_path):
     (tmp_path / "other").mkdir()
     assert find_split(tmp_path) == find_split(tmp_path / "val") == tmp_path / "val"
     repacked(tmp_path / "test", ["a"])
-    with pytest.raises(PhotoError, match=r"has pairs in test and val; .*; point at one, for example .*test"):
+    with pytest.raises(
+        PhotoError, match=r"has pairs in test and val; .*; give the path of one, for example .*test"
+    ):
         find_split(tmp_path)
 
 
 # --- trees
 
 
-def test_the_original_trees_are_joined_shot_by_shot(tmp_path):
+def test_the_original_trees_are_grouped_shot_by_shot(tmp_path):
     found = read_tree(postcard(tmp_path / "p", ["ab", "ba"]), "postcard")
     assert names(found)[:4] == ["ab-Focus-11", "ab-Focus-13", "ab-Focus-16", "ab-Focus-19"]
     assert names(found)[7:10] == ["ab-Thick-3", "ab-Thick-5", "ab-Thick-10"]
-    assert {trio.scene for trio in found.trios} == {"ab", "ba"}
-    thick = next(trio for trio in found.trios if trio.name == "ab-Thick-10")
+    assert {group.scene for group in found.groups} == {"ab", "ba"}
+    thick = next(group for group in found.groups if group.name == "ab-Thick-10")
     there = tmp_path / "p" / "Thick" / "ab" / "10"
     assert (thick.photo, thick.transmission) == (there / "ab-10-m-3.png", there / "ab-10-g-3.png")
     found = read_tree(solidobject(tmp_path / "s", [2, 10]), "solidobject")
     assert names(found)[::10] == ["2-Focus-11", "10-Focus-11"]
     found = read_tree(wildscene(tmp_path / "w", 8), "wildscene")
     assert names(found) == ["1s", "2", "3", "4s", "5", "6", "7s", "8"]
-    assert all(trio.scene == trio.name for trio in found.trios)
-    for trio in found.trios:
-        assert [path.stem for path in (trio.photo, trio.transmission, trio.reflection)] == ["m", "g", "r"]
-        assert len({trio.photo.parent, trio.transmission.parent, trio.reflection.parent}) == 1
+    assert all(group.scene == group.name for group in found.groups)
+    for group in found.groups:
+        assert [path.stem for path in (group.photo, group.transmission, group.reflection)] == ["m", "g", "r"]
+        assert len({group.photo.parent, group.transmission.parent, group.reflection.parent}) == 1
 
 
-def test_two_triplets_in_a_folder_are_told_apart_by_their_names(tmp_path):
+def test_two_triplets_in_a_folder_are_distinguished_by_their_names(tmp_path):
     write(tmp_path, *(f"Focus/ab/11/ab-{k}-{letter}-11.png" for k in (3, 5) for letter in "mgr"))
     found = read_tree(tmp_path, "postcard")
     assert names(found) == ["ab-Focus-11-ab-3-11", "ab-Focus-11-ab-5-11"]
-    assert all(trio.photo.name.split("-")[1] == trio.transmission.name.split("-")[1] for trio in found.trios)
+    assert all(
+        group.photo.name.split("-")[1] == group.transmission.name.split("-")[1] for group in found.groups
+    )
 
 
-def test_a_triplet_without_truth_is_refused_and_one_without_reflection_is_not(tmp_path):
+def test_a_triplet_without_ground_truth_is_refused_and_one_without_reflection_is_not(tmp_path):
     write(tmp_path, "1/m.jpg", "1/r.jpg", "2/m.jpg", "2/g.jpg", "3/g.jpg", "3/r.jpg")
     found = read_tree(tmp_path, "wildscene")
     assert names(found) == ["2"]
@@ -198,7 +202,7 @@ def test_a_triplet_without_truth_is_refused_and_one_without_reflection_is_not(tm
     assert all("no partner" in line for line in found.refused)
 
 
-def test_a_letter_stands_alone_in_either_case(tmp_path):
+def test_the_letter_of_a_role_is_a_separate_word_in_either_case(tmp_path):
     write(
         tmp_path,
         "1/M.JPG",
@@ -212,7 +216,7 @@ def test_a_letter_stands_alone_in_either_case(tmp_path):
     )
     found = read_tree(tmp_path, "wildscene")
     assert names(found) == ["1", "2"]
-    assert found.remarks == ("passed over 2/big.png", "passed over 3/grm.png and 3/m-g.png")
+    assert found.remarks == ("ignored 2/big.png", "ignored 3/grm.png and 3/m-g.png")
     assert len(found.refused) == 1
 
 
@@ -221,27 +225,27 @@ def test_shots_of_one_name_in_two_folders_are_refused_both(tmp_path):
         tmp_path, *(f"{kind}/ab/11/ab-3-{letter}-11.png" for kind in ("Focus", "focus") for letter in "mgr")
     )
     if len(entries(tmp_path)[0]) < 2:
-        pytest.skip("this file system does not tell Focus from focus")
+        pytest.skip("this file system is not case-sensitive")
     found = read_tree(tmp_path, "postcard")
-    assert found.trios == ()
+    assert found.groups == ()
     assert len(found.refused) == 2
     assert all("ambiguous" in line for line in found.refused)
 
 
-def test_other_files_in_a_tree_are_passed_over_aloud(tmp_path):
+def test_other_files_in_a_tree_are_ignored_with_a_remark(tmp_path):
     wildscene(tmp_path, 2)
     write(tmp_path, "README.txt", "1s/notes.txt", "1s/.DS_Store")
-    assert read_tree(tmp_path, "wildscene").remarks == ("passed over 1s/notes.txt", "passed over README.txt")
+    assert read_tree(tmp_path, "wildscene").remarks == ("ignored 1s/notes.txt", "ignored README.txt")
 
 
 @pytest.mark.parametrize("subset", ["postcard", "solidobject", "wildscene"])
-def test_a_folder_without_a_tree_is_an_error_that_draws_it(tmp_path, subset):
+def test_a_folder_without_a_tree_is_an_error_that_shows_the_expected_tree(tmp_path, subset):
     write(tmp_path, "a.png")
-    with pytest.raises(PhotoError, match=rf"is no {subset} set; .*<scene>.*; "):
+    with pytest.raises(PhotoError, match=rf"is not a {subset} set; .*<scene>.*; "):
         read_tree(tmp_path, subset)
 
 
-def test_subsets_are_known_by_their_first_letters(tmp_path):
+def test_subsets_are_recognised_by_their_first_letters(tmp_path):
     for name in ("Postcard Dataset", "Solid_Object-2", "WildSceneDataset", "others"):
         (tmp_path / name).mkdir()
     assert {subset: path.name for subset, path in find_subsets(tmp_path).items()} == {
@@ -254,7 +258,7 @@ def test_subsets_are_known_by_their_first_letters(tmp_path):
         find_subsets(tmp_path)
 
 
-# --- both
+# --- both layouts
 
 
 @settings(max_examples=15)
@@ -278,20 +282,20 @@ def shuffled(items, order: random.Random):
 
 @given(st.sets(st.text(min_size=1)), st.randoms())
 def test_natural_order_is_total_and_puts_2_before_10(some, order):
-    assert sorted(shuffled(some, order), key=natural) == sorted(some, key=natural)
-    assert sorted(["a10", "a2", "10", "2", "a"], key=natural) == ["2", "10", "a", "a2", "a10"]
+    assert sorted(shuffled(some, order), key=natural_key) == sorted(some, key=natural_key)
+    assert sorted(["a10", "a2", "10", "2", "a"], key=natural_key) == ["2", "10", "a", "a2", "a10"]
 
 
-def test_long_lists_are_cut():
-    assert listed(["a"]) == "a"
-    assert listed(["a", "b", "c"], " or ") == "a, b or c"
-    assert listed([str(number) for number in range(100)]) == "0, 1, 2, 3, 4 and 95 more"
+def test_long_lists_are_shortened():
+    assert join_names(["a"]) == "a"
+    assert join_names(["a", "b", "c"], " or ") == "a, b or c"
+    assert join_names([str(number) for number in range(100)]) == "0, 1, 2, 3, 4 and 95 more"
 
 
 # --- training
 
 
-def test_training_pairs_are_joined_by_the_same_rule(tmp_path):
+def test_training_pairs_are_grouped_by_the_same_rule(tmp_path):
     for size, name in (((8, 6), "2"), ((6, 8), "10")):
         repacked(tmp_path, [name], ("blended", "transmission"), size=size)
     assert [tuple(photo.shape) for photo, _ in read_pairs([tmp_path])] == [(8, 6, 3), (6, 8, 3)]
@@ -309,14 +313,14 @@ def test_a_training_pair_of_two_sizes_is_an_error_that_names_both(tmp_path):
         read_pairs([tmp_path])
 
 
-def test_training_pairs_that_are_not_there_are_an_error_of_the_recipe(tmp_path):
+def test_training_pairs_that_are_missing_are_an_error_of_the_recipe(tmp_path):
     with pytest.raises(
         RecipeError, match=r"gone cannot be read \(No such file or directory\); .*BREWSTER_DATA"
     ):
         read_pairs([tmp_path / "gone"])
 
 
-def test_a_folder_with_a_semicolon_in_its_name_is_named_whole(tmp_path):
+def test_a_folder_with_a_semicolon_in_its_name_is_named_in_full(tmp_path):
     with pytest.raises(RecipeError) as raised:
         read_pairs([tmp_path / "window; north"])
     assert raised.value.happened == f"{tmp_path}/window; north cannot be read (No such file or directory)"

@@ -1,4 +1,4 @@
-"""The field's benchmarks are read whole, in either form, and nothing that does not fit is taken."""
+"""Benchmarks are read completely, in either layout, and cases that do not fit are refused."""
 
 import pickle
 import random
@@ -16,7 +16,7 @@ from benchmark_folders import (
     write,
 )
 from brewster.benchmarks import registry
-from brewster.benchmarks.pairing import natural
+from brewster.benchmarks.pairing import natural_key
 from brewster.benchmarks.registry import (
     BENCHMARKS,
     PAPER_SEED,
@@ -51,7 +51,7 @@ def names(cases):
     return [case.name for case in cases]
 
 
-# --- what is read
+# --- layouts
 
 
 @pytest.mark.parametrize("name", ["real20", "nature20"])
@@ -64,7 +64,7 @@ def test_twenty_pairs_are_read_under_the_name_of_their_benchmark(tmp_path, name)
         benchmark=name,
         name="2",
         scene="2",
-        place="blended/2",
+        relative_path="blended/2",
         photo=PictureFile(tmp_path / "blended" / "2.png"),
         transmission=PictureFile(tmp_path / "transmission_layer" / "2.png"),
     )
@@ -80,19 +80,21 @@ def test_the_original_sir2_has_199_and_200_and_101_triplets(whole):
         assert read.remarks == read.refused == ()
         assert all(case.reflection for case in read.cases)
         assert {case.benchmark for case in read.cases} == {name}
-        assert len({case.place for case in read.cases}) == len(set(names(read.cases))) == len(read.cases)
+        assert (
+            len({case.relative_path for case in read.cases}) == len(set(names(read.cases))) == len(read.cases)
+        )
     assert len({case.scene for case in whole["postcard"].cases}) == 20
     assert len({case.scene for case in whole["solidobject"].cases}) == 20
     assert len({case.scene for case in whole["wildscene"].cases}) == 101
 
 
 def test_a_place_is_where_the_photo_lies_below_the_folder_given(whole, original):
-    places = {case.name: case.place for read in whole.values() for case in read.cases}
+    places = {case.name: case.relative_path for read in whole.values() for case in read.cases}
     assert places["ab-Thick-10"] == "Postcard Dataset/Thick/ab/10/ab-10-m-3"
     assert places["1-Focus-11"] == "SolidObjectDataset/1/Focus/11/m"
     assert places["7s"] == "Wildscene/7s/m"
     alone = only("solidobject", original / "SolidObjectDataset")
-    assert alone.cases[0].place == "1/Focus/11/m"
+    assert alone.cases[0].relative_path == "1/Focus/11/m"
 
 
 @pytest.mark.parametrize("subset", ["postcard", "solidobject", "wildscene"])
@@ -113,7 +115,7 @@ def test_sir2_may_be_repacked_in_part_and_what_is_missing_is_said(tmp_path):
     cards, wild = read_benchmark("sir2", tmp_path)
     assert names(cards.cases) == ["ab-3-32", "ab-5-32", "ba-1-2"]
     assert [case.scene for case in cards.cases] == ["ab", "ab", "ba"]
-    assert cards.cases[0].place == "postcard/blended/ab-3-32"
+    assert cards.cases[0].relative_path == "postcard/blended/ab-3-32"
     assert cards.remarks == (
         f"SIR2 SolidObject is not in {tmp_path}",
         "3 pictures, where SIR2 Postcard has 199",
@@ -125,7 +127,7 @@ def test_one_split_below_an_openrr_folder_is_taken(tmp_path):
     repacked(tmp_path / "val_100", ["1", "2"], ("Input", "GT"))
     read = only("openrr", tmp_path)
     assert (read.name, read.expected, read.remarks) == ("openrr", (), ())
-    assert read.cases[0].place == "val_100/Input/1"
+    assert read.cases[0].relative_path == "val_100/Input/1"
     assert names(only("openrr", tmp_path / "val_100").cases) == ["1", "2"]
 
 
@@ -141,13 +143,13 @@ def test_one_split_below_an_openrr_folder_is_taken(tmp_path):
         ("pairs", "pairs"),
     ],
 )
-def test_a_folder_of_pairs_is_called_by_its_own_name_but_never_passes_for_a_known_set(tmp_path, folder, name):
+def test_a_folder_of_pairs_has_the_name_of_its_folder_but_never_that_of_a_known_set(tmp_path, folder, name):
     read = only("pairs", repacked(tmp_path / folder, ["a"]))
     assert (read.name, read.title) == (name, folder.rstrip("/"))
     assert read.cases[0].benchmark == name
 
 
-def test_a_folder_is_called_by_its_name_from_inside_too(tmp_path, monkeypatch):
+def test_a_folder_has_its_name_also_as_the_current_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(repacked(tmp_path / "mine", ["a"]))
     assert only("pairs", registry.Path()).name == "mine"
 
@@ -160,7 +162,7 @@ def test_a_rendered_set_gives_its_background_and_its_reflection(tmp_path, shards
     assert names(read.cases) == ["000000", "000001", "000002"]
     for case in read.cases:
         assert case.rendered
-        assert (case.scene, case.place) == (case.name, f"{case.name}/photo")
+        assert (case.scene, case.relative_path) == (case.name, f"{case.name}/photo")
         assert Photo.open(case.photo.read()).size == (24, 16)
     make(tmp_path / "again", count=3)
     for case, file in ((read.cases[1], "background"), (read.cases[2], "background")):
@@ -168,12 +170,12 @@ def test_a_rendered_set_gives_its_background_and_its_reflection(tmp_path, shards
         assert case.reflection.read() == (tmp_path / "again" / case.name / "reflection.jpg").read_bytes()
 
 
-def test_a_rendered_sample_that_is_not_whole_is_refused(tmp_path):
+def test_an_incomplete_rendered_sample_is_refused(tmp_path):
     make(tmp_path, count=2)
     (tmp_path / "000001" / "background.jpg").unlink()
     read = only("rendered", tmp_path)
     assert names(read.cases) == ["000000"]
-    assert read.refused == ("000001 is not whole: photo.jpg, background.jpg, reflection.jpg are needed",)
+    assert read.refused == ("000001 is incomplete: photo.jpg, background.jpg, reflection.jpg are needed",)
 
 
 def test_the_dev_pairs_are_ten_each(data):
@@ -185,7 +187,7 @@ def test_the_dev_pairs_are_ten_each(data):
     )
 
 
-# --- the same, however it is listed
+# --- the order of the listing does not matter
 
 
 def test_neither_the_order_of_writing_nor_that_of_listing_matters(tmp_path, monkeypatch):
@@ -198,13 +200,13 @@ def test_neither_the_order_of_writing_nor_that_of_listing_matters(tmp_path, monk
     listing = registry.Path.iterdir
     monkeypatch.setattr(registry.Path, "iterdir", lambda path: iter(sorted(listing(path), key=hash)))
     assert only("pairs", there) == before
-    assert names(before.cases) == sorted(stems, key=natural)
+    assert names(before.cases) == sorted(stems, key=natural_key)
 
 
-# --- what is not taken
+# --- refused cases
 
 
-def test_what_has_no_partner_or_two_is_named_and_the_rest_is_read(tmp_path):
+def test_pictures_without_a_unique_partner_are_refused_and_the_others_are_read(tmp_path):
     repacked(tmp_path, ["a", "b", "c", "d"])
     write(
         tmp_path,
@@ -230,24 +232,24 @@ def test_what_has_no_partner_or_two_is_named_and_the_rest_is_read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("size", "told"),
+    ("size", "message"),
     [
         ((600, 400), "photo 1200x800, truth 600x400: the truth is at half the scale"),
         ((300, 200), "photo 1200x800, truth 300x200: the truth is at a quarter of the scale"),
         ((2400, 1600), "photo 1200x800, truth 2400x1600: the truth is at twice the scale"),
         ((420, 280), "photo 1200x800, truth 420x280: the truth is at 0.35 times the scale"),
         ((420, 279), "photo 1200x800, truth 420x279: the truth is at 0.35 times the scale"),
-        ((800, 1200), "photo 1200x800, truth 800x1200: one of them is turned"),
-        ((1199, 800), "photo 1200x800, truth 1199x800: they must be equal"),
-        ((600, 800), "photo 1200x800, truth 600x800: they must be equal"),
+        ((800, 1200), "photo 1200x800, truth 800x1200: one of them is rotated"),
+        ((1199, 800), "photo 1200x800, truth 1199x800: their sizes must be equal"),
+        ((600, 800), "photo 1200x800, truth 600x800: their sizes must be equal"),
     ],
 )
-def test_a_truth_of_another_size_is_refused_and_another_scale_is_told(tmp_path, size, told):
+def test_a_truth_of_another_size_is_refused_and_its_scale_is_reported(tmp_path, size, message):
     write(tmp_path, "blended/a.png", size=(1200, 800))
     write(tmp_path, "gt/a.png", size=size)
     read = only("pairs", tmp_path)
     assert read.cases == ()
-    assert read.refused == (f"blended/a: {told}",)
+    assert read.refused == (f"blended/a: {message}",)
 
 
 def test_a_reflection_of_another_size_is_refused_too(tmp_path):
@@ -264,16 +266,16 @@ def test_sizes_are_those_of_upright_pictures(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("role", "called"),
+    ("role", "label"),
     [("blended", "photo"), ("transmission_layer", "truth"), ("reflection_layer", "reflection")],
 )
 @pytest.mark.parametrize(("bad", "why"), [(b"", "is empty"), (b"no picture", "no picture brewster knows")])
-def test_an_unreadable_picture_is_refused_by_name(tmp_path, role, called, bad, why):
+def test_an_unreadable_picture_is_refused_by_name(tmp_path, role, label, bad, why):
     repacked(tmp_path, ["a", "b"], ("blended", "transmission_layer", "reflection_layer"))
     (tmp_path / role / "a.png").write_bytes(bad)
     read = only("pairs", tmp_path)
     assert names(read.cases) == ["b"]
-    assert read.refused[0].startswith(f"blended/a: the {called} cannot be used: ")
+    assert read.refused[0].startswith(f"blended/a: the {label} cannot be used: ")
     assert why in read.refused[0]
 
 
@@ -286,10 +288,10 @@ def test_a_dangling_link_is_refused_by_name(tmp_path):
     assert "the photo cannot be used" in read.refused[0]
 
 
-# --- what is said aloud
+# --- remarks
 
 
-def test_a_count_that_is_not_the_known_one_is_said(tmp_path):
+def test_an_unexpected_number_of_pictures_is_a_remark(tmp_path):
     assert only("real20", repacked(tmp_path / "r", ["a"])).remarks == ("1 picture, where Real20 has 20",)
     wild = only("wildscene", wildscene(tmp_path / "w", 56))
     assert wild.remarks == ("56 pictures, where SIR2 Wildscene has 101 or 55",)
@@ -300,14 +302,14 @@ def test_pictures_without_a_reflection_are_named_where_others_have_one(tmp_path)
     repacked(tmp_path, ["a", "b", "c"])
     assert only("pairs", tmp_path).remarks == ()
     write(tmp_path, "reflection/b.png")
-    assert only("pairs", tmp_path).remarks == ("without a reflection to compare with: a and c",)
+    assert only("pairs", tmp_path).remarks == ("no reflection ground truth for a and c",)
 
 
-# --- what is refused as a whole
+# --- refused folders
 
 
 @pytest.mark.parametrize("name", BENCHMARKS)
-def test_an_empty_or_missing_folder_or_a_file_is_an_error_in_three_beats(tmp_path, name):
+def test_an_empty_or_missing_folder_or_a_file_is_an_error_in_three_parts(tmp_path, name):
     (tmp_path / "empty").mkdir()
     write(tmp_path, "a.png")
     for place in ("empty", "gone", "a.png"):
@@ -317,25 +319,25 @@ def test_an_empty_or_missing_folder_or_a_file_is_an_error_in_three_beats(tmp_pat
 
 def test_a_damaged_shard_is_an_error(tmp_path):
     write(tmp_path, "shard-000000.tar", data=b"no tar" * 200)
-    with pytest.raises(PhotoError, match=r"is no rendered set \(.*\); .*; "):
+    with pytest.raises(PhotoError, match=r"is not a rendered set \(.*\); .*; "):
         read_benchmark("rendered", tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("asked", "cure"),
-    [("nature", "did you mean nature20?"), ("SIR2", "did you mean sir2?"), ("xyz", "say pairs=FOLDER")],
+    ("name", "cure"),
+    [("nature", "did you mean nature20?"), ("SIR2", "did you mean sir2?"), ("xyz", "use pairs=FOLDER")],
 )
-def test_an_unknown_benchmark_is_an_error_that_knows_the_nearest(tmp_path, asked, cure):
+def test_an_unknown_benchmark_is_an_error_that_suggests_the_nearest(tmp_path, name, cure):
     with pytest.raises(PhotoError) as error:
-        read_benchmark(asked, tmp_path)
-    assert str(error.value).startswith(f"there is no benchmark {asked!r}; brewster reads real20, ")
+        read_benchmark(name, tmp_path)
+    assert str(error.value).startswith(f"there is no benchmark {name!r}; brewster reads real20, ")
     assert cure in str(error.value)
 
 
 # --- files
 
 
-def test_a_file_is_read_where_it_lies_and_travels(tmp_path):
+def test_a_file_or_a_span_of_it_is_read_and_can_be_pickled(tmp_path):
     write(tmp_path, "a.png")
     whole, span = PictureFile(tmp_path / "a.png"), PictureFile(tmp_path / "a.png", (1, 3))
     assert whole.read() == picture()
@@ -345,12 +347,12 @@ def test_a_file_is_read_where_it_lies_and_travels(tmp_path):
     assert str(span) == f"{tmp_path / 'a.png'} from byte 1"
 
 
-def test_a_file_that_is_gone_or_too_short_is_an_error_in_three_beats(tmp_path):
+def test_a_file_that_is_missing_or_too_short_is_an_error_in_three_parts(tmp_path):
     write(tmp_path, "a.png")
     for file, why in (
         (PictureFile(tmp_path / "b.png"), "b.png cannot be read .No such file"),
         (PictureFile(tmp_path), "cannot be read .Is a directory"),
-        (PictureFile(tmp_path / "a.png", (len(picture()) - 2, 5)), "cannot be read .2 of 5 bytes are there"),
+        (PictureFile(tmp_path / "a.png", (len(picture()) - 2, 5)), "cannot be read .it has 2 of 5 bytes"),
     ):
         with pytest.raises(UnreadablePhoto, match=f"{why}.*; .*; .*"):
             file.read()
@@ -364,7 +366,7 @@ def test_the_draw_takes_one_shot_of_each_scene(whole):
         drawn = paper_draw(whole[name])
         assert len(drawn) == len({case.scene for case in drawn}) == 20
         assert set(drawn) <= set(whole[name].cases)
-        assert [case.scene for case in drawn] == sorted((case.scene for case in drawn), key=natural)
+        assert [case.scene for case in drawn] == sorted((case.scene for case in drawn), key=natural_key)
         assert drawn != paper_draw(whole[name], seed=PAPER_SEED + 1)
     assert paper_draw(whole["wildscene"]) == whole["wildscene"].cases
 
@@ -388,7 +390,7 @@ def test_the_draw_does_not_depend_on_the_order_of_cases(whole, original, monkeyp
     assert paper_draw(only("solidobject", original)) == paper_draw(whole["solidobject"])
 
 
-def test_a_repacked_set_whose_names_tell_the_scenes_can_be_drawn(tmp_path):
+def test_a_repacked_set_whose_names_identify_the_scenes_can_be_drawn(tmp_path):
     read = only("solidobject", repacked(tmp_path, ["1-Focus-11", "1-Focus-13", "12_Thick_3", "2-x"]))
     assert [case.scene for case in read.cases] == ["1", "1", "2", "12"]
     assert [case.scene for case in paper_draw(read)] == ["1", "2", "12"]
@@ -396,18 +398,15 @@ def test_a_repacked_set_whose_names_tell_the_scenes_can_be_drawn(tmp_path):
 
 @pytest.mark.parametrize("stems", [["ab-1", "7"], ["1", "2"], [f"{number}-m" for number in range(21)]])
 @pytest.mark.parametrize("name", ["postcard", "solidobject"])
-def test_a_repacked_set_whose_names_do_not_tell_cannot_be_drawn(tmp_path, name, stems):
+def test_a_repacked_set_whose_names_do_not_identify_the_scenes_cannot_be_drawn(tmp_path, name, stems):
     read = only(name, repacked(tmp_path, stems))
     assert [case.scene for case in read.cases] == names(read.cases)
-    assert (
-        "scenes cannot be told from the names, so the paper's draw is impossible with this form"
-        in read.remarks
-    )
-    with pytest.raises(PhotoError, match=r"scenes of SIR2 .* cannot be told .*; .*; .*"):
+    assert "the names do not identify the scenes, so the paper's draw is not possible" in read.remarks
+    with pytest.raises(PhotoError, match=r"do not identify the scenes of SIR2 .*; .*; .*"):
         paper_draw(read)
 
 
-def test_other_benchmarks_are_drawn_whole(tmp_path):
+def test_the_draw_from_other_benchmarks_is_the_whole_benchmark(tmp_path):
     for name, folder in (("real20", "r"), ("pairs", "mine"), ("pairs", "postcard")):
         read = only(name, repacked(tmp_path / folder, ["a", "b"]))
         assert paper_draw(read) == read.cases

@@ -24,12 +24,12 @@ def test_markdown_shows_means_intervals_and_paired_differences(results):
     assert "21.50 / 0.123" in text
 
 
-def test_markdown_says_aloud_what_was_left_out_what_failed_and_every_choice(results):
+def test_markdown_lists_refused_files_failures_and_every_setting(results):
     text = to_markdown(results)
     for said in (
         "left out: x.png has no partner",
         "- A_b|c failed on real20/3",
-        "2 pictures answer no case",
+        "2 pictures fit no case",
         "Everything is stated.",
         "LPIPS is so.",
     ):
@@ -41,7 +41,7 @@ def test_a_table_has_as_many_cells_in_every_line_whatever_names_hold(results):
         assert len({len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines()}) == 1
 
 
-def test_a_method_that_failed_somewhere_shows_how_many_pictures_it_is_judged_on(results):
+def test_a_method_that_failed_somewhere_shows_how_many_pictures_it_is_scored_on(results):
     results["tables"]["real20"] = {
         "input (unprocessed)": {"psnr": entry(20.0)},
         "A_b|c": {"psnr": entry(21.5, count=19)},
@@ -73,17 +73,17 @@ def test_a_method_that_failed_somewhere_is_never_the_best(results):
     assert ranking(table, "psnr", METRICS["psnr"]) == ["20.00", "19.00"]
 
 
-def test_means_of_fewer_pictures_are_said_not_to_be_compared(results):
-    said = "is not to be compared"
-    assert said not in overview(results)
+def test_a_note_warns_of_means_over_fewer_pictures(results):
+    note = "Do not compare a mean over fewer pictures"
+    assert note not in overview(results)
     results["tables"]["real20"] = {
         "input (unprocessed)": {"psnr": entry(20.0)},
         "A_b|c": {"psnr": entry(21.5, count=19)},
     }
-    assert said in overview(results)
+    assert note in overview(results)
 
 
-def test_a_cell_with_many_counts_tells_the_least_and_the_most(results):
+def test_a_cell_with_several_counts_shows_the_smallest_and_the_largest(results):
     results["metrics"]["ssim"] = METRICS["psnr"]
     counts = {"psnr": entry(20.0, count=5), "ssim": entry(0.9, count=3), "lpips": entry(0.2, count=1)}
     results["tables"]["real20"] = {"input (unprocessed)": counts, "A_b|c": counts}

@@ -1,4 +1,4 @@
-"""What results.json says, from rows whose numbers are known."""
+"""The content of results.json, from rows with known numbers."""
 
 import json
 
@@ -52,14 +52,14 @@ def test_one_benchmark_alone_has_no_average(methods):
 
 def test_the_order_of_rows_does_not_matter(methods):
     parts = [benchmark("a", 9)]
-    told = rows(parts, methods, lambda case, method: int(case.name) ** 2 + (method.name == "theirs"))
-    assert summarise(parts, methods, PSNR, told) == summarise(parts, methods, PSNR, told[::-1])
+    score_rows = rows(parts, methods, lambda case, method: int(case.name) ** 2 + (method.name == "theirs"))
+    assert summarise(parts, methods, PSNR, score_rows) == summarise(parts, methods, PSNR, score_rows[::-1])
 
 
 def test_differences_are_to_every_method_named_before(methods):
     parts = [benchmark("a", 4)]
-    told = rows(parts, methods, lambda case, method: int(case.name) + 0.5 * (method.name == "theirs"))
-    (row,) = summarise(parts, methods, PSNR, told)["differences"]["a"]
+    score_rows = rows(parts, methods, lambda case, method: int(case.name) + 0.5 * (method.name == "theirs"))
+    (row,) = summarise(parts, methods, PSNR, score_rows)["differences"]["a"]
     assert (row["method"], row["than"], row["mean"], row["better"]) == (
         "theirs",
         "input (unprocessed)",
@@ -71,9 +71,9 @@ def test_differences_are_to_every_method_named_before(methods):
 
 def test_a_failed_picture_is_counted_out_and_named(methods):
     parts = [benchmark("a", 3, refused=("x.png has no partner",))]
-    told = rows(parts, methods, lambda case, method: float(case.name))
-    told[1] = ScoreRow("a", "0", "theirs", "", "", error="theirs failed")
-    results = summarise(parts, methods, PSNR, told)
+    score_rows = rows(parts, methods, lambda case, method: float(case.name))
+    score_rows[1] = ScoreRow("a", "0", "theirs", "", "", error="theirs failed")
+    results = summarise(parts, methods, PSNR, score_rows)
     assert results["tables"]["a"]["theirs"]["psnr"] | {"low": 0, "high": 0} == {
         "mean": 1.5,
         "low": 0,
@@ -84,15 +84,15 @@ def test_a_failed_picture_is_counted_out_and_named(methods):
     assert results["benchmarks"]["a"]["refused"] == ["x.png has no partner"]
 
 
-def test_metrics_that_nothing_was_measured_in_are_left_out(methods):
+def test_metrics_without_any_score_are_left_out(methods):
     parts = [benchmark("a", 2)]
-    protocol = EvaluationConfig(metrics=("psnr", "kept_reflection"))
-    results = summarise(parts, methods, protocol, rows(parts, methods, lambda *_: 1.0))
+    config = EvaluationConfig(metrics=("psnr", "kept_reflection"))
+    results = summarise(parts, methods, config, rows(parts, methods, lambda *_: 1.0))
     assert list(results["metrics"]) == ["psnr"]
     assert results["metrics"]["psnr"]["unit"] == "dB"
 
 
-def test_a_benchmark_without_pairs_is_told_and_makes_no_table(methods):
+def test_a_benchmark_without_pairs_is_listed_and_has_no_table(methods):
     parts = [benchmark("a", 2), benchmark("b", 0, refused=("all of it",))]
     results = summarise(parts, methods, PSNR, rows(parts, methods, lambda *_: 1.0))
     assert list(results["tables"]) == ["a"]
@@ -106,8 +106,8 @@ def test_the_papers_protocol_averages_over_181_pictures_and_reports_all_too(tmp_
     parts = [
         part for name in ("real20", "nature20", "sir2") for part in read_benchmark(name, tmp_path / name)
     ]
-    protocol = EvaluationConfig(metrics=("psnr",), paper=True)
-    results = summarise(parts, methods, protocol, rows(parts, methods, lambda *_: 1.0))
+    config = EvaluationConfig(metrics=("psnr",), paper=True)
+    results = summarise(parts, methods, config, rows(parts, methods, lambda *_: 1.0))
     pictures = {key: selection["pictures"] for key, selection in results["selections"].items()}
     assert pictures == {
         "real20": 20,
@@ -123,10 +123,10 @@ def test_the_papers_protocol_averages_over_181_pictures_and_reports_all_too(tmp_
     json.dumps(results, allow_nan=False)
 
 
-def test_the_papers_average_is_over_the_papers_sets_only_and_says_what_it_lacks(tmp_path, methods):
+def test_the_papers_average_is_over_the_papers_sets_only_and_states_what_is_missing(tmp_path, methods):
     parts = [benchmark("real20", 20), benchmark("nature20", 10), benchmark("mine", 7)]
-    protocol = EvaluationConfig(metrics=("psnr",), paper=True)
-    results = summarise(parts, methods, protocol, rows(parts, methods, lambda *_: 1.0))
+    config = EvaluationConfig(metrics=("psnr",), paper=True)
+    results = summarise(parts, methods, config, rows(parts, methods, lambda *_: 1.0))
     assert results["selections"]["average"]["pictures"] == 30
     assert (
         "over 181 pictures; this one is over 20 of real20, 10 of nature20"
@@ -134,14 +134,14 @@ def test_the_papers_average_is_over_the_papers_sets_only_and_says_what_it_lacks(
     )
 
 
-def test_a_metric_that_was_asked_for_in_vain_is_told(methods):
+def test_a_requested_metric_without_a_score_is_listed(methods):
     parts = [benchmark("a", 2)]
-    protocol = EvaluationConfig(metrics=("psnr", "kept_reflection"))
-    results = summarise(parts, methods, protocol, rows(parts, methods, lambda *_: 1.0))
+    config = EvaluationConfig(metrics=("psnr", "kept_reflection"))
+    results = summarise(parts, methods, config, rows(parts, methods, lambda *_: 1.0))
     assert results["unmeasured"] == ["kept_reflection"]
 
 
-def test_the_papers_draw_is_refused_where_scenes_cannot_be_told(tmp_path, methods):
+def test_the_papers_draw_is_refused_if_names_do_not_identify_the_scenes(tmp_path, methods):
     repacked(tmp_path / "postcard", ["001", "002"])
     parts = read_benchmark("postcard", tmp_path / "postcard")
     with pytest.raises(BrewsterError, match="scene"):

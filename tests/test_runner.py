@@ -1,4 +1,4 @@
-"""Resume, workers and failures: the same numbers whatever happens on the way."""
+"""Resuming, workers and failures do not change the scores."""
 
 import json
 import os
@@ -26,12 +26,12 @@ NAMES = ["1", "2", "3"]
 
 
 class Fake:
-    """A method that fails or answers as it is told, and counts how often it was asked."""
+    """A method with given predictions or failures, which records the cases that it was run on."""
 
     exclusive = False
 
-    def __init__(self, name="fake", answers=None):
-        self.name, self.answers, self.asked = name, answers or {}, []
+    def __init__(self, name="fake", predictions=None):
+        self.name, self.predictions, self.requested = name, predictions or {}, []
 
     def about(self):
         return {"kind": "fake"}
@@ -39,12 +39,12 @@ class Fake:
     def key(self, case):
         return f"{self.name}"
 
-    def answer(self, case, photo):
-        self.asked.append(case.name)
-        answer = self.answers.get(case.name, MethodOutput(photo))
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
+    def predict(self, case, photo):
+        self.requested.append(case.name)
+        prediction = self.predictions.get(case.name, MethodOutput(photo))
+        if isinstance(prediction, Exception):
+            raise prediction
+        return prediction
 
     def cached(self, case):
         return None
@@ -59,12 +59,12 @@ def real20(tmp_path):
 
 
 def numbers(rows):
-    return [(row.place, row.scores, row.error) for row in rows]
+    return [(row.id, row.scores, row.error) for row in rows]
 
 
 def test_every_method_is_scored_on_every_case_in_order(real20, tmp_path):
     rows = score(real20, [IdentityBaseline(), Fake()], QUICK, tmp_path / "out")
-    assert [row.place[1:] for row in rows] == [
+    assert [row.id[1:] for row in rows] == [
         (case, method) for case in NAMES for method in ("input (unprocessed)", "fake")
     ]
     assert rows[0].scores == rows[1].scores
@@ -72,14 +72,14 @@ def test_every_method_is_scored_on_every_case_in_order(real20, tmp_path):
     assert len((tmp_path / "out" / SCORES).read_text().splitlines()) == 6
 
 
-def test_what_is_scored_is_not_scored_again(real20, tmp_path):
+def test_logged_scores_are_reused(real20, tmp_path):
     first = score(real20, [Fake()], QUICK, tmp_path / "out")
     again = Fake()
     assert numbers(score(real20, [again], QUICK, tmp_path / "out")) == numbers(first)
-    assert again.asked == []
+    assert again.requested == []
 
 
-def test_a_run_that_was_killed_in_the_middle_of_a_line_goes_on(real20, tmp_path):
+def test_a_run_that_was_killed_in_the_middle_of_a_line_is_resumed(real20, tmp_path):
     whole = score(real20, [Fake()], QUICK, tmp_path / "whole")
     log = tmp_path / "out" / SCORES
     log.parent.mkdir()
@@ -87,71 +87,71 @@ def test_a_run_that_was_killed_in_the_middle_of_a_line_goes_on(real20, tmp_path)
     log.write_text(lines[0] + "\n" + lines[1][:40])
     fake = Fake()
     assert numbers(score(real20, [fake], QUICK, tmp_path / "out")) == numbers(whole)
-    assert fake.asked == ["2", "3"]
+    assert fake.requested == ["2", "3"]
     fake = Fake()
     score(real20, [fake], QUICK, tmp_path / "out")
-    assert fake.asked == []
+    assert fake.requested == []
 
 
-def test_a_changed_photo_truth_or_protocol_is_measured_anew(real20, tmp_path):
+def test_a_changed_photo_ground_truth_or_setting_is_scored_again(real20, tmp_path):
     score(real20, [Fake()], QUICK, tmp_path / "out")
     paint(tmp_path / "real20" / "transmission_layer" / "2.png", 77)
     fake = Fake()
     score(real20, [fake], QUICK, tmp_path / "out")
-    assert fake.asked == ["2"]
+    assert fake.requested == ["2"]
     fake = Fake()
     score(real20, [fake], replace(QUICK, metrics=("psnr",)), tmp_path / "out")
-    assert fake.asked == NAMES
+    assert fake.requested == NAMES
 
 
-def test_other_metrics_do_not_make_a_model_answer_again(real20, model, tmp_path, monkeypatch):
+def test_other_metrics_do_not_run_the_model_again(real20, model, tmp_path, monkeypatch):
     ours = ModelMethod("pane", str(model), tmp_path / "out" / "predictions" / "pane")
     first = score(real20, [ours], QUICK, tmp_path / "out")
-    monkeypatch.setattr(ModelMethod, "answer", lambda *_: pytest.fail("it was asked again"))
+    monkeypatch.setattr(ModelMethod, "predict", lambda *_: pytest.fail("it was run again"))
     more = score(real20, [ours], EvaluationConfig(metrics=("psnr", "psnr_region")), tmp_path / "out")
     assert [row.scores["psnr"] for row in more] == [row.scores["psnr"] for row in first]
 
 
-def test_an_answer_that_was_changed_on_the_disk_is_made_again(real20, model, tmp_path):
+def test_a_stored_prediction_that_was_changed_is_made_again(real20, model, tmp_path):
     ours = ModelMethod("pane", str(model), tmp_path / "kept")
     first = score(real20, [ours], QUICK, tmp_path / "out")
-    kept = tmp_path / "kept" / "real20" / "2.transmission.png"
-    kept.write_bytes((tmp_path / "real20" / "blended" / "2.png").read_bytes())
+    stored = tmp_path / "kept" / "real20" / "2.transmission.png"
+    stored.write_bytes((tmp_path / "real20" / "blended" / "2.png").read_bytes())
     again = score(real20, [ours], EvaluationConfig(metrics=("psnr",)), tmp_path / "out")
     assert [row.scores["psnr"] for row in again] == [row.scores["psnr"] for row in first]
 
 
 @pytest.mark.parametrize(
-    ("changed", "asked"),
+    ("changed", "requested"),
     [("brewster.__version__", []), ("brewster.evaluate.runner.SCORE_FORMAT", NAMES)],
 )
-def test_scores_are_made_again_when_scoring_changes_and_not_with_a_new_version(
-    real20, tmp_path, monkeypatch, changed, asked
+def test_scores_are_made_again_with_another_score_format_and_not_with_a_new_version(
+    real20, tmp_path, monkeypatch, changed, requested
 ):
     score(real20, [Fake()], QUICK, tmp_path / "out")
     monkeypatch.setattr(changed, 99)
     fake = Fake()
     score(real20, [fake], QUICK, tmp_path / "out")
-    assert fake.asked == asked
+    assert fake.requested == requested
 
 
 @pytest.mark.parametrize(
-    ("changed", "asked"),
-    [("brewster.__version__", 0), ("brewster.evaluate.methods.ANSWER_FORMAT", 3)],
+    ("changed", "requested"),
+    [("brewster.__version__", 0), ("brewster.evaluate.methods.PREDICTION_FORMAT", 3)],
 )
-def test_answers_are_made_again_when_answering_changes_and_not_with_a_new_version(
-    real20, model, tmp_path, monkeypatch, changed, asked
+def test_predictions_are_made_again_with_another_prediction_format_and_not_with_a_new_version(
+    real20, model, tmp_path, monkeypatch, changed, requested
 ):
     ours = ModelMethod("pane", str(model), tmp_path / "kept")
     score(real20, [ours], QUICK, tmp_path / "out")
     monkeypatch.setattr(changed, 99)
-    made, answer = [], ModelMethod.answer
-    monkeypatch.setattr(ModelMethod, "answer", lambda self, *case: made.append(1) or answer(self, *case))
+    made, predict = [], ModelMethod.predict
+    monkeypatch.setattr(ModelMethod, "predict", lambda self, *case: made.append(1) or predict(self, *case))
     score(real20, [ours], QUICK, tmp_path / "out")
-    assert len(made) == asked
+    assert len(made) == requested
 
 
-def test_a_worker_that_dies_is_told_and_scores_are_kept(real20, model, tmp_path):
+def test_a_worker_that_dies_is_an_error(real20, model, tmp_path):
     with pytest.raises(BrewsterError, match="a worker process died"):
         score(real20, [IdentityBaseline(), Deadly()], QUICK, tmp_path / "out", workers=2)
 
@@ -167,7 +167,7 @@ class Deadly:
     def key(self, case):
         return self.name
 
-    def answer(self, case, photo):
+    def predict(self, case, photo):
         os._exit(1)
 
     def cached(self, case):
@@ -177,7 +177,7 @@ class Deadly:
 @final
 @dataclass(frozen=True)
 class Endless:
-    """A method that says that it has begun, and never answers."""
+    """A method that creates a file when it starts and never returns."""
 
     begun: Path
     name: str = "endless"
@@ -186,7 +186,7 @@ class Endless:
     def key(self, case):
         return self.name
 
-    def answer(self, case, photo):
+    def predict(self, case, photo):
         (self.begun / case.name).touch()
         time.sleep(1000)
 
@@ -194,7 +194,7 @@ class Endless:
         return None
 
 
-def test_a_run_that_is_killed_takes_its_workers_along(real20, tmp_path):
+def test_killing_a_run_ends_its_workers(real20, tmp_path):
     (tmp_path / "begun").mkdir()
     code = f"""
 from pathlib import Path
@@ -206,7 +206,8 @@ if __name__ == "__main__":
 """
     (tmp_path / "run.py").write_text(code)
     with subprocess.Popen(
-        [sys.executable, tmp_path / "run.py"], env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+        [sys.executable, tmp_path / "run.py"],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])},
     ) as run:
         wait_for(lambda: len(list((tmp_path / "begun").iterdir())) == 2, run)
         workers = children(run)
@@ -215,40 +216,40 @@ if __name__ == "__main__":
     assert len(workers) >= 2
 
 
-def test_kept_layers_score_exactly_as_fresh_ones(real20, model, tmp_path):
+def test_stored_layers_have_the_same_scores_as_new_ones(real20, model, tmp_path):
     ours = ModelMethod("pane", str(model), tmp_path / "kept")
     fresh = score(real20, [ours], QUICK, tmp_path / "out")
-    kept = score(real20, [PredictionFolder("pane", tmp_path / "kept")], QUICK, tmp_path / "out")
-    assert [row.scores for row in fresh] == [row.scores for row in kept]
+    stored = score(real20, [PredictionFolder("pane", tmp_path / "kept")], QUICK, tmp_path / "out")
+    assert [row.scores for row in fresh] == [row.scores for row in stored]
 
 
 def test_two_workers_give_the_same_rows_as_one(real20, model, tmp_path):
     methods = [IdentityBaseline(), ModelMethod("pane", str(model), tmp_path / "kept")]
-    protocol = EvaluationConfig(metrics=("psnr", "ssim", "psnr_region"))
-    one = score(real20, methods, protocol, tmp_path / "one")
-    two = score(real20, methods, protocol, tmp_path / "two", workers=2)
+    config = EvaluationConfig(metrics=("psnr", "ssim", "psnr_region"))
+    one = score(real20, methods, config, tmp_path / "one")
+    two = score(real20, methods, config, tmp_path / "two", workers=2)
     assert numbers(one) == numbers(two)
 
 
 def test_a_method_that_fails_on_one_picture_is_named_and_the_rest_is_scored(real20, tmp_path):
-    fake = Fake(answers={"2": PhotoError("the picture is odd", "an even one", "paint another")})
+    fake = Fake(predictions={"2": PhotoError("the picture is odd", "an even one", "paint another")})
     rows = score(real20, [IdentityBaseline(), fake], QUICK, tmp_path / "out")
     assert [bool(row.error) for row in rows] == [False, False, False, True, False, False]
     assert rows[3].error.startswith("fake failed on real20/2: the picture is odd")
 
 
 def test_a_crash_is_named_with_its_picture_and_is_tried_again_next_time(real20, tmp_path):
-    rows = score(real20, [Fake(answers={"2": RuntimeError("boom")})], QUICK, tmp_path / "out")
+    rows = score(real20, [Fake(predictions={"2": RuntimeError("boom")})], QUICK, tmp_path / "out")
     assert rows[1].error == "fake failed on real20/2: RuntimeError: boom"
     better = Fake()
     assert not any(row.error for row in score(real20, [better], QUICK, tmp_path / "out"))
-    assert better.asked == ["2"]
+    assert better.requested == ["2"]
 
 
-def test_an_answer_of_another_size_is_refused_never_resized(real20, tmp_path):
+def test_a_prediction_of_another_size_is_refused_and_not_resized(real20, tmp_path):
     small = Photo.from_array(np.zeros((8, 8, 3), np.uint8), encoding="srgb")
-    rows = score(real20, [Fake(answers={"1": MethodOutput(small)})], QUICK, tmp_path / "out")
-    assert "fake's transmission of real20/1 is 8x8; 24x16" in rows[0].error
+    rows = score(real20, [Fake(predictions={"1": MethodOutput(small)})], QUICK, tmp_path / "out")
+    assert "fake's transmission of real20/1 is 8x8; expected 24x16" in rows[0].error
 
 
 def test_a_picture_that_cannot_be_decoded_fails_for_all_methods(real20, tmp_path):
@@ -291,7 +292,7 @@ def test_pictures_are_reduced_before_any_method_sees_them(tmp_path):
     repacked(tmp_path / "real20", ["1"], size=(80, 40))
     fake = Fake()
     seen = []
-    fake.answer = lambda case, photo: seen.append(photo.size) or MethodOutput(photo)
+    fake.predict = lambda case, photo: seen.append(photo.size) or MethodOutput(photo)
     (row,) = score(
         read_benchmark("real20", tmp_path / "real20"), [fake], replace(QUICK, size=20), tmp_path / "out"
     )
@@ -305,40 +306,40 @@ def test_a_folder_that_cannot_be_written_is_an_error(real20, tmp_path):
         score(real20, [Fake()], QUICK, tmp_path / "out")
 
 
-def test_progress_is_told_after_every_answer(real20, tmp_path):
-    told = []
+def test_progress_is_reported_after_every_prediction(real20, tmp_path):
+    calls = []
     score(
         real20,
         [IdentityBaseline(), Fake()],
         QUICK,
         tmp_path / "out",
-        report=lambda *now: told.append(now[:2]),
+        on_progress=lambda *now: calls.append(now[:2]),
     )
-    assert told == [(i, 6) for i in range(1, 7)]
+    assert calls == [(i, 6) for i in range(1, 7)]
 
 
-def test_lines_of_another_version_are_passed_over(real20, tmp_path):
+def test_lines_of_another_version_are_ignored(real20, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / SCORES).write_text(json.dumps({"benchmark": "real20", "odd": 1}) + "\n[]\n7\n")
     assert len(score(real20, [Fake()], QUICK, tmp_path / "out")) == 3
 
 
-def test_an_interrupt_leaves_what_was_scored(real20, tmp_path, monkeypatch):
+def test_an_interrupt_keeps_the_logged_scores(real20, tmp_path, monkeypatch):
     fake = Fake()
 
-    def answer(case, photo):
+    def predict(case, photo):
         if case.name == "3":
             raise KeyboardInterrupt
         return MethodOutput(photo)
 
-    monkeypatch.setattr(fake, "answer", answer)
+    monkeypatch.setattr(fake, "predict", predict)
     with pytest.raises(KeyboardInterrupt):
         score(real20, [fake], QUICK, tmp_path / "out")
     assert len((tmp_path / "out" / SCORES).read_text().splitlines()) == 2
 
 
 class Large(Fake):
-    """Writes down who asked it, and in which process."""
+    """Logs the process, its name and the case."""
 
     exclusive = True
 
@@ -346,20 +347,18 @@ class Large(Fake):
         super().__init__(name)
         self.log = log
 
-    def answer(self, case, photo):
+    def predict(self, case, photo):
         with self.log.open("a") as file:
             file.write(f"{os.getpid()} {self.name} {case.name}\n")
-        return super().answer(case, photo)
+        return super().predict(case, photo)
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_methods_that_need_the_memory_for_themselves_go_through_all_cases_one_after_another(
-    real20, tmp_path, workers
-):
+def test_exclusive_methods_run_one_after_another_on_all_cases(real20, tmp_path, workers):
     log = tmp_path / "log"
     methods = [Large("one", log), Fake("small"), Large("two", log)]
     rows = score(real20, methods, QUICK, tmp_path / "out", workers=workers)
-    asked = [line.split() for line in log.read_text().splitlines()]
-    assert [name for _, name, _ in asked] == ["one"] * 3 + ["two"] * 3
-    assert {int(process) for process, _, _ in asked} == {os.getpid()}
+    requested = [line.split() for line in log.read_text().splitlines()]
+    assert [name for _, name, _ in requested] == ["one"] * 3 + ["two"] * 3
+    assert {int(process) for process, _, _ in requested} == {os.getpid()}
     assert [row.method for row in rows[:3]] == ["one", "small", "two"]

@@ -15,10 +15,10 @@ from brewster.metrics import METRICS, Lpips, Metric, kept_reflection, lpips, psn
 from set_folders import make
 
 
-def open_case(folder, protocol, name="pairs"):
+def open_case(folder, config, name="pairs"):
     ((case, *_),) = (part.cases for part in read_benchmark(name, folder))
-    truth = GroundTruth.open(case, protocol)
-    return truth, Scorer(truth, protocol)
+    truth = GroundTruth.open(case, config)
+    return truth, Scorer(truth, config)
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def triplet(tmp_path):
 
 @pytest.fixture
 def rendered(tmp_path):
-    """A sample in which the right half mirrors a bright patch, as brewster render leaves it."""
+    """A sample as `brewster render` writes it, with a bright reflection in the right half."""
     make(tmp_path / "set", count=1)
     background = np.full((48, 64, 3), 0.3, np.float32)
     background[8:40, 4:28] = 0.05
@@ -48,10 +48,10 @@ def rendered(tmp_path):
     return tmp_path / "set"
 
 
-def test_doing_nothing_scores_what_scikit_image_says(triplet):
-    truth, judge = open_case(triplet, EvaluationConfig(metrics=("psnr", "ssim", "ssim_gaussian")))
+def test_the_baseline_scores_agree_with_scikit_image(triplet):
+    truth, scorer = open_case(triplet, EvaluationConfig(metrics=("psnr", "ssim", "ssim_gaussian")))
     photo, transmission = truth.pictures["photo"], truth.pictures["transmission"]
-    scores = judge.score(IdentityBaseline().answer(truth.case, truth.photo))
+    scores = scorer.score(IdentityBaseline().predict(truth.case, truth.photo))
     gaussian = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 255}
     assert scores == {
         "psnr": pytest.approx(peak_signal_noise_ratio(transmission, photo), abs=1e-6),
@@ -62,62 +62,66 @@ def test_doing_nothing_scores_what_scikit_image_says(triplet):
     }
 
 
-def test_the_reflection_is_measured_where_there_is_truth_and_an_answer(triplet):
-    protocol = EvaluationConfig(metrics=("psnr", "psnr_reflection"))
-    truth, judge = open_case(triplet, protocol)
+def test_the_reflection_is_scored_if_there_is_a_ground_truth_and_a_prediction(triplet):
+    config = EvaluationConfig(metrics=("psnr", "psnr_reflection"))
+    truth, scorer = open_case(triplet, config)
     mirrored = Photo.from_array(truth.pictures["reflection"], encoding="srgb")
-    assert judge.score(MethodOutput(truth.photo, mirrored))["psnr_reflection"] == 100
-    assert "psnr_reflection" not in judge.score(MethodOutput(truth.photo))
+    assert scorer.score(MethodOutput(truth.photo, mirrored))["psnr_reflection"] == 100
+    assert "psnr_reflection" not in scorer.score(MethodOutput(truth.photo))
 
 
 def test_where_there_is_no_reflection_the_region_has_no_score(tmp_path):
     for role in ("blended", "transmission"):
         paint(tmp_path / "mine" / role / "a.png", 1)
-    truth, judge = open_case(
+    truth, scorer = open_case(
         tmp_path / "mine", EvaluationConfig(metrics=("psnr", "psnr_region", "ssim_region"))
     )
-    assert judge.score(MethodOutput(truth.photo)) == {"psnr": 100.0, "psnr_region": None, "ssim_region": None}
-    assert judge.region_share == 0
+    assert scorer.score(MethodOutput(truth.photo)) == {
+        "psnr": 100.0,
+        "psnr_region": None,
+        "ssim_region": None,
+    }
+    assert scorer.region_share == 0
 
 
 def test_swept_thresholds_measure_smaller_and_smaller_regions(triplet):
-    protocol = EvaluationConfig(metrics=("psnr_region",), thresholds=(0.01, 0.1))
-    truth, judge = open_case(triplet, protocol)
-    scores = judge.score(MethodOutput(truth.photo))
+    config = EvaluationConfig(metrics=("psnr_region",), thresholds=(0.01, 0.1))
+    truth, scorer = open_case(triplet, config)
+    scores = scorer.score(MethodOutput(truth.photo))
     assert scores["psnr_region@0.1"] < scores["psnr_region@0.01"]
 
 
 def test_the_failure_cases_are_scored_on_rendered_pictures_only(triplet, rendered):
-    protocol = EvaluationConfig(metrics=("psnr", "removed_content", "kept_reflection"))
-    truth, judge = open_case(triplet, protocol)
-    assert list(judge.score(MethodOutput(truth.photo))) == ["psnr"]
-    truth, judge = open_case(rendered, protocol, "rendered")
+    config = EvaluationConfig(metrics=("psnr", "removed_content", "kept_reflection"))
+    truth, scorer = open_case(triplet, config)
+    assert list(scorer.score(MethodOutput(truth.photo))) == ["psnr"]
+    truth, scorer = open_case(rendered, config, "rendered")
     perfect = Photo.from_array(truth.pictures["transmission"], encoding="srgb")
-    kept, removed = judge.score(MethodOutput(truth.photo)), judge.score(MethodOutput(perfect))
+    unchanged, removed = scorer.score(MethodOutput(truth.photo)), scorer.score(MethodOutput(perfect))
     assert removed["kept_reflection"] == pytest.approx(0, abs=0.02)
-    assert kept["kept_reflection"] > 0.5
+    assert unchanged["kept_reflection"] > 0.5
     assert removed["removed_content"] == 0
 
 
 def test_pictures_too_small_for_a_metric_have_no_score(tmp_path):
     for role in ("blended", "transmission"):
         paint(tmp_path / "mine" / role / "a.png", 1, size=(8, 4))
-    truth, judge = open_case(tmp_path / "mine", EvaluationConfig(metrics=("psnr", "ssim")))
-    assert judge.score(MethodOutput(truth.photo)) == {"psnr": 100.0, "ssim": None}
+    truth, scorer = open_case(tmp_path / "mine", EvaluationConfig(metrics=("psnr", "ssim")))
+    assert scorer.score(MethodOutput(truth.photo)) == {"psnr": 100.0, "ssim": None}
 
 
 def test_lpips_of_the_dev_pairs_is_small_for_the_truth_and_large_for_noise(data, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
-    protocol = EvaluationConfig(metrics=("lpips", "lpips_region"))
-    truth, judge = open_case(data / "real/dev/nature", protocol, "nature20")
+    config = EvaluationConfig(metrics=("lpips", "lpips_region"))
+    truth, scorer = open_case(data / "real/dev/nature", config, "nature20")
     perfect = Photo.from_array(truth.pictures["transmission"], encoding="srgb")
     noise = np.random.default_rng(1).integers(0, 256, truth.pictures["photo"].shape, np.uint8)
     scores = [
-        judge.score(MethodOutput(photo))["lpips"]
+        scorer.score(MethodOutput(photo))["lpips"]
         for photo in (perfect, truth.photo, Photo.from_array(noise, encoding="srgb"))
     ]
     assert scores[0] == 0 < scores[1] < 0.5 < scores[2]
-    assert judge.score(MethodOutput(truth.photo))["lpips_region"] > scores[1]
+    assert scorer.score(MethodOutput(truth.photo))["lpips_region"] > scores[1]
 
 
 def a_metric(name, score, **more):
@@ -131,9 +135,9 @@ def test_a_new_metric_is_one_row_with_its_function(triplet, tmp_path, monkeypatc
         "darkest",
         a_metric("darkest", lambda case: float(case.answer.pixels.min()) - float(case.truth.pixels.min())),
     )
-    protocol = EvaluationConfig(metrics=("darkest",))
-    (row,) = score(read_benchmark("pairs", triplet), [IdentityBaseline()], protocol, tmp_path / "out")
-    truth, _ = open_case(triplet, protocol)
+    config = EvaluationConfig(metrics=("darkest",))
+    (row,) = score(read_benchmark("pairs", triplet), [IdentityBaseline()], config, tmp_path / "out")
+    truth, _ = open_case(triplet, config)
     least = {role: float(picture.min()) for role, picture in truth.pictures.items()}
     assert row.scores == {"darkest": least["photo"] - least["transmission"]} != {"darkest": 0}
 
@@ -141,8 +145,8 @@ def test_a_new_metric_is_one_row_with_its_function(triplet, tmp_path, monkeypatc
 def test_a_metric_of_a_region_is_given_the_region_of_its_column(triplet, monkeypatch):
     row = a_metric("share", lambda case: float(case.region.mean()), where="region")
     monkeypatch.setitem(METRICS, "share", row)
-    truth, judge = open_case(triplet, EvaluationConfig(metrics=("share",), thresholds=(0.01, 0.1)))
-    assert judge.score(MethodOutput(truth.photo)) == {
+    truth, scorer = open_case(triplet, EvaluationConfig(metrics=("share",), thresholds=(0.01, 0.1)))
+    assert scorer.score(MethodOutput(truth.photo)) == {
         f"share@{threshold}": pytest.approx(truth.region(threshold).mean(), abs=1e-6)
         for threshold in (0.01, 0.1)
     }
@@ -152,15 +156,15 @@ def test_what_a_metric_needs_is_loaded_before_the_first_score(triplet, tmp_path,
     order = []
     row = a_metric("late", lambda case: float(len(order)), prepare=lambda: order.append("prepared"))
     monkeypatch.setitem(METRICS, "late", row)
-    benchmarks, protocol = read_benchmark("pairs", triplet), EvaluationConfig(metrics=("late",))
-    (first,) = score(benchmarks, [IdentityBaseline()], protocol, tmp_path / "out")
-    (again,) = score(benchmarks, [IdentityBaseline()], protocol, tmp_path / "out")
+    benchmarks, config = read_benchmark("pairs", triplet), EvaluationConfig(metrics=("late",))
+    (first,) = score(benchmarks, [IdentityBaseline()], config, tmp_path / "out")
+    (again,) = score(benchmarks, [IdentityBaseline()], config, tmp_path / "out")
     assert first.scores == again.scores == {"late": 1.0}
     assert order == ["prepared"]
 
 
 def test_features_are_computed_once_for_each_picture(triplet, monkeypatch):
-    """Two metrics share them, and the truth's serve every answer."""
+    """Two metrics share them, and those of the ground truth serve every prediction."""
     computed = []
 
     def compute(picture):
@@ -172,8 +176,8 @@ def test_features_are_computed_once_for_each_picture(triplet, monkeypatch):
 
     for name in ("one", "two"):
         monkeypatch.setitem(METRICS, name, a_metric(name, measure))
-    truth, judge = open_case(triplet, EvaluationConfig(metrics=("one", "two")))
-    scores = [judge.score(MethodOutput(photo)) for photo in (truth.photo, truth.photo)]
+    truth, scorer = open_case(triplet, EvaluationConfig(metrics=("one", "two")))
+    scores = [scorer.score(MethodOutput(photo)) for photo in (truth.photo, truth.photo)]
     assert scores[0] == scores[1]
     assert [picture is truth.pictures["transmission"] for picture in computed] == [False, True, False]
 
@@ -182,10 +186,10 @@ def test_every_row_scores_as_its_own_function_says(data, monkeypatch):
     """Each row is checked against a direct call, so that a row with another's function is noticed."""
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     names = tuple(name for name, metric in METRICS.items() if metric.of == "transmission")
-    truth, judge = open_case(data / "real/dev/nature", EvaluationConfig(metrics=names, size=96), "nature20")
+    truth, scorer = open_case(data / "real/dev/nature", EvaluationConfig(metrics=names, size=96), "nature20")
     photo, behind = truth.pictures["photo"], truth.pictures["transmission"]
     region = truth.region(0.08)
-    assert judge.score(MethodOutput(truth.photo)) == {
+    assert scorer.score(MethodOutput(truth.photo)) == {
         "psnr": pytest.approx(psnr(photo, behind), abs=1e-6),
         "ssim": pytest.approx(ssim(photo, behind), abs=1e-6),
         "ssim_gaussian": pytest.approx(ssim(photo, behind, window="gaussian"), abs=1e-6),
@@ -198,9 +202,9 @@ def test_every_row_scores_as_its_own_function_says(data, monkeypatch):
 
 def test_rows_of_rendered_samples_and_reflections_score_as_their_own_functions_say(rendered):
     names = ("psnr_reflection", "ssim_reflection", "removed_content", "removed_white", "kept_reflection")
-    truth, judge = open_case(rendered, EvaluationConfig(metrics=names), "rendered")
+    truth, scorer = open_case(rendered, EvaluationConfig(metrics=names), "rendered")
     photo, behind, mirrored = (truth.pictures[role] for role in ("photo", "transmission", "reflection"))
-    scores = judge.score(MethodOutput(truth.photo, truth.photo))
+    scores = scorer.score(MethodOutput(truth.photo, truth.photo))
     assert scores["psnr_reflection"] == pytest.approx(psnr(photo, mirrored), abs=1e-6)
     assert scores["ssim_reflection"] == pytest.approx(ssim(photo, mirrored), abs=1e-6)
     for name, measure in (("removed_content", removed_content), ("kept_reflection", kept_reflection)):
@@ -208,12 +212,12 @@ def test_rows_of_rendered_samples_and_reflections_score_as_their_own_functions_s
     assert scores["removed_white"] is None  # nothing behind this glass is white
 
 
-def test_lpips_looks_at_each_picture_once(data, monkeypatch):
+def test_lpips_features_are_computed_once_for_each_picture(data, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     seen, features = [], Lpips.features
     monkeypatch.setattr(Lpips, "features", lambda self, picture: seen.append(1) or features(self, picture))
-    protocol = EvaluationConfig(metrics=("lpips", "lpips_region"), thresholds=(0.05, 0.1), size=96)
-    truth, judge = open_case(data / "real/dev/nature", protocol, "nature20")
-    judge.score(MethodOutput(truth.photo))
-    judge.score(MethodOutput(truth.photo))
+    config = EvaluationConfig(metrics=("lpips", "lpips_region"), thresholds=(0.05, 0.1), size=96)
+    truth, scorer = open_case(data / "real/dev/nature", config, "nature20")
+    scorer.score(MethodOutput(truth.photo))
+    scorer.score(MethodOutput(truth.photo))
     assert len(seen) == 3

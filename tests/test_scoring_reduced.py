@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from brewster import Photo
-from brewster.evaluate.scoring import reduced
+from brewster.evaluate.scoring import downscale
 
 
 @pytest.mark.parametrize(
@@ -13,5 +13,5 @@ from brewster.evaluate.scoring import reduced
 def test_a_photo_is_reduced_to_its_shorter_side_and_never_enlarged(size, small):
     width, height = size
     photo = Photo.from_array(np.zeros((height, width, 3), np.uint8), encoding="srgb")
-    assert reduced(photo, 20).size == small
-    assert reduced(photo, None) is photo
+    assert downscale(photo, 20).size == small
+    assert downscale(photo, None) is photo

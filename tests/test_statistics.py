@@ -1,4 +1,4 @@
-"""Intervals must cover what they say, and depend on the pictures alone."""
+"""Intervals have their stated coverage and depend on the pictures alone."""
 
 import numpy as np
 import pytest
@@ -14,55 +14,55 @@ def stratum(values, scenes=None, name="set"):
 
 
 def only(strata):
-    (answer,) = estimate(strata)
-    return answer
+    (estimated,) = estimate(strata)
+    return estimated
 
 
 def test_the_mean_is_over_all_pictures_not_over_benchmarks():
-    answer = only([stratum([1.0, 1.0, 1.0], name="a"), stratum([5.0], name="b")])
-    assert answer.mean == 2.0
-    assert answer.count == 4
+    estimated = only([stratum([1.0, 1.0, 1.0], name="a"), stratum([5.0], name="b")])
+    assert estimated.mean == 2.0
+    assert estimated.count == 4
 
 
-def test_a_constant_is_certain():
-    answer = only([stratum([3.0] * 10)])
-    assert (answer.low, answer.mean, answer.high) == (3.0, 3.0, 3.0)
+def test_the_interval_of_a_constant_has_no_width():
+    estimated = only([stratum([3.0] * 10)])
+    assert (estimated.low, estimated.mean, estimated.high) == (3.0, 3.0, 3.0)
 
 
 def test_one_scene_has_no_interval():
     assert only([stratum([1.0, 2.0, 3.0], scenes=["x"] * 3)]).low is None
 
 
-def test_a_region_that_one_picture_alone_has_has_no_interval():
+def test_a_score_of_a_single_picture_has_no_interval():
     assert only([stratum([1.0, np.nan, np.nan])]).low is None
     assert only([stratum([1.0], name="a"), stratum([2.0], name="b")]).low is None
     assert only([stratum([1.0], name="a"), stratum([2.0, 3.0], name="b")]).low is not None
 
 
 def test_missing_values_are_not_counted():
-    answer = only([stratum([1.0, np.nan, 3.0])])
-    assert (answer.mean, answer.count) == (2.0, 2)
+    estimated = only([stratum([1.0, np.nan, 3.0])])
+    assert (estimated.mean, estimated.count) == (2.0, 2)
     assert only([stratum([np.nan, np.nan])]) is None
 
 
 def test_intervals_agree_with_the_normal_ones_where_those_hold(random):
     values = random.normal(20, 3, 400)
-    answer = only([stratum(values)])
+    estimated = only([stratum(values)])
     half = 1.96 * values.std(ddof=1) / np.sqrt(400)
-    assert answer.high - answer.mean == pytest.approx(half, rel=0.06)
-    assert answer.mean - answer.low == pytest.approx(half, rel=0.06)
+    assert estimated.high - estimated.mean == pytest.approx(half, rel=0.06)
+    assert estimated.mean - estimated.low == pytest.approx(half, rel=0.06)
 
 
 def test_intervals_cover_the_truth_at_their_stated_rate(random):
     """95 % of intervals of means of 60 pictures; a percentile bootstrap is a little short of it at such sizes."""
     hits = 0
     for i in range(200):
-        answer = only([stratum(random.normal(0, 1, 60), name=str(i))])
-        hits += answer.low <= 0 <= answer.high
+        estimated = only([stratum(random.normal(0, 1, 60), name=str(i))])
+        hits += estimated.low <= 0 <= estimated.high
     assert 0.90 <= hits / 200 <= 0.99
 
 
-def test_ten_variants_of_a_scene_are_hardly_more_certain_than_one(random):
+def test_ten_variants_of_a_scene_hardly_narrow_the_interval(random):
     scenes = random.normal(0, 1, 20)
     one = only([stratum(scenes)])
     ten = only([stratum(np.repeat(scenes, 10), scenes=[str(i // 10) for i in range(200)])])
@@ -80,12 +80,12 @@ def test_a_benchmarks_interval_does_not_depend_on_its_order_nor_on_its_neighbour
 
 @given(st.lists(st.floats(-100, 100), min_size=2, max_size=20))
 def test_the_mean_lies_in_its_interval_and_that_between_the_extremes(values):
-    answer = only([stratum(values)])
-    assert min(values) - 1e-9 <= answer.low <= answer.high <= max(values) + 1e-9
-    assert answer.mean == pytest.approx(np.mean(values), abs=1e-9)
+    estimated = only([stratum(values)])
+    assert min(values) - 1e-9 <= estimated.low <= estimated.high <= max(values) + 1e-9
+    assert estimated.mean == pytest.approx(np.mean(values), abs=1e-9)
 
 
-def test_differences_are_paired_and_surer_than_the_means_they_are_made_of(random):
+def test_paired_differences_have_narrower_intervals_than_the_means(random):
     pictures = random.normal(22, 5, 50)
     values = np.stack([pictures, pictures + random.normal(0.5, 0.1, 50)], axis=1)
     series = [("nothing", "psnr"), ("ours", "psnr")]

@@ -1,1 +1,1 @@
-"""The field's benchmarks: which there are, how their folders are laid out, and how their files are paired by name."""
+"""Public benchmarks of reflection removal: a registry of their folder layouts, and the pairing of files by name."""

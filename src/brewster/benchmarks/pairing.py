@@ -1,8 +1,11 @@
-"""Which pictures in a folder belong together: by name, never by position, and nothing is guessed.
+"""Groups the pictures of a benchmark folder by name: photo, transmission and, if there is one, reflection.
 
-Benchmarks come in two forms. Repacked, a folder for each role with equal names in them: blended/a.png,
-transmission_layer/a.png. Or as SIR2's authors gave them, a folder for each shot, with a letter for each role: ab/3/ab-3-m-32.png,
-ab/3/ab-3-g-32.png. Either way, a name with one picture for each role is a `PictureGroup`, and every other is refused aloud.
+Pictures are paired by name only, never by sorted position. Two layouts are supported:
+
+- Pairs: one folder per role with equal file names: blended/a.png, transmission_layer/a.png.
+- The original SIR2 tree: one folder per shot, with one letter per role: ab/3/ab-3-m-32.png, ab/3/ab-3-g-32.png.
+
+A name with exactly one picture for each role becomes a `PictureGroup`. Every other name is refused with a reason.
 """
 
 from __future__ import annotations
@@ -23,27 +26,27 @@ ROLES: Final[dict[str, tuple[str, ...]]] = {
     "transmission": ("transmission_layer", "transmission", "gt", "ground_truth", "without_reflection", "t"),
     "reflection": ("reflection_layer", "reflection", "r"),
 }
-"""What the folder of a role is called, in lower case; the first is the usual name."""
+"""role -> accepted folder names, in lower case. The first one is the usual name."""
 
-TREES: Final[dict[str, tuple[str, ...]]] = {
+SIR2_TREES: Final[dict[str, tuple[str, ...]]] = {
     "postcard": ("kind", "scene", "variant"),
     "solidobject": ("scene", "kind", "variant"),
     "wildscene": ("scene",),
 }
-"""SIR2's three sets, and what the folders on the way down to a shot mean."""
+"""SIR2's three subsets -> the meaning of each folder level from the subset's root to a shot."""
 
 _KINDS: Final = ("focus", "thick")
 _LETTERS: Final = {"m": "photo", "g": "transmission", "r": "reflection"}
 _LETTER: Final = re.compile(r"(?<![^\W_])[mgr](?![^\W_])", re.IGNORECASE)
-_JUNK: Final = ("thumbs.db", "desktop.ini", "__macosx")
+_SYSTEM_FILES: Final = ("thumbs.db", "desktop.ini", "__macosx")
 
-Parts = Mapping[str, list[Path]]
+_FilesByRole = Mapping[str, list[Path]]
 
 
 @final
 @dataclass(frozen=True)
 class PictureGroup:
-    """Pictures of one name: a photo, its truth, and perhaps what was mirrored; `scene` is "" where nobody tells."""
+    """Pictures of one name: photo, transmission (ground truth) and, if there is one, reflection. `scene` is "" if unknown."""
 
     name: str
     scene: str
@@ -55,35 +58,38 @@ class PictureGroup:
 @final
 @dataclass(frozen=True)
 class FolderListing:
-    """What a folder holds: trios in natural order, and lines about what was passed over and what was refused."""
+    """The content of a folder: groups in natural order of their names.
 
-    trios: tuple[PictureGroup, ...] = ()
+    `remarks` are lines about ignored files, `refused` lines about files without a unique partner.
+    """
+
+    groups: tuple[PictureGroup, ...] = ()
     remarks: tuple[str, ...] = ()
     refused: tuple[str, ...] = ()
 
 
-def natural(name: str) -> tuple[list[str | int], str]:
-    """Sorts names as people do: 2 before 10."""
+def natural_key(name: str) -> tuple[list[str | int], str]:
+    """Sort key for natural order: 2 before 10."""
     pieces = re.split(r"(\d+)", name)
-    return [int(piece) if place % 2 else piece for place, piece in enumerate(pieces)], name
+    return [int(piece) if i % 2 else piece for i, piece in enumerate(pieces)], name
 
 
 def entries(folder: Path) -> tuple[list[Path], list[Path]]:
-    """The folders and the files in a folder, without hidden ones and what systems leave, in natural order.
+    """The folders and the files in a folder, each in natural order, without hidden files and files of the system.
 
     Raises:
-        PhotoError: it cannot be read.
+        PhotoError: the folder cannot be read.
     """
     kinds: tuple[list[Path], list[Path]] = ([], [])
     try:
-        for path in sorted(folder.iterdir(), key=lambda path: natural(path.name)):
-            if path.name[0] != "." and path.name.lower() not in _JUNK:
+        for path in sorted(folder.iterdir(), key=lambda path: natural_key(path.name)):
+            if path.name[0] != "." and path.name.lower() not in _SYSTEM_FILES:
                 kinds[not path.is_dir()].append(path)
     except OSError as error:
         raise PhotoError(
             f"{folder} cannot be read ({error.strerror or error})",
-            "a benchmark is a folder with pictures",
-            "name the folder where your copy lies",
+            "a folder with pictures was expected",
+            "give the path of your copy of the benchmark",
         ) from error
     return kinds
 
@@ -92,49 +98,49 @@ def entries(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def find_roles(folder: Path) -> dict[str, Path]:
-    """The folders of ROLES that lie in a folder, by role.
+    """role -> subfolder that has one of the role's names (see ROLES).
 
     Raises:
-        PhotoError: it cannot be read, or has two folders for one role.
+        PhotoError: the folder cannot be read, or has two subfolders for one role.
     """
     roles = {name: role for role, names in ROLES.items() for name in names}
-    return _labelled(folder, lambda name: roles.get(re.sub(r"[\s-]+", "_", name.lower()), ""))
+    return _find_labelled(folder, lambda name: roles.get(re.sub(r"[\s-]+", "_", name.lower()), ""))
 
 
 def find_split(folder: Path) -> Path:
-    """The folder itself if pairs lie in it, else the one folder in it where they do: train, val or test.
+    """The folder itself if it contains pairs, else its only subfolder that does: train, val or test.
 
     Raises:
-        PhotoError: there are several, or a folder cannot be read.
+        PhotoError: several subfolders contain pairs, or a folder cannot be read.
     """
     if "photo" in find_roles(folder):
         return folder
     splits = [path for path in entries(folder)[0] if "photo" in find_roles(path)]
     if len(splits) > 1:
         raise PhotoError(
-            f"{folder} has pairs in {listed([path.name for path in splits])}",
-            "a benchmark is one of them",
-            f"point at one, for example {splits[0]}",
+            f"{folder} has pairs in {join_names([path.name for path in splits])}",
+            "one split was expected",
+            f"give the path of one, for example {splits[0]}",
         )
     return splits[0] if splits else folder
 
 
 def read_folders(folder: Path) -> FolderListing:
-    """Trios from a folder for each role, joined by their stems, whatever their suffixes.
+    """Groups from one folder per role, matched by file stem; suffixes may differ.
 
     Raises:
-        PhotoError: a folder is missing, empty or unreadable, or two could have one role.
+        PhotoError: a folder is missing, empty or unreadable, or two folders have one role.
     """
     roles = find_roles(folder)
-    joined: dict[str, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
-    strays: list[Path] = []
+    by_name: dict[str, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
+    ignored: list[Path] = []
     for role in ROLES:
         pictures, others = _role_pictures(folder, role, roles)
-        strays += others
+        ignored += others
         for picture in pictures:
-            joined[unicodedata.normalize("NFC", picture.stem)][role].append(picture)
-    pieces = [_join(folder, stem, "", joined[stem]) for stem in sorted(joined, key=natural)]
-    return _together([*pieces, _passed_over(folder, [*strays, *entries(folder)[1]])])
+            by_name[unicodedata.normalize("NFC", picture.stem)][role].append(picture)
+    pieces = [_make_group(folder, stem, "", by_name[stem]) for stem in sorted(by_name, key=natural_key)]
+    return _merge([*pieces, _ignored_remark(folder, [*ignored, *entries(folder)[1]])])
 
 
 def _role_pictures(folder: Path, role: str, roles: Mapping[str, Path]) -> tuple[list[Path], list[Path]]:
@@ -143,160 +149,167 @@ def _role_pictures(folder: Path, role: str, roles: Mapping[str, Path]) -> tuple[
             return [], []
         raise PhotoError(
             f"{folder} has no folder for the {role}",
-            f"pairs lie in folders beside each other, this one called {listed(ROLES[role], ' or ')}",
-            "rename yours, or name the folder above them",
+            f"expected one folder per role, side by side, this one named {join_names(ROLES[role], ' or ')}",
+            "rename your folder, or give the path of its parent folder",
         )
     pictures, others = _pictures(roles[role])
     if not pictures:
         raise PhotoError(
-            f"no pictures in {roles[role]}", f"files ending in {', '.join(SUFFIXES)}", "name another folder"
+            f"no pictures in {roles[role]}",
+            f"expected files ending in {', '.join(SUFFIXES)}",
+            "give another folder",
         )
     return pictures, others
 
 
-# --- SIR2's own trees
+# --- the original SIR2 trees
 
 
 def find_subsets(folder: Path) -> dict[str, Path]:
-    """The folders of TREES that lie in a folder; only the first letters count: "Postcard Dataset", "postcard".
+    """subset of SIR2 -> its folder. Only the beginning of the name is compared: "Postcard Dataset", "postcard".
 
     Raises:
-        PhotoError: it cannot be read, or has two folders for one set.
+        PhotoError: the folder cannot be read, or has two folders for one subset.
     """
-    return _labelled(folder, _subset_of)
+    return _find_labelled(folder, _subset_of)
 
 
 def read_tree(folder: Path, subset: str) -> FolderListing:
-    """Trios from a folder for each shot, joined by their names without the role's letter.
+    """Groups from one folder per shot, matched by file name without the letter of the role.
 
     Raises:
-        PhotoError: a folder cannot be read, or there is no shot in this tree.
+        PhotoError: a folder cannot be read, or the tree contains no shot.
     """
-    found = _unique(folder, _together(_read_branches(folder, folder, TREES[subset], {})))
-    if not found.trios and not found.refused:
+    found = _refuse_duplicates(folder, _merge(_read_branches(folder, folder, SIR2_TREES[subset], {})))
+    if not found.groups and not found.refused:
         raise PhotoError(
-            f"{folder} is no {subset} set",
-            f"photos in {'/'.join(f'<{level}>' for level in TREES[subset])}/*m*.*, or in {ROLES['photo'][0]}/",
-            "name the folder where your copy lies",
+            f"{folder} is not a {subset} set",
+            f"expected photos in {'/'.join(f'<{level}>' for level in SIR2_TREES[subset])}/*m*.*, or in {ROLES['photo'][0]}/",
+            "give the path of your copy",
         )
     return found
 
 
 def _subset_of(name: str) -> str:
     letters = re.sub(r"[^a-z]", "", name.lower())
-    return next((subset for subset in TREES if letters.startswith(subset)), "")
+    return next((subset for subset in SIR2_TREES if letters.startswith(subset)), "")
 
 
 def _read_branches(
-    root: Path, folder: Path, levels: Sequence[str], way: Mapping[str, str]
+    root: Path, folder: Path, levels: Sequence[str], labels: Mapping[str, str]
 ) -> Iterator[FolderListing]:
     if not levels:
-        yield _read_shot(root, folder, way)
+        yield _read_shot(root, folder, labels)
         return
     folders, files = entries(folder)
     kinds = [path for path in folders if levels[0] != "kind" or path.name.lower() in _KINDS]
     for path in kinds:
         step = path.name.capitalize() if levels[0] == "kind" else path.name
-        yield from _read_branches(root, path, levels[1:], {**way, levels[0]: step})
-    yield _passed_over(root, [*files, *(path for path in folders if path not in kinds)])
+        yield from _read_branches(root, path, levels[1:], {**labels, levels[0]: step})
+    yield _ignored_remark(root, [*files, *(path for path in folders if path not in kinds)])
 
 
-def _read_shot(root: Path, folder: Path, way: Mapping[str, str]) -> FolderListing:
-    joined: dict[str, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
-    pictures, strays = _pictures(folder)
+def _read_shot(root: Path, folder: Path, labels: Mapping[str, str]) -> FolderListing:
+    by_name: dict[str, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
+    pictures, others = _pictures(folder)
     for picture in pictures:
         letters = _LETTER.findall(picture.stem)
         if len(letters) == 1:
-            joined[_without_letter(picture.stem)][_LETTERS[letters[0].lower()]].append(picture)
+            by_name[_without_letter(picture.stem)][_LETTERS[letters[0].lower()]].append(picture)
         else:
-            strays.append(picture)
-    shot = "-".join(way[level] for level in ("scene", "kind", "variant") if level in way)
-    names = {rest: shot if len(joined) == 1 else f"{shot}-{rest}".rstrip("-") for rest in joined}
-    pieces = [_join(root, names[rest], way["scene"], joined[rest]) for rest in joined]
-    return _together([*pieces, _passed_over(root, strays)])
+            others.append(picture)
+    shot = "-".join(labels[level] for level in ("scene", "kind", "variant") if level in labels)
+    names = {rest: shot if len(by_name) == 1 else f"{shot}-{rest}".rstrip("-") for rest in by_name}
+    pieces = [_make_group(root, names[rest], labels["scene"], by_name[rest]) for rest in by_name]
+    return _merge([*pieces, _ignored_remark(root, others)])
 
 
 def _without_letter(stem: str) -> str:
     return "-".join(piece for piece in re.split(r"[-_ ]+", _LETTER.sub("", stem)) if piece)
 
 
-def _unique(root: Path, found: FolderListing) -> FolderListing:
-    """Folders that differ in case only can give two shots one name: then neither is taken."""
-    counts = Counter(trio.name for trio in found.trios)
-    twins = tuple(
-        f"{_below(root, trio.photo)} is ambiguous: another photo would be called {trio.name} too"
-        for trio in found.trios
-        if counts[trio.name] > 1
+def _refuse_duplicates(root: Path, found: FolderListing) -> FolderListing:
+    """Refuses all groups that share a name. Folders whose names differ only in case can cause this."""
+    counts = Counter(group.name for group in found.groups)
+    duplicates = tuple(
+        f"{_relative(root, group.photo)} is ambiguous: another photo has the name {group.name} too"
+        for group in found.groups
+        if counts[group.name] > 1
     )
-    kept = tuple(trio for trio in found.trios if counts[trio.name] == 1)
-    return FolderListing(kept, found.remarks, (*found.refused, *twins))
+    unique = tuple(group for group in found.groups if counts[group.name] == 1)
+    return FolderListing(unique, found.remarks, (*found.refused, *duplicates))
 
 
-# --- both
+# --- both layouts
 
 
-def _join(root: Path, name: str, scene: str, parts: Parts) -> FolderListing:
-    """One trio, or the reason why there is none."""
-    trouble = _trouble(root, parts)
-    if trouble:
-        return FolderListing(refused=(trouble,))
+def _make_group(root: Path, name: str, scene: str, parts: _FilesByRole) -> FolderListing:
+    """A listing with one group, or with the reason why there is none."""
+    problem = _problem(root, parts)
+    if problem:
+        return FolderListing(refused=(problem,))
     reflection = parts["reflection"][0] if parts.get("reflection") else None
     return FolderListing(
         (PictureGroup(name, scene, parts["photo"][0], parts["transmission"][0], reflection),)
     )
 
 
-def _trouble(root: Path, parts: Parts) -> str:
+def _problem(root: Path, parts: _FilesByRole) -> str:
     for role, paths in parts.items():
         if len(paths) > 1:
-            named = listed([_below(root, path) for path in paths])
-            return f"{named} are ambiguous: there must be one {role} of that name"
+            named = join_names([_relative(root, path) for path in paths])
+            return f"{named} are ambiguous: expected one {role} of that name"
     for role in ("photo", "transmission"):
         if not parts.get(role):
-            named = listed([_below(root, path) for paths in parts.values() for path in paths])
+            named = join_names([_relative(root, path) for paths in parts.values() for path in paths])
             return f"{named} has no partner: there is no {role} of that name"
     return ""
 
 
 def _pictures(folder: Path) -> tuple[list[Path], list[Path]]:
-    """The pictures by name, and whatever else is there."""
+    """The pictures of a folder in natural order, and all other entries."""
     folders, files = entries(folder)
     pictures = [path for path in files if path.suffix.lower() in SUFFIXES]
     return pictures, [*folders, *(path for path in files if path.suffix.lower() not in SUFFIXES)]
 
 
-def _labelled(folder: Path, label: Callable[[str], str]) -> dict[str, Path]:
+def _find_labelled(folder: Path, label: Callable[[str], str]) -> dict[str, Path]:
     found: dict[str, Path] = {}
     for path in entries(folder)[0]:
         role = label(path.name)
         if role and found.setdefault(role, path) != path:
             raise PhotoError(
                 f"{folder} has two folders for {role}, {found[role].name} and {path.name}",
-                "one of each is wanted, and brewster does not choose",
-                "move one of them away",
+                "expected one of each",
+                "move or rename one of them",
             )
     return {role: path for role, path in found.items() if role}
 
 
-def _passed_over(root: Path, strays: Iterable[Path]) -> FolderListing:
-    named = [_below(root, path) for path in strays]
-    return FolderListing(remarks=(f"passed over {listed(named)}",) if named else ())
+def _ignored_remark(root: Path, others: Iterable[Path]) -> FolderListing:
+    named = [_relative(root, path) for path in others]
+    return FolderListing(remarks=(f"ignored {join_names(named)}",) if named else ())
 
 
-def _together(pieces: Iterable[FolderListing]) -> FolderListing:
-    every = list(pieces)
+def _merge(pieces: Iterable[FolderListing]) -> FolderListing:
+    listings = list(pieces)
     return FolderListing(
-        tuple(sorted((trio for piece in every for trio in piece.trios), key=lambda trio: natural(trio.name))),
-        tuple(line for piece in every for line in piece.remarks),
-        tuple(line for piece in every for line in piece.refused),
+        tuple(
+            sorted(
+                (group for piece in listings for group in piece.groups),
+                key=lambda group: natural_key(group.name),
+            )
+        ),
+        tuple(line for piece in listings for line in piece.remarks),
+        tuple(line for piece in listings for line in piece.refused),
     )
 
 
-def _below(root: Path, path: Path) -> str:
+def _relative(root: Path, path: Path) -> str:
     return path.relative_to(root).as_posix()
 
 
-def listed(names: Sequence[str], last: str = " and ") -> str:
-    """Names in a sentence: "a, b and c", and where they are many, the first of them and how many more."""
+def join_names(names: Sequence[str], last: str = " and ") -> str:
+    """Names as text: "a, b and c". Of ten names or more, the first five and the number of the others."""
     shown = [*names] if len(names) < 10 else [*names[:5], f"{len(names) - 5} more"]
     return last.join(([", ".join(shown[:-1])] if len(shown) > 1 else []) + shown[-1:])

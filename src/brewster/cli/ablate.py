@@ -57,12 +57,12 @@ def ablate(
     parts = read.open_benchmarks()
     is_whole = tell_of(parts, quiet=quiet)
 
-    def report(choice: str, step: int, steps: int, numbers: Mapping[str, float], logged: bool) -> None:
+    def on_progress(choice: str, step: int, steps: int, numbers: Mapping[str, float], logged: bool) -> None:
         interrupts.heed()
         if logged and not quiet:
             say(f"{choice}, step {step} of {steps}: loss {numbers['loss']:.4f}")
 
-    results = run(read, parts, out, workers=workers, report=report)
+    results = run(read, parts, out, workers=workers, on_progress=on_progress)
     if not quiet:
         print_tables(results)
         say(f"all of it is in {out}")

@@ -233,7 +233,7 @@ class _EvaluateRequest:
         total = len(methods) * sum(len(part.cases) for part in found)
         with progress(total, shown=not self.quiet) as advance:
 
-            def report(done: int, _of: int, row: ScoreRow) -> None:
+            def on_progress(done: int, _of: int, row: ScoreRow) -> None:
                 interrupts.heed()
                 advance(done, f"{row.benchmark}/{row.case} {row.method}")
 
@@ -244,7 +244,7 @@ class _EvaluateRequest:
                 self.out,
                 workers=self.workers,
                 shown=self.pictures,
-                report=report,
+                on_progress=on_progress,
             )
         if self.as_json:
             write_out(f"{json.dumps(results)}\n".encode())

@@ -1,1 +1,1 @@
-"""Is it true? Benchmarks, scores with their uncertainty, tables, a page to look at, and ablations."""
+"""Evaluation: scores methods on benchmarks, with confidence intervals, tables, an HTML report, and ablation studies."""

@@ -1,10 +1,10 @@
-"""Ablations: one value of a training recipe changed at a time, each choice trained and measured alike.
+"""Ablation studies: trains a model for each choice of one value of a training recipe, and compares their scores.
 
     study = read_study(Path("recipes/ablations/mixing.toml"))
     ablate(study, study.open_benchmarks(), Path("out/ablations/mixing"))
 
-A study is a TOML file that names a base recipe, the value, its choices and the benchmarks; the first choice is what
-the others are compared with. Both training and measuring go on where they were stopped.
+A study is a TOML file with a base recipe, the value, its choices and the benchmarks. The first choice is the reference
+of the comparisons. A stopped study resumes both training and evaluation.
 """
 
 from __future__ import annotations
@@ -27,40 +27,40 @@ from brewster.training.recipe import CompactRecipe, LoraRecipe, data_folder, rea
 from brewster.training.trainers import open_trainer
 
 Choice = str | int | float | bool
-Report = Callable[[str, int, int, Mapping[str, float], bool], None]
-"""Called with (choice, step, steps, numbers, logged) after every step of training."""
+AblationCallback = Callable[[str, int, int, Mapping[str, float], bool], None]
+"""Called with (choice, step, steps, losses, is_logged) after each training step."""
 
 PLOT: Final = "plot.png"
 
 
 def _all_different(choices: list[Choice]) -> list[Choice]:
     if len({str(choice) for choice in choices}) < len(choices):
-        raise ValueError("a choice stands there twice")
+        raise ValueError("two choices are equal")
     return choices
 
 
 @final
 class AblationStudy(FrozenModel):
-    """One question: what does this value do?"""
+    """The definition of an ablation study."""
 
     base: Path
-    """A training recipe; in the file, relative to it."""
+    """The base training recipe. In the file, the path is relative to the file."""
     value: str
-    """The value that changes, dotted: "data.rendered.mixing"."""
+    """The key of the value that changes, with dots: "data.rendered.mixing"."""
     choices: Annotated[list[Choice], Field(min_length=2), AfterValidator(_all_different)]
-    """The first is what the others are compared with."""
+    """The first choice is the reference of the comparisons."""
     benchmarks: Annotated[dict[str, Path], Field(min_length=1)]
-    """name -> folder below BREWSTER_DATA."""
+    """name -> folder, relative to BREWSTER_DATA."""
 
     def label(self, choice: Choice) -> str:
-        """What tables call a choice: "mixing 8-bit"."""
+        """The name of a choice in tables: "mixing 8-bit"."""
         return f"{self.value.rpartition('.')[2]} {str(choice).replace('/', ' ')}"
 
     def open_benchmarks(self) -> list[Benchmark]:
-        """Its benchmarks.
+        """Reads the benchmarks of the study.
 
         Raises:
-            RecipeError: BREWSTER_DATA names no folder.
+            RecipeError: BREWSTER_DATA is not a folder.
             PhotoError: a benchmark cannot be read.
         """
         root = data_folder()
@@ -70,10 +70,10 @@ class AblationStudy(FrozenModel):
 
 
 def read_study(path: Path) -> AblationStudy:
-    """Reads and checks a study.
+    """Reads and validates a study.
 
     Raises:
-        RecipeError: missing, not TOML, or with values that are missing, unknown or impossible.
+        RecipeError: the file is missing or not TOML, or its values are missing, unknown or invalid.
     """
     study = read_toml(AblationStudy, path, compare="the studies in recipes/ablations/")
     return study.model_copy(update={"base": path.parent / study.base})
@@ -85,22 +85,25 @@ def ablate(
     out: Path,
     *,
     workers: int = 1,
-    report: Report = lambda _choice, _step, _steps, _numbers, _logged: None,
+    on_progress: AblationCallback = lambda _choice, _step, _steps, _numbers, _logged: None,
 ) -> Results:
-    """Trains and measures every choice; `out` receives a folder for each, and what `evaluate` writes.
+    """Trains and evaluates every choice. `out` gets one folder per choice and the files that `evaluate` writes.
 
-    Where the choices are numbers, plot.png shows the metrics over them.
+    If all choices are numbers, plot.png shows the metrics against them.
 
     Args:
-        study: the question.
-        benchmarks: what to measure on, such as `study.open_benchmarks()`.
-        out: a folder of this study's own.
-        workers: processes that score at once.
-        report: called after every step of training.
+        study: the definition of the study.
+        benchmarks: the benchmarks to score on, such as `study.open_benchmarks()`.
+        out: a folder for this study only.
+        workers: number of processes that score in parallel.
+        on_progress: called after each training step.
+
+    Returns:
+        The results of `evaluate`; each choice is a method.
 
     Raises:
-        RecipeError: the base recipe or the value is wrong, or data is missing.
-        BrewsterError: what training and `evaluate` raise.
+        RecipeError: the base recipe or the value is invalid, or data is missing.
+        BrewsterError: as raised by training and `evaluate`.
     """
     base = read_recipe(study.base)
     recipes = {study.label(choice): with_value(base, study.value, choice) for choice in study.choices}
@@ -108,11 +111,11 @@ def ablate(
     for label, recipe in recipes.items():
         folder = out / label.replace(" ", "-")
 
-        def tell(*told: Any, label: str = label) -> None:  # noqa: ANN401  (what train tells)
-            report(label, *told)
+        def on_step(*values: Any, label: str = label) -> None:  # noqa: ANN401  (the arguments of the training callback)
+            on_progress(label, *values)
 
         models.append(
-            ModelMethod(label, str(_trained(recipe, folder, tell)), out / "predictions" / folder.name)
+            ModelMethod(label, str(_train(recipe, folder, on_step)), out / "predictions" / folder.name)
         )
     results = evaluate(benchmarks, [IdentityBaseline(), *models], EvaluationConfig(), out, workers=workers)
     numbers = [
@@ -123,18 +126,18 @@ def ablate(
     return results
 
 
-def _trained(recipe: CompactRecipe | LoraRecipe, folder: Path, tell: loop.Report) -> Path:
-    """The model of this recipe, in memory no longer than it learns."""
+def _train(recipe: CompactRecipe | LoraRecipe, folder: Path, on_step: loop.Report) -> Path:
+    """Trains a recipe and returns the path of its model. The trainer is freed on return, so that memory does not grow."""
     trainer = open_trainer(recipe)
-    loop.run(trainer, folder, tell)
+    loop.run(trainer, folder, on_step)
     return trainer.export(folder)
 
 
 def _plot(study: AblationStudy, numbers: Sequence[float], results: Results) -> bytes:
-    """PSNR, SSIM and LPIPS over the numbers, a line a set, intervals as bands: a PNG."""
+    """A PNG plot of PSNR, SSIM and LPIPS against the numbers: one line per set, intervals as bands."""
     import io  # noqa: PLC0415
 
-    from matplotlib.figure import Figure  # noqa: PLC0415  (only those who ablate numbers need it)
+    from matplotlib.figure import Figure  # noqa: PLC0415  (only needed for plots)
 
     metrics = [name for name in ("psnr", "ssim", "lpips") if name in results["metrics"]]
     figure = Figure(figsize=(4 * len(metrics), 3.4), layout="constrained")

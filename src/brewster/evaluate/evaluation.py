@@ -1,30 +1,35 @@
-"""A whole evaluation: score every method on every benchmark, and write results, tables and a page.
+"""Runs a complete evaluation: scores every method on every benchmark, and writes results, tables and an HTML report.
 
 benchmarks = read_benchmark("nature20", Path("nature20"))
-evaluate(benchmarks, [Nothing(), Predictions("RDNet", Path("rdnet"))], Protocol(), Path("out/evaluate"))
+methods = [IdentityBaseline(), PredictionFolder("RDNet", Path("rdnet"))]
+evaluate(benchmarks, methods, EvaluationConfig(), Path("out/evaluate"))
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from tempfile import TemporaryDirectory
+from typing import Final, final
 
 from brewster.benchmarks.registry import Benchmark, Case
 from brewster.errors import BrewsterError, PhotoError
 from brewster.evaluate.config import EvaluationConfig
-from brewster.evaluate.methods import NOTHING, Method, MethodOutput, PredictionFolder, refuse_names
-from brewster.evaluate.report.html_report import CaseImages, write_report
+from brewster.evaluate.methods import BASELINE, Method, MethodOutput, PredictionFolder, check_names
+from brewster.evaluate.report.html_report import write_report
+from brewster.evaluate.report.images import CaseImages, CaseTiles, method_tiles, photo_tiles, to_tiles
 from brewster.evaluate.report.latex import to_latex
 from brewster.evaluate.report.published import read_published
 from brewster.evaluate.report.published import to_markdown as published_to_markdown
 from brewster.evaluate.report.tables import to_csv, to_markdown
-from brewster.evaluate.results import Results, draw, summarise
-from brewster.evaluate.runner import Place, Report, ScoreRow, find_answer, score
-from brewster.evaluate.scoring import GroundTruth, reduced
+from brewster.evaluate.results import Results, paper_draws, summarise
+from brewster.evaluate.runner import RowId, ScoreCallback, ScoreRow, get_prediction, score
+from brewster.evaluate.scoring import GroundTruth, downscale
 from brewster.files import write_atomically
 from brewster.metrics import IDENTICAL_DB
 from brewster.photo import Photo
@@ -36,98 +41,113 @@ PICTURES_SHOWN: Final = 50
 def evaluate(
     benchmarks: Sequence[Benchmark],
     methods: Sequence[Method],
-    protocol: EvaluationConfig,
+    config: EvaluationConfig,
     out: Path,
     *,
     workers: int = 1,
     shown: int = PICTURES_SHOWN,
-    report: Report = lambda _done, _of, _row: None,
+    on_progress: ScoreCallback = lambda _done, _total, _row: None,
 ) -> Results:
     """Scores and writes results.json, tables.md, table.tex, table.csv and report.html into `out`.
 
-    Where the protocol reduces photos, they are in `out`/inputs as methods see them.
+    With `config.size`, the reduced photos are written into `out`/inputs. Each picture is read and decoded once. There are
+    two exceptions: exclusive methods, which read the cases again, and the pictures that the report shows of a benchmark
+    with more than `shown` cases or of an earlier run.
 
     Args:
-        benchmarks: as `read_benchmark` gives them.
-        methods: in the order of the tables; "input (unprocessed)" belongs first.
-        protocol: the choices of the run.
-        out: a folder of this evaluation's own; a run that was stopped goes on from what lies there.
-        workers: processes that score at once.
-        shown: how many pictures of each benchmark the page shows, the worst of the first method that does something.
-        report: called after every answer.
+        benchmarks: as `read_benchmark` returns them.
+        methods: in the order of the tables; the baseline belongs first.
+        config: the settings of the evaluation.
+        out: a folder for this evaluation only. A stopped run is resumed from its files.
+        workers: number of processes that score in parallel.
+        shown: number of cases of each benchmark in the report: the worst of the first method that is not the baseline.
+        on_progress: called after each new row.
+
+    Returns:
+        The content of results.json.
 
     Raises:
-        BrewsterError: there is nothing to compare, names are shared, predictions could be paired wrongly, the paper's
-            draw is impossible, or a part of brewster is missing.
+        BrewsterError: no case or no method, shared names, ambiguous predictions, the paper's draw is not possible, or an
+            optional dependency is missing.
         TargetError: `out` cannot be written.
     """
-    check(benchmarks, methods, protocol)
+    check(benchmarks, methods, config)
     cases = [case for part in benchmarks for case in part.cases]
-    if protocol.size:
-        _write_inputs(cases, protocol.size, out / INPUTS)
-    rows = score(benchmarks, methods, protocol, out, workers=workers, report=report)
-    results = summarise(benchmarks, methods, protocol, rows)
-    for method in methods:
-        if remarks := list(_remarks(method, cases, rows)):
-            results["methods"][method.name]["remark"] = "; ".join(remarks)
-    _write(results, out)
-    write_report(results, _shown(cases, methods, protocol, rows, shown), out / PAGE)
+    with TemporaryDirectory(prefix="brewster-report-") as folder:
+        complete = frozenset(part.name for part in benchmarks if len(part.cases) <= shown)
+        tiles = _TileCache(Path(folder), complete, config, out / INPUTS)
+        rows = score(
+            benchmarks, methods, config, out, workers=workers, on_progress=on_progress, on_decoded=tiles
+        )
+        if config.size:
+            _write_missing_inputs(cases, config.size, out / INPUTS)
+        results = summarise(benchmarks, methods, config, rows)
+        for method in methods:
+            if remarks := list(_method_remarks(method, cases, rows)):
+                results["methods"][method.name]["remark"] = "; ".join(remarks)
+        _write(results, out)
+        write_report(results, _page_cases(cases, methods, rows, shown, tiles), out / PAGE)
     return results
 
 
-def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], protocol: EvaluationConfig) -> None:
-    """Refuses what cannot be measured as asked, before anything is.
+def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: EvaluationConfig) -> None:
+    """Checks everything that can be checked before the evaluation starts.
 
     Raises:
         BrewsterError: see `evaluate`.
     """
-    refuse_names(methods)
+    check_names(methods)
     names = [part.name for part in benchmarks]
     for name in names:
         if names.count(name) > 1:
             raise BrewsterError(
-                f"{names.count(name)} benchmarks are called {name!r}",
-                "each once",
+                f"{names.count(name)} benchmarks have the name {name!r}",
+                "expected unique names",
                 "rename one of the folders",
             )
     if not any(part.cases for part in benchmarks):
         refused = [reason for part in benchmarks for reason in part.refused]
         raise PhotoError(
             f"there is no pair in {', '.join(names) or 'no benchmark'}",
-            "a photo and its truth",
-            "; ".join(refused[:5]) or "name a folder that has some",
+            "expected photos with their ground truth",
+            "; ".join(refused[:5]) or "give a folder with pairs",
         )
-    if protocol.paper:
-        draw(benchmarks)
+    if config.paper:
+        paper_draws(benchmarks)
     cases = [case for part in benchmarks for case in part.cases]
     for method in methods:
         if isinstance(method, PredictionFolder):
-            method.refuse_wrong_pairing(cases)
+            method.check_pairing(cases)
 
 
-def _remarks(method: Method, cases: Sequence[Case], rows: Sequence[ScoreRow]) -> Iterator[str]:
-    """What is odd about a method's answers."""
+def _method_remarks(method: Method, cases: Sequence[Case], rows: Sequence[ScoreRow]) -> Iterator[str]:
+    """Signs that a prediction folder is not what it should be: copies of the ground truth, or unused pictures."""
     if not isinstance(method, PredictionFolder):
         return
     perfect = [row for row in rows if row.scores.get("psnr") == IDENTICAL_DB]
-    trivial = {row.place[:2] for row in perfect if row.method == NOTHING}
-    copied = [row for row in perfect if row.method == method.name and row.place[:2] not in trivial]
+    trivial = {row.id[:2] for row in perfect if row.method == BASELINE}
+    copied = [row for row in perfect if row.method == method.name and row.id[:2] not in trivial]
     if copied:
-        yield f"its answer is the truth itself on {_pictures(len(copied))}: are these its own?"
+        yield f"its prediction equals the ground truth on {_pictures(len(copied))}: check the folder"
     if unused := method.unused(cases):
-        yield f"no case is answered by {_pictures(unused)} of its folder"
+        yield f"{_pictures(unused)} of its folder {'fits' if unused == 1 else 'fit'} no case"
 
 
 def _pictures(count: int) -> str:
     return f"{count} {'picture' if count == 1 else 'pictures'}"
 
 
-def _write_inputs(cases: Sequence[Case], size: int, folder: Path) -> None:
-    """The photos as methods see them, for those that answer elsewhere; what cannot be read is told when it is scored."""
+def _write_missing_inputs(cases: Sequence[Case], size: int, folder: Path) -> None:
+    """The reduced photos of cases that were not decoded in this run. Unreadable photos are skipped: rows report them."""
     for case in cases:
-        with suppress(PhotoError):
-            photo = reduced(Photo.open(case.photo.read()), size)
-            photo.save(folder / case.benchmark / f"{case.name}.png", overwrite=True)
+        path = _input_path(folder, case)
+        if not path.exists():
+            with suppress(PhotoError):
+                downscale(Photo.open(case.photo.read()), size).save(path)
+
+
+def _input_path(folder: Path, case: Case) -> Path:
+    return folder / case.benchmark / f"{case.name}.png"
 
 
 def _write(results: Results, out: Path) -> None:
@@ -141,56 +161,112 @@ def _write(results: Results, out: Path) -> None:
         write_atomically(out / name, text.encode(errors="backslashreplace"), overwrite=True)
 
 
-# --- what the page shows
+# --- pictures of the report
 
 
-def _shown(
+@final
+@dataclass(frozen=True)
+class _TileCache:
+    """Writes what needs decoded pictures while they are in memory: the report's tiles and the reduced photos.
+
+    Tiles are made for benchmarks of which the report shows every case. They are files, because a worker process makes
+    them, and so that memory does not grow with the number of cases.
+    """
+
+    folder: Path
+    benchmarks: frozenset[str]
+    config: EvaluationConfig
+    inputs: Path
+
+    def __call__(self, truth: GroundTruth, predictions: Mapping[str, MethodOutput]) -> None:
+        """Called once for each case that is decoded for scoring."""
+        case = truth.case
+        if self.config.size:
+            truth.photo.save(_input_path(self.inputs, case), overwrite=True)
+        if case.benchmark not in self.benchmarks:
+            return
+        images = _case_images(truth, predictions, self.config)
+        width, height = truth.photo.size
+        texts = {BASELINE: photo_tiles(images)}
+        texts |= {name: method_tiles(images, name) for name in predictions if name != BASELINE}
+        for method, text in texts.items():
+            data = json.dumps([width, height, text], ensure_ascii=True).encode()
+            self._path(case, method).write_bytes(data)
+
+    def read(self, case: Case, methods: Sequence[str]) -> CaseTiles | None:
+        """The tiles of a case with those of the methods; None if one is missing."""
+        texts = {}
+        width = height = 0
+        for method in (BASELINE, *methods):
+            path = self._path(case, method)
+            if not path.exists():
+                return None
+            width, height, texts[method] = json.loads(path.read_bytes())
+        return CaseTiles(case.benchmark, case.name, (width, height), texts.pop(BASELINE), texts)
+
+    def _path(self, case: Case, method: str) -> Path:
+        name = json.dumps([case.benchmark, case.name, method])
+        return self.folder / f"{hashlib.sha256(name.encode()).hexdigest()}.json"
+
+
+def _page_cases(
     cases: Sequence[Case],
     methods: Sequence[Method],
-    protocol: EvaluationConfig,
     rows: Sequence[ScoreRow],
-    most: int,
-) -> Iterator[CaseImages]:
-    """The pictures, read again one case at a time."""
-    good = {row.place: row for row in rows if not row.error}
-    for case in _worst(cases, methods, protocol, good, most):
-        try:
-            truth = GroundTruth.open(case, protocol)
-        except PhotoError:
-            continue  # named in the tables already
-        answers = {
-            method.name: find_answer(truth, method, row)
+    limit: int,
+    tiles: _TileCache,
+) -> Iterator[CaseTiles]:
+    """The cases of the report, one at a time. Those without cached tiles are read and decoded again."""
+    good = {row.id: row for row in rows if not row.error}
+    for case in _worst_cases(cases, methods, tiles.config, good, limit):
+        scored = {
+            method: row
             for method in methods
-            if method.name != NOTHING and (row := good.get((case.benchmark, case.name, method.name)))
+            if method.name != BASELINE and (row := good.get((case.benchmark, case.name, method.name)))
         }
-        yield _show(truth, answers, protocol)
+        cached = tiles.read(case, [method.name for method in scored])
+        if cached:
+            yield cached
+            continue
+        try:
+            truth = GroundTruth.open(case, tiles.config)
+        except PhotoError:
+            continue  # the tables name it
+        predictions = {method.name: get_prediction(truth, method, row) for method, row in scored.items()}
+        yield to_tiles(_case_images(truth, predictions, tiles.config))
 
 
-def _show(truth: GroundTruth, answers: dict[str, MethodOutput], protocol: EvaluationConfig) -> CaseImages:
+def _case_images(
+    truth: GroundTruth, predictions: Mapping[str, MethodOutput], config: EvaluationConfig
+) -> CaseImages:
+    others = {name: output for name, output in predictions.items() if name != BASELINE}
     return CaseImages(
         benchmark=truth.case.benchmark,
         name=truth.case.name,
         photo=truth.pictures["photo"],
         truth=truth.pictures["transmission"],
-        region=truth.region(protocol.thresholds[0]),
-        answers={name: answer.transmission.srgb_8bit() for name, answer in answers.items()},
+        region=truth.region(config.thresholds[0]),
+        predictions={name: output.transmission.srgb_8bit() for name, output in others.items()},
         reflections={
-            name: answer.reflection.srgb_8bit() for name, answer in answers.items() if answer.reflection
+            name: output.reflection.srgb_8bit() for name, output in others.items() if output.reflection
         },
         reflection_truth=truth.pictures.get("reflection"),
     )
 
 
-def _worst(
+def _worst_cases(
     cases: Sequence[Case],
     methods: Sequence[Method],
-    protocol: EvaluationConfig,
-    rows: Mapping[Place, ScoreRow],
-    most: int,
+    config: EvaluationConfig,
+    rows: Mapping[RowId, ScoreRow],
+    limit: int,
 ) -> list[Case]:
-    """So many cases of each benchmark: what the first method that does something failed on, then its worst in the first metric."""
-    method = next((method.name for method in methods if method.name != NOTHING), NOTHING)
-    column, metric = next(iter(protocol.columns().items()))
+    """Up to `limit` cases of each benchmark, those first that the first method failed on, then its worst scores.
+
+    The first method is the first that is not the baseline; the scores are those of the first metric.
+    """
+    method = next((method.name for method in methods if method.name != BASELINE), BASELINE)
+    column, metric = next(iter(config.columns().items()))
 
     def merit(case: Case) -> float:
         row = rows.get((case.benchmark, case.name, method))
@@ -202,5 +278,5 @@ def _worst(
 
     chosen = []
     for name in dict.fromkeys(case.benchmark for case in cases):
-        chosen += sorted((case for case in cases if case.benchmark == name), key=merit)[:most]
+        chosen += sorted((case for case in cases if case.benchmark == name), key=merit)[:limit]
     return chosen

@@ -1,7 +1,7 @@
-"""What is measured: the unprocessed input, our models, and folders of pictures that any other method has left.
+"""The methods to evaluate: the unprocessed input, brewster's models, and folders with predictions of other methods.
 
-Every method answers a case with a transmission and perhaps a reflection. `key` says all that the answer depends on
-beside the photo, so that an answer made once need not be made again.
+A method predicts a transmission and, optionally, a reflection for a case. Its `key` identifies everything that the
+prediction depends on apart from the photo, so that a stored prediction can be reused.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import time
 import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Final, Protocol, final
@@ -27,19 +27,19 @@ from brewster.models.zoo import find_model, is_large
 from brewster.options import Device, Quality
 from brewster.photo import Photo
 
-NOTHING: Final = "input (unprocessed)"
-ANSWER_FORMAT: Final = 1
-"""Raised when the same model comes to answer differently, so that kept answers are made again; see test_house_formats."""
+BASELINE: Final = "input (unprocessed)"
+PREDICTION_FORMAT: Final = 1
+"""Increase it when the same model predicts other layers, so that stored predictions are made again; see test_house_formats."""
 
-_ENDINGS: Final = {"transmission": ("_t", "_l"), "reflection": ("_r",)}
+_STEM_SUFFIXES: Final = {"transmission": ("_t", "_l"), "reflection": ("_r",)}
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class MethodOutput:
-    """The layers that a method gives for a photo.
+    """The layers that a method predicts for a photo.
 
-    `seconds` is the wall time that this took it, if it was seen; `digest` the digest of the files that keep the answer.
+    `seconds` is the wall time of the prediction if it was measured, `digest` that of the files that store the layers.
     """
 
     transmission: Photo
@@ -48,78 +48,77 @@ class MethodOutput:
     digest: str | None = None
 
     @classmethod
-    def read(cls, files: Mapping[str, Path]) -> MethodOutput:
-        """The answer in these files, by layer.
+    def decode(cls, data: Mapping[str, bytes]) -> MethodOutput:
+        """Decodes the encoded pictures of a prediction, by layer.
 
         Raises:
-            PhotoError: one cannot be read.
+            PhotoError: a picture cannot be decoded.
         """
-        data = {layer: _read(path) for layer, path in files.items()}
         photos = {layer: Photo.open(picture) for layer, picture in data.items()}
         return cls(photos["transmission"], photos.get("reflection"), digest=_digest(data.values()))
 
 
 class Method(Protocol):
-    """Anything that answers cases. It is sent to other processes, so it is data; a failure is an exception."""
+    """A method that predicts layers. It must be picklable, because worker processes run it. A failure is an exception."""
 
     @property
     def name(self) -> str:
-        """What tables call it."""
+        """The name in tables and results."""
         ...
 
     @property
     def exclusive(self) -> bool:
-        """Whether it needs the memory for itself, and so answers after the others."""
+        """Whether it needs all memory for itself. Exclusive methods run after the others, one at a time."""
         ...
 
     def about(self) -> dict[str, str]:
-        """What it is, in plain values for results.json; the first is its kind."""
+        """A description for results.json; the first entry is its kind."""
         ...
 
     def key(self, case: Case) -> str:
-        """All that its answer depends on, beside the photo."""
+        """Identifies everything that the prediction depends on, apart from the photo."""
         ...
 
-    def answer(self, case: Case, photo: Photo) -> MethodOutput:
-        """Its layers for the photo of this case."""
+    def predict(self, case: Case, photo: Photo) -> MethodOutput:
+        """The predicted layers for the photo of a case."""
         ...
 
     def cached(self, case: Case) -> MethodOutput | None:
-        """The answer as it lies on the disk, if it does."""
+        """The stored prediction, or None if there is none."""
         ...
 
 
 @final
 @dataclass(frozen=True)
 class IdentityBaseline:
-    """The photo itself as transmission and black as reflection: what every method must beat."""
+    """The baseline: the photo itself as transmission, black as reflection."""
 
-    name: str = NOTHING
+    name: str = BASELINE
     exclusive: Final = False
 
     def about(self) -> dict[str, str]:
-        """Its kind."""
+        """The kind of method."""
         return {"kind": "baseline"}
 
-    def key(self, case: Case) -> str:  # noqa: ARG002  (it is the same for all)
-        """Nothing."""
+    def key(self, case: Case) -> str:  # noqa: ARG002  (the same for all cases)
+        """A constant."""
         return "nothing"
 
-    def answer(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002
-        """The photo and black."""
+    def predict(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002
+        """The photo and a black reflection."""
         return MethodOutput(photo, photo.with_pixels(np.zeros_like(photo.pixels)))
 
     def cached(self, case: Case) -> MethodOutput | None:  # noqa: ARG002
-        """Nothing is kept: it costs nothing."""
+        """None: the baseline is not stored."""
         return None
 
 
 @final
 @dataclass(frozen=True)
 class ModelMethod:
-    """A model, run through the `Separator` that users use; its answers are kept as PNG in `folder`.
+    """A model, run with `Separator` as users run it. Its predictions are stored as PNG files in `folder`.
 
-    `folder` takes the form of a folder of predictions, and can be measured as one later.
+    The folder has the layout that `PredictionFolder` reads.
     """
 
     name: str
@@ -130,47 +129,54 @@ class ModelMethod:
 
     @property
     def exclusive(self) -> bool:
-        """Large image models: two of them fill any card."""
+        """True for large image models: two of them do not fit on one GPU."""
         return is_large(self.model)
 
     def about(self) -> dict[str, str]:
-        """Its kind, the digest of its file, and how closely it looks."""
+        """The kind of method, the digest of the model file, and the quality."""
         return {"kind": "model", "sha256": self._sha256, "quality": self.quality}
 
-    def key(self, case: Case) -> str:  # noqa: ARG002  (it is the same for all)
-        """The model's digest, its quality, and the format of the answers."""
-        return f"{self._sha256} {self.quality} {ANSWER_FORMAT}"
+    def key(self, case: Case) -> str:  # noqa: ARG002  (the same for all cases)
+        """The model's digest, the quality, and the format of predictions."""
+        return f"{self._sha256} {self.quality} {PREDICTION_FORMAT}"
 
-    def answer(self, case: Case, photo: Photo) -> MethodOutput:
-        """Separates the photo and keeps both layers.
+    def predict(self, case: Case, photo: Photo) -> MethodOutput:
+        """Separates the photo and stores both layers.
+
+        Returns:
+            The layers as decoded from the stored bytes, so that a stored prediction has the same scores.
 
         Raises:
             BrewsterError: the model or the photo cannot be used, or the layers cannot be written.
         """
-        separator = (_large if self.exclusive else _small)(self.model, self.device)
+        separator = (_load_exclusive_separator if self.exclusive else _load_separator)(
+            self.model, self.device
+        )
         started = time.perf_counter()
         separation = separator(photo, quality=self.quality)
         seconds = time.perf_counter() - started
-        files = self._files(case)
-        for layer, path in files.items():
-            data = getattr(separation, layer).encode("png", depth=8)
-            write_atomically(path, data, overwrite=True)
-        return replace(MethodOutput.read(files), seconds=seconds)  # what is kept is what is scored
+        data = {}
+        for layer, path in self._files(case).items():
+            data[layer] = getattr(separation, layer).encode("png", depth=8)
+            write_atomically(path, data[layer], overwrite=True)
+        return replace(MethodOutput.decode(data), seconds=seconds)
 
     def cached(self, case: Case) -> MethodOutput | None:
-        """The layers that were kept.
+        """The stored layers, or None.
 
         Raises:
-            PhotoError: they cannot be read.
+            PhotoError: a stored layer cannot be read.
         """
         files = self._files(case)
-        return MethodOutput.read(files) if all(path.is_file() for path in files.values()) else None
+        if not all(path.is_file() for path in files.values()):
+            return None
+        return MethodOutput.decode({layer: _read(path) for layer, path in files.items()})
 
     @cached_property
     def _sha256(self) -> str:
         if not self.exclusive:
             return find_model(self.model).verify()
-        from brewster.models.diffusion.pipeline import fingerprint  # noqa: PLC0415  (wakes torch)
+        from brewster.models.diffusion.pipeline import fingerprint  # noqa: PLC0415  (imports torch)
 
         return fingerprint(self.model, device=self.device)
 
@@ -180,57 +186,68 @@ class ModelMethod:
 
 
 @cache
-def _small(model: str, device: Device) -> Separator:
-    """A model, loaded once a process."""
+def _load_separator(model: str, device: Device) -> Separator:
+    """A model, loaded once per process."""
     return Separator.load(model, device=device)
 
 
-_held: dict[tuple[str, Device], Separator] = {}
+_exclusive_separators: dict[tuple[str, Device], Separator] = {}
 
 
-def _large(model: str, device: Device) -> Separator:
-    """A model that makes room for the next one before that is loaded."""
-    if (model, device) not in _held:
-        _held.clear()
+def _load_exclusive_separator(model: str, device: Device) -> Separator:
+    """A large model. The previous one is freed first, because two of them do not fit into memory."""
+    if (model, device) not in _exclusive_separators:
+        _exclusive_separators.clear()
         gc.collect()
-        _held[model, device] = Separator.load(model, device=device)
-    return _held[model, device]
+        _exclusive_separators[model, device] = Separator.load(model, device=device)
+    return _exclusive_separators[model, device]
 
 
 @final
 @dataclass(frozen=True)
 class PredictionFolder:
-    """A folder with another method's pictures, found by name; README and docs say how they may be called."""
+    """A folder with the predictions of another method, found by file name; docs/evaluation.md lists the accepted names."""
 
     name: str
     folder: Path
     exclusive: Final = False
+    _hashed: dict[Case, dict[str, bytes]] = field(default_factory=dict, init=False, repr=False, compare=False)
+    """The bytes that `key` hashed last. `predict` decodes them, so that each file is read once."""
 
     def about(self) -> dict[str, str]:
-        """Its kind."""
+        """The kind of method."""
         return {"kind": "predictions"}
 
     def key(self, case: Case) -> str:
-        """The digest of the files, or what is wrong with them."""
+        """The digest of the files, or the error message if they cannot be read."""
+        self._hashed.clear()
         try:
-            return _digest(_read(path) for path in self.files(case).values())
+            data = self._hashed[case] = self._read(case)
         except BrewsterError as error:
             return str(error)
+        return _digest(data.values())
 
-    def answer(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002  (it is answered already)
-        """Reads its pictures for this case.
+    def predict(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002  (the predictions exist already)
+        """Reads the pictures for a case.
 
         Raises:
-            PhotoError: there is none, there are several, or they cannot be read.
+            PhotoError: a layer has no file or several, or a file cannot be read.
         """
-        return MethodOutput.read(self.files(case))
+        return MethodOutput.decode(self._hashed.pop(case, {}) or self._read(case))
 
     def cached(self, case: Case) -> MethodOutput | None:
-        """What `answer` gives, and raises."""
-        return MethodOutput.read(self.files(case))
+        """Same as `predict`.
+
+        Raises:
+            PhotoError: as `predict`.
+        """
+        return MethodOutput.decode(self._hashed.pop(case, {}) or self._read(case))
+
+    def _read(self, case: Case) -> dict[str, bytes]:
+        return {layer: _read(path) for layer, path in self.files(case).items()}
 
     def files(self, case: Case) -> dict[str, Path]:
-        """layer -> file for this case, transmission and perhaps reflection.
+        """layer -> file for a case: the transmission and, if there is one, the reflection.
 
         Raises:
             PhotoError: there is no transmission, or more than one file for a layer.
@@ -241,32 +258,34 @@ class PredictionFolder:
                 raise PhotoError(
                     f"{self.name} has {len(paths)} pictures for the {layer} of {case.benchmark}/{case.name}"
                     f" ({', '.join(sorted(path.name for path in paths))})",
-                    "one is needed",
+                    "expected one",
                     "remove the others",
                 )
         if not found["transmission"]:
             raise PhotoError(
                 f"{self.name} has no picture for {case.benchmark}/{case.name}",
-                f"such as {self.folder / case.benchmark / case.name}.png",
-                "add it, or rename it",
+                f"expected a file such as {self.folder / case.benchmark / case.name}.png",
+                "add or rename the file",
             )
         return {layer: path for layer, paths in found.items() for path in paths}
 
     def unused(self, cases: Iterable[Case]) -> int:
-        """How many of the folder's pictures answer none of these cases: a hint that names differ."""
+        """The number of pictures in the folder that belong to none of the cases: a hint that names differ."""
         layers = ("transmission", "reflection")
         used = {path for case in cases for layer in layers for path in self._candidates(case, layer)}
         return sum(map(len, self._pictures.values())) - len(used)
 
-    def refuse_wrong_pairing(self, cases: Sequence[Case]) -> None:
-        """Refuses a folder in which one picture would answer two cases, or none any.
+    def check_pairing(self, cases: Sequence[Case]) -> None:
+        """Checks that the folder can be paired with the cases by name.
 
         Raises:
-            PhotoError: so it is.
+            PhotoError: the folder is missing, one picture fits two cases, or no picture fits any case.
         """
         if not self.folder.is_dir():
             raise PhotoError(
-                f"{self.folder} is no folder", f"{self.name} needs one with its pictures", "name another"
+                f"{self.folder} is not a folder",
+                f"{self.name} needs a folder with its pictures",
+                "give another path",
             )
         owners: defaultdict[Path, list[Case]] = defaultdict(list)
         for case in cases:
@@ -276,39 +295,39 @@ class PredictionFolder:
             if len(claimed) > 1:
                 first, second, *_ = (f"{case.benchmark}/{case.name}" for case in claimed)
                 raise PhotoError(
-                    f"{path} could be {self.name}'s answer to {first} and to {second}",
-                    "a picture answers one case",
-                    f"sort the pictures into {', '.join(sorted({str(self.folder / case.benchmark) for case in claimed}))}",
+                    f"{path} fits two cases of {self.name}, {first} and {second}",
+                    "expected one case for each picture",
+                    f"move the pictures into the folders {', '.join(sorted({str(self.folder / case.benchmark) for case in claimed}))}",
                 )
         if not owners:
             example = f"{cases[0].benchmark}/{cases[0].name}" if cases else "a case"
             raise PhotoError(
-                f"no picture in {self.folder} is called like a case",
+                f"no picture in {self.folder} has the name of a case",
                 f"{self.name} needs pictures such as {example}.png",
-                "rename them, or name another folder",
+                "rename them, or give another folder",
             )
 
     def _candidates(self, case: Case, layer: str) -> set[Path]:
-        """The files that could be this layer, under any of the names that are understood."""
+        """The files of a layer, under any of the accepted names."""
         root = self.folder / case.benchmark
         root = root if root.is_dir() else self.folder
-        places = [root / f"{stem}.{layer}" for stem in (case.name, case.place)]
+        places = [root / f"{stem}.{layer}" for stem in (case.name, case.relative_path)]
         places += [root / folder / case.name for folder in (layer, f"{layer}_layer")]
-        places += [root / case.name / name for name in self._own_names(root / case.name, layer)]
+        places += [root / case.name / name for name in self._suffixed_stems(root / case.name, layer)]
         if layer == "transmission":
             places += [root / case.name]
-        return {path for place in places for path in self._pictures.get(_plain(place), ())}
+        return {path for place in places for path in self._pictures.get(_normalised(place), ())}
 
-    def _own_names(self, folder: Path, layer: str) -> list[str]:
-        """Stems such as rdnet_t or dsrnet_l, where a method has left a folder for each picture."""
-        return [stem for stem in self._stems.get(folder, ()) if stem.endswith(_ENDINGS[layer])]
+    def _suffixed_stems(self, folder: Path, layer: str) -> list[str]:
+        """Stems such as rdnet_t or dsrnet_l, if the method wrote a folder for each picture."""
+        return [stem for stem in self._stems.get(folder, ()) if stem.endswith(_STEM_SUFFIXES[layer])]
 
     @cached_property
     def _pictures(self) -> dict[Path, list[Path]]:
-        """The folder's pictures by their paths without suffix."""
+        """path without suffix -> the pictures at that path."""
         found: defaultdict[Path, list[Path]] = defaultdict(list)
         for path in filter(_is_picture, walk(self.folder, _is_picture)):
-            found[_plain(path.with_suffix(""))].append(path)
+            found[_normalised(path.with_suffix(""))].append(path)
         return dict(found)
 
     @cached_property
@@ -323,8 +342,8 @@ def _is_picture(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
-def _plain(path: Path) -> Path:
-    """A path in one spelling: some systems write an accented letter as two characters."""
+def _normalised(path: Path) -> Path:
+    """The path in Unicode form NFC: some file systems store an accented letter as two characters."""
     return Path(unicodedata.normalize("NFC", str(path)))
 
 
@@ -334,33 +353,33 @@ def _read(path: Path) -> bytes:
     except OSError as error:
         raise PhotoError(
             f"{path} cannot be read ({error.strerror or error})",
-            "an answer's file",
-            "mend that and run again",
+            "expected a readable picture",
+            "make the file readable and run again",
         ) from error
 
 
 def _digest(data: Iterable[bytes]) -> str:
-    """One digest of several files."""
+    """One SHA-256 of several files."""
     return hashlib.sha256(b"".join(hashlib.sha256(one).digest() for one in data)).hexdigest()
 
 
-def refuse_names(methods: Sequence[Method]) -> None:
-    """Refuses no method at all, two of one name, since tables could not tell them apart, and names that are no names of folders.
+def check_names(methods: Sequence[Method]) -> None:
+    """Checks that there is a method, and that the names are unique and valid as folder names.
 
     Raises:
-        BrewsterError: so it is.
+        BrewsterError: there is no method, two methods share a name, or a name is not valid for a folder.
     """
     if not methods:
-        raise BrewsterError("there is no method", "one or more to measure", "begin with Nothing()")
+        raise BrewsterError("there is no method", "expected one or more", "start with IdentityBaseline()")
     (name, count), *_ = Counter(method.name for method in methods).most_common(1)
     if count > 1:
         raise BrewsterError(
-            f"{count} methods are called {name!r}", "each needs a name of its own", "write NAME=... for one"
+            f"{count} methods have the name {name!r}", "expected unique names", "rename one with NAME=..."
         )
     for method in methods:
         if method.name in ("", ".", "..") or set("/\\") & set(method.name) or not method.name.isprintable():
             raise BrewsterError(
-                f"a method is called {method.name!r}",
-                "names become folders: no slashes, no control letters, not . or ..",
-                "choose another with NAME=...",
+                f"a method has the name {method.name!r}",
+                "names are used for folders: no slashes, no control characters, not . or ..",
+                "choose another name with NAME=...",
             )

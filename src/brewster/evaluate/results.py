@@ -1,4 +1,4 @@
-"""From rows to results: means and differences with their intervals, in plain values that JSON keeps for good."""
+"""Aggregates score rows into results.json: means and paired differences with confidence intervals, as plain values."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from brewster.evaluate.statistics import Stratum, differences, estimate
 
 AVERAGE: Final = "average"
 PAPER: Final = {"real20": 20, "nature20": 20, "postcard": 20, "solidobject": 20, "wildscene": 101}
-"""The paper's sets, and of how many pictures its average takes of each."""
+"""The sets in the paper's average, with the number of pictures of each."""
 _DIGITS: Final = 6
-_AVERAGED: Final = "The average is over pictures, not over sets: each counts once, whatever set it is from."
+_AVERAGED: Final = "The average is over pictures, not over sets: each picture has the same weight."
 
 Results = dict[str, Any]
-"""What results.json holds: see docs/evaluation.md."""
+"""The content of results.json: see docs/evaluation.md."""
 
 
 @final
 @dataclass(frozen=True)
 class Selection:
-    """Pictures that a table is about: a whole benchmark, or the paper's draw from it."""
+    """The pictures of a table: a whole benchmark, or the paper's draw from it."""
 
     key: str
     title: str
@@ -38,59 +38,59 @@ class Selection:
 def summarise(
     benchmarks: Sequence[Benchmark],
     methods: Sequence[Method],
-    protocol: EvaluationConfig,
+    config: EvaluationConfig,
     rows: Sequence[ScoreRow],
 ) -> Results:
-    """The results of a run; the same for any order of rows.
+    """The content of results.json. The order of the rows does not matter.
 
     Raises:
-        BrewsterError: the paper's draw was asked for, and a benchmark does not tell its scenes.
+        BrewsterError: the paper's draw was requested, and the names of a benchmark do not identify its scenes.
     """
-    by_place = {row.place: row for row in rows}
-    named = [method.name for method in methods]
+    by_id = {row.id: row for row in rows}
+    method_names = [method.name for method in methods]
     measured = {column for row in rows for column, score in row.scores.items() if score is not None}
-    columns = {name: metric for name, metric in protocol.columns().items() if name in measured}
+    columns = {name: metric for name, metric in config.columns().items() if name in measured}
     full = [Selection(part.name, part.title, part.cases) for part in benchmarks if part.cases]
-    drawn = draw(benchmarks) if protocol.paper else []
+    drawn = paper_draws(benchmarks) if config.paper else []
     tables = [[selection] for selection in (*full, *drawn)]
-    together = _together([part for part in full if part.key in PAPER] if protocol.paper else full, drawn)
+    together = _averaged([part for part in full if part.key in PAPER] if config.paper else full, drawn)
     selections = {group[0].key: group for group in tables} | ({AVERAGE: together} if together else {})
-    series = [(method, column) for method in named for column in columns]
+    series = [(method, column) for method in method_names for column in columns]
     directions = {name: metric.higher_is_better for name, metric in columns.items()}
-    strata = {key: [_stratum(part, series, by_place) for part in group] for key, group in selections.items()}
+    strata = {key: [_stratum(part, series, by_id) for part in group] for key, group in selections.items()}
     return {
         "brewster": brewster.__version__,
         "protocol": {
-            "size": protocol.size or "native",
-            "quality": protocol.quality,
-            "region_thresholds": list(protocol.thresholds),
-            "choices": _choices(protocol, together),
+            "size": config.size or "native",
+            "quality": config.quality,
+            "region_thresholds": list(config.thresholds),
+            "choices": _choices(config, together),
         },
         "metrics": {name: metric.described() for name, metric in columns.items()},
-        "benchmarks": {part.name: _described(part) for part in benchmarks},
+        "benchmarks": {part.name: _describe(part) for part in benchmarks},
         "selections": {key: _titled(key, group) for key, group in selections.items()},
         "methods": {method.name: method.about() for method in methods},
-        "unmeasured": [] if protocol.metrics == DEFAULT_METRICS else _missing(protocol, measured),
+        "unmeasured": [] if config.metrics == DEFAULT_METRICS else _unmeasured(config, measured),
         "draw": {"seed": PAPER_SEED} | {part.key: [case.name for case in part.cases] for part in drawn},
-        "pictures": [_picture(case, named, by_place) for part in benchmarks for case in part.cases],
+        "pictures": [_picture(case, method_names, by_id) for part in benchmarks for case in part.cases],
         "tables": {key: _table(strata[key], series) for key in selections},
         "differences": {
-            key: [_flat(difference) for difference in differences(strata[key], series, directions)]
+            key: [_flattened(difference) for difference in differences(strata[key], series, directions)]
             for key in selections
         },
     }
 
 
-def _missing(protocol: EvaluationConfig, measured: set[str]) -> list[str]:
-    """Metrics that were asked for, and that no picture has the truth for."""
-    return [name for name in protocol.columns() if name not in measured]
+def _unmeasured(config: EvaluationConfig, measured: set[str]) -> list[str]:
+    """Requested metrics without a score, because no picture has the ground truth that they need."""
+    return [name for name in config.columns() if name not in measured]
 
 
-def draw(benchmarks: Sequence[Benchmark]) -> list[Selection]:
-    """The paper's draws, of the benchmarks that it does not take whole.
+def paper_draws(benchmarks: Sequence[Benchmark]) -> list[Selection]:
+    """The paper's draws from the benchmarks that it does not use completely.
 
     Raises:
-        BrewsterError: a benchmark does not tell its scenes.
+        BrewsterError: the names of a benchmark do not identify its scenes.
     """
     draws = [(part, paper_draw(part)) for part in benchmarks if part.cases]
     return [
@@ -100,8 +100,8 @@ def draw(benchmarks: Sequence[Benchmark]) -> list[Selection]:
     ]
 
 
-def _together(full: Sequence[Selection], drawn: Sequence[Selection]) -> list[Selection]:
-    """What the average is over: of each benchmark the draw, if there is one; nothing if there is only one."""
+def _averaged(full: Sequence[Selection], drawn: Sequence[Selection]) -> list[Selection]:
+    """The selections of the average: each benchmark's draw if there is one; empty for a single benchmark."""
     draws = {part.key.partition(":")[0]: part for part in drawn}
     return [draws.get(part.key, part) for part in full] if len(full) > 1 else []
 
@@ -111,13 +111,13 @@ def _titled(key: str, group: Sequence[Selection]) -> dict[str, Any]:
     return {"title": "Average" if key == AVERAGE else group[0].title, "pictures": pictures}
 
 
-def _choices(protocol: EvaluationConfig, together: Sequence[Selection]) -> list[str]:
-    """The protocol's, how the average comes about, and what the paper's lacks."""
-    choices = [*protocol.choices(), *([_AVERAGED] if together else [])]
+def _choices(config: EvaluationConfig, together: Sequence[Selection]) -> list[str]:
+    """The settings as sentences, how the average is computed, and how it differs from the paper's."""
+    choices = [*config.choices(), *([_AVERAGED] if together else [])]
     there = {part.key.partition(":")[0]: len(part.cases) for part in together}
-    if not protocol.paper or there == PAPER:
+    if not config.paper or there == PAPER:
         return choices
-    found = ", ".join(f"{count} of {name}" for name, count in there.items()) or "too few sets for one"
+    found = ", ".join(f"{count} of {name}" for name, count in there.items()) or "too few sets"
     return [
         *choices,
         f"The paper's average is over {sum(PAPER.values())} pictures; this one is over {found}.",
@@ -143,13 +143,13 @@ def _score(row: ScoreRow, column: str) -> float:
 
 def _table(strata: Sequence[Stratum], series: Sequence[tuple[str, str]]) -> dict[str, dict[str, Any]]:
     table: dict[str, dict[str, Any]] = {method: {} for method, _ in series}
-    for (method, column), answer in zip(series, estimate(strata), strict=True):
-        if answer:
-            table[method][column] = _rounded(asdict(answer))
+    for (method, column), mean in zip(series, estimate(strata), strict=True):
+        if mean:
+            table[method][column] = _rounded(asdict(mean))
     return table
 
 
-def _flat(difference: Any) -> dict[str, Any]:  # noqa: ANN401  (a Difference)
+def _flattened(difference: Any) -> dict[str, Any]:  # noqa: ANN401  (a Difference)
     row = asdict(difference)
     return _rounded(row.pop("estimate") | row)
 
@@ -158,7 +158,7 @@ def _rounded(row: dict[str, Any]) -> dict[str, Any]:
     return {name: round(value, _DIGITS) if isinstance(value, float) else value for name, value in row.items()}
 
 
-def _described(part: Benchmark) -> dict[str, Any]:
+def _describe(part: Benchmark) -> dict[str, Any]:
     return {
         "title": part.title,
         "pictures": len(part.cases),

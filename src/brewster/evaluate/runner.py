@@ -1,8 +1,9 @@
-"""Every method answers every case and is scored, in one process or several, resumable.
+"""Scores every method on every case, in one process or several; a stopped run can be resumed.
 
-    rows = score(read_benchmark("nature20", folder), [Nothing(), model], Protocol(), Path("out/evaluate"))
+    rows = score(read_benchmark("nature20", folder), [IdentityBaseline(), model], EvaluationConfig(), Path("out/evaluate"))
 
-`scores.jsonl` in the folder gains a line for each answer as it is scored; a run that was stopped reads them and goes on.
+`scores.jsonl` in the output folder gets one line for each scored prediction. A later run reuses the lines whose inputs
+have not changed. The files of a case are read once: the same bytes are hashed and, if a row is missing, decoded.
 """
 
 from __future__ import annotations
@@ -10,11 +11,10 @@ from __future__ import annotations
 import hashlib
 import json
 import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, field, replace
-from itertools import groupby
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Final, final
@@ -22,27 +22,30 @@ from typing import Any, Final, final
 from brewster.benchmarks.registry import Benchmark, Case
 from brewster.errors import BrewsterError, TargetError
 from brewster.evaluate.config import EvaluationConfig
-from brewster.evaluate.methods import Method, MethodOutput, refuse_names
-from brewster.evaluate.scoring import GroundTruth, Scorer
+from brewster.evaluate.methods import Method, MethodOutput, check_names
+from brewster.evaluate.scoring import CaseFiles, GroundTruth, Scorer
 from brewster.worker_setup import end_with_parent, one_thread
 
 SCORES: Final = "scores.jsonl"
 SCORE_FORMAT: Final = 2
-"""Raised when the same answers come to score differently, so that they are scored again; see test_house_formats."""
+"""Increase it when the same prediction gets other scores, so that logged rows are scored again; see test_house_formats."""
 
-Report = Callable[[int, int, "ScoreRow"], None]
-"""Called with (done, of how many, the row) after every answer that was scored."""
+ScoreCallback = Callable[[int, int, "ScoreRow"], None]
+"""Called with (done, total, row) after each prediction that was scored."""
 
-Place = tuple[str, str, str]
+DecodedCallback = Callable[[GroundTruth, Mapping[str, MethodOutput]], None]
+"""Called with a decoded case and its new predictions, by method, in the process that scored them."""
+
+RowId = tuple[str, str, str]
 
 
 @final
 @dataclass(frozen=True)
 class ScoreRow:
-    """What became of one method's answer to one case.
+    """The scores of one method on one case, or the error. A line of scores.jsonl has these fields.
 
-    `key` is a digest of all that the scores depend on, `answer_key` of all that the answer does: where it is equal,
-    nothing need be done again. `digest` is the digest of the answer's files, where it lies on the disk.
+    `key` is a digest of everything that the scores depend on, `answer_key` of everything that the prediction depends
+    on. Equal digests mean that the work need not be repeated. `digest` is that of the prediction's files, if it has any.
     """
 
     benchmark: str
@@ -59,183 +62,245 @@ class ScoreRow:
     region_share: float = 0.0
 
     @property
-    def place(self) -> Place:
-        """Benchmark, case and method: where it stands in the results."""
+    def id(self) -> RowId:
+        """(benchmark, case, method)."""
         return self.benchmark, self.case, self.method
 
 
 @final
 @dataclass(frozen=True)
 class _ScoringTask:
-    """A case, and the rows that are to be filled; `digest` of a row says which answer on the disk is the right one."""
+    """A case, the names of the methods to score on it, and the rows of earlier runs by method."""
 
     case: Case
-    rows: tuple[ScoreRow, ...]
+    methods: tuple[str, ...]
+    logged: Mapping[str, ScoreRow]
 
 
 def score(
     benchmarks: Sequence[Benchmark],
     methods: Sequence[Method],
-    protocol: EvaluationConfig,
+    config: EvaluationConfig,
     out: Path,
     *,
     workers: int = 1,
-    report: Report = lambda _done, _of, _row: None,
+    on_progress: ScoreCallback = lambda _done, _total, _row: None,
+    on_decoded: DecodedCallback | None = None,
 ) -> list[ScoreRow]:
-    """Has every method answer every case and scores the answers; those that `out` knows already are not made again.
+    """Runs every method on every case and scores the predictions; unchanged rows of an earlier run are reused.
 
-    Methods that need the memory for themselves go through all cases one after another, when the others are done.
-    A method that fails on a case gives a row with an `error`; the others are scored. Rows come in the order of
-    benchmarks, cases and methods, the same for any number of workers.
+    Exclusive methods run last, one after another and in this process; each of them reads the cases again.
+
+    Args:
+        benchmarks: as `read_benchmark` returns them.
+        methods: with unique names.
+        config: the settings of the evaluation.
+        out: the folder of scores.jsonl.
+        workers: number of processes that score in parallel.
+        on_progress: called after each new row.
+        on_decoded: called once for each case with new rows. With several workers it must be picklable.
+
+    Returns:
+        One row for each case and method, in the order of benchmarks, cases and methods, for any number of workers. A
+        row of a method that failed has an `error`.
 
     Raises:
-        BrewsterError: methods' names are shared or unfit, a part of brewster is missing, or a worker died.
+        BrewsterError: names of methods are shared or invalid, a metric is not available, or a worker process died.
         TargetError: `out` cannot be written.
     """
-    refuse_names(methods)
-    known = _read(out / SCORES)
+    check_names(methods)
+    logged = _read_log(out / SCORES)
     cases = {(case.benchmark, case.name): case for part in benchmarks for case in part.cases}
-    wanted = [row for case in cases.values() for row in _rows(case, methods, protocol, known)]
-    rows = {row.place: known[row.place] for row in wanted if _is_scored(row, known)}
-    todo = [row for row in wanted if row.place not in rows]
-    exclusive = [method.name for method in methods if method.exclusive]
-    tasks = list(_tasks(cases, [row for row in todo if row.method not in exclusive]))
-    later = [
-        task for name in exclusive for task in _tasks(cases, [row for row in todo if row.method == name])
-    ]
-    for metric in protocol.columns().values() if todo else ():
-        if metric.prepare:  # here, once: weights may have to be fetched, or be missing
-            metric.prepare()
-    log = _Log(out / SCORES)
+    ids = [(*case, method.name) for case in cases for method in methods]
+    _prepare_metrics(config, ids, logged)
+    log, rows = _ScoreLog(out / SCORES), dict[RowId, ScoreRow]()
 
-    def take(made: Sequence[ScoreRow]) -> None:
-        for row in made:
-            log.write(row)
-            rows[row.place] = row
-            report(len(rows), len(wanted), row)
+    def on_rows(case_rows: Sequence[ScoreRow]) -> None:
+        for row in case_rows:
+            rows[row.id] = row
+            if row != logged.get(row.id):
+                log.write(row)
+                on_progress(len(rows), len(ids), row)
 
-    _run(tasks, methods, protocol, take, workers)
-    _run(later, methods, protocol, take, 1)
-    return [rows[row.place] for row in wanted]
-
-
-def _rows(
-    case: Case, methods: Sequence[Method], protocol: EvaluationConfig, known: Mapping[Place, ScoreRow]
-) -> Iterator[ScoreRow]:
-    """Rows without scores; their keys are digests of all that they depend on."""
-    photo, *truths = (
-        hashlib.sha256(file.read()).hexdigest() if file else ""
-        for file in (case.photo, case.transmission, case.reflection)
-    )
-    asked = asdict(protocol) | {"paper": None, "quality": None}
+    state = _WorkerState({method.name: method for method in methods}, config, on_decoded)
+    shared = [method.name for method in methods if not method.exclusive]
+    _run_tasks(_tasks(cases.values(), shared, logged), state, on_rows, workers)
     for method in methods:
-        answer_key = _digest(photo, protocol.size, method.key(case))
-        key = _digest(answer_key, truths, asked, case.rendered, SCORE_FORMAT)
-        row = ScoreRow(case.benchmark, case.name, method.name, answer_key, key)
-        before = known.get(row.place)
-        is_answered = before and before.answer_key == answer_key
-        yield replace(row, digest=before.digest) if before and is_answered else row
+        if method.exclusive:
+            _run_tasks(_tasks(cases.values(), [method.name], logged), state, on_rows, 1)
+    return [rows[row_id] for row_id in ids]
 
 
-def _tasks(cases: Mapping[tuple[str, str], Case], todo: Sequence[ScoreRow]) -> Iterator[_ScoringTask]:
-    """Case by case."""
-    for place, rows in groupby(todo, lambda row: row.place[:2]):
-        yield _ScoringTask(cases[place], tuple(rows))
+def _tasks(
+    cases: Iterable[Case], methods: Sequence[str], logged: Mapping[RowId, ScoreRow]
+) -> list[_ScoringTask]:
+    def of_case(case: Case) -> dict[str, ScoreRow]:
+        ids = ((case.benchmark, case.name, method) for method in methods)
+        return {row_id[2]: logged[row_id] for row_id in ids if row_id in logged}
+
+    return [_ScoringTask(case, tuple(methods), of_case(case)) for case in cases] if methods else []
 
 
-def _is_scored(row: ScoreRow, known: Mapping[Place, ScoreRow]) -> bool:
-    return row.place in known and known[row.place].key == row.key
+def _prepare_metrics(
+    config: EvaluationConfig, ids: Sequence[RowId], logged: Mapping[RowId, ScoreRow]
+) -> None:
+    """Loads what metrics need, such as weights, before the workers start: once, and an error stops the run.
+
+    A logged row with a score of the metric shows that an earlier run has loaded it.
+    """
+    columns: dict[Callable[[], object], set[str]] = {}
+    for column, metric in config.columns().items():
+        if metric.prepare:
+            columns.setdefault(metric.prepare, set()).add(column)
+    for prepare, names in columns.items():
+        if any(row_id not in logged or not names & logged[row_id].scores.keys() for row_id in ids):
+            prepare()
+
+
+# --- one case
+
+
+@final
+@dataclass(frozen=True)
+class _WorkerState:
+    """What a process needs to score any case."""
+
+    methods: Mapping[str, Method]
+    config: EvaluationConfig
+    on_decoded: DecodedCallback | None
+
+
+def _score_case(task: _ScoringTask, state: _WorkerState) -> list[ScoreRow]:
+    """The rows of a case. Pictures are decoded only if a row of an earlier run cannot be reused."""
+    case = task.case
+    try:
+        files = CaseFiles.read(case)
+    except BrewsterError as error:
+        rows = [ScoreRow(case.benchmark, case.name, name, "", "") for name in task.methods]
+        return [_case_failed(row, error) for row in rows]
+    rows = [_empty_row(files, state.methods[name], state.config, task.logged) for name in task.methods]
+    if all(_is_scored(row, task.logged) for row in rows):
+        return [task.logged[row.method] for row in rows]
+    try:
+        truth = GroundTruth.decode(files, state.config)
+    except BrewsterError as error:
+        return [
+            task.logged[row.method] if _is_scored(row, task.logged) else _case_failed(row, error)
+            for row in rows
+        ]
+    return _score_rows(rows, truth, task, state)
+
+
+def _score_rows(
+    rows: Sequence[ScoreRow], truth: GroundTruth, task: _ScoringTask, state: _WorkerState
+) -> list[ScoreRow]:
+    scorer, predictions = Scorer(truth, state.config), dict[str, MethodOutput]()
+    done = []
+    for row in rows:
+        if _is_scored(row, task.logged):
+            done.append(task.logged[row.method])
+            continue
+        try:
+            prediction = get_prediction(truth, state.methods[row.method], row)
+            truth.check(prediction, row.method)
+        except BrewsterError as error:
+            done.append(_method_failed(row, str(error)))
+        except Exception as error:  # noqa: BLE001  (a crash on one picture must not stop the evaluation)
+            done.append(_method_failed(row, f"{type(error).__name__}: {error}"))
+        else:
+            predictions[row.method] = prediction
+            done.append(_scored_row(row, truth, scorer, prediction))
+    if state.on_decoded:
+        state.on_decoded(truth, predictions)
+    return done
+
+
+def _empty_row(
+    files: CaseFiles, method: Method, config: EvaluationConfig, logged: Mapping[str, ScoreRow]
+) -> ScoreRow:
+    """A row without scores, whose keys are digests of everything that the scores depend on."""
+    case = files.case
+    photo, *truths = files.digests()
+    settings = asdict(config) | {"paper": None, "quality": None}
+    answer_key = _digest(photo, config.size, method.key(case))
+    key = _digest(answer_key, truths, settings, case.rendered, SCORE_FORMAT)
+    row = ScoreRow(case.benchmark, case.name, method.name, answer_key, key)
+    before = logged.get(method.name)
+    return replace(row, digest=before.digest) if before and before.answer_key == answer_key else row
+
+
+def _is_scored(row: ScoreRow, logged: Mapping[str, ScoreRow]) -> bool:
+    return row.method in logged and logged[row.method].key == row.key
+
+
+def _scored_row(row: ScoreRow, truth: GroundTruth, scorer: Scorer, prediction: MethodOutput) -> ScoreRow:
+    width, height = truth.photo.size
+    return replace(
+        row,
+        scores=scorer.score(prediction),
+        seconds=prediction.seconds,
+        digest=prediction.digest,
+        width=width,
+        height=height,
+        region_share=scorer.region_share,
+    )
+
+
+def get_prediction(truth: GroundTruth, method: Method, row: ScoreRow) -> MethodOutput:
+    """The stored prediction if its digest is that of the row, else a new one.
+
+    Raises:
+        BrewsterError: what the method raises.
+    """
+    cached = method.cached(truth.case) if row.digest else None
+    return cached if cached and cached.digest == row.digest else method.predict(truth.case, truth.photo)
+
+
+def _case_failed(row: ScoreRow, error: BrewsterError) -> ScoreRow:
+    return replace(row, error=f"{row.benchmark}/{row.case}: {error}")
+
+
+def _method_failed(row: ScoreRow, error: str) -> ScoreRow:
+    return replace(row, error=f"{row.method} failed on {row.benchmark}/{row.case}: {error}")
 
 
 def _digest(*parts: object) -> str:
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
 
 
-# --- one case
-
-
-def _do(task: _ScoringTask, methods: Mapping[str, Method], protocol: EvaluationConfig) -> list[ScoreRow]:
-    """Scores all answers to a case."""
-    try:
-        truth = GroundTruth.open(task.case, protocol)
-    except BrewsterError as error:
-        return [replace(row, error=f"{row.benchmark}/{row.case}: {error}") for row in task.rows]
-    judge = Scorer(truth, protocol)
-    return [_scored(row, truth, judge, methods[row.method]) for row in task.rows]
-
-
-def _scored(row: ScoreRow, truth: GroundTruth, judge: Scorer, method: Method) -> ScoreRow:
-    try:
-        answer = find_answer(truth, method, row)
-        truth.check(answer, method.name)
-    except BrewsterError as error:
-        return _failed(row, str(error))
-    except Exception as error:  # noqa: BLE001  (a model that stumbles over one picture must not stop the others)
-        return _failed(row, f"{type(error).__name__}: {error}")
-    width, height = truth.photo.size
-    return replace(
-        row,
-        scores=judge.score(answer),
-        seconds=answer.seconds,
-        digest=answer.digest,
-        width=width,
-        height=height,
-        region_share=judge.region_share,
-    )
-
-
-def find_answer(truth: GroundTruth, method: Method, row: ScoreRow) -> MethodOutput:
-    """The answer that lies on the disk, if it is the one that the row knows; else a new one.
-
-    Raises:
-        BrewsterError: what the method raises.
-    """
-    kept = method.cached(truth.case) if row.digest else None
-    return kept if kept and kept.digest == row.digest else method.answer(truth.case, truth.photo)
-
-
-def _failed(row: ScoreRow, error: str) -> ScoreRow:
-    return replace(row, error=f"{row.method} failed on {row.benchmark}/{row.case}: {error}")
-
-
 # --- all cases
 
-Take = Callable[[Sequence[ScoreRow]], None]
+RowsCallback = Callable[[Sequence[ScoreRow]], None]
 
 
-def _run(
-    tasks: Sequence[_ScoringTask],
-    methods: Sequence[Method],
-    protocol: EvaluationConfig,
-    take: Take,
-    workers: int,
+def _run_tasks(
+    tasks: Sequence[_ScoringTask], state: _WorkerState, on_rows: RowsCallback, workers: int
 ) -> None:
-    """Does the tasks here, or in so many processes, and hands their rows over as they come.
+    """Runs the tasks in this process or in several worker processes; calls `on_rows` after each task.
 
-    Each process uses one thread for metrics, so that all give equal numbers.
+    Each process computes metrics with one thread, so that the scores do not depend on the number of workers.
     """
-    named = {method.name: method for method in methods}
     if workers == 1:
         with one_thread():
             for task in tasks:
-                take(_do(task, named, protocol))
+                on_rows(_score_case(task, state))
         return
-    pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (named, protocol))
-    waiting = {pool.submit(_do_here, task) for task in tasks}
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), _initialize_worker, (state,))
+    futures = {pool.submit(_score_case_in_worker, task) for task in tasks}
     try:
-        for future in as_completed(set(waiting)):
-            waiting.remove(future)
-            take(future.result())
+        for future in as_completed(set(futures)):
+            futures.remove(future)
+            on_rows(future.result())
     except BrokenProcessPool as error:
         raise BrewsterError(
             "a worker process died",
-            "it was killed, or out of memory",
-            "run again with fewer workers: scores are kept",
+            "it was killed or ran out of memory",
+            "run again with fewer workers; the scores so far are saved",
         ) from error
     except KeyboardInterrupt:
         pool.shutdown(cancel_futures=True)
-        for rows in _finished(waiting):
-            take(rows)
+        for rows in _finished(futures):
+            on_rows(rows)
         raise
     finally:
         pool.shutdown(cancel_futures=True)
@@ -245,35 +310,37 @@ def _finished(futures: set[Future[list[ScoreRow]]]) -> Iterator[list[ScoreRow]]:
     return (future.result() for future in futures if not future.cancelled() and not future.exception())
 
 
-_process: dict[str, Any] = {}
+_worker_state: list[_WorkerState] = []  # one element in a worker process
 
 
-def _begin(methods: dict[str, Method], protocol: EvaluationConfig) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which lets a case be finished
+def _initialize_worker(state: _WorkerState) -> None:
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # only the parent handles Ctrl-C: it lets running cases finish
     end_with_parent()
-    _process.update(methods=methods, protocol=protocol)
+    _worker_state.append(state)
 
 
-def _do_here(task: _ScoringTask) -> list[ScoreRow]:
+def _score_case_in_worker(task: _ScoringTask) -> list[ScoreRow]:
     with one_thread():
-        return _do(task, _process["methods"], _process["protocol"])
+        return _score_case(task, _worker_state[0])
 
 
 # --- the log
 
 
 @final
-class _Log:
-    """The file that a stopped run goes on from; it is made with the first row."""
+class _ScoreLog:
+    """The file scores.jsonl. It is created with the first row."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def write(self, row: ScoreRow) -> None:
-        """Adds a line.
+        """Appends a line.
 
         Raises:
-            TargetError: it cannot be written.
+            TargetError: the file cannot be written.
         """
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
@@ -282,20 +349,20 @@ class _Log:
         except OSError as error:
             raise TargetError(
                 f"{self._path} was not written ({error.strerror or error})",
-                "a run needs a folder of its own",
-                "free some space or name another folder with -o, and run again: what is scored is kept",
+                "a writable output folder was expected",
+                "free some space or choose another folder with -o, and run again; the scores so far are saved",
             ) from error
 
-    def _separator(self, file: Any) -> bytes:  # noqa: ANN401  (what open gives)
-        """A killed run may have left half a line."""
+    def _separator(self, file: Any) -> bytes:  # noqa: ANN401  (the type that open returns)
+        """A newline if the last line is incomplete, as a killed run can leave it."""
         if not file.seek(0, 2):
             return b""
         file.seek(-1, 2)
         return b"" if file.read(1) == b"\n" else b"\n"
 
 
-def _read(path: Path) -> dict[Place, ScoreRow]:
-    """The last row of earlier runs at each place; failures, half lines and lines of other versions are passed over."""
+def _read_log(path: Path) -> dict[RowId, ScoreRow]:
+    """The last row of earlier runs for each id, without failures, incomplete lines and lines of other versions."""
     rows = {}
     for line in path.read_text(errors="replace").splitlines() if path.is_file() else ():
         try:
@@ -303,5 +370,5 @@ def _read(path: Path) -> dict[Place, ScoreRow]:
         except (ValueError, TypeError):
             continue
         if not row.error:
-            rows[row.place] = row
+            rows[row.id] = row
     return rows

@@ -1,6 +1,6 @@
-"""Means with their uncertainty: bootstrap over scenes, and paired differences over the same pictures.
+"""Means with bootstrap confidence intervals, and paired differences between methods.
 
-Pictures of one scene (ten variants of a postcard, say) are not independent of each other, so whole scenes are drawn.
+Pictures of one scene, such as ten shots of a postcard, are not independent. The bootstrap therefore draws whole scenes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _PERCENTILES: Final = (2.5, 97.5)
 @final
 @dataclass(frozen=True)
 class Estimate:
-    """A mean and its 95 % interval, which is None where no benchmark has two scenes with a value."""
+    """A mean and its 95 % interval. `low` and `high` are None if no benchmark has two scenes with a value."""
 
     mean: float
     low: float | None
@@ -36,9 +36,9 @@ class Estimate:
 @final
 @dataclass(frozen=True, eq=False)
 class Stratum:
-    """A benchmark's scores: `values` (pictures, series), NaN where there is none, and the scene of each picture.
+    """The scores of a benchmark: `values` (pictures, series), NaN for a missing score, and the scene of each picture.
 
-    `name` seeds the draw, so that a benchmark's intervals do not depend on which others were run beside it.
+    `name` seeds the resampling, so that the intervals of a benchmark do not depend on the other benchmarks of the run.
     """
 
     name: str
@@ -47,47 +47,48 @@ class Stratum:
 
 
 def estimate(strata: Sequence[Stratum]) -> list[Estimate | None]:
-    """For each series its mean over all pictures of all strata, and the interval; None where no value is there.
+    """The mean of each series over all pictures of all strata, with its interval; None for a series without values.
 
-    Percentile bootstrap (Efron and Tibshirani 1993, chapter 13), 95 %, 10,000 resamples with a fixed seed: within
-    each stratum as many scenes are drawn, with replacement, as it has, and each brings all its pictures.
+    Stratified cluster bootstrap with percentile intervals (Efron and Tibshirani 1993, chapter 13): 95 %, 10,000
+    resamples, fixed seed. Each resample draws, with replacement, as many scenes of a stratum as it has; a drawn scene
+    contributes all its pictures.
     """
-    drawn = [_draw(stratum) for stratum in strata]
-    sums, counts = (np.sum([part[i] for part in drawn], axis=0) for i in range(2))
+    resampled = [_resample(stratum) for stratum in strata]
+    sums, counts = (np.sum([part[i] for part in resampled], axis=0) for i in range(2))
     values = np.concatenate([stratum.values for stratum in strata])
-    is_varied = np.any([_scenes(stratum) > 1 for stratum in strata], axis=0)
+    has_interval = np.any([_scenes(stratum) > 1 for stratum in strata], axis=0)
     return [
-        _estimate(values[:, i], sums[:, i], counts[:, i], is_varied=bool(is_varied[i]))
+        _estimate(values[:, i], sums[:, i], counts[:, i], has_interval=bool(has_interval[i]))
         for i in range(values.shape[1])
     ]
 
 
 def _scenes(stratum: Stratum) -> NDArray[np.int64]:
-    """How many scenes have a value, for each series."""
+    """The number of scenes with a value, for each series, (s,)."""
     names = np.array(stratum.scenes)
     return np.array([len(set(names[has])) for has in np.isfinite(stratum.values).T])
 
 
-def _draw(stratum: Stratum) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Sums and numbers of values in each resample, (10,000, series) each."""
+def _resample(stratum: Stratum) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Sums and counts of the values in each resample, (10,000, s) each."""
     names = {scene: i for i, scene in enumerate(sorted(set(stratum.scenes)))}
-    owner = np.array([names[scene] for scene in stratum.scenes], int)
+    scene_index = np.array([names[scene] for scene in stratum.scenes], int)
     sums, counts = (np.zeros((len(names), stratum.values.shape[1])) for _ in range(2))
-    np.add.at(sums, owner, np.nan_to_num(stratum.values))
-    np.add.at(counts, owner, np.isfinite(stratum.values))
+    np.add.at(sums, scene_index, np.nan_to_num(stratum.values))
+    np.add.at(counts, scene_index, np.isfinite(stratum.values))
     rng = np.random.default_rng([SEED, zlib.crc32(stratum.name.encode())])
     times = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), RESAMPLES).astype(float)
     return times @ sums, times @ counts
 
 
 def _estimate(
-    values: NDArray[np.float64], sums: NDArray[np.float64], counts: NDArray[np.float64], *, is_varied: bool
+    values: NDArray[np.float64], sums: NDArray[np.float64], counts: NDArray[np.float64], *, has_interval: bool
 ) -> Estimate | None:
     valid = values[np.isfinite(values)]
     if not valid.size:
         return None
     mean = math.fsum(valid) / valid.size
-    if not is_varied:
+    if not has_interval:
         return Estimate(mean, None, None, valid.size)
     low, high = np.percentile(sums[counts > 0] / counts[counts > 0], _PERCENTILES)
     return Estimate(mean, float(low), float(high), valid.size)
@@ -96,9 +97,9 @@ def _estimate(
 @final
 @dataclass(frozen=True)
 class Difference:
-    """The mean of `method` minus `than` in one metric over the pictures that both have, and its interval.
+    """The mean of `method` minus `than` in one metric over the pictures that both have, with its interval.
 
-    `better` counts the pictures on which the method is better than the other, by the metric's own direction.
+    `better` is the number of pictures on which `method` is better than `than`.
     """
 
     method: str
@@ -111,31 +112,32 @@ class Difference:
 def differences(
     strata: Sequence[Stratum], series: Sequence[tuple[str, str]], directions: Mapping[str, bool]
 ) -> list[Difference]:
-    """Every method against every method named before it, in every metric, paired picture by picture.
+    """Compares each method with every method before it, in every metric, paired by picture.
 
     Args:
-        strata: their series are those of `series`, in the same order, on the same pictures.
-        series: (method, metric) of each series.
+        strata: scores whose columns are `series`.
+        series: (method, metric) of each column.
         directions: metric -> whether higher is better.
     """
-    place = {name: i for i, name in enumerate(series)}
+    column_of = {name: i for i, name in enumerate(series)}
     methods = list(dict.fromkeys(method for method, _ in series))
-    asked = [
+    comparisons = [
         (method, than, metric)
         for i, method in enumerate(methods)
         for than in methods[:i]
         for metric in directions
     ]
-    if not asked:
+    if not comparisons:
         return []
-    mine, others = ([place[row[i], row[2]] for row in asked] for i in range(2))
-    apart = [
-        replace(stratum, values=stratum.values[:, mine] - stratum.values[:, others]) for stratum in strata
+    columns, other_columns = ([column_of[row[i], row[2]] for row in comparisons] for i in range(2))
+    paired = [
+        replace(stratum, values=stratum.values[:, columns] - stratum.values[:, other_columns])
+        for stratum in strata
     ]
-    signs = [1 if directions[metric] else -1 for *_, metric in asked]
-    better = sum((stratum.values * signs > 0).sum(axis=0) for stratum in apart)
+    signs = [1 if directions[metric] else -1 for *_, metric in comparisons]
+    better = sum((stratum.values * signs > 0).sum(axis=0) for stratum in paired)
     return [
-        Difference(*row, answer, int(count))
-        for row, answer, count in zip(asked, estimate(apart), better, strict=True)
-        if answer
+        Difference(*row, estimated, int(count))
+        for row, estimated, count in zip(comparisons, estimate(paired), better, strict=True)
+        if estimated
     ]

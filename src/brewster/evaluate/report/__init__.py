@@ -1,1 +1,1 @@
-"""How results are told: tables, a page to look at, and, apart from them, what others have published."""
+"""Reports of results: tables in Markdown, CSV and LaTeX, an HTML page, and published scores of other methods."""

@@ -1,9 +1,9 @@
-"""The visual report: one HTML page that needs no other file, with every number, every picture and its errors.
+"""The HTML report: one self-contained page with all scores, the pictures and their error maps.
 
-    write_report(json.loads(Path("results.json").read_text()), shown, Path("report.html"))
+    write_report(json.loads(Path("results.json").read_text()), cases, Path("report.html"))
 
-page.html beside this file is the page without its content: look, controls and the flicker comparison. What is
-filled in here works without them. Pictures are taken one by one, so that memory does not grow with their number.
+The template page.html has the style, the controls and the viewer. The content that this module adds is readable without
+JavaScript. Cases are written one at a time, so that memory does not grow with their number.
 """
 
 from __future__ import annotations
@@ -16,19 +16,15 @@ from html import escape
 from pathlib import Path
 from typing import Any, Final
 
-from brewster.evaluate.methods import NOTHING
+from brewster.evaluate.methods import BASELINE
 from brewster.evaluate.report.images import (
-    BRIGHTEST_ERROR,
-    LONGEST,
-    RAMP,
-    CaseImages,
-    answer_tiles,
-    photo_tiles,
+    COLOUR_MAP,
+    MAX_ERROR,
+    MAX_SIDE_PX,
+    CaseTiles,
 )
 from brewster.evaluate.report.tables import is_complete, ranking, remarks
 from brewster.files import arriving
-
-__all__ = ["CaseImages", "write_report"]
 
 Results = Mapping[str, Any]
 
@@ -36,29 +32,30 @@ _TEMPLATE: Final = Path(__file__).with_name("page.html")
 _DASH: Final = "&ndash;"
 
 
-def write_report(results: Results, shown: Iterable[CaseImages], path: Path) -> None:
-    """Writes the page, whole or not at all, in the place of an older one. The same input gives the same bytes.
+def write_report(results: Results, cases: Iterable[CaseTiles], path: Path) -> None:
+    """Writes the page atomically and replaces an older one. The same input gives the same bytes.
 
     Args:
         results: the content of results.json.
-        shown: the cases to show, each taken once and let go before the next; scores come from `results`.
+        cases: the cases to show, in this order. They are consumed one at a time.
+        path: the HTML file.
 
     Raises:
-        TargetError: it cannot be written.
+        TargetError: the file cannot be written.
     """
     with (
         arriving(path) as part,
         part.open("x", encoding="utf-8", errors="replace", newline="\n") as file,
     ):
-        file.writelines(_page(results, shown))
+        file.writelines(_page(results, cases))
 
 
-def _page(results: Results, shown: Iterable[CaseImages]) -> Iterator[str]:
-    """The template's text with each <!--part--> in its place; the data come last, when every case has passed."""
+def _page(results: Results, cases: Iterable[CaseTiles]) -> Iterator[str]:
+    """The template with its <!--part--> comments replaced. "data" is the last part, because it needs the scores of all cases."""
     scores: list[Any] = []
     parts = {
         "results": _results(results),
-        "cases": _cases(results, shown, scores),
+        "cases": _cases(results, cases, scores),
         "data": _data(results, scores),
     }
     for place, text in enumerate(re.split(r"<!--(\w+)-->", _TEMPLATE.read_text("utf-8"))):
@@ -69,7 +66,7 @@ def _page(results: Results, shown: Iterable[CaseImages]) -> Iterator[str]:
 
 
 def _data(results: Results, scores: list[Any]) -> Iterator[str]:
-    """What the page sorts by, as JSON that cannot end its own script element."""
+    """The data that the page sorts by, as JSON. "<" is escaped, so that a name cannot close the script element."""
     data = {
         "metrics": {
             name: {"title": metric["title"], "unit": metric["unit"], "higher": metric["higher_is_better"]}
@@ -78,7 +75,7 @@ def _data(results: Results, scores: list[Any]) -> Iterator[str]:
         },
         "methods": [*results["methods"]],
         "benchmarks": {name: benchmark["title"] for name, benchmark in results["benchmarks"].items()},
-        "nothing": NOTHING,
+        "baseline": BASELINE,
         "scores": scores,
     }
     yield json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
@@ -89,46 +86,46 @@ def _data(results: Results, scores: list[Any]) -> Iterator[str]:
 
 def _results(results: Results) -> Iterator[str]:
     pictures, methods = results["pictures"], results["methods"]
-    benchmarks, protocol = results["benchmarks"], results["protocol"]
+    benchmarks, config = results["benchmarks"], results["protocol"]
     yield (
         f"<p class=lede>{_count(len(methods), 'method')} on {_count(len(pictures), 'picture')} of "
-        f"{_count(len(benchmarks), 'benchmark')}: size {escape(str(protocol['size']))}, quality "
-        f"{escape(str(protocol['quality']))}, brewster {escape(results['brewster'])}.</p>\n"
+        f"{_count(len(benchmarks), 'benchmark')}: size {escape(str(config['size']))}, quality "
+        f"{escape(str(config['quality']))}, brewster {escape(results['brewster'])}.</p>\n"
     )
     yield from _problems(results)
     yield _means(results)
     yield _differences(results)
-    yield from _how(results)
+    yield from _method_notes(results)
 
 
 def _problems(results: Results) -> Iterator[str]:
-    """What did not go as it should, said before any number."""
+    """Failures, refused files and remarks."""
     pictures, benchmarks = results["pictures"], results["benchmarks"].values()
     failed = [
         (f"{one['benchmark']}/{one['name']}", *error) for one in pictures for error in one["errors"].items()
     ]
     counts = Counter(method for _, method, _ in failed)
-    said = ", ".join(
+    counted = ", ".join(
         f"{method} on {count} of {_count(len(pictures), 'picture')}" for method, count in counts.items()
     )
-    yield _noted(f"Failed: {said}", [f"{name}, {method}: {error}" for name, method, error in failed])
-    refused, said_of_sets = (
+    yield _note(f"Failed: {counted}", [f"{name}, {method}: {error}" for name, method, error in failed])
+    refused, benchmark_remarks = (
         [f"{benchmark['title']}: {point}" for benchmark in benchmarks for point in benchmark[kind]]
         for kind in ("refused", "remarks")
     )
-    points = said_of_sets + remarks(results)
-    yield _noted(_count(len(refused), "file refused"), refused)
-    yield _noted(_count(len(points), "remark"), points)
+    points = benchmark_remarks + remarks(results)
+    yield _note(_count(len(refused), "file refused"), refused)
+    yield _note(_count(len(points), "remark"), points)
     if not failed:
         yield "<p>No method failed on any picture.</p>\n"
 
 
-def _noted(said: str, points: Sequence[str]) -> str:
-    """A few points stand in the open, many can be opened, none is no note."""
+def _note(title: str, points: Sequence[str]) -> str:
+    """A collapsible list, open if it has at most five points; "" if it has none."""
     if not points:
         return ""
     is_open = " open" if len(points) <= 5 else ""
-    return f"<details class=note{is_open}><summary>{escape(said)}</summary>{_list(points)}</details>\n"
+    return f"<details class=note{is_open}><summary>{escape(title)}</summary>{_list(points)}</details>\n"
 
 
 def _list(points: Iterable[str]) -> str:
@@ -136,13 +133,13 @@ def _list(points: Iterable[str]) -> str:
 
 
 def _count(number: int, noun: str) -> str:
-    """A number and its noun, whose first word takes the plural."""
+    """A number with its noun; the first word of the noun gets the plural."""
     first, *rest = noun.split()
     return " ".join([f"{number:,}", first if number == 1 else f"{first}s", *rest])
 
 
 def _used(results: Results) -> dict[str, Any]:
-    """The metrics that have a value anywhere."""
+    """The metrics that have a value in any table."""
     rows = [row for table in results["tables"].values() for row in table.values()]
     return {name: metric for name, metric in results["metrics"].items() if any(row.get(name) for row in rows)}
 
@@ -219,23 +216,25 @@ def _number(value: float | None, about: Results, sign: str = "") -> str:
 
 
 def _differences(results: Results) -> str:
-    """Against the unprocessed input in the open; between methods, where there are several, to be opened."""
-    to_nothing, between = (_pairs(results, is_nothing) for is_nothing in (True, False))
-    said = "Mean change, its 95 % interval, and on how many pictures it is for the better"
-    first = _table(f"Against the unprocessed input. {said}", _used(results), to_nothing) if to_nothing else ""
+    """Differences to the unprocessed input, then, collapsed, differences between methods."""
+    to_baseline, between = (_pairs(results, is_baseline) for is_baseline in (True, False))
+    legend = "Mean change, its 95 % interval, and the number of pictures with a better score"
+    first = (
+        _table(f"Against the unprocessed input. {legend}", _used(results), to_baseline) if to_baseline else ""
+    )
     if not between:
         return first
-    second = _table(f"Between methods. {said}", _used(results), between)
+    second = _table(f"Between methods. {legend}", _used(results), between)
     return f"{first}<details><summary>Differences between methods</summary>{second}</details>\n"
 
 
-def _pairs(results: Results, is_nothing: bool) -> list[str]:
+def _pairs(results: Results, is_baseline: bool) -> list[str]:
     metrics, bodies = _used(results), []
     for name, differences in results["differences"].items():
         rows: dict[str, dict[str, Results]] = {}
         for row in differences:
-            if (row["than"] == NOTHING) == is_nothing:
-                pair = row["method"] if is_nothing else f"{row['method']} against {row['than']}"
+            if (row["than"] == BASELINE) == is_baseline:
+                pair = row["method"] if is_baseline else f"{row['method']} against {row['than']}"
                 rows.setdefault(pair, {})[row["metric"]] = row
         cells = (
             (pair, [_change(row.get(metric), metrics[metric]) for metric in metrics])
@@ -249,10 +248,14 @@ def _pairs(results: Results, is_nothing: bool) -> list[str]:
 def _change(row: Results | None, about: Results) -> str:
     if not row:
         return f"<td>{_DASH}</td>"
-    is_open = row["low"] is None or row["low"] <= 0 <= row["high"]
+    is_inconclusive = row["low"] is None or row["low"] <= 0 <= row["high"]
     is_better = (row["mean"] > 0) == about["higher_is_better"]
     verdict, mark = (
-        ("open", "") if is_open else ("better", "&#9650; ") if is_better else ("worse", "&#9660; ")
+        ("inconclusive", "")
+        if is_inconclusive
+        else ("better", "&#9650; ")
+        if is_better
+        else ("worse", "&#9660; ")
     )
     return (
         f"<td class={verdict}>{mark}<span class=hidden>{verdict}: </span><b>{_number(row['mean'], about, '+')}</b>"
@@ -260,7 +263,7 @@ def _change(row: Results | None, about: Results) -> str:
     )
 
 
-def _how(results: Results) -> Iterator[str]:
+def _method_notes(results: Results) -> Iterator[str]:
     yield f"<details><summary>How it was measured</summary>{_list(results['protocol']['choices'])}<dl>"
     for name, metric in results["metrics"].items():
         better = "higher is better" if metric["higher_is_better"] else "lower is better"
@@ -275,34 +278,34 @@ def _how(results: Results) -> Iterator[str]:
 # --- pictures
 
 
-def _cases(results: Results, shown: Iterable[CaseImages], scores: list[Any]) -> Iterator[str]:
+def _cases(results: Results, cases: Iterable[CaseTiles], scores: list[Any]) -> Iterator[str]:
     known = {(picture["benchmark"], picture["name"]): picture for picture in results["pictures"]}
-    steps = (f"<i style='background:rgb({red},{green},{blue})'></i>" for red, green, blue in RAMP)
+    steps = (f"<i style='background:rgb({red},{green},{blue})'></i>" for red, green, blue in COLOUR_MAP)
     yield (
-        f"<p class=legend>Errors, of 255: 0 <span>{''.join(steps)}</span> {BRIGHTEST_ERROR} and more. "
-        f"Pictures are embedded with at most {LONGEST} px on the longer side.</p>\n"
+        f"<p class=legend>Errors, of 255: 0 <span>{''.join(steps)}</span> {MAX_ERROR} and more. "
+        f"Pictures are embedded with at most {MAX_SIDE_PX} px on the longer side.</p>\n"
     )
-    for case in shown:
+    for case in cases:
         picture = known.get((case.benchmark, case.name), {"scores": {}, "errors": {}})
         scores.append(picture["scores"])
         yield _case(results, case, picture)
     if len(scores) < len(known):
         yield (
             f"<p>{len(scores):,} of {_count(len(known), 'picture')} are on this page: of each benchmark those that the "
-            "first method that does something failed on, then its worst by the first metric.</p>\n"
+            "first method after the baseline failed on, then its worst by the first metric.</p>\n"
         )
 
 
-def _case(results: Results, case: CaseImages, picture: Results) -> str:
+def _case(results: Results, case: CaseTiles, picture: Results) -> str:
     facts = [
         escape(_title(results, case.benchmark)),
-        f"{case.photo.shape[1]} &times; {case.photo.shape[0]} px",
+        f"{case.size[0]} &times; {case.size[1]} px",
     ]
     if (share := picture.get("region_share")) is not None:
         facts.append(f"region {share:.0%}")
-    others = [name for name in results["methods"] if name != NOTHING]
-    rows = [_row(results, picture, NOTHING, photo_tiles(case))]
-    rows += [_row(results, picture, method, answer_tiles(case, method)) for method in others]
+    others = [name for name in results["methods"] if name != BASELINE]
+    rows = [_row(results, picture, BASELINE, case.photo)]
+    rows += [_row(results, picture, method, case.methods.get(method, "")) for method in others]
     return (
         f'<article data-benchmark="{escape(case.benchmark)}" data-name="{escape(case.name)}">\n'
         f"<h3>{escape(case.name)}</h3><p>{' &middot; '.join(facts)} <span class=key></span></p>\n{''.join(rows)}</article>\n"
@@ -312,7 +315,7 @@ def _case(results: Results, case: CaseImages, picture: Results) -> str:
 def _row(results: Results, picture: Results, method: str, tiles: str) -> str:
     error = picture["errors"].get(method)
     failure = f"<p class=failure>Failed: {escape(error)}</p>" if error else ""
-    title = "photo, input (unprocessed)" if method == NOTHING else method
+    title = "photo, input (unprocessed)" if method == BASELINE else method
     return (
         f"<section><div><h4>{escape(title)}</h4>{failure}{_scores(results, picture['scores'], method)}</div>"
         f"<div class=tiles>{tiles}</div></section>\n"
@@ -321,13 +324,13 @@ def _row(results: Results, picture: Results, method: str, tiles: str) -> str:
 
 def _scores(results: Results, scores: Results, method: str) -> str:
     """A method's scores on one picture, and their change to the unprocessed input."""
-    mine, nothing = scores.get(method, {}), scores.get(NOTHING, {})
+    mine, baseline = scores.get(method, {}), scores.get(BASELINE, {})
     lines = []
     for name, about in results["metrics"].items():
         if all(row.get(name) is None for row in scores.values()) or method not in scores:
             continue
-        value, before = mine.get(name), nothing.get(name)
-        has_change = method != NOTHING and value is not None and before is not None and value != before
+        value, before = mine.get(name), baseline.get(name)
+        has_change = method != BASELINE and value is not None and before is not None and value != before
         change = _gain(value - before, about) if has_change else ""
         lines.append(
             f"<tr><th scope=row>{escape(about['title'])}</th><td>{_number(value, about)}</td><td>{change}</td></tr>"

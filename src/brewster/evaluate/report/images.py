@@ -1,4 +1,4 @@
-"""A case in pictures, for the report: one reduction for all, errors in colour, the region as a tint to lay over."""
+"""The pictures of a case in the HTML report: downscaled layers, coloured error maps, and the region as an overlay."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from brewster.photo import FileInfo, Photo
 Pixels = NDArray[np.uint8]
 Float32 = NDArray[np.float32]
 
-LONGEST: Final = 480
-"""The longer side of an embedded picture in px, at most."""
+MAX_SIDE_PX: Final = 480
+"""The maximum of the longer side of an embedded picture, in px."""
 
-BRIGHTEST_ERROR: Final = 96
-"""The error, of 255, from which on the brightest colour is given."""
+MAX_ERROR: Final = 96
+"""The error, of 255, that gets the last colour of the map; larger errors get it too."""
 
 _INFERNO: Final = (
     0x000004,
@@ -38,17 +38,17 @@ _INFERNO: Final = (
 _STEPS: Final = 16
 
 
-def _ramp() -> Pixels:
+def _colour_map() -> Pixels:
     anchors = np.array([[colour >> shift & 255 for shift in (16, 8, 0)] for colour in _INFERNO])
     at = np.linspace(0, 1, _STEPS)
     channels = [np.interp(at, np.linspace(0, 1, len(anchors)), anchors[:, channel]) for channel in range(3)]
-    ramp: Pixels = np.rint(np.stack(channels, axis=1)).astype(np.uint8)
-    return ramp
+    colours: Pixels = np.rint(np.stack(channels, axis=1)).astype(np.uint8)
+    return colours
 
 
-RAMP: Final = _ramp()
-"""Colours of errors (16, 3), sRGB: matplotlib's "inferno" (CC0), whose lightness grows evenly, so that grey prints
-tell as much. Each stands for a sixteenth of BRIGHTEST_ERROR: few enough for small files without loss."""
+COLOUR_MAP: Final = _colour_map()
+"""Colours of error maps, sRGB uint8 (16, 3): matplotlib's "inferno" (CC0). Its lightness grows evenly, so that it can be
+read in a grey print. Each colour covers a sixteenth of MAX_ERROR. With 16 colours, lossless files are small."""
 
 _LINEAR: Final = srgb.to_linear(np.linspace(0, 1, 256, dtype=np.float32))
 _TINT: Final = (255, 40, 150)
@@ -58,10 +58,10 @@ _TINT_ALPHA: Final = 115
 @final
 @dataclass(frozen=True, eq=False)
 class CaseImages:
-    """A case as the page shows it: uint8 sRGB (H, W, 3), region bool (H, W).
+    """The pictures of a case at full size: uint8 sRGB (H, W, 3); region bool (H, W).
 
-    `answers` are methods' transmissions, without the baseline; `reflections` their reflection layers, where there
-    are any.
+    `predictions` are the transmissions by method, without the baseline; `reflections` the reflection layers by method,
+    if the method predicts them.
     """
 
     benchmark: str
@@ -69,13 +69,33 @@ class CaseImages:
     photo: Pixels
     truth: Pixels
     region: NDArray[np.bool_]
-    answers: Mapping[str, Pixels]
+    predictions: Mapping[str, Pixels]
     reflections: Mapping[str, Pixels] = field(default_factory=dict)
     reflection_truth: Pixels | None = None
 
 
+@final
+@dataclass(frozen=True)
+class CaseTiles:
+    """The pictures of a case as HTML with embedded files. `size` is that of the photo, (width, height) in px."""
+
+    benchmark: str
+    name: str
+    size: tuple[int, int]
+    photo: str
+    methods: Mapping[str, str]
+
+
+def to_tiles(case: CaseImages) -> CaseTiles:
+    """Downscales and encodes all pictures of a case."""
+    height, width = case.photo.shape[:2]
+    names = dict.fromkeys((*case.predictions, *case.reflections))
+    methods = {name: method_tiles(case, name) for name in names}
+    return CaseTiles(case.benchmark, case.name, (width, height), photo_tiles(case), methods)
+
+
 def photo_tiles(case: CaseImages) -> str:
-    """What is known of a case, as HTML: photo, its error, truth, region, and the true reflection where there is one."""
+    """HTML of the photo, its error, the ground truth, the region and, if there is one, the true reflection."""
     tiles = [
         _tile(case, "picture", "photo", webp(case.photo)),
         _tile(case, "error", "error of the photo", lossless(error_map(case.photo, case.truth))),
@@ -87,61 +107,61 @@ def photo_tiles(case: CaseImages) -> str:
     return "".join(tiles)
 
 
-def answer_tiles(case: CaseImages, method: str) -> str:
-    """What a method made of a case, as HTML: its transmission, the error of that, its reflection; empty where it failed."""
+def method_tiles(case: CaseImages, method: str) -> str:
+    """HTML of a method's transmission, its error and its reflection. Empty if the method failed."""
     tiles = []
-    if method in case.answers:
-        answer = case.answers[method]
-        tiles.append(_tile(case, "picture", method, webp(answer)))
-        tiles.append(_tile(case, "error", f"error of {method}", lossless(error_map(answer, case.truth))))
+    if method in case.predictions:
+        prediction = case.predictions[method]
+        tiles.append(_tile(case, "picture", method, webp(prediction)))
+        tiles.append(_tile(case, "error", f"error of {method}", lossless(error_map(prediction, case.truth))))
     if method in case.reflections:
         tiles.append(_tile(case, "reflection", f"reflection by {method}", webp(case.reflections[method])))
     return "".join(tiles)
 
 
-def _tile(case: CaseImages, kind: str, said: str, data: bytes) -> str:
-    """A picture that can be opened; arrow keys step through those of one kind."""
+def _tile(case: CaseImages, kind: str, caption: str, data: bytes) -> str:
+    """A picture as a button that opens it. In the viewer, arrow keys step through pictures of one kind."""
     width, height = size_of(case.photo)
     return (
         f"<figure><button type=button data-kind={kind}><img width={width} height={height} loading=lazy "
-        f'alt="{escape(said)}, {escape(case.name)}" src="data:image/webp;base64,{base64.b64encode(data).decode()}">'
-        f"</button><figcaption>{escape(said)}</figcaption></figure>"
+        f'alt="{escape(caption)}, {escape(case.name)}" src="data:image/webp;base64,{base64.b64encode(data).decode()}">'
+        f"</button><figcaption>{escape(caption)}</figcaption></figure>"
     )
 
 
 def size_of(picture: NDArray[Any]) -> tuple[int, int]:
-    """Width and height of an embedded picture."""
+    """(width, height) of the embedded version of a picture."""
     height, width = picture.shape[:2]
-    scale = min(1, LONGEST / max(height, width))
+    scale = min(1, MAX_SIDE_PX / max(height, width))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
 def webp(picture: Pixels) -> bytes:
-    """The file of a picture, sRGB (H, W, 3), reduced to `size_of` it by area means in linear light."""
+    """A picture as WebP, sRGB (H, W, 3), downscaled to `size_of` it by area means in linear light."""
     if size_of(picture) != picture.shape[1::-1]:
         encoded = srgb.to_encoded(_area_means(_LINEAR[picture]))
         picture = np.rint(encoded * 255).clip(0, 255).astype(np.uint8)
     return Photo.from_array(picture, encoding="srgb").encode("webp")
 
 
-def error_map(answer: Pixels, truth: Pixels) -> Pixels:
-    """Where an answer (H, W, 3) is wrong: uint8 (h, w, 3) in the colours of the RAMP, reduced like the picture.
+def error_map(prediction: Pixels, truth: Pixels) -> Pixels:
+    """The error of a prediction (H, W, 3) in colours of COLOUR_MAP, uint8 (h, w, 3), downscaled like the picture.
 
-    The absolute difference of the largest channel, averaged over the area of each new pixel, then coloured.
+    The error is the largest absolute difference of the channels, averaged over the area of each new pixel.
     """
-    errors = np.abs(answer.astype(np.int16) - truth).max(axis=2)
+    errors = np.abs(prediction.astype(np.int16) - truth).max(axis=2)
     means = _area_means(errors.astype(np.float32)[..., None])[..., 0]
-    colours: Pixels = RAMP[(means / BRIGHTEST_ERROR * _STEPS).astype(int).clip(0, _STEPS - 1)]
+    colours: Pixels = COLOUR_MAP[(means / MAX_ERROR * _STEPS).astype(int).clip(0, _STEPS - 1)]
     return colours
 
 
 def lossless(picture: Pixels, alpha: Pixels | None = None) -> bytes:
-    """The file of a picture (H, W, 3) as it is, with its `alpha` (H, W)."""
+    """A picture (H, W, 3) with its `alpha` (H, W) as lossless WebP."""
     return Photo(picture, alpha, FileInfo(container="webp", lossless=True)).encode()
 
 
 def overlay(region: NDArray[np.bool_]) -> bytes:
-    """A tint where most of a pixel is in the region, clear elsewhere: laid over the photo by the page."""
+    """A WebP that is tinted where at least half of a pixel is in the region, else transparent. The page draws it over the photo."""
     inside = _area_means(region.astype(np.float32)[..., None])[..., 0] >= 0.5
     alpha = np.where(inside, np.uint8(_TINT_ALPHA), np.uint8(0))
     tint = np.broadcast_to(np.array(_TINT, np.uint8), (*alpha.shape, 3)).copy()
@@ -149,17 +169,17 @@ def overlay(region: NDArray[np.bool_]) -> bytes:
 
 
 def _area_means(values: Float32) -> Float32:
-    """(H, W, C) numbers at the size of embedded pictures: the mean over each new pixel's area.
+    """Downscales (H, W, C) to the size of embedded pictures: the mean over the area of each new pixel.
 
-    What Photo.small does row by row, to save memory, is done here at once, to save time.
+    Photo.small computes the same row by row to save memory; this is faster.
     """
     width, height = size_of(values)
-    rows = np.tensordot(_shares(values.shape[0], height), values, 1)
-    return np.tensordot(_shares(values.shape[1], width), rows, (1, 1)).transpose(1, 0, 2)
+    rows = np.tensordot(_area_weights(values.shape[0], height), values, 1)
+    return np.tensordot(_area_weights(values.shape[1], width), rows, (1, 1)).transpose(1, 0, 2)
 
 
-def _shares(old: int, new: int) -> Float32:
-    """The share of each of `old` pixels in the mean that is each of `new` ones, (new, old)."""
+def _area_weights(old: int, new: int) -> Float32:
+    """The weights of `old` pixels in the means of `new` pixels along one axis, (new, old). Each row sums to 1."""
     edges, pixels = np.linspace(0, old, new + 1), np.arange(old)
     overlap = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
     return (overlap.clip(0) * new / old).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Results as LaTeX, in the layout of the paper's Table 1."""
+"""Results as a LaTeX table in the layout of the paper's Table 1."""
 
 from __future__ import annotations
 
@@ -7,31 +7,34 @@ from typing import Any, Final
 
 from brewster.evaluate.report.tables import MAIN, is_complete, ranking
 from brewster.evaluate.results import AVERAGE, Results
-from brewster.latex import escaped
 
 _SIR2: Final = ("postcard", "solidobject", "wildscene")
 _MARKS: Final = ("\\textbf", "\\underline", "\\uuline")
-"""How the paper marks the first, the second and the third."""
+"""The paper's marks of the first, second and third place."""
 _DAGGER: Final = "$^\\dagger$"
+_ESCAPES: Final = str.maketrans(
+    {letter: f"\\{letter}" for letter in "&%$#_{}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\^{}"}
+)
 
 
 def to_latex(results: Results) -> str:
-    """The layout of the paper's Table 1: a row a method, three metrics a set, SIR2 under one head, the average last.
+    """One row per method, three metrics per set, SIR2's subsets under one heading, the average last.
 
-    The best three are marked as there, but never the last of a column; a dagger marks means over fewer pictures than
-    others have. Needs the packages multirow and ulem.
+    The best three values of a column are marked as in the paper, but never the last one. A dagger marks means over fewer
+    pictures than those of other methods. The table needs the packages multirow and ulem.
     """
     metrics = [name for name in MAIN if name in results["metrics"]]
     keys = _of_the_paper(results)
     if not metrics or not keys:
-        return "% none of PSNR, SSIM and LPIPS was measured\n"
+        return "% PSNR, SSIM and LPIPS were not measured\n"
     columns = "|".join("c" * len(metrics) for _ in keys)
     titles = [_title(results, name) for name in metrics]
     rows = [
-        _line([escaped(method), *(cell for key in keys for cell in _cells(results, key, method, metrics))])
+        _line([_escape(method), *(cell for key in keys for cell in _cells(results, key, method, metrics))])
         for method in results["methods"]
     ]
-    note = f"{_DAGGER} over fewer pictures than others, and not to be compared with them"
+    note = f"{_DAGGER} over fewer pictures than others; do not compare"
     is_noted = any(_DAGGER in row for row in rows)
     return "\n".join([
         "% brewster evaluate; needs \\usepackage{multirow} and \\usepackage[normalem]{ulem}",
@@ -50,7 +53,7 @@ def to_latex(results: Results) -> str:
 
 
 def _of_the_paper(results: Results) -> list[str]:
-    """The selections that the table has: of a benchmark the paper's draw rather than all, SIR2 together, average last."""
+    """The selections of the table: a benchmark's draw instead of the whole, SIR2's subsets side by side, the average last."""
     keys = [
         key for key in results["selections"] if f"{key}:paper" not in results["selections"] and key != AVERAGE
     ]
@@ -59,13 +62,13 @@ def _of_the_paper(results: Results) -> list[str]:
 
 
 def _heads(results: Results, keys: Sequence[str], width: int) -> list[str]:
-    """The names of the sets, SIR2's below a common one."""
+    """The header rows with the names of the sets. SIR2's subsets get a common heading."""
     sir2 = [key for key in keys if key.partition(":")[0] in _SIR2]
 
     def head(key: str, rows: int) -> str:
         selection = results["selections"][key]
         name = selection["title"].partition(",")[0].removeprefix("SIR2 ")
-        text = f"{escaped(name)} ({selection['pictures']})"
+        text = f"{_escape(name)} ({selection['pictures']})"
         return _over(width, _tall(text) if rows > 1 else text, is_last=key == keys[-1])
 
     if len(sir2) < 2:
@@ -102,7 +105,7 @@ def _title(results: Results, metric: str) -> str:
 
 
 def _cells(results: Results, key: str, method: str, metrics: Iterable[str]) -> Iterator[str]:
-    """Means, with one digit more in the average, as in the paper."""
+    """The means, with one more digit in the average, as in the paper."""
     table = results["tables"][key]
     for metric in metrics:
         about: dict[str, Any] = results["metrics"][metric]
@@ -116,3 +119,8 @@ def _cells(results: Results, key: str, method: str, metrics: Iterable[str]) -> I
             continue
         marks = dict(zip(ranking(table, metric, about)[:-1], _MARKS, strict=False))
         yield f"{marks[text]}{{{text}}}" if text in marks else text
+
+
+def _escape(text: str) -> str:
+    """The text with LaTeX's special characters escaped."""
+    return text.translate(_ESCAPES)

@@ -1,4 +1,4 @@
-"""What others have published, kept apart from what is measured here: published.toml as rows and as Markdown.
+"""Published scores of other methods (published.toml), as rows and as Markdown. They are never mixed with measured scores.
 
 for row in read_published():
     print(row.method, row.scores["real20"]["psnr"], row.protocol)
@@ -23,10 +23,10 @@ _Name = TypeVar("_Name")
 @final
 @dataclass(frozen=True)
 class PublishedScores:
-    """A method's figures as one source printed them.
+    """The scores of a method as one source printed them.
 
-    `scores` is set -> metric -> value: PSNR in dB, SSIM and LPIPS without a unit. A value prints as it was printed.
-    `protocol` says in words which pictures, how many and at what size, and what is unknown of that.
+    `scores` is set -> metric -> value: PSNR in dB, SSIM and LPIPS without a unit; str(value) has the printed digits.
+    `protocol` describes the pictures, their number and size, and what is unknown.
     """
 
     method: str
@@ -37,7 +37,7 @@ class PublishedScores:
 
 
 class _PrintedNumber(float):
-    """A number that remembers how it was printed: 26.60 is not 26.6."""
+    """A number that keeps its printed digits: 26.60, not 26.6."""
 
     def __new__(cls, printed: str) -> _PrintedNumber:
         figure = super().__new__(cls, printed)
@@ -51,7 +51,7 @@ class _PrintedNumber(float):
 
 
 def read_published() -> list[PublishedScores]:
-    """Every row of published.toml, in its order."""
+    """The rows of published.toml, in file order."""
     tables = tomllib.loads(_FILE.read_text("utf-8"), parse_float=_PrintedNumber)["table"]
     return [
         PublishedScores(method, table["source"], table["read_in"], table["protocol"].strip(), scores)
@@ -61,9 +61,9 @@ def read_published() -> list[PublishedScores]:
 
 
 def to_markdown(published: Sequence[PublishedScores]) -> str:
-    """A section of Markdown: a table for each protocol, which stands above it with its sources.
+    """A Markdown section with one table per protocol, below the protocol and its sources.
 
-    Rows of one protocol belong together only if they follow each other.
+    Only consecutive rows of one protocol share a table.
     """
     groups = groupby(published, key=lambda row: row.protocol)
     parts = [_table(protocol, list(rows)) for protocol, rows in groups]
@@ -102,5 +102,5 @@ def _line(cells: Iterable[str]) -> str:
 
 
 def _names(names: Iterable[_Name]) -> list[_Name]:
-    """Each once, in the order of their first mention."""
+    """The distinct names, in the order of their first occurrence."""
     return list(dict.fromkeys(names))

@@ -1,4 +1,4 @@
-"""Results as tables: Markdown to read, CSV to go on with."""
+"""Results as tables in Markdown and CSV."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ from typing import Any, Final
 from brewster.evaluate.results import Results
 
 MAIN: Final = ("psnr", "ssim", "lpips")
-"""The metrics of an overview."""
+"""The metrics of the overview table."""
 
 _ARROWS: Final = {True: "↑", False: "↓"}
-_UNFAIR: Final = "\n\nA mean over fewer pictures than the others is not to be compared with them; differences are over common pictures."
+_UNEQUAL_COUNTS: Final = (
+    "\n\nDo not compare a mean over fewer pictures with the others; differences are over common pictures."
+)
 _MINUS: Final = "\N{MINUS SIGN}"
 
 
@@ -21,25 +23,25 @@ _MINUS: Final = "\N{MINUS SIGN}"
 
 
 def to_markdown(results: Results) -> str:
-    """All tables: an overview, one for each benchmark with intervals and differences, what was left out, the choices."""
+    """All tables: an overview, details of each benchmark with intervals and differences, notes, and the settings."""
     parts = [
         _overview(results),
         *(_details(results, key) for key in results["selections"]),
-        _told(results),
+        _notes(results),
         _choices(results),
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def overview(results: Results) -> str:
-    """The tables exclusive, as a terminal shows them."""
+    """The tables without notes and settings, for the terminal."""
     return (
         "\n\n".join([_overview(results), *(_details(results, key) for key in results["selections"])]) + "\n"
     )
 
 
 def _overview(results: Results) -> str:
-    """A row a method, a column a selection, the main metrics in each cell."""
+    """One row per method, one column per selection, the main metrics in each cell."""
     metrics = [name for name in MAIN if name in results["metrics"]]
     if not metrics:
         return ""
@@ -49,11 +51,11 @@ def _overview(results: Results) -> str:
         [method, *(_cell(results, key, method, metrics) for key in results["selections"])]
         for method in results["methods"]
     ]
-    return f"{titles}\n\n{_grid(rows)}{_UNFAIR if _some_failed(results, metrics) else ''}"
+    return f"{titles}\n\n{_grid(rows)}{_UNEQUAL_COUNTS if _has_unequal_counts(results, metrics) else ''}"
 
 
-def _some_failed(results: Results, metrics: Iterable[str]) -> bool:
-    """Whether a method has means over fewer pictures than another."""
+def _has_unequal_counts(results: Results, metrics: Iterable[str]) -> bool:
+    """Whether a method has a mean over fewer pictures than another."""
     return any(
         metric in row and not is_complete(table, method, metric)
         for table in results["tables"].values()
@@ -72,7 +74,7 @@ def _cell(results: Results, key: str, method: str, metrics: Iterable[str]) -> st
 
 
 def _details(results: Results, key: str) -> str:
-    """A selection: a row a metric; means with intervals, then differences to the unprocessed input and between the others."""
+    """A table of one selection: one row per metric, with the means of the methods and the differences between them."""
     selection, table = results["selections"][key], results["tables"][key]
     methods, apart = list(results["methods"]), results["differences"][key]
     pairs = list(dict.fromkeys((row["method"], row["than"]) for row in apart))
@@ -85,7 +87,11 @@ def _details(results: Results, key: str) -> str:
             _mean(results, metric, table[method].get(metric), selection["pictures"]) for method in methods
         ]
         rows.append(
-            [_heading(results, metric), *means, *(_apart(results, metric, found.get(pair)) for pair in pairs)]
+            [
+                _heading(results, metric),
+                *means,
+                *(_difference_cell(results, metric, found.get(pair)) for pair in pairs),
+            ]
         )
     return f"### {selection['title']} ({selection['pictures']} pictures)\n\n{_grid(rows)}"
 
@@ -97,7 +103,7 @@ def _mean(results: Results, metric: str, entry: Mapping[str, Any] | None, pictur
     return f"{_number(results, metric, entry['mean'])}{_interval(results, metric, entry)}{some}"
 
 
-def _apart(results: Results, metric: str, row: Mapping[str, Any] | None) -> str:
+def _difference_cell(results: Results, metric: str, row: Mapping[str, Any] | None) -> str:
     if row is None:
         return "-"
     mean, interval = (
@@ -114,26 +120,26 @@ def _interval(results: Results, metric: str, entry: Mapping[str, Any], *, sign: 
     return f" ({low} to {high})"
 
 
-def _told(results: Results) -> str:
-    """What should be said aloud: remarks, files left out, failures."""
+def _notes(results: Results) -> str:
+    """Remarks, refused files, metrics without a score, and failures."""
     lines = [
         f"- {part['title']}: {text}"
         for part in results["benchmarks"].values()
         for text in (*part["remarks"], *(f"left out: {reason}" for reason in part["refused"]))
     ]
     lines += [f"- {remark}" for remark in remarks(results)]
-    lines += [f"- {name}: no picture has the truth that it needs" for name in results["unmeasured"]]
+    lines += [f"- {name}: no picture has the ground truth that it needs" for name in results["unmeasured"]]
     lines += [f"- {error}" for error in failures(results)]
-    return "\n".join(["### Said aloud", "", *lines]) if lines else ""
+    return "\n".join(["### Notes", "", *lines]) if lines else ""
 
 
 def remarks(results: Mapping[str, Any]) -> list[str]:
-    """What is odd about methods."""
+    """The remarks on methods."""
     return [f"{name}: {about['remark']}" for name, about in results["methods"].items() if "remark" in about]
 
 
 def failures(results: Results) -> list[str]:
-    """What methods failed on, each said once."""
+    """The errors of methods, without repetitions."""
     errors = (error for picture in results["pictures"] for error in picture["errors"].values())
     return list(dict.fromkeys(errors))
 
@@ -165,10 +171,9 @@ def _number(results: Results, metric: str, value: float, *, sign: str = "") -> s
 
 
 def ranking(table: Mapping[str, Any], metric: str, about: Mapping[str, Any]) -> list[str]:
-    """The means as they are printed, the best first, so that what prints alike is marked alike; none twice.
+    """The means as printed, the best first, without repetitions; equal printed means get the same mark.
 
-    A method that was judged on fewer pictures than others, since it failed on some, is not in the running, and a
-    method exclusive wins nothing.
+    Methods with a score on fewer pictures than others are left out. With fewer than two methods the list is empty.
     """
     means = [row[metric]["mean"] for method, row in table.items() if is_complete(table, method, metric)]
     if len(means) < 2:
@@ -178,7 +183,7 @@ def ranking(table: Mapping[str, Any], metric: str, about: Mapping[str, Any]) -> 
 
 
 def is_complete(table: Mapping[str, Any], method: str, metric: str) -> bool:
-    """Whether a method is judged on as many pictures in this metric as any other."""
+    """Whether no other method has a score in this metric on more pictures."""
     counts = {name: row[metric]["count"] for name, row in table.items() if row.get(metric)}
     return counts.get(method) == max(counts.values(), default=0)
 
@@ -187,7 +192,7 @@ def is_complete(table: Mapping[str, Any], method: str, metric: str) -> bool:
 
 
 def to_csv(results: Results) -> str:
-    """A line for each set, method and metric, and for each difference (`than` names the other method)."""
+    """One line for each set, method and metric, and for each difference; `than` is the other method."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["set", "method", "than", "metric", "unit", "mean", "low", "high", "better", "count"])

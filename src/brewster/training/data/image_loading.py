@@ -97,7 +97,7 @@ def _trios(folder: Path) -> list[PictureGroup]:
             "each photo needs one transmission of its name, and no transmission is left over",
             "add or remove files until the names match",
         )
-    return sorted(found.trios, key=lambda trio: trio.photo)
+    return sorted(found.groups, key=lambda trio: trio.photo)
 
 
 def _read_pair(trio: PictureGroup) -> tuple[Tensor, Tensor]:

@@ -192,7 +192,7 @@ def open_samples(recipe: LoraRecipe) -> SampleSequence:
 
 def _pairs(folder: Path, recipe: LoraRecipe) -> list[TrainingSample]:
     pictures = read_pairs([folder])
-    trios = sorted(read_folders(folder).trios, key=lambda trio: trio.photo)
+    trios = sorted(read_folders(folder).groups, key=lambda trio: trio.photo)
     if "R" in recipe.panels and recipe.reflections == "given":
         _refuse_without_reflections(folder, trios)
     return [_whole(trio, *pair) for trio, pair in zip(trios, pictures, strict=True)]

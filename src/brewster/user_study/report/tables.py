@@ -7,8 +7,6 @@ import io
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
-from brewster.latex import escaped
-
 _GROUPS: Final = {"included": "After the rule", "everyone": "Everyone"}
 _CHOICES: Final = """\
 Rates are shares of the answers about a pair of methods. Average weights each dataset by its number of pictures, as the \
@@ -21,6 +19,11 @@ Strength: Bradley and Terry's model over all answers, a tie being half a win for
 Agreement: Krippendorff's alpha of win, tie and lose over comparisons; 1 is perfect, 0 is chance."""
 
 Results = Mapping[str, Any]
+
+_ESCAPES: Final = str.maketrans(
+    {letter: f"\\{letter}" for letter in "&%$#_{}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\^{}"}
+)
 
 
 # --- Markdown
@@ -130,7 +133,7 @@ def to_latex(results: Results) -> str:
         "% brewster study report; needs \\usepackage{booktabs}; below each rate its 95\\% interval",
         f"\\begin{{tabular}}{{c|{'|'.join('ccc' for _ in tables)}}}",
         "\\toprule",
-        " & ".join(map(escaped, ["Dataset", *heads])) + r" \\",
+        " & ".join(map(_escape, ["Dataset", *heads])) + r" \\",
         "\\midrule",
         *lines,
         *(["\\midrule"] if lines else []),
@@ -146,7 +149,7 @@ def _latex_row(tables: Iterable[Mapping[str, Any]], key: str) -> str:
     entries = [row[name] for row in rows for name in ("win", "tie", "lose")]
     above = ["--" if entry["mean"] is None else f"{100 * entry['mean']:.2f}\\%" for entry in entries]
     below = ["" if entry["low"] is None else f"\\scriptsize {_ends(entry, join='--')}" for entry in entries]
-    return " & ".join([escaped(rows[0]["title"]), *above]) + " \\\\\n" + " & ".join(["", *below]) + r" \\"
+    return " & ".join([_escape(rows[0]["title"]), *above]) + " \\\\\n" + " & ".join(["", *below]) + r" \\"
 
 
 # --- CSV
@@ -168,3 +171,8 @@ def to_csv(results: Results) -> str:
                     place = [key, pair["first"], pair["second"], row["key"], row["title"]]
                     table.writerow([*place, name, *ends, row["answers"]])
     return text.getvalue()
+
+
+def _escape(text: str) -> str:
+    """The text with LaTeX's special characters escaped."""
+    return text.translate(_ESCAPES)
