@@ -52,27 +52,27 @@ def test_an_answer_that_leaves_what_the_glass_absorbs_fails_nowhere_either(scene
 
 def test_the_photo_itself_keeps_all_of_the_reflection_and_removes_nothing(scene):
     background, photo, reflection = scene
-    content, white, kept = (score(photo, background, photo, reflection) for score in SCORES)
+    content, white, remaining = (score(photo, background, photo, reflection) for score in SCORES)
     assert (content, white) == pytest.approx((0, 0), abs=0.01)
-    assert kept == pytest.approx(1, abs=0.01)
+    assert remaining == pytest.approx(1, abs=0.01)
 
 
 def test_half_of_the_reflection_counts_half(scene):
     background, photo, reflection = scene
     light = [to_linear(picture / 255) for picture in (background, reflection)]
-    answer = encode(light[0] + light[1] / 2)
-    assert kept_reflection(answer, background, photo, reflection) == pytest.approx(0.5, abs=0.01)
+    prediction = encode(light[0] + light[1] / 2)
+    assert kept_reflection(prediction, background, photo, reflection) == pytest.approx(0.5, abs=0.01)
 
 
 def test_a_white_sheet_taken_for_a_highlight_is_removed_white(scene):
     background, photo, reflection = scene
-    answer = background.copy()
-    answer[WHITE] = 0
+    prediction = background.copy()
+    prediction[WHITE] = 0
     left = np.s_[:, : SIDE // 2]
     sheet = to_linear(background[WHITE] / 255).sum() / to_linear(background[left] / 255).sum()
-    assert removed_white(answer, background, photo, reflection) == 1
-    assert removed_content(answer, background, photo, reflection) == pytest.approx(sheet, abs=0.01)
-    assert kept_reflection(answer, background, photo, reflection) == 0
+    assert removed_white(prediction, background, photo, reflection) == 1
+    assert removed_content(prediction, background, photo, reflection) == pytest.approx(sheet, abs=0.01)
+    assert kept_reflection(prediction, background, photo, reflection) == 0
 
 
 def test_a_black_answer_removes_everything_and_keeps_nothing(scene):
@@ -85,11 +85,11 @@ def test_a_third_of_the_pixels_at_half_their_light_does_not_change_the_gain(scen
     background, photo, reflection = scene
     third = np.s_[: SIDE // 3]
     light = to_linear(background / 255)
-    answer = light * 0.7
-    answer[third] /= 2
-    calm = np.s_[:, : SIDE // 2]
-    lost = light[third][calm].sum() / 2 / light[calm].sum()
-    assert removed_content(encode(answer), background, photo, reflection) == pytest.approx(lost, abs=0.01)
+    prediction = light * 0.7
+    prediction[third] /= 2
+    unreflected = np.s_[:, : SIDE // 2]
+    lost = light[third][unreflected].sum() / 2 / light[unreflected].sum()
+    assert removed_content(encode(prediction), background, photo, reflection) == pytest.approx(lost, abs=0.01)
 
 
 def halves(share):
@@ -103,9 +103,9 @@ def halves(share):
 @pytest.mark.parametrize(("share", "lost"), [(0.01, 0.5), (0.05, 0), (0.15, 0)])
 def test_content_counts_where_less_than_two_percent_is_mirrored(share, lost):
     background, photo, reflection = halves(share)
-    answer = background.copy()
-    answer[:, SIDE // 2 :] = 0
-    assert removed_content(answer, background, photo, reflection) == pytest.approx(lost, abs=0.01)
+    prediction = background.copy()
+    prediction[:, SIDE // 2 :] = 0
+    assert removed_content(prediction, background, photo, reflection) == pytest.approx(lost, abs=0.01)
 
 
 def test_a_reflection_counts_from_a_tenth_of_the_photo_on():
@@ -131,35 +131,37 @@ def test_white_is_bright_in_all_channels_and_without_colour(scene, sheet, is_whi
     background, photo, reflection = scene
     background = background.copy()
     background[30:46, 4:20] = sheet
-    answer = background.copy()
-    answer[30:46, 4:20] = 0
-    assert (removed_white(answer, background, photo, reflection) > 0.1) == is_white
+    prediction = background.copy()
+    prediction[30:46, 4:20] = 0
+    assert (removed_white(prediction, background, photo, reflection) > 0.1) == is_white
 
 
 @pytest.mark.parametrize("gain", [0.8, 1.1])
 def test_scores_hardly_depend_on_the_brightness_of_an_answer(scene, gain):
     background, photo, reflection = scene
-    answer = encode(to_linear(background / 255) * 0.7 + to_linear(reflection / 255) * 0.4)
-    answer[WHITE] //= 2
+    prediction = encode(to_linear(background / 255) * 0.7 + to_linear(reflection / 255) * 0.4)
+    prediction[WHITE] //= 2
     for score in SCORES:
-        told = score(answer, background, photo, reflection)
-        assert score(brighten(answer, gain), background, photo, reflection) == pytest.approx(told, abs=0.02)
+        expected = score(prediction, background, photo, reflection)
+        assert score(brighten(prediction, gain), background, photo, reflection) == pytest.approx(
+            expected, abs=0.02
+        )
 
 
 def test_clipped_values_do_not_mislead_the_gain(scene):
     background, photo, reflection = scene
     background = background.copy()
     background[:, :20] = (
-        255  # most of where nothing is mirrored; the answer is darker there than the glass explains
+        255  # most of where nothing is mirrored; the prediction is darker there than the glass explains
     )
-    answer = brighten(background, 0.5)
-    answer[:, :20] = 255
-    assert kept_reflection(answer, background, photo, reflection) == pytest.approx(0, abs=0.01)
+    prediction = brighten(background, 0.5)
+    prediction[:, :20] = 255
+    assert kept_reflection(prediction, background, photo, reflection) == pytest.approx(0, abs=0.01)
 
 
 @pytest.mark.parametrize("score", SCORES)
 def test_no_answer_gains_by_darkness_where_the_gain_cannot_be_known(scene, score):
-    """A reflection over the whole picture but for 63 pixels: nothing tells how bright an answer should be."""
+    """A reflection over the whole picture but for 63 pixels: nothing tells how bright an prediction should be."""
     background, photo, reflection = scene
     reflection = np.maximum(reflection, 60)
     reflection.reshape(-1, 3)[:63] = 0
@@ -189,10 +191,12 @@ def test_pictures_of_different_shapes_are_refused(scene, score):
 
 
 @given(pictures, pictures, pictures, pictures, st.integers(0, 16), st.sampled_from(SCORES))
-def test_scores_are_shares_whatever_the_pictures(answer, background, photo, reflection, calm, score):
+def test_scores_are_shares_whatever_the_pictures(
+    prediction, background, photo, reflection, unreflected, score
+):
     reflection = reflection.copy()
-    reflection[:calm] = 0
+    reflection[:unreflected] = 0
     if score is removed_white:
         background = background // 16 + np.uint8(220)
     with contextlib.suppress(ValueError):  # too few such pixels
-        assert 0 <= score(answer, background, photo, reflection) <= 1
+        assert 0 <= score(prediction, background, photo, reflection) <= 1

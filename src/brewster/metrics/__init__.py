@@ -45,34 +45,34 @@ __all__ = [
 
 
 def _psnr(case: Comparison) -> float:
-    return min(psnr(case.answer.pixels, case.truth.pixels, region=case.region), IDENTICAL_DB)
+    return min(psnr(case.prediction.pixels, case.truth.pixels, region=case.region), IDENTICAL_DB)
 
 
 def _ssim(case: Comparison) -> float:
-    return ssim(case.answer.pixels, case.truth.pixels, region=case.region)
+    return ssim(case.prediction.pixels, case.truth.pixels, region=case.region)
 
 
 def _ssim_gaussian(case: Comparison) -> float:
-    return ssim(case.answer.pixels, case.truth.pixels, window="gaussian", region=case.region)
+    return ssim(case.prediction.pixels, case.truth.pixels, window="gaussian", region=case.region)
 
 
 def _lpips(case: Comparison) -> float:
-    answer, truth = (picture.features(_lpips_features) for picture in (case.answer, case.truth))
-    return Lpips.load().distance(answer, truth, region=case.region)
+    prediction, truth = (picture.features(_lpips_features) for picture in (case.prediction, case.truth))
+    return Lpips.load().distance(prediction, truth, region=case.region)
 
 
 def _lpips_features(picture: Picture) -> Features:
     return Lpips.load().features(picture)
 
 
-def _of_rendered(
+def _rendered_score(
     score: Callable[[Picture, Picture, Picture, Picture], float],
 ) -> Callable[[Comparison], float]:
-    """A score of all layers of a rendered sample: answer, background, photo, reflection."""
+    """A score of all layers of a rendered sample: prediction, background, photo, reflection."""
 
     def score_case(case: Comparison) -> float:
         assert case.reflection is not None
-        return score(case.answer.pixels, case.truth.pixels, case.photo, case.reflection)
+        return score(case.prediction.pixels, case.truth.pixels, case.photo, case.reflection)
 
     return score_case
 
@@ -173,7 +173,7 @@ _ROWS: Final = (
         "Share of the background's light that the answer lacks where the reflection is below 2 % of the photo,"
         f" {_GAIN}.",
         "rendered",
-        _of_rendered(removed_content),
+        _rendered_score(removed_content),
     ),
     Metric(
         "removed_white",
@@ -185,7 +185,7 @@ _ROWS: Final = (
         " background is white (encoded channels above 0.75 and less than 0.12 apart),"
         f" {_GAIN}.",
         "rendered",
-        _of_rendered(removed_white),
+        _rendered_score(removed_white),
     ),
     Metric(
         "kept_reflection",
@@ -196,7 +196,7 @@ _ROWS: Final = (
         "Share of the reflection's light that the answer still has above the background, where the reflection is at"
         f" least 10 % of the photo and the photo is not clipped, {_GAIN}.",
         "rendered",
-        _of_rendered(kept_reflection),
+        _rendered_score(kept_reflection),
     ),
 )
 
@@ -212,6 +212,6 @@ def find_metric(name: str) -> Metric:
     """
     if name in METRICS:
         return METRICS[name]
-    near = difflib.get_close_matches(name.lower(), METRICS, n=1)
-    cure = f"did you mean {near[0]}?" if near else "choose one of them"
-    raise BrewsterError(f"there is no metric {name!r}", f"metrics are {', '.join(METRICS)}", cure)
+    close = difflib.get_close_matches(name.lower(), METRICS, n=1)
+    hint = f"did you mean {close[0]}?" if close else "choose one of them"
+    raise BrewsterError(f"there is no metric {name!r}", f"metrics are {', '.join(METRICS)}", hint)

@@ -34,7 +34,7 @@ class Comparison:
     A metric "of" a rendered sample gets the transmissions, and always has a `reflection`.
     """
 
-    answer: CachedPicture
+    prediction: CachedPicture
     truth: CachedPicture
     photo: Picture
     reflection: Picture | None = None
@@ -66,7 +66,7 @@ class Metric:
     prepare: Callable[[], object] | None = None
     """Loads what it needs (weights that may be missing), once, before anything is scored."""
 
-    def described(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """Its plain values but the name, for results.json."""
-        told = ("title", "unit", "higher_is_better", "digits", "about", "of", "where")
-        return {key: getattr(self, key) for key in told}
+        keys = ("title", "unit", "higher_is_better", "digits", "about", "of", "where")
+        return {key: getattr(self, key) for key in keys}

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.errors import MissingExtra
-from brewster.metrics.weights import load_backbone, read_heads
+from brewster.metrics.weights import load_alexnet, read_heads
 from brewster.metrics.windows import Picture, Region, check_pictures, check_region
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     Map = Float[Tensor, "c h w"]
 
-LEAST_SIDE: Final = 31
+MIN_SIDE: Final = 31
 """AlexNet halves a picture until a smaller one has nothing left."""
 
 _SHIFT: Final = np.array([-0.030, -0.088, -0.188])
@@ -35,20 +35,20 @@ _SCALE: Final = np.array([0.458, 0.448, 0.450])
 """ImageNet's mean and spread of values in -1..1, as LPIPS 0.1 rounds them."""
 
 
-class _Step(NamedTuple):
+class _Layer(NamedTuple):
     """A convolution of AlexNet; before some, each 3x3 pixels are pooled in steps of two."""
 
     stride: int
     padding: int
-    pooled: bool
+    pooled_before: bool
 
 
-_STEPS: Final = (
-    _Step(4, 2, pooled=False),
-    _Step(1, 2, pooled=True),
-    _Step(1, 1, pooled=True),
-    _Step(1, 1, pooled=False),
-    _Step(1, 1, pooled=False),
+_LAYERS: Final = (
+    _Layer(4, 2, pooled_before=False),
+    _Layer(1, 2, pooled_before=True),
+    _Layer(1, 1, pooled_before=True),
+    _Layer(1, 1, pooled_before=False),
+    _Layer(1, 1, pooled_before=False),
 )
 
 
@@ -94,18 +94,18 @@ class Lpips:
 
         check_pictures(picture)
         size = picture.shape[:2]
-        if min(size) < LEAST_SIDE:
-            raise ValueError(
-                f"LPIPS needs at least {LEAST_SIDE}x{LEAST_SIDE} pixels, not {size[0]}x{size[1]}"
-            )
+        if min(size) < MIN_SIDE:
+            raise ValueError(f"LPIPS needs at least {MIN_SIDE}x{MIN_SIDE} pixels, not {size[0]}x{size[1]}")
         maps = []
         with torch.inference_mode():
-            seen = torch.from_numpy(_scaled(picture)).permute(2, 0, 1)[None]
-            for (weight, bias), step in zip(self.convolutions, _STEPS, strict=True):
-                if step.pooled:
-                    seen = functional.max_pool2d(seen, 3, 2)
-                seen = functional.relu(functional.conv2d(seen, weight, bias, step.stride, step.padding))
-                maps.append(seen[0] / (torch.linalg.vector_norm(seen[0], dim=0) + 1e-10))
+            activations = torch.from_numpy(_normalised(picture)).permute(2, 0, 1)[None]
+            for (weight, bias), layer in zip(self.convolutions, _LAYERS, strict=True):
+                if layer.pooled_before:
+                    activations = functional.max_pool2d(activations, 3, 2)
+                activations = functional.relu(
+                    functional.conv2d(activations, weight, bias, layer.stride, layer.padding)
+                )
+                maps.append(activations[0] / (torch.linalg.vector_norm(activations[0], dim=0) + 1e-10))
         return Features(tuple(maps), size)
 
     def distance(self, one: Features, other: Features, *, region: Region | None = None) -> float:
@@ -131,10 +131,10 @@ class Lpips:
             if region is None:
                 return float(sum(_mean(map_.numpy()) for map_ in maps))
             check_region(region, one.size)
-            return _mean(_enlarged(maps, one.size).numpy()[region])
+            return _mean(_upsampled(maps, one.size).numpy()[region])
 
 
-def lpips(picture: Picture, truth: Picture, *, region: Region | None = None) -> float:
+def lpips(prediction: Picture, truth: Picture, *, region: Region | None = None) -> float:
     """LPIPS 0.1 (AlexNet) of two pictures, 0 for equal ones, lower is better; see `Lpips.distance`.
 
     Raises:
@@ -142,9 +142,9 @@ def lpips(picture: Picture, truth: Picture, *, region: Region | None = None) -> 
             region is empty or of another shape.
         BrewsterError: what `Lpips.load` raises.
     """
-    check_pictures(picture, truth)
+    check_pictures(prediction, truth)
     metric = Lpips.load()
-    return metric.distance(metric.features(picture), metric.features(truth), region=region)
+    return metric.distance(metric.features(prediction), metric.features(truth), region=region)
 
 
 @functools.cache
@@ -155,13 +155,13 @@ def _load() -> Lpips:
         raise MissingExtra(
             "torch is not installed", "LPIPS is a neural network", "pip install 'brewster[evaluate]'"
         ) from error
-    tensors = [*load_backbone().values()]
+    tensors = [*load_alexnet().values()]
     weights = [weight.to(memory_format=torch.channels_last) for weight in tensors[::2]]  # faster on the CPU
     heads = tuple(torch.from_numpy(head) for head in read_heads())
     return Lpips(tuple(zip(weights, tensors[1::2], strict=True)), heads)
 
 
-def _scaled(picture: Picture) -> NDArray[np.float32]:
+def _normalised(picture: Picture) -> NDArray[np.float32]:
     """(value / 127.5 - 1 - shift) / scale, (H, W, 3); in this order of memory AlexNet's convolutions are fastest.
 
     Whole rows at once: numpy is slow along an axis of three.
@@ -178,7 +178,7 @@ def _mean(values: NDArray[np.float32]) -> float:
     return float(values.mean(dtype=np.float64))
 
 
-def _enlarged(maps: list[Tensor], size: tuple[int, int]) -> Tensor:
+def _upsampled(maps: list[Tensor], size: tuple[int, int]) -> Tensor:
     from torch.nn.functional import interpolate  # noqa: PLC0415 - an extra
 
     full = [interpolate(map_[None, None], size, mode="bilinear", align_corners=False)[0, 0] for map_ in maps]

@@ -58,20 +58,20 @@ def check_region(region: Region, size: tuple[int, int]) -> None:
 def box_sums(values: _Values) -> _Values:
     """Sums over all whole 7x7 windows, (H - 6, W - 6, ...), of integers exactly; their type must hold the sums."""
     for axis in (0, 1):
-        line = np.moveaxis(values, axis, 0)
-        two = line[:-1] + line[1:]
-        four = two[:-2] + two[2:]
-        values = np.moveaxis(four[:-3] + two[4:-1] + line[6:], 0, axis)
+        along_axis = np.moveaxis(values, axis, 0)
+        sums_of_2 = along_axis[:-1] + along_axis[1:]
+        sums_of_4 = sums_of_2[:-2] + sums_of_2[2:]
+        values = np.moveaxis(sums_of_4[:-3] + sums_of_2[4:-1] + along_axis[6:], 0, axis)
     return values
 
 
 def gaussian_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Means under the Gaussian window at all places where it is whole, (H - 10, W - 10, ...)."""
     for axis in (0, 1):
-        line = np.moveaxis(values, axis, 0)
-        count, last = len(line) - 2 * GAUSSIAN_RADIUS, 2 * GAUSSIAN_RADIUS
-        mean = line[GAUSSIAN_RADIUS : GAUSSIAN_RADIUS + count] * _GAUSSIAN[GAUSSIAN_RADIUS]
+        along_axis = np.moveaxis(values, axis, 0)
+        count, last = len(along_axis) - 2 * GAUSSIAN_RADIUS, 2 * GAUSSIAN_RADIUS
+        mean = along_axis[GAUSSIAN_RADIUS : GAUSSIAN_RADIUS + count] * _GAUSSIAN[GAUSSIAN_RADIUS]
         for i in range(GAUSSIAN_RADIUS):
-            mean += (line[i : i + count] + line[last - i : last - i + count]) * _GAUSSIAN[i]
+            mean += (along_axis[i : i + count] + along_axis[last - i : last - i + count]) * _GAUSSIAN[i]
         values = np.moveaxis(mean, 0, axis)
     return values
