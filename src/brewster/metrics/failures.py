@@ -25,8 +25,9 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
     Light = Float[NDArray[np.float64], "h w"]
+    LightOfPixels = Float[NDArray[np.float64], " pixels"]
 else:
-    Light = NDArray
+    Light = LightOfPixels = NDArray
 
 NEGLIGIBLE_SHARE: Final = 0.02
 """Of I: a reflection below this share is none."""
@@ -126,7 +127,7 @@ class _Luminances:
         return _share(missing, self.background, mask & (self.background > 0), condition)
 
 
-def _gain(prediction: Light, background: Light) -> float:
+def _gain(prediction: LightOfPixels, background: LightOfPixels) -> float:
     return float(np.median(background / prediction)) if prediction.size >= MIN_PIXELS else 1.0
 
 

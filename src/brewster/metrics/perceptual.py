@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-    Map = Float[Tensor, "c h w"]
+    Map = Float[Tensor, "_c _h _w"]
+    """The maps of one picture differ in all three sizes; the underscores tell jaxtyping not to compare them."""
 
 MIN_SIDE: Final = 31
 """AlexNet halves a picture until a smaller one has nothing left."""
