@@ -88,9 +88,9 @@ def test_latent_statistics_are_applied_and_undone(name, monkeypatch):
     assert mean.abs().max() > 0.05
     assert (deviation - 1).abs().max() > 0.05
     grid = torch.randn(1, backbone.channels // 4, 4, 4)
-    monkeypatch.setattr(backbone, "_see", lambda picture: grid)
+    monkeypatch.setattr(backbone, "_vae_encode", lambda picture: grid)
     black, shown = torch.zeros(1, 3, 32, 32), []
-    monkeypatch.setattr(backbone, "_show", lambda latent: shown.append(latent) or black)
+    monkeypatch.setattr(backbone, "_vae_decode", lambda latent: shown.append(latent) or black)
     backbone.decode(backbone.encode(black))
     torch.testing.assert_close(shown, [grid])
 
@@ -118,7 +118,7 @@ def test_a_quantised_base_predicts_nearly_the_same_and_trains_a_lora(saved, quan
 
 
 def test_a_base_that_was_silently_left_unquantised_is_refused(saved, monkeypatch):
-    monkeypatch.setattr(backbones, "_placed", lambda device: {"device_map": {"": device}})
+    monkeypatch.setattr(backbones, "_device_map", lambda device: {"device_map": {"": device}})
     with pytest.raises(ModelError, match=r"loaded as torch\.bfloat16; stored as int8"):
         load_backbone(str(saved / "kontext"), quantise="int8", dtype=torch.bfloat16)
 
@@ -172,7 +172,7 @@ def with_words(tmp_path_factory):
         },
         "klein": {"tokenizer": qwen, "text_encoder": transformers.Qwen3ForCausalLM(layers)},
     }
-    lazy_imports.bars_on_terminals_only()
+    lazy_imports.disable_progress_bars_in_pipes()
     for name, reader in readers.items():
         pipeline = tiny(name)[0].pipeline()
         pipeline.register_modules(**reader)
@@ -284,6 +284,6 @@ def test_running_out_of_memory_while_loading_says_what_to_lower(folder, monkeypa
     def full(*_, **__):
         raise torch.OutOfMemoryError("CUDA out of memory.")
 
-    monkeypatch.setattr(backbones, "_part", full)
+    monkeypatch.setattr(backbones, "_load_part", full)
     with pytest.raises(DeviceError, match='use quantise="int8", a smaller backbone'):
         load_backbone(str(folder))

@@ -16,7 +16,7 @@ from brewster.inference.separator import RECONSTRUCTION_ERROR_LIMIT
 from brewster.models.diffusion.adapter.lora import LORA_FILE, add_lora, lora_parameters, save_lora
 from brewster.models.diffusion.backbones import TINY, tiny
 from brewster.models.diffusion.panels import PanelLayout
-from brewster.models.diffusion.pipeline import fingerprint, open_decomposer
+from brewster.models.diffusion.pipeline import fingerprint, load_pipeline
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion.tensors import read_tensors, write_tensors
 from brewster.srgb import to_encoded, to_linear
@@ -197,9 +197,9 @@ def test_a_lora_goes_through_the_separator_by_its_folder(lora):
 
 
 def test_a_backbone_without_a_lora_is_asked_for_the_transmission_alone():
-    decomposer = open_decomposer("tiny:klein")
+    decomposer = load_pipeline("tiny:klein")
     assert decomposer.task.layout.panels == ("T",)
-    generic = open_decomposer("tiny:klein", prompt="generic")
+    generic = load_pipeline("tiny:klein", prompt="generic")
     assert generic.prompt.text == "Remove the reflection."
     assert generic.sha256 != decomposer.sha256
     result = Separator(DiffusionPredictor(decomposer, steps=1))(smooth(40, 40))
@@ -208,16 +208,16 @@ def test_a_backbone_without_a_lora_is_asked_for_the_transmission_alone():
 
 def test_what_a_lora_is_opened_with_is_checked(lora, tmp_path):
     with pytest.raises(ModelError, match="is a LoRA of kontext; its base, not a klein"):
-        open_decomposer(str(lora), base="tiny:klein")
+        load_pipeline(str(lora), base="tiny:klein")
     with pytest.raises(ModelError, match="is a base itself"):
-        open_decomposer("tiny:klein", base="tiny:kontext")
+        load_pipeline("tiny:klein", base="tiny:kontext")
     with pytest.raises(DeviceError, match="do not run on coreml; one of auto, cuda, rocm, cpu"):
-        open_decomposer(str(lora), device="coreml")
+        load_pipeline(str(lora), device="coreml")
     with pytest.raises(ModelError, match=f"holds no model; a LoRA .{LORA_FILE}"):
-        open_decomposer(str(tmp_path))
+        load_pipeline(str(tmp_path))
     (tmp_path / LORA_FILE).write_bytes(b"torn")
     with pytest.raises(ModelError):
-        open_decomposer(str(tmp_path))
+        load_pipeline(str(tmp_path))
 
 
 @pytest.mark.parametrize(

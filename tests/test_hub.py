@@ -14,7 +14,7 @@ from brewster.models.diffusion.adapter.hub import FILES, plan_push, push
 from brewster.models.diffusion.adapter.lora import LORA_FILE, add_lora, load_lora, save_lora
 from brewster.models.diffusion.backbones import BACKBONES, tiny
 from brewster.models.diffusion.task import DecompositionTask
-from brewster.models.diffusion.tensors import read_tensors, said_of
+from brewster.models.diffusion.tensors import read_metadata, read_tensors
 from brewster.training.lora.model_card import write_card
 from brewster.training.recipe import LoraRecipe
 from file_server import loopback_only, unheard
@@ -78,7 +78,7 @@ def test_four_files_would_be_sent_as_they_are(write):
     assert plan.is_private
     assert plan.message == "LoRA of black-forest-labs/FLUX.1-Kontext-dev, rank 2"
     assert plan.remarks[1:] == ("not sent: notes.txt",)
-    for file in plan.about()["files"]:
+    for file in plan.to_dict()["files"]:
         assert file["sha256"] == hashlib.sha256((folder / file["name"]).read_bytes()).hexdigest()
     assert all(name in plan.table() for name in FILES)
 
@@ -98,7 +98,7 @@ def test_places_of_this_machine_are_renamed_in_what_is_sent_and_the_lora_still_l
     recipe = json.loads(sent["recipe.json"])
     assert recipe["data"]["rendered"]["sets"] == ["window"]
     assert recipe["backbone"] == BACKBONES["kontext"].hub_id
-    assert json.loads(said_of(sent[LORA_FILE])["brewster"])["base"] == BACKBONES["kontext"].hub_id
+    assert json.loads(read_metadata(sent[LORA_FILE])["brewster"])["base"] == BACKBONES["kontext"].hub_id
     assert f"{sets} is called window in what is sent" in plan.remarks
     assert before == {name: (folder / name).read_bytes() for name in FILES}
     for name, data in sent.items():

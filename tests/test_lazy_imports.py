@@ -9,7 +9,7 @@ from huggingface_hub import errors as hub_errors
 
 from brewster.errors import DownloadError, MissingExtra
 from brewster.models.diffusion.backbones import encode_prompt, load_backbone
-from brewster.models.diffusion.lazy_imports import library
+from brewster.models.diffusion.lazy_imports import import_library
 
 
 def hub_error(kind, status, **headers):
@@ -60,7 +60,7 @@ def test_what_the_hub_refuses_is_told_plainly(monkeypatch, error, words, load):
 def test_a_missing_library_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "bitsandbytes", None)
     with pytest.raises(MissingExtra, match=r"pip install 'brewster\[large\]'"):
-        library("bitsandbytes")
+        import_library("bitsandbytes")
 
 
 def test_the_room_wakes_no_stock_library_until_a_model_is_built_and_then_keeps_its_silence(tmp_path):

@@ -12,7 +12,7 @@ from PIL import Image
 from brewster.errors import ModelError
 from brewster.models.diffusion.adapter.lora import add_lora, lora_parameters, save_lora
 from brewster.models.diffusion.backbones import BACKBONES, tiny
-from brewster.models.diffusion.panels import PanelLayout, condition, split
+from brewster.models.diffusion.panels import PanelLayout, conditioning_image, split
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
 from brewster.models.diffusion.sampling import sample
 from brewster.models.diffusion.task import DecompositionTask
@@ -133,7 +133,7 @@ def exported(tmp_path):
         Image.fromarray(picture.numpy()).save(tmp_path / "photo.png")
         photo = picture.permute(2, 0, 1)[None] / 127.5 - 1
         size = layout.composite_size((64, 64))
-        return split(sample(backbone, condition(photo, layout), prompt, size=size), layout)["T"]
+        return split(sample(backbone, conditioning_image(photo, layout), prompt, size=size), layout)["T"]
 
     return export
 

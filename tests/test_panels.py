@@ -6,7 +6,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from brewster.errors import PhotoError, RecipeError
-from brewster.models.diffusion.panels import PanelLayout, compose, condition, fit_panel, split
+from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_image, fit_panel, split
 
 LAYOUTS = [
     PanelLayout(panels, direction)
@@ -31,7 +31,7 @@ def test_splitting_undoes_composing_to_the_bit(layout, height, width, seed):
 
 def test_the_model_is_shown_the_photo_and_white_space():
     photo = torch.rand(1, 3, 4, 5) - 1
-    shown = split(condition(photo, PanelLayout()), PanelLayout())
+    shown = split(conditioning_image(photo, PanelLayout()), PanelLayout())
     assert torch.equal(shown["I"], photo)
     assert shown["T"].eq(1).all()
     assert shown["R"].eq(1).all()
@@ -39,7 +39,7 @@ def test_the_model_is_shown_the_photo_and_white_space():
 
 def test_without_a_generated_photo_the_photo_is_shown_alone():
     photo = torch.rand(1, 3, 4, 5)
-    assert torch.equal(condition(photo, PanelLayout(("T", "R"))), photo)
+    assert torch.equal(conditioning_image(photo, PanelLayout(("T", "R"))), photo)
 
 
 def test_the_papers_composite_is_three_squares_of_512_pixels():
@@ -73,7 +73,7 @@ def test_any_photo_fits_without_a_stretch_or_is_refused(width, height, layout, b
     )
     picture = torch.rand(1, 1, fit.content[1], 1).expand(1, 1, fit.content[1], fit.content[0])
     if fit.panel[0] * fit.panel[1] < 200_000:
-        assert torch.equal(fit.cut(fit.pad(picture)), picture)
+        assert torch.equal(fit.crop(fit.pad(picture)), picture)
 
 
 @given(st.integers(16, 4000), st.integers(16, 4000), layouts, st.integers(10_000, 2_000_000))

@@ -1,13 +1,14 @@
-"""How badly an answer fails where the truth is known exactly: content that it took away, reflections that it left.
+"""Failure metrics for rendered samples: how much content a prediction removes, and how much reflection it leaves.
 
-For rendered samples, whose photo I, background B and reflection R share one exposure and tone curve. All is luminance
-in linear light, with R in the photo's light: I = T + R, and T is B as far as the glass lets it through. Methods differ
-on whether they restore what the glass absorbs, so an answer is first multiplied by the one gain that makes it match B
-where nothing is mirrored: the median of B over answer, among pixels that are neither black nor clipped in either.
-Where B has too few such pixels, no score has a meaning; an answer that is black or clipped in nearly all of them is
-taken as it is.
+They need a sample whose photo I, background B and reflection R share one exposure and tone curve. All values are
+luminance in linear light, with I = T + R, where the transmission T is the part of B that passes through the glass.
 
-Each score is a share of light, in 0..1, lower is better.
+Some methods restore the light that the glass absorbs, and others do not. To score both alike, the prediction is first
+multiplied by one gain: the median of B / prediction over the pixels without reflection that are neither black nor
+clipped in either picture. If B has too few such pixels, the scores are undefined (ValueError). If only the prediction
+has too few, the gain is 1.
+
+Each score is a share of light in 0..1; lower is better.
 """
 
 from __future__ import annotations
@@ -30,44 +31,51 @@ else:
     Light = LightOfPixels = NDArray
 
 NEGLIGIBLE_SHARE: Final = 0.02
-"""Of I: a reflection below this share is none."""
+"""A pixel with R below this share of I counts as a pixel without reflection."""
 
 NOTICEABLE_SHARE: Final = 0.1
-"""Of I: a reflection from this share on is one."""
+"""A pixel with R of at least this share of I counts as a pixel with reflection."""
 
 WHITE_MIN: Final = 0.75
 WHITE_MAX_DIFFERENCE: Final = 0.12
-"""White is where all encoded channels are above the one and no two are further apart than the other."""
+"""A pixel is white if all its encoded channels, in 0..1, are above WHITE_MIN and less than WHITE_MAX_DIFFERENCE apart."""
 
 BLACK_LUMINANCE: Final = 0.01
-"""Luminance below which an 8-bit value is too coarse to be divided by."""
+"""Pixels below this luminance are left out of the gain: 8-bit steps are too coarse there for a ratio."""
 
 CLIPPED_MIN: Final = 254
-"""From this 8-bit value on, a channel may have been brighter than it says."""
+"""From this 8-bit value on, a channel may be clipped: its true value is unknown."""
 
 MIN_PIXELS: Final = 64
+"""A score or gain over fewer pixels is too noisy to report."""
 
 _LINEAR: Final = to_linear(np.arange(256) / 255)
 
 
 def removed_content(prediction: Picture, background: Picture, photo: Picture, reflection: Picture) -> float:
-    """The share of the background's light that the answer lacks where nothing is mirrored, 0..1, lower is better.
+    """The share of the background's light that the prediction lacks where there is no reflection.
 
-    sum max(B - g answer, 0) / sum B, over the pixels with R < 2 % of I; I and B not black everywhere there.
+    sum max(B - g prediction, 0) / sum B over the pixels with R < 2 % of I and B > 0, where g is the gain of the module.
+
+    Returns:
+        A share in 0..1; lower is better.
 
     Raises:
-        ValueError: the pictures are not uint8 (H, W, 3) or differ in shape, or less than 64 pixels are such as the
-            score is over, or such that the gain could be known.
+        ValueError: the pictures are not uint8 (H, W, 3) or differ in shape, or fewer than 64 pixels are left for the
+            score or in B for the gain.
     """
     luminance = _Luminances.of(prediction, background, photo, reflection)
     return luminance.removed_share(luminance.unreflected, f"R < {NEGLIGIBLE_SHARE:.0%} of I")
 
 
 def removed_white(prediction: Picture, background: Picture, photo: Picture, reflection: Picture) -> float:
-    """The share of light that the answer lacks in white areas behind the glass, 0..1, lower is better.
+    """The share of the background's light that the prediction lacks in white areas without reflection.
 
-    As `removed_content`, over those of its pixels that are white in B: every encoded channel above 0.75, and the
-    largest less than 0.12 above the smallest. High where white things were taken for highlights.
+    As `removed_content`, over the pixels that are also white in B: every encoded channel is above 0.75, and the
+    largest is less than 0.12 above the smallest. It is high where a method takes white objects for highlights.
+
+    Returns:
+        A share in 0..1; lower is better.
 
     Raises:
         ValueError: as `removed_content`.
@@ -79,9 +87,13 @@ def removed_white(prediction: Picture, background: Picture, photo: Picture, refl
 
 
 def kept_reflection(prediction: Picture, background: Picture, photo: Picture, reflection: Picture) -> float:
-    """The share of the reflection's light that the answer still has, 0..1, lower is better.
+    """The share of the reflection's light that the prediction still contains.
 
-    sum min(max(g answer - B, 0), R) / sum R, over the pixels with R >= 10 % of I where I is not clipped.
+    sum min(max(g prediction - B, 0), R) / sum R over the pixels with R >= 10 % of I where I is not clipped, where g is
+    the gain of the module.
+
+    Returns:
+        A share in 0..1; lower is better.
 
     Raises:
         ValueError: as `removed_content`.
@@ -101,14 +113,14 @@ def kept_reflection(prediction: Picture, background: Picture, photo: Picture, re
 @final
 @dataclass(frozen=True, eq=False)
 class _Luminances:
-    """The luminances of four pictures, (H, W); the answer's after its gain."""
+    """The linear luminances of the four pictures, (H, W); that of the prediction is multiplied by the gain."""
 
     prediction: Light
     background: Light
     photo: Light
     reflection: Light
     unreflected: Region
-    """Where nothing is mirrored."""
+    """Pixels without reflection."""
 
     @classmethod
     def of(cls, prediction: Picture, background: Picture, photo: Picture, reflection: Picture) -> _Luminances:
@@ -128,6 +140,7 @@ class _Luminances:
 
 
 def _gain(prediction: LightOfPixels, background: LightOfPixels) -> float:
+    # The median, because content that is missing in less than half of the pixels must not change the gain.
     return float(np.median(background / prediction)) if prediction.size >= MIN_PIXELS else 1.0
 
 
@@ -138,7 +151,7 @@ def _share(part: Light, whole: Light, mask: Region, condition: str) -> float:
 
 def _require_pixels(mask: Region, condition: str) -> None:
     if (count := np.count_nonzero(mask)) < MIN_PIXELS:
-        raise ValueError(f"{count} pixels have {condition}; a score needs {MIN_PIXELS}")
+        raise ValueError(f"{count} pixels have {condition}; a score needs at least {MIN_PIXELS}")
 
 
 def _luminance(picture: Picture) -> Light:

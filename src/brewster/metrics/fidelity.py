@@ -1,11 +1,11 @@
-"""How close the values of two pictures are: PSNR and SSIM, on 8-bit sRGB values and in this field's definitions.
+"""PSNR and SSIM of 8-bit sRGB pictures, as papers on reflection removal define them.
 
-SSIM (Z. Wang et al., IEEE Trans. Image Proc. 13, 2004; K1 0.01, K2 0.03, range 255) is taken per RGB channel, and
-its map is averaged where the window lies wholly in the picture. Two windows are in use:
+SSIM (Z. Wang et al., IEEE Trans. Image Proc. 13, 2004; K1 0.01, K2 0.03, range 255) is computed per RGB channel, and
+its map is averaged over the positions where the whole window is inside the picture. Two windows are in use:
 
-    uniform    7x7, sample covariance: what ERRNet, RAGNet and their successors report. scikit-image's
+    uniform    7x7, sample covariance, as ERRNet, RAGNet and their successors report it. Equal to scikit-image's
                structural_similarity(a, b, channel_axis=2)
-    gaussian   11x11, sigma 1.5, population covariance: what its authors describe. The same with
+    gaussian   11x11, sigma 1.5, population covariance, as in the paper of Wang et al. Equal to the same call with
                gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=255
 """
 
@@ -37,12 +37,15 @@ _WINDOW_SIDES: Final[dict[Window, int]] = {"uniform": BOX, "gaussian": 2 * GAUSS
 
 
 def psnr(prediction: Picture, truth: Picture, *, region: Region | None = None) -> float:
-    """Peak signal-to-noise ratio in dB, higher is better; infinite for equal pictures.
+    """Peak signal-to-noise ratio, 10 log10(255^2 / MSE).
 
-    10 log10(255^2 / MSE), the mean over all three channels of all pixels, or of those in `region`, bool (H, W).
+    The mean squared error is over the three channels of all pixels, or of the pixels in `region`, bool (H, W).
+
+    Returns:
+        dB; higher is better. Infinity for equal pictures.
 
     Raises:
-        ValueError: the pictures are not uint8 (H, W, 3), differ in shape, or the region is empty or of another shape.
+        ValueError: the pictures are not uint8 (H, W, 3) or differ in shape, or the region is empty or of another shape.
     """
     check_pictures(prediction, truth)
     difference = prediction.astype(np.int32) - truth
@@ -56,14 +59,17 @@ def psnr(prediction: Picture, truth: Picture, *, region: Region | None = None) -
 def ssim(
     prediction: Picture, truth: Picture, *, window: Window = "uniform", region: Region | None = None
 ) -> float:
-    """Structural similarity, at most 1, higher is better; by Wang et al. 2004, the window as the module says.
+    """Structural similarity (Wang et al. 2004), with one of the two windows of this module.
 
-    With a `region`, bool (H, W), the mean of the local values at its pixels. Those nearer to the picture's border
-    than the window reaches (3 pixels, Gaussian 5) have none.
+    With a `region`, bool (H, W), the mean of the SSIM map over its pixels. The map has no values within 3 pixels of the
+    picture's border (Gaussian window: 5 pixels).
+
+    Returns:
+        At most 1; higher is better.
 
     Raises:
         ValueError: the pictures are not uint8 (H, W, 3), differ in shape, or are smaller than the window; the
-            region is of another shape, or has no pixel with a value.
+            region is empty, of another shape, or has only pixels without a value.
     """
     check_pictures(prediction, truth)
     side = _WINDOW_SIDES[window]
@@ -77,13 +83,13 @@ def ssim(
         values = values[region[border : height - border, border : width - border]]
         if not values.size:
             raise ValueError(
-                f"all of the region lies within {border} pixels of the border, where SSIM has no value"
+                f"all pixels of the region are within {border} pixels of the border, where SSIM has no value"
             )
     return float(np.mean(values))
 
 
 def _ssim_map(prediction: Picture, truth: Picture, window: Window) -> NDArray[np.float64]:
-    """The map of local values, (H - side + 1, W - side + 1, 3), in strips that stay in the processor's cache."""
+    """The SSIM map, (H - side + 1, W - side + 1, 3), computed in strips that fit the processor's cache."""
     windowed_ssim, strip_height = _WINDOWED_SSIM[window], _STRIP_ROWS + _WINDOW_SIDES[window] - 1
     tops = range(0, len(prediction) - _WINDOW_SIDES[window] + 1, _STRIP_ROWS)
     return np.concatenate(
@@ -92,7 +98,7 @@ def _ssim_map(prediction: Picture, truth: Picture, window: Window) -> NDArray[np
 
 
 def _ssim_uniform(prediction: Picture, truth: Picture) -> NDArray[np.float64]:
-    """Sums of 8-bit values over the window fit int32 and are exact, so only the end is floating."""
+    """In int32, which holds the sums of 8-bit values and products over the window exactly."""
     return _ssim_formula(
         prediction.astype(np.int32), truth.astype(np.int32), box_sums, BOX**2, sample_covariance=True
     )
@@ -112,9 +118,11 @@ def _ssim_formula(
     *,
     sample_covariance: bool,
 ) -> NDArray[np.float64]:
-    """SSIM with both fractions multiplied through by the window's weight: one division, and sums stay integers.
+    """SSIM = (2 mx my + C1) (2 cov + C2) / ((mx^2 + my^2 + C1) (vx + vy + C2)), computed from window sums.
 
-    The variances of both pictures are only ever added, so x^2 + y^2 is summed at once.
+    Numerator and denominator are multiplied by powers of `weight`, the number of pixels that a window sum counts
+    (1 if `window_sum` returns means). So there is one division, and integer sums stay integers until then. The formula
+    only needs the sum of both variances, so x^2 + y^2 is summed at once.
     """
     mean_x, mean_y, squares, products = (
         window_sum(x),

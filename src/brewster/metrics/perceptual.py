@@ -1,11 +1,11 @@
-"""How alike two pictures look: LPIPS 0.1 with AlexNet, from its own five convolutions.
+"""LPIPS 0.1 with AlexNet: the perceptual distance of two pictures.
 
     metric = Lpips.load()
-    truth = metric.features(picture)  # once for many answers
-    print([metric.distance(metric.features(answer), truth) for answer in answers])
+    truth = metric.features(picture)  # once for many predictions
+    print([metric.distance(metric.features(prediction), truth) for prediction in predictions])
 
-R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018; the definition
-is that of the `lpips` package, version 0.1 of the weights. torch is woken by `Lpips.load` only.
+R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018; the same definition
+as the `lpips` package with version 0.1 of its weights. Only `Lpips.load` imports torch.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ if TYPE_CHECKING:
     """The maps of one picture differ in all three sizes; the underscores tell jaxtyping not to compare them."""
 
 MIN_SIDE: Final = 31
-"""AlexNet halves a picture until a smaller one has nothing left."""
+"""With fewer pixels on a side, AlexNet's strides and poolings leave an empty map."""
 
 _SHIFT: Final = np.array([-0.030, -0.088, -0.188])
 _SCALE: Final = np.array([0.458, 0.448, 0.450])
-"""ImageNet's mean and spread of values in -1..1, as LPIPS 0.1 rounds them."""
+"""Mean and standard deviation of ImageNet's values in -1..1, rounded as in LPIPS 0.1."""
 
 
 class _Layer(NamedTuple):
-    """A convolution of AlexNet; before some, each 3x3 pixels are pooled in steps of two."""
+    """A convolution of AlexNet. If `pooled_before`, a 3x3 max pooling with stride 2 precedes it."""
 
     stride: int
     padding: int
@@ -56,7 +56,10 @@ _LAYERS: Final = (
 @final
 @dataclass(frozen=True, eq=False)
 class Features:
-    """What AlexNet sees in a picture: five maps (C, h, w) float32 of unit length in C, and the picture's (H, W)."""
+    """AlexNet's features of a picture: five float32 maps (C, h, w), normalised to unit length over C.
+
+    `size` is the (height, width) of the picture.
+    """
 
     maps: tuple[Map, ...]
     size: tuple[int, int]
@@ -65,30 +68,30 @@ class Features:
 @final
 @dataclass(frozen=True, eq=False)
 class Lpips:
-    """The metric with its weights; on the CPU, reusable and thread-safe."""
+    """LPIPS with its weights. It runs on the CPU; several threads may share one object."""
 
     convolutions: tuple[tuple[Tensor, Tensor], ...]
     """Weights (out, in, k, k) and biases (out,) of AlexNet's five convolutions."""
     heads: tuple[Tensor, ...]
-    """How much each channel of the five maps counts, (C,)."""
+    """The weight of each channel of the five maps, (C,): the linear layers of LPIPS."""
 
     @classmethod
     def load(cls) -> Lpips:
-        """The metric with its published weights, which are read once.
+        """LPIPS with its published weights; later calls return the same object.
 
         Raises:
             MissingExtra: torch is not installed.
-            ModelError: the file of the convolutions is damaged or another one.
-            DownloadError: there is no such file yet, and the server does not give it.
-            TargetError: there is none, and the cache folder cannot be written.
+            ModelError: the file of AlexNet's weights is damaged, or holds other weights.
+            DownloadError: AlexNet's weights are not on this machine, and the download fails.
+            TargetError: the downloaded weights cannot be written to the cache folder.
         """
         return _load()
 
     def features(self, picture: Picture) -> Features:
-        """What AlexNet sees in a picture.
+        """The features of a picture, uint8 (H, W, 3).
 
         Raises:
-            ValueError: the picture is not uint8 (H, W, 3), or has less than 31 pixels on a side.
+            ValueError: the picture is not uint8 (H, W, 3), or has fewer than 31 pixels on a side.
         """
         import torch  # noqa: PLC0415 - an extra
         from torch.nn import functional  # noqa: PLC0415
@@ -110,12 +113,16 @@ class Lpips:
         return Features(tuple(maps), size)
 
     def distance(self, one: Features, other: Features, *, region: Region | None = None) -> float:
-        """How differently two pictures look, 0 for equal ones, lower is better.
+        """The LPIPS distance of two pictures.
 
-        The squared differences of the maps, weighted by channel, are averaged over each map and summed over the
-        five. With a `region`, bool (H, W), each is first enlarged to the picture's size (bilinear, corners not
-        aligned: what `lpips` calls spatial), and their sum is averaged over the region's pixels. A region that is
-        the whole picture differs slightly from none, because enlarging counts the rims of the maps differently.
+        The squared differences of the features are weighted by channel, averaged over each map, and summed over the
+        five maps. With a `region`, bool (H, W), each map of differences is first upsampled to the size of the picture
+        (bilinear, align_corners=False; `spatial=True` in `lpips`), and their sum is averaged over the region. A region
+        that is the whole picture gives a slightly different value than no region, because upsampling changes the
+        weight of the pixels at the border of a map.
+
+        Returns:
+            0 for equal pictures; lower is better.
 
         Raises:
             ValueError: the pictures differ in size, or the region is empty or of another shape.
@@ -136,12 +143,15 @@ class Lpips:
 
 
 def lpips(prediction: Picture, truth: Picture, *, region: Region | None = None) -> float:
-    """LPIPS 0.1 (AlexNet) of two pictures, 0 for equal ones, lower is better; see `Lpips.distance`.
+    """LPIPS 0.1 (AlexNet) of two pictures, with weights from `Lpips.load`; see `Lpips.distance`.
+
+    Returns:
+        0 for equal pictures; lower is better.
 
     Raises:
         ValueError: the pictures are not uint8 (H, W, 3), differ in shape, or are smaller than 31x31 pixels; the
             region is empty or of another shape.
-        BrewsterError: what `Lpips.load` raises.
+        BrewsterError: the weights cannot be loaded; see `Lpips.load`.
     """
     check_pictures(prediction, truth)
     metric = Lpips.load()
@@ -154,7 +164,7 @@ def _load() -> Lpips:
         import torch  # noqa: PLC0415 - an extra
     except ImportError as error:
         raise MissingExtra(
-            "torch is not installed", "LPIPS is a neural network", "pip install 'brewster[evaluate]'"
+            "torch is not installed", "the library that computes LPIPS", "pip install 'brewster[evaluate]'"
         ) from error
     tensors = [*load_alexnet().values()]
     weights = [weight.to(memory_format=torch.channels_last) for weight in tensors[::2]]  # faster on the CPU
@@ -163,9 +173,10 @@ def _load() -> Lpips:
 
 
 def _normalised(picture: Picture) -> NDArray[np.float32]:
-    """(value / 127.5 - 1 - shift) / scale, (H, W, 3); in this order of memory AlexNet's convolutions are fastest.
+    """(value / 127.5 - 1 - shift) / scale, (H, W, 3).
 
-    Whole rows at once: numpy is slow along an axis of three.
+    The channels stay last in memory, in which layout the convolutions are fastest on a CPU. The arithmetic runs on
+    whole rows, because numpy is slow along an axis of length 3.
     """
     height, width, _ = picture.shape
     values = picture.reshape(height, -1).astype(np.float32, order="C")
@@ -175,7 +186,7 @@ def _normalised(picture: Picture) -> NDArray[np.float32]:
 
 
 def _mean(values: NDArray[np.float32]) -> float:
-    """In numpy, in double: the order of its sums does not depend on the number of threads."""
+    """The mean by numpy in float64: unlike torch, the order of its sums does not depend on the number of threads."""
     return float(values.mean(dtype=np.float64))
 
 

@@ -1,9 +1,9 @@
-"""The weights of LPIPS: its five linear heads are shipped, the five convolutions are found or fetched once.
+"""The weights of LPIPS. Its five linear layers ("heads") are part of brewster; AlexNet's weights are downloaded once.
 
 The convolutions are those of torchvision's AlexNet (`features.0`, 3, 6, 8 and 10 of alexnet-owt-7be5be79.pth,
-BSD-3-Clause). `lpips_alexnet_features.pth`, a state dict of these ten tensors, is looked for in brewster/weights of the
-user's cache folder, then in `weights` of the folder that `BREWSTER_DATA` names. Wherever they come from, a digest
-over their values must be right: a number that depends on other weights is not LPIPS.
+BSD-3-Clause). Their ten tensors are stored as a state dict, `lpips_alexnet_features.pth`. It is searched for in
+brewster/weights of the user's cache folder, then in `weights` of the folder that `BREWSTER_DATA` names. A digest of
+the values is always checked, because distances from other weights are not LPIPS.
 """
 
 from __future__ import annotations
@@ -56,17 +56,17 @@ _LOAD_ERRORS: Final = (
     MemoryError,
     OSError,
 )
-"""All that torch says about a file that is not a state dict, or is no longer one."""
+"""The exceptions that torch.load and the lookup of tensors raise for a file that is damaged or not a state dict."""
 
 
 def load_alexnet(
     remote: RemoteFile = TORCHVISION_ALEXNET, digest: str = DIGEST, *, downloader: Downloader | None = None
 ) -> dict[str, Tensor]:
-    """The ten tensors by name, float32, from the first place that has them; else downloaded into the cache.
+    """AlexNet's ten tensors by name, float32: from the cache, from BREWSTER_DATA, or downloaded into the cache.
 
     Raises:
-        ModelError: a file is there, and is damaged or another one.
-        DownloadError: there is none, and the server does not give it.
+        ModelError: the file is damaged, or holds other weights.
+        DownloadError: there is no file, and the download fails.
         TargetError: the cache folder cannot be written.
     """
     cached = cache_folder() / "weights" / WEIGHTS_FILE
@@ -78,10 +78,10 @@ def load_alexnet(
 
 
 def read_alexnet(path: Path, digest: str = DIGEST) -> dict[str, Tensor]:
-    """The ten tensors of a state dict, which may have others beside them; checked.
+    """The ten tensors of a state dict, whose digest is checked. Other tensors in the file are ignored.
 
     Raises:
-        ModelError: the file is damaged or another one.
+        ModelError: the file is damaged, or holds other weights.
     """
     import torch  # noqa: PLC0415 - an extra
 
@@ -96,7 +96,7 @@ def read_alexnet(path: Path, digest: str = DIGEST) -> dict[str, Tensor]:
 
 
 def read_heads() -> list[NDArray[np.float32]]:
-    """The weights of the five layers' channels, (64,), (192,), (384,), (256,), (256,); none is negative."""
+    """The channel weights of the five layers, (64,), (192,), (384,), (256,), (256,); none is negative."""
     with np.load(Path(__file__).with_name("lpips_alex_v0.1.npz")) as file:
         return [file[f"layer{i}"] for i in range(5)]
 
@@ -111,7 +111,7 @@ def digest_of(tensors: dict[str, Tensor]) -> str:
 
 
 def _fetch(remote: RemoteFile, digest: str, cached: Path, downloader: Downloader) -> dict[str, Tensor]:
-    """Keeps the ten tensors of the whole network's file, and drops the file: 96 % of it are of no use here."""
+    """Downloads the whole network, stores its ten tensors in `cached`, and deletes the rest (96 % of the file)."""
     import torch  # noqa: PLC0415 - an extra
 
     full_file = cached.with_name(remote.url.rsplit("/", 1)[-1])
@@ -119,9 +119,9 @@ def _fetch(remote: RemoteFile, digest: str, cached: Path, downloader: Downloader
         downloader.fetch(remote, full_file)
     except DownloadError as error:
         raise DownloadError(
-            f"LPIPS needs AlexNet once, 233 MiB, and it cannot be had: {str(error).rstrip('.')}",
-            f"a network, or {WEIGHTS_FILE} in the folder weights of BREWSTER_DATA",
-            "leave LPIPS out with --metrics psnr,ssim",
+            f"AlexNet's weights for LPIPS (233 MiB) could not be downloaded: {str(error).rstrip('.')}",
+            f"a network connection, or {WEIGHTS_FILE} in the folder weights of BREWSTER_DATA",
+            "connect and try again, or leave LPIPS out with --metrics psnr,ssim",
         ) from error
     try:
         tensors = read_alexnet(full_file, digest)
@@ -135,7 +135,7 @@ def _fetch(remote: RemoteFile, digest: str, cached: Path, downloader: Downloader
 
 def _not_alexnet(path: Path, why: str) -> ModelError:
     return ModelError(
-        f"{path} is not the AlexNet of LPIPS ({why})",
+        f"{path} does not hold the AlexNet weights of LPIPS ({why})",
         "the first convolutions of torchvision's alexnet-owt-7be5be79.pth",
-        "delete the file, or put the right one in its place: without it, brewster downloads 233 MiB once",
+        "delete the file, and brewster downloads it again (233 MiB); or replace it by the right one",
     )

@@ -18,14 +18,14 @@ from brewster.errors import DeviceError, DownloadError, MissingExtra, ModelError
 _CPU_MEMORY_ERROR = re.compile(r"out of memory|not enough memory|can't allocate memory", re.IGNORECASE)
 
 
-def library(name: str) -> Any:  # noqa: ANN401 - a module of a library that may be missing
+def import_library(name: str) -> Any:  # noqa: ANN401 - a module of a library that may be missing
     """A module of an outside library, imported at its first use.
 
     Raises:
         MissingExtra: it is not installed.
     """
     try:
-        with quiet():
+        with suppress_warnings():
             return importlib.import_module(name)
     except ImportError as error:
         raise MissingExtra(
@@ -35,19 +35,19 @@ def library(name: str) -> Any:  # noqa: ANN401 - a module of a library that may 
         ) from error
 
 
-def stock_class(name: str) -> Any:  # noqa: ANN401 - diffusers has no types that mypy reads
+def diffusers_class(name: str) -> Any:  # noqa: ANN401 - diffusers has no types that mypy reads
     """A class of diffusers, which imports its parts one by one when they are asked for.
 
     Raises:
         MissingExtra: diffusers, or what this class needs, is not installed.
     """
-    diffusers = library("diffusers")
-    with quiet():
+    diffusers = import_library("diffusers")
+    with suppress_warnings():
         return getattr(diffusers, name)
 
 
 @contextlib.contextmanager
-def quiet() -> Iterator[None]:
+def suppress_warnings() -> Iterator[None]:
     """The stock libraries greet every import with notes about what else could be installed; errors still show."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
@@ -57,13 +57,13 @@ def quiet() -> Iterator[None]:
         logging.disable(before)
 
 
-def bars_on_terminals_only() -> None:
+def disable_progress_bars_in_pipes() -> None:
     """The stock libraries draw progress bars into any pipe; ours stay on terminals."""
     if sys.stderr.isatty():
         return
-    library("huggingface_hub.utils").disable_progress_bars()
-    library("diffusers.utils.logging").disable_progress_bar()
-    library("transformers.utils.logging").disable_progress_bar()
+    import_library("huggingface_hub.utils").disable_progress_bars()
+    import_library("diffusers.utils.logging").disable_progress_bar()
+    import_library("transformers.utils.logging").disable_progress_bar()
 
 
 def fetch(source: str, patterns: list[str]) -> Path:
@@ -78,12 +78,12 @@ def fetch(source: str, patterns: list[str]) -> Path:
     """
     if Path(source).is_dir():
         return Path(source)
-    hub, errors = library("huggingface_hub"), library("huggingface_hub.errors")
+    hub, errors = import_library("huggingface_hub"), import_library("huggingface_hub.errors")
     page = f"https://huggingface.co/{source}"
     try:
         return Path(hub.snapshot_download(source, allow_patterns=patterns))
     except errors.GatedRepoError as error:
-        raise _no_access(error, source, page) from error
+        raise _gated_error(error, source, page) from error
     except errors.RepositoryNotFoundError as error:
         raise DownloadError(
             f"the hub shows no model {source}",
@@ -91,7 +91,7 @@ def fetch(source: str, patterns: list[str]) -> Path:
             f"check {page}, then `hf auth login` or set HF_TOKEN",
         ) from error
     except errors.HfHubHTTPError as error:
-        raise _refused(error, source) from error
+        raise _http_error(error, source) from error
     except errors.HFValidationError as error:
         raise ModelError(
             f"there is no folder {source}, and it is no hub id",
@@ -101,7 +101,7 @@ def fetch(source: str, patterns: list[str]) -> Path:
     except (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled) as error:
         # Where nothing is in the cache, the client hides the hub's answer behind the missing file.
         if isinstance(error.__cause__, errors.HfHubHTTPError):
-            raise _refused(error.__cause__, source) from error
+            raise _http_error(error.__cause__, source) from error
         raise DownloadError(
             f"{source} is not in the cache and the hub cannot be reached",
             "a network, or a folder with the model's files",
@@ -121,20 +121,20 @@ def has_token() -> bool:
     Raises:
         MissingExtra: huggingface_hub is not installed.
     """
-    return library("huggingface_hub").get_token() is not None
+    return import_library("huggingface_hub").get_token() is not None
 
 
-def _no_access(error: Exception, source: str, page: str) -> DownloadError:
+def _gated_error(error: Exception, source: str, page: str) -> DownloadError:
     """A gated model: 401 without a token, 403 with a token whose owner has not been let in."""
-    known = _status(error) == 403
+    is_authenticated = _status(error) == 403
     return DownloadError(
-        f"{source} is gated and {'your account has no access' if known else 'no valid token was sent'}",
+        f"{source} is gated and {'your account has no access' if is_authenticated else 'no valid token was sent'}",
         f"its licence accepted at {page} by the owner of the token",
         "open that page, agree to the licence, then `hf auth login` or set HF_TOKEN to a token with read access",
     )
 
 
-def _refused(error: Exception, source: str) -> DownloadError:
+def _http_error(error: Exception, source: str) -> DownloadError:
     status = _status(error)
     if status in {401, 403}:
         return DownloadError(
@@ -152,8 +152,8 @@ def _status(error: Exception) -> int | None:
 
 
 @contextlib.contextmanager
-def within_memory(cure: str) -> Iterator[None]:
-    """Tells an out-of-memory plainly, on any device; `cure` says what to lower.
+def explain_out_of_memory(hint: str) -> Iterator[None]:
+    """Tells an out-of-memory plainly, on any device; `hint` says what to lower.
 
     Raises:
         DeviceError: out of memory.
@@ -164,6 +164,6 @@ def within_memory(cure: str) -> Iterator[None]:
         if isinstance(error, MemoryError | torch.OutOfMemoryError) or _CPU_MEMORY_ERROR.search(str(error)):
             first = str(error).splitlines()[0] if str(error) else "out of memory"
             raise DeviceError(
-                f"the device ran out of memory ({first})", "room for the model", cure
+                f"the device ran out of memory ({first})", "room for the model", hint
             ) from error
         raise

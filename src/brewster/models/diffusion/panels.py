@@ -103,7 +103,7 @@ def split(composite: Float[Tensor, "n c h w"], layout: PanelLayout) -> dict[str,
     return dict(zip(layout.panels, composite.chunk(count, dim=layout.axis), strict=True))
 
 
-def condition(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> Tensor:
+def conditioning_image(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> Tensor:
     """The picture that the model is shown: I, and white space where the others are to come.
 
     White space turns the task into inpainting, "which is not necessary, but it turns out easier to converge"
@@ -134,19 +134,19 @@ class PanelFit:
         Raises:
             PhotoError: the picture has another size.
         """
-        _refuse_other_size(content, self.content)
+        _check_size(content, self.content)
         right, below = (panel - used for panel, used in zip(self.panel, self.content, strict=True))
         if not right and not below:
             return content
         return functional.pad(content, (0, right, 0, below), mode="reflect")
 
-    def cut(self, panel: Float[Tensor, "n c H W"]) -> Float[Tensor, "n c h w"]:
+    def crop(self, panel: Float[Tensor, "n c H W"]) -> Float[Tensor, "n c h w"]:
         """The content of a panel: exactly undoes `pad`.
 
         Raises:
             PhotoError: the panel has another size.
         """
-        _refuse_other_size(panel, self.panel)
+        _check_size(panel, self.panel)
         width, height = self.content
         return panel[..., :height, :width]
 
@@ -165,11 +165,11 @@ def fit_panel(size: tuple[int, int], layout: PanelLayout, *, budget_px: int, mul
     if short < 1:
         raise PhotoError(f"the photo has {size[0]} x {size[1]} pixels", "at least one", "check the file")
     area = budget_px // len(layout.panels)
-    highest = math.isqrt(area * short // long + 1) + multiple
-    for side in range(highest // multiple * multiple, 0, -multiple):
-        other = max(multiple, round(side * long / short / multiple) * multiple)
-        if side * other <= area:
-            fit = _fit(size, (side, other) if size[0] <= size[1] else (other, side))
+    upper_bound = math.isqrt(area * short // long + 1) + multiple
+    for short_side in range(upper_bound // multiple * multiple, 0, -multiple):
+        long_side = max(multiple, round(short_side * long / short / multiple) * multiple)
+        if short_side * long_side <= area:
+            fit = _fit(size, (short_side, long_side) if size[0] <= size[1] else (long_side, short_side))
             _refuse_enlarging(size, fit, layout, multiple)
             return fit
     raise PhotoError(
@@ -197,7 +197,7 @@ def _refuse_enlarging(size: tuple[int, int], fit: PanelFit, layout: PanelLayout,
     )
 
 
-def _refuse_other_size(picture: Tensor, size: tuple[int, int]) -> None:
+def _check_size(picture: Tensor, size: tuple[int, int]) -> None:
     height, width = picture.shape[-2:]
     if (width, height) != size:
         raise PhotoError(

@@ -1,7 +1,7 @@
 """A photo in a panel, the other panels out: a backbone with what it has learnt, ready for use.
 
-    decomposer = open_decomposer("out/kontext/lora", device="cuda")
-    panels = decomposer(photo, steps=20, seeds=[0, 1])     # {"I": ..., "T": ..., "R": ...}
+    pipeline = load_pipeline("out/kontext/lora", device="cuda")
+    panels = pipeline(photo, steps=20, seeds=[0, 1])     # {"I": ..., "T": ..., "R": ...}
 
 A backbone without a LoRA is asked for T alone, from the photo as its control image: what the paper compares with
 ("Comparing to original Flux model").
@@ -22,8 +22,8 @@ from brewster.errors import DeviceError, ModelError
 from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraCard, load_lora, read_card
 from brewster.models.diffusion.backbones import BACKBONES, encode_prompt, family_of, load_backbone
 from brewster.models.diffusion.families.family import Backbone
-from brewster.models.diffusion.lazy_imports import fetch, within_memory
-from brewster.models.diffusion.panels import PanelLayout, compose, condition, split
+from brewster.models.diffusion.lazy_imports import explain_out_of_memory, fetch
+from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_image, split
 from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding
 from brewster.models.diffusion.sampling import STEPS, euler, sample
 from brewster.models.diffusion.task import DecompositionTask
@@ -33,8 +33,8 @@ from brewster.options import Quantisation
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-_LOWER: Final = "use a quantised or a smaller backbone"
-_END: Final = 1 << 20
+_MEMORY_HINT: Final = "use a quantised or a smaller backbone"
+_FINGERPRINT_BYTES: Final = 1 << 20
 """So many bytes of each end of a file are read to tell it from others."""
 _DEVICES: Final = {"auto": "", "cuda": "cuda", "rocm": "cuda", "cpu": "cpu"}
 
@@ -69,11 +69,11 @@ class DecompositionPipeline:
         """
         layout = self.task.layout
         if self.task.objective == "one_step":
-            return split(self._at_once(photo, on_progress), layout)
+            return split(self._one_step(photo, on_progress), layout)
         height, width = photo.shape[-2:]
         pictures = sample(
             self.backbone,
-            condition(photo, layout),
+            conditioning_image(photo, layout),
             self.prompt,
             size=layout.composite_size((width, height)),
             steps=steps,
@@ -84,13 +84,13 @@ class DecompositionPipeline:
         return split(pictures, layout)
 
     @torch.no_grad()
-    def _at_once(self, photo: Tensor, on_progress: Callable[[int, int], None] | None) -> Tensor:
+    def _one_step(self, photo: Tensor, on_progress: Callable[[int, int], None] | None) -> Tensor:
         backbone, layout = self.backbone, self.task.layout
-        with within_memory(_LOWER):
+        with explain_out_of_memory(_MEMORY_HINT):
             latents = euler(
                 backbone,
-                start(photo, backbone, layout),
-                backbone.encode(condition(photo, layout)),
+                one_step_latents(photo, backbone, layout),
+                backbone.encode(conditioning_image(photo, layout)),
                 self.prompt,
                 steps=1,
                 guidance=self.task.guidance,
@@ -101,14 +101,14 @@ class DecompositionPipeline:
         return picture
 
 
-def start(
+def one_step_latents(
     photo: Float[Tensor, "1 3 h w"], backbone: Backbone, layout: PanelLayout
 ) -> Float[Tensor, "1 c p q"]:
     """Where the one step starts, encoded: the photo in every panel."""
     return backbone.encode(compose(dict.fromkeys(layout.panels, photo), layout))
 
 
-def open_decomposer(
+def load_pipeline(
     model: str,
     *,
     device: str = "auto",
@@ -131,23 +131,23 @@ def open_decomposer(
         DeviceError: no such device, or out of memory (says what to lower).
         MissingExtra: diffusers, torchao or bitsandbytes is not installed.
     """
-    place = torch_device(device)
+    torch_name = torch_device(device)
     folder = _lora_folder(model)
     if folder:
-        return _with_lora(model, folder, place, base, quantise)
+        return _load_with_lora(model, folder, torch_name, base, quantise)
     if base:
         raise ModelError(
             f"{model} is a base itself, and {base} was named as its base",
             f"a LoRA, a folder with {LORA_FILE}",
             "leave the base out",
         )
-    words = encode_prompt(
-        model, PROMPTS.get(prompt, prompt), device=place
+    embedding = encode_prompt(
+        model, PROMPTS.get(prompt, prompt), device=torch_name
     )  # first: there is room for one of the two
-    backbone = load_backbone(model, device=place, quantise=quantise)
-    named = fingerprint(model, device=device, quantise=quantise, prompt=prompt)
+    backbone = load_backbone(model, device=torch_name, quantise=quantise)
+    digest = fingerprint(model, device=device, quantise=quantise, prompt=prompt)
     return DecompositionPipeline(
-        backbone, words, DecompositionTask(PanelLayout(("T",))), model_name(model), named
+        backbone, embedding, DecompositionTask(PanelLayout(("T",))), model_name(model), digest
     )
 
 
@@ -159,7 +159,7 @@ def fingerprint(
     quantise: Quantisation | None = None,
     prompt: str = "detailed",
 ) -> str:
-    """SHA-256 of what `open_decomposer` would open: LoRA, prompt, base, and how the base is stored.
+    """SHA-256 of what `load_pipeline` would open: LoRA, prompt, base, and how the base is stored.
 
     A base on the hub counts by its name; one in a folder by the names, sizes and ends of its files, since reading
     all of them takes a minute.
@@ -169,16 +169,16 @@ def fingerprint(
     """
     folder = _lora_folder(model)
     if folder is None:
-        parts = [_identity(model), str(quantise), PROMPTS.get(prompt, prompt)]
+        parts = [_source_id(model), str(quantise), PROMPTS.get(prompt, prompt)]
     else:
         card = read_card(folder)
         weights = hashlib.sha256((folder / LORA_FILE).read_bytes()).hexdigest()
-        stored = _stored(card, torch_device(device), quantise)
-        parts = [weights, card.prompt_sha256, _identity(base or card.base), str(stored)]
+        stored_as = _base_quantisation(card, torch_device(device), quantise)
+        parts = [weights, card.prompt_sha256, _source_id(base or card.base), str(stored_as)]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
-def _identity(source: str) -> str:
+def _source_id(source: str) -> str:
     """A folder by its files, anything else by its name."""
     folder, digest = Path(source), hashlib.sha256()
     if source in BACKBONES or not folder.is_dir():
@@ -186,13 +186,13 @@ def _identity(source: str) -> str:
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         digest.update(f"{path.relative_to(folder)} {path.stat().st_size}\0".encode())
         with path.open("rb") as file:
-            digest.update(file.read(_END))
-            file.seek(max(0, path.stat().st_size - _END))
+            digest.update(file.read(_FINGERPRINT_BYTES))
+            file.seek(max(0, path.stat().st_size - _FINGERPRINT_BYTES))
             digest.update(file.read())
     return digest.hexdigest()
 
 
-def _stored(card: LoraCard, device: str, quantise: Quantisation | None) -> Quantisation | None:
+def _base_quantisation(card: LoraCard, device: str, quantise: Quantisation | None) -> Quantisation | None:
     """As it is asked for, or as the LoRA has learnt on it; on the CPU nothing is gained by it."""
     return quantise or (card.quantise if device != "cpu" else None)
 
@@ -226,27 +226,27 @@ def _lora_folder(model: str) -> Path | None:
     return None
 
 
-def _with_lora(
+def _load_with_lora(
     model: str, folder: Path, device: str, base: str | None, quantise: Quantisation | None
 ) -> DecompositionPipeline:
     card = read_card(folder)
-    found = base or card.base
-    if base is None and _is_local(found) and not Path(found).is_dir():
+    source = base or card.base
+    if base is None and _is_local(source) and not Path(source).is_dir():
         raise ModelError(
-            f"the base of {model} was {found}, which is not there",
+            f"the base of {model} was {source}, which is not there",
             f"a {card.backbone} in diffusers' layout",
             "name its folder or hub id with --base",
         )
-    family = family_of(found)  # before it is loaded, which may take an hour
+    family = family_of(source)  # before it is loaded, which may take an hour
     if family.name != card.backbone:
         raise ModelError(
             f"{model} is a LoRA of {card.backbone}", f"its base, not a {family.name}", "name another base"
         )
-    backbone = load_backbone(found, device=device, quantise=_stored(card, device, quantise))
+    backbone = load_backbone(source, device=device, quantise=_base_quantisation(card, device, quantise))
     card, prompt = load_lora(folder, backbone)
-    where = "cpu" if device == "cpu" else "cuda"
-    named = fingerprint(model, device=where, base=base, quantise=quantise)
-    return DecompositionPipeline(backbone, prompt, card.task, model_name(model), named)
+    torch_name = "cpu" if device == "cpu" else "cuda"
+    digest = fingerprint(model, device=torch_name, base=base, quantise=quantise)
+    return DecompositionPipeline(backbone, prompt, card.task, model_name(model), digest)
 
 
 def _is_local(source: str) -> bool:

@@ -84,8 +84,8 @@ class PromptEmbedding:
         Raises:
             TargetError: the file cannot be written.
         """
-        about = {"kind": _FORMAT, "backbone": self.backbone, "text": self.text, "sha256": self.sha256}
-        write_tensors(path, self.tensors, about)
+        metadata = {"kind": _FORMAT, "backbone": self.backbone, "text": self.text, "sha256": self.sha256}
+        write_tensors(path, self.tensors, metadata)
 
 
 def load_prompt(path: Path, backbone: str) -> PromptEmbedding:
@@ -94,21 +94,21 @@ def load_prompt(path: Path, backbone: str) -> PromptEmbedding:
     Raises:
         ModelError: missing, damaged, not a prompt, or another backbone's.
     """
-    tensors, about = read_tensors(path)
-    is_one = about.get("kind") == _FORMAT and {"backbone", "text", "sha256"} <= about.keys()
-    if not (is_one and {"embeds"} <= set(tensors) <= {"embeds", "pooled", "negative"}):
+    tensors, metadata = read_tensors(path)
+    is_prompt = metadata.get("kind") == _FORMAT and {"backbone", "text", "sha256"} <= metadata.keys()
+    if not (is_prompt and {"embeds"} <= set(tensors) <= {"embeds", "pooled", "negative"}):
         raise ModelError(f"{path} is not an encoded prompt", f"a file of kind {_FORMAT!r}", "encode it again")
-    if about["backbone"] != backbone:
+    if metadata["backbone"] != backbone:
         raise ModelError(
-            f"{path} was encoded for {about['backbone']}",
+            f"{path} was encoded for {metadata['backbone']}",
             f"a prompt for {backbone}",
             f"encode it with {backbone}'s text encoder",
         )
-    if _digest(about["backbone"], about["text"], tensors) != about["sha256"]:
+    if _digest(metadata["backbone"], metadata["text"], tensors) != metadata["sha256"]:
         raise ModelError(
-            f"{path} does not have the digest that it names", f"{about['sha256'][:12]}...", "copy it again"
+            f"{path} does not have the digest that it names", f"{metadata['sha256'][:12]}...", "copy it again"
         )
-    return PromptEmbedding(about["backbone"], about["text"], **tensors)
+    return PromptEmbedding(metadata["backbone"], metadata["text"], **tensors)
 
 
 def _digest(backbone: str, text: str, tensors: Mapping[str, Tensor]) -> str:

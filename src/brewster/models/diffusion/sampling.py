@@ -17,7 +17,7 @@ from torch import Tensor
 
 from brewster.errors import ModelError
 from brewster.models.diffusion.families.family import Backbone
-from brewster.models.diffusion.lazy_imports import within_memory
+from brewster.models.diffusion.lazy_imports import explain_out_of_memory
 from brewster.models.diffusion.prompt import PromptEmbedding
 
 if TYPE_CHECKING:
@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 
 STEPS: Final = 20
 GUIDANCE: Final = 4.0
-_CURE: Final = "store the base in fewer bits (quantise), or take a smaller base or a card with more memory"
+_MEMORY_HINT: Final = (
+    "store the base in fewer bits (quantise), or take a smaller base or a card with more memory"
+)
 
 
 @torch.no_grad()
@@ -50,22 +52,30 @@ def sample(
         ModelError: sides that are not multiples of 16, a prompt that guidance cannot use, or no steps, seeds or batch.
         DeviceError: out of memory (says what to lower).
     """
-    _refuse_fewer_than_one(f"{steps} steps", steps, usual=STEPS)
-    _refuse_fewer_than_one(f"{len(seeds)} seeds", len(seeds), usual=1)
-    _refuse_fewer_than_one(f"a batch of {batch}", batch, usual=1)
+    _check_positive(f"{steps} steps", steps, usual=STEPS)
+    _check_positive(f"{len(seeds)} seeds", len(seeds), usual=1)
+    _check_positive(f"a batch of {batch}", batch, usual=1)
     groups = [seeds[start : start + batch] for start in range(0, len(seeds), batch)]
     done = itertools.count(1)
 
-    def told() -> None:
+    def report_step() -> None:
         if on_progress:
             on_progress(next(done), steps * len(groups))
 
     pictures = []
-    with within_memory(_CURE):
-        shown = backbone.encode(condition)
+    with explain_out_of_memory(_MEMORY_HINT):
+        condition_latents = backbone.encode(condition)
         for group in groups:
             noise = torch.cat([backbone.noise(size, seed) for seed in group])
-            latents = euler(backbone, noise, shown, prompt, steps=steps, guidance=guidance, on_progress=told)
+            latents = euler(
+                backbone,
+                noise,
+                condition_latents,
+                prompt,
+                steps=steps,
+                guidance=guidance,
+                on_progress=report_step,
+            )
             pictures.append(backbone.decode(latents).clamp(-1, 1).cpu())
     return torch.cat(pictures)
 
@@ -86,14 +96,14 @@ def euler(
     """
     latents = noise.to(backbone.device)
     sigmas = backbone.schedule(latents.shape[2] * latents.shape[3], steps).to(latents.device)
-    for now, after in itertools.pairwise(sigmas):
-        velocity = backbone.predict(latents, condition, now.expand(len(latents)), prompt, guidance)
-        latents = latents + (after - now) * velocity
+    for sigma, next_sigma in itertools.pairwise(sigmas):
+        velocity = backbone.predict(latents, condition, sigma.expand(len(latents)), prompt, guidance)
+        latents = latents + (next_sigma - sigma) * velocity
         if on_progress:
             on_progress()
     return latents
 
 
-def _refuse_fewer_than_one(told: str, count: int, *, usual: int) -> None:
+def _check_positive(request: str, count: int, *, usual: int) -> None:
     if count < 1:
-        raise ModelError(f"sampling was asked for {told}", "at least 1", f"the usual is {usual}")
+        raise ModelError(f"sampling was asked for {request}", "at least 1", f"the usual is {usual}")

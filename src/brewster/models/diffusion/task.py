@@ -42,10 +42,10 @@ class DecompositionTask:
         Raises:
             PhotoError: the photo has fewer than `multiple` pixels a side, or is too long and thin.
         """
-        most = self.budget_px // (len(self.layout.panels) * multiple**2)
-        cells = min(most, math.prod(-(-side // multiple) for side in size))
-        for count in range(cells, 0, -1):
-            budget = count * len(self.layout.panels) * multiple**2
+        max_cells = self.budget_px // (len(self.layout.panels) * multiple**2)
+        cells = min(max_cells, math.prod(-(-side // multiple) for side in size))
+        for cell_count in range(cells, 0, -1):
+            budget = cell_count * len(self.layout.panels) * multiple**2
             with suppress(PhotoError):
                 return fit_panel(size, self.layout, budget_px=budget, multiple=multiple)
         raise PhotoError(

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from brewster.errors import ModelError, RecipeError
 from brewster.models.diffusion.families.family import Backbone
-from brewster.models.diffusion.lazy_imports import library
+from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding, load_prompt
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion.tensors import read_tensors, write_tensors
@@ -32,9 +32,9 @@ from brewster.options import Quantisation
 LORA_FILE: Final = "pytorch_lora_weights.safetensors"
 """The name that stock diffusers looks for."""
 _PREFIX: Final = "transformer."
-_OURS: Final = "brewster"
-_STOCK: Final = "lora_adapter_metadata"
-_ADAPTER: Final = "default"
+_CARD_KEY: Final = "brewster"
+_PEFT_KEY: Final = "lora_adapter_metadata"
+_ADAPTER_NAME: Final = "default"
 
 
 @final
@@ -65,7 +65,7 @@ class LoraCard:
             ModelError: not such a line.
         """
         try:
-            return _cards().validate_json(text, strict=True, extra="forbid")
+            return _card_validator().validate_json(text, strict=True, extra="forbid")
         except (ValueError, RecipeError) as error:
             raise ModelError(
                 f"the card of the LoRA cannot be read: {error}",
@@ -75,7 +75,7 @@ class LoraCard:
 
 
 @cache
-def _cards() -> TypeAdapter[LoraCard]:
+def _card_validator() -> TypeAdapter[LoraCard]:
     return TypeAdapter(LoraCard)
 
 
@@ -90,13 +90,13 @@ def add_lora(backbone: Backbone, *, rank: int = 16, alpha: int = 16, seed: int =
         raise ModelError(f"the rank is {rank}", "at least 1", "the paper takes 16")
     if has_lora(backbone):
         raise ModelError("the backbone has a LoRA already", "one at a time", "remove_lora first")
-    peft = library("peft")
+    peft = import_library("peft")
     config = peft.LoraConfig(r=rank, lora_alpha=alpha, target_modules=backbone.lora_targets())
-    with torch.random.fork_rng(devices=_devices(backbone)):
+    with torch.random.fork_rng(devices=_cuda_devices(backbone)):
         torch.manual_seed(seed)
-        backbone.transformer.add_adapter(config, adapter_name=_ADAPTER)
+        backbone.transformer.add_adapter(config, adapter_name=_ADAPTER_NAME)
     # On a bf16 base the LoRA is bf16, too, until it is cast.
-    library("diffusers.training_utils").cast_training_params(backbone.transformer, torch.float32)
+    import_library("diffusers.training_utils").cast_training_params(backbone.transformer, torch.float32)
     return lora_parameters(backbone)
 
 
@@ -120,7 +120,7 @@ def lora_state(backbone: Backbone) -> dict[str, Tensor]:
     """The LoRA's weights by name, such as transformer_blocks.0.attn.to_q.lora_A.weight; empty without a LoRA."""
     if not has_lora(backbone):
         return {}
-    state = library("peft").get_peft_model_state_dict(backbone.transformer, adapter_name=_ADAPTER)
+    state = import_library("peft").get_peft_model_state_dict(backbone.transformer, adapter_name=_ADAPTER_NAME)
     return dict(sorted(state.items()))
 
 
@@ -131,7 +131,9 @@ def load_lora_state(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
         ModelError: no LoRA to fill, or weights of another backbone or rank.
     """
     _refuse_other_weights(lora_state(backbone), state)
-    library("peft").set_peft_model_state_dict(backbone.transformer, dict(state), adapter_name=_ADAPTER)
+    import_library("peft").set_peft_model_state_dict(
+        backbone.transformer, dict(state), adapter_name=_ADAPTER_NAME
+    )
 
 
 def save_lora(
@@ -157,7 +159,7 @@ def save_lora(
         raise ModelError(
             f"the prompt was encoded for {prompt.backbone}", f"{backbone.name}", "encode it for this backbone"
         )
-    config = backbone.transformer.peft_config[_ADAPTER]
+    config = backbone.transformer.peft_config[_ADAPTER_NAME]
     card = LoraCard(
         backbone.name,
         base or backbone.hub_id,
@@ -169,7 +171,7 @@ def save_lora(
     )
     tensors = {_PREFIX + name: tensor for name, tensor in lora_state(backbone).items()}
     prompt.save(folder / PROMPT_FILE)
-    write_tensors(folder / LORA_FILE, tensors, {_OURS: card.to_json(), _STOCK: _stock_settings(config)})
+    write_tensors(folder / LORA_FILE, tensors, {_CARD_KEY: card.to_json(), _PEFT_KEY: _peft_settings(config)})
     return card
 
 
@@ -223,35 +225,35 @@ def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraCard, PromptEmbeddi
 
 
 def _read(folder: Path) -> tuple[dict[str, Tensor], LoraCard]:
-    tensors, about = read_tensors(folder / LORA_FILE)
-    if _OURS not in about:
+    tensors, metadata = read_tensors(folder / LORA_FILE)
+    if _CARD_KEY not in metadata:
         raise ModelError(
             f"{folder / LORA_FILE} was not written by brewster",
             "a LoRA with its card, which names backbone, layout and prompt",
             "use one that brewster train wrote",
         )
-    card = LoraCard.from_json(about[_OURS])
+    card = LoraCard.from_json(metadata[_CARD_KEY])
     return {name.removeprefix(_PREFIX): tensor for name, tensor in tensors.items()}, card
 
 
-def _refuse_other_weights(wanted: Mapping[str, Tensor], found: Mapping[str, Tensor]) -> None:
-    astray = sorted(set(wanted) ^ set(found))
-    if astray:
+def _refuse_other_weights(expected: Mapping[str, Tensor], found: Mapping[str, Tensor]) -> None:
+    mismatched = sorted(set(expected) ^ set(found))
+    if mismatched:
         raise ModelError(
-            f"{len(astray)} weights of the LoRA are too few or too many, {astray[0]} among them",
+            f"{len(mismatched)} weights of the LoRA are too few or too many, {mismatched[0]} among them",
             "one pair for each linear layer of the blocks",
             "use the backbone that it was trained on",
         )
     for name, tensor in sorted(found.items()):
-        if tensor.shape != wanted[name].shape:
+        if tensor.shape != expected[name].shape:
             raise ModelError(
                 f"{name} has the shape {tuple(tensor.shape)}",
-                f"{tuple(wanted[name].shape)}",
+                f"{tuple(expected[name].shape)}",
                 "use the rank and the backbone that it was trained with",
             )
 
 
-def _stock_settings(config: Any) -> str:  # noqa: ANN401 - peft's configuration
+def _peft_settings(config: Any) -> str:  # noqa: ANN401 - peft's configuration
     """What stock diffusers reads: without it, alpha would be taken for the rank."""
     settings = {
         "r": config.r,
@@ -261,5 +263,5 @@ def _stock_settings(config: Any) -> str:  # noqa: ANN401 - peft's configuration
     return json.dumps({_PREFIX + name: value for name, value in settings.items()}, sort_keys=True)
 
 
-def _devices(backbone: Backbone) -> list[torch.device]:
+def _cuda_devices(backbone: Backbone) -> list[torch.device]:
     return [backbone.device] if backbone.device.type == "cuda" else []

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from brewster.errors import ModelError
-from brewster.models.diffusion.lazy_imports import quiet, stock_class
+from brewster.models.diffusion.lazy_imports import diffusers_class, suppress_warnings
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ APACHE_2: Final = Licence("Apache-2.0", {"license": "apache-2.0"})
 
 @final
 @dataclass(frozen=True)
-class StockCall:
+class DiffusersUsage:
     """How the card of a LoRA calls the stock pipeline so that it makes the same composite, as Python source."""
 
     parts: str
@@ -70,15 +70,15 @@ class Backbone(ABC):
     name: ClassVar[str]
     hub_id: ClassVar[str]
     licence: ClassVar[Licence]
-    stock_use: ClassVar[StockCall | str]
+    diffusers_usage: ClassVar[DiffusersUsage | str]
     """For the card: how to call the stock pipeline, or why it cannot make the same picture, "but ..."."""
     classes: ClassVar[Mapping[str, str]]
     """Names in diffusers of the "pipeline", "transformer", "vae" and "scheduler"."""
-    real: ClassVar[Architecture]
+    full_size: ClassVar[Architecture]
     tiny: ClassVar[Architecture]
     guided_by_embedding: ClassVar[bool]
     """Whether guidance is a number that the transformer reads, or a second prediction (classifier-free)."""
-    words_need: ClassVar[tuple[str, ...]] = ()
+    text_encoder_requirements: ClassVar[tuple[str, ...]] = ()
     """Libraries beyond the extra `large` that its text encoders are loaded with."""
     multiple: ClassVar[int] = 16
     """Sides of a panel are multiples of this many pixels."""
@@ -117,17 +117,17 @@ class Backbone(ABC):
         Raises:
             ModelError: sides that are not multiples of 16.
         """
-        self._refuse_off_grid(picture.shape[-1], picture.shape[-2])
+        self._check_grid(picture.shape[-1], picture.shape[-2])
         mean, deviation = self.statistics()
-        seen = self._see(picture.to(self.vae.device, self.vae.dtype))
-        return (functional.pixel_unshuffle(seen, PATCH).float() - mean) / deviation
+        cells = self._vae_encode(picture.to(self.vae.device, self.vae.dtype))
+        return (functional.pixel_unshuffle(cells, PATCH).float() - mean) / deviation
 
     @torch.no_grad()
     def decode(self, latents: Float[Tensor, "n c h w"]) -> Float[Tensor, "n 3 16*h 16*w"]:
         """Latent grids as pictures, about [-1, 1], not clamped, float32."""
         mean, deviation = self.statistics()
         grid = latents.to(self.vae.device).float() * deviation + mean
-        return self._show(functional.pixel_shuffle(grid, PATCH).to(self.vae.dtype)).float()
+        return self._vae_decode(functional.pixel_shuffle(grid, PATCH).to(self.vae.dtype)).float()
 
     @abstractmethod
     def statistics(self) -> tuple[Tensor, Tensor]:
@@ -168,10 +168,10 @@ class Backbone(ABC):
         Raises:
             ModelError: sides that are not multiples of 16.
         """
-        self._refuse_off_grid(*size)
+        self._check_grid(*size)
         width, height = (side // self.multiple * PATCH for side in size)
         shape = (1, self.channels // PATCH**2, height, width)
-        return functional.pixel_unshuffle(_normal(shape, seed), PATCH)
+        return functional.pixel_unshuffle(_seeded_noise(shape, seed), PATCH)
 
     def shift(self, tokens: int, steps: int) -> float:  # noqa: ARG002 - one family's shift counts the steps
         """The schedule's shift mu for a composite of this many generated tokens (condition not counted).
@@ -187,9 +187,9 @@ class Backbone(ABC):
         """Times in (0, 1] moved towards noise as the schedule moves them, for training."""
         scheduler = self.scheduler
         if scheduler.config.use_dynamic_shifting:
-            moved = scheduler.time_shift(self.shift(tokens, steps), 1.0, sigma)
-            assert isinstance(moved, Tensor)
-            return moved
+            shifted = scheduler.time_shift(self.shift(tokens, steps), 1.0, sigma)
+            assert isinstance(shifted, Tensor)
+            return shifted
         return scheduler.shift * sigma / (1 + (scheduler.shift - 1) * sigma)  # type: ignore[no-any-return]
 
     def schedule(self, tokens: int, steps: int) -> Float[Tensor, " sigmas"]:
@@ -219,24 +219,24 @@ class Backbone(ABC):
         Raises:
             MissingExtra: diffusers is not installed.
         """
-        kind = stock_class(self.classes["pipeline"])
+        kind = diffusers_class(self.classes["pipeline"])
         parts = {"transformer": self.transformer, "vae": self.vae, "scheduler": self.scheduler}
-        wanted = inspect.signature(kind.__init__).parameters
-        absent = {
+        parameters = inspect.signature(kind.__init__).parameters
+        omitted = {
             name: None
-            for name, parameter in wanted.items()
+            for name, parameter in parameters.items()
             if name not in {"self", *parts} and parameter.default is parameter.empty
         }
-        distilled = {"is_distilled": self.distilled} if "is_distilled" in wanted else {}
-        return kind(**parts, **absent, **distilled)
+        distilled = {"is_distilled": self.distilled} if "is_distilled" in parameters else {}
+        return kind(**parts, **omitted, **distilled)
 
     def save(self, folder: Path) -> None:
         """Writes the folder that `load_backbone` and stock diffusers read."""
         pipeline = self.pipeline()
-        with quiet():  # a warning for each text encoder that is not there
+        with suppress_warnings():  # a warning for each text encoder that is not there
             pipeline.save_pretrained(folder)
 
-    def _refuse_off_grid(self, width: int, height: int) -> None:
+    def _check_grid(self, width: int, height: int) -> None:
         if width % self.multiple or height % self.multiple:
             raise ModelError(
                 f"the picture has {width} x {height} pixels",
@@ -244,10 +244,10 @@ class Backbone(ABC):
                 "pad it with panels.fit_panel",
             )
 
-    def _see(self, picture: Tensor) -> Tensor:
+    def _vae_encode(self, picture: Tensor) -> Tensor:
         return self.vae.encode(picture).latent_dist.mode()  # type: ignore[no-any-return]
 
-    def _show(self, latent: Tensor) -> Tensor:
+    def _vae_decode(self, latent: Tensor) -> Tensor:
         return self.vae.decode(latent, return_dict=False)[0]  # type: ignore[no-any-return]
 
     def _tokens(self, latents: Tensor, condition: Tensor) -> Float[Tensor, "n t c"]:
@@ -269,22 +269,24 @@ class ClassifierFreeBackbone(Backbone):
         Raises:
             ModelError: guidance above 1 and a prompt without its empty counterpart.
         """
-        wanted = self._velocity(latents, condition, sigma, prompt.embeds)
+        conditional = self._velocity(latents, condition, sigma, prompt.embeds)
         if guidance <= 1 or self.distilled:
-            return wanted
-        empty = self._velocity(latents, condition, sigma, _empty(prompt))
-        return self._guided(wanted, empty, guidance)
+            return conditional
+        unconditional = self._velocity(latents, condition, sigma, _negative_embeds(prompt))
+        return self._guided(conditional, unconditional, guidance)
 
     @abstractmethod
-    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, words: Tensor) -> Tensor:
+    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor) -> Tensor:
         """What the transformer predicts when it is told these words, (1, tokens, width)."""
 
-    def _guided(self, wanted: Tensor, empty: Tensor, guidance: float) -> Tensor:
+    def _guided(self, conditional: Tensor, unconditional: Tensor, guidance: float) -> Tensor:
         """Away from what the empty prompt predicts."""
-        return empty + guidance * (wanted - empty)
+        return unconditional + guidance * (conditional - unconditional)
 
 
-def grid_of(tokens: Float[Tensor, "n t c"], like: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
+def tokens_to_grid(
+    tokens: Float[Tensor, "n t c"], like: Float[Tensor, "n c h w"]
+) -> Float[Tensor, "n c h w"]:
     """The generated tokens, the first ones, on their grid again, float32."""
     generated = tokens[:, : like.shape[2] * like.shape[3]].mT.float()
     return generated.reshape(like.shape)
@@ -293,12 +295,12 @@ def grid_of(tokens: Float[Tensor, "n t c"], like: Float[Tensor, "n c h w"]) -> F
 def random_prompt(backbone: str, seed: int, **shapes: tuple[int, ...]) -> PromptEmbedding:
     """The paper's words with random numbers for their meaning: `embeds` and what else has a shape."""
     tensors = {
-        name: _normal(shape, seed + index) for index, (name, shape) in enumerate(sorted(shapes.items()))
+        name: _seeded_noise(shape, seed + index) for index, (name, shape) in enumerate(sorted(shapes.items()))
     }
     return PromptEmbedding(backbone, PROMPT, **tensors)
 
 
-def _empty(prompt: PromptEmbedding) -> Tensor:
+def _negative_embeds(prompt: PromptEmbedding) -> Tensor:
     if prompt.negative is None:
         raise ModelError(
             f"the prompt for {prompt.backbone} has no empty counterpart",
@@ -308,5 +310,5 @@ def _empty(prompt: PromptEmbedding) -> Tensor:
     return prompt.negative
 
 
-def _normal(shape: tuple[int, ...], seed: int) -> Tensor:
+def _seeded_noise(shape: tuple[int, ...], seed: int) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))

@@ -10,9 +10,9 @@ from torch import Tensor
 from brewster.models.diffusion.families.family import (
     APACHE_2,
     ClassifierFreeBackbone,
-    StockCall,
-    grid_of,
+    DiffusersUsage,
     random_prompt,
+    tokens_to_grid,
 )
 from brewster.models.diffusion.prompt import PromptEmbedding
 
@@ -34,7 +34,7 @@ class Klein(ClassifierFreeBackbone):
     name = "klein"
     hub_id = "black-forest-labs/FLUX.2-klein-base-4B"
     licence = APACHE_2
-    stock_use = StockCall(
+    diffusers_usage = DiffusersUsage(
         "text_encoder=None, tokenizer=None",
         'negative_prompt_embeds=words["negative"],',
         "A condition of more than 1024 x 1024 pixels would be rescaled in silence.",
@@ -43,7 +43,7 @@ class Klein(ClassifierFreeBackbone):
         "pipeline": "Flux2KleinPipeline", "transformer": "Flux2Transformer2DModel",
         "vae": "AutoencoderKLFlux2", "scheduler": "FlowMatchEulerDiscreteScheduler",
     }  # fmt: skip
-    real: ClassVar = {
+    full_size: ClassVar = {
         "transformer": {
             "guidance_embeds": False, "num_layers": 5, "num_single_layers": 20, "num_attention_heads": 24,
             "joint_attention_dim": 7680,
@@ -73,7 +73,7 @@ class Klein(ClassifierFreeBackbone):
         Raises:
             ModelError: sides that are not multiples of 16.
         """
-        self._refuse_off_grid(*size)
+        self._check_grid(*size)
         width, height = (side // self.multiple for side in size)
         return torch.randn(1, self.channels, height, width, generator=torch.Generator().manual_seed(seed))
 
@@ -87,7 +87,9 @@ class Klein(ClassifierFreeBackbone):
 
     def positions(self, latents: Tensor, condition: Tensor) -> Tensor:
         """(tokens, 4): time (0 generated, 10 conditioning), row, column, place in the text (0)."""
-        return torch.cat([_ids(latents, 0), _ids(condition, _CONDITION_TIME)]).to(self.device)
+        return torch.cat([_position_ids(latents, 0), _position_ids(condition, _CONDITION_TIME)]).to(
+            self.device
+        )
 
     @classmethod
     def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a stock pipeline
@@ -102,25 +104,25 @@ class Klein(ClassifierFreeBackbone):
         shape = (1, 8, transformer.config.joint_attention_dim)
         return random_prompt(cls.name, seed, embeds=shape, negative=shape)
 
-    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, words: Tensor) -> Tensor:
-        told = words.to(self.device, self.dtype).expand(len(latents), -1, -1)
+    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor) -> Tensor:
+        embeds = embeds.to(self.device, self.dtype).expand(len(latents), -1, -1)
         tokens = self.transformer(
             hidden_states=self._tokens(latents, condition),
-            encoder_hidden_states=told,
+            encoder_hidden_states=embeds,
             timestep=sigma.to(self.device, self.dtype),
             guidance=None,
-            txt_ids=_text_ids(told).to(self.device),
+            txt_ids=_text_position_ids(embeds).to(self.device),
             img_ids=self.positions(latents, condition),
             return_dict=False,
         )[0]
-        return grid_of(tokens, latents)
+        return tokens_to_grid(tokens, latents)
 
 
-def _ids(grid: Tensor, time: int) -> Tensor:
+def _position_ids(grid: Tensor, time: int) -> Tensor:
     rows, columns = (torch.arange(side) for side in grid.shape[2:])
     return torch.cartesian_prod(torch.tensor([time]), rows, columns, torch.arange(1))
 
 
-def _text_ids(words: Tensor) -> Tensor:
+def _text_position_ids(embeds: Tensor) -> Tensor:
     zero = torch.arange(1)
-    return torch.cartesian_prod(zero, zero, zero, torch.arange(words.shape[1]))
+    return torch.cartesian_prod(zero, zero, zero, torch.arange(embeds.shape[1]))

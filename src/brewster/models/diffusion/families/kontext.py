@@ -8,7 +8,13 @@ import torch
 from torch import Tensor
 
 from brewster.errors import ModelError
-from brewster.models.diffusion.families.family import Backbone, Licence, StockCall, grid_of, random_prompt
+from brewster.models.diffusion.families.family import (
+    Backbone,
+    DiffusersUsage,
+    Licence,
+    random_prompt,
+    tokens_to_grid,
+)
 from brewster.models.diffusion.prompt import PromptEmbedding
 
 _SCHEDULER: Final = {
@@ -37,7 +43,7 @@ class Kontext(Backbone):
         },
         is_commercial=False,
     )
-    stock_use = StockCall(
+    diffusers_usage = DiffusersUsage(
         "text_encoder=None, text_encoder_2=None, tokenizer=None, tokenizer_2=None",
         'pooled_prompt_embeds=words["pooled"], max_area={area}, _auto_resize=False,',
         "Without `max_area` and `_auto_resize=False` the pipeline rescales both pictures in silence.",
@@ -46,7 +52,7 @@ class Kontext(Backbone):
         "pipeline": "FluxKontextPipeline", "transformer": "FluxTransformer2DModel",
         "vae": "AutoencoderKL", "scheduler": "FlowMatchEulerDiscreteScheduler",
     }  # fmt: skip
-    real: ClassVar = {
+    full_size: ClassVar = {
         "transformer": {"guidance_embeds": True},
         "vae": {**_VAE, "block_out_channels": (128, 256, 512, 512), "layers_per_block": 2},
         "scheduler": _SCHEDULER,
@@ -71,7 +77,7 @@ class Kontext(Backbone):
 
     def positions(self, latents: Tensor, condition: Tensor) -> Tensor:
         """(tokens, 3): 0 for generated and 1 for conditioning tokens, row, column."""
-        return torch.cat([_ids(latents, 0), _ids(condition, 1)]).to(self.device)
+        return torch.cat([_position_ids(latents, 0), _position_ids(condition, 1)]).to(self.device)
 
     def predict(
         self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float
@@ -83,20 +89,20 @@ class Kontext(Backbone):
         """
         if prompt.pooled is None:
             raise ModelError("the prompt has no pooled vector", "one, from CLIP", "encode the prompt again")
-        count, words = len(latents), prompt.to(self.device, self.dtype)
-        assert words.pooled is not None
-        embeds = self.transformer.config.guidance_embeds
+        count, embedding = len(latents), prompt.to(self.device, self.dtype)
+        assert embedding.pooled is not None
+        takes_guidance = self.transformer.config.guidance_embeds
         tokens = self.transformer(
             hidden_states=self._tokens(latents, condition),
-            encoder_hidden_states=words.embeds.expand(count, -1, -1),
-            pooled_projections=words.pooled.expand(count, -1),
+            encoder_hidden_states=embedding.embeds.expand(count, -1, -1),
+            pooled_projections=embedding.pooled.expand(count, -1),
             timestep=sigma.to(self.device, self.dtype),
-            guidance=torch.full((count,), guidance, device=self.device) if embeds else None,
-            txt_ids=torch.zeros(words.embeds.shape[1], 3, device=self.device),
+            guidance=torch.full((count,), guidance, device=self.device) if takes_guidance else None,
+            txt_ids=torch.zeros(embedding.embeds.shape[1], 3, device=self.device),
             img_ids=self.positions(latents, condition).float(),
             return_dict=False,
         )[0]
-        return grid_of(tokens, latents)
+        return tokens_to_grid(tokens, latents)
 
     @classmethod
     def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a stock pipeline
@@ -112,6 +118,6 @@ class Kontext(Backbone):
         return random_prompt(cls.name, seed, **shapes)
 
 
-def _ids(grid: Tensor, picture: int) -> Tensor:
+def _position_ids(grid: Tensor, picture: int) -> Tensor:
     rows, columns = (torch.arange(side) for side in grid.shape[2:])
     return torch.cartesian_prod(torch.tensor([picture]), rows, columns)

@@ -11,8 +11,8 @@ from brewster.models.diffusion.families.family import (
     APACHE_2,
     PATCH,
     ClassifierFreeBackbone,
-    grid_of,
     random_prompt,
+    tokens_to_grid,
 )
 from brewster.models.diffusion.prompt import PromptEmbedding
 
@@ -34,13 +34,15 @@ class Qwen(ClassifierFreeBackbone):
     name = "qwen"
     hub_id = "Qwen/Qwen-Image-Edit"
     licence = APACHE_2
-    stock_use = "but resizes what it is shown to a megapixel, so that its panels are not the ones learnt"
-    words_need = ("torchvision",)
+    diffusers_usage = (
+        "but resizes what it is shown to a megapixel, so that its panels are not the ones learnt"
+    )
+    text_encoder_requirements = ("torchvision",)
     classes: ClassVar = {
         "pipeline": "QwenImageEditPipeline", "transformer": "QwenImageTransformer2DModel",
         "vae": "AutoencoderKLQwenImage", "scheduler": "FlowMatchEulerDiscreteScheduler",
     }  # fmt: skip
-    real: ClassVar = {"transformer": {}, "vae": {}, "scheduler": _SCHEDULER}
+    full_size: ClassVar = {"transformer": {}, "vae": {}, "scheduler": _SCHEDULER}
     tiny: ClassVar = {
         "transformer": {
             "num_layers": 2, "attention_head_dim": 16, "num_attention_heads": 2, "joint_attention_dim": 32,
@@ -79,25 +81,25 @@ class Qwen(ClassifierFreeBackbone):
         width = transformer.config.joint_attention_dim
         return random_prompt(cls.name, seed, embeds=(1, 8, width), negative=(1, 6, width))
 
-    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, words: Tensor) -> Tensor:
+    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor) -> Tensor:
         tokens = self.transformer(
             hidden_states=self._tokens(latents, condition),
-            encoder_hidden_states=words.to(self.device, self.dtype).expand(len(latents), -1, -1),
+            encoder_hidden_states=embeds.to(self.device, self.dtype).expand(len(latents), -1, -1),
             timestep=sigma.to(self.device, self.dtype),
             img_shapes=self.positions(latents, condition),
             return_dict=False,
         )[0]
-        return grid_of(tokens, latents)
+        return tokens_to_grid(tokens, latents)
 
-    def _guided(self, wanted: Tensor, empty: Tensor, guidance: float) -> Tensor:
+    def _guided(self, conditional: Tensor, unconditional: Tensor, guidance: float) -> Tensor:
         """The direction of the guided prediction, the length of the wanted one, token by token."""
-        combined = super()._guided(wanted, empty, guidance)
-        return combined * (_length(wanted) / _length(combined))
+        combined = super()._guided(conditional, unconditional, guidance)
+        return combined * (_length(conditional) / _length(combined))
 
-    def _see(self, picture: Tensor) -> Tensor:
+    def _vae_encode(self, picture: Tensor) -> Tensor:
         return self.vae.encode(picture[:, :, None]).latent_dist.mode()[:, :, 0]  # type: ignore[no-any-return]
 
-    def _show(self, latent: Tensor) -> Tensor:
+    def _vae_decode(self, latent: Tensor) -> Tensor:
         return self.vae.decode(latent[:, :, None], return_dict=False)[0][:, :, 0]  # type: ignore[no-any-return]
 
 
