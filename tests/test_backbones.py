@@ -1,4 +1,4 @@
-"""The table of large backbones: real loading code on tiny folders, and every way in which a model can be amiss."""
+"""The table of large backbones: the real loading code on tiny folders, and all errors of damaged or wrong folders."""
 
 import json
 import shutil
@@ -18,7 +18,7 @@ from brewster.models.diffusion.prompt import PROMPT
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
-    """Folders of tiny twins, to be read only."""
+    """Folders of tiny versions; tests must not change them."""
     folder = tmp_path_factory.mktemp("twins")
     for name in BACKBONES:
         tiny(name, seed=1)[0].save(folder / name)
@@ -27,7 +27,7 @@ def saved(tmp_path_factory):
 
 @pytest.fixture
 def folder(saved, tmp_path):
-    """A folder of a tiny Kontext that may be broken."""
+    """A folder of a tiny Kontext that a test may change."""
     return shutil.copytree(saved / "kontext", tmp_path / "kontext")
 
 
@@ -38,7 +38,7 @@ def velocity(backbone, prompt):
 
 
 @pytest.mark.parametrize("name", list(BACKBONES))
-def test_a_twin_survives_its_folder(saved, name):
+def test_a_tiny_version_survives_saving_and_loading(saved, name):
     twin, prompt = tiny(name, seed=1)
     back = load_backbone(str(saved / name))
     assert type(back) is BACKBONES[name]
@@ -49,7 +49,7 @@ def test_a_twin_survives_its_folder(saved, name):
 
 
 @pytest.mark.parametrize("name", list(BACKBONES))
-def test_twins_have_the_classes_of_the_real_ones_and_differ_by_seed_only(name):
+def test_tiny_versions_have_the_classes_of_the_full_size_models_and_differ_by_seed_only(name):
     twin, prompt = tiny(name, seed=1)
     same, same_prompt = tiny(name, seed=1)
     other, other_prompt = tiny(name, seed=2)
@@ -64,7 +64,7 @@ def test_twins_have_the_classes_of_the_real_ones_and_differ_by_seed_only(name):
 @pytest.mark.parametrize(
     ("name", "billions", "targets"), [("kontext", 11.90, 494), ("klein", 3.88, 100), ("qwen", 20.43, 840)]
 )
-def test_full_size_architectures_cost_nothing_on_meta(name, billions, targets):
+def test_full_size_architectures_need_no_memory_on_the_meta_device(name, billions, targets):
     backbone = build(name, device="meta", dtype=torch.bfloat16)
     parameters = sum(parameter.numel() for parameter in backbone.transformer.parameters())
     assert parameters / 1e9 == pytest.approx(billions, abs=0.005)
@@ -82,7 +82,7 @@ def test_a_picture_becomes_one_token_for_16_by_16_pixels(name):
 
 
 @pytest.mark.parametrize("name", list(BACKBONES))
-def test_latent_statistics_are_applied_and_undone(name, monkeypatch):
+def test_latent_statistics_are_applied_and_inverted(name, monkeypatch):
     backbone, _ = tiny(name, seed=1)
     mean, deviation = backbone.statistics()
     assert mean.abs().max() > 0.05
@@ -95,7 +95,7 @@ def test_latent_statistics_are_applied_and_undone(name, monkeypatch):
     torch.testing.assert_close(shown, [grid])
 
 
-def test_a_panel_encoded_apart_is_not_the_panel_of_the_composite():
+def test_a_panel_encoded_separately_differs_from_that_panel_of_the_composite():
     backbone, _ = tiny("kontext", seed=1)
     composite = torch.rand(1, 3, 32, 96) * 2 - 1
     assert not torch.allclose(
@@ -119,31 +119,31 @@ def test_a_quantised_base_predicts_nearly_the_same_and_trains_a_lora(saved, quan
 
 def test_a_base_that_was_silently_left_unquantised_is_refused(saved, monkeypatch):
     monkeypatch.setattr(backbones, "_device_map", lambda device: {"device_map": {"": device}})
-    with pytest.raises(ModelError, match=r"loaded as torch\.bfloat16; stored as int8"):
+    with pytest.raises(ModelError, match=r"loaded as torch\.bfloat16; weights stored as int8"):
         load_backbone(str(saved / "kontext"), quantise="int8", dtype=torch.bfloat16)
 
 
-def test_nf4_wants_an_nvidia_gpu():
+def test_nf4_needs_an_nvidia_gpu():
     with pytest.raises(DeviceError, match='nf4 does not run on cpu; an NVIDIA GPU; use quantise="int8"'):
         load_backbone("kontext", quantise="nf4")
 
 
-def test_unknown_names_are_answered_with_known_ones():
+def test_unknown_names_get_suggestions():
     with pytest.raises(ModelError, match="did you mean kontext"):
         tiny("kontxt")
     with pytest.raises(ModelError, match="there is no quantisation 'int2'; one of int8, float8, nf4"):
         load_backbone("kontext", quantise="int2")
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is one")
-def test_an_absent_gpu_is_told_before_anything_is_loaded():
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_a_missing_gpu_is_reported_before_anything_is_loaded():
     with pytest.raises(DeviceError, match="there is no CUDA device"):
         load_backbone("/nowhere", device="cuda")
 
 
 @pytest.fixture(scope="module")
 def with_words(tmp_path_factory):
-    """Folders of tiny twins with text encoders and tokenizers: every byte is a word."""
+    """Folders of tiny versions with text encoders, and tokenizers whose tokens are single bytes."""
     folder = tmp_path_factory.mktemp("words")
     letters = sorted(ByteLevel.alphabet())
     torch.manual_seed(0)
@@ -163,7 +163,7 @@ def with_words(tmp_path_factory):
     layers = transformers.Qwen3Config(
         vocab_size=300, num_hidden_layers=28, num_key_value_heads=1, head_dim=8, **small
     )
-    readers = {
+    text_modules = {
         "kontext": {
             "tokenizer": clip,
             "text_encoder": transformers.CLIPTextModel(summary),
@@ -173,9 +173,9 @@ def with_words(tmp_path_factory):
         "klein": {"tokenizer": qwen, "text_encoder": transformers.Qwen3ForCausalLM(layers)},
     }
     lazy_imports.disable_progress_bars_in_pipes()
-    for name, reader in readers.items():
+    for name, modules in text_modules.items():
         pipeline = tiny(name)[0].pipeline()
-        pipeline.register_modules(**reader)
+        pipeline.register_modules(**modules)
         pipeline.save_pretrained(folder / name)
     return folder
 
@@ -195,28 +195,28 @@ def test_a_prompt_is_encoded_by_the_text_encoders_of_the_folder(with_words, name
     assert not torch.equal(encode_prompt(str(with_words / name), "a cat").embeds, prompt.embeds)
 
 
-def test_without_a_network_the_hub_client_itself_ends_in_plain_words(tmp_path, monkeypatch):
+def test_the_offline_error_of_huggingface_hub_is_explained(tmp_path, monkeypatch):
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
     with pytest.raises(DownloadError, match="cannot be reached"):
         load_backbone("klein")
 
 
-def test_only_the_parts_that_see_pictures_are_downloaded(saved, monkeypatch):
-    asked = []
+def test_text_encoders_are_not_downloaded(saved, monkeypatch):
+    requests = []
 
-    def give(source, *, allow_patterns):
-        asked.append((source, allow_patterns))
+    def snapshot_download(source, *, allow_patterns):
+        requests.append((source, allow_patterns))
         return str(saved / "klein")
 
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", give)
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
     load_backbone("klein")
-    source, patterns = asked[0]
+    source, patterns = requests[0]
     assert source == "black-forest-labs/FLUX.2-klein-base-4B"
     assert patterns == ["model_index.json", "transformer/*", "vae/*", "scheduler/*"]
 
 
-def test_a_path_that_is_nowhere_is_no_hub_id_either():
+def test_a_path_that_does_not_exist_is_not_taken_for_a_hub_id():
     with pytest.raises(ModelError, match=r"there is no folder ./nowhere/at/all"):
         load_backbone("./nowhere/at/all")
 
@@ -238,7 +238,7 @@ def test_a_missing_file_is_named(folder, name):
 
 
 @pytest.mark.parametrize("size", [0, 100, -7])
-def test_truncated_weights_are_told_plainly(folder, size):
+def test_truncated_weights_are_refused(folder, size):
     path = folder / "transformer" / "diffusion_pytorch_model.safetensors"
     path.write_bytes(path.read_bytes()[:size])
     with pytest.raises(ModelError, match=r"transformer cannot be loaded.*download the model again"):
@@ -249,20 +249,20 @@ def change(path, **values):
     path.write_text(json.dumps(json.loads(path.read_text()) | values))
 
 
-def test_another_pipeline_is_not_one_of_ours(folder):
+def test_a_folder_of_another_pipeline_is_refused(folder):
     change(folder / "model_index.json", _class_name="StableDiffusionPipeline")
-    with pytest.raises(ModelError, match="holds a StableDiffusionPipeline; one of FluxKontextPipeline"):
+    with pytest.raises(ModelError, match="contains a StableDiffusionPipeline; one of FluxKontextPipeline"):
         load_backbone(str(folder))
 
 
 def test_a_transformer_of_another_architecture_is_refused(folder, saved):
     shutil.rmtree(folder / "transformer")
     shutil.copytree(saved / "qwen" / "transformer", folder / "transformer")
-    with pytest.raises(ModelError, match="holds a QwenImageTransformer2DModel; a FluxTransformer2DModel"):
+    with pytest.raises(ModelError, match="contains a QwenImageTransformer2DModel; a FluxTransformer2DModel"):
         load_backbone(str(folder))
 
 
-def test_settings_that_do_not_fit_the_weights_are_refused(folder):
+def test_settings_that_do_not_match_the_weights_are_refused(folder):
     change(folder / "transformer" / "config.json", num_layers=3)
     with pytest.raises(ModelError, match="transformer"):
         load_backbone(str(folder))
@@ -271,16 +271,16 @@ def test_settings_that_do_not_fit_the_weights_are_refused(folder):
         load_backbone(str(folder))
 
 
-def test_a_broken_index_is_told_plainly(folder):
+def test_a_damaged_index_is_refused(folder):
     (folder / "model_index.json").write_text("{")
     with pytest.raises(ModelError, match=r"model_index.json is not JSON"):
         load_backbone(str(folder))
     (folder / "model_index.json").write_text("[]")
-    with pytest.raises(ModelError, match="holds no settings"):
+    with pytest.raises(ModelError, match="contains no settings"):
         load_backbone(str(folder))
 
 
-def test_running_out_of_memory_while_loading_says_what_to_lower(folder, monkeypatch):
+def test_out_of_memory_while_loading_says_what_to_reduce(folder, monkeypatch):
     def full(*_, **__):
         raise torch.OutOfMemoryError("CUDA out of memory.")
 

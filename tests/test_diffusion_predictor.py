@@ -209,11 +209,11 @@ def test_a_backbone_without_a_lora_is_asked_for_the_transmission_alone():
 def test_what_a_lora_is_opened_with_is_checked(lora, tmp_path):
     with pytest.raises(ModelError, match="is a LoRA of kontext; its base, not a klein"):
         load_pipeline(str(lora), base="tiny:klein")
-    with pytest.raises(ModelError, match="is a base itself"):
+    with pytest.raises(ModelError, match="is a backbone, and the base tiny:kontext was given"):
         load_pipeline("tiny:klein", base="tiny:kontext")
     with pytest.raises(DeviceError, match="do not run on coreml; one of auto, cuda, rocm, cpu"):
         load_pipeline(str(lora), device="coreml")
-    with pytest.raises(ModelError, match=f"holds no model; a LoRA .{LORA_FILE}"):
+    with pytest.raises(ModelError, match=f"contains no model; a LoRA .{LORA_FILE}"):
         load_pipeline(str(tmp_path))
     (tmp_path / LORA_FILE).write_bytes(b"torn")
     with pytest.raises(ModelError):
@@ -231,7 +231,7 @@ def test_what_a_lora_is_opened_with_is_checked(lora, tmp_path):
         ({"more": 1}, "card of the LoRA cannot be read"),
         ({"task": {"objective": "two"}}, "card of the LoRA cannot be read"),
         ({"task": {"budget_px": "18432"}}, "card of the LoRA cannot be read"),
-        ({"task": {"layout": {"panels": ["I", "R"], "direction": "stacked"}}}, "T among them"),
+        ({"task": {"layout": {"panels": ["I", "R"], "direction": "stacked"}}}, "a list with T"),
         ({"task": {"layout": {"panels": ["T", "T"], "direction": "stacked"}}}, "each once"),
     ],
 )
@@ -266,7 +266,7 @@ def test_a_base_that_has_moved_can_be_named(tmp_path):
     backbone, prompt = tiny("kontext")
     add_lora(backbone, rank=1, alpha=1)
     save_lora(tmp_path / "lora", backbone, prompt, DecompositionTask(budget_px=SMALL), base="/gone/kontext")
-    with pytest.raises(ModelError, match=r"the base of .* was /gone/kontext, which is not there.*--base"):
+    with pytest.raises(ModelError, match=r"the base of .* was /gone/kontext, which does not exist.*--base"):
         Separator.load(str(tmp_path / "lora"))
     assert Separator.load(str(tmp_path / "lora"), base="tiny:kontext").name == "lora"
 

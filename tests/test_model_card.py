@@ -109,7 +109,7 @@ def test_what_was_measured_takes_its_place_again_and_again():
 def test_what_stock_pipelines_cannot_do_is_not_promised():
     assert "max_area" in card()
     assert "starts from noise" in card(objective="one_step")
-    assert "resizes what it is shown to a megapixel" in card("qwen")
+    assert "resizes the conditioning image to one megapixel" in card("qwen")
     assert all("from diffusers" not in text for text in (card(objective="one_step"), card("qwen")))
 
 

@@ -1,9 +1,9 @@
-"""The table of large backbones: load a real one from the hub or a folder, or build a tiny twin without a network.
+"""The table of large backbones: load one from the hub or a folder, or build a tiny version without a network.
 
     backbone = load_backbone("kontext", device="cuda", quantise="int8")
     backbone, prompt = tiny("kontext", seed=0)
 
-The files are read by diffusers itself; what it finds wrong with them is told in our words.
+diffusers reads the files; its exceptions are converted to brewster's errors.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ from brewster.options import Quantisation
 BACKBONES: Final[dict[str, type[Backbone]]] = {
     name: pkgutil.resolve_name(adapter) for name, adapter in LARGE.items()
 }
-"""name -> adapter, which holds its hub id, licence, classes, full-size settings and card text. The rows are in `zoo`."""
+"""name -> Backbone class, with hub id, licence, diffusers classes and architecture. `zoo.LARGE` lists the rows."""
 
 _INDEX: Final = "model_index.json"
 _CONFIGS: Final = {"transformer": "config.json", "vae": "config.json", "scheduler": "scheduler_config.json"}
 _PICTURE_PARTS: Final = [_INDEX, *(f"{part}/*" for part in _CONFIGS)]
 _TEXT_PARTS: Final = [_INDEX, "scheduler/*", "text_encoder*/*", "tokenizer*/*", "processor/*"]
 _STATISTICS_SPREAD: Final = 0.2
-"""How far a tiny twin's latent statistics stray from 0 and 1: enough to notice when they are forgotten."""
+"""The spread of a tiny version's latent statistics around 0 and 1, so that tests detect code that ignores them."""
 
 
 def load_backbone(
@@ -55,17 +55,17 @@ def load_backbone(
     dtype: torch.dtype | None = None,
     quantise: Quantisation | None = None,
 ) -> Backbone:
-    """A backbone by its name in the table, a hub id or a folder in diffusers' layout, without text encoders.
+    """Loads a backbone without its text encoders.
 
-    "tiny:" and a name is that backbone's toy twin.
-
-    `dtype` is bfloat16 on an accelerator and float32 on the CPU. `quantise` stores the transformer's weights in
-    8 bits (torchao) or 4 (bitsandbytes, CUDA only).
+    `source` is a name in the table, a hub id, a folder in diffusers' layout, or "tiny:" and a name for the tiny version.
+    `dtype` is by default bfloat16 on an accelerator and float32 on the CPU. `quantise` stores the transformer's weights
+    in 8 bits (torchao) or 4 bits (bitsandbytes, CUDA only).
 
     Raises:
-        DownloadError: no access to a gated model (says how to ask), wrong token, no network.
-        ModelError: a missing or damaged file, another architecture, an unknown name or quantisation.
-        DeviceError: no such device, or out of memory (says what to lower).
+        DownloadError: no access to a gated model (the message says how to get it), an invalid token, or no network
+            connection.
+        ModelError: a file is missing or damaged, the architecture is another one, or the name or quantisation is unknown.
+        DeviceError: there is no such device, or it is out of memory; the message says what to reduce.
         MissingExtra: diffusers, torchao or bitsandbytes is not installed.
     """
     _check_device(device)
@@ -88,9 +88,12 @@ def load_backbone(
 
 
 def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> PromptEmbedding:
-    """Loads a backbone's text encoders, encodes the prompt, and forgets them; see `load_backbone` for `source`.
+    """Encodes a prompt with a backbone's text encoders, which are loaded for this call only.
 
-    A toy twin has none: its prompt is random numbers, others for other words.
+    For `source`, see `load_backbone`. A tiny version has no text encoder: its embedding is random, seeded by the text.
+
+    Returns:
+        The embedding on the CPU.
 
     Raises:
         DownloadError, ModelError, DeviceError, MissingExtra: as `load_backbone`.
@@ -120,10 +123,10 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
 
 
 def tiny(name: str, seed: int = 0) -> tuple[Backbone, PromptEmbedding]:
-    """A seeded toy of the same classes, a tenth of a second to build, and a random prompt of its shape.
+    """Builds a tiny version of a backbone, with the same classes and seeded random weights, and a random prompt for it.
 
     Raises:
-        ModelError: a name that is not in the table.
+        ModelError: the name is not in the table.
     """
     family = find_family(name)
     backbone = build(name, family.tiny, seed=seed)
@@ -138,10 +141,10 @@ def build(
     device: str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> Backbone:
-    """A backbone with random weights; full size unless told otherwise, and free of charge on device "meta".
+    """Builds a backbone with seeded random weights, by default in full size. On device "meta" it needs no memory.
 
     Raises:
-        ModelError: a name that is not in the table.
+        ModelError: the name is not in the table.
         DeviceError: out of memory.
     """
     family = find_family(name)
@@ -161,10 +164,10 @@ def build(
 
 
 def find_family(name: str) -> type[Backbone]:
-    """The adapter of that name.
+    """The Backbone class of this name.
 
     Raises:
-        ModelError: none.
+        ModelError: the name is not in the table; the message suggests the closest one.
     """
     if name in BACKBONES:
         return BACKBONES[name]
@@ -177,7 +180,7 @@ def find_family(name: str) -> type[Backbone]:
 
 
 def family_of(source: str) -> type[Backbone]:
-    """Which adapter `load_backbone` would take for this source; no weights are fetched for it.
+    """The Backbone class that `load_backbone` would use for this source. No weights are downloaded.
 
     Raises:
         DownloadError, ModelError, MissingExtra: as `load_backbone`.
@@ -190,7 +193,9 @@ def family_of(source: str) -> type[Backbone]:
 def _load_tiny(source: str, device: str, quantise: str | None) -> Backbone:
     if quantise:
         raise ModelError(
-            f"{source} was asked for as {quantise}", "a toy twin is never quantised", "leave quantise out"
+            f"{source} was requested with quantise={quantise}",
+            "a tiny version without quantisation",
+            "leave quantise out",
         )
     backbone, _ = tiny(source.removeprefix(TINY))
     backbone.transformer.to(device)
@@ -209,19 +214,19 @@ def _family_in(folder: Path) -> tuple[type[Backbone], dict[str, Any]]:
         if family.classes["pipeline"] == kind:
             return family, index
     raise ModelError(
-        f"{folder} holds a {kind}",
+        f"{folder} contains a {kind}",
         f"one of {', '.join(family.classes['pipeline'] for family in BACKBONES.values())}",
         f"use {', '.join(family.hub_id for family in BACKBONES.values())} or a finetune of one",
     )
 
 
 def _load_part(folder: Path, family: type[Backbone], part: str, **options: Any) -> Any:  # noqa: ANN401 - passed on
-    """The transformer, VAE or scheduler of a folder, complete and of the right class."""
+    """Loads the transformer, VAE or scheduler of a folder; refuses another class, and missing or unexpected weights."""
     part_folder, expected = folder / part, family.classes[part]
     found = _read_json(part_folder / _CONFIGS[part]).get("_class_name")
     if found != expected:
         raise ModelError(
-            f"{part_folder} holds a {found}", f"a {expected}", f"use a folder of {family.hub_id}"
+            f"{part_folder} contains a {found}", f"a {expected}", f"use a folder of {family.hub_id}"
         )
     kind = diffusers_class(expected)
     if part == "scheduler":
@@ -233,7 +238,7 @@ def _load_part(folder: Path, family: type[Backbone], part: str, **options: Any) 
     mismatched = [*report["missing_keys"], *report["unexpected_keys"]]
     if mismatched:
         raise ModelError(
-            f"{part_folder} has {len(mismatched)} weights too few or too many, {mismatched[0]} among them",
+            f"{part_folder} has {len(mismatched)} missing or unexpected weights, for example {mismatched[0]}",
             f"the weights of a {expected}",
             "copy the model again",
         )
@@ -248,35 +253,35 @@ def _read_json(path: Path) -> dict[str, Any]:
             f"{path} is missing", "a model's folder in diffusers' layout", "copy or download it again"
         ) from error
     except ValueError as error:
-        raise ModelError(f"{path} is not JSON: {error}", "a whole file", "copy it again") from error
+        raise ModelError(f"{path} is not JSON: {error}", "a complete JSON file", "copy it again") from error
     if not isinstance(value, dict):
-        raise ModelError(f"{path} holds no settings", "a JSON object", "copy it again")
+        raise ModelError(f"{path} contains no settings", "a JSON object", "copy it again")
     return value
 
 
 @contextlib.contextmanager
 def _translate_load_errors(folder: Path) -> Iterator[None]:
-    """Tells what diffusers finds wrong with the files of a folder; memory is told elsewhere."""
+    """Converts the exceptions of diffusers for a folder's files; see `explain_out_of_memory` for those about memory."""
     damaged = import_library("safetensors").SafetensorError
     try:
         yield
     except ImportError as error:
         raise MissingExtra(
             f"{folder} needs a library that is not installed ({' '.join(str(error).split())[:200]})",
-            "every library that its classes use",
-            "install it beside brewster[large]",
+            "all libraries that its classes use",
+            "install this library in addition to brewster[large]",
         ) from error
     except (OSError, KeyError, ValueError, TypeError, damaged) as error:
         reason = " ".join(str(error).split())[:200]
         raise ModelError(
             f"{folder} cannot be loaded: {reason}",
-            "whole weights that fit their config.json",
+            "complete weights that match config.json",
             "copy or download the model again",
         ) from error
 
 
 def _quantisation_options(quantise: str, device: str) -> dict[str, Any]:
-    """diffusers' option for a quantisation, checked before anything is downloaded."""
+    """The keyword argument of from_pretrained for a quantisation; checked before any download."""
     if quantise not in get_args(Quantisation):
         raise ModelError(
             f"there is no quantisation {quantise!r}",
@@ -297,15 +302,13 @@ def _quantisation_options(quantise: str, device: str) -> dict[str, Any]:
 
 
 def _device_map(device: str) -> dict[str, Any]:
-    """Weights go straight to an accelerator, so that the model never stands in the host's memory as a whole."""
+    """The keyword argument that loads weights directly to an accelerator, without a copy of the model in host memory."""
     return {} if device == "cpu" else {"device_map": {"": device}}
 
 
 def _memory_hint(quantise: str | None) -> str:
     hints = {None: 'use quantise="int8"', "int8": 'use quantise="nf4"', "float8": 'use quantise="nf4"'}
-    return (
-        f"{hints.get(quantise, 'close what else uses the card')}, a smaller backbone (klein) or a larger card"
-    )
+    return f"{hints.get(quantise, 'close other programs that use the GPU')}, a smaller backbone (klein) or a GPU with more memory"
 
 
 def _check_device(device: str) -> None:
@@ -322,19 +325,19 @@ def _check_channels(backbone: Backbone, folder: Path) -> None:
     packed = backbone.statistics()[0].shape[1]
     if packed not in {1, backbone.channels}:
         raise ModelError(
-            f"the VAE in {folder} gives {packed} numbers a token",
-            f"the {backbone.channels} that its transformer takes",
-            "copy both from one model",
+            f"the VAE in {folder} gives {packed} values per token",
+            f"{backbone.channels}, the input channels of its transformer",
+            "copy both from the same model",
         )
 
 
 def _check_quantised(backbone: Backbone, quantise: str) -> None:
-    """diffusers leaves a part that it places on the CPU as it is, in silence: the card would be full in no time."""
+    """Refuses weights that diffusers left unquantised, which it does silently for parts on the CPU; they need more memory."""
     weight = backbone.transformer.get_submodule(backbone.lora_targets()[0]).weight
     if type(weight) in {Tensor, nn.Parameter}:
         raise ModelError(
             f"the weights were loaded as {weight.dtype}",
-            f"stored as {quantise}",
+            f"weights stored as {quantise}",
             "update diffusers and torchao (constraints.txt names versions that work)",
         )
 
@@ -350,7 +353,7 @@ def _default_dtype(dtype: torch.dtype) -> Iterator[None]:
 
 
 def _randomise_batch_norms(vae: nn.Module) -> None:
-    """Random running statistics for batch norms, which otherwise start at exactly 0 and 1."""
+    """Sets random running statistics, which otherwise are exactly 0 and 1; see _STATISTICS_SPREAD."""
     for module in vae.modules():
         if isinstance(module, nn.BatchNorm2d) and module.running_mean is not None:
             assert module.running_var is not None

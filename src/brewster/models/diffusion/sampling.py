@@ -1,9 +1,9 @@
-"""From noise to panels: the stock pipelines' Euler steps, without their silent rescaling.
+"""Generates panels from noise with the Euler steps of the pipelines in diffusers, but without their rescaling.
 
     pictures = sample(backbone, condition, prompt, size=(1536, 512), seeds=[0, 1])
 
-The paper takes 20 steps and guidance 4 (Experimental Setup). Fewer steps are faster and rougher; several seeds can
-be averaged, which removes what the model merely made up.
+The paper uses 20 steps and guidance 4 (Experimental Setup). Fewer steps are faster and less accurate. Averaging the
+pictures of several seeds reduces details that the model invents, because they differ between seeds.
 """
 
 from __future__ import annotations
@@ -43,14 +43,19 @@ def sample(
     batch: int = 1,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Float[Tensor, "seeds 3 h w"]:
-    """One composite of this (width, height) for each seed, in [-1, 1], float32, on the CPU.
+    """Generates one composite of this (width, height) for each seed.
 
-    The noise comes from the CPU, so a seed means the same on every device, and `batch` only says how many are
-    computed together; `.mean(0, keepdim=True)` averages them. `on_progress(done, all)` is called after each step.
+    The noise is drawn on the CPU, so a seed gives the same noise on every device. `batch` is the number of seeds that
+    are computed at once; it does not change the result beyond rounding. `on_progress(done, total)` is called after
+    each step.
+
+    Returns:
+        The composites in [-1, 1], float32, on the CPU. `.mean(0, keepdim=True)` averages them.
 
     Raises:
-        ModelError: sides that are not multiples of 16, a prompt that guidance cannot use, or no steps, seeds or batch.
-        DeviceError: out of memory (says what to lower).
+        ModelError: a side is not a multiple of 16, the prompt lacks the embedding that guidance needs, or `steps`,
+            `batch` or the number of seeds is less than one.
+        DeviceError: out of memory; the message says what to reduce.
     """
     _check_positive(f"{steps} steps", steps, usual=STEPS)
     _check_positive(f"{len(seeds)} seeds", len(seeds), usual=1)
@@ -90,9 +95,12 @@ def euler(
     guidance: float,
     on_progress: Callable[[], None] | None = None,
 ) -> Float[Tensor, "n c h w"]:
-    """The latents at sigma 0: x(next sigma) = x(sigma) + (next sigma - sigma) velocity, in float32.
+    """Integrates the flow from sigma 1 to 0: x(next sigma) = x(sigma) + (next sigma - sigma) velocity, in float32.
 
-    `condition` is encoded; `on_progress()` is called after each step.
+    `condition` is the encoded conditioning image. `on_progress()` is called after each step.
+
+    Returns:
+        The latents at sigma 0.
     """
     latents = noise.to(backbone.device)
     sigmas = backbone.schedule(latents.shape[2] * latents.shape[3], steps).to(latents.device)
@@ -106,4 +114,6 @@ def euler(
 
 def _check_positive(request: str, count: int, *, usual: int) -> None:
     if count < 1:
-        raise ModelError(f"sampling was asked for {request}", "at least 1", f"the usual is {usual}")
+        raise ModelError(
+            f"sampling was requested with {request}", "at least 1", f"the usual value is {usual}"
+        )

@@ -1,4 +1,4 @@
-"""Safetensors files with the same bytes for the same tensors, and plain words for damaged ones."""
+"""Reads and writes safetensors files. The same tensors and metadata always give the same bytes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from brewster.models.diffusion.lazy_imports import import_library
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
-    """Writes the tensors and what is said about them, whole or not at all, replacing an older file.
+    """Writes the tensors and their metadata atomically, and replaces an existing file.
 
     Raises:
         TargetError: the file cannot be written.
@@ -23,13 +23,14 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[s
     """
     cpu_tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     metadata = {"format": "pt", **metadata}
-    # safetensors writes its metadata in an order that changes from run to run; offsets count from its end.
+    # safetensors writes metadata in an order that differs between runs, so the header is written again in sorted order.
+    # This is safe, because the offsets of the tensors count from the end of the header.
     data = with_metadata(import_library("safetensors.torch").save(cpu_tensors, metadata), metadata)
     write_atomically(path, data, overwrite=True)
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The tensors of a file by name, on the CPU, and what is said about them.
+    """The tensors of a file by name, on the CPU, and its metadata.
 
     Raises:
         ModelError: the file is missing or damaged.
@@ -37,7 +38,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """
     safetensors = import_library("safetensors")
     try:
-        # Not mapped but read: whoever writes the file anew would pull a mapped tensor from under our feet.
+        # Read, not memory-mapped: if another process rewrites the file, mapped tensors would change.
         data = path.read_bytes()
         tensors = import_library("safetensors.torch").load(data)
         return dict(sorted(tensors.items())), read_metadata(data)
@@ -45,7 +46,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         raise ModelError(f"{path} is missing", "a safetensors file", "copy the whole folder") from error
     except (OSError, ValueError, safetensors.SafetensorError) as error:
         raise ModelError(
-            f"{path} cannot be read: {error}", "a whole safetensors file", "copy or write it again"
+            f"{path} cannot be read: {error}", "a complete safetensors file", "copy or write it again"
         ) from error
 
 
@@ -54,18 +55,18 @@ def _header(data: bytes) -> dict[str, Any]:
 
 
 def _header_end(data: bytes) -> int:
-    """Where the header ends: its length stands in the first eight bytes."""
+    """The offset of the header's end; the first eight bytes of the file hold its length."""
     return 8 + int.from_bytes(data[:8], "little")
 
 
 def read_metadata(data: bytes) -> dict[str, str]:
-    """What is said about the tensors in a whole file's bytes."""
+    """The metadata in the bytes of a complete file."""
     metadata: dict[str, str] = _header(data).get("__metadata__", {})
     return metadata
 
 
 def with_metadata(data: bytes, metadata: Mapping[str, str]) -> bytes:
-    """The same tensors in a whole file's bytes, with something else said about them."""
+    """The bytes of a file with the same tensors and other metadata."""
     header = _header(data)
     header["__metadata__"] = dict(sorted(metadata.items()))
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()

@@ -1,4 +1,4 @@
-"""FLUX.1 Kontext [dev], the paper's backbone: 11.9 billion parameters, guidance distilled into the transformer."""
+"""FLUX.1 Kontext [dev], the paper's backbone: 11.9 billion parameters, with distilled guidance."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Kontext(Backbone):
     diffusers_usage = DiffusersUsage(
         "text_encoder=None, text_encoder_2=None, tokenizer=None, tokenizer_2=None",
         'pooled_prompt_embeds=words["pooled"], max_area={area}, _auto_resize=False,',
-        "Without `max_area` and `_auto_resize=False` the pipeline rescales both pictures in silence.",
+        "Without `max_area` and `_auto_resize=False` the pipeline silently rescales both pictures.",
     )
     classes: ClassVar = {
         "pipeline": "FluxKontextPipeline", "transformer": "FluxTransformer2DModel",
@@ -69,26 +69,26 @@ class Kontext(Backbone):
     guided_by_embedding = True
 
     def statistics(self) -> tuple[Tensor, Tensor]:
-        """One number each: FLUX.1's VAE has a common shift and scale."""
+        """One value each, (1, 1, 1, 1): FLUX.1's VAE has one shift and scale for all channels."""
         config = self.vae.config
         mean = torch.tensor(config.shift_factor, device=self.vae.device)
         deviation = 1 / torch.tensor(config.scaling_factor, device=self.vae.device)
         return mean.view(1, 1, 1, 1), deviation.view(1, 1, 1, 1)
 
     def positions(self, latents: Tensor, condition: Tensor) -> Tensor:
-        """(tokens, 3): 0 for generated and 1 for conditioning tokens, row, column."""
+        """Position ids, (tokens, 3): picture (0 generated, 1 conditioning), row, column."""
         return torch.cat([_position_ids(latents, 0), _position_ids(condition, 1)]).to(self.device)
 
     def predict(
         self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float
     ) -> Tensor:
-        """See Backbone; guidance is a number that the transformer reads.
+        """See `Backbone.predict`. The guidance scale is an input of the transformer.
 
         Raises:
-            ModelError: a prompt without its summary vector.
+            ModelError: the prompt has no pooled vector.
         """
         if prompt.pooled is None:
-            raise ModelError("the prompt has no pooled vector", "one, from CLIP", "encode the prompt again")
+            raise ModelError("the prompt has no pooled vector", "one by CLIP", "encode the prompt again")
         count, embedding = len(latents), prompt.to(self.device, self.dtype)
         assert embedding.pooled is not None
         takes_guidance = self.transformer.config.guidance_embeds
@@ -105,14 +105,14 @@ class Kontext(Backbone):
         return tokens_to_grid(tokens, latents)
 
     @classmethod
-    def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a stock pipeline
-        """T5's tokens and CLIP's summary of the prompt."""
+    def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a pipeline of diffusers
+        """The prompt's token embeddings by T5, and its pooled vector by CLIP."""
         embeds, pooled, _ = pipeline.encode_prompt(prompt=text, prompt_2=text)
         return PromptEmbedding(cls.name, text, embeds.detach(), pooled.detach())
 
     @classmethod
-    def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a stock transformer
-        """Eight random tokens and a random summary."""
+    def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a transformer of diffusers
+        """Eight random tokens and a random pooled vector."""
         config = transformer.config
         shapes = {"embeds": (1, 8, config.joint_attention_dim), "pooled": (1, config.pooled_projection_dim)}
         return random_prompt(cls.name, seed, **shapes)
