@@ -19,7 +19,7 @@ from brewster.models.diffusion.prompt import PROMPT
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
     """Folders of tiny versions; tests must not change them."""
-    folder = tmp_path_factory.mktemp("twins")
+    folder = tmp_path_factory.mktemp("tiny")
     for name in BACKBONES:
         tiny(name, seed=1)[0].save(folder / name)
     return folder
@@ -39,24 +39,24 @@ def velocity(backbone, prompt):
 
 @pytest.mark.parametrize("name", list(BACKBONES))
 def test_a_tiny_version_survives_saving_and_loading(saved, name):
-    twin, prompt = tiny(name, seed=1)
-    back = load_backbone(str(saved / name))
-    assert type(back) is BACKBONES[name]
-    weights = back.transformer.state_dict()
-    assert all(torch.equal(weights[key], value) for key, value in twin.transformer.state_dict().items())
-    torch.testing.assert_close(velocity(back, prompt), velocity(twin, prompt), atol=1e-6, rtol=0)
-    assert not any(parameter.requires_grad for parameter in back.transformer.parameters())
+    original, prompt = tiny(name, seed=1)
+    loaded = load_backbone(str(saved / name))
+    assert type(loaded) is BACKBONES[name]
+    weights = loaded.transformer.state_dict()
+    assert all(torch.equal(weights[key], value) for key, value in original.transformer.state_dict().items())
+    torch.testing.assert_close(velocity(loaded, prompt), velocity(original, prompt), atol=1e-6, rtol=0)
+    assert not any(parameter.requires_grad for parameter in loaded.transformer.parameters())
 
 
 @pytest.mark.parametrize("name", list(BACKBONES))
 def test_tiny_versions_have_the_classes_of_the_full_size_models_and_differ_by_seed_only(name):
-    twin, prompt = tiny(name, seed=1)
+    original, prompt = tiny(name, seed=1)
     same, same_prompt = tiny(name, seed=1)
     other, other_prompt = tiny(name, seed=2)
-    parts = {"transformer": twin.transformer, "vae": twin.vae, "scheduler": twin.scheduler}
-    assert {part: type(value).__name__ for part, value in parts.items()}.items() <= twin.classes.items()
-    assert torch.equal(velocity(twin, prompt), velocity(same, same_prompt))
-    assert not torch.equal(velocity(twin, prompt), velocity(other, prompt))
+    parts = {"transformer": original.transformer, "vae": original.vae, "scheduler": original.scheduler}
+    assert {part: type(value).__name__ for part, value in parts.items()}.items() <= original.classes.items()
+    assert torch.equal(velocity(original, prompt), velocity(same, same_prompt))
+    assert not torch.equal(velocity(original, prompt), velocity(other, prompt))
     assert prompt.sha256 == same_prompt.sha256 != other_prompt.sha256
     assert prompt.text == PROMPT
 
@@ -142,7 +142,7 @@ def test_a_missing_gpu_is_reported_before_anything_is_loaded():
 
 
 @pytest.fixture(scope="module")
-def with_words(tmp_path_factory):
+def with_text_encoders(tmp_path_factory):
     """Folders of tiny versions with text encoders, and tokenizers whose tokens are single bytes."""
     folder = tmp_path_factory.mktemp("words")
     letters = sorted(ByteLevel.alphabet())
@@ -158,19 +158,21 @@ def with_words(tmp_path_factory):
     qwen = transformers.Qwen2TokenizerFast(vocab=words, merges=[])
     qwen.chat_template = "{% for m in messages %}<|im_start|>{{ m.content }}<|im_end|>{% endfor %}"
     small = {"intermediate_size": 16, "num_attention_heads": 2, "hidden_size": 16}
-    summary = transformers.CLIPTextConfig(vocab_size=len(clip), num_hidden_layers=1, **small)
-    tokens = transformers.T5Config(vocab_size=len(t5), d_model=32, d_kv=8, d_ff=16, num_layers=1, num_heads=2)
-    layers = transformers.Qwen3Config(
+    clip_config = transformers.CLIPTextConfig(vocab_size=len(clip), num_hidden_layers=1, **small)
+    t5_config = transformers.T5Config(
+        vocab_size=len(t5), d_model=32, d_kv=8, d_ff=16, num_layers=1, num_heads=2
+    )
+    qwen_config = transformers.Qwen3Config(
         vocab_size=300, num_hidden_layers=28, num_key_value_heads=1, head_dim=8, **small
     )
     text_modules = {
         "kontext": {
             "tokenizer": clip,
-            "text_encoder": transformers.CLIPTextModel(summary),
+            "text_encoder": transformers.CLIPTextModel(clip_config),
             "tokenizer_2": t5,
-            "text_encoder_2": transformers.T5EncoderModel(tokens),
+            "text_encoder_2": transformers.T5EncoderModel(t5_config),
         },
-        "klein": {"tokenizer": qwen, "text_encoder": transformers.Qwen3ForCausalLM(layers)},
+        "klein": {"tokenizer": qwen, "text_encoder": transformers.Qwen3ForCausalLM(qwen_config)},
     }
     lazy_imports.disable_progress_bars_in_pipes()
     for name, modules in text_modules.items():
@@ -187,12 +189,12 @@ def with_words(tmp_path_factory):
         ("klein", {"embeds": (1, 512, 48), "negative": (1, 512, 48)}),
     ],
 )
-def test_a_prompt_is_encoded_by_the_text_encoders_of_the_folder(with_words, name, shapes):
-    prompt = encode_prompt(str(with_words / name))
+def test_a_prompt_is_encoded_by_the_text_encoders_of_the_folder(with_text_encoders, name, shapes):
+    prompt = encode_prompt(str(with_text_encoders / name))
     assert (prompt.backbone, prompt.text) == (name, PROMPT)
     assert {key: tuple(tensor.shape) for key, tensor in prompt.tensors.items()} == shapes
-    assert encode_prompt(str(with_words / name)).sha256 == prompt.sha256
-    assert not torch.equal(encode_prompt(str(with_words / name), "a cat").embeds, prompt.embeds)
+    assert encode_prompt(str(with_text_encoders / name)).sha256 == prompt.sha256
+    assert not torch.equal(encode_prompt(str(with_text_encoders / name), "a cat").embeds, prompt.embeds)
 
 
 def test_the_offline_error_of_huggingface_hub_is_explained(tmp_path, monkeypatch):

@@ -32,20 +32,20 @@ def _network_off(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def twin():
+def tiny_model():
     backbone, prompt = tiny("kontext")
     add_lora(backbone, rank=2, alpha=2)
     return backbone, prompt
 
 
 @pytest.fixture
-def write(twin, tmp_path):
+def write(tiny_model, tmp_path):
     """A function that writes a LoRA's folder as training does."""
 
     def write(base="kontext", sets="sets/window"):
         folder = tmp_path / "lora"
         hub_id = BACKBONES["kontext"].hub_id if base == "kontext" else base
-        save_lora(folder, *twin, DecompositionTask(), base=hub_id)
+        save_lora(folder, *tiny_model, DecompositionTask(), base=hub_id)
         recipe = LoraRecipe.model_validate(
             VALUES | {"backbone": base, "data": {"rendered": {"sets": [sets]}}}
         )
@@ -88,7 +88,7 @@ def test_remarks_name_a_non_commercial_base_and_a_tiny_one(write):
     assert "a tiny test model: it cannot separate" in plan_push(write("tiny:kontext"), REPO).remarks[0]
 
 
-def test_local_paths_are_replaced_in_uploaded_files_and_the_lora_still_loads(write, tmp_path, twin):
+def test_local_paths_are_replaced_in_uploaded_files_and_the_lora_still_loads(write, tmp_path, tiny_model):
     base, sets = tmp_path / "models" / "flux", tmp_path / "secret" / "window"
     folder = write(str(base), str(sets))
     before = {name: (folder / name).read_bytes() for name in FILES}

@@ -27,7 +27,7 @@ from brewster.models.diffusion.tensors import read_tensors, write_tensors
 
 
 @pytest.fixture(params=list(BACKBONES))
-def twin(request):
+def tiny_model(request):
     return tiny(request.param, seed=1)
 
 
@@ -52,8 +52,8 @@ def trained(backbone, *, alpha=16, rank=4):
     return backbone
 
 
-def test_every_linear_layer_of_the_blocks_is_changed_and_nothing_else(twin):
-    backbone, _ = twin
+def test_every_linear_layer_of_the_blocks_is_changed_and_nothing_else(tiny_model):
+    backbone, _ = tiny_model
     targets = backbone.lora_targets()
     linear = {name for name, module in backbone.transformer.named_modules() if isinstance(module, nn.Linear)}
     outside = linear - set(targets)
@@ -67,8 +67,8 @@ def test_every_linear_layer_of_the_blocks_is_changed_and_nothing_else(twin):
     assert backbone.lora_targets() == targets
 
 
-def test_a_fresh_lora_changes_nothing_and_is_all_that_is_trained(twin):
-    backbone, prompt = twin
+def test_a_fresh_lora_changes_nothing_and_is_all_that_is_trained(tiny_model):
+    backbone, prompt = tiny_model
     before = velocity(backbone, prompt)
     parameters = add_lora(backbone, rank=4)
     assert torch.equal(velocity(backbone, prompt), before)
@@ -109,8 +109,8 @@ def test_on_a_bf16_base_the_lora_is_float32(kontext):
 
 
 @pytest.mark.parametrize("alpha", [4, 16])
-def test_a_saved_lora_gives_the_same_prediction_reloaded_and_in_diffusers(twin, tmp_path, alpha):
-    backbone, prompt = twin
+def test_a_saved_lora_gives_the_same_prediction_reloaded_and_in_diffusers(tiny_model, tmp_path, alpha):
+    backbone, prompt = tiny_model
     plain = copy.deepcopy(backbone.transformer)
     untouched = velocity(backbone, prompt)
     with_lora = velocity(trained(backbone, alpha=alpha), prompt)
@@ -146,8 +146,8 @@ def test_a_state_of_the_weights_alone_can_be_loaded(kontext):
     assert torch.equal(velocity(backbone, prompt), expected)
 
 
-def test_removing_a_lora_restores_the_backbone(twin):
-    backbone, prompt = twin
+def test_removing_a_lora_restores_the_backbone(tiny_model):
+    backbone, prompt = tiny_model
     before = velocity(backbone, prompt)
     remove_lora(trained(backbone))
     assert not has_lora(backbone)

@@ -32,7 +32,7 @@ def pipeline():
     """The diffusers pipeline with a tokenizer of single bytes, and an image of 16 tokens."""
     words = {word: number for number, word in enumerate([*sorted(ByteLevel.alphabet()), *MARKS])}
     tokenizer = transformers.Qwen2TokenizerFast(vocab=words, merges=[], additional_special_tokens=MARKS)
-    eyes = Qwen2VLImageProcessorPil(min_pixels=28 * 28, max_pixels=28 * 28 * PICTURE_TOKENS)
+    image_processor = Qwen2VLImageProcessorPil(min_pixels=28 * 28, max_pixels=28 * 28 * PICTURE_TOKENS)
     text = {
         "vocab_size": len(words), "hidden_size": 32, "intermediate_size": 16, "num_hidden_layers": 2,
         "num_attention_heads": 2, "num_key_value_heads": 1, "bos_token_id": 0, "eos_token_id": 0,
@@ -48,13 +48,13 @@ def pipeline():
         vision_end_token_id=words["<|vision_end|>"],
     )
     torch.manual_seed(0)
-    made = tiny("qwen")[0].pipeline()
-    made.register_modules(
+    pipe = tiny("qwen")[0].pipeline()
+    pipe.register_modules(
         tokenizer=tokenizer,
-        processor=WithoutVideo(image_processor=eyes, tokenizer=tokenizer),
+        processor=WithoutVideo(image_processor=image_processor, tokenizer=tokenizer),
         text_encoder=transformers.Qwen2_5_VLForConditionalGeneration(config).eval(),
     )
-    return made
+    return pipe
 
 
 def test_a_prompt_is_encoded_with_a_uniform_grey_image(pipeline):
@@ -69,9 +69,12 @@ def test_a_prompt_is_encoded_with_a_uniform_grey_image(pipeline):
         token_ids = pipeline.tokenizer(pipeline.prompt_template_encode.format(words)).input_ids
         count = len(token_ids) - 1 + PICTURE_TOKENS - pipeline.prompt_template_encode_start_idx
         assert embeds.shape == (1, count, 32)
-        eyes = pipeline.processor.image_processor
+        image_processor = pipeline.processor.image_processor
         grey = torch.tensor(
-            [(128 / 255 - mean) / std for mean, std in zip(eyes.image_mean, eyes.image_std, strict=True)]
+            [
+                (128 / 255 - mean) / std
+                for mean, std in zip(image_processor.image_mean, image_processor.image_std, strict=True)
+            ]
         )
         seen = kwargs["pixel_values"].unflatten(1, (3, -1))
         torch.testing.assert_close(seen, grey[:, None].expand_as(seen).to(seen), atol=1e-5, rtol=0)
