@@ -183,8 +183,8 @@ _ROWS: Final = (
         "",
         False,
         3,
-        "Share of the background's light that the prediction lacks where the reflection is below 2 % of the photo and the"
-        " background is white (encoded channels above 0.75 and less than 0.12 apart),"
+        "Share of the background's light that the prediction lacks where the reflection is below 2 % of the photo and"
+        " the background is white (encoded channels above 0.75 and less than 0.12 apart),"
         f" {_GAIN}.",
         "rendered",
         _rendered_score(removed_white),

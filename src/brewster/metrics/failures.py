@@ -38,7 +38,7 @@ NOTICEABLE_SHARE: Final = 0.1
 
 WHITE_MIN: Final = 0.75
 WHITE_MAX_DIFFERENCE: Final = 0.12
-"""A pixel is white if all its encoded channels, in 0..1, are above WHITE_MIN and less than WHITE_MAX_DIFFERENCE apart."""
+"""A pixel is white if its encoded channels, in 0..1, are above WHITE_MIN and less than WHITE_MAX_DIFFERENCE apart."""
 
 BLACK_LUMINANCE: Final = 0.01
 """Pixels below this luminance are left out of the gain: 8-bit steps are too coarse there for a ratio."""

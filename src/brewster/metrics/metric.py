@@ -61,11 +61,11 @@ class Metric:
     of: Literal["transmission", "reflection", "rendered"]
     """The ground truth that it needs: the transmission, the reflection, or all layers of a rendered sample."""
     score: Callable[[Comparison], float]
-    """Computes the value. Raises ValueError where the metric is undefined: an empty region, a picture that is too small."""
+    """Computes the value. Raises ValueError where it is undefined: an empty region, a picture that is too small."""
     where: Literal["picture", "region"] = "picture"
     """Whether it averages over the whole picture or over the reflection region."""
     prepare: Callable[[], object] | None = None
-    """Loads what it needs, such as weights. Called before the first score, so that missing weights are an early error."""
+    """Loads what it needs, such as weights. Called before the first score, so that missing weights fail early."""
 
     def to_dict(self) -> dict[str, Any]:
         """All fields except the name and the functions, for results.json."""

@@ -4,8 +4,8 @@
     truth = metric.features(picture)  # once for many predictions
     print([metric.distance(metric.features(prediction), truth) for prediction in predictions])
 
-R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018; the same definition
-as the `lpips` package with version 0.1 of its weights. Only `Lpips.load` imports torch.
+R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018; the same
+definition as the `lpips` package with version 0.1 of its weights. Only `Lpips.load` imports torch.
 """
 
 from __future__ import annotations

@@ -9,8 +9,8 @@ import numpy as np
 from brewster.metrics.windows import BOX, Picture, Region, box_sums, check_pictures
 
 DEFAULT_THRESHOLD: Final = 0.08
-"""A share of the 8-bit range. Chosen by eye on 20 real pairs, where it marks 0.1 to 87 % of the pixels (median: a third).
-With 0.04, most of a picture is marked, half of it because of haze or tint; with 0.15, often only highlights are."""
+"""A share of the 8-bit range. Chosen by eye on 20 real pairs, where it marks 0.1 to 87 % of the pixels (median: a
+third). With 0.04, most of a picture is marked, half of it because of haze or tint; with 0.15, often only highlights are."""
 
 
 def reflection_region(photo: Picture, truth: Picture, *, threshold: float = DEFAULT_THRESHOLD) -> Region:

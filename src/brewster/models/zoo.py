@@ -103,7 +103,7 @@ def model_name(model: str) -> str:
 
 
 def _is_hub_id(name: str) -> bool:
-    """Whether this has the form OWNER/NAME. If a folder OWNER exists, it is a local path, and the hub must not be queried."""
+    """Whether this is OWNER/NAME. If a folder OWNER exists, it is a local path, and the hub must not be queried."""
     is_one = re.fullmatch(r"[\w-][\w.-]*/[\w-][\w.-]*", name) is not None
     return is_one and not name.endswith(".onnx") and not Path(name).parent.is_dir()
 

@@ -57,14 +57,14 @@ def load_backbone(
 ) -> Backbone:
     """Loads a backbone without its text encoders.
 
-    `source` is a name in the table, a hub id, a folder in diffusers' layout, or "tiny:" and a name for the tiny version.
+    `source` is a name in the table, a hub id, a folder in diffusers' layout, or "tiny:" and a name for a tiny version.
     `dtype` is by default bfloat16 on an accelerator and float32 on the CPU. `quantise` stores the transformer's weights
     in 8 bits (torchao) or 4 bits (bitsandbytes, CUDA only).
 
     Raises:
         DownloadError: no access to a gated model (the message says how to get it), an invalid token, or no network
             connection.
-        ModelError: a file is missing or damaged, the architecture is another one, or the name or quantisation is unknown.
+        ModelError: a file is missing or damaged, the architecture is another one, or a name or quantisation is unknown.
         DeviceError: there is no such device, or it is out of memory; the message says what to reduce.
         MissingExtra: diffusers, torchao or bitsandbytes is not installed.
     """
@@ -302,7 +302,7 @@ def _quantisation_options(quantise: str, device: str) -> dict[str, Any]:
 
 
 def _device_map(device: str) -> dict[str, Any]:
-    """The keyword argument that loads weights directly to an accelerator, without a copy of the model in host memory."""
+    """The keyword argument that loads weights directly to an accelerator, without a full copy in host memory."""
     return {} if device == "cpu" else {"device_map": {"": device}}
 
 
@@ -332,7 +332,7 @@ def _check_channels(backbone: Backbone, folder: Path) -> None:
 
 
 def _check_quantised(backbone: Backbone, quantise: str) -> None:
-    """Refuses weights that diffusers left unquantised, which it does silently for parts on the CPU; they need more memory."""
+    """Refuses weights that diffusers silently left unquantised, as it does for parts on the CPU."""
     weight = backbone.transformer.get_submodule(backbone.lora_targets()[0]).weight
     if type(weight) in {Tensor, nn.Parameter}:
         raise ModelError(

@@ -58,7 +58,7 @@ def suppress_warnings() -> Iterator[None]:
 
 
 def disable_progress_bars_in_pipes() -> None:
-    """Disables the progress bars of third-party libraries unless stderr is a terminal: they also write them to pipes."""
+    """Disables the progress bars of third-party libraries, which also write to pipes, unless stderr is a terminal."""
     if sys.stderr.isatty():
         return
     import_library("huggingface_hub.utils").disable_progress_bars()

@@ -107,7 +107,7 @@ def conditioning_image(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> 
 
     White space turns the task into inpainting, "which is not necessary, but it turns out easier to converge"
     (Text-to-image Model Fine-tuning). If I is not among the generated panels, the photo alone is the conditioning
-    picture, as the control image (Experimental Setup), which has a third of the tokens.
+    image (Experimental Setup: "control image"), which has a third of the tokens.
 
     Returns:
         (N, 3, H, W) of the composite's size with panel I, otherwise the photo itself.

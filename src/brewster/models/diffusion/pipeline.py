@@ -164,8 +164,8 @@ def fingerprint(
 ) -> str:
     """SHA-256 that identifies what `load_pipeline` would load: LoRA, prompt, base, and the base's quantisation.
 
-    A base on the hub is identified by its name. A base in a folder is identified by the names, sizes, and first and last
-    MiB of its files, because reading them completely takes a minute.
+    A base on the hub is identified by its name. A base in a folder is identified by the names, sizes, and first and
+    last MiB of its files, because reading them completely takes a minute.
 
     Raises:
         ModelError, DownloadError: the LoRA does not exist or is damaged.
@@ -197,7 +197,7 @@ def _source_id(source: str) -> str:
 
 
 def _base_quantisation(card: LoraCard, device: str, quantise: Quantisation | None) -> Quantisation | None:
-    """The requested quantisation, or that of the LoRA's training; none by default on the CPU, where it saves nothing."""
+    """The requested quantisation; by default that of the LoRA's training, and none on the CPU, where it saves nothing."""
     return quantise or (card.quantise if device != "cpu" else None)
 
 

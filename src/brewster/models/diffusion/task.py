@@ -14,6 +14,7 @@ from brewster.models.diffusion.sampling import GUIDANCE
 Objective = Literal["flow", "one_step"]
 
 PAPER_PX: Final = 1536 * 512
+"""The size of the paper's composite: three panels of 512 x 512 pixels."""
 
 
 @final

@@ -4,8 +4,8 @@
     save_lora(folder, backbone, prompt, task)     # in diffusers: pipe.load_lora_weights(folder)
     card, prompt = load_lora(folder, backbone)
 
-The paper gives the rank, 16 (Experimental Setup). Alpha 16 and adapters on all linear layers of the blocks are the usual
-settings with it. The LoRA is float32 on a base of any precision, because most of Adam's updates are smaller than the
+The paper gives the rank, 16 (Experimental Setup). Alpha 16 and adapters on all linear layers of the blocks are the
+usual settings with it. The LoRA is float32 on a base of any precision, because most of Adam's updates are smaller than the
 rounding of bf16.
 """
 

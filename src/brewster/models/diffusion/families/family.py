@@ -132,7 +132,7 @@ class Backbone(ABC):
 
     @abstractmethod
     def statistics(self) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation of the packed latents of natural images, (1, C, 1, 1) each, float32; C may be 1."""
+        """Mean and standard deviation of the packed latents of natural images, float32 (1, C, 1, 1) or (1, 1, 1, 1)."""
 
     @abstractmethod
     def predict(
@@ -151,7 +151,7 @@ class Backbone(ABC):
 
     @abstractmethod
     def positions(self, latents: Tensor, condition: Tensor) -> Any:  # noqa: ANN401 - each family has its own kind
-        """The position of each token, and whether its picture is generated or the condition; generated tokens come first."""
+        """The position ids of the generated tokens, then of the conditioning tokens, as the transformer takes them."""
 
     @classmethod
     @abstractmethod

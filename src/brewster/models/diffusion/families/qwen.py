@@ -27,8 +27,8 @@ _GREY_SIDE_PX: Final = 448
 class Qwen(ClassifierFreeBackbone):
     """Qwen-Image-Edit (Qwen team 2025), with classifier-free guidance that preserves the norm of each token.
 
-    The pipeline of diffusers resizes the conditioning image to one megapixel; this class does not. Its text encoder also
-    reads the conditioning image; this class encodes the prompt once, with a uniform grey image.
+    The pipeline of diffusers resizes the conditioning image to one megapixel; this class does not. Its text encoder
+    also reads the conditioning image; this class encodes the prompt once, with a uniform grey image.
     """
 
     name = "qwen"
