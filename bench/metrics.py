@@ -19,7 +19,7 @@ from torch.nn import functional
 
 from brewster import Photo
 from brewster.metrics import Lpips, psnr, reflection_region, ssim
-from brewster.metrics.weights import NAMES, load_backbone, read_heads
+from brewster.metrics.weights import TENSOR_NAMES, load_alexnet, read_heads
 
 HEIGHT, WIDTH = 400, 540
 ROUNDS = 11
@@ -64,7 +64,7 @@ class Package:
     """The same number in the order of the lpips package's own operations."""
 
     def __init__(self) -> None:
-        tensors = [load_backbone()[name] for name in NAMES]
+        tensors = [load_alexnet()[name] for name in TENSOR_NAMES]
         self.convolutions = list(zip(tensors[::2], tensors[1::2], strict=True))
         self.heads = [torch.from_numpy(head).view(1, -1, 1, 1) for head in read_heads()]
         self.shift = torch.tensor([-0.030, -0.088, -0.188]).view(1, 3, 1, 1)

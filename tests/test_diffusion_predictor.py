@@ -16,7 +16,7 @@ from brewster.inference.separator import RECONSTRUCTION_ERROR_LIMIT
 from brewster.models.diffusion.adapter.lora import LORA_FILE, add_lora, lora_parameters, save_lora
 from brewster.models.diffusion.backbones import TINY, tiny
 from brewster.models.diffusion.panels import PanelLayout
-from brewster.models.diffusion.pipeline import fingerprint, open_decomposer
+from brewster.models.diffusion.pipeline import fingerprint, load_pipeline
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion.tensors import read_tensors, write_tensors
 from brewster.srgb import to_encoded, to_linear
@@ -139,7 +139,7 @@ def test_photos_of_any_shape_come_back_in_their_size(width, height):
 
 
 def test_a_photo_that_is_smaller_than_a_token_is_refused_with_the_size_it_takes():
-    with pytest.raises(PhotoError, match=r"15 x 40 pixels; at least 16 a side, .* or use the compact model"):
+    with pytest.raises(PhotoError, match=r"15 x 40 pixels; at least 16 pixels a side, .* or use the compact model"):
         Separator(DiffusionPredictor(Oracle()))(smooth(15, 40))
 
 
@@ -197,9 +197,9 @@ def test_a_lora_goes_through_the_separator_by_its_folder(lora):
 
 
 def test_a_backbone_without_a_lora_is_asked_for_the_transmission_alone():
-    decomposer = open_decomposer("tiny:klein")
+    decomposer = load_pipeline("tiny:klein")
     assert decomposer.task.layout.panels == ("T",)
-    generic = open_decomposer("tiny:klein", prompt="generic")
+    generic = load_pipeline("tiny:klein", prompt="generic")
     assert generic.prompt.text == "Remove the reflection."
     assert generic.sha256 != decomposer.sha256
     result = Separator(DiffusionPredictor(decomposer, steps=1))(smooth(40, 40))
@@ -208,16 +208,16 @@ def test_a_backbone_without_a_lora_is_asked_for_the_transmission_alone():
 
 def test_what_a_lora_is_opened_with_is_checked(lora, tmp_path):
     with pytest.raises(ModelError, match="is a LoRA of kontext; its base, not a klein"):
-        open_decomposer(str(lora), base="tiny:klein")
-    with pytest.raises(ModelError, match="is a base itself"):
-        open_decomposer("tiny:klein", base="tiny:kontext")
+        load_pipeline(str(lora), base="tiny:klein")
+    with pytest.raises(ModelError, match="is a backbone, and the base tiny:kontext was given"):
+        load_pipeline("tiny:klein", base="tiny:kontext")
     with pytest.raises(DeviceError, match="do not run on coreml; one of auto, cuda, rocm, cpu"):
-        open_decomposer(str(lora), device="coreml")
-    with pytest.raises(ModelError, match=f"holds no model; a LoRA .{LORA_FILE}"):
-        open_decomposer(str(tmp_path))
+        load_pipeline(str(lora), device="coreml")
+    with pytest.raises(ModelError, match=f"contains no model; a LoRA .{LORA_FILE}"):
+        load_pipeline(str(tmp_path))
     (tmp_path / LORA_FILE).write_bytes(b"torn")
     with pytest.raises(ModelError):
-        open_decomposer(str(tmp_path))
+        load_pipeline(str(tmp_path))
 
 
 @pytest.mark.parametrize(
@@ -231,7 +231,7 @@ def test_what_a_lora_is_opened_with_is_checked(lora, tmp_path):
         ({"more": 1}, "card of the LoRA cannot be read"),
         ({"task": {"objective": "two"}}, "card of the LoRA cannot be read"),
         ({"task": {"budget_px": "18432"}}, "card of the LoRA cannot be read"),
-        ({"task": {"layout": {"panels": ["I", "R"], "direction": "stacked"}}}, "T among them"),
+        ({"task": {"layout": {"panels": ["I", "R"], "direction": "stacked"}}}, "a list with T"),
         ({"task": {"layout": {"panels": ["T", "T"], "direction": "stacked"}}}, "each once"),
     ],
 )
@@ -266,7 +266,7 @@ def test_a_base_that_has_moved_can_be_named(tmp_path):
     backbone, prompt = tiny("kontext")
     add_lora(backbone, rank=1, alpha=1)
     save_lora(tmp_path / "lora", backbone, prompt, DecompositionTask(budget_px=SMALL), base="/gone/kontext")
-    with pytest.raises(ModelError, match=r"the base of .* was /gone/kontext, which is not there.*--base"):
+    with pytest.raises(ModelError, match=r"the base of .* was /gone/kontext, which does not exist.*--base"):
         Separator.load(str(tmp_path / "lora"))
     assert Separator.load(str(tmp_path / "lora"), base="tiny:kontext").name == "lora"
 

@@ -69,7 +69,7 @@ def test_large_image_models_have_one_door():
     opened = {
         (path.relative_to(SOURCE).parts[:2], library)
         for path in FILES
-        for library in re.findall(r'\b(?:library|stock_class)\("?(\w+)', path.read_text())
+        for library in re.findall(r'\b(?:import_library|diffusers_class)\("?(\w+)', path.read_text())
     }
     outside = {library for room, library in opened if room != ("models", "diffusion")}
     assert outside == {"accelerate"}  # training/distributed

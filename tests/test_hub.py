@@ -1,4 +1,4 @@
-"""What leaves for the hub: which files, without whose home, and what is said where the hub refuses."""
+"""Uploads to the hub: the files, the removal of local paths, and the errors."""
 
 import hashlib
 import json
@@ -14,7 +14,7 @@ from brewster.models.diffusion.adapter.hub import FILES, plan_push, push
 from brewster.models.diffusion.adapter.lora import LORA_FILE, add_lora, load_lora, save_lora
 from brewster.models.diffusion.backbones import BACKBONES, tiny
 from brewster.models.diffusion.task import DecompositionTask
-from brewster.models.diffusion.tensors import read_tensors, said_of
+from brewster.models.diffusion.tensors import read_metadata, read_tensors
 from brewster.training.lora.model_card import write_card
 from brewster.training.recipe import LoraRecipe
 from file_server import loopback_only, unheard
@@ -32,20 +32,20 @@ def _network_off(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def twin():
+def tiny_model():
     backbone, prompt = tiny("kontext")
     add_lora(backbone, rank=2, alpha=2)
     return backbone, prompt
 
 
 @pytest.fixture
-def write(twin, tmp_path):
-    """Writes a LoRA's folder as training does."""
+def write(tiny_model, tmp_path):
+    """A function that writes a LoRA's folder as training does."""
 
     def write(base="kontext", sets="sets/window"):
         folder = tmp_path / "lora"
         hub_id = BACKBONES["kontext"].hub_id if base == "kontext" else base
-        save_lora(folder, *twin, DecompositionTask(), base=hub_id)
+        save_lora(folder, *tiny_model, DecompositionTask(), base=hub_id)
         recipe = LoraRecipe.model_validate(
             VALUES | {"backbone": base, "data": {"rendered": {"sets": [sets]}}}
         )
@@ -78,17 +78,17 @@ def test_four_files_would_be_sent_as_they_are(write):
     assert plan.is_private
     assert plan.message == "LoRA of black-forest-labs/FLUX.1-Kontext-dev, rank 2"
     assert plan.remarks[1:] == ("not sent: notes.txt",)
-    for file in plan.about()["files"]:
+    for file in plan.to_dict()["files"]:
         assert file["sha256"] == hashlib.sha256((folder / file["name"]).read_bytes()).hexdigest()
     assert all(name in plan.table() for name in FILES)
 
 
-def test_a_base_that_forbids_commerce_and_a_toy_are_said(write):
+def test_remarks_name_a_non_commercial_base_and_a_tiny_one(write):
     assert "not for commercial use" in plan_push(write(), REPO).remarks[0]
-    assert "a toy: nobody can separate" in plan_push(write("tiny:kontext"), REPO).remarks[0]
+    assert "a tiny test model: it cannot separate" in plan_push(write("tiny:kontext"), REPO).remarks[0]
 
 
-def test_places_of_this_machine_are_renamed_in_what_is_sent_and_the_lora_still_loads(write, tmp_path, twin):
+def test_local_paths_are_replaced_in_uploaded_files_and_the_lora_still_loads(write, tmp_path, tiny_model):
     base, sets = tmp_path / "models" / "flux", tmp_path / "secret" / "window"
     folder = write(str(base), str(sets))
     before = {name: (folder / name).read_bytes() for name in FILES}
@@ -98,8 +98,8 @@ def test_places_of_this_machine_are_renamed_in_what_is_sent_and_the_lora_still_l
     recipe = json.loads(sent["recipe.json"])
     assert recipe["data"]["rendered"]["sets"] == ["window"]
     assert recipe["backbone"] == BACKBONES["kontext"].hub_id
-    assert json.loads(said_of(sent[LORA_FILE])["brewster"])["base"] == BACKBONES["kontext"].hub_id
-    assert f"{sets} is called window in what is sent" in plan.remarks
+    assert json.loads(read_metadata(sent[LORA_FILE])["brewster"])["base"] == BACKBONES["kontext"].hub_id
+    assert f"{sets} is replaced by window in the uploaded files" in plan.remarks
     assert before == {name: (folder / name).read_bytes() for name in FILES}
     for name, data in sent.items():
         (folder / name).write_bytes(data)
@@ -111,11 +111,11 @@ def test_places_of_this_machine_are_renamed_in_what_is_sent_and_the_lora_still_l
 
 
 @pytest.mark.parametrize("home", ["/home/ann/photos", "/Users/ann/x.jpg", r"C:\Users\ann\x.jpg"])
-def test_a_card_that_names_somebodys_home_is_refused(write, home):
+def test_a_card_with_the_path_of_a_home_folder_is_refused(write, home):
     folder = write()
     with (folder / "README.md").open("a") as card:
         card.write(f"Trained on {home}, at night.\n")
-    with pytest.raises(ModelError, match=r"README\.md names .*ann.*; nothing of this machine"):
+    with pytest.raises(ModelError, match=r"README\.md contains the path .*ann.*; no path of a home folder"):
         plan_push(folder, REPO)
 
 
@@ -130,13 +130,13 @@ def test_a_missing_file_is_named(write, name):
 @pytest.mark.parametrize(
     ("card", "words"),
     [
-        ("# No front matter\n", "says nothing of base_model, library_name, license"),
-        ("---\nlicense: mit\nlibrary_name: diffusers\n---\n", "says nothing of base_model"),
+        ("# No front matter\n", "has no base_model, library_name, license"),
+        ("---\nlicense: mit\nlibrary_name: diffusers\n---\n", "has no base_model"),
         ("---\nlicense: [mit\n---\n", "is not YAML"),
         ("---\n- mit\n---\n", "is not YAML"),
     ],
 )
-def test_a_card_that_the_hub_could_not_read_is_refused(write, card, words):
+def test_a_card_with_invalid_front_matter_is_refused(write, card, words):
     folder = write()
     (folder / "README.md").write_text(card)
     with pytest.raises(ModelError, match=words):
@@ -159,8 +159,8 @@ def test_damaged_files_and_another_prompt_are_refused(write):
 
 
 @pytest.mark.parametrize("name", ["name", "a/b/c", "a b/c", "", "-a/b"])
-def test_a_name_that_the_hub_does_not_take_is_refused(write, name):
-    with pytest.raises(ModelError, match=r"is no name on the hub .*; OWNER/NAME"):
+def test_an_invalid_hub_id_is_refused(write, name):
+    with pytest.raises(ModelError, match=r"is not a valid hub id .*; OWNER/NAME"):
         plan_push(write(), name)
 
 
@@ -178,50 +178,50 @@ def test_a_push_makes_a_private_repository_with_the_four_files_in_one_commit(wri
     assert hub.messages == ["First try", "Again"]
 
 
-def test_what_shall_be_private_does_not_go_into_a_public_repository(write, hub):
+def test_a_private_upload_to_a_public_repository_is_refused(write, hub):
     push(plan_push(write(), REPO, public=True))
     assert hub.private == {REPO: False}
-    with pytest.raises(DownloadError, match=r"is there already and public; .*; pass --public"):
+    with pytest.raises(DownloadError, match=r"exists already and is public; .*; pass --public"):
         push(plan_push(write(), REPO))
     assert len(hub.messages) == 1
 
 
-def test_without_a_token_nothing_is_asked(write, hub, monkeypatch):
+def test_without_a_token_no_request_is_made(write, hub, monkeypatch):
     monkeypatch.delenv("HF_TOKEN")
     with pytest.raises(DownloadError, match=r"there is no token to write to .*; .*; make one at https"):
         push(plan_push(write(), REPO))
-    assert hub.asked == []
+    assert hub.requests == []
 
 
 @pytest.mark.parametrize(
-    ("place", "status", "words"),
+    ("path", "status", "words"),
     [
-        ("repos/create", 403, "the token may not write to somebody/.* whose owner is somebody"),
+        ("repos/create", 403, "the token may not write to somebody/.* repositories of somebody"),
         ("/commit/", 403, "the token may not write"),
         ("/commit/", 401, "the hub refused the token"),
-        ("/commit/", 500, "the hub answered HTTP 500 .*; try again later"),
+        ("/commit/", 500, "the hub returned HTTP 500 .*; try again later"),
         ("validate-yaml", 400, r"the hub refused README\.md"),
     ],
 )
-def test_what_the_hub_refuses_is_told_plainly(write, hub, place, status, words):
-    hub.refusals[place] = status
+def test_refusals_of_the_hub_are_explained(write, hub, path, status, words):
+    hub.refusals[path] = status
     with pytest.raises(DownloadError, match=words):
         push(plan_push(write(), REPO))
     assert hub.messages == []
 
 
-def test_a_wrong_token_is_told_plainly(write, hub):
+def test_an_invalid_token_is_explained(write, hub):
     with pytest.raises(DownloadError, match="the hub refused the token"):
         push(plan_push(write(), REPO), token="hf_wrong")
 
 
-def test_what_is_no_hub_is_told_plainly(write, hub):
-    hub.speaks_html = True
-    with pytest.raises(DownloadError, match=r"what answered is no hub .*; JSON; look at HF_ENDPOINT"):
+def test_a_server_that_is_not_a_hub_is_explained(write, hub):
+    hub.returns_html = True
+    with pytest.raises(DownloadError, match=r"the server's response is not JSON .*; check HF_ENDPOINT"):
         push(plan_push(write(), REPO))
 
 
-def test_no_network_is_told_plainly(write, monkeypatch):
+def test_a_missing_network_connection_is_explained(write, monkeypatch):
     monkeypatch.setattr(huggingface_hub.constants, "ENDPOINT", unheard())
     with pytest.raises(DownloadError, match=r"the hub cannot be reached .*; a network"):
         push(plan_push(write(), REPO), token="hf_right")
@@ -233,21 +233,21 @@ def test_no_network_is_told_plainly(write, monkeypatch):
 # --- the command
 
 
-def test_the_command_shows_what_it_would_send_and_sends_nothing(bare, write, hub):
+def test_a_dry_run_of_the_command_prints_the_plan_and_sends_nothing(bare, write, hub):
     folder = write()
     code, out, err = bare("models", "push", folder, REPO, "--dry-run")
-    assert (code, hub.asked) == (0, [])
+    assert (code, hub.requests) == (0, [])
     assert out.decode().splitlines()[-1] == "nothing was sent"
     assert "not for commercial use" in err
     code, out, _ = bare(
         "models", "push", folder, REPO, "--dry-run", "--json", "--public", "--message", "Hello"
     )
-    told = json.loads(out)
-    assert (told["address"], told["private"], told["message"]) == (None, False, "Hello")
-    assert [file["name"] for file in told["files"]] == list(FILES)
+    plan = json.loads(out)
+    assert (plan["address"], plan["private"], plan["message"]) == (None, False, "Hello")
+    assert [file["name"] for file in plan["files"]] == list(FILES)
 
 
-def test_the_command_sends_and_says_where(bare, write, hub):
+def test_the_command_sends_and_prints_the_address(bare, write, hub):
     code, out, _ = bare("models", "push", write(), REPO)
     assert code == 0
     assert out.decode().splitlines()[-1] == f"sent: {hub.url}/{REPO}/commit/1"
@@ -258,7 +258,7 @@ def test_the_command_sends_and_says_where(bare, write, hub):
     assert "error: the hub refused the token" in err
 
 
-def test_the_card_of_a_folder_is_printed_and_takes_scores(bare, write, tmp_path):
+def test_the_card_of_a_folder_is_printed_and_scores_are_added(bare, write, tmp_path):
     folder = write()
     code, out, _ = bare("models", "card", folder)
     assert (code, out.decode()) == (0, (folder / "README.md").read_text() + "\n")

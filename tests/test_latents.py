@@ -78,7 +78,7 @@ def test_panels_are_the_whole_sample_in_its_own_aspect_ratio(recipe, root, backb
         assert (fit.content, fit.panel) == ((24, 16), (32, 16))
         for letter, name in zip("ITR", ("photo", "transmission", "reflection"), strict=True):
             picture = torch.from_numpy(Photo.open(entry.read(f"{name}.jpg")).pixels.copy())
-            whole = (fit.cut(panels[letter])[0].permute(1, 2, 0) + 1) * 127.5
+            whole = (fit.crop(panels[letter])[0].permute(1, 2, 0) + 1) * 127.5
             torch.testing.assert_close(whole, picture.float(), atol=0.01, rtol=0)
 
 

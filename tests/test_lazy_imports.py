@@ -1,4 +1,4 @@
-"""The door to the stock libraries: opened late, in silence, and with its errors told plainly."""
+"""Third-party libraries are imported late and without output, and their errors are translated."""
 
 import subprocess
 import sys
@@ -9,20 +9,20 @@ from huggingface_hub import errors as hub_errors
 
 from brewster.errors import DownloadError, MissingExtra
 from brewster.models.diffusion.backbones import encode_prompt, load_backbone
-from brewster.models.diffusion.lazy_imports import library
+from brewster.models.diffusion.lazy_imports import import_library
 
 
 def hub_error(kind, status, **headers):
-    """An error as huggingface_hub raises it for an answer of the hub."""
+    """An error as huggingface_hub raises it for this status."""
     httpx = sys.modules[hub_errors.Response.__module__.split(".")[0]]
     request = httpx.Request("GET", "https://huggingface.co/api/models/owner/name")
     return kind(f"{status} Client Error.", response=httpx.Response(status, request=request, headers=headers))
 
 
-def caused_by(answer):
-    """As snapshot_download raises it where nothing is in the cache, either."""
+def caused_by(http_error):
+    """The error that snapshot_download raises if the cache is empty as well."""
     error = hub_errors.LocalEntryNotFoundError("Got: HfHubHTTPError")
-    error.__cause__ = answer
+    error.__cause__ = http_error
     return error
 
 
@@ -37,33 +37,33 @@ def caused_by(answer):
             hub_error(hub_errors.GatedRepoError, 403),
             "is gated and your account has no access.*open that page",
         ),
-        (hub_error(hub_errors.RepositoryNotFoundError, 401), "the hub shows no model .*hf auth login"),
+        (hub_error(hub_errors.RepositoryNotFoundError, 401), "the hub has no model .*hf auth login"),
         (hub_error(hub_errors.HfHubHTTPError, 401), "refused the token.*settings/tokens"),
-        (hub_error(hub_errors.HfHubHTTPError, 503), "answered HTTP 503.*try again later"),
-        (caused_by(hub_error(hub_errors.HfHubHTTPError, 503)), "answered HTTP 503.*try again later"),
+        (hub_error(hub_errors.HfHubHTTPError, 503), "returned HTTP 503.*try again later"),
+        (caused_by(hub_error(hub_errors.HfHubHTTPError, 503)), "returned HTTP 503.*try again later"),
         (OSError(28, "No space left on device"), "No space left on device.*HF_HOME"),
         (hub_errors.LocalEntryNotFoundError("no network"), "not in the cache and the hub cannot be reached"),
         (hub_errors.OfflineModeIsEnabled("HF_HUB_OFFLINE"), "the hub cannot be reached.*give the folder"),
     ],
 )
 @pytest.mark.parametrize("load", [load_backbone, encode_prompt])
-def test_what_the_hub_refuses_is_told_plainly(monkeypatch, error, words, load):
+def test_errors_of_the_hub_are_explained(monkeypatch, error, words, load):
     def refuse(*_, **__):
         raise error
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", refuse)
-    with pytest.raises(DownloadError, match=words) as told:
+    with pytest.raises(DownloadError, match=words) as raised:
         load("kontext")
-    assert "black-forest-labs/FLUX.1-Kontext-dev" in str(told.value)
+    assert "black-forest-labs/FLUX.1-Kontext-dev" in str(raised.value)
 
 
 def test_a_missing_library_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "bitsandbytes", None)
     with pytest.raises(MissingExtra, match=r"pip install 'brewster\[large\]'"):
-        library("bitsandbytes")
+        import_library("bitsandbytes")
 
 
-def test_the_room_wakes_no_stock_library_until_a_model_is_built_and_then_keeps_its_silence(tmp_path):
+def test_libraries_are_imported_when_a_model_is_built_and_print_nothing(tmp_path):
     code = f"""
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""LoRAs on tiny twins: what is trained, saved and loaded, by us and by stock diffusers."""
+"""LoRAs on tiny versions of the backbones: training, saving, and loading by brewster and by diffusers."""
 
 import copy
 
@@ -27,7 +27,7 @@ from brewster.models.diffusion.tensors import read_tensors, write_tensors
 
 
 @pytest.fixture(params=list(BACKBONES))
-def twin(request):
+def tiny_model(request):
     return tiny(request.param, seed=1)
 
 
@@ -43,7 +43,7 @@ def velocity(backbone, prompt):
 
 
 def trained(backbone, *, alpha=16, rank=4):
-    """A LoRA as if training had moved it: B is no longer zero."""
+    """Adds a LoRA with nonzero B matrices, as after training."""
     add_lora(backbone, rank=rank, alpha=alpha, seed=2)
     generator = torch.Generator().manual_seed(4)
     with torch.no_grad():
@@ -52,8 +52,8 @@ def trained(backbone, *, alpha=16, rank=4):
     return backbone
 
 
-def test_every_linear_layer_of_the_blocks_is_changed_and_nothing_else(twin):
-    backbone, _ = twin
+def test_every_linear_layer_of_the_blocks_is_changed_and_nothing_else(tiny_model):
+    backbone, _ = tiny_model
     targets = backbone.lora_targets()
     linear = {name for name, module in backbone.transformer.named_modules() if isinstance(module, nn.Linear)}
     outside = linear - set(targets)
@@ -67,25 +67,25 @@ def test_every_linear_layer_of_the_blocks_is_changed_and_nothing_else(twin):
     assert backbone.lora_targets() == targets
 
 
-def test_a_fresh_lora_changes_nothing_and_is_all_that_is_trained(twin):
-    backbone, prompt = twin
+def test_a_fresh_lora_changes_nothing_and_is_all_that_is_trained(tiny_model):
+    backbone, prompt = tiny_model
     before = velocity(backbone, prompt)
     parameters = add_lora(backbone, rank=4)
     assert torch.equal(velocity(backbone, prompt), before)
     assert sum(map(torch.numel, parameters)) == sum(map(torch.numel, lora_state(backbone).values()))
     velocity(backbone, prompt).square().mean().backward()
-    idle = {
+    without_gradient = {
         name
         for name, parameter in backbone.transformer.named_parameters()
         if "lora_" in name and parameter.grad is None
     }
-    # Qwen's last block computes words that nobody reads: those layers never learn (DDP must be told).
+    # The text output of Qwen's last block is unused, so its layers get no gradient (DDP: find_unused_parameters).
     last = "transformer_blocks.1.attn.to_add_out", "transformer_blocks.1.txt_mlp."
-    assert all(name.startswith(last) for name in idle)
-    assert bool(idle) == (backbone.name == "qwen")
+    assert all(name.startswith(last) for name in without_gradient)
+    assert bool(without_gradient) == (backbone.name == "qwen")
 
 
-def test_the_seed_decides_the_lora_and_leaves_torchs_own_dice_alone(kontext):
+def test_the_seed_determines_the_lora_and_the_global_random_state_is_unchanged(kontext):
     backbone, _ = kontext
     states = []
     for seed in (7, 7, 8):
@@ -109,8 +109,8 @@ def test_on_a_bf16_base_the_lora_is_float32(kontext):
 
 
 @pytest.mark.parametrize("alpha", [4, 16])
-def test_a_saved_lora_gives_the_same_picture_reloaded_and_in_stock_diffusers(twin, tmp_path, alpha):
-    backbone, prompt = twin
+def test_a_saved_lora_gives_the_same_prediction_reloaded_and_in_diffusers(tiny_model, tmp_path, alpha):
+    backbone, prompt = tiny_model
     plain = copy.deepcopy(backbone.transformer)
     untouched = velocity(backbone, prompt)
     with_lora = velocity(trained(backbone, alpha=alpha), prompt)
@@ -135,7 +135,7 @@ def test_the_same_lora_gives_the_same_bytes(kontext, tmp_path):
     assert (tmp_path / "a" / LORA_FILE).read_bytes() == (tmp_path / "b" / LORA_FILE).read_bytes()
 
 
-def test_a_checkpoint_of_the_weights_alone_goes_back_in(kontext):
+def test_a_state_of_the_weights_alone_can_be_loaded(kontext):
     backbone, prompt = kontext
     state = {name: tensor.clone() for name, tensor in lora_state(trained(backbone)).items()}
     expected = velocity(backbone, prompt)
@@ -146,8 +146,8 @@ def test_a_checkpoint_of_the_weights_alone_goes_back_in(kontext):
     assert torch.equal(velocity(backbone, prompt), expected)
 
 
-def test_removing_a_lora_gives_the_plain_backbone_back(twin):
-    backbone, prompt = twin
+def test_removing_a_lora_restores_the_backbone(tiny_model):
+    backbone, prompt = tiny_model
     before = velocity(backbone, prompt)
     remove_lora(trained(backbone))
     assert not has_lora(backbone)
@@ -158,7 +158,7 @@ def test_removing_a_lora_gives_the_plain_backbone_back(twin):
 def test_a_lora_of_another_backbone_is_refused(kontext, tmp_path):
     backbone, prompt = kontext
     save_lora(tmp_path, trained(backbone), prompt, DecompositionTask())
-    with pytest.raises(ModelError, match="is a LoRA of kontext; one of klein; load the backbone kontext"):
+    with pytest.raises(ModelError, match="is a LoRA of kontext; a LoRA of klein; load the backbone kontext"):
         load_lora(tmp_path, tiny("klein")[0])
 
 
@@ -168,7 +168,7 @@ def changed_card(folder, **changes):
     write_tensors(folder / LORA_FILE, tensors, about | {"brewster": LoraCard(**card).to_json()})
 
 
-def test_a_card_that_does_not_fit_its_weights_is_refused_and_leaves_no_trace(kontext, tmp_path):
+def test_a_card_that_does_not_match_its_weights_is_refused_without_side_effects(kontext, tmp_path):
     backbone, prompt = kontext
     save_lora(tmp_path, trained(backbone), prompt, DecompositionTask())
     changed_card(tmp_path, rank=8)
@@ -183,7 +183,7 @@ def test_a_smaller_backbone_of_the_same_family_is_refused(kontext, tmp_path):
     save_lora(tmp_path, trained(backbone), prompt, DecompositionTask())
     fresh, _ = tiny("kontext", seed=1)
     fresh.transformer.single_transformer_blocks = fresh.transformer.single_transformer_blocks[:1]
-    with pytest.raises(ModelError, match=r"too few or too many, single_transformer_blocks\.1"):
+    with pytest.raises(ModelError, match=r"missing or unexpected, for example single_transformer_blocks\.1"):
         load_lora(tmp_path, fresh)
 
 
@@ -213,20 +213,20 @@ def test_a_corrupt_or_foreign_or_missing_file_is_refused(kontext, tmp_path):
         read_card(tmp_path)
 
 
-def test_one_lora_at_a_time_and_only_what_is_there(kontext, tmp_path):
+def test_a_second_lora_and_saving_without_a_lora_are_refused(kontext, tmp_path):
     backbone, prompt = kontext
     with pytest.raises(ModelError, match="has no LoRA"):
         save_lora(tmp_path, backbone, prompt, DecompositionTask())
     with pytest.raises(ModelError, match="the rank is 0"):
         add_lora(backbone, rank=0)
     add_lora(backbone, rank=2)
-    with pytest.raises(ModelError, match="has a LoRA already"):
+    with pytest.raises(ModelError, match="already has a LoRA"):
         add_lora(backbone)
     with pytest.raises(ModelError, match="encoded for klein"):
         save_lora(tmp_path, backbone, tiny("klein")[1], DecompositionTask())
 
 
-def test_a_card_comes_back_from_its_line():
+def test_a_card_survives_a_round_trip_through_json():
     task = DecompositionTask(PanelLayout(("T", "R"), "stacked"), 4096, "one_step", 1.0)
     card = LoraCard("qwen", "Qwen/Qwen-Image-Edit", "int8", 16, 8, task, "abc")
     assert LoraCard.from_json(card.to_json()) == card

@@ -15,7 +15,7 @@ import brewster.training.lora.trainer as module
 from brewster.errors import ModelError, RecipeError
 from brewster.models.diffusion.adapter.lora import LORA_FILE, load_lora, lora_state
 from brewster.models.diffusion.backbones import tiny
-from brewster.models.diffusion.panels import condition, split
+from brewster.models.diffusion.panels import conditioning_image, split
 from brewster.models.diffusion.sampling import GUIDANCE, STEPS, sample
 from brewster.models.diffusion.tensors import read_tensors
 from brewster.photo import Photo
@@ -133,7 +133,7 @@ def test_the_exported_lora_makes_the_same_picture_in_another_backbone(begun, tmp
         trainer.training_step(step)
     made = trainer.separate(photo())
     backbone, _ = tiny("kontext")
-    shown = condition(photo(), trainer.recipe.layout)
+    shown = conditioning_image(photo(), trainer.recipe.layout)
     plain = split(sample(backbone, shown, trainer.prompt, size=(144, 32)), trainer.recipe.layout)
     card, prompt = load_lora(trainer.export(tmp_path), backbone)
     again = split(

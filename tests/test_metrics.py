@@ -1,4 +1,4 @@
-"""Whether scores are what they say: beside scikit-image, by hand, and in a region."""
+"""PSNR, SSIM and the table of metrics, compared with scikit-image and with values computed by hand."""
 
 import subprocess
 import sys
@@ -43,7 +43,7 @@ def test_ssim_equals_scikit_image_at_any_size_and_near_white(random, size, windo
     assert ssim(one, other, window=window) == pytest.approx(peer, abs=1e-9)
 
 
-def test_equal_pictures_are_perfect(random):
+def test_equal_pictures_have_infinite_psnr_and_an_ssim_of_one(random):
     picture = random.integers(0, 256, (12, 12, 3), np.uint8)
     assert psnr(picture, picture) == float("inf")
     assert ssim(picture, picture) == ssim(picture, picture, window="gaussian") == pytest.approx(1)
@@ -56,14 +56,14 @@ def test_a_constant_offset_has_a_known_psnr(offset, decibels):
     assert psnr(picture, picture + np.uint8(offset)) == pytest.approx(decibels, abs=1e-4)
 
 
-def test_two_even_pictures_have_the_ssim_of_their_means():
+def test_two_uniform_pictures_have_the_ssim_of_their_means():
     black, white = np.zeros((11, 11, 3), np.uint8), np.full((11, 11, 3), 255, np.uint8)
     constant = (0.01 * 255) ** 2
     for window in PEERS:
         assert ssim(black, white, window=window) == pytest.approx(constant / (255**2 + constant))
 
 
-def test_pictures_may_lie_in_memory_as_they_like(random):
+def test_pictures_may_have_any_memory_layout(random):
     one, other = random.integers(0, 256, (2, 20, 26, 3), np.uint8)
     for a, b in ((one[::-1, ::2], other[::-1, ::2]), (one.transpose(1, 0, 2), other.transpose(1, 0, 2))):
         assert psnr(a, b) == psnr(a.copy(), b.copy())
@@ -81,19 +81,19 @@ def test_a_region_that_is_the_whole_picture_changes_nothing(one, other, window):
 
 
 @given(pictures, pictures, masks, windows)
-def test_ssim_in_a_region_is_the_mean_of_the_map_that_scikit_image_draws(one, other, mask, window):
+def test_ssim_in_a_region_is_the_mean_of_the_map_of_scikit_image(one, other, mask, window):
     border = BORDERS[window]
-    _, drawn = structural_similarity(other, one, full=True, **PEERS[window])
+    _, ssim_map = structural_similarity(other, one, full=True, **PEERS[window])
     inner = (slice(border, -border),) * 2
     if mask[inner].any():
-        expected = drawn[inner][mask[inner]].mean()
+        expected = ssim_map[inner][mask[inner]].mean()
         assert ssim(one, other, window=window, region=mask) == pytest.approx(expected, abs=1e-9)
     else:
         with pytest.raises(ValueError, match="region"):
             ssim(one, other, window=window, region=mask)
 
 
-def test_psnr_in_a_region_sees_nothing_else(random):
+def test_psnr_in_a_region_ignores_all_other_pixels(random):
     truth = random.integers(0, 200, (9, 9, 3), np.uint8)
     picture, region = truth.copy(), np.zeros((9, 9), bool)
     picture[:3] += np.uint8(10)
@@ -103,7 +103,7 @@ def test_psnr_in_a_region_sees_nothing_else(random):
 
 
 @pytest.mark.parametrize("metric", [psnr, ssim])
-def test_a_region_that_measures_nothing_is_refused(metric):
+def test_an_empty_region_and_one_of_another_shape_are_refused(metric):
     picture = np.zeros((9, 9, 3), np.uint8)
     with pytest.raises(ValueError, match="empty"):
         metric(picture, picture, region=np.zeros((9, 9), bool))
@@ -119,7 +119,7 @@ def test_a_region_at_the_border_has_no_ssim():
         ssim(picture, picture, region=region)
 
 
-# --- what is refused
+# --- invalid input
 
 
 @pytest.mark.parametrize("metric", [psnr, ssim])
@@ -134,7 +134,7 @@ def test_a_region_at_the_border_has_no_ssim():
         (np.zeros((0, 8, 3), np.uint8), "must be"),
     ],
 )
-def test_what_is_no_pair_of_pictures_is_refused(metric, picture, why):
+def test_pictures_of_another_type_or_shape_are_refused(metric, picture, why):
     truth = np.zeros((8, 8, 3), np.uint8)
     for pair in ((picture, truth), (truth, picture)):
         with pytest.raises(ValueError, match=why):
@@ -162,7 +162,7 @@ def test_the_table_names_each_metric_once_and_defines_it():
         assert (metric.where == "region") == metric.name.endswith("_region")
 
 
-def test_a_metric_is_found_by_name_and_a_slip_is_understood():
+def test_a_metric_is_found_by_name_and_a_typing_error_gets_a_suggestion():
     assert find_metric("ssim_gaussian") is METRICS["ssim_gaussian"]
     assert isinstance(find_metric("lpips"), Metric)
     with pytest.raises(BrewsterError, match=r"no metric 'lpisp'.*did you mean lpips\?"):
@@ -177,6 +177,6 @@ def test_exports_are_in_order():
     assert all(hasattr(brewster.metrics, name) for name in names)
 
 
-def test_metrics_wake_no_torch():
+def test_importing_metrics_does_not_import_torch():
     code = "import brewster.metrics, sys; assert not {'torch', 'scipy', 'PIL'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

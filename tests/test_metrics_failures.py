@@ -1,4 +1,4 @@
-"""The two ways to fail: taking content away, leaving reflections. On a pane that is made here in linear light."""
+"""The failure metrics (removed content, remaining reflection) on panes that are computed here in linear light."""
 
 import contextlib
 
@@ -13,7 +13,7 @@ from brewster.srgb import to_encoded, to_linear
 
 SIDE = 48
 TRANSMITTANCE = 0.8
-WHITE = (slice(4, 20), slice(4, 20))  # a white sheet behind the left half, where nothing is mirrored
+WHITE = (slice(4, 20), slice(4, 20))  # a white sheet behind the left half, which has no reflection
 SCORES = (removed_content, removed_white, kept_reflection)
 
 pictures = arrays(np.uint8, (16, 16, 3))
@@ -29,7 +29,7 @@ def brighten(picture, gain):
 
 @pytest.fixture
 def scene():
-    """Background, photo and reflection: the right half of the pane mirrors something."""
+    """Background, photo and reflection; only the right half of the pane has a reflection."""
     random = np.random.default_rng(7)
     behind = random.uniform(0.05, 0.4, (SIDE, SIDE, 3))
     behind[WHITE] = 0.8
@@ -38,13 +38,13 @@ def scene():
     return encode(behind), encode(TRANSMITTANCE * behind + mirrored), encode(mirrored)
 
 
-def test_the_background_itself_fails_nowhere(scene):
+def test_the_background_itself_scores_zero(scene):
     background, photo, reflection = scene
     assert [score(background, background, photo, reflection) for score in SCORES] == [0, 0, 0]
 
 
 @pytest.mark.parametrize("gain", [TRANSMITTANCE, 0.64, 0.5])
-def test_an_answer_that_leaves_what_the_glass_absorbs_fails_nowhere_either(scene, gain):
+def test_a_prediction_that_does_not_restore_absorbed_light_scores_zero(scene, gain):
     background, photo, reflection = scene
     scores = [score(brighten(background, gain), background, photo, reflection) for score in SCORES]
     assert scores == pytest.approx([0, 0, 0], abs=0.01)
@@ -52,48 +52,48 @@ def test_an_answer_that_leaves_what_the_glass_absorbs_fails_nowhere_either(scene
 
 def test_the_photo_itself_keeps_all_of_the_reflection_and_removes_nothing(scene):
     background, photo, reflection = scene
-    content, white, kept = (score(photo, background, photo, reflection) for score in SCORES)
+    content, white, remaining = (score(photo, background, photo, reflection) for score in SCORES)
     assert (content, white) == pytest.approx((0, 0), abs=0.01)
-    assert kept == pytest.approx(1, abs=0.01)
+    assert remaining == pytest.approx(1, abs=0.01)
 
 
 def test_half_of_the_reflection_counts_half(scene):
     background, photo, reflection = scene
     light = [to_linear(picture / 255) for picture in (background, reflection)]
-    answer = encode(light[0] + light[1] / 2)
-    assert kept_reflection(answer, background, photo, reflection) == pytest.approx(0.5, abs=0.01)
+    prediction = encode(light[0] + light[1] / 2)
+    assert kept_reflection(prediction, background, photo, reflection) == pytest.approx(0.5, abs=0.01)
 
 
 def test_a_white_sheet_taken_for_a_highlight_is_removed_white(scene):
     background, photo, reflection = scene
-    answer = background.copy()
-    answer[WHITE] = 0
+    prediction = background.copy()
+    prediction[WHITE] = 0
     left = np.s_[:, : SIDE // 2]
     sheet = to_linear(background[WHITE] / 255).sum() / to_linear(background[left] / 255).sum()
-    assert removed_white(answer, background, photo, reflection) == 1
-    assert removed_content(answer, background, photo, reflection) == pytest.approx(sheet, abs=0.01)
-    assert kept_reflection(answer, background, photo, reflection) == 0
+    assert removed_white(prediction, background, photo, reflection) == 1
+    assert removed_content(prediction, background, photo, reflection) == pytest.approx(sheet, abs=0.01)
+    assert kept_reflection(prediction, background, photo, reflection) == 0
 
 
-def test_a_black_answer_removes_everything_and_keeps_nothing(scene):
+def test_a_black_prediction_removes_everything_and_keeps_nothing(scene):
     background, photo, reflection = scene
     assert [score(np.zeros_like(photo), background, photo, reflection) for score in SCORES] == [1, 1, 0]
 
 
 def test_a_third_of_the_pixels_at_half_their_light_does_not_change_the_gain(scene):
-    """The gain is the median's: the others, which are right, fix it, and half of the third's light is missing."""
+    """The gain is a median: the correct two thirds determine it, and half of the light of the other third is missing."""
     background, photo, reflection = scene
     third = np.s_[: SIDE // 3]
     light = to_linear(background / 255)
-    answer = light * 0.7
-    answer[third] /= 2
-    calm = np.s_[:, : SIDE // 2]
-    lost = light[third][calm].sum() / 2 / light[calm].sum()
-    assert removed_content(encode(answer), background, photo, reflection) == pytest.approx(lost, abs=0.01)
+    prediction = light * 0.7
+    prediction[third] /= 2
+    unreflected = np.s_[:, : SIDE // 2]
+    lost = light[third][unreflected].sum() / 2 / light[unreflected].sum()
+    assert removed_content(encode(prediction), background, photo, reflection) == pytest.approx(lost, abs=0.01)
 
 
 def halves(share):
-    """Background, photo and reflection: on the right, this share of the photo's light is mirrored."""
+    """Background, photo and reflection; in the right half, this share of the photo's light is reflection."""
     behind = np.full((SIDE, SIDE, 3), 0.3)
     mirrored = np.zeros_like(behind)
     mirrored[:, SIDE // 2 :] = 0.3 * share / (1 - share)
@@ -101,11 +101,11 @@ def halves(share):
 
 
 @pytest.mark.parametrize(("share", "lost"), [(0.01, 0.5), (0.05, 0), (0.15, 0)])
-def test_content_counts_where_less_than_two_percent_is_mirrored(share, lost):
+def test_content_counts_where_the_reflection_is_less_than_two_percent(share, lost):
     background, photo, reflection = halves(share)
-    answer = background.copy()
-    answer[:, SIDE // 2 :] = 0
-    assert removed_content(answer, background, photo, reflection) == pytest.approx(lost, abs=0.01)
+    prediction = background.copy()
+    prediction[:, SIDE // 2 :] = 0
+    assert removed_content(prediction, background, photo, reflection) == pytest.approx(lost, abs=0.01)
 
 
 def test_a_reflection_counts_from_a_tenth_of_the_photo_on():
@@ -114,7 +114,7 @@ def test_a_reflection_counts_from_a_tenth_of_the_photo_on():
         kept_reflection(halves(0.08)[1], *halves(0.08))
 
 
-def test_where_the_photo_is_clipped_nothing_is_known_of_its_reflection():
+def test_pixels_where_the_photo_is_clipped_do_not_count_for_the_reflection():
     background, mirrored = np.full((SIDE, SIDE, 3), 0.5), np.zeros((SIDE, SIDE, 3))
     mirrored[:, SIDE // 2 :] = 0.6
     layers = [encode(layer) for layer in (background, background + mirrored, mirrored)]
@@ -131,35 +131,37 @@ def test_white_is_bright_in_all_channels_and_without_colour(scene, sheet, is_whi
     background, photo, reflection = scene
     background = background.copy()
     background[30:46, 4:20] = sheet
-    answer = background.copy()
-    answer[30:46, 4:20] = 0
-    assert (removed_white(answer, background, photo, reflection) > 0.1) == is_white
+    prediction = background.copy()
+    prediction[30:46, 4:20] = 0
+    assert (removed_white(prediction, background, photo, reflection) > 0.1) == is_white
 
 
 @pytest.mark.parametrize("gain", [0.8, 1.1])
-def test_scores_hardly_depend_on_the_brightness_of_an_answer(scene, gain):
+def test_scores_hardly_depend_on_the_brightness_of_a_prediction(scene, gain):
     background, photo, reflection = scene
-    answer = encode(to_linear(background / 255) * 0.7 + to_linear(reflection / 255) * 0.4)
-    answer[WHITE] //= 2
+    prediction = encode(to_linear(background / 255) * 0.7 + to_linear(reflection / 255) * 0.4)
+    prediction[WHITE] //= 2
     for score in SCORES:
-        told = score(answer, background, photo, reflection)
-        assert score(brighten(answer, gain), background, photo, reflection) == pytest.approx(told, abs=0.02)
+        expected = score(prediction, background, photo, reflection)
+        assert score(brighten(prediction, gain), background, photo, reflection) == pytest.approx(
+            expected, abs=0.02
+        )
 
 
-def test_clipped_values_do_not_mislead_the_gain(scene):
+def test_clipped_values_do_not_change_the_gain(scene):
     background, photo, reflection = scene
     background = background.copy()
     background[:, :20] = (
-        255  # most of where nothing is mirrored; the answer is darker there than the glass explains
+        255  # most of where nothing is mirrored; the prediction is darker there than the glass explains
     )
-    answer = brighten(background, 0.5)
-    answer[:, :20] = 255
-    assert kept_reflection(answer, background, photo, reflection) == pytest.approx(0, abs=0.01)
+    prediction = brighten(background, 0.5)
+    prediction[:, :20] = 255
+    assert kept_reflection(prediction, background, photo, reflection) == pytest.approx(0, abs=0.01)
 
 
 @pytest.mark.parametrize("score", SCORES)
-def test_no_answer_gains_by_darkness_where_the_gain_cannot_be_known(scene, score):
-    """A reflection over the whole picture but for 63 pixels: nothing tells how bright an answer should be."""
+def test_too_few_pixels_for_the_gain_are_refused(scene, score):
+    """The reflection covers all but 63 pixels, so the right brightness of a prediction is unknown."""
     background, photo, reflection = scene
     reflection = np.maximum(reflection, 60)
     reflection.reshape(-1, 3)[:63] = 0
@@ -168,7 +170,7 @@ def test_no_answer_gains_by_darkness_where_the_gain_cannot_be_known(scene, score
 
 
 @pytest.mark.parametrize("score", SCORES)
-def test_a_scene_without_such_pixels_is_refused(score):
+def test_a_scene_without_any_pixel_to_score_is_refused(score):
     grey = np.full((8, 8, 3), 100, np.uint8)
     with pytest.raises(ValueError, match="0 pixels have R"):
         score(grey, grey, grey, np.zeros_like(grey) if score is kept_reflection else grey)
@@ -189,10 +191,12 @@ def test_pictures_of_different_shapes_are_refused(scene, score):
 
 
 @given(pictures, pictures, pictures, pictures, st.integers(0, 16), st.sampled_from(SCORES))
-def test_scores_are_shares_whatever_the_pictures(answer, background, photo, reflection, calm, score):
+def test_scores_are_shares_whatever_the_pictures(
+    prediction, background, photo, reflection, unreflected, score
+):
     reflection = reflection.copy()
-    reflection[:calm] = 0
+    reflection[:unreflected] = 0
     if score is removed_white:
         background = background // 16 + np.uint8(220)
     with contextlib.suppress(ValueError):  # too few such pixels
-        assert 0 <= score(answer, background, photo, reflection) <= 1
+        assert 0 <= score(prediction, background, photo, reflection) <= 1

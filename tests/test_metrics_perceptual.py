@@ -1,4 +1,4 @@
-"""LPIPS beside its definition, beside what the lpips package answers, and wherever its weights come from."""
+"""LPIPS, compared with its definition and with the lpips package, and the ways to get its weights."""
 
 import hashlib
 import io
@@ -16,7 +16,14 @@ from torch.nn import functional
 from brewster.download import Downloader, RemoteFile
 from brewster.errors import DownloadError, MissingExtra, ModelError
 from brewster.metrics import Lpips, lpips, perceptual
-from brewster.metrics.weights import FILE, NAMES, digest_of, load_backbone, read_backbone, read_heads
+from brewster.metrics.weights import (
+    TENSOR_NAMES,
+    WEIGHTS_FILE,
+    digest_of,
+    load_alexnet,
+    read_alexnet,
+    read_heads,
+)
 from file_server import loopback_only, served, unheard
 
 SHAPES = ((64, 3, 11), (192, 64, 5), (384, 192, 3), (256, 384, 3), (256, 256, 3))
@@ -30,7 +37,7 @@ def _network_off(monkeypatch):
 
 @pytest.fixture(autouse=True)
 def cache(monkeypatch, tmp_path):
-    """An empty cache folder, no data, and nothing loaded yet."""
+    """An empty cache folder; no BREWSTER_DATA; no weights in memory."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv("BREWSTER_DATA", raising=False)
     perceptual._load.cache_clear()
@@ -40,7 +47,7 @@ def cache(monkeypatch, tmp_path):
 
 @pytest.fixture(scope="module")
 def metric():
-    """LPIPS with the published heads on convolutions of noise: what holds for it holds for any weights."""
+    """LPIPS with the published heads and random convolutions, for properties that hold for any weights."""
     noise = torch.Generator().manual_seed(7)
     convolutions = tuple(
         (torch.randn(out, into, side, side, generator=noise) / (into * side**2) ** 0.5, torch.zeros(out))
@@ -56,7 +63,7 @@ def published(data, monkeypatch):
 
 
 def pair(height, width):
-    """A picture of ramps and squares, and the same with a veil over a part of it: its region."""
+    """Photo, truth and region: a picture of ramps and squares, and the same with a haze over the region."""
     y, x = np.mgrid[:height, :width]
     squares = (x // 8 + y // 8) % 2 * 160 + 40
     truth = np.stack([x * 255 // (width - 1), y * 255 // (height - 1), squares], 2).astype(np.uint8)
@@ -69,21 +76,23 @@ def pair(height, width):
 def by_definition(metric, one, other):
     """The five maps of weighted squared differences, in double precision and without torch's convolutions."""
     shift, scale = (np.array(v)[:, None, None] for v in ((-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)))
-    seen = [torch.from_numpy((p.transpose(2, 0, 1) / 127.5 - 1 - shift) / scale)[None] for p in (one, other)]
+    activations = [
+        torch.from_numpy((p.transpose(2, 0, 1) / 127.5 - 1 - shift) / scale)[None] for p in (one, other)
+    ]
     maps = []
     for layer, ((stride, padding), (weight, bias)) in enumerate(zip(STEPS, metric.convolutions, strict=True)):
         for i in (0, 1):
             if layer in (1, 2):
-                columns = functional.unfold(seen[i], 3, stride=2).unflatten(1, (-1, 9)).amax(2)
-                side = [(n - 3) // 2 + 1 for n in seen[i].shape[2:]]
-                seen[i] = columns.unflatten(2, side)
+                columns = functional.unfold(activations[i], 3, stride=2).unflatten(1, (-1, 9)).amax(2)
+                side = [(n - 3) // 2 + 1 for n in activations[i].shape[2:]]
+                activations[i] = columns.unflatten(2, side)
             k = weight.shape[-1]
-            columns = functional.unfold(seen[i], k, padding=padding, stride=stride)
-            side = [(n + 2 * padding - k) // stride + 1 for n in seen[i].shape[2:]]
-            seen[i] = (
+            columns = functional.unfold(activations[i], k, padding=padding, stride=stride)
+            side = [(n + 2 * padding - k) // stride + 1 for n in activations[i].shape[2:]]
+            activations[i] = (
                 (weight.double().flatten(1) @ columns + bias.double()[:, None]).relu().unflatten(2, side)
             )
-        unit = [s / (s.pow(2).sum(1, keepdim=True).sqrt() + 1e-10) for s in seen]
+        unit = [s / (s.pow(2).sum(1, keepdim=True).sqrt() + 1e-10) for s in activations]
         weighted = (unit[0] - unit[1]).pow(2) * metric.heads[layer].double()[:, None, None]
         maps.append(weighted.sum(1, keepdim=True))
     return maps
@@ -100,7 +109,7 @@ def by_definition(metric, one, other):
         ((97, 130), 0.093210354, 0.254545959),
     ],
 )
-def test_it_answers_what_the_lpips_package_answers(published, size, whole, inside):
+def test_distances_equal_those_of_the_lpips_package(published, size, whole, inside):
     """Figures of lpips 0.1.4, net "alex", without and with spatial=True."""
     photo, truth, region = pair(*size)
     assert lpips(photo, truth) == pytest.approx(whole, abs=1e-6)
@@ -108,7 +117,7 @@ def test_it_answers_what_the_lpips_package_answers(published, size, whole, insid
 
 
 @pytest.mark.parametrize("size", [(31, 31), (64, 96), (75, 58)])
-def test_it_is_what_its_definition_says(metric, size):
+def test_distances_follow_the_definition(metric, size):
     photo, truth, region = pair(*size)
     maps = by_definition(metric, photo, truth)
     one, other = metric.features(photo), metric.features(truth)
@@ -120,7 +129,7 @@ def test_it_is_what_its_definition_says(metric, size):
 
 @settings(max_examples=10)
 @given(arrays(np.uint8, (2, 31, 34, 3)))
-def test_equal_pictures_are_at_no_distance_and_order_does_not_matter(metric, two):
+def test_the_distance_of_equal_pictures_is_zero_and_distances_are_symmetric(metric, two):
     one, other = map(metric.features, two)
     assert metric.distance(one, one) == 0
     assert metric.distance(one, metric.features(two[0].copy())) == 0
@@ -129,7 +138,7 @@ def test_equal_pictures_are_at_no_distance_and_order_does_not_matter(metric, two
 
 def test_features_are_of_unit_length(metric):
     found = metric.features(pair(64, 96)[0])
-    assert [tuple(seen.shape) for seen in found.maps] == [
+    assert [tuple(activations.shape) for activations in found.maps] == [
         (64, 15, 23),
         (192, 7, 11),
         (384, 3, 5),
@@ -137,17 +146,17 @@ def test_features_are_of_unit_length(metric):
         (256, 3, 5),
     ]
     assert found.size == (64, 96)
-    for seen in found.maps:
-        lengths = seen.norm(dim=0)
+    for activations in found.maps:
+        lengths = activations.norm(dim=0)
         assert ((lengths - 1).abs() < 1e-5).logical_or(lengths == 0).all()
 
 
 def test_a_uniform_difference_of_a_single_layer_is_its_head_in_every_region(metric):
-    """Where all maps are even, enlarging changes nothing, and any region has the mean of the picture."""
+    """Upsampling does not change uniform maps, so any region has the mean of the picture."""
     one = metric.features(np.full((40, 40, 3), 10, np.uint8))
-    maps = [torch.zeros_like(seen) for seen in one.maps]
+    maps = [torch.zeros_like(activations) for activations in one.maps]
     other = perceptual.Features(
-        tuple(seen.clone().index_fill_(0, torch.tensor(5), 0.5) for seen in maps), (40, 40)
+        tuple(activations.clone().index_fill_(0, torch.tensor(5), 0.5) for activations in maps), (40, 40)
     )
     none = perceptual.Features(tuple(maps), (40, 40))
     expected = sum(head[5].item() for head in metric.heads) / 4
@@ -157,19 +166,19 @@ def test_a_uniform_difference_of_a_single_layer_is_its_head_in_every_region(metr
     assert metric.distance(none, other, region=region) == pytest.approx(expected)
 
 
-def test_threads_change_nothing(metric):
+def test_the_number_of_threads_does_not_change_the_distance(metric):
     photo, truth, _ = pair(97, 130)
-    threads, answers = torch.get_num_threads(), []
+    threads, distances = torch.get_num_threads(), []
     try:
         for count in (1, 2):
             torch.set_num_threads(count)
-            answers.append(metric.distance(metric.features(photo), metric.features(truth)))
+            distances.append(metric.distance(metric.features(photo), metric.features(truth)))
     finally:
         torch.set_num_threads(threads)
-    assert answers[0] == pytest.approx(answers[1], abs=1e-7)
+    assert distances[0] == pytest.approx(distances[1], abs=1e-7)
 
 
-def test_pictures_may_lie_in_memory_as_they_like(metric):
+def test_pictures_may_have_any_memory_layout(metric):
     photo = pair(64, 96)[0]
     photo.flags.writeable = False
     turned = photo[::-1, ::-1]
@@ -184,11 +193,11 @@ def test_the_heads_are_the_published_ones():
     assert sums == "718a8b40b0d22f96192d34ab93c0db5c7943558ff6c2407f44812dce2f29b5f4"
 
 
-# --- what is refused
+# --- invalid input
 
 
 @pytest.mark.parametrize("size", [(30, 90), (90, 30)])
-def test_a_picture_that_alexnet_cannot_take_is_refused(metric, size):
+def test_a_picture_that_is_too_small_for_alexnet_is_refused(metric, size):
     with pytest.raises(ValueError, match=f"at least 31x31 pixels, not {size[0]}x{size[1]}"):
         metric.features(np.zeros((*size, 3), np.uint8))
 
@@ -205,7 +214,7 @@ def test_unequal_sizes_and_wrong_regions_are_refused(metric):
         metric.features(np.zeros((31, 31, 3)))
 
 
-def test_shapes_are_compared_before_any_weights_are_asked_for():
+def test_shapes_are_compared_before_weights_are_loaded():
     with pytest.raises(ValueError, match="shape"):
         lpips(np.zeros((31, 31, 3), np.uint8), np.zeros((31, 32, 3), np.uint8))
 
@@ -216,7 +225,7 @@ def test_without_torch_the_extra_is_named(monkeypatch):
         Lpips.load()
 
 
-# --- where the weights come from; small tensors of the right names stand for AlexNet
+# --- where the weights come from; small tensors with the right names replace those of AlexNet
 
 
 @pytest.fixture
@@ -228,7 +237,7 @@ def server():
 @pytest.fixture
 def state():
     noise = torch.Generator().manual_seed(7)
-    return {name: torch.randn(3, 2, generator=noise) for name in (*NAMES, "classifier.6.bias")}
+    return {name: torch.randn(3, 2, generator=noise) for name in (*TENSOR_NAMES, "classifier.6.bias")}
 
 
 def saved(state, path=None):
@@ -240,66 +249,75 @@ def saved(state, path=None):
     return buffer.getvalue()
 
 
-def promised(server, body):
+def remote_file(server, body):
     server.bodies["/whole.pth"] = body
     return RemoteFile(f"{server.url}/whole.pth", len(body), "sha256", hashlib.sha256(body).hexdigest())
 
 
 def test_the_file_in_the_shared_data_has_the_pinned_digest(data):
-    tensors = read_backbone(data / "weights" / FILE)
+    tensors = read_alexnet(data / "weights" / WEIGHTS_FILE)
     assert [tuple(t.shape[:2]) for t in tensors.values() if t.ndim == 4] == [shape[:2] for shape in SHAPES]
 
 
-def test_the_cache_comes_first_then_the_data_then_the_server(server, state, cache, monkeypatch, tmp_path):
-    promise, digest = promised(server, saved(state)), digest_of(state)
+def test_the_cache_is_searched_first_then_the_data_folder_then_the_server(
+    server, state, cache, monkeypatch, tmp_path
+):
+    remote, digest = remote_file(server, saved(state)), digest_of(state)
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "data"))
-    saved(state, tmp_path / "data" / "weights" / FILE)
-    load_backbone(promise, digest)
+    saved(state, tmp_path / "data" / "weights" / WEIGHTS_FILE)
+    load_alexnet(remote, digest)
     assert server.asked == []
     assert not cache.exists()
-    saved({name: values + 1 for name, values in state.items()}, cache / FILE)
+    saved({name: values + 1 for name, values in state.items()}, cache / WEIGHTS_FILE)
     with pytest.raises(ModelError, match=str(cache)):
-        load_backbone(promise, digest)
+        load_alexnet(remote, digest)
 
 
-def test_what_was_downloaded_is_kept_without_the_rest_of_the_network(server, state, cache):
-    promise, digest = promised(server, saved(state)), digest_of(state)
-    first, second = (load_backbone(promise, digest) for _ in range(2))
+def test_a_download_is_stored_without_the_rest_of_the_network(server, state, cache):
+    remote, digest = remote_file(server, saved(state)), digest_of(state)
+    first, second = (load_alexnet(remote, digest) for _ in range(2))
     assert [path for path, _ in server.asked] == ["/whole.pth"]
-    assert [path.name for path in cache.iterdir()] == [FILE]
-    assert list(first) == list(second) == list(torch.load(cache / FILE, weights_only=True)) == list(NAMES)
-    assert all(torch.equal(first[name], second[name]) for name in NAMES)
+    assert [path.name for path in cache.iterdir()] == [WEIGHTS_FILE]
+    assert (
+        list(first)
+        == list(second)
+        == list(torch.load(cache / WEIGHTS_FILE, weights_only=True))
+        == list(TENSOR_NAMES)
+    )
+    assert all(torch.equal(first[name], second[name]) for name in TENSOR_NAMES)
 
 
-def test_half_a_download_is_taken_up_and_none_is_taken_for_whole(server, state, cache):
+def test_an_interrupted_download_is_resumed_and_not_used_before(server, state, cache):
     body = saved(state)
-    promise, digest = promised(server, body), digest_of(state)
+    remote, digest = remote_file(server, body), digest_of(state)
     server.faults = ["cut"]
     with pytest.raises(DownloadError, match="ended after"):
-        load_backbone(promise, digest, line=Downloader(pauses_s=()))
+        load_alexnet(remote, digest, downloader=Downloader(pauses_s=()))
     assert [path.name for path in cache.iterdir()] == ["whole.pth.part"]
-    load_backbone(promise, digest, line=Downloader(pauses_s=()))
+    load_alexnet(remote, digest, downloader=Downloader(pauses_s=()))
     assert server.asked[-1] == ("/whole.pth", f"bytes={len(body) // 2}-")
 
 
-def test_a_server_that_is_not_there_is_explained():
-    promise = RemoteFile(f"{unheard()}/whole.pth", 9, "sha256", "0")
+def test_an_unreachable_server_is_explained():
+    remote = RemoteFile(f"{unheard()}/whole.pth", 9, "sha256", "0")
     with pytest.raises(DownloadError, match="check the connection"):
-        load_backbone(promise, line=Downloader(pauses_s=()))
+        load_alexnet(remote, downloader=Downloader(pauses_s=()))
 
 
-def test_another_file_from_the_server_is_dropped(server, state, cache):
-    promise = promised(server, saved(state))
-    server.bodies["/whole.pth"] = bytes(promise.size)
+def test_a_wrong_file_from_the_server_is_deleted(server, state, cache):
+    remote = remote_file(server, saved(state))
+    server.bodies["/whole.pth"] = bytes(remote.size)
     with pytest.raises(DownloadError, match="was dropped"):
-        load_backbone(promise, digest_of(state))
+        load_alexnet(remote, digest_of(state))
     assert list(cache.iterdir()) == []
 
 
-def test_another_network_in_the_promised_file_is_dropped(server, state, cache):
-    promise = promised(server, saved(state))
-    with pytest.raises(ModelError, match=r"whole\.pth is not the AlexNet of LPIPS \(its digest"):
-        load_backbone(promise, "0" * 64)
+def test_other_weights_in_the_downloaded_file_are_deleted(server, state, cache):
+    remote = remote_file(server, saved(state))
+    with pytest.raises(
+        ModelError, match=r"whole\.pth does not hold the AlexNet weights of LPIPS \(its digest"
+    ):
+        load_alexnet(remote, "0" * 64)
     assert list(cache.iterdir()) == []
 
 
@@ -313,36 +331,40 @@ def test_another_network_in_the_promised_file_is_dropped(server, state, cache):
         lambda body: body.replace(b"features.0.weight", b"features.9.weight"),
         lambda body: saved([1, 2]),
         lambda body: saved(torch.zeros(3)),
-        lambda body: saved(dict.fromkeys(NAMES, "words")),
+        lambda body: saved(dict.fromkeys(TENSOR_NAMES, "words")),
         lambda body: saved({"model": Path("code")}),
     ],
 )
-def test_a_damaged_file_is_named_and_never_run(state, cache, damage):
+def test_a_damaged_file_is_named_and_never_executed(state, cache, damage):
     cache.mkdir(parents=True)
-    (cache / FILE).write_bytes(damage(saved(state)))
-    with pytest.raises(ModelError, match=rf"{cache / FILE} is not the AlexNet .* delete the file"):
-        load_backbone(digest=digest_of(state))
+    (cache / WEIGHTS_FILE).write_bytes(damage(saved(state)))
+    with pytest.raises(
+        ModelError, match=rf"{cache / WEIGHTS_FILE} does not hold the AlexNet .* delete the file"
+    ):
+        load_alexnet(digest=digest_of(state))
 
 
 @pytest.mark.filterwarnings("ignore:Detected pickle protocol")
 @settings(max_examples=40)
 @given(st.data())
-def test_no_flipped_byte_goes_unnoticed(tmp_path_factory, data):
-    state = {name: torch.arange(6.0).view(3, 2) for name in NAMES}
+def test_every_changed_byte_is_detected_or_harmless(tmp_path_factory, data):
+    state = {name: torch.arange(6.0).view(3, 2) for name in TENSOR_NAMES}
     body = bytearray(saved(state))
     place = data.draw(st.integers(0, len(body) - 1))
     body[place] ^= data.draw(st.integers(1, 255))
-    path = tmp_path_factory.mktemp("weights") / FILE
+    path = tmp_path_factory.mktemp("weights") / WEIGHTS_FILE
     path.write_bytes(body)
     try:
-        read = read_backbone(path, digest_of(state))
+        read = read_alexnet(path, digest_of(state))
     except ModelError:
         return
-    assert all(torch.equal(read[name], state[name]) for name in NAMES)  # it was a byte of no meaning
+    assert all(
+        torch.equal(read[name], state[name]) for name in TENSOR_NAMES
+    )  # the byte is not part of the tensors
 
 
-def test_shape_and_name_and_value_all_count_in_the_digest(state):
+def test_the_digest_depends_on_names_shapes_and_values(state):
     turned = {name: values.reshape(2, 3) for name, values in state.items()}
-    changed = state | {NAMES[9]: state[NAMES[9]] + 1e-6}
-    swapped = state | {NAMES[0]: state[NAMES[2]], NAMES[2]: state[NAMES[0]]}
+    changed = state | {TENSOR_NAMES[9]: state[TENSOR_NAMES[9]] + 1e-6}
+    swapped = state | {TENSOR_NAMES[0]: state[TENSOR_NAMES[2]], TENSOR_NAMES[2]: state[TENSOR_NAMES[0]]}
     assert len({digest_of(s) for s in (state, turned, changed, swapped)}) == 4

@@ -1,4 +1,4 @@
-"""Where the reflection is."""
+"""The reflection region."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ def test_equal_pictures_have_no_reflection():
     assert not reflection_region(photo, truth, threshold=0).any()
 
 
-def test_what_the_glass_changed_is_marked_whether_it_became_brighter_or_darker():
+def test_what_the_glass_changed_is_marked_whether_brighter_or_darker():
     photo, truth = pair()
     photo[:, :10, 1] += np.uint8(40)
     region = reflection_region(photo, truth)
@@ -35,9 +35,9 @@ def test_the_difference_is_the_mean_over_seven_by_seven_pixels_of_the_largest_ch
     assert not reflection_region(photo, truth, threshold=1 / 255).any()
 
 
-def test_edges_are_repeated_outwards():
+def test_edge_pixels_are_repeated_beyond_the_border():
     photo, truth = pair()
-    photo[0, 0] += np.uint8(49)  # stands for 16 pixels of the corner's window
+    photo[0, 0] += np.uint8(49)  # counts 16 times in the window of the corner
     marked = reflection_region(photo, truth, threshold=15.9 / 255)
     assert np.argwhere(marked).tolist() == [[0, 0]]
     assert not reflection_region(photo, truth, threshold=16.1 / 255).any()
@@ -55,7 +55,7 @@ def test_a_picture_may_be_smaller_than_the_window():
 
 
 @pytest.mark.parametrize("threshold", [-0.1, 1.1, float("nan")])
-def test_a_threshold_that_is_no_share_of_the_range_is_refused(threshold):
+def test_a_threshold_outside_0_to_1_is_refused(threshold):
     with pytest.raises(ValueError, match="threshold"):
         reflection_region(*pair(), threshold=threshold)
 

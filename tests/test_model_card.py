@@ -12,7 +12,7 @@ from PIL import Image
 from brewster.errors import ModelError
 from brewster.models.diffusion.adapter.lora import add_lora, lora_parameters, save_lora
 from brewster.models.diffusion.backbones import BACKBONES, tiny
-from brewster.models.diffusion.panels import PanelLayout, condition, split
+from brewster.models.diffusion.panels import PanelLayout, conditioning_image, split
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
 from brewster.models.diffusion.sampling import sample
 from brewster.models.diffusion.task import DecompositionTask
@@ -109,7 +109,7 @@ def test_what_was_measured_takes_its_place_again_and_again():
 def test_what_stock_pipelines_cannot_do_is_not_promised():
     assert "max_area" in card()
     assert "starts from noise" in card(objective="one_step")
-    assert "resizes what it is shown to a megapixel" in card("qwen")
+    assert "resizes the conditioning image to one megapixel" in card("qwen")
     assert all("from diffusers" not in text for text in (card(objective="one_step"), card("qwen")))
 
 
@@ -133,7 +133,7 @@ def exported(tmp_path):
         Image.fromarray(picture.numpy()).save(tmp_path / "photo.png")
         photo = picture.permute(2, 0, 1)[None] / 127.5 - 1
         size = layout.composite_size((64, 64))
-        return split(sample(backbone, condition(photo, layout), prompt, size=size), layout)["T"]
+        return split(sample(backbone, conditioning_image(photo, layout), prompt, size=size), layout)["T"]
 
     return export
 

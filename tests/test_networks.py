@@ -1,4 +1,4 @@
-"""The table of compact networks: what a row promises to the trainer and to the exported file."""
+"""The table of compact networks: the contract of a row with the trainer and the exported file."""
 
 from dataclasses import replace
 
@@ -37,7 +37,7 @@ def silent(step, steps, numbers, logged):
 
 
 @pytest.mark.parametrize("name", list(NETWORKS))
-def test_every_network_keeps_the_promises_of_its_row(name):
+def test_every_network_fulfils_the_contract_of_its_row(name):
     entry = NETWORKS[name]
     assert LARGEST_STRIDE % entry.stride == 0
     fresh, started = entry.build(), entry.pretrained()

@@ -6,7 +6,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from brewster.errors import PhotoError, RecipeError
-from brewster.models.diffusion.panels import PanelLayout, compose, condition, fit_panel, split
+from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_image, fit_panel, split
 
 LAYOUTS = [
     PanelLayout(panels, direction)
@@ -18,7 +18,7 @@ sides = st.integers(1, 9)
 
 
 @given(layouts, sides, sides, st.integers(0, 2**31))
-def test_splitting_undoes_composing_to_the_bit(layout, height, width, seed):
+def test_splitting_is_the_exact_inverse_of_composing(layout, height, width, seed):
     generator = torch.Generator().manual_seed(seed)
     panels = {name: torch.randn(2, 3, height, width, generator=generator) for name in layout.panels}
     composite = compose(panels, layout)
@@ -29,17 +29,17 @@ def test_splitting_undoes_composing_to_the_bit(layout, height, width, seed):
     assert torch.equal(compose(back, layout), composite)
 
 
-def test_the_model_is_shown_the_photo_and_white_space():
+def test_the_conditioning_image_is_the_photo_and_white_space():
     photo = torch.rand(1, 3, 4, 5) - 1
-    shown = split(condition(photo, PanelLayout()), PanelLayout())
+    shown = split(conditioning_image(photo, PanelLayout()), PanelLayout())
     assert torch.equal(shown["I"], photo)
     assert shown["T"].eq(1).all()
     assert shown["R"].eq(1).all()
 
 
-def test_without_a_generated_photo_the_photo_is_shown_alone():
+def test_without_a_generated_photo_the_conditioning_image_is_the_photo():
     photo = torch.rand(1, 3, 4, 5)
-    assert torch.equal(condition(photo, PanelLayout(("T", "R"))), photo)
+    assert torch.equal(conditioning_image(photo, PanelLayout(("T", "R"))), photo)
 
 
 def test_the_papers_composite_is_three_squares_of_512_pixels():
@@ -53,7 +53,7 @@ def test_the_papers_composite_is_three_squares_of_512_pixels():
     st.integers(1000, 2_000_000),
     st.sampled_from([8, 16, 32]),
 )
-def test_any_photo_fits_without_a_stretch_or_is_refused(width, height, layout, budget_px, multiple):
+def test_any_photo_fits_without_distortion_or_is_refused(width, height, layout, budget_px, multiple):
     try:
         fit = fit_panel((width, height), layout, budget_px=budget_px, multiple=multiple)
     except PhotoError:
@@ -66,18 +66,18 @@ def test_any_photo_fits_without_a_stretch_or_is_refused(width, height, layout, b
     assert all(side % multiple == 0 for side in fit.panel)
     scales = [content / own for content, own in zip(fit.content, (width, height), strict=True)]
     assert max(scales) <= 1
-    # One side decides the scale, the other follows it to the nearest pixel.
+    # One side determines the scale; the other is rounded to the nearest pixel.
     assert any(
         all(abs(got - scale * own) <= 0.501 for got, own in zip(fit.content, (width, height), strict=True))
         for scale in scales
     )
     picture = torch.rand(1, 1, fit.content[1], 1).expand(1, 1, fit.content[1], fit.content[0])
     if fit.panel[0] * fit.panel[1] < 200_000:
-        assert torch.equal(fit.cut(fit.pad(picture)), picture)
+        assert torch.equal(fit.crop(fit.pad(picture)), picture)
 
 
 @given(st.integers(16, 4000), st.integers(16, 4000), layouts, st.integers(10_000, 2_000_000))
-def test_the_next_larger_panel_would_break_the_budget(width, height, layout, budget_px):
+def test_the_next_larger_panel_would_exceed_the_budget(width, height, layout, budget_px):
     try:
         fit = fit_panel((width, height), layout, budget_px=budget_px, multiple=16)
     except PhotoError:
@@ -88,21 +88,21 @@ def test_the_next_larger_panel_would_break_the_budget(width, height, layout, bud
 
 
 @given(st.integers(16, 500), st.integers(16, 500), layouts)
-def test_a_photo_smaller_than_its_panel_is_told_a_budget_that_works(width, height, layout):
+def test_the_error_for_a_photo_smaller_than_its_panel_names_a_budget_that_works(width, height, layout):
     with pytest.raises(PhotoError, match="lower budget_px to") as refused:
         fit_panel((width, height), layout, budget_px=10**7, multiple=16)
     budget_px = int(str(refused.value).rstrip(".").rsplit(maxsplit=1)[1])
-    with contextlib.suppress(PhotoError):  # so thin that no panel of its shape is left below it
+    with contextlib.suppress(PhotoError):  # the aspect ratio may be too extreme for this budget
         fit = fit_panel((width, height), layout, budget_px=budget_px, multiple=16)
         assert max(fit.content) <= max(width, height)
 
 
-def test_a_thread_of_a_photo_is_refused_plainly():
-    with pytest.raises(PhotoError, match=r"no panel with the shape of 9000 x 2 pixels fits"):
+def test_an_extreme_aspect_ratio_is_refused():
+    with pytest.raises(PhotoError, match=r"no panel with the aspect ratio of 9000 x 2 pixels fits"):
         fit_panel((9000, 2), PanelLayout(), budget_px=30_000, multiple=16)
 
 
-def test_padding_continues_the_picture_by_its_reflection():
+def test_padding_is_a_mirrored_copy_of_the_border():
     fit = fit_panel((100, 61), PanelLayout(("T",)), budget_px=48 * 80, multiple=16)
     assert (fit.content, fit.panel) == ((79, 48), (80, 48))
     picture = torch.rand(1, 3, 48, 79)
@@ -110,7 +110,7 @@ def test_padding_continues_the_picture_by_its_reflection():
 
 
 @pytest.mark.parametrize("panels", [(), ("I", "I"), ("I", "B")])
-def test_panels_are_some_of_three_letters_each_once(panels):
+def test_unknown_repeated_and_missing_panels_are_refused(panels):
     with pytest.raises(RecipeError, match="some of I, T and R, each once"):
         PanelLayout(panels)
 
@@ -120,13 +120,13 @@ def test_an_unknown_direction_is_refused():
         PanelLayout(direction="diagonal")
 
 
-def test_panels_that_do_not_belong_together_are_refused():
+def test_missing_panels_and_wrong_sizes_are_refused():
     one = torch.zeros(1, 3, 4, 4)
     with pytest.raises(PhotoError, match="there is no panel R"):
         compose({"I": one, "T": one}, PanelLayout())
-    with pytest.raises(PhotoError, match="they must be alike"):
+    with pytest.raises(PhotoError, match="equal shapes"):
         compose({"T": one, "R": one[..., :2]}, PanelLayout(("T", "R")))
-    with pytest.raises(PhotoError, match="does not divide by 3"):
+    with pytest.raises(PhotoError, match="is not divisible by 3"):
         split(one, PanelLayout())
     with pytest.raises(PhotoError, match="resize it first"):
         fit_panel((64, 64), PanelLayout(("T",)), budget_px=64 * 64, multiple=16).pad(one)

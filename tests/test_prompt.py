@@ -27,7 +27,7 @@ def test_the_prompt_names_three_images():
     assert {f"[IMAGE{n}]" for n in (1, 2, 3)} == set(re.findall(r"\[IMAGE.\]", PROMPT))
 
 
-def test_a_saved_prompt_comes_back_to_the_bit(prompt, tmp_path):
+def test_a_saved_prompt_is_read_back_exactly(prompt, tmp_path):
     prompt.save(tmp_path / "prompt.safetensors")
     back = load_prompt(tmp_path / "prompt.safetensors", "kontext")
     assert (back.text, back.sha256, back.negative) == (PROMPT, prompt.sha256, None)
@@ -44,7 +44,7 @@ def test_the_same_prompt_gives_the_same_bytes(prompt, tmp_path):
     assert header.index(b'"backbone"') < header.index(b'"kind"') < header.index(b'"sha256"')
 
 
-def test_another_text_or_backbone_or_number_is_another_digest(prompt):
+def test_the_digest_depends_on_text_backbone_and_tensors(prompt):
     digests = {
         prompt.sha256,
         PromptEmbedding("qwen", PROMPT, prompt.embeds, prompt.pooled).sha256,
@@ -55,7 +55,7 @@ def test_another_text_or_backbone_or_number_is_another_digest(prompt):
     assert len(digests) == 5
 
 
-def test_moving_a_prompt_keeps_what_it_says(prompt):
+def test_moving_a_prompt_preserves_its_text(prompt):
     moved = prompt.to("cpu", torch.float32)
     assert moved.embeds.dtype == moved.pooled.dtype == torch.float32
     assert moved.text == prompt.text
@@ -72,5 +72,5 @@ def test_a_prompt_that_was_changed_is_refused(prompt, tmp_path):
     data = bytearray((tmp_path / "p").read_bytes())
     data[-1] ^= 1
     (tmp_path / "p").write_bytes(data)
-    with pytest.raises(ModelError, match="does not have the digest that it names"):
+    with pytest.raises(ModelError, match="does not have the digest in its metadata"):
         load_prompt(tmp_path / "p", "kontext")

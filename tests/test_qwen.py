@@ -1,4 +1,4 @@
-"""Qwen's prompt through the real stock pipeline, with a toy of its text encoder that looks at pictures, too."""
+"""Qwen's prompt through the real pipeline of diffusers, with a tiny version of its text and image encoder."""
 
 import importlib.util
 
@@ -20,7 +20,7 @@ PICTURE_TOKENS = 16
 
 
 class WithoutVideo(transformers.Qwen2VLProcessor):
-    """The stock one insists on a video processor, which needs torchvision."""
+    """The processor of transformers requires a video processor, which needs torchvision."""
 
     def check_argument_for_proper_class(self, name, argument):
         if name != "video_processor":
@@ -29,10 +29,10 @@ class WithoutVideo(transformers.Qwen2VLProcessor):
 
 @pytest.fixture(scope="module")
 def pipeline():
-    """The stock pipeline: every byte is a word, and the picture is shrunk to 16 tokens."""
+    """The diffusers pipeline with a tokenizer of single bytes, and an image of 16 tokens."""
     words = {word: number for number, word in enumerate([*sorted(ByteLevel.alphabet()), *MARKS])}
     tokenizer = transformers.Qwen2TokenizerFast(vocab=words, merges=[], additional_special_tokens=MARKS)
-    eyes = Qwen2VLImageProcessorPil(min_pixels=28 * 28, max_pixels=28 * 28 * PICTURE_TOKENS)
+    image_processor = Qwen2VLImageProcessorPil(min_pixels=28 * 28, max_pixels=28 * 28 * PICTURE_TOKENS)
     text = {
         "vocab_size": len(words), "hidden_size": 32, "intermediate_size": 16, "num_hidden_layers": 2,
         "num_attention_heads": 2, "num_key_value_heads": 1, "bos_token_id": 0, "eos_token_id": 0,
@@ -48,37 +48,40 @@ def pipeline():
         vision_end_token_id=words["<|vision_end|>"],
     )
     torch.manual_seed(0)
-    made = tiny("qwen")[0].pipeline()
-    made.register_modules(
+    pipe = tiny("qwen")[0].pipeline()
+    pipe.register_modules(
         tokenizer=tokenizer,
-        processor=WithoutVideo(image_processor=eyes, tokenizer=tokenizer),
+        processor=WithoutVideo(image_processor=image_processor, tokenizer=tokenizer),
         text_encoder=transformers.Qwen2_5_VLForConditionalGeneration(config).eval(),
     )
-    return made
+    return pipe
 
 
-def test_a_prompt_is_read_beside_a_plain_grey_picture(pipeline):
-    asked = []
+def test_a_prompt_is_encoded_with_a_uniform_grey_image(pipeline):
+    calls = []
     hook = pipeline.text_encoder.register_forward_pre_hook(
-        lambda module, args, kwargs: asked.append(kwargs), with_kwargs=True
+        lambda module, args, kwargs: calls.append(kwargs), with_kwargs=True
     )
     with torch.no_grad():
         prompt = Qwen.embed(pipeline, PROMPT)
     hook.remove()
-    for words, kwargs, embeds in zip((PROMPT, " "), asked, (prompt.embeds, prompt.negative), strict=True):
-        told = pipeline.tokenizer(pipeline.prompt_template_encode.format(words)).input_ids
-        left = len(told) - 1 + PICTURE_TOKENS - pipeline.prompt_template_encode_start_idx
-        assert embeds.shape == (1, left, 32)
-        eyes = pipeline.processor.image_processor
+    for words, kwargs, embeds in zip((PROMPT, " "), calls, (prompt.embeds, prompt.negative), strict=True):
+        token_ids = pipeline.tokenizer(pipeline.prompt_template_encode.format(words)).input_ids
+        count = len(token_ids) - 1 + PICTURE_TOKENS - pipeline.prompt_template_encode_start_idx
+        assert embeds.shape == (1, count, 32)
+        image_processor = pipeline.processor.image_processor
         grey = torch.tensor(
-            [(128 / 255 - mean) / std for mean, std in zip(eyes.image_mean, eyes.image_std, strict=True)]
+            [
+                (128 / 255 - mean) / std
+                for mean, std in zip(image_processor.image_mean, image_processor.image_std, strict=True)
+            ]
         )
         seen = kwargs["pixel_values"].unflatten(1, (3, -1))
         torch.testing.assert_close(seen, grey[:, None].expand_as(seen).to(seen), atol=1e-5, rtol=0)
     assert (prompt.backbone, prompt.text, prompt.pooled) == ("qwen", PROMPT, None)
 
 
-def test_another_prompt_is_another_embedding_with_the_same_empty_counterpart(pipeline):
+def test_other_prompts_have_other_embeddings_and_the_same_empty_prompt(pipeline):
     with torch.no_grad():
         one, same, other = (Qwen.embed(pipeline, words) for words in ("a cat", "a cat", "a dog"))
     assert one.sha256 == same.sha256
@@ -86,7 +89,7 @@ def test_another_prompt_is_another_embedding_with_the_same_empty_counterpart(pip
     assert torch.equal(one.negative, other.negative)
 
 
-def test_what_it_embeds_guides_the_twin(pipeline):
+def test_its_embedding_guides_the_tiny_version(pipeline):
     backbone, _ = tiny("qwen")
     with torch.no_grad():
         prompt = Qwen.embed(pipeline, "a cat")
@@ -98,8 +101,8 @@ def test_what_it_embeds_guides_the_twin(pipeline):
     assert not torch.allclose(plain, guided, atol=1e-4)
 
 
-@pytest.mark.skipif(bool(importlib.util.find_spec("torchvision")), reason="there it is")
-def test_torchvision_is_asked_for_before_anything_is_downloaded(monkeypatch):
-    monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda *_, **__: pytest.fail("it was"))
+@pytest.mark.skipif(bool(importlib.util.find_spec("torchvision")), reason="torchvision is installed")
+def test_missing_torchvision_is_reported_before_any_download(monkeypatch):
+    monkeypatch.setattr(huggingface_hub, "snapshot_download", lambda *_, **__: pytest.fail("downloaded"))
     with pytest.raises(MissingExtra, match=r"torchvision is not installed; .* pip install torchvision"):
         encode_prompt("qwen")

@@ -1,4 +1,4 @@
-"""Our loop against the stock pipelines, on tiny twins of the same classes."""
+"""Our sampling loop, compared with the pipelines of diffusers on tiny versions of the same classes."""
 
 import pytest
 import torch
@@ -15,12 +15,12 @@ STEPS = 4
 
 
 @pytest.fixture(params=list(BACKBONES), scope="module")
-def twin(request):
+def tiny_model(request):
     return tiny(request.param, seed=1)
 
 
 def eight_bit_picture(width, height):
-    """In steps of 1/255, so that the pipelines that insist on PIL see the same numbers."""
+    """A picture with 8-bit values, so that pipelines that only accept PIL images get the same numbers."""
     generator = torch.Generator().manual_seed(5)
     return torch.randint(0, 256, (1, 3, height, width), generator=generator) / 127.5 - 1
 
@@ -29,9 +29,9 @@ def as_pil(picture):
     return Image.fromarray(((picture[0] + 1) * 127.5).round().byte().permute(1, 2, 0).numpy())
 
 
-def stock_picture(twin, condition, monkeypatch, *, guidance=4.0, seed=3):
-    """The stock pipeline's picture in [0, 1], its rescaling switched off, with its own noise for the seed."""
-    backbone, prompt = twin
+def diffusers_picture(tiny_model, condition, monkeypatch, *, guidance=4.0, seed=3):
+    """The picture of the diffusers pipeline in [0, 1], without its rescaling, with its own noise for the seed."""
+    backbone, prompt = tiny_model
     width, height = SIZE
     options = {"prompt_embeds": prompt.embeds, "height": height, "width": width, "output_type": "pt"}
     options |= {"num_inference_steps": STEPS, "generator": torch.Generator().manual_seed(seed)}
@@ -51,121 +51,129 @@ def stock_picture(twin, condition, monkeypatch, *, guidance=4.0, seed=3):
     return pipe(**options).images
 
 
-def ours(twin, condition, **options):
-    backbone, prompt = twin
+def ours(tiny_model, condition, **options):
+    backbone, prompt = tiny_model
     return sample(backbone, condition, prompt, **({"size": SIZE, "steps": STEPS, "seeds": [3]} | options))
 
 
 @pytest.mark.parametrize("condition_size", [SIZE, (64, 96)])
 @pytest.mark.parametrize("guidance", [1.0, 4.0])
-def test_our_loop_gives_the_stock_pipelines_picture(twin, monkeypatch, guidance, condition_size):
+def test_our_loop_gives_the_picture_of_the_diffusers_pipeline(
+    tiny_model, monkeypatch, guidance, condition_size
+):
     condition = eight_bit_picture(*condition_size)
-    stock = stock_picture(twin, condition, monkeypatch, guidance=guidance)
-    mine = (ours(twin, condition, guidance=guidance) + 1) / 2
-    torch.testing.assert_close(mine, stock, atol=1e-5, rtol=0)
-    assert stock.std() > 0.01
+    expected = diffusers_picture(tiny_model, condition, monkeypatch, guidance=guidance)
+    actual = (ours(tiny_model, condition, guidance=guidance) + 1) / 2
+    torch.testing.assert_close(actual, expected, atol=1e-5, rtol=0)
+    assert expected.std() > 0.01
 
 
-def test_the_transformer_is_asked_exactly_what_the_stock_pipeline_asks(twin, monkeypatch):
-    """Tokens and their order, ids, times and guidance, at every step."""
-    asked = []
-    backbone, _ = twin
+def test_the_transformer_gets_the_same_input_as_in_the_diffusers_pipeline(tiny_model, monkeypatch):
+    """Tokens and their order, position ids, times and guidance, at every step."""
+    calls = []
+    backbone, _ = tiny_model
     hook = backbone.transformer.register_forward_pre_hook(
-        lambda module, args, kwargs: asked.append(kwargs), with_kwargs=True
+        lambda module, args, kwargs: calls.append(kwargs), with_kwargs=True
     )
     condition = eight_bit_picture(64, 96)
-    stock_picture(twin, condition, monkeypatch)
-    ours(twin, condition)
+    diffusers_picture(tiny_model, condition, monkeypatch)
+    ours(tiny_model, condition)
     hook.remove()
-    half = len(asked) // 2
+    half = len(calls) // 2
     assert half == STEPS * (1 if backbone.guided_by_embedding else 2)
     names = ("hidden_states", "img_ids", "txt_ids", "timestep", "guidance", "encoder_hidden_states")
-    for theirs, mine in zip(asked[:half], asked[half:], strict=True):
+    for expected_call, actual_call in zip(calls[:half], calls[half:], strict=True):
         for name in names:
-            if theirs.get(name) is not None:
-                same_shape = mine[name].reshape(theirs[name].shape)
-                torch.testing.assert_close(same_shape, theirs[name], atol=2e-5, rtol=0, check_dtype=False)
-        assert mine.get("img_shapes") == theirs.get("img_shapes")
+            if expected_call.get(name) is not None:
+                same_shape = actual_call[name].reshape(expected_call[name].shape)
+                torch.testing.assert_close(
+                    same_shape, expected_call[name], atol=2e-5, rtol=0, check_dtype=False
+                )
+        assert actual_call.get("img_shapes") == expected_call.get("img_shapes")
 
 
-def test_everything_that_is_given_matters(twin):
-    backbone, _ = twin
+def test_every_argument_changes_the_picture(tiny_model):
+    backbone, _ = tiny_model
     condition = eight_bit_picture(*SIZE)
-    usual = ours(twin, condition)
+    reference = ours(tiny_model, condition)
     others = {
-        "condition": ours(twin, -condition),
-        "guidance": ours(twin, condition, guidance=2.0),
-        "seed": ours(twin, condition, seeds=[4]),
+        "condition": ours(tiny_model, -condition),
+        "guidance": ours(tiny_model, condition, guidance=2.0),
+        "seed": ours(tiny_model, condition, seeds=[4]),
         "prompt": ours((backbone, backbone.random_prompt(backbone.transformer, 9)), condition),
     }
-    assert not [name for name, other in others.items() if (other - usual).abs().max() < 1e-4]
+    assert not [name for name, other in others.items() if (other - reference).abs().max() < 1e-4]
 
 
-def test_a_seed_means_the_same_alone_and_in_a_batch(twin):
+def test_a_seed_gives_the_same_picture_alone_and_in_a_batch(tiny_model):
     condition = eight_bit_picture(*SIZE)
-    alone = ours(twin, condition, seeds=[3, 4, 5])
-    together = ours(twin, condition, seeds=[3, 4, 5], batch=2)
+    alone = ours(tiny_model, condition, seeds=[3, 4, 5])
+    together = ours(tiny_model, condition, seeds=[3, 4, 5], batch=2)
     torch.testing.assert_close(alone, together, atol=5e-5, rtol=0)
-    assert torch.equal(ours(twin, condition, seeds=[4]), alone[1:2])
+    assert torch.equal(ours(tiny_model, condition, seeds=[4]), alone[1:2])
     assert (alone[0] - alone[1]).abs().max() > 0.01
 
 
-def test_the_schedule_counts_generated_tokens_and_ends_at_the_picture(twin):
-    backbone, _ = twin
+def test_the_schedule_counts_generated_tokens_and_ends_at_the_picture(tiny_model):
+    backbone, _ = tiny_model
     few, many = backbone.schedule(256, 20), backbone.schedule(3072, 20)
     assert len(few) == 21
     assert (few[0], few[-1]) == (1, 0)
     assert (few.diff() < 0).all()
-    assert (many[1:-2] > few[1:-2]).all()  # larger pictures stay longer in the noise
+    assert (many[1:-2] > few[1:-2]).all()  # larger pictures get more steps at high noise
 
 
-def test_training_times_are_moved_as_the_schedule_moves_them(twin):
-    backbone, _ = twin
+def test_training_times_are_shifted_like_those_of_the_schedule(tiny_model):
+    backbone, _ = tiny_model
     moved = backbone.shifted(torch.linspace(1, 1 / 8, 8), 3072, steps=8)
-    if backbone.scheduler.config.shift_terminal:  # the sampler stretches its end afterwards
-        kept = (1 - moved[-1]) / (1 - backbone.scheduler.config.shift_terminal)
-        moved = 1 - (1 - moved) / kept
+    if backbone.scheduler.config.shift_terminal:  # the scheduler stretches the end afterwards
+        stretch = (1 - moved[-1]) / (1 - backbone.scheduler.config.shift_terminal)
+        moved = 1 - (1 - moved) / stretch
     torch.testing.assert_close(moved, backbone.schedule(3072, 8)[:-1], atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("steps", [1, 2])
-def test_few_steps_are_allowed_and_every_step_is_told(twin, steps):
-    told = []
+def test_few_steps_are_allowed_and_every_step_is_reported(tiny_model, steps):
+    reported = []
     ours(
-        twin, eight_bit_picture(*SIZE), steps=steps, seeds=[1, 2], on_progress=lambda *step: told.append(step)
+        tiny_model,
+        eight_bit_picture(*SIZE),
+        steps=steps,
+        seeds=[1, 2],
+        on_progress=lambda *step: reported.append(step),
     )
-    assert told == [(done, 2 * steps) for done in range(1, 2 * steps + 1)]
+    assert reported == [(done, 2 * steps) for done in range(1, 2 * steps + 1)]
 
 
-def test_guidance_without_an_empty_prompt_says_what_to_do(twin):
-    backbone, prompt = twin
+def test_guidance_without_an_empty_prompt_is_refused_with_a_hint(tiny_model):
+    backbone, prompt = tiny_model
     if backbone.guided_by_embedding:
         pytest.skip("guidance is distilled into this one")
     bare = PromptEmbedding(prompt.backbone, prompt.text, prompt.embeds)
-    with pytest.raises(ModelError, match=r"no empty counterpart.*set the guidance to 1"):
+    with pytest.raises(ModelError, match=r"no embedding of the empty prompt.*set the guidance to 1"):
         ours((backbone, bare), eight_bit_picture(*SIZE))
     assert ours((backbone, bare), eight_bit_picture(*SIZE), guidance=1.0).isfinite().all()
 
 
-def test_a_picture_off_the_grid_is_refused(twin):
+def test_a_picture_off_the_grid_is_refused(tiny_model):
     with pytest.raises(ModelError, match="has 100 x 64 pixels; sides that are multiples of 16"):
-        ours(twin, torch.zeros(1, 3, 64, 100))
+        ours(tiny_model, torch.zeros(1, 3, 64, 100))
     with pytest.raises(ModelError, match="has 100 x 64 pixels"):
-        ours(twin, torch.zeros(1, 3, 64, 64), size=(100, 64))
+        ours(tiny_model, torch.zeros(1, 3, 64, 64), size=(100, 64))
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"steps": 0}, "0 steps; at least 1; the usual is 20"),
-        ({"steps": -3}, "-3 steps; at least 1; the usual is 20"),
-        ({"seeds": []}, "0 seeds; at least 1; the usual is 1"),
-        ({"batch": 0}, "a batch of 0; at least 1; the usual is 1"),
+        ({"steps": 0}, "0 steps; at least 1; the usual value is 20"),
+        ({"steps": -3}, "-3 steps; at least 1; the usual value is 20"),
+        ({"seeds": []}, "0 seeds; at least 1; the usual value is 1"),
+        ({"batch": 0}, "a batch of 0; at least 1; the usual value is 1"),
     ],
 )
-def test_nothing_cannot_be_sampled(twin, options, words):
+def test_counts_less_than_one_are_refused(tiny_model, options, words):
     with pytest.raises(ModelError, match=words):
-        ours(twin, eight_bit_picture(*SIZE), **options)
+        ours(tiny_model, eight_bit_picture(*SIZE), **options)
 
 
 @pytest.mark.parametrize(
@@ -176,19 +184,19 @@ def test_nothing_cannot_be_sampled(twin, options, words):
         MemoryError(),
     ],
 )
-def test_running_out_of_memory_says_what_to_lower(twin, monkeypatch, error):
+def test_out_of_memory_errors_say_what_to_reduce(tiny_model, monkeypatch, error):
     def full(*_, **__):
         raise error
 
-    monkeypatch.setattr(twin[0], "predict", full)
+    monkeypatch.setattr(tiny_model[0], "predict", full)
     with pytest.raises(DeviceError, match="fewer bits"):
-        ours(twin, eight_bit_picture(*SIZE))
+        ours(tiny_model, eight_bit_picture(*SIZE))
 
 
-def test_other_errors_are_not_taken_for_memory(twin, monkeypatch):
+def test_other_errors_are_not_converted_to_memory_errors(tiny_model, monkeypatch):
     def broken(*_, **__):
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr(twin[0], "predict", broken)
+    monkeypatch.setattr(tiny_model[0], "predict", broken)
     with pytest.raises(RuntimeError, match="a bug"):
-        ours(twin, eight_bit_picture(*SIZE))
+        ours(tiny_model, eight_bit_picture(*SIZE))

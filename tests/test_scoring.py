@@ -133,7 +133,9 @@ def test_a_new_metric_is_one_row_with_its_function(triplet, tmp_path, monkeypatc
     monkeypatch.setitem(
         METRICS,
         "darkest",
-        a_metric("darkest", lambda case: float(case.answer.pixels.min()) - float(case.truth.pixels.min())),
+        a_metric(
+            "darkest", lambda case: float(case.prediction.pixels.min()) - float(case.truth.pixels.min())
+        ),
     )
     config = EvaluationConfig(metrics=("darkest",))
     (row,) = score(read_benchmark("pairs", triplet), [IdentityBaseline()], config, tmp_path / "out")
@@ -172,7 +174,7 @@ def test_features_are_computed_once_for_each_picture(triplet, monkeypatch):
         return float(picture.mean())
 
     def measure(case):
-        return case.answer.features(compute) - case.truth.features(compute)
+        return case.prediction.features(compute) - case.truth.features(compute)
 
     for name in ("one", "two"):
         monkeypatch.setitem(METRICS, name, a_metric(name, measure))

@@ -5,11 +5,11 @@ from brewster.errors import ModelError
 from brewster.models.diffusion.tensors import read_tensors, write_tensors
 
 
-def test_tensors_and_what_is_said_about_them_come_back(tmp_path):
+def test_tensors_and_metadata_survive_a_round_trip(tmp_path):
     tensors = {"b": torch.randn(2, 3).T, "a": torch.arange(3, dtype=torch.bfloat16), "none": torch.zeros(0)}
     write_tensors(tmp_path / "t", tensors, {"name": "größer", "a": "1"})
-    back, about = read_tensors(tmp_path / "t")
-    assert about == {"format": "pt", "name": "größer", "a": "1"}
+    back, metadata = read_tensors(tmp_path / "t")
+    assert metadata == {"format": "pt", "name": "größer", "a": "1"}
     assert all(torch.equal(back[name], tensor) for name, tensor in tensors.items())
 
 

@@ -7,7 +7,7 @@ from brewster.models.diffusion.backbones import BACKBONES
 from brewster.models.zoo import LARGE, MODELS, find_model
 
 
-def test_every_shipped_model_is_whole_small_enough_and_has_a_card():
+def test_every_shipped_model_is_intact_small_enough_and_has_a_card():
     assert "compact" in MODELS
     for model in MODELS.values():
         assert model.verify() == model.sha256
@@ -17,17 +17,17 @@ def test_every_shipped_model_is_whole_small_enough_and_has_a_card():
             assert heading in card, (model.name, heading)
 
 
-def test_a_misspelt_model_is_answered_with_the_likely_one():
+def test_a_misspelt_model_name_gets_a_suggestion():
     with pytest.raises(ModelError, match="did you mean compact"):
         find_model("compct")
 
 
-def test_a_damaged_file_does_not_pass(tmp_path):
+def test_a_damaged_file_is_refused(tmp_path):
     broken = tmp_path / "compact.onnx"
     broken.write_bytes(MODELS["compact"].path.read_bytes()[:-1])
     with pytest.raises(ModelError, match="SHA-256"):
         replace(MODELS["compact"], path=broken).verify()
 
 
-def test_the_large_models_that_are_named_are_the_backbones_that_there_are():
+def test_the_large_models_of_the_registry_are_the_backbones():
     assert list(LARGE) == list(BACKBONES) == [backbone.name for backbone in BACKBONES.values()]

@@ -13,7 +13,7 @@ import torch
 from torch.nn import functional
 
 from brewster.models.diffusion.backbones import tiny
-from brewster.models.diffusion.panels import PanelLayout, compose, condition
+from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_image
 from brewster.photo import Photo
 from brewster.srgb import to_encoded, to_linear
 
@@ -71,7 +71,7 @@ def pretrain(name, folder, *, vae_steps, steps):
     shown, target, start = (
         torch.cat([backbone.encode(part) for part in pictures.split(32)])
         for pictures in (
-            condition(seen["I"], LAYOUT),
+            conditioning_image(seen["I"], LAYOUT),
             compose(seen, LAYOUT),
             compose(dict.fromkeys("ITR", seen["I"]), LAYOUT),
         )
@@ -99,7 +99,7 @@ def _learn_to_see(backbone, seen, steps):
     def loss(step):
         some = torch.randint(len(seen["I"]), (4,), generator=generator)
         layers = {name: pictures[some] for name, pictures in seen.items()}
-        kinds = [compose(layers, LAYOUT), condition(layers["I"], LAYOUT)]
+        kinds = [compose(layers, LAYOUT), conditioning_image(layers["I"], LAYOUT)]
         kinds += [kinds[0], compose(dict.fromkeys("ITR", layers["I"]), LAYOUT)]
         picture = kinds[step % 4]
         return (backbone._show(backbone._see(picture)) - picture).square().mean()

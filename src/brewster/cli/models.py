@@ -100,7 +100,7 @@ def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: boo
         say(remark)
     address = None if dry_run else hub.push(plan)
     if as_json:
-        print_out(json.dumps(plan.about() | {"address": address}))
+        print_out(json.dumps(plan.to_dict() | {"address": address}))
     else:
         print_out(plan.table())
         print_out(f"sent: {address}" if address else "nothing was sent")

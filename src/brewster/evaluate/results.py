@@ -66,7 +66,7 @@ def summarise(
             "region_thresholds": list(config.thresholds),
             "choices": _choices(config, together),
         },
-        "metrics": {name: metric.described() for name, metric in columns.items()},
+        "metrics": {name: metric.to_dict() for name, metric in columns.items()},
         "benchmarks": {part.name: _describe(part) for part in benchmarks},
         "selections": {key: _titled(key, group) for key, group in selections.items()},
         "methods": {method.name: method.about() for method in methods},

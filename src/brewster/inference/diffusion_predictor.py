@@ -137,7 +137,7 @@ class DiffusionPredictor(Predictor):
         )
         count.tile_done()
         _refuse_broken(panels)
-        light = {name: _light(fit.cut(panel)) for name, panel in panels.items()}
+        light = {name: _light(fit.crop(panel)) for name, panel in panels.items()}
         photo = light.get("I", tile)
         change = light["T"] - photo
         reflection = light.get("R", np.maximum(-change, 0))

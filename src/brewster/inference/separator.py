@@ -130,12 +130,12 @@ class Separator:
     def _load_large(cls, model: str, device: str, asked: DiffusionOptions) -> Separator:
         try:
             from brewster.inference.diffusion_predictor import DiffusionPredictor  # noqa: PLC0415
-            from brewster.models.diffusion.pipeline import open_decomposer  # noqa: PLC0415  (wakes torch)
+            from brewster.models.diffusion.pipeline import load_pipeline  # noqa: PLC0415  (wakes torch)
         except ImportError as error:
             raise MissingExtra(
                 f"{error.name} is not installed", f"{model} needs it", "pip install 'brewster[large]'"
             ) from error
-        decomposer = open_decomposer(
+        decomposer = load_pipeline(
             model, device=device, base=asked.get("base"), quantise=asked.get("quantise")
         )
         look = DiffusionPredictor(

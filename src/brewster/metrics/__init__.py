@@ -1,10 +1,14 @@
-"""How close are two pictures? Scores of an answer beside the truth, each stated so that its number can be believed.
+"""Metrics that compare a prediction with its ground truth. All pictures are uint8 sRGB, (H, W, 3).
 
     from brewster.metrics import METRICS, psnr, reflection_region
-    psnr(answer, truth, region=reflection_region(photo, truth))
+    psnr(prediction, truth, region=reflection_region(photo, truth))
 
-fidelity: PSNR and SSIM. perceptual: LPIPS (torch is woken when it is used). region: where the reflection is.
-failures: what was removed wrongly or left, where the truth is known exactly. Pictures are uint8 sRGB (H, W, 3).
+    fidelity     PSNR and SSIM
+    perceptual   LPIPS; imports torch at its first use
+    region       the reflection region: pixels that the glass has visibly changed
+    failures     removed content and remaining reflection, for rendered samples
+
+`METRICS` is the table of all metrics, with the definition of each.
 """
 
 from __future__ import annotations
@@ -45,40 +49,40 @@ __all__ = [
 
 
 def _psnr(case: Comparison) -> float:
-    return min(psnr(case.answer.pixels, case.truth.pixels, region=case.region), IDENTICAL_DB)
+    return min(psnr(case.prediction.pixels, case.truth.pixels, region=case.region), IDENTICAL_DB)
 
 
 def _ssim(case: Comparison) -> float:
-    return ssim(case.answer.pixels, case.truth.pixels, region=case.region)
+    return ssim(case.prediction.pixels, case.truth.pixels, region=case.region)
 
 
 def _ssim_gaussian(case: Comparison) -> float:
-    return ssim(case.answer.pixels, case.truth.pixels, window="gaussian", region=case.region)
+    return ssim(case.prediction.pixels, case.truth.pixels, window="gaussian", region=case.region)
 
 
 def _lpips(case: Comparison) -> float:
-    answer, truth = (picture.features(_lpips_features) for picture in (case.answer, case.truth))
-    return Lpips.load().distance(answer, truth, region=case.region)
+    prediction, truth = (picture.features(_lpips_features) for picture in (case.prediction, case.truth))
+    return Lpips.load().distance(prediction, truth, region=case.region)
 
 
 def _lpips_features(picture: Picture) -> Features:
     return Lpips.load().features(picture)
 
 
-def _of_rendered(
+def _rendered_score(
     score: Callable[[Picture, Picture, Picture, Picture], float],
 ) -> Callable[[Comparison], float]:
-    """A score of all layers of a rendered sample: answer, background, photo, reflection."""
+    """Adapts a function of prediction, background, photo and reflection to the `score` of a metric."""
 
     def score_case(case: Comparison) -> float:
         assert case.reflection is not None
-        return score(case.answer.pixels, case.truth.pixels, case.photo, case.reflection)
+        return score(case.prediction.pixels, case.truth.pixels, case.photo, case.reflection)
 
     return score_case
 
 
 IDENTICAL_DB: Final = 100.0
-"""What the PSNR of identical pictures, which is infinite, counts as."""
+"""The PSNR that METRICS reports for identical pictures, whose PSNR is infinite, so that means stay finite."""
 
 _PSNR: Final = "10 log10(255^2 / MSE) over the three channels of 8-bit sRGB"
 _SSIM: Final = "per RGB channel of 8-bit sRGB, K1 0.01, K2 0.03, range 255"
@@ -88,9 +92,7 @@ _REGION: Final = (
     "the reflection region, where |photo - truth| / 255 in its largest channel, averaged over 7x7 pixels,"
     f" is above {DEFAULT_THRESHOLD} unless the report states another threshold"
 )
-_GAIN: Final = (
-    "after one gain, the median of background over answer where nothing is mirrored, in linear luminance"
-)
+_GAIN: Final = "after one gain, the median of background over prediction where there is no reflection, in linear luminance"
 
 _ROWS: Final = (
     Metric("psnr", "PSNR", "dB", True, 2, f"{_PSNR} of all pixels.", "transmission", _psnr),
@@ -170,10 +172,10 @@ _ROWS: Final = (
         "",
         False,
         3,
-        "Share of the background's light that the answer lacks where the reflection is below 2 % of the photo,"
+        "Share of the background's light that the prediction lacks where the reflection is below 2 % of the photo,"
         f" {_GAIN}.",
         "rendered",
-        _of_rendered(removed_content),
+        _rendered_score(removed_content),
     ),
     Metric(
         "removed_white",
@@ -181,11 +183,11 @@ _ROWS: Final = (
         "",
         False,
         3,
-        "Share of the background's light that the answer lacks where the reflection is below 2 % of the photo and the"
-        " background is white (encoded channels above 0.75 and less than 0.12 apart),"
+        "Share of the background's light that the prediction lacks where the reflection is below 2 % of the photo and"
+        " the background is white (encoded channels above 0.75 and less than 0.12 apart),"
         f" {_GAIN}.",
         "rendered",
-        _of_rendered(removed_white),
+        _rendered_score(removed_white),
     ),
     Metric(
         "kept_reflection",
@@ -193,25 +195,25 @@ _ROWS: Final = (
         "",
         False,
         3,
-        "Share of the reflection's light that the answer still has above the background, where the reflection is at"
+        "Share of the reflection's light that the prediction still has above the background, where the reflection is at"
         f" least 10 % of the photo and the photo is not clipped, {_GAIN}.",
         "rendered",
-        _of_rendered(kept_reflection),
+        _rendered_score(kept_reflection),
     ),
 )
 
 METRICS: Final = {metric.name: metric for metric in _ROWS}
-"""All scores by name, in the order of reports."""
+"""All metrics by name, in the order of reports."""
 
 
 def find_metric(name: str) -> Metric:
-    """A metric by its name.
+    """The metric of this name.
 
     Raises:
-        BrewsterError: there is none of this name.
+        BrewsterError: there is no metric of this name; the message suggests the closest one.
     """
     if name in METRICS:
         return METRICS[name]
-    near = difflib.get_close_matches(name.lower(), METRICS, n=1)
-    cure = f"did you mean {near[0]}?" if near else "choose one of them"
-    raise BrewsterError(f"there is no metric {name!r}", f"metrics are {', '.join(METRICS)}", cure)
+    close = difflib.get_close_matches(name.lower(), METRICS, n=1)
+    hint = f"did you mean {close[0]}?" if close else "choose one of them"
+    raise BrewsterError(f"there is no metric {name!r}", f"metrics are {', '.join(METRICS)}", hint)

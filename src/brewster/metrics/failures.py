@@ -1,13 +1,14 @@
-"""How badly an answer fails where the truth is known exactly: content that it took away, reflections that it left.
+"""Failure metrics for rendered samples: how much content a prediction removes, and how much reflection it leaves.
 
-For rendered samples, whose photo I, background B and reflection R share one exposure and tone curve. All is luminance
-in linear light, with R in the photo's light: I = T + R, and T is B as far as the glass lets it through. Methods differ
-on whether they restore what the glass absorbs, so an answer is first multiplied by the one gain that makes it match B
-where nothing is mirrored: the median of B over answer, among pixels that are neither black nor clipped in either.
-Where B has too few such pixels, no score has a meaning; an answer that is black or clipped in nearly all of them is
-taken as it is.
+They need a sample whose photo I, background B and reflection R share one exposure and tone curve. All values are
+luminance in linear light, with I = T + R, where the transmission T is the part of B that passes through the glass.
 
-Each score is a share of light, in 0..1, lower is better.
+Some methods restore the light that the glass absorbs, and others do not. To score both alike, the prediction is first
+multiplied by one gain: the median of B / prediction over the pixels without reflection that are neither black nor
+clipped in either picture. If B has too few such pixels, the scores are undefined (ValueError). If only the prediction
+has too few, the gain is 1.
+
+Each score is a share of light in 0..1; lower is better.
 """
 
 from __future__ import annotations
@@ -25,109 +26,132 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
     Light = Float[NDArray[np.float64], "h w"]
+    LightOfPixels = Float[NDArray[np.float64], " pixels"]
 else:
-    Light = NDArray
+    Light = LightOfPixels = NDArray
 
-NEGLIGIBLE: Final = 0.02
-"""Of I: a reflection below this share is none."""
+NEGLIGIBLE_SHARE: Final = 0.02
+"""A pixel with R below this share of I counts as a pixel without reflection."""
 
-NOTICEABLE: Final = 0.1
-"""Of I: a reflection from this share on is one."""
+NOTICEABLE_SHARE: Final = 0.1
+"""A pixel with R of at least this share of I counts as a pixel with reflection."""
 
-WHITE: Final = 0.75
-COLOURLESS: Final = 0.12
-"""White is where all encoded channels are above the one and no two are further apart than the other."""
+WHITE_MIN: Final = 0.75
+WHITE_MAX_DIFFERENCE: Final = 0.12
+"""A pixel is white if its encoded channels, in 0..1, are above WHITE_MIN and less than WHITE_MAX_DIFFERENCE apart."""
 
-BLACK: Final = 0.01
-"""Luminance below which an 8-bit value is too coarse to be divided by."""
+BLACK_LUMINANCE: Final = 0.01
+"""Pixels below this luminance are left out of the gain: 8-bit steps are too coarse there for a ratio."""
 
-CLIPPED: Final = 254
-"""From this 8-bit value on, a channel may have been brighter than it says."""
+CLIPPED_MIN: Final = 254
+"""From this 8-bit value on, a channel may be clipped: its true value is unknown."""
 
-LEAST_PIXELS: Final = 64
+MIN_PIXELS: Final = 64
+"""A score or gain over fewer pixels is too noisy to report."""
 
 _LINEAR: Final = to_linear(np.arange(256) / 255)
 
 
-def removed_content(answer: Picture, background: Picture, photo: Picture, reflection: Picture) -> float:
-    """The share of the background's light that the answer lacks where nothing is mirrored, 0..1, lower is better.
+def removed_content(prediction: Picture, background: Picture, photo: Picture, reflection: Picture) -> float:
+    """The share of the background's light that the prediction lacks where there is no reflection.
 
-    sum max(B - g answer, 0) / sum B, over the pixels with R < 2 % of I; I and B not black everywhere there.
+    sum max(B - g prediction, 0) / sum B over the pixels with R < 2 % of I and B > 0, where g is the gain of the module.
 
-    Raises:
-        ValueError: the pictures are not uint8 (H, W, 3) or differ in shape, or less than 64 pixels are such as the
-            score is over, or such that the gain could be known.
-    """
-    case = _Case.of(answer, background, photo, reflection)
-    return case.removed(case.calm, f"R < {NEGLIGIBLE:.0%} of I")
-
-
-def removed_white(answer: Picture, background: Picture, photo: Picture, reflection: Picture) -> float:
-    """The share of light that the answer lacks in white areas behind the glass, 0..1, lower is better.
-
-    As `removed_content`, over those of its pixels that are white in B: every encoded channel above 0.75, and the
-    largest less than 0.12 above the smallest. High where white things were taken for highlights.
+    Returns:
+        A share in 0..1; lower is better.
 
     Raises:
-        ValueError: as `removed_content`.
+        ValueError: the pictures are not uint8 (H, W, 3) or differ in shape, or fewer than 64 pixels are left for the
+            score or in B for the gain.
     """
-    case = _Case.of(answer, background, photo, reflection)
-    return case.removed(case.calm & _is_white(background), f"R < {NEGLIGIBLE:.0%} of I and white in B")
+    luminance = _Luminances.of(prediction, background, photo, reflection)
+    return luminance.removed_share(luminance.unreflected, f"R < {NEGLIGIBLE_SHARE:.0%} of I")
 
 
-def kept_reflection(answer: Picture, background: Picture, photo: Picture, reflection: Picture) -> float:
-    """The share of the reflection's light that the answer still has, 0..1, lower is better.
+def removed_white(prediction: Picture, background: Picture, photo: Picture, reflection: Picture) -> float:
+    """The share of the background's light that the prediction lacks in white areas without reflection.
 
-    sum min(max(g answer - B, 0), R) / sum R, over the pixels with R >= 10 % of I where I is not clipped.
+    As `removed_content`, over the pixels that are also white in B: every encoded channel is above 0.75, and the
+    largest is less than 0.12 above the smallest. It is high where a method takes white objects for highlights.
+
+    Returns:
+        A share in 0..1; lower is better.
 
     Raises:
         ValueError: as `removed_content`.
     """
-    case = _Case.of(answer, background, photo, reflection)
-    mirrored = (case.reflection >= NOTICEABLE * case.photo) & (case.reflection > 0) & ~_is_clipped(photo)
-    kept = np.clip(case.answer - case.background, 0, case.reflection)
-    return _share(kept, case.reflection, mirrored, f"R >= {NOTICEABLE:.0%} of I and I not clipped")
+    luminance = _Luminances.of(prediction, background, photo, reflection)
+    return luminance.removed_share(
+        luminance.unreflected & _is_white(background), f"R < {NEGLIGIBLE_SHARE:.0%} of I and white in B"
+    )
+
+
+def kept_reflection(prediction: Picture, background: Picture, photo: Picture, reflection: Picture) -> float:
+    """The share of the reflection's light that the prediction still contains.
+
+    sum min(max(g prediction - B, 0), R) / sum R over the pixels with R >= 10 % of I where I is not clipped, where g is
+    the gain of the module.
+
+    Returns:
+        A share in 0..1; lower is better.
+
+    Raises:
+        ValueError: as `removed_content`.
+    """
+    luminance = _Luminances.of(prediction, background, photo, reflection)
+    reflective = (
+        (luminance.reflection >= NOTICEABLE_SHARE * luminance.photo)
+        & (luminance.reflection > 0)
+        & ~_is_clipped(photo)
+    )
+    remaining = np.clip(luminance.prediction - luminance.background, 0, luminance.reflection)
+    return _share(
+        remaining, luminance.reflection, reflective, f"R >= {NOTICEABLE_SHARE:.0%} of I and I not clipped"
+    )
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class _Case:
-    """The luminances of four pictures, (H, W); the answer's after its gain."""
+class _Luminances:
+    """The linear luminances of the four pictures, (H, W); that of the prediction is multiplied by the gain."""
 
-    answer: Light
+    prediction: Light
     background: Light
     photo: Light
     reflection: Light
-    calm: Region
-    """Where nothing is mirrored."""
+    unreflected: Region
+    """Pixels without reflection."""
 
     @classmethod
-    def of(cls, answer: Picture, background: Picture, photo: Picture, reflection: Picture) -> _Case:
-        check_pictures(answer, background, photo, reflection)
-        given, behind, whole, mirrored = map(_luminance, (answer, background, photo, reflection))
-        calm = mirrored < NEGLIGIBLE * whole
-        told = calm & (behind >= BLACK) & ~_is_clipped(background)
-        _refuse_few(told, f"R < {NEGLIGIBLE:.0%} of I and B neither black nor clipped")
-        comparable = told & (given >= BLACK) & ~_is_clipped(answer)
-        return cls(given * _gain(given[comparable], behind[comparable]), behind, whole, mirrored, calm)
+    def of(cls, prediction: Picture, background: Picture, photo: Picture, reflection: Picture) -> _Luminances:
+        check_pictures(prediction, background, photo, reflection)
+        t, b, i, r = map(_luminance, (prediction, background, photo, reflection))
+        unreflected = r < NEGLIGIBLE_SHARE * i
+        comparable_background = unreflected & (b >= BLACK_LUMINANCE) & ~_is_clipped(background)
+        _require_pixels(
+            comparable_background, f"R < {NEGLIGIBLE_SHARE:.0%} of I and B neither black nor clipped"
+        )
+        comparable = comparable_background & (t >= BLACK_LUMINANCE) & ~_is_clipped(prediction)
+        return cls(t * _gain(t[comparable], b[comparable]), b, i, r, unreflected)
 
-    def removed(self, where: Region, condition: str) -> float:
-        missing = np.maximum(self.background - self.answer, 0)
-        return _share(missing, self.background, where & (self.background > 0), condition)
-
-
-def _gain(answer: Light, background: Light) -> float:
-    return float(np.median(background / answer)) if answer.size >= LEAST_PIXELS else 1.0
+    def removed_share(self, mask: Region, condition: str) -> float:
+        missing = np.maximum(self.background - self.prediction, 0)
+        return _share(missing, self.background, mask & (self.background > 0), condition)
 
 
-def _share(part: Light, whole: Light, where: Region, condition: str) -> float:
-    _refuse_few(where, condition)
-    return float(part[where].sum() / whole[where].sum())
+def _gain(prediction: LightOfPixels, background: LightOfPixels) -> float:
+    # The median, because content that is missing in less than half of the pixels must not change the gain.
+    return float(np.median(background / prediction)) if prediction.size >= MIN_PIXELS else 1.0
 
 
-def _refuse_few(where: Region, condition: str) -> None:
-    if (count := np.count_nonzero(where)) < LEAST_PIXELS:
-        raise ValueError(f"{count} pixels have {condition}; a score needs {LEAST_PIXELS}")
+def _share(part: Light, whole: Light, mask: Region, condition: str) -> float:
+    _require_pixels(mask, condition)
+    return float(part[mask].sum() / whole[mask].sum())
+
+
+def _require_pixels(mask: Region, condition: str) -> None:
+    if (count := np.count_nonzero(mask)) < MIN_PIXELS:
+        raise ValueError(f"{count} pixels have {condition}; a score needs at least {MIN_PIXELS}")
 
 
 def _luminance(picture: Picture) -> Light:
@@ -136,12 +160,12 @@ def _luminance(picture: Picture) -> Light:
 
 
 def _is_clipped(picture: Picture) -> Region:
-    clipped: Region = picture.max(axis=2) >= CLIPPED
+    clipped: Region = picture.max(axis=2) >= CLIPPED_MIN
     return clipped
 
 
 def _is_white(picture: Picture) -> Region:
-    least, most = picture.min(axis=2), picture.max(axis=2)
-    bright: Region = least > WHITE * 255
-    grey: Region = most - least < COLOURLESS * 255
+    darkest, brightest = picture.min(axis=2), picture.max(axis=2)
+    bright: Region = darkest > WHITE_MIN * 255
+    grey: Region = brightest - darkest < WHITE_MAX_DIFFERENCE * 255
     return bright & grey

@@ -1,4 +1,4 @@
-"""What a metric is, and what its function is given: one answer and the ground truth of one case."""
+"""The row type of METRICS, and the input of its functions: one prediction and the ground truth of one case."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class CachedPicture:
     _features: dict[Callable[[Picture], Any], Any] = field(default_factory=dict, repr=False)
 
     def features(self, compute: Callable[[Picture], _Features]) -> _Features:
-        """The result of `compute` for this picture; computed once, however many metrics ask for it."""
+        """The result of `compute` for this picture. Metrics share it: it is computed once."""
         if compute not in self._features:
             self._features[compute] = compute(self.pixels)
         return cast("_Features", self._features[compute])
@@ -29,44 +29,45 @@ class CachedPicture:
 @final
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """The layer that is scored, its ground truth, and the rest of the case.
+    """The predicted layer to score, its ground truth, and the photo.
 
-    A metric "of" a rendered sample gets the transmissions, and always has a `reflection`.
+    A metric whose `of` is "rendered" gets the transmission as `prediction` and the background as `truth`, and its
+    `reflection` is never None.
     """
 
-    answer: CachedPicture
+    prediction: CachedPicture
     truth: CachedPicture
     photo: Picture
     reflection: Picture | None = None
-    """The ground truth of the reflection, if the case has one."""
+    """The ground truth of the reflection; None if the case has none."""
     region: Region | None = None
-    """The pixels to score, for a metric that is limited to the reflection region."""
+    """The pixels to score, for a metric whose `where` is "region"; otherwise None."""
 
 
 @final
 @dataclass(frozen=True)
 class Metric:
-    """A score: how to compute it, how to print it, and how to read it."""
+    """A metric: its function, how its values are printed, and what they mean."""
 
     name: str
     title: str
     unit: str
-    """"dB", or nothing for a pure number."""
+    """"dB", or "" for a number without unit."""
     higher_is_better: bool
     digits: int
-    """After the point, in tables."""
+    """Decimal places in tables."""
     about: str
-    """The definition with its parameters, in one sentence."""
+    """The definition with all parameters, in one sentence."""
     of: Literal["transmission", "reflection", "rendered"]
-    """Which truth it needs: the transmission, the reflection, or all layers of a rendered sample."""
+    """The ground truth that it needs: the transmission, the reflection, or all layers of a rendered sample."""
     score: Callable[[Comparison], float]
-    """Computes it; a ValueError says that it has no meaning here (no region, a picture too small)."""
+    """Computes the value. Raises ValueError where it is undefined: an empty region, a picture that is too small."""
     where: Literal["picture", "region"] = "picture"
-    """Over the whole picture, or in the reflection region only."""
+    """Whether it averages over the whole picture or over the reflection region."""
     prepare: Callable[[], object] | None = None
-    """Loads what it needs (weights that may be missing), once, before anything is scored."""
+    """Loads what it needs, such as weights. Called before the first score, so that missing weights fail early."""
 
-    def described(self) -> dict[str, Any]:
-        """Its plain values but the name, for results.json."""
-        told = ("title", "unit", "higher_is_better", "digits", "about", "of", "where")
-        return {key: getattr(self, key) for key in told}
+    def to_dict(self) -> dict[str, Any]:
+        """All fields except the name and the functions, for results.json."""
+        keys = ("title", "unit", "higher_is_better", "digits", "about", "of", "where")
+        return {key: getattr(self, key) for key in keys}

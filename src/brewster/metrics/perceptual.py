@@ -1,11 +1,11 @@
-"""How alike two pictures look: LPIPS 0.1 with AlexNet, from its own five convolutions.
+"""LPIPS 0.1 with AlexNet: the perceptual distance of two pictures.
 
     metric = Lpips.load()
-    truth = metric.features(picture)  # once for many answers
-    print([metric.distance(metric.features(answer), truth) for answer in answers])
+    truth = metric.features(picture)  # once for many predictions
+    print([metric.distance(metric.features(prediction), truth) for prediction in predictions])
 
-R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018; the definition
-is that of the `lpips` package, version 0.1 of the weights. torch is woken by `Lpips.load` only.
+R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018; the same
+definition as the `lpips` package with version 0.1 of its weights. Only `Lpips.load` imports torch.
 """
 
 from __future__ import annotations
@@ -18,44 +18,48 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.errors import MissingExtra
-from brewster.metrics.weights import load_backbone, read_heads
+from brewster.metrics.weights import load_alexnet, read_heads
 from brewster.metrics.windows import Picture, Region, check_pictures, check_region
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
-    Map = Float[Tensor, "c h w"]
+    Map = Float[Tensor, "_c _h _w"]
+    """The maps of one picture differ in all three sizes; the underscores tell jaxtyping not to compare them."""
 
-LEAST_SIDE: Final = 31
-"""AlexNet halves a picture until a smaller one has nothing left."""
+MIN_SIDE: Final = 31
+"""With fewer pixels on a side, AlexNet's strides and poolings leave an empty map."""
 
 _SHIFT: Final = np.array([-0.030, -0.088, -0.188])
 _SCALE: Final = np.array([0.458, 0.448, 0.450])
-"""ImageNet's mean and spread of values in -1..1, as LPIPS 0.1 rounds them."""
+"""Mean and standard deviation of ImageNet's values in -1..1, rounded as in LPIPS 0.1."""
 
 
-class _Step(NamedTuple):
-    """A convolution of AlexNet; before some, each 3x3 pixels are pooled in steps of two."""
+class _Layer(NamedTuple):
+    """A convolution of AlexNet. If `pooled_before`, a 3x3 max pooling with stride 2 precedes it."""
 
     stride: int
     padding: int
-    pooled: bool
+    pooled_before: bool
 
 
-_STEPS: Final = (
-    _Step(4, 2, pooled=False),
-    _Step(1, 2, pooled=True),
-    _Step(1, 1, pooled=True),
-    _Step(1, 1, pooled=False),
-    _Step(1, 1, pooled=False),
+_LAYERS: Final = (
+    _Layer(4, 2, pooled_before=False),
+    _Layer(1, 2, pooled_before=True),
+    _Layer(1, 1, pooled_before=True),
+    _Layer(1, 1, pooled_before=False),
+    _Layer(1, 1, pooled_before=False),
 )
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Features:
-    """What AlexNet sees in a picture: five maps (C, h, w) float32 of unit length in C, and the picture's (H, W)."""
+    """AlexNet's features of a picture: five float32 maps (C, h, w), normalised to unit length over C.
+
+    `size` is the (height, width) of the picture.
+    """
 
     maps: tuple[Map, ...]
     size: tuple[int, int]
@@ -64,57 +68,61 @@ class Features:
 @final
 @dataclass(frozen=True, eq=False)
 class Lpips:
-    """The metric with its weights; on the CPU, reusable and thread-safe."""
+    """LPIPS with its weights. It runs on the CPU; several threads may share one object."""
 
     convolutions: tuple[tuple[Tensor, Tensor], ...]
     """Weights (out, in, k, k) and biases (out,) of AlexNet's five convolutions."""
     heads: tuple[Tensor, ...]
-    """How much each channel of the five maps counts, (C,)."""
+    """The weight of each channel of the five maps, (C,): the linear layers of LPIPS."""
 
     @classmethod
     def load(cls) -> Lpips:
-        """The metric with its published weights, which are read once.
+        """LPIPS with its published weights; later calls return the same object.
 
         Raises:
             MissingExtra: torch is not installed.
-            ModelError: the file of the convolutions is damaged or another one.
-            DownloadError: there is no such file yet, and the server does not give it.
-            TargetError: there is none, and the cache folder cannot be written.
+            ModelError: the file of AlexNet's weights is damaged, or holds other weights.
+            DownloadError: AlexNet's weights are not on this machine, and the download fails.
+            TargetError: the downloaded weights cannot be written to the cache folder.
         """
         return _load()
 
     def features(self, picture: Picture) -> Features:
-        """What AlexNet sees in a picture.
+        """The features of a picture, uint8 (H, W, 3).
 
         Raises:
-            ValueError: the picture is not uint8 (H, W, 3), or has less than 31 pixels on a side.
+            ValueError: the picture is not uint8 (H, W, 3), or has fewer than 31 pixels on a side.
         """
         import torch  # noqa: PLC0415 - an extra
         from torch.nn import functional  # noqa: PLC0415
 
         check_pictures(picture)
         size = picture.shape[:2]
-        if min(size) < LEAST_SIDE:
-            raise ValueError(
-                f"LPIPS needs at least {LEAST_SIDE}x{LEAST_SIDE} pixels, not {size[0]}x{size[1]}"
-            )
+        if min(size) < MIN_SIDE:
+            raise ValueError(f"LPIPS needs at least {MIN_SIDE}x{MIN_SIDE} pixels, not {size[0]}x{size[1]}")
         maps = []
         with torch.inference_mode():
-            seen = torch.from_numpy(_scaled(picture)).permute(2, 0, 1)[None]
-            for (weight, bias), step in zip(self.convolutions, _STEPS, strict=True):
-                if step.pooled:
-                    seen = functional.max_pool2d(seen, 3, 2)
-                seen = functional.relu(functional.conv2d(seen, weight, bias, step.stride, step.padding))
-                maps.append(seen[0] / (torch.linalg.vector_norm(seen[0], dim=0) + 1e-10))
+            activations = torch.from_numpy(_normalised(picture)).permute(2, 0, 1)[None]
+            for (weight, bias), layer in zip(self.convolutions, _LAYERS, strict=True):
+                if layer.pooled_before:
+                    activations = functional.max_pool2d(activations, 3, 2)
+                activations = functional.relu(
+                    functional.conv2d(activations, weight, bias, layer.stride, layer.padding)
+                )
+                maps.append(activations[0] / (torch.linalg.vector_norm(activations[0], dim=0) + 1e-10))
         return Features(tuple(maps), size)
 
     def distance(self, one: Features, other: Features, *, region: Region | None = None) -> float:
-        """How differently two pictures look, 0 for equal ones, lower is better.
+        """The LPIPS distance of two pictures.
 
-        The squared differences of the maps, weighted by channel, are averaged over each map and summed over the
-        five. With a `region`, bool (H, W), each is first enlarged to the picture's size (bilinear, corners not
-        aligned: what `lpips` calls spatial), and their sum is averaged over the region's pixels. A region that is
-        the whole picture differs slightly from none, because enlarging counts the rims of the maps differently.
+        The squared differences of the features are weighted by channel, averaged over each map, and summed over the
+        five maps. With a `region`, bool (H, W), each map of differences is first upsampled to the size of the picture
+        (bilinear, align_corners=False; `spatial=True` in `lpips`), and their sum is averaged over the region. A region
+        that is the whole picture gives a slightly different value than no region, because upsampling changes the
+        weight of the pixels at the border of a map.
+
+        Returns:
+            0 for equal pictures; lower is better.
 
         Raises:
             ValueError: the pictures differ in size, or the region is empty or of another shape.
@@ -131,20 +139,23 @@ class Lpips:
             if region is None:
                 return float(sum(_mean(map_.numpy()) for map_ in maps))
             check_region(region, one.size)
-            return _mean(_enlarged(maps, one.size).numpy()[region])
+            return _mean(_upsampled(maps, one.size).numpy()[region])
 
 
-def lpips(picture: Picture, truth: Picture, *, region: Region | None = None) -> float:
-    """LPIPS 0.1 (AlexNet) of two pictures, 0 for equal ones, lower is better; see `Lpips.distance`.
+def lpips(prediction: Picture, truth: Picture, *, region: Region | None = None) -> float:
+    """LPIPS 0.1 (AlexNet) of two pictures, with weights from `Lpips.load`; see `Lpips.distance`.
+
+    Returns:
+        0 for equal pictures; lower is better.
 
     Raises:
         ValueError: the pictures are not uint8 (H, W, 3), differ in shape, or are smaller than 31x31 pixels; the
             region is empty or of another shape.
-        BrewsterError: what `Lpips.load` raises.
+        BrewsterError: the weights cannot be loaded; see `Lpips.load`.
     """
-    check_pictures(picture, truth)
+    check_pictures(prediction, truth)
     metric = Lpips.load()
-    return metric.distance(metric.features(picture), metric.features(truth), region=region)
+    return metric.distance(metric.features(prediction), metric.features(truth), region=region)
 
 
 @functools.cache
@@ -153,18 +164,19 @@ def _load() -> Lpips:
         import torch  # noqa: PLC0415 - an extra
     except ImportError as error:
         raise MissingExtra(
-            "torch is not installed", "LPIPS is a neural network", "pip install 'brewster[evaluate]'"
+            "torch is not installed", "the library that computes LPIPS", "pip install 'brewster[evaluate]'"
         ) from error
-    tensors = [*load_backbone().values()]
+    tensors = [*load_alexnet().values()]
     weights = [weight.to(memory_format=torch.channels_last) for weight in tensors[::2]]  # faster on the CPU
     heads = tuple(torch.from_numpy(head) for head in read_heads())
     return Lpips(tuple(zip(weights, tensors[1::2], strict=True)), heads)
 
 
-def _scaled(picture: Picture) -> NDArray[np.float32]:
-    """(value / 127.5 - 1 - shift) / scale, (H, W, 3); in this order of memory AlexNet's convolutions are fastest.
+def _normalised(picture: Picture) -> NDArray[np.float32]:
+    """(value / 127.5 - 1 - shift) / scale, (H, W, 3).
 
-    Whole rows at once: numpy is slow along an axis of three.
+    The channels stay last in memory, in which layout the convolutions are fastest on a CPU. The arithmetic runs on
+    whole rows, because numpy is slow along an axis of length 3.
     """
     height, width, _ = picture.shape
     values = picture.reshape(height, -1).astype(np.float32, order="C")
@@ -174,11 +186,11 @@ def _scaled(picture: Picture) -> NDArray[np.float32]:
 
 
 def _mean(values: NDArray[np.float32]) -> float:
-    """In numpy, in double: the order of its sums does not depend on the number of threads."""
+    """The mean by numpy in float64: unlike torch, the order of its sums does not depend on the number of threads."""
     return float(values.mean(dtype=np.float64))
 
 
-def _enlarged(maps: list[Tensor], size: tuple[int, int]) -> Tensor:
+def _upsampled(maps: list[Tensor], size: tuple[int, int]) -> Tensor:
     from torch.nn.functional import interpolate  # noqa: PLC0415 - an extra
 
     full = [interpolate(map_[None, None], size, mode="bilinear", align_corners=False)[0, 0] for map_ in maps]

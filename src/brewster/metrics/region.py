@@ -1,4 +1,4 @@
-"""Where the reflection is: the pixels of a photo that the glass has visibly changed."""
+"""The reflection region: the pixels of a photo that the glass has visibly changed."""
 
 from __future__ import annotations
 
@@ -9,15 +9,18 @@ import numpy as np
 from brewster.metrics.windows import BOX, Picture, Region, box_sums, check_pictures
 
 DEFAULT_THRESHOLD: Final = 0.08
-"""Of the range of 8-bit values. Chosen by eye on 20 real pairs, of which it marks 0.1 to 87 %, in the middle a third:
-at 0.04 most of a picture is marked, half of it for mere haze or tint; at 0.15 often highlights only."""
+"""A share of the 8-bit range. Chosen by eye on 20 real pairs, where it marks 0.1 to 87 % of the pixels (median: a
+third). With 0.04, most of a picture is marked, half of it because of haze or tint; with 0.15, often only highlights are."""
 
 
 def reflection_region(photo: Picture, truth: Picture, *, threshold: float = DEFAULT_THRESHOLD) -> Region:
-    """Where a photo differs from the picture without the reflection by more than a threshold, bool (H, W).
+    """The pixels where a photo differs from the ground truth without reflection by more than a threshold.
 
-    The difference is |photo - truth| / 255 in the channel where it is largest, averaged over 7x7 pixels, for which
-    the picture's edges are repeated outwards.
+    The difference is |photo - truth| / 255 in the channel where it is largest, averaged over 7x7 pixels. Beyond the
+    border of the picture, its edge pixels are repeated.
+
+    Returns:
+        A bool mask (H, W).
 
     Raises:
         ValueError: the pictures are not uint8 (H, W, 3) or differ in shape, or the threshold is not in 0..1.

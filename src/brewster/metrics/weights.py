@@ -1,9 +1,9 @@
-"""The weights of LPIPS: its five linear heads are shipped, the five convolutions are found or fetched once.
+"""The weights of LPIPS. Its five linear layers ("heads") are part of brewster; AlexNet's weights are downloaded once.
 
 The convolutions are those of torchvision's AlexNet (`features.0`, 3, 6, 8 and 10 of alexnet-owt-7be5be79.pth,
-BSD-3-Clause). `lpips_alexnet_features.pth`, a state dict of these ten tensors, is looked for in brewster/weights of the
-user's cache folder, then in `weights` of the folder that `BREWSTER_DATA` names. Wherever they come from, a digest
-over their values must be right: a number that depends on other weights is not LPIPS.
+BSD-3-Clause). Their ten tensors are stored as a state dict, `lpips_alexnet_features.pth`. It is searched for in
+brewster/weights of the user's cache folder, then in `weights` of the folder that `BREWSTER_DATA` names. A digest of
+the values is always checked, because distances from other weights are not LPIPS.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ from brewster.files import cache_folder, write_atomically
 if TYPE_CHECKING:
     from torch import Tensor
 
-NAMES: Final = tuple(f"features.{i}.{kind}" for i in (0, 3, 6, 8, 10) for kind in ("weight", "bias"))
+TENSOR_NAMES: Final = tuple(f"features.{i}.{kind}" for i in (0, 3, 6, 8, 10) for kind in ("weight", "bias"))
 
-FILE: Final = "lpips_alexnet_features.pth"
+WEIGHTS_FILE: Final = "lpips_alexnet_features.pth"
 
 DIGEST: Final = "b58cb12516261361a1ed14f3b70c0abad70c1ca4c1c75e1aa576654d3759aa06"
 """See `digest_of`."""
 
-TORCHVISION: Final = RemoteFile(
+TORCHVISION_ALEXNET: Final = RemoteFile(
     "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
     size=244_408_911,
     algorithm="sha256",
     digest="7be5be791159472b1fbf3c69796f7cb30dca7ad8466c2df70058c37116cdee02",
 )
 
-_BROKEN: Final = (
+_LOAD_ERRORS: Final = (
     pickle.UnpicklingError,
     zipfile.BadZipFile,
     struct.error,
@@ -56,86 +56,86 @@ _BROKEN: Final = (
     MemoryError,
     OSError,
 )
-"""All that torch says about a file that is not a state dict, or is no longer one."""
+"""The exceptions that torch.load and the lookup of tensors raise for a file that is damaged or not a state dict."""
 
 
-def load_backbone(
-    promise: RemoteFile = TORCHVISION, digest: str = DIGEST, *, line: Downloader | None = None
+def load_alexnet(
+    remote: RemoteFile = TORCHVISION_ALEXNET, digest: str = DIGEST, *, downloader: Downloader | None = None
 ) -> dict[str, Tensor]:
-    """The ten tensors by name, float32, from the first place that has them; else downloaded into the cache.
+    """AlexNet's ten tensors by name, float32: from the cache, from BREWSTER_DATA, or downloaded into the cache.
 
     Raises:
-        ModelError: a file is there, and is damaged or another one.
-        DownloadError: there is none, and the server does not give it.
+        ModelError: the file is damaged, or holds other weights.
+        DownloadError: there is no file, and the download fails.
         TargetError: the cache folder cannot be written.
     """
-    cached = cache_folder() / "weights" / FILE
+    cached = cache_folder() / "weights" / WEIGHTS_FILE
     data = os.environ.get("BREWSTER_DATA")
-    for path in (cached, *([Path(data) / "weights" / FILE] if data else [])):
+    for path in (cached, *([Path(data) / "weights" / WEIGHTS_FILE] if data else [])):
         if path.is_file():
-            return read_backbone(path, digest)
-    return _fetch(promise, digest, cached, line or Downloader())
+            return read_alexnet(path, digest)
+    return _fetch(remote, digest, cached, downloader or Downloader())
 
 
-def read_backbone(path: Path, digest: str = DIGEST) -> dict[str, Tensor]:
-    """The ten tensors of a state dict, which may have others beside them; checked.
+def read_alexnet(path: Path, digest: str = DIGEST) -> dict[str, Tensor]:
+    """The ten tensors of a state dict, whose digest is checked. Other tensors in the file are ignored.
 
     Raises:
-        ModelError: the file is damaged or another one.
+        ModelError: the file is damaged, or holds other weights.
     """
     import torch  # noqa: PLC0415 - an extra
 
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-        tensors = {name: state[name].float().contiguous() for name in NAMES}
-    except _BROKEN as error:
+        tensors = {name: state[name].float().contiguous() for name in TENSOR_NAMES}
+    except _LOAD_ERRORS as error:
         raise _not_alexnet(path, f"it cannot be read: {type(error).__name__}") from error
-    if (found := digest_of(tensors)) != digest:
-        raise _not_alexnet(path, f"its digest is {found:.12}...")
+    if (actual := digest_of(tensors)) != digest:
+        raise _not_alexnet(path, f"its digest is {actual:.12}...")
     return tensors
 
 
 def read_heads() -> list[NDArray[np.float32]]:
-    """The weights of the five layers' channels, (64,), (192,), (384,), (256,), (256,); none is negative."""
+    """The channel weights of the five layers, (64,), (192,), (384,), (256,), (256,); none is negative."""
     with np.load(Path(__file__).with_name("lpips_alex_v0.1.npz")) as file:
         return [file[f"layer{i}"] for i in range(5)]
 
 
 def digest_of(tensors: dict[str, Tensor]) -> str:
-    """SHA-256 over name, shape and little-endian float32 values of each tensor, in the order of `NAMES`."""
+    """SHA-256 over name, shape and little-endian float32 values of each tensor, in the order of `TENSOR_NAMES`."""
     digest = hashlib.sha256()
-    for name in NAMES:
+    for name in TENSOR_NAMES:
         values: NDArray[Any] = tensors[name].numpy().astype("<f4", order="C")
         digest.update(f"{name} {values.shape}\n".encode() + values.tobytes())
     return digest.hexdigest()
 
 
-def _fetch(promise: RemoteFile, digest: str, cached: Path, line: Downloader) -> dict[str, Tensor]:
-    """Keeps the ten tensors of the whole network's file, and drops the file: 96 % of it are of no use here."""
+def _fetch(remote: RemoteFile, digest: str, cached: Path, downloader: Downloader) -> dict[str, Tensor]:
+    """Downloads the whole network, stores its ten tensors in `cached`, and deletes the rest (96 % of the file)."""
     import torch  # noqa: PLC0415 - an extra
 
-    whole = cached.with_name(promise.url.rsplit("/", 1)[-1])
+    full_file = cached.with_name(remote.url.rsplit("/", 1)[-1])
     try:
-        line.fetch(promise, whole)
+        downloader.fetch(remote, full_file)
     except DownloadError as error:
         raise DownloadError(
-            f"LPIPS needs AlexNet once, 233 MiB, and it cannot be had: {str(error).rstrip('.')}",
-            f"a network, or {FILE} in the folder weights of BREWSTER_DATA",
-            "leave LPIPS out with --metrics psnr,ssim",
+            f"AlexNet's weights for LPIPS (233 MiB) could not be downloaded: {str(error).rstrip('.')}",
+            f"a network connection, or {WEIGHTS_FILE} in the folder weights of BREWSTER_DATA",
+            "connect and try again, or leave LPIPS out with --metrics psnr,ssim",
         ) from error
     try:
-        tensors = read_backbone(whole, digest)
+        tensors = read_alexnet(full_file, digest)
         buffer = io.BytesIO()
         torch.save(tensors, buffer)
         write_atomically(cached, buffer.getvalue(), overwrite=True)
     finally:
-        whole.unlink(missing_ok=True)
+        full_file.unlink(missing_ok=True)
     return tensors
 
 
 def _not_alexnet(path: Path, why: str) -> ModelError:
     return ModelError(
-        f"{path} is not the AlexNet of LPIPS ({why})",
+        f"{path} does not hold the AlexNet weights of LPIPS ({why})",
         "the first convolutions of torchvision's alexnet-owt-7be5be79.pth",
-        "delete the file, or put the right one in its place: without it, brewster downloads 233 MiB once",
+        "delete the file, and brewster downloads it again (233 MiB); or replace it by the right one",
     )

@@ -1,4 +1,4 @@
-"""What the metrics share: which pictures and regions they take, and sums over windows that slide over a picture."""
+"""Shared by the metrics: checks of pictures and regions, and sums over sliding windows."""
 
 from __future__ import annotations
 
@@ -22,19 +22,18 @@ BOX: Final = 7
 
 GAUSSIAN_RADIUS: Final = 5
 GAUSSIAN_SIGMA: Final = 1.5
-"""The Gaussian window of Wang et al. 2004: 11x11 pixels, that is cut off after 3.5 sigma."""
+"""The Gaussian window of Wang et al. 2004: 11x11 pixels, as scikit-image's truncation at 3.5 sigma gives."""
 
 _TAPS: Final = np.exp(-0.5 * (np.arange(-GAUSSIAN_RADIUS, 1) / GAUSSIAN_SIGMA) ** 2)
-_GAUSSIAN: Final = _TAPS / (
-    2 * _TAPS.sum() - _TAPS[-1]
-)  # up to the middle: the other half is its mirror image
+# The first half of the symmetric window, up to its centre.
+_GAUSSIAN: Final = _TAPS / (2 * _TAPS.sum() - _TAPS[-1])
 
 
 def check_pictures(*pictures: Picture) -> None:
-    """Refuses what is no 8-bit RGB picture, and pictures that differ in shape.
+    """Checks that all pictures are uint8 (H, W, 3) and of the same shape.
 
     Raises:
-        ValueError: one of them is not uint8 (H, W, 3) or has no pixels, or they differ in shape.
+        ValueError: a picture is not uint8 (H, W, 3) or has no pixels, or the shapes differ.
     """
     for picture in pictures:
         if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or not picture.size:
@@ -44,7 +43,7 @@ def check_pictures(*pictures: Picture) -> None:
 
 
 def check_region(region: Region, size: tuple[int, int]) -> None:
-    """Refuses what is no mask of a picture of this height and width, and a mask without any pixel.
+    """Checks that a region is a bool mask of this (height, width) with at least one pixel.
 
     Raises:
         ValueError: the region is not bool (H, W), or is empty.
@@ -52,26 +51,26 @@ def check_region(region: Region, size: tuple[int, int]) -> None:
     if region.dtype != np.bool_ or region.shape != size:
         raise ValueError(f"the region must be bool {size}, not {region.dtype} {region.shape}")
     if not region.any():
-        raise ValueError("the region is empty: there is nothing to measure in it")
+        raise ValueError("the region is empty; a metric needs at least one pixel")
 
 
 def box_sums(values: _Values) -> _Values:
-    """Sums over all whole 7x7 windows, (H - 6, W - 6, ...), of integers exactly; their type must hold the sums."""
+    """Sums over all complete 7x7 windows, (H - 6, W - 6, ...). Integer sums are exact if the dtype can hold them."""
     for axis in (0, 1):
-        line = np.moveaxis(values, axis, 0)
-        two = line[:-1] + line[1:]
-        four = two[:-2] + two[2:]
-        values = np.moveaxis(four[:-3] + two[4:-1] + line[6:], 0, axis)
+        along_axis = np.moveaxis(values, axis, 0)
+        sums_of_2 = along_axis[:-1] + along_axis[1:]
+        sums_of_4 = sums_of_2[:-2] + sums_of_2[2:]
+        values = np.moveaxis(sums_of_4[:-3] + sums_of_2[4:-1] + along_axis[6:], 0, axis)
     return values
 
 
 def gaussian_means(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Means under the Gaussian window at all places where it is whole, (H - 10, W - 10, ...)."""
+    """Gaussian-weighted means over all complete 11x11 windows, (H - 10, W - 10, ...)."""
     for axis in (0, 1):
-        line = np.moveaxis(values, axis, 0)
-        count, last = len(line) - 2 * GAUSSIAN_RADIUS, 2 * GAUSSIAN_RADIUS
-        mean = line[GAUSSIAN_RADIUS : GAUSSIAN_RADIUS + count] * _GAUSSIAN[GAUSSIAN_RADIUS]
+        along_axis = np.moveaxis(values, axis, 0)
+        count, last = len(along_axis) - 2 * GAUSSIAN_RADIUS, 2 * GAUSSIAN_RADIUS
+        mean = along_axis[GAUSSIAN_RADIUS : GAUSSIAN_RADIUS + count] * _GAUSSIAN[GAUSSIAN_RADIUS]
         for i in range(GAUSSIAN_RADIUS):
-            mean += (line[i : i + count] + line[last - i : last - i + count]) * _GAUSSIAN[i]
+            mean += (along_axis[i : i + count] + along_axis[last - i : last - i + count]) * _GAUSSIAN[i]
         values = np.moveaxis(mean, 0, axis)
     return values

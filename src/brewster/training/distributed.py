@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from brewster.errors import DeviceError
-from brewster.models.diffusion.lazy_imports import library
+from brewster.models.diffusion.lazy_imports import import_library
 
 _LAUNCHER: Final = ("RANK", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
 """What a launcher tells each process, beside WORLD_SIZE."""
@@ -76,7 +76,7 @@ def all_reduce_sum(tensors: Sequence[Tensor]) -> None:
     """Replaces these tensors, of one device, by their sums over all processes."""
     if world_size() > 1 and tensors:
         flat = torch.cat([tensor.flatten() for tensor in tensors])
-        total = library("accelerate.utils").reduce(flat, "sum")
+        total = import_library("accelerate.utils").reduce(flat, "sum")
         parts = torch.split(total, [tensor.numel() for tensor in tensors])
         for tensor, part in zip(tensors, parts, strict=True):
             tensor.copy_(part.view_as(tensor))
@@ -87,7 +87,7 @@ def _together() -> Any | None:  # noqa: ANN401 - accelerate's state
     if _announced() == 1:
         return None
     # Without a GPU, accelerate has to be told so: else each process quietly believes that it is the only one.
-    return library("accelerate").PartialState(cpu=not torch.cuda.is_available())
+    return import_library("accelerate").PartialState(cpu=not torch.cuda.is_available())
 
 
 def _announced() -> int:

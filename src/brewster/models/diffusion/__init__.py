@@ -1,14 +1,15 @@
-"""Which large image models can learn in-context separation, and how do they see pictures?
+"""Large image-editing diffusion models that separate photos by generating I, T and R as panels of one picture.
 
-    backbones   the table of models: load a real one, or build a tiny twin
-    families/   what differs between them: kontext, klein, qwen
-    panels      I, T and R in one picture, and out again
-    prompt      the paper's prompt, encoded once
-    task        which panels to make, how large, and by which way
-    sampling    from noise to panels, as the stock pipelines do it
-    decompose   a photo in, its layers out
-    adapter/    what training adds, in a folder that stock diffusers loads: lora, and the hub
+    backbones     the table of models: load one from the hub or a folder, or build a tiny version
+    families/     one Backbone class per model family: kontext, klein, qwen
+    panels        composes I, T and R into one picture, and splits it again
+    prompt        the paper's prompt, encoded once
+    task          which panels to generate, their size, and the sampling method
+    sampling      generates panels from noise, step by step as the pipelines of diffusers do
+    pipeline      a backbone with its LoRA and prompt: photo in, panels out
+    adapter/      LoRA files that diffusers can load, and their upload to the hub
+    tensors       safetensors files with metadata
+    lazy_imports  imports diffusers, transformers and peft at their first use
 
-No training and no command line here. diffusers, transformers and peft are imported in this room only, through
-`stock`, and only when a model is built: importing the room costs nothing but torch.
+Training and commands are in other packages. Importing this package imports torch, but none of the other libraries.
 """

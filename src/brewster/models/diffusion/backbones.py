@@ -1,9 +1,9 @@
-"""The table of large backbones: load a real one from the hub or a folder, or build a tiny twin without a network.
+"""The table of large backbones: load one from the hub or a folder, or build a tiny version without a network.
 
     backbone = load_backbone("kontext", device="cuda", quantise="int8")
     backbone, prompt = tiny("kontext", seed=0)
 
-The files are read by diffusers itself; what it finds wrong with them is told in our words.
+diffusers reads the files; its exceptions are converted to brewster's errors.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from torch import Tensor, nn
 from brewster.errors import DeviceError, MissingExtra, ModelError
 from brewster.models.diffusion.families.family import Architecture, Backbone
 from brewster.models.diffusion.lazy_imports import (
-    bars_on_terminals_only,
+    diffusers_class,
+    disable_progress_bars_in_pipes,
+    explain_out_of_memory,
     fetch,
-    library,
-    stock_class,
-    within_memory,
+    import_library,
 )
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
 from brewster.models.zoo import LARGE, TINY
@@ -38,14 +38,14 @@ from brewster.options import Quantisation
 BACKBONES: Final[dict[str, type[Backbone]]] = {
     name: pkgutil.resolve_name(adapter) for name, adapter in LARGE.items()
 }
-"""name -> adapter, which holds its hub id, licence, classes, full-size settings and card text. The rows are in `zoo`."""
+"""name -> Backbone class, with hub id, licence, diffusers classes and architecture. `zoo.LARGE` lists the rows."""
 
 _INDEX: Final = "model_index.json"
 _CONFIGS: Final = {"transformer": "config.json", "vae": "config.json", "scheduler": "scheduler_config.json"}
 _PICTURE_PARTS: Final = [_INDEX, *(f"{part}/*" for part in _CONFIGS)]
 _TEXT_PARTS: Final = [_INDEX, "scheduler/*", "text_encoder*/*", "tokenizer*/*", "processor/*"]
-_SPREAD: Final = 0.2
-"""How far a tiny twin's latent statistics stray from 0 and 1: enough to notice when they are forgotten."""
+_STATISTICS_SPREAD: Final = 0.2
+"""The spread of a tiny version's latent statistics around 0 and 1, so that tests detect code that ignores them."""
 
 
 def load_backbone(
@@ -55,63 +55,66 @@ def load_backbone(
     dtype: torch.dtype | None = None,
     quantise: Quantisation | None = None,
 ) -> Backbone:
-    """A backbone by its name in the table, a hub id or a folder in diffusers' layout, without text encoders.
+    """Loads a backbone without its text encoders.
 
-    "tiny:" and a name is that backbone's toy twin.
-
-    `dtype` is bfloat16 on an accelerator and float32 on the CPU. `quantise` stores the transformer's weights in
-    8 bits (torchao) or 4 (bitsandbytes, CUDA only).
+    `source` is a name in the table, a hub id, a folder in diffusers' layout, or "tiny:" and a name for a tiny version.
+    `dtype` is by default bfloat16 on an accelerator and float32 on the CPU. `quantise` stores the transformer's weights
+    in 8 bits (torchao) or 4 bits (bitsandbytes, CUDA only).
 
     Raises:
-        DownloadError: no access to a gated model (says how to ask), wrong token, no network.
-        ModelError: a missing or damaged file, another architecture, an unknown name or quantisation.
-        DeviceError: no such device, or out of memory (says what to lower).
+        DownloadError: no access to a gated model (the message says how to get it), an invalid token, or no network
+            connection.
+        ModelError: a file is missing or damaged, the architecture is another one, or a name or quantisation is unknown.
+        DeviceError: there is no such device, or it is out of memory; the message says what to reduce.
         MissingExtra: diffusers, torchao or bitsandbytes is not installed.
     """
-    _refuse_absent(device)
+    _check_device(device)
     if source.startswith(TINY):
-        return _toy(source, device, quantise)
-    options = _quantised(quantise, device) if quantise else {}
+        return _load_tiny(source, device, quantise)
+    options = _quantisation_options(quantise, device) if quantise else {}
     dtype = dtype or (torch.float32 if device == "cpu" else torch.bfloat16)
-    bars_on_terminals_only()
+    disable_progress_bars_in_pipes()
     folder = _folder(source, _PICTURE_PARTS)
-    family, index = _family(folder)
-    with within_memory(_lower(quantise)):
-        vae = _part(folder, family, "vae", dtype=dtype, **_placed(device))
-        transformer = _part(folder, family, "transformer", dtype=dtype, **_placed(device), **options)
-    scheduler = _part(folder, family, "scheduler")
+    family, index = _family_in(folder)
+    with explain_out_of_memory(_memory_hint(quantise)):
+        vae = _load_part(folder, family, "vae", dtype=dtype, **_device_map(device))
+        transformer = _load_part(folder, family, "transformer", dtype=dtype, **_device_map(device), **options)
+    scheduler = _load_part(folder, family, "scheduler")
     backbone = family(transformer, vae, scheduler, distilled=bool(index.get("is_distilled")))
-    _refuse_misfit(backbone, folder)
+    _check_channels(backbone, folder)
     if quantise:
-        _refuse_unquantised(backbone, quantise)
+        _check_quantised(backbone, quantise)
     return backbone
 
 
 def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> PromptEmbedding:
-    """Loads a backbone's text encoders, encodes the prompt, and forgets them; see `load_backbone` for `source`.
+    """Encodes a prompt with a backbone's text encoders, which are loaded for this call only.
 
-    A toy twin has none: its prompt is random numbers, others for other words.
+    For `source`, see `load_backbone`. A tiny version has no text encoder: its embedding is random, seeded by the text.
+
+    Returns:
+        The embedding on the CPU.
 
     Raises:
         DownloadError, ModelError, DeviceError, MissingExtra: as `load_backbone`.
     """
-    _refuse_absent(device)
+    _check_device(device)
     if source.startswith(TINY):
         seed = 0 if text == PROMPT else zlib.crc32(text.encode())
         return replace(tiny(source.removeprefix(TINY), seed)[1], text=text)
-    for name in family_of(source).words_need:  # before the download, which may take an hour
+    for name in family_of(source).text_encoder_requirements:  # before the download, which may take an hour
         if importlib.util.find_spec(name) is None:
             raise MissingExtra(
                 f"{name} is not installed",
                 f"the text encoder of {source} needs it",
                 f"pip install {name}, of the version that fits your torch",
             )
-    bars_on_terminals_only()
+    disable_progress_bars_in_pipes()
     folder = _folder(source, _TEXT_PARTS)
-    family, _ = _family(folder)
+    family, _ = _family_in(folder)
     dtype = torch.float32 if device == "cpu" else torch.bfloat16
-    kind = stock_class(family.classes["pipeline"])
-    with within_memory('encode the prompt with device="cpu"'), _plainly(folder):
+    kind = diffusers_class(family.classes["pipeline"])
+    with explain_out_of_memory('encode the prompt with device="cpu"'), _translate_load_errors(folder):
         pipeline = kind.from_pretrained(
             folder, transformer=None, vae=None, dtype=dtype, local_files_only=True
         ).to(device)
@@ -120,10 +123,10 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
 
 
 def tiny(name: str, seed: int = 0) -> tuple[Backbone, PromptEmbedding]:
-    """A seeded toy of the same classes, a tenth of a second to build, and a random prompt of its shape.
+    """Builds a tiny version of a backbone, with the same classes and seeded random weights, and a random prompt for it.
 
     Raises:
-        ModelError: a name that is not in the table.
+        ModelError: the name is not in the table.
     """
     family = find_family(name)
     backbone = build(name, family.tiny, seed=seed)
@@ -138,33 +141,33 @@ def build(
     device: str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> Backbone:
-    """A backbone with random weights; full size unless told otherwise, and free of charge on device "meta".
+    """Builds a backbone with seeded random weights, by default in full size. On device "meta" it needs no memory.
 
     Raises:
-        ModelError: a name that is not in the table.
+        ModelError: the name is not in the table.
         DeviceError: out of memory.
     """
     family = find_family(name)
-    architecture = architecture or family.real
-    kinds = {part: stock_class(family.classes[part]) for part in _CONFIGS}
+    architecture = architecture or family.full_size
+    kinds = {part: diffusers_class(family.classes[part]) for part in _CONFIGS}
     with (
         torch.random.fork_rng(devices=[]),
         torch.device(device),
-        _precision(dtype),
-        within_memory(_lower(None)),
+        _default_dtype(dtype),
+        explain_out_of_memory(_memory_hint(None)),
     ):
         torch.manual_seed(seed)
         transformer = kinds["transformer"](**architecture["transformer"])
         vae = kinds["vae"](**architecture["vae"])
-        _stray(vae)
+        _randomise_batch_norms(vae)
     return family(transformer, vae, kinds["scheduler"](**architecture["scheduler"]))
 
 
 def find_family(name: str) -> type[Backbone]:
-    """The adapter of that name.
+    """The Backbone class of this name.
 
     Raises:
-        ModelError: none.
+        ModelError: the name is not in the table; the message suggests the closest one.
     """
     if name in BACKBONES:
         return BACKBONES[name]
@@ -177,20 +180,22 @@ def find_family(name: str) -> type[Backbone]:
 
 
 def family_of(source: str) -> type[Backbone]:
-    """Which adapter `load_backbone` would take for this source; no weights are fetched for it.
+    """The Backbone class that `load_backbone` would use for this source. No weights are downloaded.
 
     Raises:
         DownloadError, ModelError, MissingExtra: as `load_backbone`.
     """
     if source in BACKBONES or source.startswith(TINY):
         return find_family(source.removeprefix(TINY))
-    return _family(fetch(source, [_INDEX]))[0]
+    return _family_in(fetch(source, [_INDEX]))[0]
 
 
-def _toy(source: str, device: str, quantise: str | None) -> Backbone:
+def _load_tiny(source: str, device: str, quantise: str | None) -> Backbone:
     if quantise:
         raise ModelError(
-            f"{source} was asked for as {quantise}", "a toy twin is never quantised", "leave quantise out"
+            f"{source} was requested with quantise={quantise}",
+            "a tiny version without quantisation",
+            "leave quantise out",
         )
     backbone, _ = tiny(source.removeprefix(TINY))
     backbone.transformer.to(device)
@@ -202,43 +207,45 @@ def _folder(source: str, patterns: list[str]) -> Path:
     return fetch(BACKBONES[source].hub_id if source in BACKBONES else source, patterns)
 
 
-def _family(folder: Path) -> tuple[type[Backbone], dict[str, Any]]:
-    index = _read(folder / _INDEX)
+def _family_in(folder: Path) -> tuple[type[Backbone], dict[str, Any]]:
+    index = _read_json(folder / _INDEX)
     kind = index.get("_class_name")
     for family in BACKBONES.values():
         if family.classes["pipeline"] == kind:
             return family, index
     raise ModelError(
-        f"{folder} holds a {kind}",
+        f"{folder} contains a {kind}",
         f"one of {', '.join(family.classes['pipeline'] for family in BACKBONES.values())}",
         f"use {', '.join(family.hub_id for family in BACKBONES.values())} or a finetune of one",
     )
 
 
-def _part(folder: Path, family: type[Backbone], part: str, **options: Any) -> Any:  # noqa: ANN401 - passed on
-    """The transformer, VAE or scheduler of a folder, complete and of the right class."""
-    place, expected = folder / part, family.classes[part]
-    found = _read(place / _CONFIGS[part]).get("_class_name")
+def _load_part(folder: Path, family: type[Backbone], part: str, **options: Any) -> Any:  # noqa: ANN401 - passed on
+    """Loads the transformer, VAE or scheduler of a folder; refuses another class, and missing or unexpected weights."""
+    part_folder, expected = folder / part, family.classes[part]
+    found = _read_json(part_folder / _CONFIGS[part]).get("_class_name")
     if found != expected:
-        raise ModelError(f"{place} holds a {found}", f"a {expected}", f"use a folder of {family.hub_id}")
-    kind = stock_class(expected)
-    if part == "scheduler":
-        return kind.from_pretrained(place)
-    with _plainly(place):
-        model, report = kind.from_pretrained(
-            place, use_safetensors=True, local_files_only=True, output_loading_info=True, **options
-        )
-    astray = [*report["missing_keys"], *report["unexpected_keys"]]
-    if astray:
         raise ModelError(
-            f"{place} has {len(astray)} weights too few or too many, {astray[0]} among them",
+            f"{part_folder} contains a {found}", f"a {expected}", f"use a folder of {family.hub_id}"
+        )
+    kind = diffusers_class(expected)
+    if part == "scheduler":
+        return kind.from_pretrained(part_folder)
+    with _translate_load_errors(part_folder):
+        model, report = kind.from_pretrained(
+            part_folder, use_safetensors=True, local_files_only=True, output_loading_info=True, **options
+        )
+    mismatched = [*report["missing_keys"], *report["unexpected_keys"]]
+    if mismatched:
+        raise ModelError(
+            f"{part_folder} has {len(mismatched)} missing or unexpected weights, for example {mismatched[0]}",
             f"the weights of a {expected}",
             "copy the model again",
         )
     return model
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read_json(path: Path) -> dict[str, Any]:
     try:
         value = json.loads(path.read_text())
     except FileNotFoundError as error:
@@ -246,35 +253,35 @@ def _read(path: Path) -> dict[str, Any]:
             f"{path} is missing", "a model's folder in diffusers' layout", "copy or download it again"
         ) from error
     except ValueError as error:
-        raise ModelError(f"{path} is not JSON: {error}", "a whole file", "copy it again") from error
+        raise ModelError(f"{path} is not JSON: {error}", "a complete JSON file", "copy it again") from error
     if not isinstance(value, dict):
-        raise ModelError(f"{path} holds no settings", "a JSON object", "copy it again")
+        raise ModelError(f"{path} contains no settings", "a JSON object", "copy it again")
     return value
 
 
 @contextlib.contextmanager
-def _plainly(place: Path) -> Iterator[None]:
-    """Tells what diffusers finds wrong with the files of a folder; memory is told elsewhere."""
-    damaged = library("safetensors").SafetensorError
+def _translate_load_errors(folder: Path) -> Iterator[None]:
+    """Converts the exceptions of diffusers for a folder's files; see `explain_out_of_memory` for those about memory."""
+    damaged = import_library("safetensors").SafetensorError
     try:
         yield
     except ImportError as error:
         raise MissingExtra(
-            f"{place} needs a library that is not installed ({' '.join(str(error).split())[:200]})",
-            "every library that its classes use",
-            "install it beside brewster[large]",
+            f"{folder} needs a library that is not installed ({' '.join(str(error).split())[:200]})",
+            "all libraries that its classes use",
+            "install this library in addition to brewster[large]",
         ) from error
     except (OSError, KeyError, ValueError, TypeError, damaged) as error:
         reason = " ".join(str(error).split())[:200]
         raise ModelError(
-            f"{place} cannot be loaded: {reason}",
-            "whole weights that fit their config.json",
+            f"{folder} cannot be loaded: {reason}",
+            "complete weights that match config.json",
             "copy or download the model again",
         ) from error
 
 
-def _quantised(quantise: str, device: str) -> dict[str, Any]:
-    """diffusers' option for a quantisation, checked before anything is downloaded."""
+def _quantisation_options(quantise: str, device: str) -> dict[str, Any]:
+    """The keyword argument of from_pretrained for a quantisation; checked before any download."""
     if quantise not in get_args(Quantisation):
         raise ModelError(
             f"there is no quantisation {quantise!r}",
@@ -284,29 +291,27 @@ def _quantised(quantise: str, device: str) -> dict[str, Any]:
     if quantise == "nf4":
         if not device.startswith("cuda"):
             raise DeviceError(f"nf4 does not run on {device}", "an NVIDIA GPU", 'use quantise="int8"')
-        library("bitsandbytes")
-        config = stock_class("BitsAndBytesConfig")(
+        import_library("bitsandbytes")
+        config = diffusers_class("BitsAndBytesConfig")(
             load_in_4bit=True, bnb_4bit_quant_type="nf4", bnb_4bit_compute_dtype=torch.bfloat16
         )
         return {"quantization_config": config}
-    torchao = library("torchao.quantization")
+    torchao = import_library("torchao.quantization")
     kinds = {"int8": torchao.Int8WeightOnlyConfig, "float8": torchao.Float8WeightOnlyConfig}
-    return {"quantization_config": stock_class("TorchAoConfig")(kinds[quantise]())}
+    return {"quantization_config": diffusers_class("TorchAoConfig")(kinds[quantise]())}
 
 
-def _placed(device: str) -> dict[str, Any]:
-    """Weights go straight to an accelerator, so that the model never stands in the host's memory as a whole."""
+def _device_map(device: str) -> dict[str, Any]:
+    """The keyword argument that loads weights directly to an accelerator, without a full copy in host memory."""
     return {} if device == "cpu" else {"device_map": {"": device}}
 
 
-def _lower(quantise: str | None) -> str:
-    lower = {None: 'use quantise="int8"', "int8": 'use quantise="nf4"', "float8": 'use quantise="nf4"'}
-    return (
-        f"{lower.get(quantise, 'close what else uses the card')}, a smaller backbone (klein) or a larger card"
-    )
+def _memory_hint(quantise: str | None) -> str:
+    hints = {None: 'use quantise="int8"', "int8": 'use quantise="nf4"', "float8": 'use quantise="nf4"'}
+    return f"{hints.get(quantise, 'close other programs that use the GPU')}, a smaller backbone (klein) or a GPU with more memory"
 
 
-def _refuse_absent(device: str) -> None:
+def _check_device(device: str) -> None:
     kind = torch.device(device).type
     if kind == "cuda" and not torch.cuda.is_available():
         raise DeviceError(
@@ -316,29 +321,29 @@ def _refuse_absent(device: str) -> None:
         raise DeviceError("there is no MPS device", "an Apple GPU", "use device cpu")
 
 
-def _refuse_misfit(backbone: Backbone, folder: Path) -> None:
+def _check_channels(backbone: Backbone, folder: Path) -> None:
     packed = backbone.statistics()[0].shape[1]
     if packed not in {1, backbone.channels}:
         raise ModelError(
-            f"the VAE in {folder} gives {packed} numbers a token",
-            f"the {backbone.channels} that its transformer takes",
-            "copy both from one model",
+            f"the VAE in {folder} gives {packed} values per token",
+            f"{backbone.channels}, the input channels of its transformer",
+            "copy both from the same model",
         )
 
 
-def _refuse_unquantised(backbone: Backbone, quantise: str) -> None:
-    """diffusers leaves a part that it places on the CPU as it is, in silence: the card would be full in no time."""
+def _check_quantised(backbone: Backbone, quantise: str) -> None:
+    """Refuses weights that diffusers silently left unquantised, as it does for parts on the CPU."""
     weight = backbone.transformer.get_submodule(backbone.lora_targets()[0]).weight
     if type(weight) in {Tensor, nn.Parameter}:
         raise ModelError(
             f"the weights were loaded as {weight.dtype}",
-            f"stored as {quantise}",
+            f"weights stored as {quantise}",
             "update diffusers and torchao (constraints.txt names versions that work)",
         )
 
 
 @contextlib.contextmanager
-def _precision(dtype: torch.dtype) -> Iterator[None]:
+def _default_dtype(dtype: torch.dtype) -> Iterator[None]:
     before = torch.get_default_dtype()
     torch.set_default_dtype(dtype)
     try:
@@ -347,10 +352,10 @@ def _precision(dtype: torch.dtype) -> Iterator[None]:
         torch.set_default_dtype(before)
 
 
-def _stray(vae: nn.Module) -> None:
-    """Random running statistics for batch norms, which otherwise start at exactly 0 and 1."""
+def _randomise_batch_norms(vae: nn.Module) -> None:
+    """Sets random running statistics, which otherwise are exactly 0 and 1; see _STATISTICS_SPREAD."""
     for module in vae.modules():
         if isinstance(module, nn.BatchNorm2d) and module.running_mean is not None:
             assert module.running_var is not None
-            module.running_mean.normal_(0, _SPREAD)
-            module.running_var.uniform_(1 - _SPREAD, 1 + _SPREAD)
+            module.running_mean.normal_(0, _STATISTICS_SPREAD)
+            module.running_var.uniform_(1 - _STATISTICS_SPREAD, 1 + _STATISTICS_SPREAD)

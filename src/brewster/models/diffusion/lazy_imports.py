@@ -1,4 +1,4 @@
-"""The door to diffusers, transformers, peft and the hub: opened late, and their errors told plainly."""
+"""Imports diffusers, transformers, peft and huggingface_hub at their first use, and translates their errors."""
 
 from __future__ import annotations
 
@@ -18,37 +18,37 @@ from brewster.errors import DeviceError, DownloadError, MissingExtra, ModelError
 _CPU_MEMORY_ERROR = re.compile(r"out of memory|not enough memory|can't allocate memory", re.IGNORECASE)
 
 
-def library(name: str) -> Any:  # noqa: ANN401 - a module of a library that may be missing
-    """A module of an outside library, imported at its first use.
+def import_library(name: str) -> Any:  # noqa: ANN401 - a module of a library that may be missing
+    """Imports a module of a third-party library and returns it.
 
     Raises:
-        MissingExtra: it is not installed.
+        MissingExtra: the library is not installed.
     """
     try:
-        with quiet():
+        with suppress_warnings():
             return importlib.import_module(name)
     except ImportError as error:
         raise MissingExtra(
             f"{error.name or name} cannot be imported ({error})",
-            "the large models need it",
+            "a library that the large models need",
             "pip install 'brewster[large]'",
         ) from error
 
 
-def stock_class(name: str) -> Any:  # noqa: ANN401 - diffusers has no types that mypy reads
-    """A class of diffusers, which imports its parts one by one when they are asked for.
+def diffusers_class(name: str) -> Any:  # noqa: ANN401 - diffusers has no types that mypy reads
+    """A class of diffusers by its name; diffusers imports the module of the class at this first access.
 
     Raises:
-        MissingExtra: diffusers, or what this class needs, is not installed.
+        MissingExtra: diffusers, or a library that this class needs, is not installed.
     """
-    diffusers = library("diffusers")
-    with quiet():
+    diffusers = import_library("diffusers")
+    with suppress_warnings():
         return getattr(diffusers, name)
 
 
 @contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """The stock libraries greet every import with notes about what else could be installed; errors still show."""
+def suppress_warnings() -> Iterator[None]:
+    """Suppresses log messages up to WARNING: diffusers and transformers log notes about optional packages on import."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
@@ -57,84 +57,86 @@ def quiet() -> Iterator[None]:
         logging.disable(before)
 
 
-def bars_on_terminals_only() -> None:
-    """The stock libraries draw progress bars into any pipe; ours stay on terminals."""
+def disable_progress_bars_in_pipes() -> None:
+    """Disables the progress bars of third-party libraries, which also write to pipes, unless stderr is a terminal."""
     if sys.stderr.isatty():
         return
-    library("huggingface_hub.utils").disable_progress_bars()
-    library("diffusers.utils.logging").disable_progress_bar()
-    library("transformers.utils.logging").disable_progress_bar()
+    import_library("huggingface_hub.utils").disable_progress_bars()
+    import_library("diffusers.utils.logging").disable_progress_bar()
+    import_library("transformers.utils.logging").disable_progress_bar()
 
 
 def fetch(source: str, patterns: list[str]) -> Path:
-    """A model's folder: `source` itself where it is one, else the hub's files that match, from the cache or net.
+    """The local folder of a model.
 
-    The token is the one of `hf auth login` or HF_TOKEN.
+    If `source` is a folder, it is returned as it is. Otherwise `source` is a hub id, and the files that match the
+    patterns are taken from the cache or downloaded. The token is that of `hf auth login` or HF_TOKEN.
 
     Raises:
-        DownloadError: no access (says how to ask for it), no such model, no network.
-        ModelError: neither a folder nor a hub id.
+        DownloadError: the account has no access (the message says how to get it), the hub has no such model, or there
+            is no network connection.
+        ModelError: `source` is neither a folder nor a hub id.
         MissingExtra: huggingface_hub is not installed.
     """
     if Path(source).is_dir():
         return Path(source)
-    hub, errors = library("huggingface_hub"), library("huggingface_hub.errors")
+    hub, errors = import_library("huggingface_hub"), import_library("huggingface_hub.errors")
     page = f"https://huggingface.co/{source}"
     try:
         return Path(hub.snapshot_download(source, allow_patterns=patterns))
     except errors.GatedRepoError as error:
-        raise _no_access(error, source, page) from error
+        raise _gated_error(error, source, page) from error
     except errors.RepositoryNotFoundError as error:
         raise DownloadError(
-            f"the hub shows no model {source}",
+            f"the hub has no model {source}, or your token has no access to it",
             "a public model, or a private one that your token may read",
             f"check {page}, then `hf auth login` or set HF_TOKEN",
         ) from error
     except errors.HfHubHTTPError as error:
-        raise _refused(error, source) from error
+        raise _http_error(error, source) from error
     except errors.HFValidationError as error:
         raise ModelError(
-            f"there is no folder {source}, and it is no hub id",
+            f"there is no folder {source}, and it is not a hub id",
             "a model's folder or OWNER/NAME",
             "check the path",
         ) from error
     except (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled) as error:
-        # Where nothing is in the cache, the client hides the hub's answer behind the missing file.
+        # If the cache is empty, huggingface_hub reports a missing file and chains the HTTP error as its cause.
         if isinstance(error.__cause__, errors.HfHubHTTPError):
-            raise _refused(error.__cause__, source) from error
+            raise _http_error(error.__cause__, source) from error
         raise DownloadError(
             f"{source} is not in the cache and the hub cannot be reached",
-            "a network, or a folder with the model's files",
+            "a network connection, or a folder with the model's files",
             f"connect, or copy the model from {page} and give the folder",
         ) from error
     except OSError as error:
         raise DownloadError(
             f"{source} could not be downloaded: {error}",
-            "room in the cache (HF_HOME)",
-            "make room and try again",
+            "enough disk space in the cache folder (HF_HOME)",
+            "free disk space and try again",
         ) from error
 
 
 def has_token() -> bool:
-    """Whether the hub's client finds a token, wherever it looks for one.
+    """Whether huggingface_hub finds a token in any of the places where it searches.
 
     Raises:
         MissingExtra: huggingface_hub is not installed.
     """
-    return library("huggingface_hub").get_token() is not None
+    return import_library("huggingface_hub").get_token() is not None
 
 
-def _no_access(error: Exception, source: str, page: str) -> DownloadError:
-    """A gated model: 401 without a token, 403 with a token whose owner has not been let in."""
-    known = _status(error) == 403
+def _gated_error(error: Exception, source: str, page: str) -> DownloadError:
+    """The error for a gated model. The hub returns 401 without a token, and 403 if the account has no access."""
+    is_authenticated = _status(error) == 403
     return DownloadError(
-        f"{source} is gated and {'your account has no access' if known else 'no valid token was sent'}",
+        f"{source} is gated and {'your account has no access' if is_authenticated else 'no valid token was sent'}",
         f"its licence accepted at {page} by the owner of the token",
         "open that page, agree to the licence, then `hf auth login` or set HF_TOKEN to a token with read access",
     )
 
 
-def _refused(error: Exception, source: str) -> DownloadError:
+def _http_error(error: Exception, source: str) -> DownloadError:
     status = _status(error)
     if status in {401, 403}:
         return DownloadError(
@@ -143,7 +145,7 @@ def _refused(error: Exception, source: str) -> DownloadError:
             "make one at https://huggingface.co/settings/tokens, then `hf auth login` or set HF_TOKEN",
         )
     return DownloadError(
-        f"the hub answered HTTP {status} for {source}", "the model's files", "try again later"
+        f"the hub returned HTTP {status} for {source}", "the model's files", "try again later"
     )
 
 
@@ -152,8 +154,8 @@ def _status(error: Exception) -> int | None:
 
 
 @contextlib.contextmanager
-def within_memory(cure: str) -> Iterator[None]:
-    """Tells an out-of-memory plainly, on any device; `cure` says what to lower.
+def explain_out_of_memory(hint: str) -> Iterator[None]:
+    """Converts out-of-memory errors of any device to a DeviceError; `hint` says what to reduce.
 
     Raises:
         DeviceError: out of memory.
@@ -164,6 +166,6 @@ def within_memory(cure: str) -> Iterator[None]:
         if isinstance(error, MemoryError | torch.OutOfMemoryError) or _CPU_MEMORY_ERROR.search(str(error)):
             first = str(error).splitlines()[0] if str(error) else "out of memory"
             raise DeviceError(
-                f"the device ran out of memory ({first})", "room for the model", cure
+                f"the device ran out of memory ({first})", "enough memory for the model", hint
             ) from error
         raise

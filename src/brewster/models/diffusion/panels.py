@@ -1,8 +1,8 @@
-"""Several pictures in one: how panels are laid out, what the model is shown, and how photos of any shape fit.
+"""Panels: I, T and R composed into one picture, the conditioning image, and the fit of photos into panels.
 
-Pictures are sRGB-encoded tensors (N, 3, H, W) in [-1, 1], as the VAEs want them. The paper contradicts itself:
-"Text-to-image Model Fine-tuning" generates [I:T:R] from a condition with white space, "Experimental Setup"
-concatenates T and R and takes I as the control image. So the list of panels is a value.
+Pictures are sRGB-encoded tensors (N, 3, H, W) in [-1, 1], the input range of the VAEs. The paper describes two
+layouts: "Text-to-image Model Fine-tuning" generates [I:T:R] from a condition with white space, and "Experimental
+Setup" concatenates T and R with I as the control image. So the list of panels is a setting.
 """
 
 from __future__ import annotations
@@ -25,15 +25,16 @@ Panel = Literal["I", "T", "R"]
 Direction = Literal["side by side", "stacked"]
 
 WHITE: Final = 1.0
-"""White space in the conditioning picture, before the VAE sees it."""
+"""The value of white space in the conditioning image, before VAE encoding."""
 
 
 @final
 @dataclass(frozen=True)
 class PanelLayout:
-    """Which panels stand in the composite, in which order and direction.
+    """The panels of the composite, in their order, and the direction in which they follow each other.
 
-    Raises RecipeError for no panel, an unknown or repeated one, or an unknown direction.
+    Raises:
+        RecipeError: there is no panel, a panel is unknown or repeated, or the direction is unknown.
     """
 
     panels: tuple[Panel, ...] = ("I", "T", "R")
@@ -60,55 +61,56 @@ class PanelLayout:
         return -1 if self.direction == "side by side" else -2
 
     def composite_size(self, panel: tuple[int, int]) -> tuple[int, int]:
-        """(width, height) of the composite whose panels have this (width, height)."""
+        """The (width, height) of a composite of panels with this (width, height)."""
         width, height = panel
         count = len(self.panels)
         return (width * count, height) if self.axis == -1 else (width, height * count)
 
 
 def compose(panels: Mapping[str, Tensor], layout: PanelLayout) -> Float[Tensor, "n 3 h w"]:
-    """The panels in one picture; what the layout does not name is left out.
+    """Concatenates the panels of the layout into one picture; other panels are ignored.
 
     Raises:
-        PhotoError: a panel is missing, or they differ in shape.
+        PhotoError: a panel is missing, or the panels differ in shape.
     """
     missing = [name for name in layout.panels if name not in panels]
     if missing:
         raise PhotoError(
             f"there is no panel {', '.join(missing)} among {', '.join(panels) or 'none'}",
-            f"the layout shows {', '.join(layout.panels)}",
-            "give them all or change the layout",
+            f"all panels of the layout: {', '.join(layout.panels)}",
+            "pass the missing panels or change the layout",
         )
     shapes = {name: tuple(panels[name].shape) for name in layout.panels}
     if len(set(shapes.values())) > 1:
-        raise PhotoError(
-            f"the panels have the shapes {shapes}", "they must be alike", "bring them to one size first"
-        )
+        raise PhotoError(f"the panels have the shapes {shapes}", "equal shapes", "resize them first")
     return torch.cat([panels[name] for name in layout.panels], dim=layout.axis)
 
 
 def split(composite: Float[Tensor, "n c h w"], layout: PanelLayout) -> dict[str, Tensor]:
-    """The panels of a composite by name: exactly what `compose` put in, to the bit. Works on latents, too.
+    """The panels of a composite by name: the exact inverse of `compose`. Also for latents.
 
     Raises:
-        PhotoError: the composite does not divide into that many panels.
+        PhotoError: the size of the composite is not divisible by the number of panels.
     """
     length, count = composite.shape[layout.axis], len(layout.panels)
     if length % count:
         raise PhotoError(
-            f"a composite of {length} pixels does not divide by {count}",
+            f"a composite of {length} pixels is not divisible by {count}",
             f"{count} equal panels {layout.direction}",
-            "give the picture that compose made",
+            "pass a composite that compose made",
         )
     return dict(zip(layout.panels, composite.chunk(count, dim=layout.axis), strict=True))
 
 
-def condition(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> Tensor:
-    """The picture that the model is shown: I, and white space where the others are to come.
+def conditioning_image(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> Tensor:
+    """The conditioning image: the photo in panel I, and white space in the other panels.
 
     White space turns the task into inpainting, "which is not necessary, but it turns out easier to converge"
-    (Text-to-image Model Fine-tuning). Where I is not generated there is nothing to align it with, and the
-    photo is shown alone, as the control image (Experimental Setup): a third of the conditioning tokens.
+    (Text-to-image Model Fine-tuning). If I is not among the generated panels, the photo alone is the conditioning
+    image (Experimental Setup: "control image"), which has a third of the tokens.
+
+    Returns:
+        (N, 3, H, W) of the composite's size with panel I, otherwise the photo itself.
     """
     if "I" not in layout.panels:
         return photo
@@ -119,34 +121,34 @@ def condition(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> Tensor:
 @final
 @dataclass(frozen=True)
 class PanelFit:
-    """How a photo stands in a panel: shrunk to `content`, padded to `panel`; all are (width, height) in pixels.
+    """How a photo is fitted into a panel: reduced to `content`, then padded to `panel`; (width, height) in pixels.
 
-    The content keeps the photo's aspect ratio to the nearest pixel. The rest, at most half a multiple on the
-    right or below, is the content's own reflection, and is cut away afterwards.
+    The content keeps the photo's aspect ratio to the nearest pixel. The padding, at most half a `multiple` on the
+    right or at the bottom, is a mirrored copy of the content ("reflect" mode), and is cropped afterwards.
     """
 
     content: tuple[int, int]
     panel: tuple[int, int]
 
     def pad(self, content: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c H W"]:
-        """A picture of the content's size, padded to the panel's by reflection.
+        """Pads a picture of the content's size to the panel's size with a mirrored copy of its border.
 
         Raises:
             PhotoError: the picture has another size.
         """
-        _refuse_other_size(content, self.content)
+        _check_size(content, self.content)
         right, below = (panel - used for panel, used in zip(self.panel, self.content, strict=True))
         if not right and not below:
             return content
         return functional.pad(content, (0, right, 0, below), mode="reflect")
 
-    def cut(self, panel: Float[Tensor, "n c H W"]) -> Float[Tensor, "n c h w"]:
-        """The content of a panel: exactly undoes `pad`.
+    def crop(self, panel: Float[Tensor, "n c H W"]) -> Float[Tensor, "n c h w"]:
+        """Crops a panel to its content: the exact inverse of `pad`.
 
         Raises:
             PhotoError: the panel has another size.
         """
-        _refuse_other_size(panel, self.panel)
+        _check_size(panel, self.panel)
         width, height = self.content
         return panel[..., :height, :width]
 
@@ -154,33 +156,36 @@ class PanelFit:
 def fit_panel(size: tuple[int, int], layout: PanelLayout, *, budget_px: int, multiple: int) -> PanelFit:
     """The largest panel for a photo of this (width, height) whose composite has at most `budget_px` pixels.
 
-    Both sides are multiples of `multiple`: the short one is tried from above, and the long one is the nearest
-    that keeps the photo's aspect ratio, so the two disagree by half a multiple at most and nothing is stretched.
+    Both sides are multiples of `multiple`. The short side is searched from large to small; the long side is the
+    multiple that is nearest to the photo's aspect ratio. It differs from that ratio by at most half a multiple, which
+    becomes padding, so the photo is not stretched.
 
     Raises:
-        PhotoError: the photo is smaller than its panel and would have to be enlarged, or so long and thin that
-            no panel fits the budget.
+        PhotoError: the photo is smaller than its panel and would have to be enlarged, or its aspect ratio is so
+            extreme that no panel fits the budget.
     """
     short, long = min(size), max(size)
     if short < 1:
-        raise PhotoError(f"the photo has {size[0]} x {size[1]} pixels", "at least one", "check the file")
+        raise PhotoError(
+            f"the photo has {size[0]} x {size[1]} pixels", "at least one pixel a side", "check the file"
+        )
     area = budget_px // len(layout.panels)
-    highest = math.isqrt(area * short // long + 1) + multiple
-    for side in range(highest // multiple * multiple, 0, -multiple):
-        other = max(multiple, round(side * long / short / multiple) * multiple)
-        if side * other <= area:
-            fit = _fit(size, (side, other) if size[0] <= size[1] else (other, side))
+    upper_bound = math.isqrt(area * short // long + 1) + multiple
+    for short_side in range(upper_bound // multiple * multiple, 0, -multiple):
+        long_side = max(multiple, round(short_side * long / short / multiple) * multiple)
+        if short_side * long_side <= area:
+            fit = _fit(size, (short_side, long_side) if size[0] <= size[1] else (long_side, short_side))
             _refuse_enlarging(size, fit, layout, multiple)
             return fit
     raise PhotoError(
-        f"no panel with the shape of {size[0]} x {size[1]} pixels fits into {area} pixels",
+        f"no panel with the aspect ratio of {size[0]} x {size[1]} pixels fits into {area} pixels",
         f"a side of at least {multiple} pixels",
         "crop the photo or raise budget_px",
     )
 
 
 def _fit(size: tuple[int, int], panel: tuple[int, int]) -> PanelFit:
-    """The photo, shrunk as little as lets it stand inside the panel."""
+    """The fit with the largest content that is inside the panel."""
     scale = min(panel[0] / size[0], panel[1] / size[1])
     width, height = (min(side, round(scale * own)) for own, side in zip(size, panel, strict=True))
     return PanelFit((width, height), panel)
@@ -193,11 +198,11 @@ def _refuse_enlarging(size: tuple[int, int], fit: PanelFit, layout: PanelLayout,
     raise PhotoError(
         f"the photo has {size[0]} x {size[1]} pixels",
         f"at least the panel's {fit.content[0]} x {fit.content[1]}",
-        f"lower budget_px to {small}" if small else f"use a photo of at least {multiple} pixels a side",
+        f"lower budget_px to {small}" if small else f"use a photo with sides of at least {multiple} pixels",
     )
 
 
-def _refuse_other_size(picture: Tensor, size: tuple[int, int]) -> None:
+def _check_size(picture: Tensor, size: tuple[int, int]) -> None:
     height, width = picture.shape[-2:]
     if (width, height) != size:
         raise PhotoError(

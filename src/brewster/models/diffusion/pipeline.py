@@ -1,9 +1,9 @@
-"""A photo in a panel, the other panels out: a backbone with what it has learnt, ready for use.
+"""Inference with a backbone, its LoRA and its prompt: a photo in, the panels out.
 
-    decomposer = open_decomposer("out/kontext/lora", device="cuda")
-    panels = decomposer(photo, steps=20, seeds=[0, 1])     # {"I": ..., "T": ..., "R": ...}
+    pipeline = load_pipeline("out/kontext/lora", device="cuda")
+    panels = pipeline(photo, steps=20, seeds=[0, 1])     # {"I": ..., "T": ..., "R": ...}
 
-A backbone without a LoRA is asked for T alone, from the photo as its control image: what the paper compares with
+A backbone without a LoRA generates panel T only, with the photo as its control image. This is the baseline of the paper
 ("Comparing to original Flux model").
 """
 
@@ -22,8 +22,8 @@ from brewster.errors import DeviceError, ModelError
 from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraCard, load_lora, read_card
 from brewster.models.diffusion.backbones import BACKBONES, encode_prompt, family_of, load_backbone
 from brewster.models.diffusion.families.family import Backbone
-from brewster.models.diffusion.lazy_imports import fetch, within_memory
-from brewster.models.diffusion.panels import PanelLayout, compose, condition, split
+from brewster.models.diffusion.lazy_imports import explain_out_of_memory, fetch
+from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_image, split
 from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding
 from brewster.models.diffusion.sampling import STEPS, euler, sample
 from brewster.models.diffusion.task import DecompositionTask
@@ -33,16 +33,16 @@ from brewster.options import Quantisation
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-_LOWER: Final = "use a quantised or a smaller backbone"
-_END: Final = 1 << 20
-"""So many bytes of each end of a file are read to tell it from others."""
+_MEMORY_HINT: Final = "use a quantised or a smaller backbone"
+_FINGERPRINT_BYTES: Final = 1 << 20
+"""The number of bytes at each end of a file that count for a fingerprint."""
 _DEVICES: Final = {"auto": "", "cuda": "cuda", "rocm": "cuda", "cpu": "cpu"}
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class DecompositionPipeline:
-    """A backbone, its prompt, and the task that it learnt."""
+    """A backbone, its prompt, and the task for which it was trained."""
 
     backbone: Backbone
     prompt: PromptEmbedding
@@ -58,22 +58,25 @@ class DecompositionPipeline:
         seeds: Sequence[int] = (0,),
         on_progress: Callable[[int, int], None] | None = None,
     ) -> Mapping[str, Float[Tensor, "seeds 3 h w"]]:
-        """The panels by name, [-1, 1], float32, on the CPU, one of each for every seed.
+        """Generates the panels for a photo in [-1, 1].
 
-        Where one step is the task, `steps` and `seeds` change nothing: there is one answer. `on_progress(done, all)` is
-        called after each step.
+        With the objective "one_step", `steps` and `seeds` have no effect, and there is one prediction.
+        `on_progress(done, total)` is called after each step.
+
+        Returns:
+            The panels by name, (seeds, 3, H, W) in [-1, 1], float32, on the CPU.
 
         Raises:
-            ModelError: sides that are not multiples of 16, no step or no seed.
-            DeviceError: out of memory (says what to lower).
+            ModelError: a side is not a multiple of 16, or there is no step or no seed.
+            DeviceError: out of memory; the message says what to reduce.
         """
         layout = self.task.layout
         if self.task.objective == "one_step":
-            return split(self._at_once(photo, on_progress), layout)
+            return split(self._one_step(photo, on_progress), layout)
         height, width = photo.shape[-2:]
         pictures = sample(
             self.backbone,
-            condition(photo, layout),
+            conditioning_image(photo, layout),
             self.prompt,
             size=layout.composite_size((width, height)),
             steps=steps,
@@ -84,13 +87,13 @@ class DecompositionPipeline:
         return split(pictures, layout)
 
     @torch.no_grad()
-    def _at_once(self, photo: Tensor, on_progress: Callable[[int, int], None] | None) -> Tensor:
+    def _one_step(self, photo: Tensor, on_progress: Callable[[int, int], None] | None) -> Tensor:
         backbone, layout = self.backbone, self.task.layout
-        with within_memory(_LOWER):
+        with explain_out_of_memory(_MEMORY_HINT):
             latents = euler(
                 backbone,
-                start(photo, backbone, layout),
-                backbone.encode(condition(photo, layout)),
+                one_step_latents(photo, backbone, layout),
+                backbone.encode(conditioning_image(photo, layout)),
                 self.prompt,
                 steps=1,
                 guidance=self.task.guidance,
@@ -101,14 +104,14 @@ class DecompositionPipeline:
         return picture
 
 
-def start(
+def one_step_latents(
     photo: Float[Tensor, "1 3 h w"], backbone: Backbone, layout: PanelLayout
 ) -> Float[Tensor, "1 c p q"]:
-    """Where the one step starts, encoded: the photo in every panel."""
+    """The latents from which the one step starts: the photo in every panel, encoded."""
     return backbone.encode(compose(dict.fromkeys(layout.panels, photo), layout))
 
 
-def open_decomposer(
+def load_pipeline(
     model: str,
     *,
     device: str = "auto",
@@ -116,38 +119,38 @@ def open_decomposer(
     quantise: Quantisation | None = None,
     prompt: str = "detailed",
 ) -> DecompositionPipeline:
-    """A LoRA by its folder or hub id, on its base; or a backbone as it is, by name, folder or hub id.
+    """Loads a LoRA with its base, or a backbone without a LoRA.
 
     Args:
-        model: what to open.
-        device: "auto" takes an NVIDIA or AMD card where torch sees one.
-        base: the LoRA's base, if it does not lie where it was trained; none for a backbone.
-        quantise: how the base is stored; by default as it was for the LoRA's training, on a card.
-        prompt: what a backbone without a LoRA is told: a name in `PROMPTS`, or words.
+        model: a LoRA by its folder or hub id, or a backbone by its name, folder or hub id.
+        device: "auto" uses an NVIDIA or AMD GPU if torch finds one, otherwise the CPU.
+        base: the LoRA's base, if it is not where it was during training; not allowed for a backbone.
+        quantise: the quantisation of the base; by default that of the LoRA's training, and none on the CPU.
+        prompt: for a backbone without a LoRA: a name in `PROMPTS`, or the text itself.
 
     Raises:
-        DownloadError: no access to a gated model, a wrong token, no network.
-        ModelError: a missing or damaged file, a LoRA of another backbone, an unknown name.
-        DeviceError: no such device, or out of memory (says what to lower).
+        DownloadError: no access to a gated model, an invalid token, or no network connection.
+        ModelError: a file is missing or damaged, the LoRA belongs to another backbone, or the name is unknown.
+        DeviceError: there is no such device, or it is out of memory; the message says what to reduce.
         MissingExtra: diffusers, torchao or bitsandbytes is not installed.
     """
-    place = torch_device(device)
+    torch_name = torch_device(device)
     folder = _lora_folder(model)
     if folder:
-        return _with_lora(model, folder, place, base, quantise)
+        return _load_with_lora(model, folder, torch_name, base, quantise)
     if base:
         raise ModelError(
-            f"{model} is a base itself, and {base} was named as its base",
-            f"a LoRA, a folder with {LORA_FILE}",
+            f"{model} is a backbone, and the base {base} was given for it",
+            f"a base only for a LoRA, which is a folder with {LORA_FILE}",
             "leave the base out",
         )
-    words = encode_prompt(
-        model, PROMPTS.get(prompt, prompt), device=place
-    )  # first: there is room for one of the two
-    backbone = load_backbone(model, device=place, quantise=quantise)
-    named = fingerprint(model, device=device, quantise=quantise, prompt=prompt)
+    embedding = encode_prompt(
+        model, PROMPTS.get(prompt, prompt), device=torch_name
+    )  # before the backbone: memory may hold only one of the two at a time
+    backbone = load_backbone(model, device=torch_name, quantise=quantise)
+    digest = fingerprint(model, device=device, quantise=quantise, prompt=prompt)
     return DecompositionPipeline(
-        backbone, words, DecompositionTask(PanelLayout(("T",))), model_name(model), named
+        backbone, embedding, DecompositionTask(PanelLayout(("T",))), model_name(model), digest
     )
 
 
@@ -159,49 +162,50 @@ def fingerprint(
     quantise: Quantisation | None = None,
     prompt: str = "detailed",
 ) -> str:
-    """SHA-256 of what `open_decomposer` would open: LoRA, prompt, base, and how the base is stored.
+    """SHA-256 that identifies what `load_pipeline` would load: LoRA, prompt, base, and the base's quantisation.
 
-    A base on the hub counts by its name; one in a folder by the names, sizes and ends of its files, since reading
-    all of them takes a minute.
+    A base on the hub is identified by its name. A base in a folder is identified by the names, sizes, and first and
+    last MiB of its files, because reading them completely takes a minute.
 
     Raises:
-        ModelError, DownloadError, DeviceError: there is no such LoRA or device, or the LoRA is damaged.
+        ModelError, DownloadError: the LoRA does not exist or is damaged.
+        DeviceError: large models do not run on this device.
     """
     folder = _lora_folder(model)
     if folder is None:
-        parts = [_identity(model), str(quantise), PROMPTS.get(prompt, prompt)]
+        parts = [_source_id(model), str(quantise), PROMPTS.get(prompt, prompt)]
     else:
         card = read_card(folder)
         weights = hashlib.sha256((folder / LORA_FILE).read_bytes()).hexdigest()
-        stored = _stored(card, torch_device(device), quantise)
-        parts = [weights, card.prompt_sha256, _identity(base or card.base), str(stored)]
+        stored_as = _base_quantisation(card, torch_device(device), quantise)
+        parts = [weights, card.prompt_sha256, _source_id(base or card.base), str(stored_as)]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
-def _identity(source: str) -> str:
-    """A folder by its files, anything else by its name."""
+def _source_id(source: str) -> str:
+    """A digest of the files for a folder; the name itself for anything else."""
     folder, digest = Path(source), hashlib.sha256()
     if source in BACKBONES or not folder.is_dir():
         return source
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         digest.update(f"{path.relative_to(folder)} {path.stat().st_size}\0".encode())
         with path.open("rb") as file:
-            digest.update(file.read(_END))
-            file.seek(max(0, path.stat().st_size - _END))
+            digest.update(file.read(_FINGERPRINT_BYTES))
+            file.seek(max(0, path.stat().st_size - _FINGERPRINT_BYTES))
             digest.update(file.read())
     return digest.hexdigest()
 
 
-def _stored(card: LoraCard, device: str, quantise: Quantisation | None) -> Quantisation | None:
-    """As it is asked for, or as the LoRA has learnt on it; on the CPU nothing is gained by it."""
+def _base_quantisation(card: LoraCard, device: str, quantise: Quantisation | None) -> Quantisation | None:
+    """The requested quantisation; by default that of the LoRA's training, and none on the CPU, where it saves nothing."""
     return quantise or (card.quantise if device != "cpu" else None)
 
 
 def torch_device(device: str) -> str:
-    """The name that torch has for one of the devices that a user can ask for.
+    """torch's name for a device of the command line: "cuda" or "cpu".
 
     Raises:
-        DeviceError: large models do not run there.
+        DeviceError: large models do not run on this device.
     """
     if device not in _DEVICES:
         raise DeviceError(
@@ -211,7 +215,7 @@ def torch_device(device: str) -> str:
 
 
 def _lora_folder(model: str) -> Path | None:
-    """Where the LoRA lies, fetched if it is on the hub; None for a backbone."""
+    """The folder of a LoRA, downloaded if it is on the hub; None for a backbone."""
     if model in BACKBONES or model.startswith(TINY) or (Path(model) / "model_index.json").is_file():
         return None
     folder = fetch(model, [LORA_FILE, PROMPT_FILE])
@@ -219,34 +223,34 @@ def _lora_folder(model: str) -> Path | None:
         return folder
     if Path(model).is_dir():
         raise ModelError(
-            f"{model} holds no model",
+            f"{model} contains no model",
             f"a LoRA ({LORA_FILE}) or a backbone in diffusers' layout (model_index.json)",
-            "name the folder that brewster train wrote: its lora/",
+            "give the folder lora/ that brewster train wrote",
         )
     return None
 
 
-def _with_lora(
+def _load_with_lora(
     model: str, folder: Path, device: str, base: str | None, quantise: Quantisation | None
 ) -> DecompositionPipeline:
     card = read_card(folder)
-    found = base or card.base
-    if base is None and _is_local(found) and not Path(found).is_dir():
+    source = base or card.base
+    if base is None and _is_local(source) and not Path(source).is_dir():
         raise ModelError(
-            f"the base of {model} was {found}, which is not there",
+            f"the base of {model} was {source}, which does not exist",
             f"a {card.backbone} in diffusers' layout",
-            "name its folder or hub id with --base",
+            "give its folder or hub id with --base",
         )
-    family = family_of(found)  # before it is loaded, which may take an hour
+    family = family_of(source)  # before it is loaded, which may take an hour
     if family.name != card.backbone:
         raise ModelError(
-            f"{model} is a LoRA of {card.backbone}", f"its base, not a {family.name}", "name another base"
+            f"{model} is a LoRA of {card.backbone}", f"its base, not a {family.name}", "give another base"
         )
-    backbone = load_backbone(found, device=device, quantise=_stored(card, device, quantise))
+    backbone = load_backbone(source, device=device, quantise=_base_quantisation(card, device, quantise))
     card, prompt = load_lora(folder, backbone)
-    where = "cpu" if device == "cpu" else "cuda"
-    named = fingerprint(model, device=where, base=base, quantise=quantise)
-    return DecompositionPipeline(backbone, prompt, card.task, model_name(model), named)
+    torch_name = "cpu" if device == "cpu" else "cuda"
+    digest = fingerprint(model, device=torch_name, base=base, quantise=quantise)
+    return DecompositionPipeline(backbone, prompt, card.task, model_name(model), digest)
 
 
 def _is_local(source: str) -> bool:

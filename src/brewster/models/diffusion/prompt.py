@@ -1,7 +1,7 @@
-"""The one prompt, encoded once and shipped, so that no text encoder is ever loaded again.
+"""The paper's prompt, and its embedding: encoded once and stored with the LoRA, so inference needs no text encoder.
 
-"We embed the prompt into the model as a feature specific to the task" (paper, Text-to-image Model Fine-tuning):
-4.8 billion parameters of text encoder are spared at training and at inference.
+"We embed the prompt into the model as a feature specific to the task" (paper, Text-to-image Model Fine-tuning). This
+saves 4.8 billion parameters of text encoder in training and inference.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ PROMPTS: Final[dict[str, str]] = {
     ),
 }
 """Prompts by name. "generic" and "detailed" are for a backbone without a LoRA (paper, Comparing to original Flux
-model): the paper shows their results and not their words, so that these are ours."""
+model). The paper shows results of such prompts, but not their text, so these texts are by brewster."""
 
 PROMPT_FILE: Final = "prompt.safetensors"
 _FORMAT: Final = "brewster prompt 1"
@@ -50,10 +50,10 @@ _FORMAT: Final = "brewster prompt 1"
 @final
 @dataclass(frozen=True, eq=False)
 class PromptEmbedding:
-    """A prompt as one backbone's transformer reads it.
+    """The embedding of a prompt by the text encoders of one backbone.
 
-    `embeds` (1, tokens, width); `pooled` (1, width) where the backbone wants a summary vector; `negative`
-    (1, tokens, width) is the empty prompt, where guidance needs a second prediction.
+    `embeds` is (1, tokens, width). `pooled`, (1, width), is for backbones that take a pooled vector as well.
+    `negative`, (1, tokens, width), is the embedding of the empty prompt, for classifier-free guidance.
     """
 
     backbone: str
@@ -64,51 +64,53 @@ class PromptEmbedding:
 
     @property
     def tensors(self) -> dict[str, Tensor]:
-        """The tensors by name, those that there are."""
+        """The tensors by name, without those that are None."""
         named = {"embeds": self.embeds, "negative": self.negative, "pooled": self.pooled}
         return {name: tensor for name, tensor in named.items() if tensor is not None}
 
     @property
     def sha256(self) -> str:
-        """The digest of backbone, text and tensors, whatever file and device they are on."""
+        """SHA-256 of backbone, text and tensors; independent of file and device."""
         return _digest(self.backbone, self.text, self.tensors)
 
     def to(self, device: torch.device | str, dtype: torch.dtype) -> PromptEmbedding:
-        """The same prompt where, and in what precision, the transformer computes."""
+        """The same embedding on this device and in this dtype."""
         moved = {name: tensor.to(device, dtype) for name, tensor in self.tensors.items()}
         return PromptEmbedding(self.backbone, self.text, **moved)
 
     def save(self, path: Path) -> None:
-        """Writes a safetensors file; the same prompt gives the same bytes.
+        """Writes a safetensors file. The same embedding gives the same bytes.
 
         Raises:
             TargetError: the file cannot be written.
         """
-        about = {"kind": _FORMAT, "backbone": self.backbone, "text": self.text, "sha256": self.sha256}
-        write_tensors(path, self.tensors, about)
+        metadata = {"kind": _FORMAT, "backbone": self.backbone, "text": self.text, "sha256": self.sha256}
+        write_tensors(path, self.tensors, metadata)
 
 
 def load_prompt(path: Path, backbone: str) -> PromptEmbedding:
-    """Reads what `PromptEmbedding.save` wrote, for this backbone.
+    """Reads a file that `PromptEmbedding.save` wrote.
 
     Raises:
-        ModelError: missing, damaged, not a prompt, or another backbone's.
+        ModelError: the file is missing, damaged or not a prompt, or belongs to another backbone.
     """
-    tensors, about = read_tensors(path)
-    is_one = about.get("kind") == _FORMAT and {"backbone", "text", "sha256"} <= about.keys()
-    if not (is_one and {"embeds"} <= set(tensors) <= {"embeds", "pooled", "negative"}):
+    tensors, metadata = read_tensors(path)
+    is_prompt = metadata.get("kind") == _FORMAT and {"backbone", "text", "sha256"} <= metadata.keys()
+    if not (is_prompt and {"embeds"} <= set(tensors) <= {"embeds", "pooled", "negative"}):
         raise ModelError(f"{path} is not an encoded prompt", f"a file of kind {_FORMAT!r}", "encode it again")
-    if about["backbone"] != backbone:
+    if metadata["backbone"] != backbone:
         raise ModelError(
-            f"{path} was encoded for {about['backbone']}",
+            f"{path} was encoded for {metadata['backbone']}",
             f"a prompt for {backbone}",
             f"encode it with {backbone}'s text encoder",
         )
-    if _digest(about["backbone"], about["text"], tensors) != about["sha256"]:
+    if _digest(metadata["backbone"], metadata["text"], tensors) != metadata["sha256"]:
         raise ModelError(
-            f"{path} does not have the digest that it names", f"{about['sha256'][:12]}...", "copy it again"
+            f"{path} does not have the digest in its metadata",
+            f"{metadata['sha256'][:12]}...",
+            "copy it again",
         )
-    return PromptEmbedding(about["backbone"], about["text"], **tensors)
+    return PromptEmbedding(metadata["backbone"], metadata["text"], **tensors)
 
 
 def _digest(backbone: str, text: str, tensors: Mapping[str, Tensor]) -> str:

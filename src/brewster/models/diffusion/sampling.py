@@ -1,9 +1,9 @@
-"""From noise to panels: the stock pipelines' Euler steps, without their silent rescaling.
+"""Generates panels from noise with the Euler steps of the pipelines in diffusers, but without their rescaling.
 
     pictures = sample(backbone, condition, prompt, size=(1536, 512), seeds=[0, 1])
 
-The paper takes 20 steps and guidance 4 (Experimental Setup). Fewer steps are faster and rougher; several seeds can
-be averaged, which removes what the model merely made up.
+The paper uses 20 steps and guidance 4 (Experimental Setup). Fewer steps are faster and less accurate. Averaging the
+pictures of several seeds reduces details that the model invents, because they differ between seeds.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from brewster.errors import ModelError
 from brewster.models.diffusion.families.family import Backbone
-from brewster.models.diffusion.lazy_imports import within_memory
+from brewster.models.diffusion.lazy_imports import explain_out_of_memory
 from brewster.models.diffusion.prompt import PromptEmbedding
 
 if TYPE_CHECKING:
@@ -25,7 +25,9 @@ if TYPE_CHECKING:
 
 STEPS: Final = 20
 GUIDANCE: Final = 4.0
-_CURE: Final = "store the base in fewer bits (quantise), or take a smaller base or a card with more memory"
+_MEMORY_HINT: Final = (
+    "store the base in fewer bits (quantise), or take a smaller base or a card with more memory"
+)
 
 
 @torch.no_grad()
@@ -41,31 +43,44 @@ def sample(
     batch: int = 1,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Float[Tensor, "seeds 3 h w"]:
-    """One composite of this (width, height) for each seed, in [-1, 1], float32, on the CPU.
+    """Generates one composite of this (width, height) for each seed.
 
-    The noise comes from the CPU, so a seed means the same on every device, and `batch` only says how many are
-    computed together; `.mean(0, keepdim=True)` averages them. `on_progress(done, all)` is called after each step.
+    The noise is drawn on the CPU, so a seed gives the same noise on every device. `batch` is the number of seeds that
+    are computed at once; it does not change the result beyond rounding. `on_progress(done, total)` is called after
+    each step.
+
+    Returns:
+        The composites in [-1, 1], float32, on the CPU. `.mean(0, keepdim=True)` averages them.
 
     Raises:
-        ModelError: sides that are not multiples of 16, a prompt that guidance cannot use, or no steps, seeds or batch.
-        DeviceError: out of memory (says what to lower).
+        ModelError: a side is not a multiple of 16, the prompt lacks the embedding that guidance needs, or `steps`,
+            `batch` or the number of seeds is less than one.
+        DeviceError: out of memory; the message says what to reduce.
     """
-    _refuse_fewer_than_one(f"{steps} steps", steps, usual=STEPS)
-    _refuse_fewer_than_one(f"{len(seeds)} seeds", len(seeds), usual=1)
-    _refuse_fewer_than_one(f"a batch of {batch}", batch, usual=1)
+    _check_positive(f"{steps} steps", steps, usual=STEPS)
+    _check_positive(f"{len(seeds)} seeds", len(seeds), usual=1)
+    _check_positive(f"a batch of {batch}", batch, usual=1)
     groups = [seeds[start : start + batch] for start in range(0, len(seeds), batch)]
     done = itertools.count(1)
 
-    def told() -> None:
+    def report_step() -> None:
         if on_progress:
             on_progress(next(done), steps * len(groups))
 
     pictures = []
-    with within_memory(_CURE):
-        shown = backbone.encode(condition)
+    with explain_out_of_memory(_MEMORY_HINT):
+        condition_latents = backbone.encode(condition)
         for group in groups:
             noise = torch.cat([backbone.noise(size, seed) for seed in group])
-            latents = euler(backbone, noise, shown, prompt, steps=steps, guidance=guidance, on_progress=told)
+            latents = euler(
+                backbone,
+                noise,
+                condition_latents,
+                prompt,
+                steps=steps,
+                guidance=guidance,
+                on_progress=report_step,
+            )
             pictures.append(backbone.decode(latents).clamp(-1, 1).cpu())
     return torch.cat(pictures)
 
@@ -80,20 +95,25 @@ def euler(
     guidance: float,
     on_progress: Callable[[], None] | None = None,
 ) -> Float[Tensor, "n c h w"]:
-    """The latents at sigma 0: x(next sigma) = x(sigma) + (next sigma - sigma) velocity, in float32.
+    """Integrates the flow from sigma 1 to 0: x(next sigma) = x(sigma) + (next sigma - sigma) velocity, in float32.
 
-    `condition` is encoded; `on_progress()` is called after each step.
+    `condition` is the encoded conditioning image. `on_progress()` is called after each step.
+
+    Returns:
+        The latents at sigma 0.
     """
     latents = noise.to(backbone.device)
     sigmas = backbone.schedule(latents.shape[2] * latents.shape[3], steps).to(latents.device)
-    for now, after in itertools.pairwise(sigmas):
-        velocity = backbone.predict(latents, condition, now.expand(len(latents)), prompt, guidance)
-        latents = latents + (after - now) * velocity
+    for sigma, next_sigma in itertools.pairwise(sigmas):
+        velocity = backbone.predict(latents, condition, sigma.expand(len(latents)), prompt, guidance)
+        latents = latents + (next_sigma - sigma) * velocity
         if on_progress:
             on_progress()
     return latents
 
 
-def _refuse_fewer_than_one(told: str, count: int, *, usual: int) -> None:
+def _check_positive(request: str, count: int, *, usual: int) -> None:
     if count < 1:
-        raise ModelError(f"sampling was asked for {told}", "at least 1", f"the usual is {usual}")
+        raise ModelError(
+            f"sampling was requested with {request}", "at least 1", f"the usual value is {usual}"
+        )

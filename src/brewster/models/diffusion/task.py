@@ -1,4 +1,4 @@
-"""What a large backbone is asked to do with a photo: which panels to make, how large, and by which way."""
+"""The task of a large backbone: which panels it generates, their size, and the sampling method."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ from brewster.models.diffusion.sampling import GUIDANCE
 Objective = Literal["flow", "one_step"]
 
 PAPER_PX: Final = 1536 * 512
+"""The size of the paper's composite: three panels of 512 x 512 pixels."""
 
 
 @final
 @dataclass(frozen=True)
 class DecompositionTask:
-    """Panels of at most `budget_px` pixels together, made from noise in many steps ("flow"), or in "one_step".
+    """Which panels to generate, with at most `budget_px` pixels in all panels together.
 
-    `guidance` is that of separating, which need not be that of learning.
+    `objective` is "flow" (from noise, in many steps) or "one_step" (from the photo, in one step). `guidance` is used
+    for separation; training may use another value.
     """
 
     layout: PanelLayout = field(default_factory=PanelLayout)
@@ -30,26 +32,26 @@ class DecompositionTask:
     guidance: float = GUIDANCE
 
     def __post_init__(self) -> None:
-        """Refuses a task without T, which every user wants."""
+        """Raises RecipeError for a task without T, because every separation needs a transmission."""
         if "T" not in self.layout.panels:
             raise RecipeError(
-                f"the panels are {list(self.layout.panels)}", "T among them", "add T to the panels"
+                f"the panels are {list(self.layout.panels)}", "a list with T", "add T to the panels"
             )
 
     def fit(self, size: tuple[int, int], multiple: int) -> PanelFit:
-        """The largest panel for a photo of this (width, height); a small photo gets a smaller panel.
+        """The largest panel within the budget for a photo of this (width, height). A photo is never enlarged.
 
         Raises:
-            PhotoError: the photo has fewer than `multiple` pixels a side, or is too long and thin.
+            PhotoError: the photo has fewer than `multiple` pixels on a side, or its aspect ratio is too extreme.
         """
-        most = self.budget_px // (len(self.layout.panels) * multiple**2)
-        cells = min(most, math.prod(-(-side // multiple) for side in size))
-        for count in range(cells, 0, -1):
-            budget = count * len(self.layout.panels) * multiple**2
+        max_cells = self.budget_px // (len(self.layout.panels) * multiple**2)
+        cells = min(max_cells, math.prod(-(-side // multiple) for side in size))
+        for cell_count in range(cells, 0, -1):
+            budget = cell_count * len(self.layout.panels) * multiple**2
             with suppress(PhotoError):
                 return fit_panel(size, self.layout, budget_px=budget, multiple=multiple)
         raise PhotoError(
             f"the photo has {size[0]} x {size[1]} pixels",
-            f"at least {multiple} a side, and not so long and thin",
+            f"at least {multiple} pixels a side, and an aspect ratio that is less extreme",
             "crop it, or use the compact model",
         )

@@ -1,4 +1,4 @@
-"""Safetensors files with the same bytes for the same tensors, and plain words for damaged ones."""
+"""Reads and writes safetensors files. The same tensors and metadata always give the same bytes."""
 
 from __future__ import annotations
 
@@ -11,63 +11,64 @@ from torch import Tensor
 
 from brewster.errors import ModelError
 from brewster.files import write_atomically
-from brewster.models.diffusion.lazy_imports import library
+from brewster.models.diffusion.lazy_imports import import_library
 
 
-def write_tensors(path: Path, tensors: Mapping[str, Tensor], about: Mapping[str, str]) -> None:
-    """Writes the tensors and what is said about them, whole or not at all, replacing an older file.
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
+    """Writes the tensors and their metadata atomically, and replaces an existing file.
 
     Raises:
         TargetError: the file cannot be written.
         MissingExtra: safetensors is not installed.
     """
-    alone = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    said = {"format": "pt", **about}
-    # safetensors writes its metadata in an order that changes from run to run; offsets count from its end.
-    data = retold(library("safetensors.torch").save(alone, said), said)
+    cpu_tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    metadata = {"format": "pt", **metadata}
+    # safetensors writes metadata in an order that differs between runs, so the header is written again in sorted order.
+    # This is safe, because the offsets of the tensors count from the end of the header.
+    data = with_metadata(import_library("safetensors.torch").save(cpu_tensors, metadata), metadata)
     write_atomically(path, data, overwrite=True)
 
 
 def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The tensors of a file by name, on the CPU, and what is said about them.
+    """The tensors of a file by name, on the CPU, and its metadata.
 
     Raises:
         ModelError: the file is missing or damaged.
         MissingExtra: safetensors is not installed.
     """
-    safetensors = library("safetensors")
+    safetensors = import_library("safetensors")
     try:
-        # Not mapped but read: whoever writes the file anew would pull a mapped tensor from under our feet.
+        # Read, not memory-mapped: if another process rewrites the file, mapped tensors would change.
         data = path.read_bytes()
-        tensors = library("safetensors.torch").load(data)
-        return dict(sorted(tensors.items())), said_of(data)
+        tensors = import_library("safetensors.torch").load(data)
+        return dict(sorted(tensors.items())), read_metadata(data)
     except FileNotFoundError as error:
         raise ModelError(f"{path} is missing", "a safetensors file", "copy the whole folder") from error
     except (OSError, ValueError, safetensors.SafetensorError) as error:
         raise ModelError(
-            f"{path} cannot be read: {error}", "a whole safetensors file", "copy or write it again"
+            f"{path} cannot be read: {error}", "a complete safetensors file", "copy or write it again"
         ) from error
 
 
 def _header(data: bytes) -> dict[str, Any]:
-    return json.loads(data[8 : _end(data)])  # type: ignore[no-any-return]
+    return json.loads(data[8 : _header_end(data)])  # type: ignore[no-any-return]
 
 
-def _end(data: bytes) -> int:
-    """Where the header ends: its length stands in the first eight bytes."""
+def _header_end(data: bytes) -> int:
+    """The offset of the header's end; the first eight bytes of the file hold its length."""
     return 8 + int.from_bytes(data[:8], "little")
 
 
-def said_of(data: bytes) -> dict[str, str]:
-    """What is said about the tensors in a whole file's bytes."""
-    said: dict[str, str] = _header(data).get("__metadata__", {})
-    return said
+def read_metadata(data: bytes) -> dict[str, str]:
+    """The metadata in the bytes of a complete file."""
+    metadata: dict[str, str] = _header(data).get("__metadata__", {})
+    return metadata
 
 
-def retold(data: bytes, about: Mapping[str, str]) -> bytes:
-    """The same tensors in a whole file's bytes, with something else said about them."""
+def with_metadata(data: bytes, metadata: Mapping[str, str]) -> bytes:
+    """The bytes of a file with the same tensors and other metadata."""
     header = _header(data)
-    header["__metadata__"] = dict(sorted(about.items()))
+    header["__metadata__"] = dict(sorted(metadata.items()))
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
     text += b" " * (-len(text) % 8)
-    return len(text).to_bytes(8, "little") + text + data[_end(data) :]
+    return len(text).to_bytes(8, "little") + text + data[_header_end(data) :]

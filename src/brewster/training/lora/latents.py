@@ -24,8 +24,8 @@ from torch.nn import functional
 from brewster.benchmarks.pairing import PictureGroup, read_folders
 from brewster.errors import RecipeError
 from brewster.models.diffusion.families.family import Backbone
-from brewster.models.diffusion.panels import PanelFit, compose, condition, fit_panel
-from brewster.models.diffusion.pipeline import start
+from brewster.models.diffusion.panels import PanelFit, compose, conditioning_image, fit_panel
+from brewster.models.diffusion.pipeline import one_step_latents
 from brewster.photo import Photo
 from brewster.srgb import to_encoded, to_linear
 from brewster.training.data.image_loading import read_pairs
@@ -132,8 +132,8 @@ class LatentEncoder:
         many = self._recipe.objective == "flow"
         return EncodedSample(
             see(compose(panels, layout)).cpu(),
-            see(condition(panels["I"], layout)).cpu(),
-            None if many else start(panels["I"], self._backbone, layout).cpu(),
+            see(conditioning_image(panels["I"], layout)).cpu(),
+            None if many else one_step_latents(panels["I"], self._backbone, layout).cpu(),
             sample.trust,
         )
 

@@ -19,7 +19,7 @@ from brewster.errors import BrewsterError, ModelError
 from brewster.files import write_atomically
 from brewster.models.diffusion.adapter.hub import CARD_FILE
 from brewster.models.diffusion.backbones import BACKBONES
-from brewster.models.diffusion.families.family import APACHE_2, Backbone, StockCall
+from brewster.models.diffusion.families.family import APACHE_2, Backbone, DiffusersUsage
 from brewster.models.diffusion.panels import fit_panel
 from brewster.models.diffusion.prompt import PROMPT, PROMPT_FILE, load_prompt
 from brewster.models.diffusion.sampling import GUIDANCE, STEPS
@@ -155,7 +155,7 @@ def _stock_use(recipe: LoraRecipe, base: type[Backbone]) -> str:
     loads = 'Stock diffusers loads it with `pipe.load_lora_weights("lora")`'
     if recipe.objective == "one_step":
         return f"{loads}, but starts from noise, where this LoRA starts from the photo, and takes one step."
-    stock = base.stock_use
+    stock = base.diffusers_usage
     if isinstance(stock, str):
         return f"{loads}, {stock}."
     return f"""{loads}.
@@ -167,7 +167,7 @@ Both sides of a panel are multiples of {base.multiple}. {stock.caution}
 ```"""
 
 
-def _stock_code(recipe: LoraRecipe, base: type[Backbone], stock: StockCall) -> str:
+def _stock_code(recipe: LoraRecipe, base: type[Backbone], stock: DiffusersUsage) -> str:
     fit = fit_panel(_SQUARE, recipe.layout, budget_px=recipe.budget_px, multiple=base.multiple)
     (width, height), (whole, high) = fit.panel, recipe.layout.composite_size(fit.panel)
     corners = {

@@ -189,7 +189,7 @@ def _here() -> GraphicsCard:
 def _hollow(recipe: LoraRecipe) -> Backbone:
     name = recipe.backbone.removeprefix(TINY)
     family = find_family(name)
-    size = family.tiny if recipe.backbone.startswith(TINY) else family.real
+    size = family.tiny if recipe.backbone.startswith(TINY) else family.full_size
     return build(name, size, device="meta", dtype=torch.bfloat16)
 
 

@@ -25,7 +25,7 @@ from brewster.files import write_atomically
 from brewster.models.diffusion.adapter.lora import add_lora, load_lora_state, lora_state, save_lora
 from brewster.models.diffusion.backbones import encode_prompt, load_backbone
 from brewster.models.diffusion.families.family import Backbone
-from brewster.models.diffusion.lazy_imports import within_memory
+from brewster.models.diffusion.lazy_imports import explain_out_of_memory
 from brewster.models.diffusion.panels import PanelFit, split
 from brewster.models.diffusion.pipeline import DecompositionPipeline
 from brewster.models.diffusion.prompt import PROMPTS, PromptEmbedding, load_prompt
@@ -112,7 +112,7 @@ class LoraTrainer:
             RecipeError, PhotoError: a sample is missing, damaged, or smaller than a panel.
         """
         self._optimizer.zero_grad()
-        with within_memory(_LOWER):
+        with explain_out_of_memory(_LOWER):
             parts = self._learn(step)
         distributed.all_reduce_sum(
             [parameter.grad for parameter in self._parameters if parameter.grad is not None]
@@ -215,7 +215,7 @@ class LoraTrainer:
         """The gain on a sample, and its row: photo and truths, then the panels."""
         truths, fit = self._panels(layers)
         made = self.separate(truths["I"])
-        photo, truth, answer = ((fit.cut(panel) + 1) / 2 for panel in (truths["I"], truths["T"], made["T"]))
+        photo, truth, answer = ((fit.crop(panel) + 1) / 2 for panel in (truths["I"], truths["T"], made["T"]))
         panels = [
             functional.interpolate((panel + 1) / 2, _ROW_PX) for panel in (*truths.values(), *made.values())
         ]

@@ -1,1 +1,1 @@
-"""What training leaves of a large model, and what is read, sent and fetched: the folder of a LoRA."""
+"""The folder of a LoRA: writing and reading it, and uploading it to the hub."""

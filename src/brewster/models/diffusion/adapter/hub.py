@@ -1,10 +1,10 @@
-"""What leaves this machine: a LoRA's folder as the hub shall hold it, checked first, and sent in one commit.
+"""Uploads a LoRA's folder to the Hugging Face hub: checks it first, then sends it in one commit.
 
     plan = plan_push(Path("out/kontext/lora"), "somebody/sees-through-glass")
     print(plan.table())                     # nothing has been sent yet
     address = push(plan)
 
-Four files and nothing else. Where the recipe or the LoRA name places of this machine, what is sent does not.
+It sends exactly four files. Local paths in the recipe and in the LoRA's metadata are replaced in the uploaded copies.
 """
 
 from __future__ import annotations
@@ -23,39 +23,41 @@ from typing import Any, Final, final
 from brewster.errors import DownloadError, ModelError
 from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraCard, read_card, read_prompt
 from brewster.models.diffusion.backbones import BACKBONES, find_family
-from brewster.models.diffusion.lazy_imports import library
+from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion.prompt import PROMPT_FILE
-from brewster.models.diffusion.tensors import retold, said_of
+from brewster.models.diffusion.tensors import read_metadata, with_metadata
 from brewster.models.zoo import TINY
 
 CARD_FILE: Final = "README.md"
 RECIPE_FILE: Final = "recipe.json"
 FILES: Final = (CARD_FILE, LORA_FILE, PROMPT_FILE, RECIPE_FILE)
-"""The layout on the hub. Stock diffusers reads the LoRA by its name, and the hub the card by its own."""
+"""The files on the hub. diffusers and the hub find the LoRA and the model card by these names."""
 
-_HOMES: Final = re.compile(r"(?:(?<![\w.])/home/|/Users/|/root/|[A-Za-z]:\\+Users\\+)[^\s\"'`,;)\]]*")
-_LOGIN: Final = "make one at https://huggingface.co/settings/tokens, then `hf auth login` or set HF_TOKEN"
-_AGAIN: Final = "train again to write the card anew, or mend it"
+_HOME_FOLDERS: Final = re.compile(r"(?:(?<![\w.])/home/|/Users/|/root/|[A-Za-z]:\\+Users\\+)[^\s\"'`,;)\]]*")
+_LOGIN_HINT: Final = (
+    "make one at https://huggingface.co/settings/tokens, then `hf auth login` or set HF_TOKEN"
+)
+_RETRAIN_HINT: Final = "correct the card, or train again to write a new one"
 
 
 @final
 @dataclass(frozen=True)
 class UploadFile:
-    """A file as it will lie on the hub."""
+    """A file of the upload: its name in the repository and its bytes."""
 
     name: str
     data: bytes = field(repr=False)
 
     @property
     def sha256(self) -> str:
-        """The digest of its bytes."""
+        """SHA-256 of the bytes, in hexadecimal."""
         return hashlib.sha256(self.data).hexdigest()
 
 
 @final
 @dataclass(frozen=True)
 class UploadPlan:
-    """What would be sent, where to, and what should be known before."""
+    """A checked upload: repository, files, commit message, visibility, and remarks for the user."""
 
     repo_id: str
     files: tuple[UploadFile, ...]
@@ -64,14 +66,14 @@ class UploadPlan:
     remarks: tuple[str, ...]
 
     def table(self) -> str:
-        """A line for each file, then the sum."""
+        """The plan as text: one line per file (name, bytes, SHA-256), then the total."""
         lines = [f"{file.name:36}{len(file.data):>13,}  {file.sha256[:12]}" for file in self.files]
         total = sum(len(file.data) for file in self.files)
-        kept = "private" if self.is_private else "public"
-        return "\n".join([*lines, f"{total / 1e6:.1f} MB to {self.repo_id} ({kept}): {self.message}"])
+        visibility = "private" if self.is_private else "public"
+        return "\n".join([*lines, f"{total / 1e6:.1f} MB to {self.repo_id} ({visibility}): {self.message}"])
 
-    def about(self) -> dict[str, Any]:
-        """The same in plain values."""
+    def to_dict(self) -> dict[str, Any]:
+        """The plan as JSON values, without the contents of the files."""
         files = [{"name": file.name, "bytes": len(file.data), "sha256": file.sha256} for file in self.files]
         return {
             "repo": self.repo_id, "private": self.is_private, "message": self.message,
@@ -80,24 +82,24 @@ class UploadPlan:
 
 
 def plan_push(folder: Path, repo_id: str, *, message: str = "", public: bool = False) -> UploadPlan:
-    """Checks a LoRA's folder and says what would be sent; needs no network.
+    """Checks a LoRA's folder and prepares its upload; needs no network connection.
 
     Raises:
         ModelError: a file is missing or damaged, the prompt is not the LoRA's, the card has no front matter, a
-            file names somebody's home folder, or `repo_id` is not OWNER/NAME.
+            file contains the path of a home folder, or `repo_id` is not OWNER/NAME.
         MissingExtra: huggingface_hub is not installed.
     """
-    _refuse_no_name(repo_id)
+    _check_repo_id(repo_id)
     data = {name: _bytes(folder / name) for name in FILES}
     card, recipe = read_card(folder), _recipe(folder, data[RECIPE_FILE])
     read_prompt(folder, card)
-    _refuse_bare(folder, data[CARD_FILE], is_toy=_is_toy(card))
-    renamed = {place: PureWindowsPath(place).name for place in _places(recipe)} | _public_base(card)
+    _check_front_matter(folder, data[CARD_FILE], is_tiny=_is_tiny(card))
+    renamed = {path: PureWindowsPath(path).name for path in _local_paths(recipe)} | _public_base(card)
     if renamed:
-        data[RECIPE_FILE] = f"{json.dumps(_with(recipe, renamed), indent=2)}\n".encode()
-        data[LORA_FILE] = _retold(data[LORA_FILE], card, renamed)
+        data[RECIPE_FILE] = f"{json.dumps(_with_renamed(recipe, renamed), indent=2)}\n".encode()
+        data[LORA_FILE] = _with_public_base(data[LORA_FILE], card, renamed)
     for name, sent in [*data.items(), ("the message", message.encode())]:
-        _refuse_homes(folder / name, sent)
+        _refuse_home_folders(folder / name, sent)
     return UploadPlan(
         repo_id,
         tuple(UploadFile(name, sent) for name, sent in data.items()),
@@ -108,46 +110,51 @@ def plan_push(folder: Path, repo_id: str, *, message: str = "", public: bool = F
 
 
 def push(plan: UploadPlan, token: str | None = None) -> str:
-    """Makes the repository if there is none and sends the files in one commit; the address of the commit.
+    """Creates the repository if it does not exist, and sends the files in one commit.
 
-    The token is `token`, HF_TOKEN or the one of `hf auth login`.
+    The token is `token`, HF_TOKEN, or that of `hf auth login`.
+
+    Returns:
+        The URL of the commit.
 
     Raises:
-        DownloadError: no token, a wrong one, one that may not write, a repository that is public already
-            while a private one is wanted, or no network.
+        DownloadError: there is no token, the token is invalid or may not write, the repository exists with the other
+            visibility (public or private), or there is no network connection.
         MissingExtra: huggingface_hub is not installed.
     """
-    hub = library("huggingface_hub")
+    hub = import_library("huggingface_hub")
     if not (token or hub.get_token()):
         raise DownloadError(
-            f"there is no token to write to {plan.repo_id} with", "one with write access", _LOGIN
+            f"there is no token to write to {plan.repo_id} with", "a token with write access", _LOGIN_HINT
         )
     if not sys.stderr.isatty():
-        library("huggingface_hub.utils").disable_progress_bars()
+        import_library("huggingface_hub.utils").disable_progress_bars()
     api = hub.HfApi(token=token, library_name="brewster")
     added = [hub.CommitOperationAdd(file.name, file.data) for file in plan.files]
-    with _plainly(plan.repo_id):
+    with _translate_hub_errors(plan.repo_id):
         api.create_repo(plan.repo_id, private=plan.is_private, exist_ok=True)
         is_private = bool(api.model_info(plan.repo_id).private)
         if plan.is_private != is_private:
             raise DownloadError(
-                f"{plan.repo_id} is there already and {'private' if is_private else 'public'}",
-                "private without --public, and public with it",
+                f"{plan.repo_id} exists already and is {'private' if is_private else 'public'}",
+                "a private repository without --public, or a public one with it",
                 f"{'leave out' if is_private else 'pass'} --public, choose another name, or change its settings",
             )
         commit = api.create_commit(plan.repo_id, added, commit_message=plan.message)
     return str(commit.commit_url)
 
 
-def _refuse_no_name(repo_id: str) -> None:
+def _check_repo_id(repo_id: str) -> None:
     reason = "" if "/" in repo_id else "it has no owner"
     try:
-        library("huggingface_hub.utils").validate_repo_id(repo_id)
-    except library("huggingface_hub.errors").HFValidationError as error:
+        import_library("huggingface_hub.utils").validate_repo_id(repo_id)
+    except import_library("huggingface_hub.errors").HFValidationError as error:
         reason = str(error).rstrip(".")
     if reason:
         raise ModelError(
-            f"{repo_id!r} is no name on the hub ({reason})", "OWNER/NAME", "give your user name and a name"
+            f"{repo_id!r} is not a valid hub id ({reason})",
+            "OWNER/NAME",
+            "give your user name and a repository name",
         )
 
 
@@ -158,7 +165,7 @@ def _bytes(path: Path) -> bytes:
         raise ModelError(
             f"{path} cannot be read ({error.strerror})",
             f"a LoRA's folder, with {', '.join(FILES)}",
-            "name the folder lora that brewster train wrote; train again to write it anew",
+            "give the folder lora that brewster train wrote, or train again to write it",
         ) from error
 
 
@@ -173,122 +180,132 @@ def _recipe(folder: Path, data: bytes) -> Any:  # noqa: ANN401 - JSON
         ) from error
 
 
-def _refuse_bare(folder: Path, card: bytes, *, is_toy: bool) -> None:
-    """A card without base and licence: the hub would not know what it is, nor what may be done with it."""
-    wrong = (ValueError, TypeError, library("yaml").YAMLError)
-    wanted = {"license", "library_name"} | (set() if is_toy else {"base_model"})
+def _check_front_matter(folder: Path, card: bytes, *, is_tiny: bool) -> None:
+    """Checks that the card's front matter has the fields by which the hub shows licence, base and library."""
+    yaml_errors = (ValueError, TypeError, import_library("yaml").YAMLError)
+    required = {"license", "library_name"} | (set() if is_tiny else {"base_model"})
     try:
         text = card.decode()
-        found = library("huggingface_hub").ModelCard(text).data.to_dict() if text.startswith("---") else {}
-    except wrong as error:
+        fields = (
+            import_library("huggingface_hub").ModelCard(text).data.to_dict() if text.startswith("---") else {}
+        )
+    except yaml_errors as error:
         raise ModelError(
-            f"the front matter of {folder / CARD_FILE} is not YAML: {error}", "what the hub reads", _AGAIN
+            f"the front matter of {folder / CARD_FILE} is not YAML: {error}",
+            "YAML that the hub can read",
+            _RETRAIN_HINT,
         ) from error
-    missing = sorted(wanted - {name for name, value in found.items() if value})
+    missing = sorted(required - {name for name, value in fields.items() if value})
     if missing:
         raise ModelError(
-            f"the front matter of {folder / CARD_FILE} says nothing of {', '.join(missing)}",
-            "what the hub reads, between two lines ---",
-            _AGAIN,
+            f"the front matter of {folder / CARD_FILE} has no {', '.join(missing)}",
+            "these fields as YAML between two lines ---",
+            _RETRAIN_HINT,
         )
 
 
-def _places(value: object) -> Iterator[str]:
-    """The places of a machine among the strings of a recipe."""
-    if isinstance(value, str) and _is_place(value):
+def _local_paths(value: object) -> Iterator[str]:
+    """Yields all strings in a JSON value that are paths of this machine."""
+    if isinstance(value, str) and _is_local_path(value):
         yield value
-    for inside in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
-        yield from _places(inside)
+    for item in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        yield from _local_paths(item)
 
 
-def _is_place(text: str) -> bool:
+def _is_local_path(text: str) -> bool:
     return PurePosixPath(text).is_absolute() or PureWindowsPath(text).is_absolute() or text.startswith("~")
 
 
-def _with(value: Any, renamed: Mapping[str, str]) -> Any:  # noqa: ANN401 - JSON
-    """The same values with these strings renamed."""
+def _with_renamed(value: Any, renamed: Mapping[str, str]) -> Any:  # noqa: ANN401 - JSON
+    """The same JSON value with these strings replaced."""
     if isinstance(value, dict):
-        return {name: _with(inside, renamed) for name, inside in value.items()}
+        return {name: _with_renamed(item, renamed) for name, item in value.items()}
     if isinstance(value, list):
-        return [_with(inside, renamed) for inside in value]
+        return [_with_renamed(item, renamed) for item in value]
     return renamed.get(value, value) if isinstance(value, str) else value
 
 
 def _public_base(card: LoraCard) -> dict[str, str]:
-    """A base in a folder of this machine, and what everybody can load in its place."""
-    is_local = card.base not in BACKBONES and (_is_place(card.base) or Path(card.base).is_dir())
+    """If the base is a local folder: a mapping from it to the hub id that replaces it; otherwise empty."""
+    is_local = card.base not in BACKBONES and (_is_local_path(card.base) or Path(card.base).is_dir())
     return {card.base: find_family(card.backbone).hub_id} if is_local else {}
 
 
-def _retold(data: bytes, card: LoraCard, renamed: Mapping[str, str]) -> bytes:
-    """The LoRA with a card that names its base as `renamed` does."""
+def _with_public_base(data: bytes, card: LoraCard, renamed: Mapping[str, str]) -> bytes:
+    """The bytes of the LoRA file with the base in its card replaced as in `renamed`."""
     public = dataclasses.replace(card, base=renamed.get(card.base, card.base)).to_json()
-    return retold(
-        data, {name: public if text == card.to_json() else text for name, text in said_of(data).items()}
+    return with_metadata(
+        data, {name: public if text == card.to_json() else text for name, text in read_metadata(data).items()}
     )
 
 
-def _refuse_homes(path: Path, data: bytes) -> None:
-    """Who says where he lives should know it; tensors are not looked at."""
-    text = json.dumps(said_of(data)) if path.suffix == ".safetensors" else data.decode(errors="replace")
+def _refuse_home_folders(path: Path, data: bytes) -> None:
+    """Refuses text and metadata that contain a home folder, because its path can contain the user's name."""
+    text = json.dumps(read_metadata(data)) if path.suffix == ".safetensors" else data.decode(errors="replace")
     home = str(Path.home())
-    found = _HOMES.search(text)
+    found = _HOME_FOLDERS.search(text)
     if found or (len(home) > 1 and home in text):
         raise ModelError(
-            f"{path} names {found[0] if found else home}",
-            "nothing of this machine in what everybody may read",
-            "take it out of the file",
+            f"{path} contains the path {found[0] if found else home}",
+            "no path of a home folder in uploaded files",
+            "remove it from the file",
         )
 
 
-def _is_toy(card: LoraCard) -> bool:
+def _is_tiny(card: LoraCard) -> bool:
     return card.base.startswith(TINY)
 
 
 def _remarks(folder: Path, card: LoraCard, renamed: Mapping[str, str]) -> Iterator[str]:
     licence = find_family(card.backbone).licence
-    if _is_toy(card):
-        yield f"its base is {card.base}, a toy: nobody can separate photos with it"
+    if _is_tiny(card):
+        yield f"its base is {card.base}, a tiny test model: it cannot separate photos"
     elif not licence.is_commercial:
-        yield f"its base is under the {licence.title}: so is the LoRA, and it is not for commercial use"
-    yield from (f"{place} is called {name} in what is sent" for place, name in renamed.items())
+        yield f"its base has the licence {licence.title}, which also applies to the LoRA: not for commercial use"
+    yield from (f"{place} is replaced by {name} in the uploaded files" for place, name in renamed.items())
     others = sorted(path.name for path in folder.iterdir() if path.name not in FILES)
     if others:
         yield f"not sent: {', '.join(others)}"
 
 
 @contextlib.contextmanager
-def _plainly(repo_id: str) -> Iterator[None]:
-    """Tells what the hub refuses in our words."""
-    errors = library("huggingface_hub.errors")
+def _translate_hub_errors(repo_id: str) -> Iterator[None]:
+    """Converts the exceptions of huggingface_hub to DownloadError."""
+    errors = import_library("huggingface_hub.errors")
     try:
         yield
     except errors.HfHubHTTPError as error:
-        raise _refused(error.response.status_code, repo_id) from error
+        raise _http_error(error.response.status_code, repo_id) from error
     except (errors.HTTPError, errors.OfflineModeIsEnabled) as error:
         raise DownloadError(
-            f"the hub cannot be reached ({error})", "a network", "connect and push again: nothing was sent"
+            f"the hub cannot be reached ({error})",
+            "a network connection",
+            "connect and push again: nothing was sent",
         ) from error
     except json.JSONDecodeError as error:
         raise DownloadError(
-            f"what answered is no hub ({error})", "JSON", "look at HF_ENDPOINT and at proxies on the way"
+            f"the server's response is not JSON ({error})",
+            "a Hugging Face hub",
+            "check HF_ENDPOINT and your proxy settings",
         ) from error
-    except ValueError as error:  # what the hub has to say of the front matter
+    except ValueError as error:  # huggingface_hub raises it if the hub rejects the front matter
         raise DownloadError(
-            f"the hub refused {CARD_FILE}: {error}", "front matter that it knows", _AGAIN
+            f"the hub refused {CARD_FILE}: {error}", "valid front matter", _RETRAIN_HINT
         ) from error
 
 
-def _refused(status: int, repo_id: str) -> DownloadError:
+def _http_error(status: int, repo_id: str) -> DownloadError:
     if status == 401:
         return DownloadError(
-            f"the hub refused the token for {repo_id} (HTTP 401)", "a valid token with write access", _LOGIN
+            f"the hub refused the token for {repo_id} (HTTP 401)",
+            "a valid token with write access",
+            _LOGIN_HINT,
         )
     if status == 403:
         owner = repo_id.partition("/")[0]
         return DownloadError(
             f"the token may not write to {repo_id} (HTTP 403)",
-            f"a token with write access whose owner is {owner}, or may write for it",
-            _LOGIN,
+            f"a token with write access to the repositories of {owner}",
+            _LOGIN_HINT,
         )
-    return DownloadError(f"the hub answered HTTP {status} for {repo_id}", "a commit", "try again later")
+    return DownloadError(f"the hub returned HTTP {status} for {repo_id}", "a commit", "try again later")

@@ -1,11 +1,12 @@
-"""What training adds to a backbone: low-rank changes to its blocks (Hu et al. 2021), in a file of their own.
+"""LoRA: low-rank adapters of a backbone's linear layers (Hu et al. 2021), stored separately from the backbone.
 
     add_lora(backbone, rank=16, alpha=16, seed=0)
-    save_lora(folder, backbone, prompt, task)     # stock diffusers: pipe.load_lora_weights(folder)
+    save_lora(folder, backbone, prompt, task)     # in diffusers: pipe.load_lora_weights(folder)
     card, prompt = load_lora(folder, backbone)
 
-The paper names the rank, 16 (Experimental Setup); alpha 16 and every linear layer of the blocks are the common
-recipe behind it. A LoRA is float32 on a base of any precision: bf16 would round most of Adam's steps away.
+The paper gives the rank, 16 (Experimental Setup). Alpha 16 and adapters on all linear layers of the blocks are the
+usual settings with it. The LoRA is float32 on a base of any precision, because most of Adam's updates are smaller than the
+rounding of bf16.
 """
 
 from __future__ import annotations
@@ -23,24 +24,24 @@ from torch import Tensor, nn
 
 from brewster.errors import ModelError, RecipeError
 from brewster.models.diffusion.families.family import Backbone
-from brewster.models.diffusion.lazy_imports import library
+from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion.prompt import PROMPT_FILE, PromptEmbedding, load_prompt
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion.tensors import read_tensors, write_tensors
 from brewster.options import Quantisation
 
 LORA_FILE: Final = "pytorch_lora_weights.safetensors"
-"""The name that stock diffusers looks for."""
+"""The file name that diffusers expects."""
 _PREFIX: Final = "transformer."
-_OURS: Final = "brewster"
-_STOCK: Final = "lora_adapter_metadata"
-_ADAPTER: Final = "default"
+_CARD_KEY: Final = "brewster"
+_PEFT_KEY: Final = "lora_adapter_metadata"
+_ADAPTER_NAME: Final = "default"
 
 
 @final
 @dataclass(frozen=True)
 class LoraCard:
-    """What a LoRA was made for: the backbone and how it was stored, the LoRA's size, its task, and the prompt's digest.
+    """The metadata of a LoRA: its backbone, the base's quantisation, rank and alpha, task, and the prompt's digest.
 
     `base` is a hub id, a folder, or a name in the table of backbones.
     """
@@ -54,65 +55,70 @@ class LoraCard:
     prompt_sha256: str
 
     def to_json(self) -> str:
-        """One line of JSON."""
+        """The card as one line of JSON."""
         return json.dumps(asdict(self), sort_keys=True)
 
     @classmethod
     def from_json(cls, text: str) -> LoraCard:
-        """Reads `to_json`.
+        """Parses the result of `to_json`.
 
         Raises:
-            ModelError: not such a line.
+            ModelError: the text is not a valid card.
         """
         try:
-            return _cards().validate_json(text, strict=True, extra="forbid")
+            return _card_validator().validate_json(text, strict=True, extra="forbid")
         except (ValueError, RecipeError) as error:
             raise ModelError(
                 f"the card of the LoRA cannot be read: {error}",
-                "one that brewster wrote",
+                "a card that brewster wrote",
                 "save the LoRA again",
             ) from error
 
 
 @cache
-def _cards() -> TypeAdapter[LoraCard]:
+def _card_validator() -> TypeAdapter[LoraCard]:
     return TypeAdapter(LoraCard)
 
 
 def add_lora(backbone: Backbone, *, rank: int = 16, alpha: int = 16, seed: int = 0) -> list[nn.Parameter]:
-    """Adds a LoRA that changes nothing yet to every linear layer of the blocks; gives what is to be trained.
+    """Adds a LoRA to every linear layer of the blocks. Its B matrices are zero, so predictions do not change yet.
+
+    Returns:
+        The parameters to train.
 
     Raises:
-        ModelError: the backbone has one already, or the rank is not positive.
+        ModelError: the backbone already has a LoRA, or the rank is less than 1.
         MissingExtra: peft is not installed.
     """
     if rank < 1:
-        raise ModelError(f"the rank is {rank}", "at least 1", "the paper takes 16")
+        raise ModelError(f"the rank is {rank}", "at least 1", "use 16 as in the paper")
     if has_lora(backbone):
-        raise ModelError("the backbone has a LoRA already", "one at a time", "remove_lora first")
-    peft = library("peft")
+        raise ModelError(
+            "the backbone already has a LoRA", "a backbone without one", "call remove_lora first"
+        )
+    peft = import_library("peft")
     config = peft.LoraConfig(r=rank, lora_alpha=alpha, target_modules=backbone.lora_targets())
-    with torch.random.fork_rng(devices=_devices(backbone)):
+    with torch.random.fork_rng(devices=_cuda_devices(backbone)):
         torch.manual_seed(seed)
-        backbone.transformer.add_adapter(config, adapter_name=_ADAPTER)
-    # On a bf16 base the LoRA is bf16, too, until it is cast.
-    library("diffusers.training_utils").cast_training_params(backbone.transformer, torch.float32)
+        backbone.transformer.add_adapter(config, adapter_name=_ADAPTER_NAME)
+    # peft creates the LoRA in the dtype of the base, which may be bf16.
+    import_library("diffusers.training_utils").cast_training_params(backbone.transformer, torch.float32)
     return lora_parameters(backbone)
 
 
 def remove_lora(backbone: Backbone) -> None:
-    """Gives the plain backbone back; nothing happens where there is no LoRA."""
+    """Removes the LoRA, which restores the base's predictions; without a LoRA it does nothing."""
     if has_lora(backbone):
         backbone.transformer.unload_lora()
 
 
 def has_lora(backbone: Backbone) -> bool:
-    """Whether the backbone carries a LoRA."""
+    """Whether the backbone has a LoRA."""
     return bool(getattr(backbone.transformer, "peft_config", None))
 
 
 def lora_parameters(backbone: Backbone) -> list[nn.Parameter]:
-    """The LoRA's weights, the only ones that are trained, always in the same order."""
+    """The LoRA's parameters, the only ones that require gradients, always in the same order."""
     return [parameter for parameter in backbone.transformer.parameters() if parameter.requires_grad]
 
 
@@ -120,18 +126,20 @@ def lora_state(backbone: Backbone) -> dict[str, Tensor]:
     """The LoRA's weights by name, such as transformer_blocks.0.attn.to_q.lora_A.weight; empty without a LoRA."""
     if not has_lora(backbone):
         return {}
-    state = library("peft").get_peft_model_state_dict(backbone.transformer, adapter_name=_ADAPTER)
+    state = import_library("peft").get_peft_model_state_dict(backbone.transformer, adapter_name=_ADAPTER_NAME)
     return dict(sorted(state.items()))
 
 
 def load_lora_state(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
-    """Puts weights that `lora_state` gave back into a backbone with a LoRA of the same shape.
+    """Loads weights from `lora_state` into a backbone with a LoRA of the same shapes.
 
     Raises:
-        ModelError: no LoRA to fill, or weights of another backbone or rank.
+        ModelError: the backbone has no LoRA, or the weights are those of another backbone or rank.
     """
     _refuse_other_weights(lora_state(backbone), state)
-    library("peft").set_peft_model_state_dict(backbone.transformer, dict(state), adapter_name=_ADAPTER)
+    import_library("peft").set_peft_model_state_dict(
+        backbone.transformer, dict(state), adapter_name=_ADAPTER_NAME
+    )
 
 
 def save_lora(
@@ -143,21 +151,24 @@ def save_lora(
     base: str = "",
     quantise: Quantisation | None = None,
 ) -> LoraCard:
-    """Writes the LoRA in the file that stock diffusers loads, and the prompt beside it; same LoRA, same bytes.
+    """Writes a folder with the LoRA, in a file that diffusers can load, and the prompt. Deterministic to the byte.
 
-    `base` is the backbone's own hub id unless it is named.
+    `base` is by default the backbone's hub id.
+
+    Returns:
+        The card that is stored in the metadata of the file.
 
     Raises:
-        ModelError: no LoRA, or a prompt of another backbone.
+        ModelError: the backbone has no LoRA, or the prompt belongs to another backbone.
         TargetError: the folder cannot be written.
     """
     if not has_lora(backbone):
-        raise ModelError("the backbone has no LoRA", "one to save", "add_lora first")
+        raise ModelError("the backbone has no LoRA", "a backbone with one", "call add_lora first")
     if prompt.backbone != backbone.name:
         raise ModelError(
             f"the prompt was encoded for {prompt.backbone}", f"{backbone.name}", "encode it for this backbone"
         )
-    config = backbone.transformer.peft_config[_ADAPTER]
+    config = backbone.transformer.peft_config[_ADAPTER_NAME]
     card = LoraCard(
         backbone.name,
         base or backbone.hub_id,
@@ -169,15 +180,15 @@ def save_lora(
     )
     tensors = {_PREFIX + name: tensor for name, tensor in lora_state(backbone).items()}
     prompt.save(folder / PROMPT_FILE)
-    write_tensors(folder / LORA_FILE, tensors, {_OURS: card.to_json(), _STOCK: _stock_settings(config)})
+    write_tensors(folder / LORA_FILE, tensors, {_CARD_KEY: card.to_json(), _PEFT_KEY: _peft_settings(config)})
     return card
 
 
 def read_card(folder: Path) -> LoraCard:
-    """What the LoRA in this folder was made for, so that its backbone can be loaded.
+    """The card of the LoRA in this folder; it says which backbone to load.
 
     Raises:
-        ModelError: no LoRA, a damaged one, or one that brewster did not write.
+        ModelError: the LoRA is missing or damaged, or was not written by brewster.
     """
     return _read(folder)[1]
 
@@ -186,7 +197,7 @@ def read_prompt(folder: Path, card: LoraCard) -> PromptEmbedding:
     """The prompt of the LoRA in this folder.
 
     Raises:
-        ModelError: missing, damaged, or not the one that the LoRA was trained with.
+        ModelError: the prompt is missing or damaged, or is not the one with which the LoRA was trained.
     """
     prompt = load_prompt(folder / PROMPT_FILE, card.backbone)
     if prompt.sha256 != card.prompt_sha256:
@@ -199,17 +210,20 @@ def read_prompt(folder: Path, card: LoraCard) -> PromptEmbedding:
 
 
 def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraCard, PromptEmbedding]:
-    """Adds the LoRA of a folder to its backbone, and gives its card and its prompt.
+    """Adds the LoRA of a folder to its backbone.
+
+    Returns:
+        The LoRA's card and its prompt.
 
     Raises:
-        ModelError: a LoRA of another backbone, of a rank that its weights do not have, a damaged file, a prompt
-            that does not belong to it, or a backbone that carries a LoRA already.
+        ModelError: the LoRA belongs to another backbone, its weights do not have the rank of its card, a file is
+            damaged, the prompt does not belong to it, or the backbone already has a LoRA.
     """
     state, card = _read(folder)
     if card.backbone != backbone.name:
         raise ModelError(
             f"{folder} is a LoRA of {card.backbone}",
-            f"one of {backbone.name}",
+            f"a LoRA of {backbone.name}",
             f"load the backbone {card.backbone} for it",
         )
     prompt = read_prompt(folder, card)
@@ -223,36 +237,36 @@ def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraCard, PromptEmbeddi
 
 
 def _read(folder: Path) -> tuple[dict[str, Tensor], LoraCard]:
-    tensors, about = read_tensors(folder / LORA_FILE)
-    if _OURS not in about:
+    tensors, metadata = read_tensors(folder / LORA_FILE)
+    if _CARD_KEY not in metadata:
         raise ModelError(
             f"{folder / LORA_FILE} was not written by brewster",
-            "a LoRA with its card, which names backbone, layout and prompt",
-            "use one that brewster train wrote",
+            "a LoRA with a card in its metadata",
+            "use a LoRA that brewster train wrote",
         )
-    card = LoraCard.from_json(about[_OURS])
+    card = LoraCard.from_json(metadata[_CARD_KEY])
     return {name.removeprefix(_PREFIX): tensor for name, tensor in tensors.items()}, card
 
 
-def _refuse_other_weights(wanted: Mapping[str, Tensor], found: Mapping[str, Tensor]) -> None:
-    astray = sorted(set(wanted) ^ set(found))
-    if astray:
+def _refuse_other_weights(expected: Mapping[str, Tensor], found: Mapping[str, Tensor]) -> None:
+    mismatched = sorted(set(expected) ^ set(found))
+    if mismatched:
         raise ModelError(
-            f"{len(astray)} weights of the LoRA are too few or too many, {astray[0]} among them",
-            "one pair for each linear layer of the blocks",
+            f"{len(mismatched)} weights of the LoRA are missing or unexpected, for example {mismatched[0]}",
+            "one pair of matrices for each linear layer of the blocks",
             "use the backbone that it was trained on",
         )
     for name, tensor in sorted(found.items()):
-        if tensor.shape != wanted[name].shape:
+        if tensor.shape != expected[name].shape:
             raise ModelError(
                 f"{name} has the shape {tuple(tensor.shape)}",
-                f"{tuple(wanted[name].shape)}",
-                "use the rank and the backbone that it was trained with",
+                f"{tuple(expected[name].shape)}",
+                "use the rank and the backbone with which it was trained",
             )
 
 
-def _stock_settings(config: Any) -> str:  # noqa: ANN401 - peft's configuration
-    """What stock diffusers reads: without it, alpha would be taken for the rank."""
+def _peft_settings(config: Any) -> str:  # noqa: ANN401 - peft's configuration
+    """The LoRA settings that diffusers reads from the metadata. Without them, it assumes that alpha equals the rank."""
     settings = {
         "r": config.r,
         "lora_alpha": config.lora_alpha,
@@ -261,5 +275,5 @@ def _stock_settings(config: Any) -> str:  # noqa: ANN401 - peft's configuration
     return json.dumps({_PREFIX + name: value for name, value in settings.items()}, sort_keys=True)
 
 
-def _devices(backbone: Backbone) -> list[torch.device]:
+def _cuda_devices(backbone: Backbone) -> list[torch.device]:
     return [backbone.device] if backbone.device.type == "cuda" else []

@@ -1,1 +1,1 @@
-"""What differs between backbones: FLUX.1 Kontext, FLUX.2 klein, Qwen-Image-Edit; `family` is what they share."""
+"""The model families: FLUX.1 Kontext, FLUX.2 klein and Qwen-Image-Edit. `family` has their base classes."""

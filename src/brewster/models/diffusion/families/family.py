@@ -1,7 +1,7 @@
-"""What every large backbone can do, whatever its family: see, show, predict, and name what a LoRA may change.
+"""Base classes of the large backbones: encode, decode, predict the velocity, and list the layers for a LoRA.
 
-Latents are grids (N, C, H/16, W/16): the VAE's latents with each 2 x 2 patch packed into the channels, so that a
-grid cell is a token, a panel is a block of whole cells, and one cell stands for 16 x 16 pixels.
+Latents are grids (N, C, H/16, W/16): the VAE's latents with each 2 x 2 patch packed into the channels. One grid cell is
+one token of the transformer and 16 x 16 pixels of the picture, and a panel is a block of whole cells.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from brewster.errors import ModelError
-from brewster.models.diffusion.lazy_imports import quiet, stock_class
+from brewster.models.diffusion.lazy_imports import diffusers_class, suppress_warnings
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
 
 if TYPE_CHECKING:
     from jaxtyping import Float
 
 PATCH: Final = 2
-"""VAE cells per token side; every family packs 2 x 2."""
+"""The side of a token in VAE cells; every family packs 2 x 2."""
 _BLOCKS: Final = ("transformer_blocks", "single_transformer_blocks")
 _LORA_PARTS: Final = ("lora_A", "lora_B")
 
 Architecture = Mapping[str, Mapping[str, Any]]
-"""The settings of the three parts "transformer", "vae" and "scheduler"."""
+"""The constructor arguments of the three parts "transformer", "vae" and "scheduler"."""
 
 
 @final
 @dataclass(frozen=True)
 class Licence:
-    """The terms of a base, which are those of every LoRA on it."""
+    """The licence of a base, which also applies to every LoRA of it."""
 
     title: str
     hub: Mapping[str, str]
-    """Its entries in the front matter of a model card on the hub."""
+    """Its fields in the front matter of a model card on the hub."""
     is_commercial: bool = True
 
 
@@ -50,38 +50,38 @@ APACHE_2: Final = Licence("Apache-2.0", {"license": "apache-2.0"})
 
 @final
 @dataclass(frozen=True)
-class StockCall:
-    """How the card of a LoRA calls the stock pipeline so that it makes the same composite, as Python source."""
+class DiffusersUsage:
+    """Python source for model cards: how to call the pipeline of diffusers so that it generates the same composite."""
 
     parts: str
     """Arguments of `from_pretrained` that leave out the text encoders."""
     options: str
-    """Arguments of the call; {area} stands for the pixels of the composite, `words` for the encoded prompt."""
+    """Arguments of the call. {area} is replaced by the pixels of the composite; `words` is the encoded prompt."""
     caution: str
-    """What the pipeline does unless it is called so, one sentence."""
+    """What the pipeline does without these options, in one sentence."""
 
 
 class Backbone(ABC):
-    """A flow-matching transformer that generates a picture beside a conditioning picture, its VAE and scheduler.
+    """A flow-matching transformer that generates a picture from a conditioning image, with its VAE and scheduler.
 
-    Time is sigma: 1 is noise, 0 is the picture, and the transformer predicts velocity = noise - picture.
+    Time is sigma: 1 is noise, 0 is the picture. The transformer predicts velocity = noise - picture.
     """
 
     name: ClassVar[str]
     hub_id: ClassVar[str]
     licence: ClassVar[Licence]
-    stock_use: ClassVar[StockCall | str]
-    """For the card: how to call the stock pipeline, or why it cannot make the same picture, "but ..."."""
+    diffusers_usage: ClassVar[DiffusersUsage | str]
+    """For model cards: how to call the pipeline of diffusers, or a clause "but ..." why it gives another picture."""
     classes: ClassVar[Mapping[str, str]]
-    """Names in diffusers of the "pipeline", "transformer", "vae" and "scheduler"."""
-    real: ClassVar[Architecture]
+    """Class names in diffusers of the "pipeline", "transformer", "vae" and "scheduler"."""
+    full_size: ClassVar[Architecture]
     tiny: ClassVar[Architecture]
     guided_by_embedding: ClassVar[bool]
-    """Whether guidance is a number that the transformer reads, or a second prediction (classifier-free)."""
-    words_need: ClassVar[tuple[str, ...]] = ()
-    """Libraries beyond the extra `large` that its text encoders are loaded with."""
+    """True if the guidance scale is an input of the transformer; False for classifier-free guidance."""
+    text_encoder_requirements: ClassVar[tuple[str, ...]] = ()
+    """Libraries that its text encoders need in addition to the extra `large`."""
     multiple: ClassVar[int] = 16
-    """Sides of a panel are multiples of this many pixels."""
+    """The sides of a panel must be multiples of this, in pixels."""
 
     def __init__(self, transformer: Any, vae: Any, scheduler: Any, *, distilled: bool = False) -> None:  # noqa: ANN401
         self.transformer = transformer.eval().requires_grad_(False)
@@ -91,47 +91,48 @@ class Backbone(ABC):
 
     @property
     def device(self) -> torch.device:
-        """Where the transformer is."""
+        """The device of the transformer."""
         device = self.transformer.device
         assert isinstance(device, torch.device)
         return device
 
     @property
     def dtype(self) -> torch.dtype:
-        """The precision in which the transformer computes."""
+        """The dtype in which the transformer computes."""
         dtype = self.transformer.dtype
         assert isinstance(dtype, torch.dtype)
         return dtype
 
     @property
     def channels(self) -> int:
-        """Channels of a latent grid: numbers per token."""
+        """The number of channels of a latent grid, that is, values per token."""
         return int(self.transformer.config.in_channels)
 
     @torch.no_grad()
     def encode(self, picture: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c h/16 w/16"]:
-        """Pictures in [-1, 1] as normal latent grids, float32: the mean of the VAE's distribution, without noise.
+        """Encodes pictures in [-1, 1] to normalised latent grids, float32: the mode of the VAE's distribution.
 
-        Encode the whole composite: panels encoded apart differ at the seams and, through GroupNorm, everywhere.
+        Encode the whole composite at once. Panels that are encoded separately differ at the seams and, because of
+        GroupNorm, everywhere.
 
         Raises:
-            ModelError: sides that are not multiples of 16.
+            ModelError: a side is not a multiple of 16.
         """
-        self._refuse_off_grid(picture.shape[-1], picture.shape[-2])
+        self._check_grid(picture.shape[-1], picture.shape[-2])
         mean, deviation = self.statistics()
-        seen = self._see(picture.to(self.vae.device, self.vae.dtype))
-        return (functional.pixel_unshuffle(seen, PATCH).float() - mean) / deviation
+        cells = self._vae_encode(picture.to(self.vae.device, self.vae.dtype))
+        return (functional.pixel_unshuffle(cells, PATCH).float() - mean) / deviation
 
     @torch.no_grad()
     def decode(self, latents: Float[Tensor, "n c h w"]) -> Float[Tensor, "n 3 16*h 16*w"]:
-        """Latent grids as pictures, about [-1, 1], not clamped, float32."""
+        """Decodes latent grids to pictures, float32, about [-1, 1], not clamped."""
         mean, deviation = self.statistics()
         grid = latents.to(self.vae.device).float() * deviation + mean
-        return self._show(functional.pixel_shuffle(grid, PATCH).to(self.vae.dtype)).float()
+        return self._vae_decode(functional.pixel_shuffle(grid, PATCH).to(self.vae.dtype)).float()
 
     @abstractmethod
     def statistics(self) -> tuple[Tensor, Tensor]:
-        """Mean and deviation of the packed latents over natural pictures, (1, C, 1, 1) each, float32."""
+        """Mean and standard deviation of the packed latents of natural images, float32 (1, C, 1, 1) or (1, 1, 1, 1)."""
 
     @abstractmethod
     def predict(
@@ -142,41 +143,43 @@ class Backbone(ABC):
         prompt: PromptEmbedding,
         guidance: float,
     ) -> Float[Tensor, "n c h w"]:
-        """The velocity noise - picture at time sigma, float32; carries gradients where the caller wants them.
+        """The velocity (noise - picture) of the latents at time sigma, float32; differentiable.
 
         Raises:
-            ModelError: a prompt that lacks what this guidance needs.
+            ModelError: the prompt lacks an embedding that this guidance needs.
         """
 
     @abstractmethod
     def positions(self, latents: Tensor, condition: Tensor) -> Any:  # noqa: ANN401 - each family has its own kind
-        """Where each token stands, generated ones first, and which of the two pictures it belongs to."""
+        """The position ids of the generated tokens, then of the conditioning tokens, as the transformer takes them."""
 
     @classmethod
     @abstractmethod
-    def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a stock pipeline
-        """The prompt through the text encoders of a stock pipeline."""
+    def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a pipeline of diffusers
+        """Encodes a prompt with the text encoders of a diffusers pipeline."""
 
     @classmethod
     @abstractmethod
-    def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a stock transformer
-        """Random numbers of a prompt's shape, for twins that have no text encoder."""
+    def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a transformer of diffusers
+        """A random embedding with the shapes of a prompt, for tiny versions, which have no text encoder."""
 
     def noise(self, size: tuple[int, int], seed: int) -> Float[Tensor, "1 c h w"]:
-        """Where the stock pipeline starts for a composite of this (width, height) and seed; always from the CPU.
+        """The noise from which the diffusers pipeline starts for a composite of this (width, height) and seed.
+
+        It is drawn on the CPU, so it is the same for every device.
 
         Raises:
-            ModelError: sides that are not multiples of 16.
+            ModelError: a side is not a multiple of 16.
         """
-        self._refuse_off_grid(*size)
+        self._check_grid(*size)
         width, height = (side // self.multiple * PATCH for side in size)
         shape = (1, self.channels // PATCH**2, height, width)
-        return functional.pixel_unshuffle(_normal(shape, seed), PATCH)
+        return functional.pixel_unshuffle(_seeded_noise(shape, seed), PATCH)
 
     def shift(self, tokens: int, steps: int) -> float:  # noqa: ARG002 - one family's shift counts the steps
-        """The schedule's shift mu for a composite of this many generated tokens (condition not counted).
+        """The schedule's shift mu for a composite of this many generated tokens, without those of the condition.
 
-        Linear in the tokens between the scheduler's two anchors (Esser et al. 2024; FLUX).
+        A linear function of the number of tokens through the scheduler's two anchors (Esser et al. 2024; FLUX).
         """
         config = self.scheduler.config
         low, high = config.base_image_seq_len, config.max_image_seq_len
@@ -184,17 +187,19 @@ class Backbone(ABC):
         return float(config.base_shift + slope * (tokens - low))
 
     def shifted(self, sigma: Tensor, tokens: int, steps: int = 20) -> Tensor:
-        """Times in (0, 1] moved towards noise as the schedule moves them, for training."""
+        """Times in (0, 1], shifted towards noise as in the sampling schedule; for training."""
         scheduler = self.scheduler
         if scheduler.config.use_dynamic_shifting:
-            moved = scheduler.time_shift(self.shift(tokens, steps), 1.0, sigma)
-            assert isinstance(moved, Tensor)
-            return moved
+            shifted = scheduler.time_shift(self.shift(tokens, steps), 1.0, sigma)
+            assert isinstance(shifted, Tensor)
+            return shifted
         return scheduler.shift * sigma / (1 + (scheduler.shift - 1) * sigma)  # type: ignore[no-any-return]
 
     def schedule(self, tokens: int, steps: int) -> Float[Tensor, " sigmas"]:
-        """The sigmas from 1 to 0, by the stock scheduler itself: steps + 1 values, falling."""
-        if steps == 1:  # any shift leaves 1 where it is, but a stretched end would divide 0 by 0
+        """The sigmas from 1 to 0 by the scheduler of diffusers: steps + 1 decreasing values."""
+        if (
+            steps == 1
+        ):  # a shift does not change sigma 1, but stretching to `shift_terminal` would divide 0 by 0
             return torch.tensor([1.0, 0.0])
         scheduler = type(self.scheduler).from_config(self.scheduler.config)
         dynamic = {"mu": self.shift(tokens, steps)} if scheduler.config.use_dynamic_shifting else {}
@@ -204,7 +209,7 @@ class Backbone(ABC):
         return sigmas
 
     def lora_targets(self) -> list[str]:
-        """Full names of every linear layer in the blocks; suffixes would hit the top-level proj_out, too."""
+        """The full names of all linear layers in the blocks. Suffixes would also match the top-level proj_out."""
         return [
             name.removesuffix(".base_layer")
             for name, module in self.transformer.named_modules()
@@ -213,30 +218,30 @@ class Backbone(ABC):
             and not set(name.split(".")) & set(_LORA_PARTS)
         ]
 
-    def pipeline(self) -> Any:  # noqa: ANN401 - a stock pipeline
-        """The stock pipeline around the same transformer, VAE and scheduler, without text encoders.
+    def pipeline(self) -> Any:  # noqa: ANN401 - a pipeline of diffusers
+        """The pipeline of diffusers with the same transformer, VAE and scheduler, without text encoders.
 
         Raises:
             MissingExtra: diffusers is not installed.
         """
-        kind = stock_class(self.classes["pipeline"])
+        kind = diffusers_class(self.classes["pipeline"])
         parts = {"transformer": self.transformer, "vae": self.vae, "scheduler": self.scheduler}
-        wanted = inspect.signature(kind.__init__).parameters
-        absent = {
+        parameters = inspect.signature(kind.__init__).parameters
+        omitted = {
             name: None
-            for name, parameter in wanted.items()
+            for name, parameter in parameters.items()
             if name not in {"self", *parts} and parameter.default is parameter.empty
         }
-        distilled = {"is_distilled": self.distilled} if "is_distilled" in wanted else {}
-        return kind(**parts, **absent, **distilled)
+        distilled = {"is_distilled": self.distilled} if "is_distilled" in parameters else {}
+        return kind(**parts, **omitted, **distilled)
 
     def save(self, folder: Path) -> None:
-        """Writes the folder that `load_backbone` and stock diffusers read."""
+        """Writes a folder that `load_backbone` and diffusers can read."""
         pipeline = self.pipeline()
-        with quiet():  # a warning for each text encoder that is not there
+        with suppress_warnings():  # diffusers warns about each missing text encoder
             pipeline.save_pretrained(folder)
 
-    def _refuse_off_grid(self, width: int, height: int) -> None:
+    def _check_grid(self, width: int, height: int) -> None:
         if width % self.multiple or height % self.multiple:
             raise ModelError(
                 f"the picture has {width} x {height} pixels",
@@ -244,69 +249,71 @@ class Backbone(ABC):
                 "pad it with panels.fit_panel",
             )
 
-    def _see(self, picture: Tensor) -> Tensor:
+    def _vae_encode(self, picture: Tensor) -> Tensor:
         return self.vae.encode(picture).latent_dist.mode()  # type: ignore[no-any-return]
 
-    def _show(self, latent: Tensor) -> Tensor:
+    def _vae_decode(self, latent: Tensor) -> Tensor:
         return self.vae.decode(latent, return_dict=False)[0]  # type: ignore[no-any-return]
 
     def _tokens(self, latents: Tensor, condition: Tensor) -> Float[Tensor, "n t c"]:
-        """Generated tokens, then conditioning tokens, row by row, as the transformer takes them."""
+        """The input of the transformer: generated tokens, then conditioning tokens, each row by row."""
         grids = [latents, condition.expand(len(latents), -1, -1, -1)]
         return torch.cat([grid.flatten(2).mT for grid in grids], dim=1).to(self.device, self.dtype)
 
 
 class ClassifierFreeBackbone(Backbone):
-    """A backbone whose guidance is classifier-free (Ho & Salimans 2022): above 1 it predicts a second time."""
+    """A backbone with classifier-free guidance (Ho & Salimans 2022): a guidance above 1 needs a second prediction."""
 
     guided_by_embedding = False
 
     def predict(
         self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float
     ) -> Tensor:
-        """See Backbone; a distilled model takes no guidance.
+        """See `Backbone.predict`. A distilled model ignores the guidance.
 
         Raises:
-            ModelError: guidance above 1 and a prompt without its empty counterpart.
+            ModelError: the guidance is above 1, and the prompt has no embedding of the empty prompt.
         """
-        wanted = self._velocity(latents, condition, sigma, prompt.embeds)
+        conditional = self._velocity(latents, condition, sigma, prompt.embeds)
         if guidance <= 1 or self.distilled:
-            return wanted
-        empty = self._velocity(latents, condition, sigma, _empty(prompt))
-        return self._guided(wanted, empty, guidance)
+            return conditional
+        unconditional = self._velocity(latents, condition, sigma, _negative_embeds(prompt))
+        return self._guided(conditional, unconditional, guidance)
 
     @abstractmethod
-    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, words: Tensor) -> Tensor:
-        """What the transformer predicts when it is told these words, (1, tokens, width)."""
+    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor) -> Tensor:
+        """The transformer's prediction for this prompt embedding, (1, tokens, width)."""
 
-    def _guided(self, wanted: Tensor, empty: Tensor, guidance: float) -> Tensor:
-        """Away from what the empty prompt predicts."""
-        return empty + guidance * (wanted - empty)
+    def _guided(self, conditional: Tensor, unconditional: Tensor, guidance: float) -> Tensor:
+        """Extrapolates from the prediction for the empty prompt to that for the prompt."""
+        return unconditional + guidance * (conditional - unconditional)
 
 
-def grid_of(tokens: Float[Tensor, "n t c"], like: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c h w"]:
-    """The generated tokens, the first ones, on their grid again, float32."""
+def tokens_to_grid(
+    tokens: Float[Tensor, "n t c"], like: Float[Tensor, "n c h w"]
+) -> Float[Tensor, "n c h w"]:
+    """The generated tokens, which come first, as a grid of the shape of `like`, float32."""
     generated = tokens[:, : like.shape[2] * like.shape[3]].mT.float()
     return generated.reshape(like.shape)
 
 
 def random_prompt(backbone: str, seed: int, **shapes: tuple[int, ...]) -> PromptEmbedding:
-    """The paper's words with random numbers for their meaning: `embeds` and what else has a shape."""
+    """The paper's prompt with random tensors of these shapes as its embedding."""
     tensors = {
-        name: _normal(shape, seed + index) for index, (name, shape) in enumerate(sorted(shapes.items()))
+        name: _seeded_noise(shape, seed + index) for index, (name, shape) in enumerate(sorted(shapes.items()))
     }
     return PromptEmbedding(backbone, PROMPT, **tensors)
 
 
-def _empty(prompt: PromptEmbedding) -> Tensor:
+def _negative_embeds(prompt: PromptEmbedding) -> Tensor:
     if prompt.negative is None:
         raise ModelError(
-            f"the prompt for {prompt.backbone} has no empty counterpart",
+            f"the prompt for {prompt.backbone} has no embedding of the empty prompt",
             "one, for a guidance above 1",
             "encode the prompt again or set the guidance to 1",
         )
     return prompt.negative
 
 
-def _normal(shape: tuple[int, ...], seed: int) -> Tensor:
+def _seeded_noise(shape: tuple[int, ...], seed: int) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed))

@@ -10,9 +10,9 @@ from torch import Tensor
 from brewster.models.diffusion.families.family import (
     APACHE_2,
     ClassifierFreeBackbone,
-    StockCall,
-    grid_of,
+    DiffusersUsage,
     random_prompt,
+    tokens_to_grid,
 )
 from brewster.models.diffusion.prompt import PromptEmbedding
 
@@ -21,29 +21,29 @@ _SCHEDULER: Final = {
     "base_image_seq_len": 256, "max_image_seq_len": 4096,
 }  # fmt: skip
 _CONDITION_TIME: Final = 10
-"""Generated tokens stand at time 0; the first reference picture stands at 10, a second one would at 20."""
+"""The time coordinate of conditioning tokens. Generated tokens have 0; FLUX.2's first reference picture has 10."""
 
 
 @final
 class Klein(ClassifierFreeBackbone):
-    """FLUX.2 klein (Black Forest Labs 2026), the base model: guidance is classifier-free.
+    """FLUX.2 klein (Black Forest Labs 2026), the base model, with classifier-free guidance.
 
-    The distilled models of the same family load, too; they take no guidance.
+    The distilled models of the family can be loaded too; they ignore the guidance.
     """
 
     name = "klein"
     hub_id = "black-forest-labs/FLUX.2-klein-base-4B"
     licence = APACHE_2
-    stock_use = StockCall(
+    diffusers_usage = DiffusersUsage(
         "text_encoder=None, tokenizer=None",
         'negative_prompt_embeds=words["negative"],',
-        "A condition of more than 1024 x 1024 pixels would be rescaled in silence.",
+        "The pipeline silently rescales a condition of more than 1024 x 1024 pixels.",
     )
     classes: ClassVar = {
         "pipeline": "Flux2KleinPipeline", "transformer": "Flux2Transformer2DModel",
         "vae": "AutoencoderKLFlux2", "scheduler": "FlowMatchEulerDiscreteScheduler",
     }  # fmt: skip
-    real: ClassVar = {
+    full_size: ClassVar = {
         "transformer": {
             "guidance_embeds": False, "num_layers": 5, "num_single_layers": 20, "num_attention_heads": 24,
             "joint_attention_dim": 7680,
@@ -62,23 +62,23 @@ class Klein(ClassifierFreeBackbone):
     }  # fmt: skip
 
     def statistics(self) -> tuple[Tensor, Tensor]:
-        """The running statistics of the VAE's batch norm, one pair for each packed channel."""
+        """The running statistics of the VAE's batch norm, one value per packed channel."""
         norm = self.vae.bn
         deviation = (norm.running_var.float() + self.vae.config.batch_norm_eps).sqrt()
         return norm.running_mean.float().view(1, -1, 1, 1), deviation.view(1, -1, 1, 1)
 
     def noise(self, size: tuple[int, int], seed: int) -> Tensor:
-        """Drawn on the packed grid, unlike the other families'.
+        """See `Backbone.noise`. Unlike in the other families, the noise is drawn on the packed grid.
 
         Raises:
-            ModelError: sides that are not multiples of 16.
+            ModelError: a side is not a multiple of 16.
         """
-        self._refuse_off_grid(*size)
+        self._check_grid(*size)
         width, height = (side // self.multiple for side in size)
         return torch.randn(1, self.channels, height, width, generator=torch.Generator().manual_seed(seed))
 
     def shift(self, tokens: int, steps: int) -> float:
-        """Black Forest Labs' empirical fit: a line in the steps between its values at 10 and at 200."""
+        """Black Forest Labs' empirical fit of mu: linear in the steps between its values at 10 and at 200 steps."""
         at_200 = 0.00016927 * tokens + 0.45666666
         if tokens > 4300:
             return at_200
@@ -86,41 +86,43 @@ class Klein(ClassifierFreeBackbone):
         return at_200 + (at_200 - at_10) / 190 * (steps - 200)
 
     def positions(self, latents: Tensor, condition: Tensor) -> Tensor:
-        """(tokens, 4): time (0 generated, 10 conditioning), row, column, place in the text (0)."""
-        return torch.cat([_ids(latents, 0), _ids(condition, _CONDITION_TIME)]).to(self.device)
+        """Position ids, (tokens, 4): time (0 generated, 10 conditioning), row, column, index in the text (0)."""
+        return torch.cat([_position_ids(latents, 0), _position_ids(condition, _CONDITION_TIME)]).to(
+            self.device
+        )
 
     @classmethod
-    def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a stock pipeline
-        """Three layers of Qwen3 for the prompt, and for the empty one."""
+    def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a pipeline of diffusers
+        """Hidden states of three layers of Qwen3, for the prompt and for the empty prompt."""
         embeds, _ = pipeline.encode_prompt(prompt=text)
         negative, _ = pipeline.encode_prompt(prompt="")
         return PromptEmbedding(cls.name, text, embeds.detach(), negative=negative.detach())
 
     @classmethod
-    def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a stock transformer
-        """Eight random tokens, and eight for the empty prompt."""
+    def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a transformer of diffusers
+        """Eight random tokens each for the prompt and the empty prompt."""
         shape = (1, 8, transformer.config.joint_attention_dim)
         return random_prompt(cls.name, seed, embeds=shape, negative=shape)
 
-    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, words: Tensor) -> Tensor:
-        told = words.to(self.device, self.dtype).expand(len(latents), -1, -1)
+    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor) -> Tensor:
+        embeds = embeds.to(self.device, self.dtype).expand(len(latents), -1, -1)
         tokens = self.transformer(
             hidden_states=self._tokens(latents, condition),
-            encoder_hidden_states=told,
+            encoder_hidden_states=embeds,
             timestep=sigma.to(self.device, self.dtype),
             guidance=None,
-            txt_ids=_text_ids(told).to(self.device),
+            txt_ids=_text_position_ids(embeds).to(self.device),
             img_ids=self.positions(latents, condition),
             return_dict=False,
         )[0]
-        return grid_of(tokens, latents)
+        return tokens_to_grid(tokens, latents)
 
 
-def _ids(grid: Tensor, time: int) -> Tensor:
+def _position_ids(grid: Tensor, time: int) -> Tensor:
     rows, columns = (torch.arange(side) for side in grid.shape[2:])
     return torch.cartesian_prod(torch.tensor([time]), rows, columns, torch.arange(1))
 
 
-def _text_ids(words: Tensor) -> Tensor:
+def _text_position_ids(embeds: Tensor) -> Tensor:
     zero = torch.arange(1)
-    return torch.cartesian_prod(zero, zero, zero, torch.arange(words.shape[1]))
+    return torch.cartesian_prod(zero, zero, zero, torch.arange(embeds.shape[1]))

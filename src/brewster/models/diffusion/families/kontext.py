@@ -1,4 +1,4 @@
-"""FLUX.1 Kontext [dev], the paper's backbone: 11.9 billion parameters, guidance distilled into the transformer."""
+"""FLUX.1 Kontext [dev], the paper's backbone: 11.9 billion parameters, with distilled guidance."""
 
 from __future__ import annotations
 
@@ -8,7 +8,13 @@ import torch
 from torch import Tensor
 
 from brewster.errors import ModelError
-from brewster.models.diffusion.families.family import Backbone, Licence, StockCall, grid_of, random_prompt
+from brewster.models.diffusion.families.family import (
+    Backbone,
+    DiffusersUsage,
+    Licence,
+    random_prompt,
+    tokens_to_grid,
+)
 from brewster.models.diffusion.prompt import PromptEmbedding
 
 _SCHEDULER: Final = {
@@ -37,16 +43,16 @@ class Kontext(Backbone):
         },
         is_commercial=False,
     )
-    stock_use = StockCall(
+    diffusers_usage = DiffusersUsage(
         "text_encoder=None, text_encoder_2=None, tokenizer=None, tokenizer_2=None",
         'pooled_prompt_embeds=words["pooled"], max_area={area}, _auto_resize=False,',
-        "Without `max_area` and `_auto_resize=False` the pipeline rescales both pictures in silence.",
+        "Without `max_area` and `_auto_resize=False` the pipeline silently rescales both pictures.",
     )
     classes: ClassVar = {
         "pipeline": "FluxKontextPipeline", "transformer": "FluxTransformer2DModel",
         "vae": "AutoencoderKL", "scheduler": "FlowMatchEulerDiscreteScheduler",
     }  # fmt: skip
-    real: ClassVar = {
+    full_size: ClassVar = {
         "transformer": {"guidance_embeds": True},
         "vae": {**_VAE, "block_out_channels": (128, 256, 512, 512), "layers_per_block": 2},
         "scheduler": _SCHEDULER,
@@ -63,55 +69,55 @@ class Kontext(Backbone):
     guided_by_embedding = True
 
     def statistics(self) -> tuple[Tensor, Tensor]:
-        """One number each: FLUX.1's VAE has a common shift and scale."""
+        """One value each, (1, 1, 1, 1): FLUX.1's VAE has one shift and scale for all channels."""
         config = self.vae.config
         mean = torch.tensor(config.shift_factor, device=self.vae.device)
         deviation = 1 / torch.tensor(config.scaling_factor, device=self.vae.device)
         return mean.view(1, 1, 1, 1), deviation.view(1, 1, 1, 1)
 
     def positions(self, latents: Tensor, condition: Tensor) -> Tensor:
-        """(tokens, 3): 0 for generated and 1 for conditioning tokens, row, column."""
-        return torch.cat([_ids(latents, 0), _ids(condition, 1)]).to(self.device)
+        """Position ids, (tokens, 3): picture (0 generated, 1 conditioning), row, column."""
+        return torch.cat([_position_ids(latents, 0), _position_ids(condition, 1)]).to(self.device)
 
     def predict(
         self, latents: Tensor, condition: Tensor, sigma: Tensor, prompt: PromptEmbedding, guidance: float
     ) -> Tensor:
-        """See Backbone; guidance is a number that the transformer reads.
+        """See `Backbone.predict`. The guidance scale is an input of the transformer.
 
         Raises:
-            ModelError: a prompt without its summary vector.
+            ModelError: the prompt has no pooled vector.
         """
         if prompt.pooled is None:
-            raise ModelError("the prompt has no pooled vector", "one, from CLIP", "encode the prompt again")
-        count, words = len(latents), prompt.to(self.device, self.dtype)
-        assert words.pooled is not None
-        embeds = self.transformer.config.guidance_embeds
+            raise ModelError("the prompt has no pooled vector", "one by CLIP", "encode the prompt again")
+        count, embedding = len(latents), prompt.to(self.device, self.dtype)
+        assert embedding.pooled is not None
+        takes_guidance = self.transformer.config.guidance_embeds
         tokens = self.transformer(
             hidden_states=self._tokens(latents, condition),
-            encoder_hidden_states=words.embeds.expand(count, -1, -1),
-            pooled_projections=words.pooled.expand(count, -1),
+            encoder_hidden_states=embedding.embeds.expand(count, -1, -1),
+            pooled_projections=embedding.pooled.expand(count, -1),
             timestep=sigma.to(self.device, self.dtype),
-            guidance=torch.full((count,), guidance, device=self.device) if embeds else None,
-            txt_ids=torch.zeros(words.embeds.shape[1], 3, device=self.device),
+            guidance=torch.full((count,), guidance, device=self.device) if takes_guidance else None,
+            txt_ids=torch.zeros(embedding.embeds.shape[1], 3, device=self.device),
             img_ids=self.positions(latents, condition).float(),
             return_dict=False,
         )[0]
-        return grid_of(tokens, latents)
+        return tokens_to_grid(tokens, latents)
 
     @classmethod
-    def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a stock pipeline
-        """T5's tokens and CLIP's summary of the prompt."""
+    def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a pipeline of diffusers
+        """The prompt's token embeddings by T5, and its pooled vector by CLIP."""
         embeds, pooled, _ = pipeline.encode_prompt(prompt=text, prompt_2=text)
         return PromptEmbedding(cls.name, text, embeds.detach(), pooled.detach())
 
     @classmethod
-    def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a stock transformer
-        """Eight random tokens and a random summary."""
+    def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a transformer of diffusers
+        """Eight random tokens and a random pooled vector."""
         config = transformer.config
         shapes = {"embeds": (1, 8, config.joint_attention_dim), "pooled": (1, config.pooled_projection_dim)}
         return random_prompt(cls.name, seed, **shapes)
 
 
-def _ids(grid: Tensor, picture: int) -> Tensor:
+def _position_ids(grid: Tensor, picture: int) -> Tensor:
     rows, columns = (torch.arange(side) for side in grid.shape[2:])
     return torch.cartesian_prod(torch.tensor([picture]), rows, columns)

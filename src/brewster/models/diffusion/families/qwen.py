@@ -1,4 +1,4 @@
-"""Qwen-Image-Edit: 20 billion parameters, Apache-2.0, the backbone of the strongest published peer (WindowSeat)."""
+"""Qwen-Image-Edit: 20 billion parameters, Apache-2.0; the backbone of WindowSeat, the best published method."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from brewster.models.diffusion.families.family import (
     APACHE_2,
     PATCH,
     ClassifierFreeBackbone,
-    grid_of,
     random_prompt,
+    tokens_to_grid,
 )
 from brewster.models.diffusion.prompt import PromptEmbedding
 
@@ -25,22 +25,22 @@ _GREY_SIDE_PX: Final = 448
 
 @final
 class Qwen(ClassifierFreeBackbone):
-    """Qwen-Image-Edit (Qwen team 2025); guidance is classifier-free and keeps each token's length.
+    """Qwen-Image-Edit (Qwen team 2025), with classifier-free guidance that preserves the norm of each token.
 
-    Its stock pipeline resizes the condition to a megapixel; here it is seen as it is. Its text encoder looks at the
-    picture, too; here the prompt is encoded once, beside a plain grey picture.
+    The pipeline of diffusers resizes the conditioning image to one megapixel; this class does not. Its text encoder
+    also reads the conditioning image; this class encodes the prompt once, with a uniform grey image.
     """
 
     name = "qwen"
     hub_id = "Qwen/Qwen-Image-Edit"
     licence = APACHE_2
-    stock_use = "but resizes what it is shown to a megapixel, so that its panels are not the ones learnt"
-    words_need = ("torchvision",)
+    diffusers_usage = "but resizes the conditioning image to one megapixel, so that its panels differ from those in training"
+    text_encoder_requirements = ("torchvision",)
     classes: ClassVar = {
         "pipeline": "QwenImageEditPipeline", "transformer": "QwenImageTransformer2DModel",
         "vae": "AutoencoderKLQwenImage", "scheduler": "FlowMatchEulerDiscreteScheduler",
     }  # fmt: skip
-    real: ClassVar = {"transformer": {}, "vae": {}, "scheduler": _SCHEDULER}
+    full_size: ClassVar = {"transformer": {}, "vae": {}, "scheduler": _SCHEDULER}
     tiny: ClassVar = {
         "transformer": {
             "num_layers": 2, "attention_head_dim": 16, "num_attention_heads": 2, "joint_attention_dim": 32,
@@ -51,53 +51,53 @@ class Qwen(ClassifierFreeBackbone):
     }  # fmt: skip
 
     def statistics(self) -> tuple[Tensor, Tensor]:
-        """One pair for each channel of the VAE, the same for the four cells of a patch."""
+        """One value per channel of the VAE, repeated for the four cells of a patch."""
         config, device = self.vae.config, self.vae.device
         mean = torch.tensor(config.latents_mean, device=device).repeat_interleave(PATCH**2)
         deviation = torch.tensor(config.latents_std, device=device).repeat_interleave(PATCH**2)
         return mean.view(1, -1, 1, 1), deviation.view(1, -1, 1, 1)
 
     def positions(self, latents: Tensor, condition: Tensor) -> list[list[tuple[int, int, int]]]:
-        """(frames, rows, columns) of the generated and of the conditioning picture, for each sample.
+        """For each sample, (frames, rows, columns) of the generated picture and of the conditioning image.
 
-        The transformer itself turns them into rotary angles, centred on each picture.
+        The transformer computes the rotary position embedding from them, centred on each picture.
         """
         shapes = [(1, int(grid.shape[2]), int(grid.shape[3])) for grid in (latents, condition)]
         return [shapes] * len(latents)
 
     @classmethod
-    def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a stock pipeline
-        """Qwen2.5-VL's last layer for the prompt beside a grey picture, and for an empty one."""
+    def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a pipeline of diffusers
+        """Qwen2.5-VL's last hidden states with a grey image, for the prompt and for an empty prompt."""
         grey = torch.full((3, _GREY_SIDE_PX, _GREY_SIDE_PX), 128, dtype=torch.uint8)
         embeds, _ = pipeline.encode_prompt(prompt=text, image=grey)
         negative, _ = pipeline.encode_prompt(prompt=" ", image=grey)
         return PromptEmbedding(cls.name, text, embeds.detach(), negative=negative.detach())
 
     @classmethod
-    def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a stock transformer
-        """Eight random tokens, and six for the empty prompt."""
+    def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a transformer of diffusers
+        """Eight random tokens for the prompt, and six for the empty prompt."""
         width = transformer.config.joint_attention_dim
         return random_prompt(cls.name, seed, embeds=(1, 8, width), negative=(1, 6, width))
 
-    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, words: Tensor) -> Tensor:
+    def _velocity(self, latents: Tensor, condition: Tensor, sigma: Tensor, embeds: Tensor) -> Tensor:
         tokens = self.transformer(
             hidden_states=self._tokens(latents, condition),
-            encoder_hidden_states=words.to(self.device, self.dtype).expand(len(latents), -1, -1),
+            encoder_hidden_states=embeds.to(self.device, self.dtype).expand(len(latents), -1, -1),
             timestep=sigma.to(self.device, self.dtype),
             img_shapes=self.positions(latents, condition),
             return_dict=False,
         )[0]
-        return grid_of(tokens, latents)
+        return tokens_to_grid(tokens, latents)
 
-    def _guided(self, wanted: Tensor, empty: Tensor, guidance: float) -> Tensor:
-        """The direction of the guided prediction, the length of the wanted one, token by token."""
-        combined = super()._guided(wanted, empty, guidance)
-        return combined * (_length(wanted) / _length(combined))
+    def _guided(self, conditional: Tensor, unconditional: Tensor, guidance: float) -> Tensor:
+        """The guided prediction, rescaled per token to the norm of the conditional one."""
+        combined = super()._guided(conditional, unconditional, guidance)
+        return combined * (_length(conditional) / _length(combined))
 
-    def _see(self, picture: Tensor) -> Tensor:
+    def _vae_encode(self, picture: Tensor) -> Tensor:
         return self.vae.encode(picture[:, :, None]).latent_dist.mode()[:, :, 0]  # type: ignore[no-any-return]
 
-    def _show(self, latent: Tensor) -> Tensor:
+    def _vae_decode(self, latent: Tensor) -> Tensor:
         return self.vae.decode(latent[:, :, None], return_dict=False)[0][:, :, 0]  # type: ignore[no-any-return]
 
 
