@@ -83,7 +83,7 @@ def compared(scene: Scene, assets: Assets, samples: int) -> list[str]:
         ours, again = render(scene, assets), render(_reseeded(scene, 1), assets)
     polarised = scene.camera.heading_deg > 30
     first, second = (
-        trace(_reseeded(scene, seed), assets, noise=0, most_samples=samples, polarised=polarised)
+        trace(_reseeded(scene, seed), assets, noise=0, max_samples=samples, polarised=polarised)
         for seed in (2, 3)
     )
     return [_line(name, ours, again, first, second) for name in LAYERS]

@@ -62,7 +62,7 @@ def converged(scene: Scene, assets: Assets) -> LightSample:
         update={"width": 4 * scene.camera.width, "height": 4 * scene.camera.height}
     )
     fine = render(scene.model_copy(update={"camera": camera}), assets)
-    return fine.each(lambda picture: avg_pool2d(picture[None], 4)[0])
+    return fine.map(lambda picture: avg_pool2d(picture[None], 4)[0])
 
 
 def mitsuba(
@@ -70,10 +70,10 @@ def mitsuba(
 ) -> tuple[float, float, int, bool]:
     """CPU-seconds to reach GOOD, the error reached, rays a pixel, and whether the seconds are extrapolated."""
     samples = 4
-    trace(scene, assets, noise=0, most_samples=samples, denoise=denoise)  # compiles its kernels
+    trace(scene, assets, noise=0, max_samples=samples, denoise=denoise)  # compiles its kernels
     while True:
         start = time.process_time()
-        traced = trace(scene, assets, noise=0, most_samples=samples, denoise=denoise)
+        traced = trace(scene, assets, noise=0, max_samples=samples, denoise=denoise)
         spent, error = time.process_time() - start, relative_error(traced, reference)
         if error <= GOOD:
             return spent, error, samples, False

@@ -12,9 +12,22 @@ from brewster.errors import RecipeError
 from brewster.render import analytic
 from brewster.render.analytic import render
 from brewster.render.rays.layered_glass import all_orders, paper_orders
+from brewster.scene.camera import axes
 from brewster.scene.glass import Glazing, Pane
 from brewster.scene.world import Side
-from worlds_of_one import WORLDS, Worlds, a_scene, around, at, board, looks, scenes, soft, sun, where
+from worlds_of_one import (
+    WORLDS,
+    Worlds,
+    a_scene,
+    around,
+    at,
+    board,
+    centroid,
+    pixel_directions,
+    scenes,
+    soft,
+    sun,
+)
 
 unshrunk = settings(phases=[Phase.explicit, Phase.generate], deadline=None, database=None)
 some, few = (settings(unshrunk, max_examples=count) for count in (25, 10))
@@ -23,7 +36,7 @@ SMOOTH = {"far": around(), "dome": around(radius_mm=3000.0), "near": board()}
 
 def closed_form(scene, form=all_orders):
     """The shares at the centre of every pixel, (3, H, W) or (1, H, W)."""
-    cosine = torch.from_numpy(-looks(scene.camera) @ np.array([0, 0, 1]))
+    cosine = torch.from_numpy(-pixel_directions(scene.camera) @ np.array([0, 0, 1]))
     shares = form(scene.glass, cosine)
     return [share.reshape(-1, *cosine.shape).float() for share in (shares.transmitted, shares.reflected)]
 
@@ -159,7 +172,7 @@ def test_a_wedge_bends_the_view_by_half_its_angle():
         camera={"fov_deg": 10}, panes=[{"wedge_deg": 2.0}], behind=around("sun"), orders="paper", samples=64
     )
     sample = render(scene, light)
-    (bent, _), (straight, _) = where(sample.transmission), where(sample.background)
+    (bent, _), (straight, _) = centroid(sample.transmission), centroid(sample.background)
     assert abs(bent - straight) * 10 / 24 == pytest.approx(1, rel=0.03)
 
 
@@ -199,7 +212,7 @@ def test_a_camera_that_turns_right_sees_a_map_move_left(heading_deg):
     for turn in (0, 5):
         camera = at(heading_deg + turn, fov_deg=30)
         scene = a_scene(camera=camera, glass=glass, behind=around("sun", heading_deg=heading_deg), samples=16)
-        places.append(where(render(scene, light).background))
+        places.append(centroid(render(scene, light).background))
     half_texel = 360 / 128 / 2
     pixels_a_degree = 24 / math.degrees(2 * math.tan(math.radians(15)))
     assert places[0][0] == pytest.approx(12 + half_texel * pixels_a_degree, abs=0.1)
@@ -212,10 +225,10 @@ def test_a_picture_before_the_glass_is_mirrored_and_one_behind_is_not():
     picture[:8, 24:] = 1  # its upper right
     scene = a_scene(behind=board("corner", width_mm=300), front=board("corner", width_mm=300))
     sample = render(scene, Worlds(corner=picture))
-    right, upper = where(sample.background)
+    right, upper = centroid(sample.background)
     assert right > 14
     assert upper < 10
-    left, also_upper = where(sample.reflection)
+    left, also_upper = centroid(sample.reflection)
     assert left == pytest.approx(24 - right, abs=0.05)
     assert also_upper == pytest.approx(upper, abs=0.05)
 
@@ -239,10 +252,10 @@ PLACES = st.fixed_dictionaries(
 )
 
 
-def projected(scene, place, glass_axes):
+def projected(scene, point, to_glass):
     """Where a pinhole sees a point that is given in the glass's frame."""
-    in_world = place @ glass_axes + np.array(scene.glass.position_mm) - np.array(scene.camera.position_mm)
-    right, up, back = map(np.array, analytic.axes(scene.camera.heading_deg, scene.camera.pitch_deg))
+    in_world = point @ to_glass + np.array(scene.glass.position_mm) - np.array(scene.camera.position_mm)
+    right, up, back = map(np.array, axes(scene.camera.heading_deg, scene.camera.pitch_deg))
     scale = scene.camera.width / 2 / scene.camera.half_width / -(in_world @ back)
     return scene.camera.width / 2 + in_world @ right * scale, scene.camera.height / 2 - in_world @ up * scale
 
@@ -252,7 +265,7 @@ def projected(scene, place, glass_axes):
 def test_a_plane_is_where_pinhole_geometry_projects_it(drawn):
     """A small plane: its centroid, and for one that faces the glass its area, as a mirror image when in front."""
     heading, pitch = drawn["glass_deg"]
-    axes = np.array(analytic.axes(heading, pitch))
+    to_glass = np.array(axes(heading, pitch))
     camera = at(
         heading + drawn["camera_deg"][0], pitch + drawn["camera_deg"][1], fov_deg=40, width=48, height=48
     )
@@ -261,9 +274,9 @@ def test_a_plane_is_where_pinhole_geometry_projects_it(drawn):
     bare = a_scene(
         camera=camera, glass=Glazing(heading_deg=heading, pitch_deg=pitch, position_mm=tuple(position))
     )
-    eye = axes @ (np.array(bare.camera.position_mm) - position)
+    eye = to_glass @ (np.array(bare.camera.position_mm) - position)
     away = drawn["distance_mm"] + 4
-    middle = axes @ looks(bare.camera)[23:25, 23:25].mean((0, 1))
+    middle = to_glass @ pixel_directions(bare.camera)[23:25, 23:25].mean((0, 1))
     reach = (eye[2] + away) / -middle[2]
     offset = (eye + middle * reach)[:2] + np.array(drawn["offset"]) * reach * bare.camera.half_width
     plane = {
@@ -277,8 +290,8 @@ def test_a_plane_is_where_pinhole_geometry_projects_it(drawn):
     scene = bare.model_copy(update={"behind": Side(), "front": Side(), which: board("square", **plane)})
     sample = render(scene, Worlds(square=np.ones((16, 16, 3), np.float32)))
     picture = sample.background if drawn["is_behind"] else sample.mirror
-    image = projected(scene, np.array([*offset, -away]), axes)
-    assert where(picture) == pytest.approx(image, abs=0.25)
+    image = projected(scene, np.array([*offset, -away]), to_glass)
+    assert centroid(picture) == pytest.approx(image, abs=0.25)
 
 
 @pytest.mark.parametrize("is_behind", [True, False])
@@ -328,7 +341,7 @@ def test_the_same_scene_gives_the_same_bytes(kind):
 @pytest.mark.parametrize("kind", sorted(KINDS))
 def test_it_does_not_matter_how_many_rays_are_worked_on_at_once(kind, monkeypatch):
     whole = render(a_scene(**KINDS[kind], samples=4), WORLDS)
-    monkeypatch.setattr(analytic, "_STRIP", 100)
+    monkeypatch.setattr(analytic, "_CPU_BATCH_RAYS", 100)
     strips = render(a_scene(**KINDS[kind], samples=4), WORLDS)
     for first, second in zip(whole.layers().values(), strips.layers().values(), strict=True):
         if kind == "rough":  # which orders are worth following is decided by the mean of a strip

@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as arrays
 
 from brewster.errors import UnsupportedPhoto
 from brewster.photo import Photo
-from brewster.render.camera_response import develop, jpeg, to_bytes, with_jpeg
+from brewster.render.camera_response import develop, encode_jpeg, to_uint8, with_jpeg
 from brewster.render.sample import LAYERS, LightSample
 from brewster.scene.scene import Development, Scene
 from brewster.srgb import REC709_LUMINANCE, to_encoded, to_linear
@@ -51,7 +51,7 @@ def noise(shape=(3, 40, 56), low=0.02, high=0.5):
 
 
 def seen(light, developed, ev=None):
-    """Light after the recorded decisions, before it is clipped."""
+    """Light after the recorded camera_settings, before it is clipped."""
     gains = torch.tensor(developed.white_balance).view(3, 1, 1)
     return light * gains * 2 ** (developed.exposure_ev if ev is None else ev)
 
@@ -128,7 +128,7 @@ def test_the_same_light_has_the_same_value_in_every_layer(picture, wish):
 def test_the_record_reproduces_the_pictures(picture, wish):
     sample = sample_of(picture, **wish.model_dump())
     developed = develop(sample)
-    outcome = tomllib.loads(tomli_w.dumps(developed.decisions()))
+    outcome = tomllib.loads(tomli_w.dumps(developed.camera_settings()))
     assert outcome["white_balance"] == list(developed.white_balance)
     for name in LAYERS:
         ev = outcome["mirror_exposure_ev" if name == "mirror" else "exposure_ev"]
@@ -269,7 +269,7 @@ def test_developing_twice_gives_the_same_bits():
         one, two = (
             develop(sample_of(noise(), white_balance=balance, shot_noise=0.1, contrast=0.3)) for _ in range(2)
         )
-        assert one.decisions() == two.decisions()
+        assert one.camera_settings() == two.camera_settings()
         assert all(torch.equal(one.layers()[name], two.layers()[name]) for name in LAYERS)
 
 
@@ -279,18 +279,18 @@ def test_developing_twice_gives_the_same_bits():
 @some
 @given(arrays.arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3))))
 def test_eight_bits_survive_the_way_to_a_tensor_and_back(pixels):
-    assert np.array_equal(to_bytes(torch.from_numpy(pixels).permute(2, 0, 1) / 255), pixels)
+    assert np.array_equal(to_uint8(torch.from_numpy(pixels).permute(2, 0, 1) / 255), pixels)
 
 
 def test_jpegs_are_the_same_bytes_again_and_grow_with_quality():
-    files = [jpeg(noise(), quality) for quality in (1, 30, 60, 90, 95, 100)]
-    assert files == [jpeg(noise(), quality) for quality in (1, 30, 60, 90, 95, 100)]
+    files = [encode_jpeg(noise(), quality) for quality in (1, 30, 60, 90, 95, 100)]
+    assert files == [encode_jpeg(noise(), quality) for quality in (1, 30, 60, 90, 95, 100)]
     sizes = [len(file) for file in files]
     assert sizes == sorted(set(sizes))
 
 
 def test_a_jpeg_says_its_quality_keeps_its_chroma_and_carries_nothing_else():
-    photo = Photo.open(jpeg(noise(), 83))
+    photo = Photo.open(encode_jpeg(noise(), 83))
     assert (photo.file_info.container, photo.file_info.jpeg_quality) == ("jpeg", 83)
     assert photo.file_info.subsampling == "4:4:4"
     assert photo.size == (56, 40)
@@ -299,15 +299,15 @@ def test_a_jpeg_says_its_quality_keeps_its_chroma_and_carries_nothing_else():
 
 def test_a_picture_too_wide_for_a_jpeg_is_refused():
     with pytest.raises(UnsupportedPhoto, match="jpeg"):
-        jpeg(torch.zeros(3, 1, 65536), 95)
+        encode_jpeg(torch.zeros(3, 1, 65536), 95)
 
 
 def test_live_training_sees_the_photo_as_it_comes_back_from_its_jpeg():
     ramp = torch.linspace(0.01, 0.6, 56).expand(3, 40, 56).clone()
     developed = develop(sample_of(ramp, jpeg_quality=40))
     lived = with_jpeg(developed)
-    decoded = Photo.open(jpeg(developed.photo_encoded, 40)).pixels
-    assert np.array_equal(to_bytes(lived.photo_encoded), decoded)
+    decoded = Photo.open(encode_jpeg(developed.photo_encoded, 40)).pixels
+    assert np.array_equal(to_uint8(lived.photo_encoded), decoded)
     assert lived.photo_encoded.dtype == torch.float32
     assert 0.001 < (lived.photo_encoded - developed.photo_encoded).abs().mean() < 0.05
     for name in LAYERS[1:]:

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from brewster.render.analytic import render
-from brewster.render.rays.defocus import _disc, blurred, margin_px
+from brewster.render.rays.defocus import _disc_kernel, defocus_blur, margin_px
 from brewster.scene.camera import Camera
-from worlds_of_one import WORLDS, Worlds, a_scene, around, at, board, sun, where
+from worlds_of_one import WORLDS, Worlds, a_scene, around, at, board, centroid, sun
 
 
 def lens(aperture_mm, focus_mm=500.0, **more):
@@ -20,7 +20,7 @@ def lens(aperture_mm, focus_mm=500.0, **more):
 def test_without_an_aperture_the_camera_is_a_pinhole():
     picture = torch.rand(3, 32, 32)
     assert margin_px(lens(0.0)) == 0
-    assert blurred(picture, lens(0.0), 0) is picture
+    assert defocus_blur(picture, lens(0.0), 0) is picture
 
 
 def test_a_tiny_aperture_is_a_pinhole_too():
@@ -32,7 +32,7 @@ def test_a_tiny_aperture_is_a_pinhole_too():
 @pytest.mark.parametrize("radius_px", [0.1, 0.5, 1.3, 4.0, 9.7])
 def test_the_disc_sums_to_one_and_has_its_own_radius(radius_px):
     reach = math.ceil(radius_px + 0.5)
-    disc = _disc(radius_px, reach)
+    disc = _disc_kernel(radius_px, reach)
     assert disc.shape == (2 * reach + 1, 2 * reach + 1)
     assert float(disc.sum()) == pytest.approx(1, abs=1e-9)
     assert torch.equal(disc, disc.T)
@@ -48,9 +48,9 @@ def test_a_point_is_seen_as_a_disc_of_half_the_aperture_over_the_focus(aperture_
     margin, radius = margin_px(camera), aperture_mm / (2 * 500) / camera.pixel_rad
     point = torch.zeros(1, 32 + 2 * margin, 32 + 2 * margin)
     point[0, margin + 14, margin + 18] = 1
-    picture = blurred(point, camera, margin)
+    picture = defocus_blur(point, camera, margin)
     assert float(picture.sum()) == pytest.approx(1, abs=1e-5)
-    assert where(picture) == pytest.approx((18.5, 14.5), abs=1e-4)
+    assert centroid(picture) == pytest.approx((18.5, 14.5), abs=1e-4)
     assert float(1 / picture.max()) == pytest.approx(math.pi * radius**2, rel=0.05)
     across = torch.arange(32) - 18
     spread = float((picture[0].sum(0) * across**2).sum())
@@ -66,7 +66,7 @@ def test_the_sun_through_a_lens_keeps_its_place_and_energy():
     )
     sharp, soft = (render(scene, light).background for scene in scenes)
     assert float(soft.sum()) == pytest.approx(float(sharp.sum()), rel=1e-3)
-    assert where(soft) == pytest.approx(where(sharp), abs=0.05)
+    assert centroid(soft) == pytest.approx(centroid(sharp), abs=0.05)
     assert soft.max() < sharp.max() / 2
 
 
@@ -76,7 +76,7 @@ def test_what_lies_outside_the_picture_is_blurred_into_it():
     margin = margin_px(camera)
     picture = torch.zeros(1, 32 + 2 * margin, 32 + 2 * margin)
     picture[:, :, margin + 32 :] = 1
-    edge = blurred(picture, camera, margin)[0, 16]
+    edge = defocus_blur(picture, camera, margin)[0, 16]
     assert 0.3 < edge[31] < 0.5
     assert edge[: 32 - margin].max() < 1e-6
 

@@ -6,7 +6,7 @@ import pytest
 from brewster.errors import RecipeError
 from brewster.render.mitsuba import renderer, variant
 from brewster.render.mitsuba.renderer import trace
-from brewster.render.mitsuba.scene_builder import MitsubaSceneBuilder, between
+from brewster.render.mitsuba.scene_builder import MitsubaSceneBuilder, sample_bilinear
 from brewster.scene.camera import Camera, axes
 from brewster.scene.glass import Glazing, Pane
 from brewster.scene.scene import Scene
@@ -51,14 +51,16 @@ def a_scene(**more):
 
 
 def traced(scene, **more):
-    return trace(scene, Pictures(), **{"noise": 0.01, "most_samples": 512, **more})
+    return trace(scene, Pictures(), **{"noise": 0.01, "max_samples": 512, **more})
 
 
 def shot(scene, side, glass, samples=64):
     """One picture (H, W, 3) without the other four."""
     mitsuba = variant.load()
-    with renderer._rendering_by(mitsuba, variant.probe().variant):
-        room = MitsubaSceneBuilder(mitsuba, scene, Pictures()).room(behind=side == "behind", glass=glass)
+    with renderer._active_variant(mitsuba, variant.probe().variant):
+        room = MitsubaSceneBuilder(mitsuba, scene, Pictures()).scene_dict(
+            behind=side == "behind", glass=glass
+        )
         return np.array(mitsuba.render(mitsuba.load_dict(room), spp=samples))
 
 
@@ -86,7 +88,7 @@ def test_glass_that_does_not_refract_is_not_there():
 
 
 def test_a_pane_of_ordinary_glass_reflects_about_eight_percent():
-    sample = traced(a_scene(camera=at(0)), noise=0.003, most_samples=4096)
+    sample = traced(a_scene(camera=at(0)), noise=0.003, max_samples=4096)
     s, _ = slab(0)
     assert float(sample.reflection.mean()) == pytest.approx(s, rel=0.02)
     assert float(sample.transmission.mean()) == pytest.approx(1 - s, rel=0.002)
@@ -104,7 +106,7 @@ def test_tinted_panes_absorb_as_beer_and_lambert_say():
         Pane(thickness_mm=10, absorption_per_m=(40, 0, 10)),
         Pane(thickness_mm=5, absorption_per_m=(0, 0, 20)),
     )
-    light = shot(a_scene(camera=at(0), glass=Glazing(panes=panes, gap_mm=10)), "behind", "unreflected")
+    light = shot(a_scene(camera=at(0), glass=Glazing(panes=panes, gap_mm=10)), "behind", "paper_transmission")
     np.testing.assert_allclose(light.mean((0, 1)), 0.96**4 * np.exp([-0.4, 0, -0.2]), rtol=0.01)
 
 
@@ -118,7 +120,7 @@ def test_polarised_light_follows_the_closed_form_at_brewsters_angle(compiled):
 
 def test_s_and_p_light_each_follow_the_closed_form(compiled, mitsuba):
     camera = {**at(56.31), "width": 16, "height": 16}
-    with renderer._rendering_by(mitsuba, renderer._variant(polarised=True)):
+    with renderer._active_variant(mitsuba, renderer._variant(polarised=True)):
         room = MitsubaSceneBuilder(mitsuba, a_scene(camera=camera), Pictures(), colour=0).room(
             behind=False, glass="full"
         )
@@ -140,9 +142,15 @@ def red_half(picture):
 def test_what_is_red_on_the_right_of_a_plane_is_red_on_the_right_of_the_picture():
     scene = a_scene(behind=board("red right"), front=board("red right"))
     assert (
-        red_half(shot(scene, "behind", "none")) == red_half(shot(scene, "behind", "unreflected")) == "right"
+        red_half(shot(scene, "behind", "none"))
+        == red_half(shot(scene, "behind", "paper_transmission"))
+        == "right"
     )
-    assert red_half(shot(scene, "front", "mirror")) == red_half(shot(scene, "front", "unentered")) == "left"
+    assert (
+        red_half(shot(scene, "front", "mirror"))
+        == red_half(shot(scene, "front", "paper_reflection"))
+        == "left"
+    )
 
 
 def test_what_is_red_on_the_top_of_a_plane_is_red_on_the_top_of_the_picture():
@@ -170,9 +178,9 @@ def test_a_map_shines_as_its_texels_say_and_only_on_its_own_side(
     ahead = random.normal(size=(3, 4000))
     ahead /= np.linalg.norm(ahead, axis=0)
     to_glass = np.array(axes(glass.heading_deg, glass.pitch_deg))
-    with renderer._rendering_by(mitsuba, variant.COMPILED):
+    with renderer._active_variant(mitsuba, variant.COMPILED):
         room = mitsuba.load_dict(
-            MitsubaSceneBuilder(mitsuba, scene, Pictures()).room(behind=behind, glass="none")
+            MitsubaSceneBuilder(mitsuba, scene, Pictures()).scene_dict(behind=behind, glass="none")
         )
         found = room.ray_intersect(
             mitsuba.Ray3f(mitsuba.Point3f(0), mitsuba.Vector3f((to_glass @ ahead).astype("f4")))
@@ -180,7 +188,9 @@ def test_a_map_shines_as_its_texels_say_and_only_on_its_own_side(
         light = np.array(found.emitter(room).eval(found))
     u = (np.arctan2(ahead[0], -ahead[2]) / (2 * np.pi) - 37 / 360) % 1
     v = np.arccos(ahead[1]) / np.pi
-    expected = np.stack([between(MOTTLED, u[i : i + 1], v[i : i + 1])[0, 0] for i in range(len(u))], axis=1)
+    expected = np.stack(
+        [sample_bilinear(MOTTLED, u[i : i + 1], v[i : i + 1])[0, 0] for i in range(len(u))], axis=1
+    )
     height = to_glass[2] @ ahead
     clear = np.abs(height) > 0.01
     np.testing.assert_allclose(light[:, clear], (expected * ((height < 0) == behind))[:, clear], atol=1e-4)
@@ -214,7 +224,7 @@ def test_a_lens_bends_light_as_the_lensmakers_formula_says(radii_mm):
     scene = a_scene(glass=glass, behind=board("ramp", distance_mm=far, width_mm=100), camera=camera)
     one, other = radii_mm
     power = 0.5 * (1 / one - 1 / other + 0.5 * 6 / (1.5 * one * other))
-    assert slope(shot(scene, "behind", "unreflected"), near) * 100 / 0.96**2 == pytest.approx(
+    assert slope(shot(scene, "behind", "paper_transmission"), near) * 100 / 0.96**2 == pytest.approx(
         1 + far / near - far * power, abs=0.02
     )
 
@@ -252,7 +262,7 @@ def test_glass_that_cannot_be_is_refused(glass):
 def test_the_same_seed_gives_the_same_bytes_and_another_one_does_not():
     scene = a_scene(behind=around("mottled"), front=around("mottled"))
     one, same, other = (
-        traced(s, most_samples=16) for s in (scene, scene, scene.model_copy(update={"seed": 1}))
+        traced(s, max_samples=16) for s in (scene, scene, scene.model_copy(update={"seed": 1}))
     )
     for first, second, third in zip(*(s.layers().values() for s in (one, same, other)), strict=True):
         assert first.numpy().tobytes() == second.numpy().tobytes()
@@ -264,7 +274,7 @@ def test_the_noise_that_was_asked_for_is_the_noise_there_is():
     errors = []
     for noise in (0.05, 0.005):
         one, other = (
-            traced(scene.model_copy(update={"seed": n}), noise=noise, most_samples=4096) for n in (1, 2)
+            traced(scene.model_copy(update={"seed": n}), noise=noise, max_samples=4096) for n in (1, 2)
         )
         difference = (one.photo - other.photo).mean(0).abs() / one.photo.mean(0)
         errors.append(float(difference.mean()) * math.sqrt(math.pi) / 2)  # E|a - b| = 2 sigma / sqrt(pi)
@@ -275,14 +285,14 @@ def test_the_noise_that_was_asked_for_is_the_noise_there_is():
 def test_denoising_keeps_the_light():
     pytest.importorskip("mitsuba_oidn")
     noisy, clean = (
-        traced(a_scene(), most_samples=16, denoise=denoise).reflection for denoise in (False, True)
+        traced(a_scene(), max_samples=16, denoise=denoise).reflection for denoise in (False, True)
     )
     assert float(clean.std()) < 0.5 * float(noisy.std())
     assert float(clean.mean()) == pytest.approx(float(noisy.mean()), rel=0.2)
 
 
 def test_another_variant_that_was_chosen_before_comes_back(mitsuba):
-    traced(a_scene(), most_samples=4)
+    traced(a_scene(), max_samples=4)
     mitsuba.set_variant("scalar_rgb")
-    traced(a_scene(), most_samples=4)
+    traced(a_scene(), max_samples=4)
     assert mitsuba.variant() == "scalar_rgb"

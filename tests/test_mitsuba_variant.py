@@ -17,7 +17,7 @@ from test_mitsuba_renderer import Pictures, a_scene
 with warnings.catch_warnings(record=True) as told:
     warnings.simplefilter("always")
     scene = a_scene(camera={"width": 16, "height": 16})
-    light = float(trace(scene, Pictures(), noise=0.01, most_samples=64).photo.mean())
+    light = float(trace(scene, Pictures(), noise=0.01, max_samples=64).photo.mean())
 assert abs(light - 1) < 0.01, light
 import mitsuba
 from brewster.errors import DeviceError
@@ -26,7 +26,7 @@ loaded = {line.split()[-1].rpartition("/")[2] for line in open("/proc/self/maps"
 print(variant.probe().variant, *loaded)
 print(*{str(warning.message) for warning in told})
 try:
-    trace(scene, Pictures(), most_samples=4, polarised=True)
+    trace(scene, Pictures(), max_samples=4, polarised=True)
 except DeviceError as error:
     print(error)
 """
@@ -62,10 +62,10 @@ def test_without_an_llvm_that_works_the_scalar_variant_renders_and_none_is_loade
 
 
 def test_the_llvm_of_the_pip_package_comes_first_and_compiles(compiled):
-    packaged = variant._of_the_package()
+    packaged = variant._packaged_llvm()
     if not packaged:
         pytest.skip(f"no LLVM of pip: {variant.INSTALL_LLVM}")
-    unnamed = {name: value for name, value in os.environ.items() if name != variant.LIBRARY}
+    unnamed = {name: value for name, value in os.environ.items() if name != variant.LLVM_PATH_VARIABLE}
     done = subprocess.run(
         [
             sys.executable,
@@ -101,17 +101,17 @@ for fails in (lambda: mitsuba.load_dict({"type": "nonsense"}), lambda: OpenEXR.F
 
 
 def test_an_llvm_that_aborts_costs_no_more_than_a_line(monkeypatch):
-    monkeypatch.setattr(variant, "_PICTURE", "import os; os.abort()")
-    assert "ends the process" in variant._fails(None)
-    monkeypatch.setattr(variant, "_PICTURE", "raise ValueError('no kernel')")
-    assert variant._fails(None) == "ValueError: no kernel"
+    monkeypatch.setattr(variant, "_TEST_PROGRAM", "import os; os.abort()")
+    assert "ends the process" in variant._failure_reason(None)
+    monkeypatch.setattr(variant, "_TEST_PROGRAM", "raise ValueError('no kernel')")
+    assert variant._failure_reason(None) == "ValueError: no kernel"
 
 
 def test_known_good_llvm_versions_are_tried_first(tmp_path, monkeypatch):
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     monkeypatch.delitem(sys.modules, "drjit", raising=False)
     monkeypatch.setattr(variant, "_FOLDERS", [str(tmp_path)])
-    monkeypatch.setattr(variant, "_PACKAGE", "no-such-package")
+    monkeypatch.setattr(variant, "_LLVM_PACKAGE", "no-such-package")
     for name in ("libLLVM-14.so.1", "libLLVM-18.so.1", "libLLVM.so.19.1", "libLLVM.so.21.0"):
         (tmp_path / name).touch()
     names = [path and path.rpartition("/")[2] for path in variant._candidates()]

@@ -6,7 +6,7 @@ import torch
 
 from brewster.render.analytic import render
 from brewster.render.rays import rough_glass
-from brewster.render.rays.ggx import seen_density, shadowing, visible_facet
+from brewster.render.rays.ggx import sample_visible_normal, smith_g1, vndf_over_cosine
 from brewster.render.rays.layered_glass import all_orders
 from brewster.render.rays.rough_glass import surfaces
 from brewster.scene.glass import Glazing, Pane
@@ -52,7 +52,7 @@ def test_light_found_by_facets_alone_or_drawn_from_the_map_too_is_the_same(monke
     side = around("soft", heading_deg=30, radius_mm=radius_mm)
     scene = rough(alpha, samples=32, behind=side, front=side)
     both = render(scene, WORLDS)
-    monkeypatch.setattr(rough_glass, "_WORTH_LIGHT", 2.0)
+    monkeypatch.setattr(rough_glass, "_MIN_LIGHT_SAMPLING_WEIGHT", 2.0)
     alone = render(scene, WORLDS)
     assert not torch.equal(both.photo, alone.photo)
     assert mean(both.photo) == pytest.approx(mean(alone.photo), rel=5e-3)
@@ -65,7 +65,7 @@ def test_a_small_sun_in_frosted_glass_is_steady_only_when_its_light_is_drawn(mon
     WORLDS.pictures["lamp"][30:32, :2] += 500
     scene = rough(0.2, samples=16, camera=at(0), behind=around("lamp", heading_deg=5))
     both = render(scene, WORLDS).transmission
-    monkeypatch.setattr(rough_glass, "_WORTH_LIGHT", 2.0)
+    monkeypatch.setattr(rough_glass, "_MIN_LIGHT_SAMPLING_WEIGHT", 2.0)
     alone = render(scene, WORLDS).transmission
     assert mean(both) == pytest.approx(mean(alone), rel=0.1)
 
@@ -81,16 +81,16 @@ def test_every_facet_that_is_seen_is_drawn_as_often_as_it_is_seen():
     normal = torch.tensor([[0.0], [0.0], [1.0]])
     for alpha in (0.1, 0.4):
         towards = torch.tensor([[0.6], [0.0], [0.8]]).expand(3, 200_000)
-        facet = visible_facet(towards, normal, alpha, torch.rand(2, 200_000, generator=generator))
+        facet = sample_visible_normal(towards, normal, alpha, torch.rand(2, 200_000, generator=generator))
         cosine = (facet * towards).sum(0).clamp(min=0)
-        density = seen_density(towards, normal, facet, alpha) * cosine
+        density = vndf_over_cosine(towards, normal, facet, alpha) * cosine
         inside = facet[2] > 0.95  # a cap of known size: the mean of 1 / density over it is its solid angle
         assert float((inside / density).mean()) == pytest.approx(2 * np.pi * 0.05, rel=0.02)
         assert facet.norm(dim=0) == pytest.approx(1, abs=1e-5)
 
 
 def test_shadowing_hides_nothing_from_above_and_much_at_a_grazing_look():
-    above, slanted, grazing = shadowing(torch.tensor([1.0, 0.5, 0.05]), 0.4)
+    above, slanted, grazing = smith_g1(torch.tensor([1.0, 0.5, 0.05]), 0.4)
     assert float(above) == 1
     assert 1 > float(slanted) > float(grazing) > 0
 

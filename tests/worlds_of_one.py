@@ -95,7 +95,7 @@ def a_scene(camera=None, panes=(), **more):
     )
 
 
-def looks(camera):
+def pixel_directions(camera):
     """Unit directions (H, W, 3) through the centres of a picture's pixels."""
     right, up, back = map(np.array, axes(camera.heading_deg, camera.pitch_deg))
     half = math.tan(math.radians(camera.fov_deg) / 2)
@@ -105,7 +105,7 @@ def looks(camera):
     return ways / np.linalg.norm(ways, axis=-1, keepdims=True)
 
 
-def where(picture):
+def centroid(picture):
     """The centroid of a picture (3, H, W), in pixels to the right and down from its upper left corner."""
     light = np.asarray(picture, np.float64).sum(0)
     height, width = light.shape
