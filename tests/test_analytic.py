@@ -1,4 +1,4 @@
-"""The analytic renderer: its pictures add up, equal closed forms where there are any, and lie where geometry says."""
+"""The analytic renderer: layers add up, match closed forms, and objects are where geometry places them."""
 
 import math
 
@@ -35,7 +35,7 @@ SMOOTH = {"far": around(), "dome": around(radius_mm=3000.0), "near": board()}
 
 
 def closed_form(scene, form=all_orders):
-    """The shares at the centre of every pixel, (3, H, W) or (1, H, W)."""
+    """Transmittance and reflectance at the centre of every pixel, (3, H, W) or (1, H, W)."""
     cosine = torch.from_numpy(-pixel_directions(scene.camera) @ np.array([0, 0, 1]))
     shares = form(scene.glass, cosine)
     return [share.reshape(-1, *cosine.shape).float() for share in (shares.transmitted, shares.reflected)]
@@ -75,7 +75,7 @@ def test_the_choice_of_orders_changes_the_layers_and_not_the_photo(scene):
 
 @few
 @given(scenes(front=Side()))
-def test_a_black_room_is_mirrored_black(scene):
+def test_without_light_in_front_there_is_no_reflection(scene):
     sample = render(scene, WORLDS)
     assert not sample.reflection.any()
     assert not sample.mirror.any()
@@ -83,7 +83,7 @@ def test_a_black_room_is_mirrored_black(scene):
 
 @few
 @given(scenes(behind=Side(), orders="all"))
-def test_before_a_black_world_the_photo_is_its_reflection(scene):
+def test_without_light_behind_the_photo_is_the_reflection(scene):
     sample = render(scene, WORLDS)
     assert not sample.transmission.any()
     assert not sample.background.any()
@@ -93,7 +93,7 @@ def test_before_a_black_world_the_photo_is_its_reflection(scene):
 @pytest.mark.parametrize("side", ["far", "dome", "near"])
 @pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("aperture_mm", [0.0, 20.0])
-def test_glass_that_does_not_refract_is_not_there(side, count, aperture_mm):
+def test_glass_with_index_one_is_invisible(side, count, aperture_mm):
     sides = {
         "far": around("mottled"),
         "dome": around("mottled", radius_mm=2000.0),
@@ -116,7 +116,7 @@ def test_glass_that_does_not_refract_is_not_there(side, count, aperture_mm):
 @pytest.mark.parametrize("side", sorted(SMOOTH))
 @pytest.mark.parametrize("aperture_mm", [0.0, 20.0])
 @pytest.mark.parametrize("orders", ["all", "paper"])
-def test_in_an_even_world_every_pixel_has_its_closed_form(side, aperture_mm, orders):
+def test_in_uniform_light_every_pixel_equals_the_closed_form(side, aperture_mm, orders):
     panes = [
         {"thickness_mm": 6.0, "absorption_per_m": (4.0, 1.5, 20.0)},
         {"index": 1.7, "absorption_per_m": (2.0, 9.0, 1.0)},
@@ -139,7 +139,7 @@ def test_in_an_even_world_every_pixel_has_its_closed_form(side, aperture_mm, ord
 
 
 def test_far_light_has_no_ghost_in_parallel_glass():
-    """However rich the world, R is MR times a factor of the angle alone: all orders leave in one direction."""
+    """R is MR times a factor that depends on the angle only: all orders leave in one direction."""
     scene = a_scene(
         camera=at(40, 10, width=25, height=25),
         panes=[{"thickness_mm": 30.0}, {}],
@@ -154,7 +154,7 @@ def test_far_light_has_no_ghost_in_parallel_glass():
 
 
 def test_a_thick_pane_brings_what_is_behind_it_nearer_by_a_third_of_its_thickness():
-    """The share of an image is its area: (distance / (distance - t (1 - 1 / n)))^2."""
+    """The image's area grows by (distance / (distance - t (1 - 1 / n)))^2."""
     scene = a_scene(
         camera=at(0, distance_mm=1000, fov_deg=10, width=48, height=48),
         panes=[{"thickness_mm": 90.0}],
@@ -176,7 +176,7 @@ def test_a_wedge_bends_the_view_by_half_its_angle():
     assert abs(bent - straight) * 10 / 24 == pytest.approx(1, rel=0.03)
 
 
-def test_a_very_small_wedge_is_none():
+def test_a_very_small_wedge_renders_like_parallel_glass():
     scenes_ = (
         a_scene(
             camera=at(25),
@@ -192,7 +192,7 @@ def test_a_very_small_wedge_is_none():
         torch.testing.assert_close(getattr(wedged, layer), getattr(parallel, layer), rtol=1e-3, atol=0)
 
 
-# --- where things are
+# --- positions
 
 
 def test_the_bright_right_of_a_map_is_on_the_right_and_its_top_on_top():
@@ -205,7 +205,7 @@ def test_the_bright_right_of_a_map_is_on_the_right_and_its_top_on_top():
 
 @pytest.mark.parametrize("heading_deg", [0, 90, -120])
 def test_a_camera_that_turns_right_sees_a_map_move_left(heading_deg):
-    """A sun at a heading of its own stands in the middle for a camera with that heading; 5 degrees are 4 pixels."""
+    """A camera with the sun's heading sees it in the centre; a turn of 5 degrees moves it by 4 pixels."""
     light = Worlds(sun=sun(64, 32, 0))
     glass = Glazing(heading_deg=heading_deg)
     places = []
@@ -253,7 +253,7 @@ PLACES = st.fixed_dictionaries(
 
 
 def projected(scene, point, to_glass):
-    """Where a pinhole sees a point that is given in the glass's frame."""
+    """The pixel position of a point that is given in the glass frame, for a pinhole camera."""
     in_world = point @ to_glass + np.array(scene.glass.position_mm) - np.array(scene.camera.position_mm)
     right, up, back = map(np.array, axes(scene.camera.heading_deg, scene.camera.pitch_deg))
     scale = scene.camera.width / 2 / scene.camera.half_width / -(in_world @ back)
@@ -263,7 +263,7 @@ def projected(scene, point, to_glass):
 @some
 @given(PLACES)
 def test_a_plane_is_where_pinhole_geometry_projects_it(drawn):
-    """A small plane: its centroid, and for one that faces the glass its area, as a mirror image when in front."""
+    """The centroid of a small plane, or of its mirror image if the plane is in front."""
     heading, pitch = drawn["glass_deg"]
     to_glass = np.array(axes(heading, pitch))
     camera = at(
@@ -306,12 +306,12 @@ def test_a_plane_is_as_large_as_pinhole_geometry_says(is_behind):
     assert float(picture[0].sum()) == pytest.approx(width * width / 2, rel=0.01)
 
 
-# --- steadiness
+# --- stability
 
 
 @pytest.mark.parametrize("texels", [0.5, 1, 1.3])
-def test_a_sun_of_one_texel_does_not_sparkle(texels):
-    """As the camera turns by tenths of a pixel that spans this many texels, the picture keeps the sun's energy."""
+def test_a_sun_of_one_texel_does_not_flicker(texels):
+    """The sun's energy in the image is constant while the camera turns by tenths of a pixel of this many texels."""
     light, fov_deg = Worlds(sun=sun(256, 128, 0)), 360 / 512 * texels * 32
     energies = []
     for tenth in range(10):
@@ -339,18 +339,18 @@ def test_the_same_scene_gives_the_same_bytes(kind):
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
-def test_it_does_not_matter_how_many_rays_are_worked_on_at_once(kind, monkeypatch):
+def test_the_result_does_not_depend_on_the_batch_size(kind, monkeypatch):
     whole = render(a_scene(**KINDS[kind], samples=4), WORLDS)
     monkeypatch.setattr(analytic, "_CPU_BATCH_RAYS", 100)
     strips = render(a_scene(**KINDS[kind], samples=4), WORLDS)
     for first, second in zip(whole.layers().values(), strips.layers().values(), strict=True):
-        if kind == "rough":  # which orders are worth following is decided by the mean of a strip
+        if kind == "rough":  # orders end by their mean weight over a batch
             assert float(first.mean()) == pytest.approx(float(second.mean()), rel=2e-3)
         else:
             torch.testing.assert_close(first, second, rtol=1e-5, atol=1e-6)
 
 
-def test_another_index_is_other_chance_with_the_same_means():
+def test_another_index_gives_other_random_numbers_and_the_same_means():
     scene = a_scene(panes=[{"wedge_deg": 0.5}], behind=around("mottled"), samples=16)
     one, other = (render(scene.model_copy(update={"index": index}), WORLDS).background for index in (0, 1))
     assert not torch.equal(one, other)
@@ -365,7 +365,7 @@ def test_another_index_is_other_chance_with_the_same_means():
     ],
     ids=["framed", "curved"],
 )
-def test_framed_and_curved_glass_is_left_to_the_tracer(glass):
+def test_framed_and_curved_glass_is_refused_with_a_hint_to_mitsuba(glass):
     with pytest.raises(RecipeError, match="--renderer mitsuba"):
         render(a_scene(glass=glass), WORLDS)
 

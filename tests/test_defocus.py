@@ -1,4 +1,4 @@
-"""The thin lens over far content: a convolution that equals what chance finds."""
+"""Defocus at infinity: the convolution equals Monte Carlo integration."""
 
 import math
 
@@ -54,7 +54,9 @@ def test_a_point_is_seen_as_a_disc_of_half_the_aperture_over_the_focus(aperture_
     assert float(1 / picture.max()) == pytest.approx(math.pi * radius**2, rel=0.05)
     across = torch.arange(32) - 18
     spread = float((picture[0].sum(0) * across**2).sum())
-    assert spread == pytest.approx(radius**2 / 4 + 1 / 12, abs=0.06)  # a disc's, and a pixel's
+    assert spread == pytest.approx(
+        radius**2 / 4 + 1 / 12, abs=0.06
+    )  # variance of the disc plus that of a pixel
     assert float(picture[0, 14, across.abs() > radius + 1].max()) < 1e-6
 
 
@@ -70,8 +72,8 @@ def test_the_sun_through_a_lens_keeps_its_place_and_energy():
     assert soft.max() < sharp.max() / 2
 
 
-def test_what_lies_outside_the_picture_is_blurred_into_it():
-    """Light just beyond the right edge reaches in by the disc's radius."""
+def test_light_outside_the_image_is_blurred_into_it():
+    """Light beyond the right edge is blurred into the image as far as the disc's radius."""
     camera = lens(60.0)
     margin = margin_px(camera)
     picture = torch.zeros(1, 32 + 2 * margin, 32 + 2 * margin)
@@ -82,9 +84,9 @@ def test_what_lies_outside_the_picture_is_blurred_into_it():
 
 
 @pytest.mark.parametrize("incidence_deg", [0, 30])
-def test_a_lens_over_far_light_equals_rays_by_chance(incidence_deg):
-    """A wedge of nearly nothing makes the renderer throw rng."""
-    by_convolution, by_chance = (
+def test_defocus_by_convolution_equals_monte_carlo_integration(incidence_deg):
+    """A tiny wedge makes the renderer use Monte Carlo integration."""
+    by_convolution, by_monte_carlo = (
         render(
             a_scene(
                 camera=at(incidence_deg, aperture_mm=40, focus_mm=800, fov_deg=40),
@@ -98,12 +100,12 @@ def test_a_lens_over_far_light_equals_rays_by_chance(incidence_deg):
         for wedge_deg in (0.0, 1e-9)
     )
     for name, most in (("background", 3e-3), ("transmission", 3e-3), ("mirror", 3e-3), ("reflection", 0.01)):
-        one, other = getattr(by_convolution, name), getattr(by_chance, name)
+        one, other = getattr(by_convolution, name), getattr(by_monte_carlo, name)
         assert float(((one - other).abs() / one.mean()).max()) < most, name
         assert float(one.mean()) == pytest.approx(float(other.mean()), rel=2e-3)
 
 
-def test_a_near_picture_is_sharp_where_the_lens_is_set_on_it():
+def test_a_near_picture_is_sharp_in_the_focus_plane():
     pictures = [
         render(
             a_scene(

@@ -1,4 +1,4 @@
-"""What a stack of panes does to a ray, against formulas written out once more by hand."""
+"""Layered glass, compared with independently written formulas."""
 
 import math
 
@@ -45,7 +45,7 @@ def exact(number):
 
 
 def surface(cosine, here, beyond):
-    """Fresnel's reflectances for s and p light by the angles on both sides."""
+    """Fresnel reflectances for s- and p-polarised light, from the angles on both sides."""
     one = math.acos(cosine)
     other = math.asin(here * math.sin(one) / beyond)
     if one < 1e-6:
@@ -56,7 +56,7 @@ def surface(cosine, here, beyond):
 
 
 def slab(pane, cosine):
-    """T and R, for s and p light, of one pane without tint: all orders summed as a geometric series."""
+    """T and R of one clear pane for s- and p-polarised light: all orders as a geometric series."""
     return [((1 - r) / (1 + r), 2 * r / (1 + r)) for r in surface(cosine, 1, pane.index)]
 
 
@@ -170,8 +170,8 @@ def test_the_orders_shares_sum_to_the_closed_form(panes, cosine):
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_what_is_lumped_onto_the_last_order_is_little(count):
-    """With no remainder to carry, ordinary glass's orders come within a thousandth of all its light."""
+def test_the_light_added_to_the_last_order_is_little(count):
+    """For ordinary glass, the enumerated orders alone hold all but a thousandth of the light."""
     panes = [Pane()] * count
     table = enumerate_orders((0.04,) * count)
     whole = all_orders(glazing(panes), exact(1))
@@ -185,7 +185,7 @@ def test_what_is_lumped_onto_the_last_order_is_little(count):
         assert found == pytest.approx(float(total), abs=1e-3)
 
 
-def test_one_pane_has_three_reflections_and_two_views_worth_following():
+def test_one_pane_has_three_reflected_and_two_transmitted_orders():
     table = enumerate_orders((0.04,))
     assert [order.behind for order in table] == [True, False, False, True, False]
     assert [order.traversals for order in table] == [(1,), (0,), (2,), (3,), (4,)]
@@ -219,7 +219,7 @@ def test_in_double_glazing_the_papers_reflection_never_enters_the_last_pane():
 # --- ghosts
 
 
-def test_the_ghosts_distance_is_the_textbooks():
+def test_the_ghost_distance_matches_the_textbook_formula():
     inside = math.asin(math.sin(math.radians(45)) / 1.5)
     expected = 2 * 6 * math.tan(inside) * math.cos(math.radians(45))
     assert ghost_distance_mm(Pane(thickness_mm=6), 45) == pytest.approx(expected, rel=1e-9)
@@ -228,7 +228,7 @@ def test_the_ghosts_distance_is_the_textbooks():
     assert ghost_distance_mm(Pane(index=1.0), 60) == pytest.approx(8 * math.sin(math.radians(60)), rel=1e-9)
 
 
-def test_traversals_go_by_snells_angle_in_glass_and_straight_on_in_the_gap():
+def test_lateral_shifts_follow_snells_law_in_glass_and_are_unrefracted_in_the_gap():
     first, gap, second = lateral_shifts_mm(
         Glazing(panes=(Pane(thickness_mm=3), Pane(thickness_mm=8, index=2)), gap_mm=16), exact(0.5)
     )
@@ -239,7 +239,7 @@ def test_traversals_go_by_snells_angle_in_glass_and_straight_on_in_the_gap():
 
 
 def line_mirrored(incidence_deg, thickness_mm):
-    """Light by column of a thin line before the glass, mirrored in the middle; a pixel's size in mm there."""
+    """The mean reflection per column of a thin line in front of the glass, and the size of a pixel there in mm."""
     before, away, slant = 600.0, 400.0, math.radians(incidence_deg)
     camera = at(incidence_deg, distance_mm=before / math.cos(slant), fov_deg=0.6, width=48, height=16)
     line = board(
@@ -270,8 +270,8 @@ def test_a_line_near_the_glass_is_mirrored_twice_as_far_apart_as_the_formula_say
     assert columns[ghost].sum() / columns[main].sum() == pytest.approx(fainter, rel=0.03)
 
 
-def test_a_ghost_that_is_a_pixel_away_moves_the_lines_centroid_by_its_share():
-    """Orders are looked up apart from each other unless they land within a tenth of a pixel."""
+def test_a_ghost_one_pixel_away_moves_the_lines_centroid_by_its_weight():
+    """Orders have separate lookups unless their images are within a tenth of a pixel."""
     columns, pixel_mm = line_mirrored(40, 0.4)
     apart = ghost_distance_mm(Pane(thickness_mm=0.4), 40) / pixel_mm
     assert 0.5 < apart < 1.5
