@@ -1,5 +1,5 @@
-"""All metrics for 500 pictures of 540x400 in one run of `brewster evaluate`: pictures a second with one worker and with
-two, and whether memory stays flat.
+"""`brewster evaluate` with all metrics on 500 images of 540x400: images per second with one and two workers, and
+whether memory stays constant.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/evaluate.py [COUNT]
 """
@@ -34,23 +34,23 @@ def main(data: Path, count: int = 500) -> None:
         )
         rate = count / seconds[workers]
         print(
-            f"{workers} workers: {rate:.2f} pictures a second, all metrics, the unprocessed input and one folder"
+            f"{workers} workers: {rate:.2f} images per second, all metrics, the unprocessed input and one folder"
         )
         print(f"  memory of all processes: {first:.2f} GiB in the first quarter, {last:.2f} GiB in the last")
     print(f"two workers are {seconds[1] / seconds[2]:.2f} times as fast as one")
     same = (OUT / "workers-1/results.json").read_bytes() == (OUT / "workers-2/results.json").read_bytes()
-    print(f"their results.json are {'equal' if same else 'NOT EQUAL'}")
+    print(f"their results.json files are {'equal' if same else 'NOT EQUAL'}")
 
 
 def make_pairs(data: Path, count: int) -> None:
-    """Triplets and another method's outputs: views of photos, lighter or darker, as JPEG and PNG."""
+    """Writes triplets and the outputs of another method, mixed from photos."""
     photos = sorted((data / "photos/permissive").glob("*.jpg"))
-    dice = np.random.default_rng(7)
+    rng = np.random.default_rng(7)
     for i in range(count):
         if (OUT / "theirs" / f"{i}.png").exists():
             continue
         behind, mirrored = (Photo.open(photos[(i + step) % len(photos)]).small(*SIZE) for step in (0, 17))
-        reflection = 0.3 * dice.uniform() * mirrored
+        reflection = 0.3 * rng.uniform() * mirrored
         layers = {
             "blended": 0.9 * behind + reflection,
             "transmission": behind,
@@ -63,7 +63,7 @@ def make_pairs(data: Path, count: int) -> None:
 
 
 def measure(out: Path, workers: int) -> tuple[float, list[float]]:
-    """Wall time and the memory (KiB, resident, all processes) every second, once the first picture is scored."""
+    """Wall time, and the resident memory of all processes in KiB, every second after the first image is scored."""
     command = [sys.executable, "-m", "brewster", "evaluate", "--quiet", "-o", out, "--workers", str(workers)]
     command += ["--benchmark", f"pairs={OUT / 'pairs'}", "--predictions", f"theirs={OUT / 'theirs'}"]
     started, memory = time.perf_counter(), []
@@ -71,7 +71,7 @@ def measure(out: Path, workers: int) -> tuple[float, list[float]]:
     watcher = threading.Thread(target=watch, args=(process, out, memory))
     watcher.start()
     if process.wait():
-        sys.exit("brewster evaluate failed: see its error above")
+        sys.exit("brewster evaluate failed; see its error above")
     taken = time.perf_counter() - started
     watcher.join()
     return taken, memory
@@ -80,19 +80,19 @@ def measure(out: Path, workers: int) -> tuple[float, list[float]]:
 def watch(process: subprocess.Popen, out: Path, memory: list[float]) -> None:
     while process.poll() is None:
         if (out / SCORES).exists() and (out / SCORES).stat().st_size:
-            memory.append(sum(resident(pid) for pid in family(process.pid)))
+            memory.append(sum(resident_kib(pid) for pid in process_tree(process.pid)))
         time.sleep(1)
 
 
-def family(pid: int) -> list[int]:
+def process_tree(pid: int) -> list[int]:
     try:
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     except OSError:
         return []
-    return [pid, *(descendant for child in children for descendant in family(int(child)))]
+    return [pid, *(descendant for child in children for descendant in process_tree(int(child)))]
 
 
-def resident(pid: int) -> float:
+def resident_kib(pid: int) -> float:
     try:
         lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     except OSError:

@@ -1,9 +1,9 @@
-"""LPIPS beside the arithmetic of the `lpips` package, and SSIM beside scikit-image, per picture of 540x400.
+"""Time per 540x400 image of our LPIPS and the arithmetic of the `lpips` package, and of our SSIM and scikit-image's.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/metrics.py
 
-One thread each, turn about, medians of 11. A table of methods asks for the features of a truth once, so that is what
-LPIPS costs here for each further answer; the package computes both pictures every time.
+One thread each, alternating, medians of 11 rounds. Our LPIPS computes the features of a ground truth once for all
+predictions, so a further prediction costs less; the package computes both images every time.
 """
 
 import os
@@ -33,14 +33,14 @@ def main(data: Path) -> None:
     picture, truth = pair(data)
     perceptual(picture, truth)
     for window, how in (("uniform", {}), ("gaussian", GAUSSIAN)):
-        ours, peer = race(
+        ours_ms, reference_ms = median_ms(
             lambda window=window: ssim(picture, truth, window=window),
             lambda how=how: structural_similarity(truth, picture, channel_axis=2, **how),
         )
         print(
-            f"SSIM {window} of 540x400: {ours:.1f} ms; scikit-image {peer:.1f} ms; {peer / ours:.2f} times as fast"
+            f"SSIM {window} of 540x400: {ours_ms:.1f} ms; scikit-image {reference_ms:.1f} ms; {reference_ms / ours_ms:.2f} times as fast"
         )
-    fast, region = race(lambda: psnr(picture, truth), lambda: reflection_region(picture, truth))
+    fast, region = median_ms(lambda: psnr(picture, truth), lambda: reflection_region(picture, truth))
     print(f"PSNR: {fast:.1f} ms; reflection region: {region:.1f} ms")
     torch.set_num_threads(threads)
 
@@ -48,20 +48,20 @@ def main(data: Path) -> None:
 def perceptual(picture: np.ndarray, truth: np.ndarray) -> None:
     metric, package = Lpips.load(), Package()
     known = metric.features(truth)
-    first, peer = race(
+    first, reference_ms = median_ms(
         lambda: metric.distance(metric.features(picture), metric.features(truth)),
         lambda: package(picture, truth),
     )
-    (further,) = race(lambda: metric.distance(metric.features(picture), known))
-    apart = abs(metric.distance(metric.features(picture), known) - package(picture, truth))
+    (further,) = median_ms(lambda: metric.distance(metric.features(picture), known))
+    difference = abs(metric.distance(metric.features(picture), known) - package(picture, truth))
     print(
-        f"LPIPS of 540x400: {first:.0f} ms, each further answer to a truth {further:.0f} ms; as the lpips package "
-        f"computes it {peer:.0f} ms; {peer / first:.2f} and {peer / further:.2f} times as fast; {apart:.1e} apart"
+        f"LPIPS of 540x400: {first:.0f} ms, each further prediction {further:.0f} ms; the lpips package's arithmetic "
+        f"{reference_ms:.0f} ms; {reference_ms / first:.2f} and {reference_ms / further:.2f} times as fast; difference {difference:.1e}"
     )
 
 
 class Package:
-    """The same number in the order of the lpips package's own operations."""
+    """LPIPS with the operations of the lpips package, in its order."""
 
     def __init__(self) -> None:
         tensors = [load_alexnet()[name] for name in TENSOR_NAMES]
@@ -100,14 +100,14 @@ def normal(values: torch.Tensor) -> torch.Tensor:
 
 
 def pair(data: Path) -> tuple[np.ndarray, np.ndarray]:
-    """A real photo and its truth, cut to 540x400."""
+    """A real photo and its ground truth, cropped to 540x400."""
     photo = min((data / "real/dev/nature/blended").iterdir())
     (truth,) = (data / "real/dev/nature/transmission").glob(f"{photo.stem}.*")
     return tuple(Photo.open(path).pixels[:HEIGHT, :WIDTH] for path in (photo, truth))
 
 
-def race(*runs: Callable[[], object]) -> list[float]:
-    """The median milliseconds of each, run turn about so that a busy machine slows all."""
+def median_ms(*runs: Callable[[], object]) -> list[float]:
+    """The median milliseconds of each function; they alternate, so that other load slows all of them alike."""
     times = [[] for _ in runs]
     for _ in range(ROUNDS + 1):
         for run, spent in zip(runs, times, strict=True):

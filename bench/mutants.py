@@ -1,11 +1,11 @@
-"""Do the tests notice small faults? Applies those of mutants.toml one at a time, and runs the tests that should fail.
+"""Mutation testing: applies the faults of mutants.toml one at a time, and runs the tests that should fail.
 
     make mutants                                  # all of them
-    python bench/mutants.py losses render/pane    # those whose file or text contains one of these words
+    python bench/mutants.py losses render/rays    # those whose file or text contains one of these words
 
-Each runs in a temporary copy of the tree. A fault is noticed if a test fails that passes without the fault; a run
-beyond the time limit counts as failed. mutmut and cosmic-ray generate every possible mutation of a file, thousands
-here; neither runs a short list with a few test files each.
+Each runs in a temporary copy of the tree. A mutant is killed if a test fails that passes without it; exceeding the
+time limit counts as a failure. mutmut and cosmic-ray generate every possible mutation of a file, thousands here;
+neither runs a short list with a few test files each.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ TARGET = 0.95
 
 @dataclass(frozen=True)
 class Mutant:
-    """One fault: `old` in `file` becomes `new`, and one of `tests` should fail. `survives` is why none can."""
+    """One fault: `old` in `file` becomes `new`, and one of `tests` should fail. `survives` explains why none can."""
 
     file: str
     old: str
@@ -58,7 +58,7 @@ class Mutant:
     survives: str = ""
 
     def __str__(self) -> str:
-        return f"{self.file}: {_short(self.old)} -> {_short(self.new)}"
+        return f"{self.file}: {_abbreviated(self.old)} -> {_abbreviated(self.new)}"
 
     def applied(self, root: Path = ROOT) -> str:
         """The mutated source.
@@ -83,7 +83,7 @@ def read_list() -> list[Mutant]:
 
 
 def main(words: Sequence[str]) -> int:
-    """Prints one line per mutant and the share that is noticed; 0 if that is at least 95 %."""
+    """Prints one line per mutant and the share that is killed; returns 0 if it is at least 95 %, else 1."""
     mutants = [m for m in read_list() if not words or any(word in f"{m.file} {m.old}" for word in words)]
     for mutant in mutants:
         mutant.applied()
@@ -91,33 +91,33 @@ def main(words: Sequence[str]) -> int:
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
         copy = _copy(Path(folder))
         survivors = {mutant: reason for mutant in mutants if (reason := _survives(copy, mutant))}
-    noticed = len(mutants) - len(survivors)
-    print(f"\n{noticed} of {len(mutants)} mutants noticed, {noticed / max(1, len(mutants)):.1%}")
+    killed = len(mutants) - len(survivors)
+    print(f"\n{killed} of {len(mutants)} mutants killed, {killed / max(1, len(mutants)):.1%}")
     for mutant, reason in survivors.items():
         print(f"survives: {mutant}\n    {reason}")
-    return int(noticed < TARGET * len(mutants))
+    return int(killed < TARGET * len(mutants))
 
 
 def _survives(copy: Path, mutant: Mutant) -> str:
-    """Why no test notices the mutant; empty if one does."""
+    """Runs the tests on a mutant; returns why it survives, or an empty string if a test kills it."""
     started = time.monotonic()
     path, tests = copy / PACKAGE / mutant.file, [f"tests/{test}" for test in mutant.tests]
     source = path.read_text("utf-8")
     path.write_text(mutant.applied(copy), "utf-8")
     try:
-        is_noticed, failed = _fails(copy, tests)
+        is_killed, failed = _run_tests(copy, tests)
     finally:
         path.write_text(source, "utf-8")
-    reason = "" if is_noticed else mutant.survives or "no reason is known: write a test"
-    if is_noticed and _fails(copy, failed or tests)[0]:
-        reason = f"{' '.join(failed or tests)} fails without it, too: mend that first"
-    told = f"SURVIVES  {reason}" if reason else f"noticed   {' '.join(failed)[:100] or 'by the time limit'}"
-    print(f"{time.monotonic() - started:4.0f} s  {mutant}\n        {told}", flush=True)
+    reason = "" if is_killed else mutant.survives or "no reason is known: write a test"
+    if is_killed and _run_tests(copy, failed or tests)[0]:
+        reason = f"{' '.join(failed or tests)} fails without it, too: fix that first"
+    result = f"SURVIVES  {reason}" if reason else f"killed    {' '.join(failed)[:100] or 'by the time limit'}"
+    print(f"{time.monotonic() - started:4.0f} s  {mutant}\n        {result}", flush=True)
     return reason
 
 
 def _copy(folder: Path) -> Path:
-    """The tree without caches; its bytecode is checked by content, as a mutation may keep size and time."""
+    """A copy of the tree without caches. Bytecode is checked by content: a mutation may keep the size and time of a file."""
     copy = folder / "brewster"
     copy.mkdir()
     for name in COPIED:
@@ -131,8 +131,8 @@ def _copy(folder: Path) -> Path:
     return copy
 
 
-def _fails(copy: Path, tests: Sequence[str]) -> tuple[bool, list[str]]:
-    """Whether these tests fail, and the first that does; at the time limit all that was started is killed."""
+def _run_tests(copy: Path, tests: Sequence[str]) -> tuple[bool, list[str]]:
+    """Whether these tests fail, and the first that does. At the time limit all processes are killed."""
     log = copy.parent / "failed.txt"
     log.write_text("")
     process = get_context("fork").Process(target=_pytest, args=(copy, tests, log))
@@ -147,7 +147,7 @@ def _fails(copy: Path, tests: Sequence[str]) -> tuple[bool, list[str]]:
 
 
 class _Recorder:
-    """A pytest plugin that writes down which tests fail."""
+    """A pytest plugin that logs which tests fail."""
 
     def __init__(self, log: Path) -> None:
         self._log = log
@@ -162,7 +162,7 @@ class _Recorder:
 
 
 def _pytest(copy: Path, tests: Sequence[str], log: Path) -> None:
-    """Becomes a process that looks like `python -m pytest` in the copy, with heavy libraries imported already."""
+    """Runs pytest in the copy, as `python -m pytest` would; the forked process has imported large libraries already."""
     os.setsid()
     for stream in (1, 2):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
@@ -176,7 +176,7 @@ def _pytest(copy: Path, tests: Sequence[str], log: Path) -> None:
 
 
 def _import_heavy() -> None:
-    """What most tests import, once: every run is forked from here, which saves seconds each time."""
+    """Imports what most tests need; every run is forked from this process, which saves seconds each time."""
     os.environ |= {"OMP_NUM_THREADS": "1", "VIPS_CONCURRENCY": "1"}
     for name in (
         "torch",
@@ -191,7 +191,7 @@ def _import_heavy() -> None:
         importlib.import_module(name)
 
 
-def _short(text: str) -> str:
+def _abbreviated(text: str) -> str:
     words = " ".join(text.split())
     return repr(words if len(words) <= 50 else f"{words[:47]}...")
 

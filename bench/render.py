@@ -1,11 +1,11 @@
-"""The analytic renderer against Mitsuba at equal error, in CPU-seconds of one run; and whole sets a second.
+"""Cost of the analytic renderer and of Mitsuba at equal error, in CPU-seconds, and the cost of complete sets.
 
     python bench/render.py
 
 Error is relMSE = mean((x - reference)^2 / (reference^2 + 0.01 mean(reference)^2)), averaged over the five pictures.
-The reference is ours at four times the size and 64 times the rays, averaged down; bench/judge.py shows that the two
-renderers agree. Mitsuba's rays are doubled until it is good enough or a minute is spent; then, and only then, its
-cost is extrapolated (error falls as 1 / rays).
+The reference is our image at four times the width and height, averaged down; bench/compare_renderers.py shows that the
+two renderers agree. Mitsuba's rays are doubled until the error is 1e-3 or the next run would exceed a minute. Only in
+the second case is its cost extrapolated (error is proportional to 1 / rays).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 import torch
-from judge import DOME, STREET, TINTED
+from compare_renderers import DOME, STREET, TINTED
 from torch.nn.functional import avg_pool2d
 
 from brewster.environments.assets import Assets
@@ -31,8 +31,8 @@ from brewster.scene.recipe import read_scene_recipe
 from brewster.scene.scene import Scene
 from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
 
-GOOD = 1e-3
-MOST_CPU_S = 60.0
+TARGET_ERROR = 1e-3
+MAX_CPU_S = 60.0
 CAMERA = Camera(fov_deg=50, position_mm=(0, 0, 800), heading_deg=10)
 ROOM = EnvironmentMap(source=AssetSource(file="builtin:room:2"))
 ART = Plane(source=AssetSource(file="builtin:painting:5"), distance_mm=500, width_mm=2500)
@@ -62,28 +62,28 @@ def converged(scene: Scene, assets: Assets) -> LightSample:
         update={"width": 4 * scene.camera.width, "height": 4 * scene.camera.height}
     )
     fine = render(scene.model_copy(update={"camera": camera}), assets)
-    return fine.each(lambda picture: avg_pool2d(picture[None], 4)[0])
+    return fine.map(lambda picture: avg_pool2d(picture[None], 4)[0])
 
 
 def mitsuba(
     scene: Scene, assets: Assets, reference: LightSample, *, denoise: bool
 ) -> tuple[float, float, int, bool]:
-    """CPU-seconds to reach GOOD, the error reached, rays a pixel, and whether the seconds are extrapolated."""
+    """CPU-seconds to reach TARGET_ERROR, the error reached, rays per pixel, and whether the seconds are extrapolated."""
     samples = 4
-    trace(scene, assets, noise=0, most_samples=samples, denoise=denoise)  # compiles its kernels
+    trace(scene, assets, noise=0, max_samples=samples, denoise=denoise)  # compiles its kernels
     while True:
         start = time.process_time()
-        traced = trace(scene, assets, noise=0, most_samples=samples, denoise=denoise)
+        traced = trace(scene, assets, noise=0, max_samples=samples, denoise=denoise)
         spent, error = time.process_time() - start, relative_error(traced, reference)
-        if error <= GOOD:
+        if error <= TARGET_ERROR:
             return spent, error, samples, False
-        if 2 * spent > MOST_CPU_S:
-            return spent * error / GOOD, error, samples, True
+        if 2 * spent > MAX_CPU_S:
+            return spent * error / TARGET_ERROR, error, samples, True
         samples *= 2
 
 
 def equal_error() -> None:
-    """Prints a row a scene and peer."""
+    """Prints one row per scene and variant of Mitsuba."""
     assets = Assets()
     print(
         "| scene | ours, relMSE | ours, CPU-s | Mitsuba | relMSE | CPU-s | times |\n|---|---|---|---|---|---|---|"
@@ -95,19 +95,19 @@ def equal_error() -> None:
         ours = render(scene, assets)
         spent, error = time.process_time() - start, relative_error(ours, reference)
         for denoise in (False, True):
-            theirs, reached, samples, guessed = mitsuba(scene, assets, reference, denoise=denoise)
+            theirs, reached, samples, is_extrapolated = mitsuba(scene, assets, reference, denoise=denoise)
             peer = f"{samples} rays" + (" + OIDN" if denoise else "")
-            cost = f"{theirs:.1f}" + (" (extrapolated)" if guessed else "")
+            cost = f"{theirs:.1f}" + (" (extrapolated)" if is_extrapolated else "")
             print(
                 f"| {name} | {error:.1e} | {spent:.3f} | {peer} | {reached:.1e} | {cost} | {theirs / spent:.0f} |",
                 flush=True,
             )
 
 
-def sets_a_second() -> None:
-    """Prints CPU-seconds a set at 512x384, all files written, for growing sets: cost must not grow."""
+def cost_per_set() -> None:
+    """Prints CPU-seconds per set at 512x384, all files written, for growing counts: the cost must not grow."""
     recipe = read_scene_recipe("window")
-    print("| sets | CPU-s a set |\n|---|---|")
+    print("| sets | CPU-s per set |\n|---|---|")
     for count in (10, 30, 90):
         with tempfile.TemporaryDirectory() as folder:
             job = RenderJob(Path(folder) / "set", recipe, BUILTIN_CATALOG, 7, "analytic", ())
@@ -120,7 +120,7 @@ def main(_: Path) -> None:
     """Both tables, on one thread."""
     torch.set_num_threads(1)
     equal_error()
-    sets_a_second()
+    cost_per_set()
 
 
 if __name__ == "__main__":

@@ -1,6 +1,8 @@
-"""What `make bench` plays: quality on the development pairs beside the unprocessed input and beside a peer, what happens
-to photographs without any reflection, the cost of a 12-megapixel photograph, metrics beside their peers, a large
-evaluation, the renderer beside Mitsuba, and both servers under load.
+"""Runs all benchmarks, as `make bench` does.
+
+Quality on the development pairs, compared with the unprocessed input and another method; photos without reflection;
+the cost of a 12-megapixel photo; metrics compared with other packages; a large evaluation; the renderer compared with
+Mitsuba; and both servers under load.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/run.py
 """
@@ -11,8 +13,8 @@ from pathlib import Path
 
 import evaluate
 import metrics
-import plain
 import quality
+import reflection_free
 import render
 import serve
 import speed
@@ -20,10 +22,13 @@ import study
 
 if __name__ == "__main__":
     if not os.environ.get("BREWSTER_DATA"):
-        sys.exit("BREWSTER_DATA is unset: the pairs and photographs to measure on are not part of brewster")
+        sys.exit(
+            "BREWSTER_DATA is not set; expected the folder of test pairs and photos, which brewster does not include;"
+            " set it to that folder"
+        )
     data = Path(os.environ["BREWSTER_DATA"])
     quality.main(data)
-    plain.main(data)
+    reflection_free.main(data)
     speed.main(data)
     metrics.main(data)
     evaluate.main(data)

@@ -1,9 +1,9 @@
-"""50 photos queued by 8 clients at `brewster serve`, beside the command line on the same folder in the same run.
+"""50 photos sent by 8 clients to `brewster serve`, compared with the command line on the same photos.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/serve.py
 
-Throughput as a ratio, the server's memory at the start, half way and at the end, and whether every answer is its own
-photo's: the bytes must be those that the command line has written.
+Prints the ratio of throughputs and the server's memory at the start, half way and at the end. The bytes of every
+response must be equal to the file that the command line wrote for the same photo.
 """
 
 import json
@@ -20,41 +20,41 @@ from pathlib import Path
 from threading import Thread
 
 PHOTOS, CLIENTS = 50, 8
-HOW = {"layers": "transmission", "quality": "draft"}
+OPTIONS = {"layers": "transmission", "quality": "draft"}
 BREWSTER = [sys.executable, "-m", "brewster"]
 
 
 def main(data: Path) -> None:
     photos = sorted((data / "photos/permissive").glob("*.jpg"))[:PHOTOS]
     with tempfile.TemporaryDirectory() as folder:
-        from_command, seconds = by_command(photos, Path(folder))
+        from_command, seconds = separate_by_command(photos, Path(folder))
     with server() as (url, process):
-        post(url, photos[0])  # the model is warm, as the command line's is after its first photo
+        post(url, photos[0])  # loads the model before the measurement starts
         memory, served = [resident_mb(process)], []
         for _ in range(2):
             started = time.perf_counter()
-            answers = by_clients(url, photos)
+            results = separate_by_clients(url, photos)
             served.append(time.perf_counter() - started)
             memory.append(resident_mb(process))
-            refuse_wrong(answers, from_command)
-    print(f"{PHOTOS} photos by {CLIENTS} clients, twice: {2 * PHOTOS / sum(served):.2f} a second")
+            check_results(results, from_command)
+    print(f"{PHOTOS} photos by {CLIENTS} clients, twice: {2 * PHOTOS / sum(served):.2f} per second")
     ratio = 2 * seconds / sum(served)
-    print(f"  the command line on the same photos: {PHOTOS / seconds:.2f} a second; ratio {ratio:.2f}")
+    print(f"  the command line on the same photos: {PHOTOS / seconds:.2f} per second; ratio {ratio:.2f}")
     print(f"  server's memory after 1, {PHOTOS + 1} and {2 * PHOTOS + 1} photos: ", end="")
     print(", ".join(f"{amount:.0f} MB" for amount in memory))
-    print("  none lost; the bytes of each are those that the command line wrote")
+    print("  no result is missing, and all are equal to the files of the command line")
 
 
-def refuse_wrong(answers: dict[str, bytes], expected: dict[str, bytes]) -> None:
-    """Ends the run if an answer is missing, or is not that of its own photo."""
-    wrong = [name for name, data in expected.items() if answers.get(name) != data]
+def check_results(results: dict[str, bytes], expected: dict[str, bytes]) -> None:
+    """Exits if a result is missing or differs from the command line's."""
+    wrong = [name for name, data in expected.items() if results.get(name) != data]
     if wrong or len(expected) != PHOTOS:
-        sys.exit(f"of {len(expected)} answers these are lost or wrong: {', '.join(wrong)}")
+        sys.exit(f"of {len(expected)} results these are missing or wrong: {', '.join(wrong)}")
 
 
-def by_command(photos: list[Path], folder: Path) -> tuple[dict[str, bytes], float]:
-    """What one run of the command writes, by photo, and its seconds from the first photo on."""
-    options = [part for name, value in HOW.items() for part in (f"--{name}", value)]
+def separate_by_command(photos: list[Path], folder: Path) -> tuple[dict[str, bytes], float]:
+    """The files that one run of the command writes, by photo, and its wall time in seconds."""
+    options = [part for name, value in OPTIONS.items() for part in (f"--{name}", value)]
     started = time.perf_counter()
     command = [*BREWSTER, *map(str, photos), "-o", str(folder), *options, "--json", "--device", "cpu"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
@@ -65,7 +65,7 @@ def by_command(photos: list[Path], folder: Path) -> tuple[dict[str, bytes], floa
 
 
 class server:
-    """`brewster serve` while it is entered: its address and its process."""
+    """A context manager that runs `brewster serve`; it yields its address and its process."""
 
     def __enter__(self) -> tuple[str, subprocess.Popen]:
         command = [*BREWSTER, "serve", "--port", "0", "--device", "cpu"]
@@ -78,40 +78,40 @@ class server:
         self.process.stdout.close()
 
 
-def by_clients(url: str, photos: list[Path]) -> dict[str, bytes]:
-    """The answers to all photos, asked for by clients that take the next one as soon as they are answered."""
-    waiting, answers = queue.SimpleQueue(), {}
+def separate_by_clients(url: str, photos: list[Path]) -> dict[str, bytes]:
+    """The results of all photos; each client sends the next photo as soon as it has the response to the last."""
+    pending, results = queue.SimpleQueue(), {}
     for photo in photos:
-        waiting.put(photo)
+        pending.put(photo)
 
     def client() -> None:
         while True:
             try:
-                photo = waiting.get_nowait()
+                photo = pending.get_nowait()
             except queue.Empty:
                 return
-            answers[photo.name] = post(url, photo)
+            results[photo.name] = post(url, photo)
 
     threads = [Thread(target=client) for _ in range(CLIENTS)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    return answers
+    return results
 
 
 def post(url: str, photo: Path) -> bytes:
     fields = [
         f'--x\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n{value}\r\n'
-        for name, value in HOW.items()
+        for name, value in OPTIONS.items()
     ]
     head = f'--x\r\nContent-Disposition: form-data; name="photo"; filename="{photo.name}"\r\n\r\n'
     body = "".join([*fields, head]).encode() + photo.read_bytes() + b"\r\n--x--\r\n"
     request = urllib.request.Request(
         f"{url}separate", body, {"Content-Type": "multipart/form-data; boundary=x"}
     )
-    with urllib.request.urlopen(request) as answer:
-        return answer.read()
+    with urllib.request.urlopen(request) as response:
+        return response.read()
 
 
 def resident_mb(process: subprocess.Popen) -> float:

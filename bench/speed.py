@@ -1,9 +1,9 @@
-"""A 12-megapixel JPEG through the command line, and the start of the command.
+"""Time and memory of the command line for a 12-megapixel JPEG, and its start-up time.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/speed.py
 
-Wall time and peak memory of the whole process at `standard`, with the share of each part as the tool reports it;
-beside it, the same file merely decoded and encoded again twice, so that a busy machine shows.
+Wall time and peak memory of the whole process at quality `standard`, with the share of each stage that the tool
+reports. For comparison, the same file is only decoded and encoded twice, which shows whether the machine is busy.
 """
 
 import json
@@ -38,14 +38,14 @@ def main(data: Path) -> None:
     seconds = json.loads(line)["seconds"]
     shares = ", ".join(f"{name} {value:.2f} s ({value / wall:.0%})" for name, value in seconds.items())
     print(f"12 megapixels: {wall:.2f} s, {peak / 2**20:.2f} GiB; {shares}")
-    print(f"  merely decoded and encoded twice: {copied:.2f} s; ratio {wall / copied:.1f}")
+    print(f"  only decoded and encoded twice: {copied:.2f} s; ratio {wall / copied:.1f}")
     helps = sorted(measure([*brewster, "--help"])[0] for _ in range(5))
     bare = sorted(measure([sys.executable, "-c", "pass"])[0] for _ in range(5))
     print(f"brewster --help: {helps[2]:.2f} s (median of 5); python alone {bare[2]:.2f} s")
 
 
 def twelve_megapixels(data: Path) -> Path:
-    """A photo enlarged to 4000x3000 with fresh grain, so that it costs what a camera's costs."""
+    """A photo enlarged to 4000x3000; added noise makes it as costly to encode as a camera's photo."""
     small = Photo.open(data / "photos/permissive/kodak24__05.jpg").pixels.astype(np.float32)
     rows, columns = (
         np.arange(side) * small.shape[axis] // side for axis, side in ((0, SIDE_PX[1]), (1, SIDE_PX[0]))

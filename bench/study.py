@@ -1,9 +1,9 @@
-"""A hundred participants at once over HTTP, and the server killed with -9 ten times: is any acknowledged answer lost?
+"""A hundred concurrent participants over HTTP while the server is killed ten times: is an acknowledged answer lost?
 
     .venv/bin/python bench/study.py
 
-The server is `brewster study serve` in a process of its own, on the loopback. What participants were told is compared
-with what lies in the database afterwards.
+The server is `brewster study serve` in a separate process, on the loopback interface, killed with SIGKILL. Afterwards
+the acknowledged answers are compared with the database.
 """
 
 import asyncio
@@ -28,12 +28,12 @@ from brewster.user_study.report.results import summarise
 from brewster.user_study.store import AnswerStore
 
 OUT = Path("out/bench/study")
-PEOPLE, KILLS = 100, 10
+PARTICIPANTS, KILLS = 100, 10
 SETS = {"real": 20, "nature": 20, "postcard": 20, "solidobject": 20, "wildscene": 101}
 
 
 class Server:
-    """The server, which can be killed and started again on the same port."""
+    """The server process; it can be killed and started again on the same port."""
 
     def __init__(self, folder):
         self.folder, self.kills = folder, 0
@@ -53,11 +53,11 @@ class Server:
         self.kills += 1
 
 
-class Crowd:
-    """What all participants together were told, and how long it took."""
+class Participants:
+    """All participants together: their acknowledged answers, response times and repeated requests."""
 
     def __init__(self, port):
-        self.url, self.told, self.links, self.times, self.retries = (
+        self.url, self.acknowledged, self.links, self.times, self.retries = (
             f"http://127.0.0.1:{port}",
             {},
             set(),
@@ -65,41 +65,41 @@ class Crowd:
             0,
         )
 
-    async def ask(self, client, method, path, **what):
-        """The answer, asked for again and again while there is no server."""
+    async def request(self, client, method, path, **options):
+        """The response; the request is repeated while the server is down."""
         while True:
             try:
-                return await client.request(method, f"{self.url}{path}", **what)
+                return await client.request(method, f"{self.url}{path}", **options)
             except httpx.TransportError:
                 self.retries += 1
                 await asyncio.sleep(0.2)
 
     async def take_part(self, number):
-        dice = random.Random(number)
+        rng = random.Random(number)
         async with httpx.AsyncClient(timeout=60) as client:
-            link = (await self.ask(client, "POST", "/participants", json={"agreed": True})).json()["link"]
+            link = (await self.request(client, "POST", "/participants", json={"agreed": True})).json()["link"]
             self.links.add(link)
-            state = (await self.ask(client, "GET", f"{link}/trial")).json()
+            state = (await self.request(client, "GET", f"{link}/trial")).json()
             while (trial := state["trial"]) is not None:
                 for side in ("photo", "left", "right"):
-                    await self.ask(client, "GET", f"{link}/pictures/{trial}/{side}")
-                choice = dice.choice(["left", "similar", "right"])
+                    await self.request(client, "GET", f"{link}/pictures/{trial}/{side}")
+                choice = rng.choice(["left", "similar", "right"])
                 started = time.perf_counter()
-                given = {"trial": trial, "choice": choice, "seconds": 3.0}
-                answer = (await self.ask(client, "POST", f"{link}/answers", json=given)).json()
+                sent = {"trial": trial, "choice": choice, "seconds": 3.0}
+                answer = (await self.request(client, "POST", f"{link}/answers", json=sent)).json()
                 self.times.append(time.perf_counter() - started)
-                self.told[link, trial] = choice, answer["kept"]
+                self.acknowledged[link, trial] = choice, answer["kept"]
                 state = answer["next"]
 
 
 def make(folder):
-    """The paper's 181 pictures and three methods, all of them random and small."""
-    dice = np.random.default_rng(1)
+    """Creates a study with as many images as the paper's, 181, and three methods; all images are random and small."""
+    rng = np.random.default_rng(1)
     for part in ("inputs", "ours", "RDNet", "DSIT"):
         for name, count in SETS.items():
             (folder / part / name).mkdir(parents=True)
             for i in range(count):
-                blocks = np.kron(dice.integers(0, 256, (6, 8, 3)), np.ones((20, 20, 1))).astype(np.uint8)
+                blocks = np.kron(rng.integers(0, 256, (6, 8, 3)), np.ones((20, 20, 1))).astype(np.uint8)
                 Photo.from_array(blocks, encoding="srgb").save(folder / part / name / f"{i}.png")
     methods = {name: folder / name for name in ("ours", "RDNet", "DSIT")}
     return create(folder / "study", folder / "inputs", methods, StudyOptions(seed=1))
@@ -108,50 +108,53 @@ def make(folder):
 async def run(study):
     server = Server(study.folder)
     await server.start()
-    crowd = Crowd(server.port)
+    participants = Participants(server.port)
     started = time.perf_counter()
-    visits = [asyncio.create_task(crowd.take_part(number)) for number in range(PEOPLE)]
-    total = PEOPLE * (study.description.pairs + study.description.catches)
+    sessions = [asyncio.create_task(participants.take_part(number)) for number in range(PARTICIPANTS)]
+    total = PARTICIPANTS * (study.description.pairs + study.description.catches)
     for kill in range(1, KILLS + 1):
-        while len(crowd.told) < total * kill / (KILLS + 1):
+        while len(participants.acknowledged) < total * kill / (KILLS + 1):
             await asyncio.sleep(0.01)
         await server.kill()
         await server.start()
-    await asyncio.gather(*visits)
+    await asyncio.gather(*sessions)
     seconds = time.perf_counter() - started
     await server.kill()
-    return crowd, server.kills - 1, seconds
+    return participants, server.kills - 1, seconds
 
 
 def main():
     shutil.rmtree(OUT, ignore_errors=True)
     study = make(OUT)
-    crowd, kills, seconds = asyncio.run(run(study))
+    participants, kills, seconds = asyncio.run(run(study))
     with sqlite3.connect(study.answers) as database:
         whole = database.execute("PRAGMA integrity_check").fetchone()[0]
         rows = database.execute(
             "SELECT '/s/' || token, trial, choice FROM answers JOIN participants ON number = participant"
         ).fetchall()
-    kept = {(link, trial): choice for link, trial, choice in rows}
+    stored = {(link, trial): choice for link, trial, choice in rows}
     answered = people(AnswerStore(study).everything())
     results = summarise(study, answered, ExclusionRule(1.0, 0.0))
-    slowest = statistics.quantiles(crowd.times, n=100)[98]
+    slowest = statistics.quantiles(participants.times, n=100)[98]
     lines = {
-        "participants at once": PEOPLE,
+        "concurrent participants": PARTICIPANTS,
         "kill -9": kills,
-        "answers acknowledged": len(crowd.told),
-        "acknowledged and missing": sum(place not in kept for place in crowd.told),
-        "acknowledged otherwise than kept": sum(
-            kept.get(place) != told for place, (_, told) in crowd.told.items()
+        "answers acknowledged": len(participants.acknowledged),
+        "acknowledged and missing": sum(place not in stored for place in participants.acknowledged),
+        "stored differently than acknowledged": sum(
+            stored.get(place) != acknowledged
+            for place, (_, acknowledged) in participants.acknowledged.items()
         ),
-        "kept otherwise than given": sum(given != told for given, told in crowd.told.values()),
-        "kept twice": len(rows) - len(kept),
-        "kept and never acknowledged": sum(place not in crowd.told for place in kept),
-        "requests sent again": crowd.retries,
+        "acknowledged differently than sent": sum(
+            sent != acknowledged for sent, acknowledged in participants.acknowledged.values()
+        ),
+        "stored twice": len(rows) - len(stored),
+        "stored and never acknowledged": sum(place not in participants.acknowledged for place in stored),
+        "repeated requests": participants.retries,
         "database": whole,
         "participants in the report": results["everyone"]["participants"],
-        "answers per second": f"{len(crowd.told) / seconds:.0f} (kills, restarts and {3 * len(crowd.told)} pictures included)",
-        "an answer, median and 99 %": f"{1000 * statistics.median(crowd.times):.0f} ms, {1000 * slowest:.0f} ms",
+        "answers per second": f"{len(participants.acknowledged) / seconds:.0f} (kills, restarts and {3 * len(participants.acknowledged)} images included)",
+        "response time, median and 99 %": f"{1000 * statistics.median(participants.times):.0f} ms, {1000 * slowest:.0f} ms",
     }
     for name, value in lines.items():
         print(f"{name:34} {value}")

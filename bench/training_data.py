@@ -1,9 +1,9 @@
-"""Statistics of training streams beside those of real collections: do the mixtures look like photos through glass?
+"""Compares statistics of training streams with those of real datasets: do the mixtures resemble photos through glass?
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/training_data.py recipes/train/compact-stage1.toml
 
-Prints one row per collection and per recipe, the 10, 25, 50, 75 and 90 % quantiles over 200 pictures of 256 px, linear
-light. Real pairs are measured, never learnt from.
+Prints one row per dataset and per recipe: the 10, 25, 50, 75 and 90 % quantiles over 200 images of 256 px, in linear
+light. The real pairs are only measured, never used for training.
 """
 
 import os
@@ -39,7 +39,7 @@ def main(data: Path, recipes: list[Path]) -> None:
 
 
 def print_row(name: str, pairs: Iterable[tuple[Tensor, Tensor]]) -> None:
-    """Pairs without any reflection count too, as they do in training."""
+    """Prints the quantiles of all pairs, including those without reflection, as in training."""
     rows = [statistics(to_linear(photo), to_linear(truth)) for photo, truth in pairs]
     cells = [
         " ".join(f"{value:.2f}" for value in np.nanquantile([row[key] for row in rows], QUANTILES))
@@ -49,7 +49,7 @@ def print_row(name: str, pairs: Iterable[tuple[Tensor, Tensor]]) -> None:
 
 
 def fit(pair: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """uint8 (H, W, 3) to encoded (3, h, w), longest side 256 px."""
+    """Converts uint8 images (H, W, 3) to encoded tensors (3, h, w) whose longer side is 256 px."""
     scale = SIZE_PX / max(pair[0].shape[:2])
     size = [round(side * scale) for side in pair[0].shape[:2]]
     photo, truth = (
@@ -60,7 +60,7 @@ def fit(pair: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
 
 
 def statistics(photo: Tensor, truth: Tensor) -> dict[str, float]:
-    """The measures of one pair, linear light (3, h, w)."""
+    """The statistics of one pair in linear light, (3, h, w) each."""
     ratio = (truth / (photo + 1e-3)).flatten()[::3]
     change = photo - truth
     gain = (photo * truth).sum((1, 2)) / (photo * photo).sum((1, 2)).clamp(min=1e-9)
@@ -83,7 +83,7 @@ def statistics(photo: Tensor, truth: Tensor) -> dict[str, float]:
 
 
 def psnr(one: Tensor, other: Tensor) -> float:
-    """Of encoded values, at most 58.9 dB, which is the rounding to 8 bits."""
+    """PSNR of encoded values, at most 58.9 dB, which is that of rounding to 8 bits."""
     error = (to_encoded(one.clamp(0, 1)) - to_encoded(other)).square().mean().item()
     return -10 * np.log10(max(error, 1 / (12 * 255**2)))
 

@@ -14,7 +14,7 @@ from brewster.environments.assets import Assets
 from brewster.environments.catalog import read_catalog
 from brewster.photo import Photo
 from brewster.render.analytic import render
-from brewster.render.camera_response import develop, to_bytes
+from brewster.render.camera_response import develop, to_uint8
 from brewster.scene.recipe import RECIPES, read_scene_recipe
 from brewster.scene.sampler import draw
 from brewster.training.data.alpha_blend import blended
@@ -35,7 +35,7 @@ def developed(name, seed, index):
 
 def save(rows, name):
     sheet = torch.cat([torch.cat(row, dim=2) for row in rows], dim=1)
-    Photo.from_array(to_bytes(sheet), encoding="srgb").save(DOCS / name, overwrite=True)
+    Photo.from_array(to_uint8(sheet), encoding="srgb").save(DOCS / name, overwrite=True)
 
 
 def scenes():

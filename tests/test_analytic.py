@@ -1,4 +1,4 @@
-"""The analytic renderer: its pictures add up, equal closed forms where there are any, and lie where geometry says."""
+"""The analytic renderer: layers add up, match closed forms, and objects are where geometry places them."""
 
 import math
 
@@ -12,9 +12,22 @@ from brewster.errors import RecipeError
 from brewster.render import analytic
 from brewster.render.analytic import render
 from brewster.render.rays.layered_glass import all_orders, paper_orders
+from brewster.scene.camera import axes
 from brewster.scene.glass import Glazing, Pane
 from brewster.scene.world import Side
-from worlds_of_one import WORLDS, Worlds, a_scene, around, at, board, looks, scenes, soft, sun, where
+from worlds_of_one import (
+    WORLDS,
+    Worlds,
+    a_scene,
+    around,
+    at,
+    board,
+    centroid,
+    pixel_directions,
+    scenes,
+    soft,
+    sun,
+)
 
 unshrunk = settings(phases=[Phase.explicit, Phase.generate], deadline=None, database=None)
 some, few = (settings(unshrunk, max_examples=count) for count in (25, 10))
@@ -22,8 +35,8 @@ SMOOTH = {"far": around(), "dome": around(radius_mm=3000.0), "near": board()}
 
 
 def closed_form(scene, form=all_orders):
-    """The shares at the centre of every pixel, (3, H, W) or (1, H, W)."""
-    cosine = torch.from_numpy(-looks(scene.camera) @ np.array([0, 0, 1]))
+    """Transmittance and reflectance at the centre of every pixel, (3, H, W) or (1, H, W)."""
+    cosine = torch.from_numpy(-pixel_directions(scene.camera) @ np.array([0, 0, 1]))
     shares = form(scene.glass, cosine)
     return [share.reshape(-1, *cosine.shape).float() for share in (shares.transmitted, shares.reflected)]
 
@@ -62,7 +75,7 @@ def test_the_choice_of_orders_changes_the_layers_and_not_the_photo(scene):
 
 @few
 @given(scenes(front=Side()))
-def test_a_black_room_is_mirrored_black(scene):
+def test_without_light_in_front_there_is_no_reflection(scene):
     sample = render(scene, WORLDS)
     assert not sample.reflection.any()
     assert not sample.mirror.any()
@@ -70,7 +83,7 @@ def test_a_black_room_is_mirrored_black(scene):
 
 @few
 @given(scenes(behind=Side(), orders="all"))
-def test_before_a_black_world_the_photo_is_its_reflection(scene):
+def test_without_light_behind_the_photo_is_the_reflection(scene):
     sample = render(scene, WORLDS)
     assert not sample.transmission.any()
     assert not sample.background.any()
@@ -80,7 +93,7 @@ def test_before_a_black_world_the_photo_is_its_reflection(scene):
 @pytest.mark.parametrize("side", ["far", "dome", "near"])
 @pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("aperture_mm", [0.0, 20.0])
-def test_glass_that_does_not_refract_is_not_there(side, count, aperture_mm):
+def test_glass_with_index_one_is_invisible(side, count, aperture_mm):
     sides = {
         "far": around("mottled"),
         "dome": around("mottled", radius_mm=2000.0),
@@ -103,7 +116,7 @@ def test_glass_that_does_not_refract_is_not_there(side, count, aperture_mm):
 @pytest.mark.parametrize("side", sorted(SMOOTH))
 @pytest.mark.parametrize("aperture_mm", [0.0, 20.0])
 @pytest.mark.parametrize("orders", ["all", "paper"])
-def test_in_an_even_world_every_pixel_has_its_closed_form(side, aperture_mm, orders):
+def test_in_uniform_light_every_pixel_equals_the_closed_form(side, aperture_mm, orders):
     panes = [
         {"thickness_mm": 6.0, "absorption_per_m": (4.0, 1.5, 20.0)},
         {"index": 1.7, "absorption_per_m": (2.0, 9.0, 1.0)},
@@ -126,7 +139,7 @@ def test_in_an_even_world_every_pixel_has_its_closed_form(side, aperture_mm, ord
 
 
 def test_far_light_has_no_ghost_in_parallel_glass():
-    """However rich the world, R is MR times a factor of the angle alone: all orders leave in one direction."""
+    """R is MR times a factor that depends on the angle only: all orders leave in one direction."""
     scene = a_scene(
         camera=at(40, 10, width=25, height=25),
         panes=[{"thickness_mm": 30.0}, {}],
@@ -141,7 +154,7 @@ def test_far_light_has_no_ghost_in_parallel_glass():
 
 
 def test_a_thick_pane_brings_what_is_behind_it_nearer_by_a_third_of_its_thickness():
-    """The share of an image is its area: (distance / (distance - t (1 - 1 / n)))^2."""
+    """The image's area grows by (distance / (distance - t (1 - 1 / n)))^2."""
     scene = a_scene(
         camera=at(0, distance_mm=1000, fov_deg=10, width=48, height=48),
         panes=[{"thickness_mm": 90.0}],
@@ -159,11 +172,11 @@ def test_a_wedge_bends_the_view_by_half_its_angle():
         camera={"fov_deg": 10}, panes=[{"wedge_deg": 2.0}], behind=around("sun"), orders="paper", samples=64
     )
     sample = render(scene, light)
-    (bent, _), (straight, _) = where(sample.transmission), where(sample.background)
+    (bent, _), (straight, _) = centroid(sample.transmission), centroid(sample.background)
     assert abs(bent - straight) * 10 / 24 == pytest.approx(1, rel=0.03)
 
 
-def test_a_very_small_wedge_is_none():
+def test_a_very_small_wedge_renders_like_parallel_glass():
     scenes_ = (
         a_scene(
             camera=at(25),
@@ -179,7 +192,7 @@ def test_a_very_small_wedge_is_none():
         torch.testing.assert_close(getattr(wedged, layer), getattr(parallel, layer), rtol=1e-3, atol=0)
 
 
-# --- where things are
+# --- positions
 
 
 def test_the_bright_right_of_a_map_is_on_the_right_and_its_top_on_top():
@@ -192,14 +205,14 @@ def test_the_bright_right_of_a_map_is_on_the_right_and_its_top_on_top():
 
 @pytest.mark.parametrize("heading_deg", [0, 90, -120])
 def test_a_camera_that_turns_right_sees_a_map_move_left(heading_deg):
-    """A sun at a heading of its own stands in the middle for a camera with that heading; 5 degrees are 4 pixels."""
+    """A camera with the sun's heading sees it in the centre; a turn of 5 degrees moves it by 4 pixels."""
     light = Worlds(sun=sun(64, 32, 0))
     glass = Glazing(heading_deg=heading_deg)
     places = []
     for turn in (0, 5):
         camera = at(heading_deg + turn, fov_deg=30)
         scene = a_scene(camera=camera, glass=glass, behind=around("sun", heading_deg=heading_deg), samples=16)
-        places.append(where(render(scene, light).background))
+        places.append(centroid(render(scene, light).background))
     half_texel = 360 / 128 / 2
     pixels_a_degree = 24 / math.degrees(2 * math.tan(math.radians(15)))
     assert places[0][0] == pytest.approx(12 + half_texel * pixels_a_degree, abs=0.1)
@@ -212,10 +225,10 @@ def test_a_picture_before_the_glass_is_mirrored_and_one_behind_is_not():
     picture[:8, 24:] = 1  # its upper right
     scene = a_scene(behind=board("corner", width_mm=300), front=board("corner", width_mm=300))
     sample = render(scene, Worlds(corner=picture))
-    right, upper = where(sample.background)
+    right, upper = centroid(sample.background)
     assert right > 14
     assert upper < 10
-    left, also_upper = where(sample.reflection)
+    left, also_upper = centroid(sample.reflection)
     assert left == pytest.approx(24 - right, abs=0.05)
     assert also_upper == pytest.approx(upper, abs=0.05)
 
@@ -239,10 +252,10 @@ PLACES = st.fixed_dictionaries(
 )
 
 
-def projected(scene, place, glass_axes):
-    """Where a pinhole sees a point that is given in the glass's frame."""
-    in_world = place @ glass_axes + np.array(scene.glass.position_mm) - np.array(scene.camera.position_mm)
-    right, up, back = map(np.array, analytic.axes(scene.camera.heading_deg, scene.camera.pitch_deg))
+def projected(scene, point, to_glass):
+    """The pixel position of a point that is given in the glass frame, for a pinhole camera."""
+    in_world = point @ to_glass + np.array(scene.glass.position_mm) - np.array(scene.camera.position_mm)
+    right, up, back = map(np.array, axes(scene.camera.heading_deg, scene.camera.pitch_deg))
     scale = scene.camera.width / 2 / scene.camera.half_width / -(in_world @ back)
     return scene.camera.width / 2 + in_world @ right * scale, scene.camera.height / 2 - in_world @ up * scale
 
@@ -250,9 +263,9 @@ def projected(scene, place, glass_axes):
 @some
 @given(PLACES)
 def test_a_plane_is_where_pinhole_geometry_projects_it(drawn):
-    """A small plane: its centroid, and for one that faces the glass its area, as a mirror image when in front."""
+    """The centroid of a small plane, or of its mirror image if the plane is in front."""
     heading, pitch = drawn["glass_deg"]
-    axes = np.array(analytic.axes(heading, pitch))
+    to_glass = np.array(axes(heading, pitch))
     camera = at(
         heading + drawn["camera_deg"][0], pitch + drawn["camera_deg"][1], fov_deg=40, width=48, height=48
     )
@@ -261,9 +274,9 @@ def test_a_plane_is_where_pinhole_geometry_projects_it(drawn):
     bare = a_scene(
         camera=camera, glass=Glazing(heading_deg=heading, pitch_deg=pitch, position_mm=tuple(position))
     )
-    eye = axes @ (np.array(bare.camera.position_mm) - position)
+    eye = to_glass @ (np.array(bare.camera.position_mm) - position)
     away = drawn["distance_mm"] + 4
-    middle = axes @ looks(bare.camera)[23:25, 23:25].mean((0, 1))
+    middle = to_glass @ pixel_directions(bare.camera)[23:25, 23:25].mean((0, 1))
     reach = (eye[2] + away) / -middle[2]
     offset = (eye + middle * reach)[:2] + np.array(drawn["offset"]) * reach * bare.camera.half_width
     plane = {
@@ -277,8 +290,8 @@ def test_a_plane_is_where_pinhole_geometry_projects_it(drawn):
     scene = bare.model_copy(update={"behind": Side(), "front": Side(), which: board("square", **plane)})
     sample = render(scene, Worlds(square=np.ones((16, 16, 3), np.float32)))
     picture = sample.background if drawn["is_behind"] else sample.mirror
-    image = projected(scene, np.array([*offset, -away]), axes)
-    assert where(picture) == pytest.approx(image, abs=0.25)
+    image = projected(scene, np.array([*offset, -away]), to_glass)
+    assert centroid(picture) == pytest.approx(image, abs=0.25)
 
 
 @pytest.mark.parametrize("is_behind", [True, False])
@@ -293,12 +306,12 @@ def test_a_plane_is_as_large_as_pinhole_geometry_says(is_behind):
     assert float(picture[0].sum()) == pytest.approx(width * width / 2, rel=0.01)
 
 
-# --- steadiness
+# --- stability
 
 
 @pytest.mark.parametrize("texels", [0.5, 1, 1.3])
-def test_a_sun_of_one_texel_does_not_sparkle(texels):
-    """As the camera turns by tenths of a pixel that spans this many texels, the picture keeps the sun's energy."""
+def test_a_sun_of_one_texel_does_not_flicker(texels):
+    """The sun's energy in the image is constant while the camera turns by tenths of a pixel of this many texels."""
     light, fov_deg = Worlds(sun=sun(256, 128, 0)), 360 / 512 * texels * 32
     energies = []
     for tenth in range(10):
@@ -326,18 +339,18 @@ def test_the_same_scene_gives_the_same_bytes(kind):
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
-def test_it_does_not_matter_how_many_rays_are_worked_on_at_once(kind, monkeypatch):
+def test_the_result_does_not_depend_on_the_batch_size(kind, monkeypatch):
     whole = render(a_scene(**KINDS[kind], samples=4), WORLDS)
-    monkeypatch.setattr(analytic, "_STRIP", 100)
+    monkeypatch.setattr(analytic, "_CPU_BATCH_RAYS", 100)
     strips = render(a_scene(**KINDS[kind], samples=4), WORLDS)
     for first, second in zip(whole.layers().values(), strips.layers().values(), strict=True):
-        if kind == "rough":  # which orders are worth following is decided by the mean of a strip
+        if kind == "rough":  # orders end by their mean weight over a batch
             assert float(first.mean()) == pytest.approx(float(second.mean()), rel=2e-3)
         else:
             torch.testing.assert_close(first, second, rtol=1e-5, atol=1e-6)
 
 
-def test_another_index_is_other_chance_with_the_same_means():
+def test_another_index_gives_other_random_numbers_and_the_same_means():
     scene = a_scene(panes=[{"wedge_deg": 0.5}], behind=around("mottled"), samples=16)
     one, other = (render(scene.model_copy(update={"index": index}), WORLDS).background for index in (0, 1))
     assert not torch.equal(one, other)
@@ -352,7 +365,7 @@ def test_another_index_is_other_chance_with_the_same_means():
     ],
     ids=["framed", "curved"],
 )
-def test_framed_and_curved_glass_is_left_to_the_tracer(glass):
+def test_framed_and_curved_glass_is_refused_with_a_hint_to_mitsuba(glass):
     with pytest.raises(RecipeError, match="--renderer mitsuba"):
         render(a_scene(glass=glass), WORLDS)
 

@@ -1,4 +1,4 @@
-"""Light becomes photographs: one exposure, one balance and one curve for all layers, and they are on record."""
+"""The camera response: one exposure, white balance and tone curve for all layers, recorded with the sample."""
 
 import tomllib
 
@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as arrays
 
 from brewster.errors import UnsupportedPhoto
 from brewster.photo import Photo
-from brewster.render.camera_response import develop, jpeg, to_bytes, with_jpeg
+from brewster.render.camera_response import develop, encode_jpeg, to_uint8, with_jpeg
 from brewster.render.sample import LAYERS, LightSample
 from brewster.scene.scene import Development, Scene
 from brewster.srgb import REC709_LUMINANCE, to_encoded, to_linear
@@ -24,7 +24,7 @@ PICTURES = arrays.arrays(np.float32, SHAPE, elements=LIGHT, fill=st.nothing()) |
     np.float32, SHAPE, elements=LIGHT
 )
 BALANCES = ["grey-world", "white-patch", "grey-edge"]
-WISHES = st.builds(
+DEVELOPMENTS = st.builds(
     Development,
     exposure=st.floats(0.01, 1),
     white_balance=st.sampled_from(["none", *BALANCES]),
@@ -33,11 +33,11 @@ WISHES = st.builds(
 )
 
 
-def sample_of(photo, reflection=None, mirror=None, seed=0, index=0, **wishes):
+def sample_of(photo, reflection=None, mirror=None, seed=0, index=0, **development):
     photo = torch.as_tensor(photo, dtype=torch.float32)
     reflection = photo * 0.25 if reflection is None else torch.as_tensor(reflection)
     return LightSample(
-        Scene(seed=seed, index=index, development=Development(**wishes)),
+        Scene(seed=seed, index=index, development=Development(**development)),
         photo=photo,
         transmission=photo - reflection,
         background=(photo - reflection) / 0.9,
@@ -50,8 +50,8 @@ def noise(shape=(3, 40, 56), low=0.02, high=0.5):
     return torch.rand(shape, generator=torch.Generator().manual_seed(3)) * (high - low) + low
 
 
-def seen(light, developed, ev=None):
-    """Light after the recorded decisions, before it is clipped."""
+def exposed(light, developed, ev=None):
+    """Light with the recorded exposure and white balance, before clipping."""
     gains = torch.tensor(developed.white_balance).view(3, 1, 1)
     return light * gains * 2 ** (developed.exposure_ev if ev is None else ev)
 
@@ -65,14 +65,14 @@ def mean_luminance(light):
 
 @some
 @given(PICTURES, st.floats(0.01, 1), st.sampled_from(["none", *BALANCES]))
-def test_the_mean_of_any_picture_is_as_wanted_wherever_it_can_be(picture, wanted, balance):
-    sample = sample_of(picture, exposure=wanted, white_balance=balance)
+def test_the_mean_of_any_picture_is_the_target_where_it_can_be_reached(picture, target, balance):
+    sample = sample_of(picture, exposure=target, white_balance=balance)
     developed = develop(sample)
     layers = (("photo", developed.exposure_ev), ("mirror", developed.mirror_exposure_ev))
     for name, ev in layers:
         light = getattr(sample, name)
-        most = mean_luminance(seen(light, developed, 32))
-        assert mean_luminance(seen(light, developed, ev)) == pytest.approx(min(wanted, most), rel=0.01)
+        most = mean_luminance(exposed(light, developed, 32))
+        assert mean_luminance(exposed(light, developed, ev)) == pytest.approx(min(target, most), rel=0.01)
 
 
 def test_a_black_picture_stays_black_and_is_not_exposed():
@@ -83,7 +83,7 @@ def test_a_black_picture_stays_black_and_is_not_exposed():
         assert not any(layer.any() for layer in developed.layers().values())
 
 
-def test_lamps_do_not_darken_the_room():
+def test_lamps_do_not_change_the_exposure():
     room = torch.full((3, 20, 20), 0.1)
     lit = room.clone()
     lit[:, 0, :4] = 1e6
@@ -91,27 +91,27 @@ def test_lamps_do_not_darken_the_room():
     assert exposures == pytest.approx([2, 2], abs=0.03)
 
 
-def test_light_that_cannot_fill_the_picture_is_not_pushed_without_end():
+def test_an_unreachable_target_does_not_raise_the_exposure_without_limit():
     half_black = torch.zeros(3, 4, 4)
     half_black[:, :2] = 0.5
     developed = develop(sample_of(half_black, exposure=0.9))
     assert developed.exposure_ev == pytest.approx(1, abs=0.02)
 
 
-def test_the_overexposed_share_counts_pixels_that_are_white_in_any_channel():
+def test_the_overexposed_share_counts_pixels_that_clip_in_any_channel():
     picture = torch.full((3, 10, 10), 0.01)
     picture[0, :2] = 100
     picture[1, 1:3] = 100
     assert develop(sample_of(picture, exposure=0.25)).overexposed == 0.3
 
 
-# --- one treatment
+# --- all layers alike
 
 
 @some
-@given(PICTURES, WISHES)
-def test_the_same_light_has_the_same_value_in_every_layer(picture, wish):
-    sample = sample_of(picture, **wish.model_dump())
+@given(PICTURES, DEVELOPMENTS)
+def test_the_same_light_has_the_same_value_in_every_layer(picture, development):
+    sample = sample_of(picture, **development.model_dump())
     alike = LightSample(sample.scene, *[sample.photo] * 5)
     layers = develop(alike).layers()
     assert list(layers) == list(LAYERS)
@@ -124,20 +124,20 @@ def test_the_same_light_has_the_same_value_in_every_layer(picture, wish):
 
 
 @some
-@given(PICTURES, WISHES)
-def test_the_record_reproduces_the_pictures(picture, wish):
-    sample = sample_of(picture, **wish.model_dump())
+@given(PICTURES, DEVELOPMENTS)
+def test_the_recorded_settings_reproduce_the_pictures(picture, development):
+    sample = sample_of(picture, **development.model_dump())
     developed = develop(sample)
-    outcome = tomllib.loads(tomli_w.dumps(developed.decisions()))
-    assert outcome["white_balance"] == list(developed.white_balance)
+    recorded = tomllib.loads(tomli_w.dumps(developed.camera_settings()))
+    assert recorded["white_balance"] == list(developed.white_balance)
     for name in LAYERS:
-        ev = outcome["mirror_exposure_ev" if name == "mirror" else "exposure_ev"]
-        encoded = to_encoded(seen(getattr(sample, name), developed, ev).clamp(0, 1))
+        ev = recorded["mirror_exposure_ev" if name == "mirror" else "exposure_ev"]
+        encoded = to_encoded(exposed(getattr(sample, name), developed, ev).clamp(0, 1))
         smooth = encoded**2 * (3 - 2 * encoded)
-        expected = encoded + wish.contrast * (smooth - encoded)
+        expected = encoded + development.contrast * (smooth - encoded)
         torch.testing.assert_close(developed.layers()[name], expected, atol=2e-6, rtol=0)
-    assert outcome["overexposed"] == pytest.approx(
-        (seen(sample.photo, developed) >= 1).any(0).float().mean().item(), abs=1e-6
+    assert recorded["overexposed"] == pytest.approx(
+        (exposed(sample.photo, developed) >= 1).any(0).float().mean().item(), abs=1e-6
     )
 
 
@@ -149,7 +149,7 @@ def test_the_layers_of_a_photograph_add_up_where_nothing_clips(picture, share, b
     photo, transmission, reflection = (
         to_linear(getattr(developed, f"{name}_encoded")) for name in ("photo", "transmission", "reflection")
     )
-    inside = seen(sample.photo, developed) < 1
+    inside = exposed(sample.photo, developed) < 1
     torch.testing.assert_close((transmission + reflection)[inside], photo[inside], atol=1e-5, rtol=0)
 
 
@@ -188,7 +188,7 @@ def test_grey_world_makes_the_means_equal_and_keeps_luminance(red, blue, seed):
 
 
 @pytest.mark.parametrize("balance", BALANCES)
-def test_every_white_balance_takes_away_a_cast(balance):
+def test_every_white_balance_removes_a_colour_cast(balance):
     grey = noise((1, 40, 56)).expand(3, 40, 56)
     developed = develop(sample_of(grey * CAST, white_balance=balance, exposure=0.2))
     gains = torch.tensor(developed.white_balance).view(3, 1, 1)
@@ -206,7 +206,7 @@ def test_white_balance_of_any_strength_keeps_luminance(strength):
 
 
 @pytest.mark.parametrize("balance", BALANCES)
-def test_half_the_strength_goes_half_the_way_in_stops(balance):
+def test_half_the_strength_is_half_the_correction_in_stops(balance):
     full, half, none = (
         np.log2(
             develop(sample_of(noise() * CAST, white_balance=balance, white_balance_strength=s)).white_balance
@@ -219,7 +219,7 @@ def test_half_the_strength_goes_half_the_way_in_stops(balance):
 
 
 @pytest.mark.parametrize("balance", BALANCES)
-def test_clipped_lamps_have_no_say_in_the_white_balance(balance):
+def test_clipped_lamps_do_not_affect_the_white_balance(balance):
     picture = noise()
     lit = picture.clone()
     lit[2, 3:5, 3:5] = 1e5
@@ -232,7 +232,7 @@ def test_clipped_lamps_have_no_say_in_the_white_balance(balance):
 
 @some
 @given(PICTURES, st.sampled_from(BALANCES), st.floats(0, 1))
-def test_white_balance_stays_within_three(picture, balance, strength):
+def test_gains_are_between_a_third_and_three(picture, balance, strength):
     developed = develop(sample_of(picture, white_balance=balance, white_balance_strength=strength))
     assert all(0.3333 <= gain <= 3 for gain in developed.white_balance)
 
@@ -240,12 +240,12 @@ def test_white_balance_stays_within_three(picture, balance, strength):
 # --- noise
 
 
-def flat(level, **wishes):
-    return sample_of(torch.full((3, 200, 200), level), exposure=level, **wishes)
+def flat(level, **development):
+    return sample_of(torch.full((3, 200, 200), level), exposure=level, **development)
 
 
 @pytest.mark.parametrize("level", [0.2, 0.6])
-def test_noise_has_the_asked_deviation_and_is_in_the_photo_alone(level):
+def test_noise_has_the_requested_deviation_and_is_in_the_photo_only(level):
     developed = develop(flat(level, shot_noise=0.03, read_noise=0.01))
     quiet = develop(flat(level))
     deviation = (to_linear(developed.photo_encoded) - level).std().item()
@@ -254,7 +254,7 @@ def test_noise_has_the_asked_deviation_and_is_in_the_photo_alone(level):
         assert torch.equal(developed.layers()[name], quiet.layers()[name])
 
 
-def test_noise_belongs_to_seed_and_index():
+def test_noise_depends_on_seed_and_index():
     first, again, other_seed, other_index, swapped = (
         develop(flat(0.3, seed=seed, index=index, read_noise=0.05)).photo_encoded
         for seed, index in [(5, 9), (5, 9), (6, 9), (5, 9 + 2**32), (9, 5)]
@@ -269,7 +269,7 @@ def test_developing_twice_gives_the_same_bits():
         one, two = (
             develop(sample_of(noise(), white_balance=balance, shot_noise=0.1, contrast=0.3)) for _ in range(2)
         )
-        assert one.decisions() == two.decisions()
+        assert one.camera_settings() == two.camera_settings()
         assert all(torch.equal(one.layers()[name], two.layers()[name]) for name in LAYERS)
 
 
@@ -278,19 +278,19 @@ def test_developing_twice_gives_the_same_bits():
 
 @some
 @given(arrays.arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3))))
-def test_eight_bits_survive_the_way_to_a_tensor_and_back(pixels):
-    assert np.array_equal(to_bytes(torch.from_numpy(pixels).permute(2, 0, 1) / 255), pixels)
+def test_eight_bits_survive_the_conversion_to_a_tensor_and_back(pixels):
+    assert np.array_equal(to_uint8(torch.from_numpy(pixels).permute(2, 0, 1) / 255), pixels)
 
 
-def test_jpegs_are_the_same_bytes_again_and_grow_with_quality():
-    files = [jpeg(noise(), quality) for quality in (1, 30, 60, 90, 95, 100)]
-    assert files == [jpeg(noise(), quality) for quality in (1, 30, 60, 90, 95, 100)]
+def test_jpegs_are_reproducible_and_grow_with_quality():
+    files = [encode_jpeg(noise(), quality) for quality in (1, 30, 60, 90, 95, 100)]
+    assert files == [encode_jpeg(noise(), quality) for quality in (1, 30, 60, 90, 95, 100)]
     sizes = [len(file) for file in files]
     assert sizes == sorted(set(sizes))
 
 
-def test_a_jpeg_says_its_quality_keeps_its_chroma_and_carries_nothing_else():
-    photo = Photo.open(jpeg(noise(), 83))
+def test_a_jpeg_has_its_quality_full_chroma_and_no_metadata():
+    photo = Photo.open(encode_jpeg(noise(), 83))
     assert (photo.file_info.container, photo.file_info.jpeg_quality) == ("jpeg", 83)
     assert photo.file_info.subsampling == "4:4:4"
     assert photo.size == (56, 40)
@@ -299,16 +299,16 @@ def test_a_jpeg_says_its_quality_keeps_its_chroma_and_carries_nothing_else():
 
 def test_a_picture_too_wide_for_a_jpeg_is_refused():
     with pytest.raises(UnsupportedPhoto, match="jpeg"):
-        jpeg(torch.zeros(3, 1, 65536), 95)
+        encode_jpeg(torch.zeros(3, 1, 65536), 95)
 
 
-def test_live_training_sees_the_photo_as_it_comes_back_from_its_jpeg():
+def test_with_jpeg_changes_the_photo_only():
     ramp = torch.linspace(0.01, 0.6, 56).expand(3, 40, 56).clone()
     developed = develop(sample_of(ramp, jpeg_quality=40))
-    lived = with_jpeg(developed)
-    decoded = Photo.open(jpeg(developed.photo_encoded, 40)).pixels
-    assert np.array_equal(to_bytes(lived.photo_encoded), decoded)
-    assert lived.photo_encoded.dtype == torch.float32
-    assert 0.001 < (lived.photo_encoded - developed.photo_encoded).abs().mean() < 0.05
+    compressed = with_jpeg(developed)
+    decoded = Photo.open(encode_jpeg(developed.photo_encoded, 40)).pixels
+    assert np.array_equal(to_uint8(compressed.photo_encoded), decoded)
+    assert compressed.photo_encoded.dtype == torch.float32
+    assert 0.001 < (compressed.photo_encoded - developed.photo_encoded).abs().mean() < 0.05
     for name in LAYERS[1:]:
-        assert torch.equal(lived.layers()[name], developed.layers()[name])
+        assert torch.equal(compressed.layers()[name], developed.layers()[name])

@@ -1,4 +1,4 @@
-"""The thin lens over far content: a convolution that equals what chance finds."""
+"""Defocus at infinity: the convolution equals Monte Carlo integration."""
 
 import math
 
@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from brewster.render.analytic import render
-from brewster.render.rays.defocus import _disc, blurred, margin_px
+from brewster.render.rays.defocus import _disc_kernel, defocus_blur, margin_px
 from brewster.scene.camera import Camera
-from worlds_of_one import WORLDS, Worlds, a_scene, around, at, board, sun, where
+from worlds_of_one import WORLDS, Worlds, a_scene, around, at, board, centroid, sun
 
 
 def lens(aperture_mm, focus_mm=500.0, **more):
@@ -20,7 +20,7 @@ def lens(aperture_mm, focus_mm=500.0, **more):
 def test_without_an_aperture_the_camera_is_a_pinhole():
     picture = torch.rand(3, 32, 32)
     assert margin_px(lens(0.0)) == 0
-    assert blurred(picture, lens(0.0), 0) is picture
+    assert defocus_blur(picture, lens(0.0), 0) is picture
 
 
 def test_a_tiny_aperture_is_a_pinhole_too():
@@ -32,7 +32,7 @@ def test_a_tiny_aperture_is_a_pinhole_too():
 @pytest.mark.parametrize("radius_px", [0.1, 0.5, 1.3, 4.0, 9.7])
 def test_the_disc_sums_to_one_and_has_its_own_radius(radius_px):
     reach = math.ceil(radius_px + 0.5)
-    disc = _disc(radius_px, reach)
+    disc = _disc_kernel(radius_px, reach)
     assert disc.shape == (2 * reach + 1, 2 * reach + 1)
     assert float(disc.sum()) == pytest.approx(1, abs=1e-9)
     assert torch.equal(disc, disc.T)
@@ -48,13 +48,15 @@ def test_a_point_is_seen_as_a_disc_of_half_the_aperture_over_the_focus(aperture_
     margin, radius = margin_px(camera), aperture_mm / (2 * 500) / camera.pixel_rad
     point = torch.zeros(1, 32 + 2 * margin, 32 + 2 * margin)
     point[0, margin + 14, margin + 18] = 1
-    picture = blurred(point, camera, margin)
+    picture = defocus_blur(point, camera, margin)
     assert float(picture.sum()) == pytest.approx(1, abs=1e-5)
-    assert where(picture) == pytest.approx((18.5, 14.5), abs=1e-4)
+    assert centroid(picture) == pytest.approx((18.5, 14.5), abs=1e-4)
     assert float(1 / picture.max()) == pytest.approx(math.pi * radius**2, rel=0.05)
     across = torch.arange(32) - 18
     spread = float((picture[0].sum(0) * across**2).sum())
-    assert spread == pytest.approx(radius**2 / 4 + 1 / 12, abs=0.06)  # a disc's, and a pixel's
+    assert spread == pytest.approx(
+        radius**2 / 4 + 1 / 12, abs=0.06
+    )  # variance of the disc plus that of a pixel
     assert float(picture[0, 14, across.abs() > radius + 1].max()) < 1e-6
 
 
@@ -66,25 +68,25 @@ def test_the_sun_through_a_lens_keeps_its_place_and_energy():
     )
     sharp, soft = (render(scene, light).background for scene in scenes)
     assert float(soft.sum()) == pytest.approx(float(sharp.sum()), rel=1e-3)
-    assert where(soft) == pytest.approx(where(sharp), abs=0.05)
+    assert centroid(soft) == pytest.approx(centroid(sharp), abs=0.05)
     assert soft.max() < sharp.max() / 2
 
 
-def test_what_lies_outside_the_picture_is_blurred_into_it():
-    """Light just beyond the right edge reaches in by the disc's radius."""
+def test_light_outside_the_image_is_blurred_into_it():
+    """Light beyond the right edge is blurred into the image as far as the disc's radius."""
     camera = lens(60.0)
     margin = margin_px(camera)
     picture = torch.zeros(1, 32 + 2 * margin, 32 + 2 * margin)
     picture[:, :, margin + 32 :] = 1
-    edge = blurred(picture, camera, margin)[0, 16]
+    edge = defocus_blur(picture, camera, margin)[0, 16]
     assert 0.3 < edge[31] < 0.5
     assert edge[: 32 - margin].max() < 1e-6
 
 
 @pytest.mark.parametrize("incidence_deg", [0, 30])
-def test_a_lens_over_far_light_equals_rays_by_chance(incidence_deg):
-    """A wedge of nearly nothing makes the renderer throw rng."""
-    by_convolution, by_chance = (
+def test_defocus_by_convolution_equals_monte_carlo_integration(incidence_deg):
+    """A tiny wedge makes the renderer use Monte Carlo integration."""
+    by_convolution, by_monte_carlo = (
         render(
             a_scene(
                 camera=at(incidence_deg, aperture_mm=40, focus_mm=800, fov_deg=40),
@@ -98,12 +100,12 @@ def test_a_lens_over_far_light_equals_rays_by_chance(incidence_deg):
         for wedge_deg in (0.0, 1e-9)
     )
     for name, most in (("background", 3e-3), ("transmission", 3e-3), ("mirror", 3e-3), ("reflection", 0.01)):
-        one, other = getattr(by_convolution, name), getattr(by_chance, name)
+        one, other = getattr(by_convolution, name), getattr(by_monte_carlo, name)
         assert float(((one - other).abs() / one.mean()).max()) < most, name
         assert float(one.mean()) == pytest.approx(float(other.mean()), rel=2e-3)
 
 
-def test_a_near_picture_is_sharp_where_the_lens_is_set_on_it():
+def test_a_near_picture_is_sharp_in_the_focus_plane():
     pictures = [
         render(
             a_scene(

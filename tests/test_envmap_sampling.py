@@ -1,4 +1,4 @@
-"""Directions are drawn as often as the map is bright, and the density says how often that is."""
+"""Importance sampling of maps: samples follow the brightness, and the density matches the samples."""
 
 import math
 
@@ -6,14 +6,14 @@ import pytest
 import torch
 
 from brewster.render.rays.emitters import CameraView, SideEmitters
-from brewster.render.rays.envmap_sampling import EnvmapDistribution, _direction, lat_long
+from brewster.render.rays.envmap_sampling import EnvmapDistribution, direction_to_uv, uv_to_direction
 from worlds_of_one import WORLDS, around, sun
 
 AHEAD = torch.tensor([0.0, 0.0, -1.0])
 HEIGHT = 32
 
 
-def pairs(count, seed=0):
+def uniforms(count, seed=0):
     return torch.rand(2, count, generator=torch.Generator().manual_seed(seed))
 
 
@@ -31,80 +31,80 @@ def centres(turn):
     u = (torch.arange(2 * HEIGHT) + 0.5) / (2 * HEIGHT)
     edges = torch.cos(torch.arange(HEIGHT + 1) / HEIGHT * math.pi)
     solid = (edges[:-1] - edges[1:]) * math.pi / HEIGHT
-    directions = _direction(u[None].expand(HEIGHT, -1), v[:, None].expand(-1, 2 * HEIGHT), turn)
+    directions = uv_to_direction(u[None].expand(HEIGHT, -1), v[:, None].expand(-1, 2 * HEIGHT), turn)
     return directions.reshape(3, -1), solid[:, None].expand(-1, 2 * HEIGHT).reshape(-1)
 
 
-def light(side, behind=True):
+def emitters(side, behind=True):
     view = CameraView(height_mm=1000.0, pixel_rad=0.01, aperture_mm=0.0, focus_mm=3000.0)
     return SideEmitters(side, WORLDS, view, behind=behind, to_world=torch.eye(3), device="cpu")
 
 
-def test_a_direction_and_its_place_in_the_map_are_inverse():
-    u, v = pairs(500) * 0.98 + 0.01
+def test_texture_coordinates_and_directions_are_inverse():
+    u, v = uniforms(500) * 0.98 + 0.01
     for turn in (0.0, 0.3, -0.8):
-        for before, after in zip((u, v), lat_long(_direction(u, v, turn), turn), strict=True):
+        for before, after in zip((u, v), direction_to_uv(uv_to_direction(u, v, turn), turn), strict=True):
             torch.testing.assert_close(before, after, atol=1e-4, rtol=0)
     ahead, right, up = torch.tensor([[0.0, 0, -1], [1, 0, 0], [0, 1, 0]])
-    assert [float(lat_long(d[:, None], 0.5)[0]) for d in (ahead, right)] == pytest.approx([0.5, 0.75])
-    assert float(lat_long(up[:, None], 0.0)[1]) == pytest.approx(0, abs=1e-3)
+    assert [float(direction_to_uv(d[:, None], 0.5)[0]) for d in (ahead, right)] == pytest.approx([0.5, 0.75])
+    assert float(direction_to_uv(up[:, None], 0.0)[1]) == pytest.approx(0, abs=1e-3)
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.37])
 @pytest.mark.parametrize("outward", [(0, 0, -1), (0.6, 0, 0.8), (0, 1, 0)])
 def test_the_density_integrates_to_one_over_the_sphere(outward, turn):
-    odds = EnvmapDistribution(random_map(), torch.tensor(outward, dtype=torch.float32), turn)
+    distribution = EnvmapDistribution(random_map(), torch.tensor(outward, dtype=torch.float32), turn)
     directions, solid = centres(turn)
-    assert float((odds.density(directions, turn) * solid).sum()) == pytest.approx(1, rel=1e-3)
+    assert float((distribution.pdf(directions, turn) * solid).sum()) == pytest.approx(1, rel=1e-3)
 
 
-def test_nothing_is_drawn_from_the_other_side_of_the_glass():
+def test_no_direction_is_sampled_on_the_other_side_of_the_glass():
     outward = torch.tensor([0.6, 0.0, 0.8])
-    odds = EnvmapDistribution(random_map(), outward, 0.2)
-    drawn = odds.draw(pairs(5000), 0.2)
-    assert float((outward @ drawn).min()) > -0.05 - math.pi / HEIGHT
-    assert (odds.density(drawn, 0.2) > 0).all()
-    assert float(odds.density(-outward[:, None], 0.2)) == 0
+    distribution = EnvmapDistribution(random_map(), outward, 0.2)
+    sampled = distribution.sample(uniforms(5000), 0.2)
+    assert float((outward @ sampled).min()) > -0.05 - math.pi / HEIGHT
+    assert (distribution.pdf(sampled, 0.2) > 0).all()
+    assert float(distribution.pdf(-outward[:, None], 0.2)) == 0
 
 
-def test_draws_land_on_the_sun():
+def test_samples_land_on_the_sun():
     row, column, turn = 12, 60, 0.1
-    odds = EnvmapDistribution(texels(sun(HEIGHT, row, column, light=1e4, night=0.01)), AHEAD, turn)
-    u, v = lat_long(odds.draw(pairs(5000), turn), turn)
+    distribution = EnvmapDistribution(texels(sun(HEIGHT, row, column, light=1e4, night=0.01)), AHEAD, turn)
+    u, v = direction_to_uv(distribution.sample(uniforms(5000), turn), turn)
     near = ((u * 2 * HEIGHT - column - 0.5).abs() <= 1.51) & ((v * HEIGHT - row - 0.5).abs() <= 1.51)
     assert float(near.float().mean()) > 0.98
 
 
 @pytest.mark.parametrize("turn", [0.0, -0.25])
-def test_the_density_is_how_often_directions_are_drawn(turn):
-    odds = EnvmapDistribution(random_map(), AHEAD, turn)
+def test_the_density_matches_the_frequency_of_samples(turn):
+    distribution = EnvmapDistribution(random_map(), AHEAD, turn)
     count = 400_000
-    drawn = odds.draw(pairs(count), turn)
-    u, v = lat_long(drawn, turn)
+    sampled = distribution.sample(uniforms(count), turn)
+    u, v = direction_to_uv(sampled, turn)
     cell = (v * HEIGHT).long().clamp(max=HEIGHT - 1) * 2 * HEIGHT + (u * 2 * HEIGHT).long() % (2 * HEIGHT)
     found = torch.bincount(cell, minlength=2 * HEIGHT**2)
     directions, solid = centres(turn)
-    expected = odds.density(directions, turn) * solid * count
+    expected = distribution.pdf(directions, turn) * solid * count
     likely = expected > 20
     chi = ((found - expected) ** 2 / expected.clamp(min=1))[likely].mean()
     assert float(chi) == pytest.approx(1, abs=0.15)
-    assert float(odds.density(drawn, turn).min()) > 0
+    assert float(distribution.pdf(sampled, turn).min()) > 0
 
 
 @pytest.mark.parametrize("radius_mm", [math.inf, 1500.0], ids=["far", "dome"])
 @pytest.mark.parametrize("behind", [True, False])
 def test_the_mean_of_one_over_the_density_is_the_solid_angle(radius_mm, behind):
-    """Seen from a point off a dome's centre too: a cone of 60 degrees has a solid angle of pi."""
-    lamp = light(around("soft", radius_mm=radius_mm, heading_deg=25), behind)
+    """A cone of half-angle 60 degrees has a solid angle of pi, from any point inside a dome."""
+    lamp = emitters(around("soft", radius_mm=radius_mm, heading_deg=25), behind)
     origin = torch.tensor([[300.0], [-200.0], [0.0]]).expand(3, 200_000)
-    direction, density = lamp.draw(origin, pairs(200_000))
+    direction, pdf = lamp.sample(origin, uniforms(200_000))
     outward = -direction[2] if behind else direction[2]
     inside = outward > 0.5
-    assert float((inside / density.clamp(min=1e-9)).mean()) == pytest.approx(math.pi, rel=0.01)
+    assert float((inside / pdf.clamp(min=1e-9)).mean()) == pytest.approx(math.pi, rel=0.01)
     torch.testing.assert_close(direction.norm(dim=0), torch.ones(200_000))
-    torch.testing.assert_close(lamp.density(origin, direction), density)
+    torch.testing.assert_close(lamp.pdf(origin, direction), pdf)
 
 
-def test_a_black_map_can_be_drawn_from():
-    odds = EnvmapDistribution(torch.zeros(3, HEIGHT, 2 * HEIGHT), AHEAD, 0.0)
-    assert torch.isfinite(odds.draw(pairs(100), 0.0)).all()
+def test_a_black_map_can_be_sampled():
+    distribution = EnvmapDistribution(torch.zeros(3, HEIGHT, 2 * HEIGHT), AHEAD, 0.0)
+    assert torch.isfinite(distribution.sample(uniforms(100), 0.0)).all()

@@ -1,4 +1,4 @@
-"""What a stack of panes does to a ray, against formulas written out once more by hand."""
+"""Layered glass, compared with independently written formulas."""
 
 import math
 
@@ -11,14 +11,14 @@ from hypothesis import strategies as st
 from brewster.render.analytic import render
 from brewster.render.rays.layered_glass import (
     all_orders,
+    enumerate_orders,
     fresnel,
     ghost_distance_mm,
-    inner_cosine,
-    order_shares,
-    orders,
+    internal_transmittance,
+    lateral_shifts_mm,
+    order_throughputs,
     paper_orders,
-    pass_once,
-    shift_per_traversal,
+    refracted_cosine,
 )
 from brewster.render.rays.rough_glass import _reflectances
 from brewster.scene.glass import Glazing, Pane
@@ -45,7 +45,7 @@ def exact(number):
 
 
 def surface(cosine, here, beyond):
-    """Fresnel's reflectances for s and p light by the angles on both sides."""
+    """Fresnel reflectances for s- and p-polarised light, from the angles on both sides."""
     one = math.acos(cosine)
     other = math.asin(here * math.sin(one) / beyond)
     if one < 1e-6:
@@ -56,7 +56,7 @@ def surface(cosine, here, beyond):
 
 
 def slab(pane, cosine):
-    """T and R, for s and p light, of one pane without tint: all orders summed as a geometric series."""
+    """T and R of one clear pane for s- and p-polarised light: all orders as a geometric series."""
     return [((1 - r) / (1 + r), 2 * r / (1 + r)) for r in surface(cosine, 1, pane.index)]
 
 
@@ -77,7 +77,7 @@ def test_p_polarised_light_is_not_reflected_at_brewsters_angle(index):
 @some
 @given(st.floats(0.05, 0.999), st.floats(1.01, 2.5))
 def test_a_surface_reflects_alike_from_both_sides(cosine, index):
-    inside = float(inner_cosine(exact(cosine), index))
+    inside = float(refracted_cosine(exact(cosine), index))
     assert math.sqrt(1 - inside**2) * index == pytest.approx(math.sqrt(1 - cosine**2), abs=1e-9)
     outside = [float(r) for r in fresnel(exact(cosine), index)]
     assert outside == pytest.approx(surface(cosine, 1, index), rel=1e-6, abs=1e-9)
@@ -134,7 +134,7 @@ def test_double_glazing_follows_the_adding_formula(cosine, first, second):
 def test_glass_absorbs_as_beer_and_lambert_say():
     pane = Pane(thickness_mm=10, absorption_per_m=(40, 0, 10))
     left = np.exp([-0.4, 0, -0.1])
-    np.testing.assert_allclose(pass_once(pane, exact(1)), left, rtol=1e-9)
+    np.testing.assert_allclose(internal_transmittance(pane, exact(1)), left, rtol=1e-9)
     np.testing.assert_allclose(paper_orders(glazing([pane]), exact(1)).transmitted, 0.96**2 * left, rtol=1e-9)
     np.testing.assert_allclose(
         all_orders(glazing([pane]), exact(1)).transmitted,
@@ -142,21 +142,21 @@ def test_glass_absorbs_as_beer_and_lambert_say():
         rtol=1e-9,
     )
     slanted = math.cos(math.asin(math.sin(math.radians(60)) / 1.5))
-    np.testing.assert_allclose(pass_once(pane, exact(0.5)), left ** (1 / slanted), rtol=1e-9)
+    np.testing.assert_allclose(internal_transmittance(pane, exact(0.5)), left ** (1 / slanted), rtol=1e-9)
 
 
 # --- orders, one by one
 
 
 def table_of(panes, cosine):
-    return orders(tuple(float(sum(fresnel(exact(cosine), pane.index))) / 2 for pane in panes))
+    return enumerate_orders(tuple(float(sum(fresnel(exact(cosine), pane.index))) / 2 for pane in panes))
 
 
 @settings(max_examples=40, phases=[Phase.generate], deadline=None, database=None)
 @given(PANES.filter(lambda panes: len(panes) < 3), st.floats(0.4, 1))
 def test_the_orders_shares_sum_to_the_closed_form(panes, cosine):
     table = table_of(panes, cosine)
-    shares = order_shares(glazing(panes), exact(cosine), table)
+    shares = order_throughputs(glazing(panes), exact(cosine), table)
     for closed, kept, error in (
         (all_orders(glazing(panes), exact(cosine)), lambda _: True, 1e-12),
         (paper_orders(glazing(panes), exact(cosine)), lambda order: order.in_paper, 6e-3),
@@ -170,10 +170,10 @@ def test_the_orders_shares_sum_to_the_closed_form(panes, cosine):
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_what_is_lumped_onto_the_last_order_is_little(count):
-    """With no remainder to carry, ordinary glass's orders come within a thousandth of all its light."""
+def test_the_light_added_to_the_last_order_is_little(count):
+    """For ordinary glass, the enumerated orders alone hold all but a thousandth of the light."""
     panes = [Pane()] * count
-    table = orders((0.04,) * count)
+    table = enumerate_orders((0.04,) * count)
     whole = all_orders(glazing(panes), exact(1))
     for behind, total in ((True, whole.transmitted), (False, whole.reflected)):
         found = sum(
@@ -185,8 +185,8 @@ def test_what_is_lumped_onto_the_last_order_is_little(count):
         assert found == pytest.approx(float(total), abs=1e-3)
 
 
-def test_one_pane_has_three_reflections_and_two_views_worth_following():
-    table = orders((0.04,))
+def test_one_pane_has_three_reflected_and_two_transmitted_orders():
+    table = enumerate_orders((0.04,))
     assert [order.behind for order in table] == [True, False, False, True, False]
     assert [order.traversals for order in table] == [(1,), (0,), (2,), (3,), (4,)]
     assert [order.reflections for order in table] == [(0,), (1,), (1,), (2,), (3,)]
@@ -198,7 +198,7 @@ def test_one_pane_has_three_reflections_and_two_views_worth_following():
 def test_each_order_of_one_pane_is_a_term_of_the_geometric_series():
     pane = Pane(thickness_mm=10, absorption_per_m=(40, 0, 10))
     a = np.exp([-0.4, 0, -0.1])
-    first, mirror, ghost, second, _ = order_shares(glazing([pane]), exact(1), orders((0.04,)))
+    first, mirror, ghost, second, _ = order_throughputs(glazing([pane]), exact(1), enumerate_orders((0.04,)))
     np.testing.assert_allclose(first, 0.96**2 * a, rtol=1e-9)
     np.testing.assert_allclose(mirror, 0.04, rtol=1e-9)
     np.testing.assert_allclose(ghost, 0.96**2 * 0.04 * a**2, rtol=1e-9)
@@ -206,7 +206,7 @@ def test_each_order_of_one_pane_is_a_term_of_the_geometric_series():
 
 
 def test_in_double_glazing_the_papers_reflection_never_enters_the_last_pane():
-    table = orders((0.04, 0.04))
+    table = enumerate_orders((0.04, 0.04))
     assert sum(order.behind and order.in_paper for order in table) == 1
     mirrored = [order for order in table if not order.behind]
     brightest = [order.traversals for order in mirrored[:4]]
@@ -219,7 +219,7 @@ def test_in_double_glazing_the_papers_reflection_never_enters_the_last_pane():
 # --- ghosts
 
 
-def test_the_ghosts_distance_is_the_textbooks():
+def test_the_ghost_distance_matches_the_textbook_formula():
     inside = math.asin(math.sin(math.radians(45)) / 1.5)
     expected = 2 * 6 * math.tan(inside) * math.cos(math.radians(45))
     assert ghost_distance_mm(Pane(thickness_mm=6), 45) == pytest.approx(expected, rel=1e-9)
@@ -228,8 +228,8 @@ def test_the_ghosts_distance_is_the_textbooks():
     assert ghost_distance_mm(Pane(index=1.0), 60) == pytest.approx(8 * math.sin(math.radians(60)), rel=1e-9)
 
 
-def test_traversals_go_by_snells_angle_in_glass_and_straight_on_in_the_gap():
-    first, gap, second = shift_per_traversal(
+def test_lateral_shifts_follow_snells_law_in_glass_and_are_unrefracted_in_the_gap():
+    first, gap, second = lateral_shifts_mm(
         Glazing(panes=(Pane(thickness_mm=3), Pane(thickness_mm=8, index=2)), gap_mm=16), exact(0.5)
     )
     sine = math.sin(math.radians(60))
@@ -239,7 +239,7 @@ def test_traversals_go_by_snells_angle_in_glass_and_straight_on_in_the_gap():
 
 
 def line_mirrored(incidence_deg, thickness_mm):
-    """Light by column of a thin line before the glass, mirrored in the middle; a pixel's size in mm there."""
+    """The mean reflection per column of a thin line in front of the glass, and the size of a pixel there in mm."""
     before, away, slant = 600.0, 400.0, math.radians(incidence_deg)
     camera = at(incidence_deg, distance_mm=before / math.cos(slant), fov_deg=0.6, width=48, height=16)
     line = board(
@@ -270,13 +270,13 @@ def test_a_line_near_the_glass_is_mirrored_twice_as_far_apart_as_the_formula_say
     assert columns[ghost].sum() / columns[main].sum() == pytest.approx(fainter, rel=0.03)
 
 
-def test_a_ghost_that_is_a_pixel_away_moves_the_lines_centroid_by_its_share():
-    """Orders are looked up apart from each other unless they land within a tenth of a pixel."""
+def test_a_ghost_one_pixel_away_moves_the_lines_centroid_by_its_weight():
+    """Orders have separate lookups unless their images are within a tenth of a pixel."""
     columns, pixel_mm = line_mirrored(40, 0.4)
     apart = ghost_distance_mm(Pane(thickness_mm=0.4), 40) / pixel_mm
     assert 0.5 < apart < 1.5
-    table = orders((0.04,))
-    shares = order_shares(Glazing(), exact(math.cos(math.radians(40))), table)
+    table = enumerate_orders((0.04,))
+    shares = order_throughputs(Glazing(), exact(math.cos(math.radians(40))), table)
     mirrored = [(float(s), o.traversals[0] / 2) for s, o in zip(shares, table, strict=True) if not o.behind]
     mean_order = sum(share * number for share, number in mirrored) / sum(share for share, _ in mirrored)
     found = np.average(np.arange(48) + 0.5, weights=columns)

@@ -6,7 +6,7 @@ import pytest
 from brewster.errors import RecipeError
 from brewster.render.mitsuba import renderer, variant
 from brewster.render.mitsuba.renderer import trace
-from brewster.render.mitsuba.scene_builder import MitsubaSceneBuilder, between
+from brewster.render.mitsuba.scene_builder import MitsubaSceneBuilder, sample_bilinear
 from brewster.scene.camera import Camera, axes
 from brewster.scene.glass import Glazing, Pane
 from brewster.scene.scene import Scene
@@ -28,7 +28,7 @@ PICTURES = {"white": WHITE, "red right": RED_RIGHT, "red top": RED_TOP, "ramp": 
 
 
 class Pictures:
-    """Assets without files: what `PICTURES` has under the source's name."""
+    """Assets without files: the entry of `PICTURES` with the source's name."""
 
     def map_light(self, lit):
         return PICTURES[lit.source.file] * np.float32(lit.luminance)
@@ -51,26 +51,28 @@ def a_scene(**more):
 
 
 def traced(scene, **more):
-    return trace(scene, Pictures(), **{"noise": 0.01, "most_samples": 512, **more})
+    return trace(scene, Pictures(), **{"noise": 0.01, "max_samples": 512, **more})
 
 
-def shot(scene, side, glass, samples=64):
-    """One picture (H, W, 3) without the other four."""
+def render_one(scene, side, glass, samples=64):
+    """Renders one image (H, W, 3)."""
     mitsuba = variant.load()
-    with renderer._rendering_by(mitsuba, variant.probe().variant):
-        room = MitsubaSceneBuilder(mitsuba, scene, Pictures()).room(behind=side == "behind", glass=glass)
-        return np.array(mitsuba.render(mitsuba.load_dict(room), spp=samples))
+    with renderer._active_variant(mitsuba, variant.probe().variant):
+        mi_scene = MitsubaSceneBuilder(mitsuba, scene, Pictures()).scene_dict(
+            behind=side == "behind", glass=glass
+        )
+        return np.array(mitsuba.render(mitsuba.load_dict(mi_scene), spp=samples))
 
 
 def at(heading_deg, distance_mm=500.0):
-    """A camera that meets the glass at an angle, in a horizontal plane."""
+    """Values of a camera that looks at the glass from this heading, at the same height."""
     turn = math.radians(heading_deg)
     position = -distance_mm * math.sin(turn), 0, distance_mm * math.cos(turn)
     return {"heading_deg": heading_deg, "position_mm": position, "fov_deg": 2}
 
 
 def slab(incidence_deg, index=1.5):
-    """Reflectances of a whole pane for s and p light: all orders sum to 2 r / (1 + r)."""
+    """Reflectances of one pane for s- and p-polarised light: all orders sum to 2 r / (1 + r)."""
     cosine = math.cos(math.radians(incidence_deg))
     inside = math.sqrt(1 - (1 - cosine**2) / index**2)
     s = ((cosine - index * inside) / (cosine + index * inside)) ** 2
@@ -78,7 +80,7 @@ def slab(incidence_deg, index=1.5):
     return 2 * s / (1 + s), 2 * p / (1 + p)
 
 
-def test_glass_that_does_not_refract_is_not_there():
+def test_glass_with_index_one_is_invisible():
     sample = traced(a_scene(behind=around("mottled"), glass=Glazing(panes=(Pane(index=1.0),))))
     assert sample.photo.shape == (3, 32, 32)
     assert float((sample.transmission - sample.background).abs().max()) < 0.02
@@ -86,7 +88,7 @@ def test_glass_that_does_not_refract_is_not_there():
 
 
 def test_a_pane_of_ordinary_glass_reflects_about_eight_percent():
-    sample = traced(a_scene(camera=at(0)), noise=0.003, most_samples=4096)
+    sample = traced(a_scene(camera=at(0)), noise=0.003, max_samples=4096)
     s, _ = slab(0)
     assert float(sample.reflection.mean()) == pytest.approx(s, rel=0.02)
     assert float(sample.transmission.mean()) == pytest.approx(1 - s, rel=0.002)
@@ -104,12 +106,14 @@ def test_tinted_panes_absorb_as_beer_and_lambert_say():
         Pane(thickness_mm=10, absorption_per_m=(40, 0, 10)),
         Pane(thickness_mm=5, absorption_per_m=(0, 0, 20)),
     )
-    light = shot(a_scene(camera=at(0), glass=Glazing(panes=panes, gap_mm=10)), "behind", "unreflected")
+    light = render_one(
+        a_scene(camera=at(0), glass=Glazing(panes=panes, gap_mm=10)), "behind", "paper_transmission"
+    )
     np.testing.assert_allclose(light.mean((0, 1)), 0.96**4 * np.exp([-0.4, 0, -0.2]), rtol=0.01)
 
 
 def test_polarised_light_follows_the_closed_form_at_brewsters_angle(compiled):
-    """In colour, Mitsuba averages s and p at each surface, which is wrong by an eighth there."""
+    """Mitsuba's colour variants average s and p at each surface, which is wrong by an eighth at this angle."""
     camera = {**at(56.31), "width": 16, "height": 16}
     sample = traced(a_scene(camera=camera), polarised=True, noise=0.01)
     s, p = slab(56.31)
@@ -118,12 +122,12 @@ def test_polarised_light_follows_the_closed_form_at_brewsters_angle(compiled):
 
 def test_s_and_p_light_each_follow_the_closed_form(compiled, mitsuba):
     camera = {**at(56.31), "width": 16, "height": 16}
-    with renderer._rendering_by(mitsuba, renderer._variant(polarised=True)):
-        room = MitsubaSceneBuilder(mitsuba, a_scene(camera=camera), Pictures(), colour=0).room(
+    with renderer._active_variant(mitsuba, renderer._variant(polarised=True)):
+        mi_scene = MitsubaSceneBuilder(mitsuba, a_scene(camera=camera), Pictures(), channel=0).scene_dict(
             behind=False, glass="full"
         )
-        room["integrator"] = {"type": "stokes", "nested": room["integrator"]}
-        stokes = np.array(mitsuba.render(mitsuba.load_dict(room), spp=4096)).mean((0, 1))
+        mi_scene["integrator"] = {"type": "stokes", "nested": mi_scene["integrator"]}
+        stokes = np.array(mitsuba.render(mitsuba.load_dict(mi_scene), spp=4096)).mean((0, 1))
     whole, difference = stokes[1], abs(stokes[4])
     s, p = slab(56.31)
     assert whole == pytest.approx((s + p) / 2, rel=0.02)
@@ -131,7 +135,7 @@ def test_s_and_p_light_each_follow_the_closed_form(compiled, mitsuba):
 
 
 def red_half(picture):
-    """Which half is red, where the other is white."""
+    """The name of the half that is red in a red and white image."""
     green = picture[..., 1] / picture[..., 0].max()
     halves = {"left": green[:, :13], "right": green[:, -13:], "top": green[:13], "bottom": green[-13:]}
     return " ".join(name for name, half in halves.items() if half.max() < 0.05)
@@ -140,28 +144,38 @@ def red_half(picture):
 def test_what_is_red_on_the_right_of_a_plane_is_red_on_the_right_of_the_picture():
     scene = a_scene(behind=board("red right"), front=board("red right"))
     assert (
-        red_half(shot(scene, "behind", "none")) == red_half(shot(scene, "behind", "unreflected")) == "right"
+        red_half(render_one(scene, "behind", "none"))
+        == red_half(render_one(scene, "behind", "paper_transmission"))
+        == "right"
     )
-    assert red_half(shot(scene, "front", "mirror")) == red_half(shot(scene, "front", "unentered")) == "left"
+    assert (
+        red_half(render_one(scene, "front", "mirror"))
+        == red_half(render_one(scene, "front", "paper_reflection"))
+        == "left"
+    )
 
 
 def test_what_is_red_on_the_top_of_a_plane_is_red_on_the_top_of_the_picture():
     scene = a_scene(behind=board("red top"), front=board("red top"))
-    assert red_half(shot(scene, "behind", "none")) == red_half(shot(scene, "front", "mirror")) == "top"
+    assert (
+        red_half(render_one(scene, "behind", "none"))
+        == red_half(render_one(scene, "front", "mirror"))
+        == "top"
+    )
 
 
 @pytest.mark.parametrize("radius_mm", [math.inf, 3000])
 def test_a_map_begins_at_its_heading_and_a_mirror_shows_what_is_behind_the_camera(radius_mm):
-    """A map's middle lies opposite its heading; who turns round to it has its right half at -x."""
+    """A map's centre is opposite its heading; seen by a camera that faces it, its right half is at -x."""
     turned, plain = (around("red right", heading_deg=heading, radius_mm=radius_mm) for heading in (180, 0))
     scene = a_scene(behind=turned, front=plain)
-    assert red_half(shot(scene, "behind", "none")) == "right"
-    assert red_half(shot(scene, "front", "mirror")) == "left"
+    assert red_half(render_one(scene, "behind", "none")) == "right"
+    assert red_half(render_one(scene, "front", "mirror")) == "left"
 
 
 @pytest.mark.parametrize("radius_mm", [math.inf, 3000])
 @pytest.mark.parametrize("behind", [True, False])
-def test_a_map_shines_as_its_texels_say_and_only_on_its_own_side(
+def test_a_map_emits_the_light_of_its_texels_and_only_on_its_own_side(
     radius_mm, behind, random, compiled, mitsuba
 ):
     lit = around("mottled", heading_deg=37, radius_mm=radius_mm)
@@ -170,17 +184,19 @@ def test_a_map_shines_as_its_texels_say_and_only_on_its_own_side(
     ahead = random.normal(size=(3, 4000))
     ahead /= np.linalg.norm(ahead, axis=0)
     to_glass = np.array(axes(glass.heading_deg, glass.pitch_deg))
-    with renderer._rendering_by(mitsuba, variant.COMPILED):
-        room = mitsuba.load_dict(
-            MitsubaSceneBuilder(mitsuba, scene, Pictures()).room(behind=behind, glass="none")
+    with renderer._active_variant(mitsuba, variant.COMPILED):
+        mi_scene = mitsuba.load_dict(
+            MitsubaSceneBuilder(mitsuba, scene, Pictures()).scene_dict(behind=behind, glass="none")
         )
-        found = room.ray_intersect(
+        found = mi_scene.ray_intersect(
             mitsuba.Ray3f(mitsuba.Point3f(0), mitsuba.Vector3f((to_glass @ ahead).astype("f4")))
         )
-        light = np.array(found.emitter(room).eval(found))
+        light = np.array(found.emitter(mi_scene).eval(found))
     u = (np.arctan2(ahead[0], -ahead[2]) / (2 * np.pi) - 37 / 360) % 1
     v = np.arccos(ahead[1]) / np.pi
-    expected = np.stack([between(MOTTLED, u[i : i + 1], v[i : i + 1])[0, 0] for i in range(len(u))], axis=1)
+    expected = np.stack(
+        [sample_bilinear(MOTTLED, u[i : i + 1], v[i : i + 1])[0, 0] for i in range(len(u))], axis=1
+    )
     height = to_glass[2] @ ahead
     clear = np.abs(height) > 0.01
     np.testing.assert_allclose(light[:, clear], (expected * ((height < 0) == behind))[:, clear], atol=1e-4)
@@ -188,20 +204,20 @@ def test_a_map_shines_as_its_texels_say_and_only_on_its_own_side(
 
 def test_a_plane_hides_the_map_behind_it():
     plane = board("white", luminance=0.5).plane
-    light = shot(a_scene(behind=Side(map=around().map, plane=plane)), "behind", "none")
+    light = render_one(a_scene(behind=Side(map=around().map, plane=plane)), "behind", "none")
     np.testing.assert_allclose(light, 0.5, atol=1e-3)
 
 
 def test_the_back_of_a_plane_between_camera_and_glass_is_black_on_both_sides_light():
     plane = board("white", distance_mm=300, width_mm=1000).plane
     scene = a_scene(front=Side(map=around().map, plane=plane))
-    assert shot(scene, "behind", "full").max() == shot(scene, "front", "full").max() == 0
+    assert render_one(scene, "behind", "full").max() == render_one(scene, "front", "full").max() == 0
 
 
 @pytest.mark.parametrize(("side", "glass"), [("behind", "full"), ("behind", "none"), ("front", "mirror")])
 def test_a_frame_is_an_opening_in_a_black_wall(side, glass):
     scene = a_scene(glass=Glazing(frame_mm=(200, 44)), camera={"position_mm": (0, 0, 250)})
-    light = shot(scene, side, glass)[..., 0]
+    light = render_one(scene, side, glass)[..., 0]
     assert (light > 0.5).sum(axis=0).tolist() == [16] * 32
 
 
@@ -214,7 +230,7 @@ def test_a_lens_bends_light_as_the_lensmakers_formula_says(radii_mm):
     scene = a_scene(glass=glass, behind=board("ramp", distance_mm=far, width_mm=100), camera=camera)
     one, other = radii_mm
     power = 0.5 * (1 / one - 1 / other + 0.5 * 6 / (1.5 * one * other))
-    assert slope(shot(scene, "behind", "unreflected"), near) * 100 / 0.96**2 == pytest.approx(
+    assert slope(render_one(scene, "behind", "paper_transmission"), near) * 100 / 0.96**2 == pytest.approx(
         1 + far / near - far * power, abs=0.02
     )
 
@@ -223,7 +239,7 @@ def test_a_curved_mirror_is_the_lenss_own_surface():
     """A sphere's focal length is half its radius: a ray at height y meets a plane at y (1 + b / a + 2 b / r)."""
     glass = Glazing(panes=(Pane(thickness_mm=20),), radii_mm=(300.0, 1000.0), frame_mm=(100.0, 100.0))
     scene = a_scene(glass=glass, front=board("ramp", distance_mm=1000, width_mm=4000), camera={"fov_deg": 2})
-    assert -slope(shot(scene, "front", "mirror"), 500) * 4000 == pytest.approx(
+    assert -slope(render_one(scene, "front", "mirror"), 500) * 4000 == pytest.approx(
         1 + 1000 / 500 + 2000 / 300, rel=0.01
     )
 
@@ -244,7 +260,7 @@ def slope(picture, distance_mm):
     ],
     ids=["knife's edge", "panes that touch", "lens without edge", "sphere too small"],
 )
-def test_glass_that_cannot_be_is_refused(glass):
+def test_impossible_glass_is_refused(glass):
     with pytest.raises(RecipeError):
         traced(a_scene(glass=glass))
 
@@ -252,19 +268,19 @@ def test_glass_that_cannot_be_is_refused(glass):
 def test_the_same_seed_gives_the_same_bytes_and_another_one_does_not():
     scene = a_scene(behind=around("mottled"), front=around("mottled"))
     one, same, other = (
-        traced(s, most_samples=16) for s in (scene, scene, scene.model_copy(update={"seed": 1}))
+        traced(s, max_samples=16) for s in (scene, scene, scene.model_copy(update={"seed": 1}))
     )
     for first, second, third in zip(*(s.layers().values() for s in (one, same, other)), strict=True):
         assert first.numpy().tobytes() == second.numpy().tobytes()
         assert first.numpy().tobytes() != third.numpy().tobytes()
 
 
-def test_the_noise_that_was_asked_for_is_the_noise_there_is():
+def test_the_noise_is_as_requested():
     scene = a_scene(behind=around("mottled"), front=around("mottled"))
     errors = []
     for noise in (0.05, 0.005):
         one, other = (
-            traced(scene.model_copy(update={"seed": n}), noise=noise, most_samples=4096) for n in (1, 2)
+            traced(scene.model_copy(update={"seed": n}), noise=noise, max_samples=4096) for n in (1, 2)
         )
         difference = (one.photo - other.photo).mean(0).abs() / one.photo.mean(0)
         errors.append(float(difference.mean()) * math.sqrt(math.pi) / 2)  # E|a - b| = 2 sigma / sqrt(pi)
@@ -275,14 +291,14 @@ def test_the_noise_that_was_asked_for_is_the_noise_there_is():
 def test_denoising_keeps_the_light():
     pytest.importorskip("mitsuba_oidn")
     noisy, clean = (
-        traced(a_scene(), most_samples=16, denoise=denoise).reflection for denoise in (False, True)
+        traced(a_scene(), max_samples=16, denoise=denoise).reflection for denoise in (False, True)
     )
     assert float(clean.std()) < 0.5 * float(noisy.std())
     assert float(clean.mean()) == pytest.approx(float(noisy.mean()), rel=0.2)
 
 
-def test_another_variant_that_was_chosen_before_comes_back(mitsuba):
-    traced(a_scene(), most_samples=4)
+def test_the_previously_selected_variant_is_restored(mitsuba):
+    traced(a_scene(), max_samples=4)
     mitsuba.set_variant("scalar_rgb")
-    traced(a_scene(), most_samples=4)
+    traced(a_scene(), max_samples=4)
     assert mitsuba.variant() == "scalar_rgb"

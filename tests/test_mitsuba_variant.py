@@ -1,4 +1,4 @@
-"""Which LLVM compiles Mitsuba's kernels, and what happens without one; each import in a process of its own."""
+"""The choice of the LLVM that compiles Mitsuba's kernels; each import runs in a separate process."""
 
 import os
 import subprocess
@@ -14,26 +14,26 @@ import warnings
 from brewster.render.mitsuba.renderer import trace
 from test_mitsuba_renderer import Pictures, a_scene
 
-with warnings.catch_warnings(record=True) as told:
+with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     scene = a_scene(camera={"width": 16, "height": 16})
-    light = float(trace(scene, Pictures(), noise=0.01, most_samples=64).photo.mean())
+    light = float(trace(scene, Pictures(), noise=0.01, max_samples=64).photo.mean())
 assert abs(light - 1) < 0.01, light
 import mitsuba
 from brewster.errors import DeviceError
 from brewster.render.mitsuba import variant
 loaded = {line.split()[-1].rpartition("/")[2] for line in open("/proc/self/maps") if "libLLVM" in line}
 print(variant.probe().variant, *loaded)
-print(*{str(warning.message) for warning in told})
+print(*{str(warning.message) for warning in caught})
 try:
-    trace(scene, Pictures(), most_samples=4, polarised=True)
+    trace(scene, Pictures(), max_samples=4, polarised=True)
 except DeviceError as error:
     print(error)
 """
 
 
 def in_a_process(program, **settings):
-    """What a program prints that has this environment beside ours."""
+    """Runs a program with additional environment variables; returns the finished process."""
     folders = os.pathsep.join((os.path.dirname(__file__), os.environ.get("PYTHONPATH", "")))  # noqa: PTH120
     return subprocess.run(
         [sys.executable, "-c", program],
@@ -44,13 +44,13 @@ def in_a_process(program, **settings):
     )
 
 
-def test_importing_the_tracer_wakes_no_mitsuba():
+def test_importing_the_renderer_does_not_import_mitsuba():
     code = "import brewster.render.mitsuba.renderer, sys; assert not {'mitsuba', 'drjit'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.parametrize("name", ["/nonexistent", "libm.so.6"])
-def test_without_an_llvm_that_works_the_scalar_variant_renders_and_none_is_loaded(mitsuba, name):
+def test_without_a_working_llvm_the_scalar_variant_renders_and_no_llvm_is_loaded(mitsuba, name):
     done = in_a_process(TRACED, DRJIT_LIBLLVM_PATH=name)
     assert done.returncode == 0, done.stderr
     loaded, warning, refused = done.stdout.splitlines()
@@ -62,10 +62,10 @@ def test_without_an_llvm_that_works_the_scalar_variant_renders_and_none_is_loade
 
 
 def test_the_llvm_of_the_pip_package_comes_first_and_compiles(compiled):
-    packaged = variant._of_the_package()
+    packaged = variant._packaged_llvm()
     if not packaged:
         pytest.skip(f"no LLVM of pip: {variant.INSTALL_LLVM}")
-    unnamed = {name: value for name, value in os.environ.items() if name != variant.LIBRARY}
+    unnamed = {name: value for name, value in os.environ.items() if name != variant.LLVM_PATH_VARIABLE}
     done = subprocess.run(
         [
             sys.executable,
@@ -84,7 +84,7 @@ def test_the_llvm_of_the_pip_package_comes_first_and_compiles(compiled):
 
 
 def test_an_exception_of_another_library_is_still_caught_next_to_the_llvm_of_the_package(compiled):
-    """With the C++ runtime of the package in the global scope, the process ends instead."""
+    """If the C++ runtime of the package were in the global scope, the process would end."""
     program = """
 import numpy
 from brewster.render.mitsuba import variant
@@ -100,18 +100,18 @@ for fails in (lambda: mitsuba.load_dict({"type": "nonsense"}), lambda: OpenEXR.F
     assert in_a_process(program).stdout.split() == ["caught", "caught"]
 
 
-def test_an_llvm_that_aborts_costs_no_more_than_a_line(monkeypatch):
-    monkeypatch.setattr(variant, "_PICTURE", "import os; os.abort()")
-    assert "ends the process" in variant._fails(None)
-    monkeypatch.setattr(variant, "_PICTURE", "raise ValueError('no kernel')")
-    assert variant._fails(None) == "ValueError: no kernel"
+def test_an_llvm_that_aborts_is_reported_in_one_line(monkeypatch):
+    monkeypatch.setattr(variant, "_TEST_PROGRAM", "import os; os.abort()")
+    assert "ends the process" in variant._failure_reason(None)
+    monkeypatch.setattr(variant, "_TEST_PROGRAM", "raise ValueError('no kernel')")
+    assert variant._failure_reason(None) == "ValueError: no kernel"
 
 
 def test_known_good_llvm_versions_are_tried_first(tmp_path, monkeypatch):
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     monkeypatch.delitem(sys.modules, "drjit", raising=False)
     monkeypatch.setattr(variant, "_FOLDERS", [str(tmp_path)])
-    monkeypatch.setattr(variant, "_PACKAGE", "no-such-package")
+    monkeypatch.setattr(variant, "_LLVM_PACKAGE", "no-such-package")
     for name in ("libLLVM-14.so.1", "libLLVM-18.so.1", "libLLVM.so.19.1", "libLLVM.so.21.0"):
         (tmp_path / name).touch()
     names = [path and path.rpartition("/")[2] for path in variant._candidates()]
@@ -124,18 +124,18 @@ def test_an_imported_drjit_has_loaded_its_llvm_so_that_no_other_is_tried(monkeyp
     assert variant._candidates() == [None]
 
 
-def test_a_missing_mitsuba_is_named_with_its_cure(monkeypatch):
+def test_a_missing_mitsuba_is_reported_with_its_install_command(monkeypatch):
     variant.probe.cache_clear()
     monkeypatch.setitem(sys.modules, "mitsuba", None)
     with pytest.raises(MissingExtra, match=r"brewster\[render\]"):
         variant.load()
 
 
-def test_a_missing_libatomic_is_named_with_the_line_that_installs_it(mitsuba, tmp_path):
-    (tmp_path / "libatomic.so.1").touch()  # is found first, and is no library
+def test_a_missing_libatomic_is_reported_with_its_install_command(mitsuba, tmp_path):
+    (tmp_path / "libatomic.so.1").touch()  # found first, but not a valid library
     program = "from brewster.render.mitsuba import variant; variant.load()"
     done = in_a_process(program, LD_LIBRARY_PATH=str(tmp_path))
-    told = done.stderr.splitlines()[-1]
-    assert "MissingExtra: mitsuba cannot be imported" in told
-    assert "libatomic.so.1" in told
-    assert told.endswith("run: apt install libatomic1.")
+    message = done.stderr.splitlines()[-1]
+    assert "MissingExtra: mitsuba cannot be imported" in message
+    assert "libatomic.so.1" in message
+    assert message.endswith("run: apt install libatomic1.")

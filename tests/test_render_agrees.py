@@ -1,4 +1,4 @@
-"""The analytic renderer against Mitsuba, in its scalar variant, which runs wherever Mitsuba can be imported."""
+"""Compares the analytic renderer with Mitsuba's scalar variant, which runs wherever Mitsuba can be imported."""
 
 import warnings
 
@@ -22,17 +22,15 @@ RUNS = 4
 
 @pytest.fixture(scope="module")
 def traced():
-    """Independent pictures of every layer, (RUNS, 3, H, W) each: their spread is the noise."""
+    """Independent images of every layer, (RUNS, 3, H, W) each; their standard deviation estimates the noise."""
     seeds = [SCENE.model_copy(update={"seed": seed}) for seed in range(RUNS)]
     with (
         pytest.MonkeyPatch.context() as patch,
-        warnings.catch_warnings(action="ignore", category=RuntimeWarning),  # of an LLVM, which is not needed
+        warnings.catch_warnings(action="ignore", category=RuntimeWarning),  # about LLVM, which is not needed
     ):
         patch.setattr(renderer, "_variant", lambda polarised: "scalar_rgb")
         try:
-            samples = [
-                renderer.trace(scene, WORLDS, noise=0.02, most_samples=512).layers() for scene in seeds
-            ]
+            samples = [renderer.trace(scene, WORLDS, noise=0.02, max_samples=512).layers() for scene in seeds]
         except MissingExtra as error:
             pytest.skip(f"Mitsuba cannot be used: {error}")
     return {name: torch.stack([sample[name] for sample in samples]).double() for name in samples[0]}
@@ -40,7 +38,7 @@ def traced():
 
 @pytest.mark.parametrize("layer", ["photo", "transmission", "background", "reflection", "mirror"])
 def test_the_analytic_renderer_gives_the_picture_that_mitsuba_traces(traced, layer):
-    """In every pixel as far as the noise lets one see, and 1.5 % of the light in the mean."""
+    """Per pixel within the noise plus 1 % of the mean light, and within 1.5 % in the mean."""
     mine = render(SCENE, WORLDS).layers()[layer].double()
     theirs, noise = traced[layer].mean(0), traced[layer].std(0) / RUNS**0.5
     light = float(theirs.mean())

@@ -55,7 +55,7 @@ def test_only_the_photo_has_the_quality_of_the_scene(scene):
 
 
 def test_statistics_compare_the_luminance_of_the_layers(scene):
-    grey = render(scene, None).each(lambda layer: torch.full_like(layer, 0.5))
+    grey = render(scene, None).map(lambda layer: torch.full_like(layer, 0.5))
     mirrored = LightSample(**{**vars(grey), "reflection": grey.reflection * 0.1})
     found = store.statistics(mirrored, store.develop(mirrored))
     assert found["reflection_to_transmission"] == pytest.approx(0.1)

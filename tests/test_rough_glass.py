@@ -1,4 +1,4 @@
-"""Rough glass: it loses little light, blurs, tends to smooth glass, and is right whichever way light is found."""
+"""Rough glass: energy, blur, the smooth limit, and agreement of the sampling strategies."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import torch
 
 from brewster.render.analytic import render
 from brewster.render.rays import rough_glass
-from brewster.render.rays.ggx import seen_density, shadowing, visible_facet
+from brewster.render.rays.ggx import sample_visible_normal, smith_g1, vndf_over_cosine
 from brewster.render.rays.layered_glass import all_orders
 from brewster.render.rays.rough_glass import surfaces
 from brewster.scene.glass import Glazing, Pane
@@ -21,7 +21,7 @@ def mean(picture):
     return float(picture.mean())
 
 
-def test_polished_glass_is_the_limit_of_rough_glass():
+def test_smooth_glass_is_the_limit_of_rough_glass():
     sides = {"behind": around("soft", heading_deg=50), "front": around("soft")}
     polished, nearly = (render(rough(alpha, samples=64, **sides), WORLDS) for alpha in (0.0, 1e-3))
     assert mean(nearly.transmission) == pytest.approx(mean(polished.transmission), rel=2e-3)
@@ -29,7 +29,7 @@ def test_polished_glass_is_the_limit_of_rough_glass():
 
 
 @pytest.mark.parametrize(("alpha", "count"), [(0.02, 1), (0.05, 1), (0.05, 2)])
-def test_in_an_even_world_rough_glass_creates_no_light_and_loses_little(alpha, count):
+def test_in_uniform_light_rough_glass_creates_no_light_and_loses_little(alpha, count):
     sample = render(rough(alpha, count, samples=2 if count == 2 else 16), WORLDS)
     whole = mean(sample.transmission) + mean(sample.reflection)
     assert 0.985 < whole < 1.003
@@ -47,12 +47,12 @@ def test_the_rougher_the_glass_the_softer_an_edge_behind_it():
 
 
 @pytest.mark.parametrize(("alpha", "radius_mm"), [(0.1, float("inf")), (0.3, 2500.0)], ids=["far", "dome"])
-def test_light_found_by_facets_alone_or_drawn_from_the_map_too_is_the_same(monkeypatch, alpha, radius_mm):
-    """A furnace that is brighter on one side."""
+def test_light_sampling_does_not_change_the_mean(monkeypatch, alpha, radius_mm):
+    """A white furnace test with a light gradient."""
     side = around("soft", heading_deg=30, radius_mm=radius_mm)
     scene = rough(alpha, samples=32, behind=side, front=side)
     both = render(scene, WORLDS)
-    monkeypatch.setattr(rough_glass, "_WORTH_LIGHT", 2.0)
+    monkeypatch.setattr(rough_glass, "_MIN_LIGHT_SAMPLING_WEIGHT", 2.0)
     alone = render(scene, WORLDS)
     assert not torch.equal(both.photo, alone.photo)
     assert mean(both.photo) == pytest.approx(mean(alone.photo), rel=5e-3)
@@ -60,12 +60,12 @@ def test_light_found_by_facets_alone_or_drawn_from_the_map_too_is_the_same(monke
     assert mean(both.reflection) == pytest.approx(mean(alone.reflection), rel=0.02)  # a noisy eighth of it
 
 
-def test_a_small_sun_in_frosted_glass_is_steady_only_when_its_light_is_drawn(monkeypatch):
+def test_light_sampling_halves_the_noise_of_a_small_sun_in_frosted_glass(monkeypatch):
     WORLDS.pictures["lamp"] = soft(64) * 0.02
     WORLDS.pictures["lamp"][30:32, :2] += 500
     scene = rough(0.2, samples=16, camera=at(0), behind=around("lamp", heading_deg=5))
     both = render(scene, WORLDS).transmission
-    monkeypatch.setattr(rough_glass, "_WORTH_LIGHT", 2.0)
+    monkeypatch.setattr(rough_glass, "_MIN_LIGHT_SAMPLING_WEIGHT", 2.0)
     alone = render(scene, WORLDS).transmission
     assert mean(both) == pytest.approx(mean(alone), rel=0.1)
 
@@ -75,27 +75,27 @@ def test_a_small_sun_in_frosted_glass_is_steady_only_when_its_light_is_drawn(mon
     assert grain(both) < grain(alone) / 2
 
 
-def test_every_facet_that_is_seen_is_drawn_as_often_as_it_is_seen():
-    """The visible facets' projected areas sum to the surface's own: the integral of D G1 <m, v> / cos is 1."""
+def test_visible_normals_are_sampled_with_their_density():
+    """The mean of 1 / density over the samples in a cap of normals is the cap's solid angle."""
     generator = torch.Generator().manual_seed(1)
     normal = torch.tensor([[0.0], [0.0], [1.0]])
     for alpha in (0.1, 0.4):
         towards = torch.tensor([[0.6], [0.0], [0.8]]).expand(3, 200_000)
-        facet = visible_facet(towards, normal, alpha, torch.rand(2, 200_000, generator=generator))
+        facet = sample_visible_normal(towards, normal, alpha, torch.rand(2, 200_000, generator=generator))
         cosine = (facet * towards).sum(0).clamp(min=0)
-        density = seen_density(towards, normal, facet, alpha) * cosine
-        inside = facet[2] > 0.95  # a cap of known size: the mean of 1 / density over it is its solid angle
+        density = vndf_over_cosine(towards, normal, facet, alpha) * cosine
+        inside = facet[2] > 0.95
         assert float((inside / density).mean()) == pytest.approx(2 * np.pi * 0.05, rel=0.02)
         assert facet.norm(dim=0) == pytest.approx(1, abs=1e-5)
 
 
-def test_shadowing_hides_nothing_from_above_and_much_at_a_grazing_look():
-    above, slanted, grazing = shadowing(torch.tensor([1.0, 0.5, 0.05]), 0.4)
+def test_smith_g1_is_one_at_normal_incidence_and_falls_towards_grazing_angles():
+    above, slanted, grazing = smith_g1(torch.tensor([1.0, 0.5, 0.05]), 0.4)
     assert float(above) == 1
     assert 1 > float(slanted) > float(grazing) > 0
 
 
-def test_surfaces_stand_one_behind_the_other():
+def test_surfaces_are_ordered_from_the_camera_on():
     glass = Glazing(panes=(Pane(thickness_mm=4), Pane(thickness_mm=6, wedge_deg=1)), gap_mm=10)
     stack = surfaces(glass, torch.zeros(1))
     assert [surface.height_mm for surface in stack] == [0, -4, -14, -20]

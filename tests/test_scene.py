@@ -11,7 +11,7 @@ from brewster.scene.camera import Camera
 from brewster.scene.recipe import RECIPES, read_scene_recipe
 from brewster.scene.sampler import draw
 from brewster.scene.scene import Scene, read_scene
-from worlds_of_one import looks
+from worlds_of_one import pixel_directions
 
 MAP = "source.file = 'builtin:street:1'"
 
@@ -125,7 +125,7 @@ def test_framed_glass_may_be_seen_at_any_angle_and_a_pinhole_has_no_focus_to_hit
 
 def test_a_cameras_corners_frame_its_pixels():
     camera = Camera(heading_deg=33, pitch_deg=-12, fov_deg=60, width=48, height=32)
-    pixels = looks(camera)
+    pixels = pixel_directions(camera)
     for corner, place in zip(camera.corners(), [(-1, 0), (0, 0), (-1, -1), (0, -1)], strict=True):
         cosine = pixels[place] @ corner / math.hypot(*corner)
         assert math.degrees(math.acos(min(cosine, 1))) < 1.3

@@ -6,7 +6,7 @@ import torch
 from brewster.environments.assets import Assets
 from brewster.environments.catalog import BUILTIN_CATALOG
 from brewster.photo import Photo
-from brewster.render.camera_response import jpeg
+from brewster.render.camera_response import encode_jpeg
 from brewster.scene.recipe import read_scene_recipe
 from brewster.training.data.online import OnlineRendered
 
@@ -52,7 +52,7 @@ def test_the_photo_has_been_through_its_jpeg_and_no_truth_has(assets, mixing):
     sample = stream(assets, mixing=mixing).sample(0)
 
     def change(encoded):
-        decoded = Photo.open(jpeg(encoded, sample.scene.development.jpeg_quality)).pixels.copy()
+        decoded = Photo.open(encode_jpeg(encoded, sample.scene.development.jpeg_quality)).pixels.copy()
         return (torch.from_numpy(decoded).permute(2, 0, 1) / 255 - encoded).abs().mean()
 
     assert change(sample.photo_encoded) < 1e-3

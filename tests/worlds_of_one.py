@@ -1,4 +1,4 @@
-"""Worlds of a single idea, which need no files: even light, one texel's sun, a half, a line; and scenes of them."""
+"""Simple environments without files (uniform light, a sun of one texel, a half, a line), and scenes that use them."""
 
 import math
 
@@ -12,7 +12,7 @@ from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
 
 
 class Worlds:
-    """Assets without files: pictures (H, W, 3) by the names of their sources."""
+    """Assets without files: images (H, W, 3) by the name of their source."""
 
     def __init__(self, **pictures):
         self.pictures = {"white": np.ones((16, 32, 3), np.float32), **pictures}
@@ -25,7 +25,7 @@ class Worlds:
 
 
 def towards(height):
-    """Unit directions (H, 2 H, 3) of a lat-long map's texels, its left edge straight ahead."""
+    """Unit directions (H, 2 H, 3) of the texels of a latitude-longitude map whose left edge is at -z."""
     heading = (np.arange(2 * height) + 0.5) / height * np.pi
     polar = (np.arange(height)[:, None] + 0.5) / height * np.pi
     across = np.sin(polar)
@@ -35,7 +35,7 @@ def towards(height):
 
 
 def soft(height):
-    """A map without edges, in three colours."""
+    """A smooth map, different in each channel."""
     x, y, z = np.moveaxis(towards(height), -1, 0)
     return np.stack([1 + 0.5 * x * z, 1 + 0.4 * y - 0.3 * z, 1 + 0.6 * x * y + 0.2 * y], -1).astype(
         np.float32
@@ -43,14 +43,14 @@ def soft(height):
 
 
 def sun(height, row, column, light=1e4, night=0.0):
-    """A night with one bright texel."""
+    """A dark map with one bright texel."""
     texels = np.full((height, 2 * height, 3), night, np.float32)
     texels[row, column] = light
     return texels
 
 
 def bright(shape, where):
-    """Black, and white at an index."""
+    """A black image that is white at an index."""
     texels = np.zeros((*shape, 3), np.float32)
     texels[where] = 1
     return texels
@@ -74,7 +74,7 @@ def board(name="white", **more):
 
 
 def at(heading_deg, pitch_deg=0.0, distance_mm=500.0, **more):
-    """A camera whose axis meets the middle of the glass."""
+    """Values of a camera whose axis meets the centre of the glass."""
     back = axes(heading_deg, pitch_deg)[2]
     return {
         "heading_deg": heading_deg,
@@ -85,7 +85,7 @@ def at(heading_deg, pitch_deg=0.0, distance_mm=500.0, **more):
 
 
 def a_scene(camera=None, panes=(), **more):
-    """White all around, a small square picture, ordinary glass; `panes` are dicts."""
+    """A scene of 24 x 24 pixels with uniform white light on both sides and ordinary glass; `panes` are dictionaries."""
     if panes:
         gap = 12.0 if len(panes) > 1 else 0.0
         more["glass"] = Glazing(panes=tuple(Pane(**pane) for pane in panes), gap_mm=gap)
@@ -95,8 +95,8 @@ def a_scene(camera=None, panes=(), **more):
     )
 
 
-def looks(camera):
-    """Unit directions (H, W, 3) through the centres of a picture's pixels."""
+def pixel_directions(camera):
+    """Unit directions (H, W, 3) through the centres of the pixels."""
     right, up, back = map(np.array, axes(camera.heading_deg, camera.pitch_deg))
     half = math.tan(math.radians(camera.fov_deg) / 2)
     x = ((np.arange(camera.width) + 0.5) * 2 - camera.width) / camera.width * half
@@ -105,8 +105,8 @@ def looks(camera):
     return ways / np.linalg.norm(ways, axis=-1, keepdims=True)
 
 
-def where(picture):
-    """The centroid of a picture (3, H, W), in pixels to the right and down from its upper left corner."""
+def centroid(picture):
+    """The centroid of an image (3, H, W), in pixels to the right and down from its upper left corner."""
     light = np.asarray(picture, np.float64).sum(0)
     height, width = light.shape
     return (
@@ -130,7 +130,7 @@ KINDS = ["smooth", "smooth", "wedge"]
 
 @st.composite
 def scenes(draw, **fixed):
-    """Scenes of every kind that the analytic renderer takes: panes, tints, wedges, roughness, sides, lenses."""
+    """Scenes of every kind that the analytic renderer supports, except rough glass: panes, tints, wedges, sides, lenses."""
     kind = draw(st.sampled_from(KINDS))
     panes = draw(st.integers(1, 2))
     tint = draw(st.sampled_from([(0.0, 0.0, 0.0), (20.0, 0.0, 5.0)]))

@@ -180,7 +180,9 @@ def _tracer() -> Iterator[Check]:
         with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # about LLVM: see below
             variant.load()
     except MissingExtra as error:
-        yield Check("tracer", "mitsuba", "broken", str(error), variant.cure(str(error)), needed=False)
+        yield Check(
+            "tracer", "mitsuba", "broken", str(error), variant.install_command(str(error)), needed=False
+        )
         return
     yield Check("tracer", "mitsuba", "ok", version)
     found = variant.probe()

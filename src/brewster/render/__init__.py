@@ -1,1 +1,1 @@
-"""What light does: a scene in, five linear pictures out, and the photograph a camera would make of them."""
+"""Renders a scene into five linear images, and simulates the photograph that a camera would take of them."""

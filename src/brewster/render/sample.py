@@ -1,4 +1,4 @@
-"""A sample: the five linear pictures of a scene, by the paper's letters I, T, B, R and MR."""
+"""A rendered sample: the five linear images of a scene, which the paper calls I, T, B, R and MR."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from torch import Tensor
 from brewster.scene.scene import Scene
 
 LAYERS: Final = ("photo", "transmission", "background", "reflection", "mirror")
-"""I, T, B, R and MR, as files and fields are called."""
+"""The names of I, T, B, R and MR in files and fields."""
 
 
 @dataclass(frozen=True, eq=False)
 class LightSample:
-    """Five pictures (3, H, W) float32 of linear light, and the scene that is their cause.
+    """Five images of linear light, float32 (3, H, W), and the scene they were rendered from.
 
-    `photo` is I, with full glass effects; `transmission` T and `reflection` R are its two layers;
-    `background` B is the view without glass; `mirror` MR is the reflection of a perfect mirror.
+    `photo` is I, the view with all glass effects; `transmission` T and `reflection` R are its two layers;
+    `background` B is the view without glass; `mirror` MR is the reflection in a perfect mirror.
     """
 
     scene: Scene
@@ -30,9 +30,9 @@ class LightSample:
     mirror: Tensor
 
     def layers(self) -> dict[str, Tensor]:
-        """The five pictures by name."""
+        """The five images by name."""
         return {name: getattr(self, name) for name in LAYERS}
 
-    def each(self, change: Callable[[Tensor], Tensor]) -> LightSample:
-        """The same sample with every picture changed alike."""
-        return LightSample(self.scene, **{name: change(layer) for name, layer in self.layers().items()})
+    def map(self, function: Callable[[Tensor], Tensor]) -> LightSample:
+        """A sample with the function applied to each image."""
+        return LightSample(self.scene, **{name: function(layer) for name, layer in self.layers().items()})

@@ -28,7 +28,7 @@ from brewster.errors import RecipeError
 from brewster.files import HIDDEN, arriving, discard, hidden_beside, write_atomically
 from brewster.photo import read_layers, write_layers
 from brewster.render.analytic import ghost_distance_px
-from brewster.render.camera_response import DevelopedSample, develop, jpeg, luminance
+from brewster.render.camera_response import DevelopedSample, develop, encode_jpeg, luminance
 from brewster.render.sample import LAYERS, LightSample
 from brewster.scene.scene import Scene
 from brewster.scene.values import wrong_value
@@ -80,9 +80,9 @@ def encode_sample(sample: LightSample, renderer: str) -> dict[str, bytes]:
     """
     developed = develop(sample)
     made = {"version": brewster.__version__, "renderer": renderer}
-    outcome = {**made, **developed.decisions(), **statistics(sample, developed)}
+    outcome = {**made, **developed.camera_settings(), **statistics(sample, developed)}
     qualities = dict.fromkeys(LAYERS, _TRUTH_QUALITY) | {"photo": sample.scene.development.jpeg_quality}
-    files = {f"{name}.jpg": jpeg(layer, qualities[name]) for name, layer in developed.layers().items()}
+    files = {f"{name}.jpg": encode_jpeg(layer, qualities[name]) for name, layer in developed.layers().items()}
     light = {name: layer.permute(1, 2, 0).float().cpu().numpy() for name, layer in sample.layers().items()}
     files[LIGHT] = write_layers(light, {"software": f"brewster {brewster.__version__}"})
     files[SCENE] = sample.scene.to_toml(outcome=outcome).encode()

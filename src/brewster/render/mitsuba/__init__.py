@@ -1,1 +1,1 @@
-"""The reference renderer, Mitsuba: against it the analytic renderer is compared."""
+"""The reference renderer: path tracing by Mitsuba 3, which validates the analytic renderer."""

@@ -1,9 +1,10 @@
-"""The judge: the five pictures of any scene, path-traced by stock Mitsuba 3, which knows nothing of our formulas.
+"""The reference renderer: path-traces the five images of any scene with an unmodified Mitsuba 3.
 
     sample = trace(scene, Assets([Path("hdri")]), noise=0.01)
 
-Every picture is lit from one side of the glass alone, the other side's objects standing there in black: light adds
-up, so that I is the sum of what comes from behind and what comes from the front, and each map keeps its own grid.
+It shares no optics code with the analytic renderer, so that the two check each other. Each image is lit from one side
+of the glass only; objects of the other side are black. Light is additive: I is the sum of the image lit from behind
+and the image lit from the front.
 """
 
 from __future__ import annotations
@@ -21,17 +22,18 @@ from torch import Tensor
 
 from brewster.environments.assets import Assets
 from brewster.errors import DeviceError, MissingExtra
-from brewster.render.mitsuba.scene_builder import Glass, MitsubaSceneBuilder
+from brewster.render.mitsuba.scene_builder import GlassMode, MitsubaSceneBuilder
 from brewster.render.mitsuba.variant import COMPILED, INSTALL_LLVM, load, probe
 from brewster.render.sample import LightSample
 from brewster.scene.scene import Scene
 
 _POLARISED: Final = "llvm_ad_mono_polarized"
-_FEWEST_PASSES: Final = 4
-_MOST_RAYS: Final = 1 << 22
-"""Of one pass: about 1 GB."""
-_DARKNESS: Final = 0.01
-"""This share of a picture's mean light is added to each pixel's before its relative error is taken."""
+_MIN_PASSES: Final = 4
+"""Fewer passes give no useful estimate of the variance."""
+_MAX_RAYS_PER_PASS: Final = 1 << 22
+"""Needs about 1 GB of memory."""
+_RELATIVE_FLOOR: Final = 0.01
+"""Share of the mean light added to each pixel before its relative error is computed, so that black pixels have one."""
 
 
 def trace(
@@ -39,37 +41,50 @@ def trace(
     assets: Assets,
     *,
     noise: float = 0.02,
-    most_samples: int = 4096,
+    max_samples: int = 4096,
     denoise: bool = False,
     polarised: bool = False,
 ) -> LightSample:
-    """The five pictures of a scene, (3, H, W) float32 linear light, in equal passes until they are good enough.
+    """Path-traces the five images of a scene in equal passes, until their noise is low enough.
 
-    A picture's error is the mean over its pixels of standard error / (light + 1 % of the mean light), where the
-    standard error comes from the passes themselves. Each picture stops as soon as its error is below `noise`, or
-    after `most_samples` rays a pixel. T and R are measured against I, whose parts they are: of the two, the one
-    that disturbs I more gets the next pass. The paper's T and R are pictures of their own.
+    The error of an image is the mean over its pixels of standard error / (light + 1 % of the mean light); the standard
+    error comes from the variance between passes. An image is finished when its error is below `noise`, or after
+    `max_samples` rays per pixel. T and R are measured relative to I, their sum: the one that adds more error to I gets
+    the next pass. With the paper's orders T and R are rendered separately.
 
-    Mitsuba's colour variants average s- and p-polarised light at every surface. Nature averages at the end:
-    `polarised` traces each colour so, at several times the cost; rough surfaces depolarise, in Mitsuba.
+    Mitsuba's colour variants average s- and p-polarised light at every surface, which is wrong for glass with several
+    surfaces. `polarised` traces each colour with the polarised variant, at several times the cost; rough surfaces in
+    Mitsuba depolarise.
+
+    Args:
+        scene: what to render.
+        assets: where its files are.
+        noise: the relative error at which an image is finished.
+        max_samples: the most rays per pixel and image.
+        denoise: whether Intel Open Image Denoise filters the result.
+        polarised: whether polarisation is traced.
+
+    Returns:
+        Linear light, float32 (3, H, W) each.
 
     Raises:
-        MissingExtra: mitsuba is not installed or cannot be imported, or mitsuba-oidn is not installed, for `denoise`.
-        DeviceError: polarised light is asked for, and no LLVM works here.
-        RecipeError: a wedge or lens has no thickness left somewhere in the view, or a file is missing.
-        PhotoError: a file cannot be read or is no map.
+        MissingExtra: mitsuba cannot be imported, or `denoise` is set and mitsuba-oidn is not installed.
+        DeviceError: `polarised` is set and there is no working LLVM.
+        RecipeError: a wedge or lens has no thickness somewhere in the view, or a file is missing.
+        PhotoError: a file cannot be decoded, or is not an environment map.
     """
     mi = load()
-    with _rendering_by(mi, _variant(polarised)):
-        studios = [
-            MitsubaSceneBuilder(mi, scene, assets, colour) for colour in (range(3) if polarised else (None,))
+    with _active_variant(mi, _variant(polarised)):
+        builders = [
+            MitsubaSceneBuilder(mi, scene, assets, channel)
+            for channel in (range(3) if polarised else (None,))
         ]
-        return _pictures(studios, noise, most_samples, denoise)
+        return _render_layers(builders, noise, max_samples, denoise)
 
 
 @contextmanager
-def _rendering_by(mi: ModuleType, name: str) -> Iterator[None]:
-    """The variant is one for the whole process: another that was chosen before comes back."""
+def _active_variant(mi: ModuleType, name: str) -> Iterator[None]:
+    """Selects a variant of Mitsuba, which is global to the process, and restores the previous one afterwards."""
     before = mi.variant()
     mi.set_variant(name)
     try:
@@ -84,39 +99,39 @@ def _variant(polarised: bool) -> str:
     if polarised and name != COMPILED:
         raise DeviceError(
             "polarised light cannot be traced",
-            "it needs an LLVM that works",
+            "tracing it needs a working LLVM",
             f"install LLVM 17 or newer: {INSTALL_LLVM}",
         )
     return _POLARISED if polarised else name
 
 
-def _pictures(
-    studios: Sequence[MitsubaSceneBuilder], noise: float, most_samples: int, denoise: bool
+def _render_layers(
+    builders: Sequence[MitsubaSceneBuilder], noise: float, max_samples: int, denoise: bool
 ) -> LightSample:
-    scene = studios[0].scene
+    scene = builders[0].scene
 
-    def take(*shots: tuple[bool, Glass]) -> list[_RunningEstimate]:
-        estimates = [_RunningEstimate(studios, behind, glass, most_samples) for behind, glass in shots]
-        _converge(estimates, noise, most_samples)
+    def estimate(*images: tuple[bool, GlassMode]) -> list[_RunningEstimate]:
+        estimates = [_RunningEstimate(builders, behind, glass, max_samples) for behind, glass in images]
+        _converge(estimates, noise, max_samples)
         return estimates
 
-    through, back = take((True, "full"), (False, "full"))
+    through, back = estimate((True, "full"), (False, "full"))
     parts = {"transmission": through, "reflection": back}
     if scene.orders == "paper":
-        [parts["transmission"]] = take((True, "unreflected"))
-        [parts["reflection"]] = take((False, "unentered"))
-    [background] = take((True, "none"))
-    [mirror] = take((False, "mirror"))
+        [parts["transmission"]] = estimate((True, "paper_transmission"))
+        [parts["reflection"]] = estimate((False, "paper_reflection"))
+    [background] = estimate((True, "none"))
+    [mirror] = estimate((False, "mirror"))
     layers = {name: estimate.light for name, estimate in parts.items()}
     layers |= {"photo": through.light + back.light, "background": background.light, "mirror": mirror.light}
-    return LightSample(scene, **{name: _finished(light, denoise) for name, light in layers.items()})
+    return LightSample(scene, **{name: _to_tensor(light, denoise) for name, light in layers.items()})
 
 
-def _finished(light: NDArray[np.float64], denoise: bool) -> Tensor:
-    picture = np.ascontiguousarray(light, np.float32)
+def _to_tensor(light: NDArray[np.float64], denoise: bool) -> Tensor:
+    image = np.ascontiguousarray(light, np.float32)
     if denoise:
-        picture = np.array(_denoiser().denoise(picture, hdr=True), np.float32)
-    return torch.from_numpy(picture).permute(2, 0, 1).contiguous()
+        image = np.array(_denoiser().denoise(image, hdr=True), np.float32)
+    return torch.from_numpy(image).permute(2, 0, 1).contiguous()
 
 
 def _denoiser() -> ModuleType:
@@ -124,32 +139,37 @@ def _denoiser() -> ModuleType:
         return importlib.import_module("mitsuba_oidn")
     except ImportError as error:
         raise MissingExtra(
-            "mitsuba_oidn is not installed", "it denoises pictures", "run: pip install 'brewster[render]'"
+            "mitsuba_oidn is not installed",
+            "denoising needs it",
+            "run: pip install 'brewster[render]'",
         ) from error
 
 
 class _RunningEstimate:
-    """A picture's light from the passes so far, and how far its pixels may be off."""
+    """The mean of an image over its passes so far, and the variance of that mean per pixel."""
 
     def __init__(
-        self, studios: Sequence[MitsubaSceneBuilder], behind: bool, glass: Glass, most_samples: int
+        self, builders: Sequence[MitsubaSceneBuilder], behind: bool, glass: GlassMode, max_samples: int
     ) -> None:
-        scene = studios[0].scene
-        self._mi = studios[0].mi
-        self._rooms = [self._mi.load_dict(studio.room(behind=behind, glass=glass)) for studio in studios]
-        self._name = scene.seed, scene.index, int(behind), get_args(Glass).index(glass)
-        self.samples = _rays_a_pass(scene.camera.width * scene.camera.height, most_samples)
+        scene = builders[0].scene
+        self._mi = builders[0].mi
+        self._scenes = [
+            self._mi.load_dict(builder.scene_dict(behind=behind, glass=glass)) for builder in builders
+        ]
+        self._seed_key = scene.seed, scene.index, int(behind), get_args(GlassMode).index(glass)
+        self.samples = _samples_per_pass(scene.camera.width * scene.camera.height, max_samples)
         self.passes = 0
         self._sum = np.zeros((scene.camera.height, scene.camera.width, 3))
         self._squares = np.zeros(self._sum.shape[:2])
 
-    def add(self) -> None:
-        """One more pass, with random numbers of its own."""
-        seed = int(np.random.SeedSequence((*self._name, self.passes)).generate_state(1)[0])
-        rendered = [np.array(self._mi.render(room, spp=self.samples, seed=seed)) for room in self._rooms]
-        picture = rendered[0] if len(rendered) == 1 else np.stack([one[..., 0] for one in rendered], axis=2)
-        self._sum += picture
-        self._squares += picture.mean(axis=2, dtype=np.float64) ** 2
+    def add_pass(self) -> None:
+        """Renders one more pass with independent random numbers."""
+        seed = int(np.random.SeedSequence((*self._seed_key, self.passes)).generate_state(1)[0])
+        rendered = [np.array(self._mi.render(scene, spp=self.samples, seed=seed)) for scene in self._scenes]
+        # With polarisation there is one grey image per colour.
+        image = rendered[0] if len(rendered) == 1 else np.stack([one[..., 0] for one in rendered], axis=2)
+        self._sum += image
+        self._squares += image.mean(axis=2, dtype=np.float64) ** 2
         self.passes += 1
 
     @property
@@ -159,27 +179,27 @@ class _RunningEstimate:
 
     @property
     def variance(self) -> NDArray[np.float64]:
-        """Of the light's mean over the colours, (H, W)."""
+        """The variance of `light` averaged over the colours, (H, W)."""
         spread = self._squares / self.passes - self.light.mean(axis=2) ** 2
         variance: NDArray[np.float64] = spread.clip(min=0) / (self.passes - 1)
         return variance
 
 
-def _rays_a_pass(pixels: int, most_samples: int) -> int:
-    """A square number, which the sampler spreads evenly over a pixel, small enough for memory and four passes."""
-    most = min(most_samples // _FEWEST_PASSES, _MOST_RAYS // pixels)
+def _samples_per_pass(pixels: int, max_samples: int) -> int:
+    """Rays per pixel and pass: a square number, which the sampler stratifies evenly, that memory and the passes allow."""
+    most = min(max_samples // _MIN_PASSES, _MAX_RAYS_PER_PASS // pixels)
     return next((samples for samples in (64, 16, 4) if samples <= most), 1)
 
 
-def _converge(estimates: Sequence[_RunningEstimate], noise: float, most_samples: int) -> None:
-    """Passes for pictures that add up to one, each to the one that disturbs it most, until it is good enough."""
+def _converge(estimates: Sequence[_RunningEstimate], noise: float, max_samples: int) -> None:
+    """Adds passes until the sum of the images is accurate enough; each pass goes to the image with the largest error."""
     for estimate in estimates:
-        for _ in range(_FEWEST_PASSES):
-            estimate.add()
-    while waiting := [one for one in estimates if (one.passes + 1) * one.samples <= most_samples]:
+        for _ in range(_MIN_PASSES):
+            estimate.add_pass()
+    while pending := [one for one in estimates if (one.passes + 1) * one.samples <= max_samples]:
         light = np.sum([one.light.mean(axis=2) for one in estimates], axis=0)
-        scale = light + _DARKNESS * light.mean() + np.finfo(np.float32).tiny
+        scale = light + _RELATIVE_FLOOR * light.mean() + np.finfo(np.float32).tiny
         variances = [one.variance for one in estimates]
         if (np.sqrt(np.sum(variances, axis=0)) / scale).mean() <= noise:
             return
-        max(waiting, key=lambda one: float((np.sqrt(one.variance) / scale).mean())).add()
+        max(pending, key=lambda one: float((np.sqrt(one.variance) / scale).mean())).add_pass()

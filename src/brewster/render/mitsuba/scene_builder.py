@@ -1,9 +1,9 @@
-"""What the tracer gives to Mitsuba: a scene's glass, camera and light as plain dictionaries.
+"""Builds Mitsuba scenes: glass, camera and light as the dictionaries that `mitsuba.load_dict` takes.
 
-All stands in the glass's own frame (x right, y up, z towards the camera, the origin at its position, millimetres):
-surfaces then are z = 0, z = -thickness and so on, which float32 keeps plane and exactly apart. A wedge turns a far
-surface about the upright axis through (0, 0, -thickness): its normal is (sin w, 0, cos w), so that with a positive
-wedge the pane is thicker on the right; panes behind it stand as if it had none.
+Coordinates are in the glass frame (x right, y up, z towards the camera, the origin at its position, millimetres).
+Surfaces are then z = 0, z = -thickness and so on, so float32 keeps them plane and their distances exact. A wedge w
+rotates a far surface about the vertical axis through (0, 0, -thickness): its normal is (sin w, 0, cos w). With a
+positive wedge the pane is thicker on the right; panes behind it are placed as if it had none.
 """
 
 from __future__ import annotations
@@ -26,54 +26,69 @@ from brewster.scene.world import EnvironmentMap, Plane
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Plugin = dict[str, Any]
-"""What Mitsuba builds an object from."""
+"""A dictionary from which Mitsuba builds an object."""
 
-Glass = Literal["full", "unreflected", "unentered", "mirror", "none"]
-"""As it is; without reflections (the paper's T); what never enters the last pane (the paper's R); a mirror; away."""
+GlassMode = Literal["full", "paper_transmission", "paper_reflection", "mirror", "none"]
+"""How the glass is rendered.
+
+`full`: all orders; `paper_transmission`: without reflections (the paper's T); `paper_reflection`: no light enters the
+last pane (the paper's R); `mirror`: the first surface is a perfect mirror (MR); `none`: no glass (B).
+"""
 
 _BLACK: Final[Plugin] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
-_CLEAREST: Final = 1e-6  # Mitsuba makes NaN of a medium that does not absorb one colour at all
-_FACETS: Final = 256  # along each side of a lens
-_FINE_ROWS: Final = 512  # of a map, so that its dark half begins within a third of a degree
-_LONGEST: Final = 64  # reflections, before chance may end a path
+_MIN_EXTINCTION_SHARE: Final = 1e-6  # Mitsuba returns NaN for a medium with an extinction of 0 in one colour
+_LENS_GRID: Final = 256  # per side of a lens
+_MIN_MAP_ROWS: Final = 512  # a map is cut off at the glass plane to within 180 / 512 degrees
+_RUSSIAN_ROULETTE_DEPTH: Final = 64
+"""Paths with fewer surfaces never end at random, so that faint orders are not noisy."""
 _WALL_MM: Final = 1e6
 
 
 class MitsubaSceneBuilder:
-    """Builds a scene for Mitsuba: in colour, or in grey from one of its colours (for polarised light).
+    """Builds a scene for Mitsuba: in colour, or in grey from one colour `channel` (for polarised light).
 
     Raises:
-        RecipeError: a wedge or lens has no thickness left somewhere in the view.
+        RecipeError: a wedge has no thickness somewhere in the view.
     """
 
-    def __init__(self, mi: ModuleType, scene: Scene, assets: Assets, colour: int | None = None) -> None:
-        self.mi, self.scene, self._assets, self._colour = mi, scene, assets, colour
+    def __init__(self, mi: ModuleType, scene: Scene, assets: Assets, channel: int | None = None) -> None:
+        self.mi, self.scene, self._assets, self._channel = mi, scene, assets, channel
         self._glass = scene.glass
         self._to_glass: Doubles = np.array(axes(scene.glass.heading_deg, scene.glass.pitch_deg))
-        self._eye = self._to_glass @ np.subtract(scene.camera.position_mm, scene.glass.position_mm)
-        self._seen = self._corners()
-        self._reach = (
-            4 * float(np.abs(self._seen).max()) + 50 * scene.glass.depth_mm + scene.camera.aperture_mm
+        self._camera_position = self._to_glass @ np.subtract(
+            scene.camera.position_mm, scene.glass.position_mm
         )
-        _refuse_knife_edges(scene.glass, self._seen[:, 0])
+        self._view_corners = self._first_surface_corners()
+        self._half_extent_mm = (
+            4 * float(np.abs(self._view_corners).max()) + 50 * scene.glass.depth_mm + scene.camera.aperture_mm
+        )
+        _check_wedges(scene.glass, self._view_corners[:, 0])
 
-    def room(self, *, behind: bool, glass: Glass) -> Plugin:
-        """The whole scene, lit from one side of the glass; the other side's objects are there, in black."""
-        tinted = glass not in {"mirror", "none"} and any(
+    def scene_dict(self, *, behind: bool, glass: GlassMode) -> Plugin:
+        """The whole scene, lit from one side of the glass; objects of the other side are black.
+
+        Raises:
+            RecipeError: a lens has no thickness somewhere in its frame.
+        """
+        is_tinted = glass not in {"mirror", "none"} and any(
             any(pane.absorption_per_m) for pane in self._glass.panes
         )
-        parts = [*self._surfaces(glass), *self._wall(), *self._lights(behind)]
+        parts = [*self._surfaces(glass), *self._wall(), *self._emitters(behind)]
         return {
             "type": "scene",
-            "integrator": {"type": "volpath" if tinted else "path", "max_depth": -1, "rr_depth": _LONGEST},
+            "integrator": {
+                "type": "volpath" if is_tinted else "path",
+                "max_depth": -1,
+                "rr_depth": _RUSSIAN_ROULETTE_DEPTH,
+            },
             "sensor": self._sensor(),
             **{f"part{number}": part for number, part in enumerate(parts)},
         }
 
-    # Camera and common tools
+    # Camera and common helpers
 
     def _sensor(self) -> Plugin:
-        """The camera; Mitsuba's own looks along +z with +x to the left, and has another pixel filter."""
+        """The camera. Mitsuba's looks along +z with +x to the left; a box filter replaces its default pixel filter."""
         camera = self.scene.camera
         right, up, back = (
             self._to_glass @ axis for axis in np.array(axes(camera.heading_deg, camera.pitch_deg))
@@ -83,7 +98,7 @@ class MitsubaSceneBuilder:
             "aperture_radius": camera.aperture_mm / 2,
             "focus_distance": camera.focus_mm,
         }
-        colours = "rgb" if self._colour is None else "luminance"
+        colours = "rgb" if self._channel is None else "luminance"
         film = {
             "type": "hdrfilm",
             "pixel_format": colours,
@@ -92,7 +107,7 @@ class MitsubaSceneBuilder:
         }
         return {
             **(lens if camera.aperture_mm > 0 else {"type": "perspective"}),
-            "to_world": self._placed((-right, up, -back), self._eye),
+            "to_world": self._transform((-right, up, -back), self._camera_position),
             "fov": camera.fov_deg,
             "fov_axis": "x",
             "near_clip": 1.0,
@@ -101,8 +116,8 @@ class MitsubaSceneBuilder:
             "film": {**film, "width": camera.width, "height": camera.height},
         }
 
-    def _placed(self, columns: ArrayLike, origin: ArrayLike, size: ArrayLike = (1, 1, 1)) -> object:
-        """The transform to where `columns` are an object's axes, scaled by `size`, and `origin` is its middle."""
+    def _transform(self, columns: ArrayLike, origin: ArrayLike, size: ArrayLike = (1, 1, 1)) -> object:
+        """The transform of an object with these axes, scaled by `size`, and its centre at `origin`."""
         matrix = np.eye(4)
         matrix[:3, :3] = np.asarray(columns).T * size
         matrix[:3, 3] = origin
@@ -111,31 +126,31 @@ class MitsubaSceneBuilder:
     def _rectangle(
         self, columns: ArrayLike, origin: ArrayLike, half: Sequence[float], more: Plugin
     ) -> Plugin:
-        return {"type": "rectangle", "to_world": self._placed(columns, origin, (*half, 1)), **more}
+        return {"type": "rectangle", "to_world": self._transform(columns, origin, (*half, 1)), **more}
 
-    def _painted(self, colours: ArrayLike) -> Floats:
-        """Colours (..., 3) as they are, or the studio's one colour three times."""
+    def _select_channel(self, colours: ArrayLike) -> Floats:
+        """Colours (..., 3) unchanged; with a `channel`, that channel three times."""
         values = np.asarray(colours, np.float32)
-        return values if self._colour is None else np.repeat(values[..., self._colour, None], 3, axis=-1)
+        return values if self._channel is None else np.repeat(values[..., self._channel, None], 3, axis=-1)
 
-    def _corners(self) -> Doubles:
-        """Places (4, 2) on the first surface: the corners of its frame, or of the view."""
+    def _first_surface_corners(self) -> Doubles:
+        """Points (4, 2) on the first surface: the corners of its frame, or of the view."""
         if self._glass.frame_mm:
             return np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)]) * self._glass.frame_mm / 2
         rays = np.array(self.scene.camera.corners()) @ self._to_glass.T
-        corners: Doubles = (self._eye - rays * (self._eye[2] / rays[:, 2:]))[:, :2]
+        corners: Doubles = (self._camera_position - rays * (self._camera_position[2] / rays[:, 2:]))[:, :2]
         return corners
 
     # The glass
 
-    def _surfaces(self, glass: Glass) -> Iterator[object]:
-        """From the camera on. Without sides: flat surfaces reach farther than any ray, but for the frame's opening."""
+    def _surfaces(self, glass: GlassMode) -> Iterator[object]:
+        """All surfaces, from the camera on. Only the frame limits the first one; the others exceed the view."""
         if glass == "none":
             return
         if self._glass.radii_mm:
             yield from self._lens(*self._glass.radii_mm, glass)
             return
-        height, wide = 0.0, (self._reach, self._reach)
+        height, wide = 0.0, (self._half_extent_mm, self._half_extent_mm)
         half = (self._glass.frame_mm[0] / 2, self._glass.frame_mm[1] / 2) if self._glass.frame_mm else wide
         for pane in self._glass.panes:
             is_entered, material = self._material(pane, glass)
@@ -148,45 +163,47 @@ class MitsubaSceneBuilder:
             half = wide
 
     def _far_surface(self, pane: Pane, height: float, material: Plugin) -> Plugin:
-        """Its outside is away from the camera; it ends where a wedge's surfaces meet in a knife's edge."""
+        """The pane's far surface; it ends at the edge where the two surfaces of a wedge meet."""
         sine, cosine = math.sin(math.radians(pane.wedge_deg)), math.cos(math.radians(pane.wedge_deg))
         edge = -pane.thickness_mm / sine if sine else math.inf
         low, high = (
-            (max(edge, -self._reach), self._reach) if edge < 0 else (-self._reach, min(edge, self._reach))
+            (max(edge, -self._half_extent_mm), self._half_extent_mm)
+            if edge < 0
+            else (-self._half_extent_mm, min(edge, self._half_extent_mm))
         )
         across = np.array((cosine, 0, -sine))
         middle = np.array((0, 0, height)) + across * (low + high) / 2
         columns = -across, np.array((0, 1, 0)), np.array((-sine, 0, -cosine))
-        return self._rectangle(columns, middle, ((high - low) / 2, self._reach), material)
+        return self._rectangle(columns, middle, ((high - low) / 2, self._half_extent_mm), material)
 
-    def _material(self, pane: Pane, glass: Glass) -> tuple[bool, Plugin]:
-        """Whether light enters the pane, and what its surfaces (outside in the air) and inside are made of."""
+    def _material(self, pane: Pane, glass: GlassMode) -> tuple[bool, Plugin]:
+        """Whether light enters the pane, and the materials of its surfaces and its interior."""
         if glass == "mirror":
             return False, {"bsdf": {"type": "conductor", "material": "none"}}
         rough = {"alpha": pane.roughness, "distribution": "ggx"} if pane.roughness and pane.index > 1 else {}
         kind = "rough" if rough else ""
-        if glass == "unentered" and pane is self._glass.panes[-1]:
-            # A conductor that does not absorb reflects as glass does, and no ray is lost to what it would let in.
+        if glass == "paper_reflection" and pane is self._glass.panes[-1]:
+            # A conductor with k = 0 has the reflectance of glass, and no ray is spent on transmission.
             index = {"type": "spectrum", "value": pane.index}
             return False, {"bsdf": {"type": kind + "conductor", "eta": index, "k": 0.0, **rough}}
         bsdf = {"type": kind + "dielectric", "int_ior": pane.index, "ext_ior": 1.0, **rough}
-        if glass == "unreflected":
+        if glass == "paper_transmission":
             bsdf["specular_reflectance"] = 0.0
-        return True, {"bsdf": bsdf, **self._inside(pane)}
+        return True, {"bsdf": bsdf, **self._interior_medium(pane)}
 
-    def _inside(self, pane: Pane) -> Plugin:
-        """Beer-Lambert absorption, per mm. Mitsuba takes colours up to 1, so their strength goes into `scale`."""
+    def _interior_medium(self, pane: Pane) -> Plugin:
+        """Beer-Lambert absorption, per mm. Mitsuba limits colours to 1, so `scale` holds the largest coefficient."""
         strongest = max(pane.absorption_per_m)
         if not strongest:
             return {}
-        share = (self._painted(pane.absorption_per_m) / strongest).clip(min=_CLEAREST)
+        share = (self._select_channel(pane.absorption_per_m) / strongest).clip(min=_MIN_EXTINCTION_SHARE)
         sigma = {"type": "rgb", "value": share.tolist()}
         return {
             "interior": {"type": "homogeneous", "albedo": 0.0, "sigma_t": sigma, "scale": strongest / 1000}
         }
 
     def _wall(self) -> Iterator[Plugin]:
-        """Four black strips around the frame's opening, in the plane of the first surface."""
+        """A black wall around the frame's opening, in the plane of the first surface: four rectangles."""
         if not self._glass.frame_mm:
             return
         right, top = self._glass.frame_mm[0] / 2, self._glass.frame_mm[1] / 2
@@ -197,39 +214,39 @@ class MitsubaSceneBuilder:
 
     # A lens
 
-    def _lens(self, near_mm: float, far_mm: float, glass: Glass) -> Iterator[object]:
-        """Two spherical surfaces, smooth between fine facets, in a black tunnel as large as the frame."""
+    def _lens(self, near_mm: float, far_mm: float, glass: GlassMode) -> Iterator[object]:
+        """Two spherical surfaces as fine meshes with interpolated normals, inside black frame sides."""
         pane = self._glass.panes[0]
         is_entered, material = self._material(pane, glass)
         near, far = self._sphere(near_mm, 0.0), self._sphere(far_mm, -pane.thickness_mm)
         depth = near[0][..., 2] - far[0][..., 2]
         if depth.min() <= 0:
             raise RecipeError(
-                f"the lens is {depth.min():.3g} mm thick at its thinnest", "it has glass everywhere in its frame",
-                "make it thicker, flatter or smaller",
+                f"the lens is {depth.min():.3g} mm thick at its thinnest", "its thickness must be above 0 everywhere in the frame",
+                "increase thickness_mm or radii_mm, or reduce frame_mm",
             )  # fmt: skip
         yield self._mesh(*near, material)
         if is_entered:
             yield self._mesh(far[0][:, ::-1], -far[1][:, ::-1], material)
         low, high = min(far[0][..., 2].min(), 0.0), max(near[0][..., 2].max(), 0.0)
-        yield from self._tunnel(low, high)
+        yield from self._frame_sides(low, high)
 
     def _sphere(self, radius_mm: float, height: float) -> tuple[Doubles, Doubles]:
-        """Places and normals towards the camera, (rows, columns, 3), of a surface with its middle at `height`."""
+        """Points and normals towards the camera, (rows, columns, 3), of a surface whose centre is at z = `height`."""
         half_width, half_height = np.array(self._glass.frame_mm) / 2
-        line = np.linspace(-1, 1, _FACETS + 1)
+        line = np.linspace(-1, 1, _LENS_GRID + 1)
         x, y = np.meshgrid(line * half_width, line * half_height)
         squared = radius_mm**2 - x**2 - y**2
         if squared.min() <= 0:
             raise RecipeError(
-                f"a sphere of {abs(radius_mm):g} mm does not fill the frame", "its radius is above half the frame's diagonal",
-                "enlarge radii_mm or make frame_mm smaller",
+                f"a sphere of {abs(radius_mm):g} mm does not fill the frame", "its radius must exceed half the frame's diagonal",
+                "increase radii_mm or reduce frame_mm",
             )  # fmt: skip
         rise = np.copysign(np.sqrt(squared), radius_mm)
         return np.stack([x, y, height - radius_mm + rise], axis=2), np.stack([x, y, rise], axis=2) / radius_mm
 
     def _mesh(self, places: Doubles, normals: Doubles, material: Plugin) -> object:
-        """Triangles over a grid of places (rows, columns, 3), with normals between which Mitsuba interpolates."""
+        """Triangles over a grid of points (rows, columns, 3); Mitsuba interpolates the normals."""
         corner = np.arange(places[..., 0].size).reshape(places.shape[:2])
         a, b, c, d = (
             part.ravel() for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1])
@@ -246,8 +263,8 @@ class MitsubaSceneBuilder:
         values.update()
         return mesh
 
-    def _tunnel(self, low: float, high: float) -> Iterator[Plugin]:
-        """The frame's black inner sides: no light passes between them and the glass."""
+    def _frame_sides(self, low: float, high: float) -> Iterator[Plugin]:
+        """The frame's black inner sides, so that no light passes between frame and glass."""
         right, top = np.array(self._glass.frame_mm) / 2
         x, y, z = np.eye(3)
         middle, half = (low + high) / 2, (high - low) / 2
@@ -257,54 +274,54 @@ class MitsubaSceneBuilder:
 
     # The light
 
-    def _lights(self, behind: bool) -> Iterator[Plugin]:
-        """One side's map and plane; the other side's plane stands in black, and all else there is farther out."""
-        lit = (self.scene.behind if behind else self.scene.front).map
-        if lit:
-            yield self._sky(lit, behind) if math.isinf(lit.radius_mm) else self._dome(lit, behind)
+    def _emitters(self, behind: bool) -> Iterator[Plugin]:
+        """One side's map and plane, and the other side's plane in black: it still hides what is behind it."""
+        envmap = (self.scene.behind if behind else self.scene.front).map
+        if envmap:
+            yield self._envmap(envmap, behind) if math.isinf(envmap.radius_mm) else self._dome(envmap, behind)
         for side, is_behind in ((self.scene.behind, True), (self.scene.front, False)):
             if side.plane:
                 yield self._plane(side.plane, is_behind, is_lit=is_behind == behind)
 
     def _plane(self, plane: Plane, behind: bool, *, is_lit: bool) -> Plugin:
-        """It faces the glass, turned by its heading and pitch in the frame of one who looks at it from there."""
-        picture = self._painted(self._assets.plane_light(plane))
+        """A plane faces the glass; heading and pitch are those seen by an observer at the glass."""
+        picture = self._select_channel(self._assets.plane_light(plane))
         facing = 1 if behind else -1
         columns = np.array(axes(plane.heading_deg, plane.pitch_deg)) * (facing, 1, facing)
         half = plane.width_mm / 2, plane.width_mm / 2 * picture.shape[0] / picture.shape[1]
-        texture = self._bitmap(picture[::-1], wrap_mode="clamp")  # a rectangle's v goes up
+        texture = self._bitmap(picture[::-1], wrap_mode="clamp")  # v increases upwards
         lamp = {"emitter": {"type": "area", "radiance": texture}} if is_lit else {}
         return self._rectangle(
             columns, (*plane.offset_mm, -facing * plane.distance_mm), half, {"bsdf": _BLACK, **lamp}
         )
 
-    def _sky(self, lit: EnvironmentMap, behind: bool) -> Plugin:
-        """Mitsuba's columns are between its texels' centres, like ours; its rows go from pole to pole."""
-        height, width = self._sizes(lit)
+    def _envmap(self, envmap: EnvironmentMap, behind: bool) -> Plugin:
+        """A map at infinity. Mitsuba places columns at texel centres, as we do, but its outer rows at the poles."""
+        height, width = self._map_size(envmap)
         u, v = (np.arange(width) + 0.5) / width, np.arange(2 * height + 1) / (2 * height)
-        columns = self._to_glass @ np.array(axes(lit.heading_deg, 0)).T
-        texels = self._texels(lit, behind, u, v)
+        columns = self._to_glass @ np.array(axes(envmap.heading_deg, 0)).T
+        texels = self._texels(envmap, behind, u, v)
         return {
             "type": "envmap",
             "bitmap": self.mi.Bitmap(texels),
-            "to_world": self._placed(columns.T, (0, 0, 0)),
+            "to_world": self._transform(columns.T, (0, 0, 0)),
         }
 
-    def _dome(self, lit: EnvironmentMap, behind: bool) -> Plugin:
-        """A sphere around the glass that shines inwards. Its longitude runs the other way, so the map is mirrored.
+    def _dome(self, envmap: EnvironmentMap, behind: bool) -> Plugin:
+        """A sphere around the glass that emits inwards. Its longitude runs the other way, so the map is mirrored.
 
-        A row more at both poles stops Mitsuba's texture, which repeats, from mixing one pole into the other.
+        Mitsuba's texture repeats in both directions: one more row at each pole keeps it from mixing the poles.
         """
-        height, width = self._sizes(lit)
+        height, width = self._map_size(envmap)
         u, v = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
-        texels = np.pad(self._texels(lit, behind, u, v)[:, ::-1], ((1, 1), (0, 0), (0, 0)), "edge")
+        texels = np.pad(self._texels(envmap, behind, u, v)[:, ::-1], ((1, 1), (0, 0), (0, 0)), "edge")
         inner = np.array(((1, 0, 0), (0, height / (height + 2), 1 / (height + 2)), (0, 0, 1)))
         texture = self._bitmap(texels, wrap_mode="repeat", to_uv=self.mi.ScalarTransform3f(inner))
-        right, up, back = (self._to_glass @ axis for axis in np.array(axes(lit.heading_deg, 0)))
+        right, up, back = (self._to_glass @ axis for axis in np.array(axes(envmap.heading_deg, 0)))
         return {
             "type": "sphere",
-            "to_world": self._placed((-back, -right, up), (0, 0, 0)),
-            "radius": lit.radius_mm,
+            "to_world": self._transform((-back, -right, up), (0, 0, 0)),
+            "radius": envmap.radius_mm,
             "flip_normals": True,
             "bsdf": _BLACK,
             "emitter": {"type": "area", "radiance": texture},
@@ -318,26 +335,26 @@ class MitsubaSceneBuilder:
             **more,
         }
 
-    def _sizes(self, lit: EnvironmentMap) -> tuple[int, int]:
-        """Of the map, times an odd number if it is coarse: then every texel's centre is still one."""
-        height, width = self._assets.map_light(lit).shape[:2]
-        times = math.ceil(_FINE_ROWS / height) // 2 * 2 + 1
+    def _map_size(self, envmap: EnvironmentMap) -> tuple[int, int]:
+        """Height and width of the map. A coarse one is enlarged by an odd factor: texel centres stay texel centres."""
+        height, width = self._assets.map_light(envmap).shape[:2]
+        times = math.ceil(_MIN_MAP_ROWS / height) // 2 * 2 + 1
         return times * height, times * width
 
-    def _texels(self, lit: EnvironmentMap, behind: bool, u: Doubles, v: Doubles) -> Floats:
-        """The map's light at columns u and rows v, (rows, columns, 3); black on the other side of the glass."""
-        texels = between(self._painted(self._assets.map_light(lit)), u, v)
-        azimuth, polar = 2 * math.pi * u + math.radians(lit.heading_deg), math.pi * v[:, None]
+    def _texels(self, envmap: EnvironmentMap, behind: bool, u: Doubles, v: Doubles) -> Floats:
+        """The map's light at u and v, (rows, columns, 3); black on the other side of the glass."""
+        texels = sample_bilinear(self._select_channel(self._assets.map_light(envmap)), u, v)
+        azimuth, polar = 2 * math.pi * u + math.radians(envmap.heading_deg), math.pi * v[:, None]
         x, y, z = self._to_glass[2]
         above_glass = np.sin(polar) * (x * np.sin(azimuth) - z * np.cos(azimuth)) + y * np.cos(polar)
         texels[(above_glass < 0) != behind] = 0
         return texels
 
 
-def between(texels: Floats, u: Doubles, v: Doubles) -> Floats:
-    """A map (H, W, 3) between its texels' centres, at all columns u (n,) and rows v (m,) in 0..1: (m, n, 3).
+def sample_bilinear(texels: Floats, u: Doubles, v: Doubles) -> Floats:
+    """Bilinear interpolation of a map (H, W, 3) on the grid of columns u (n,) and rows v (m,) in 0..1: (m, n, 3).
 
-    Bilinear; the left edge joins the right one, the first and last row reach to the poles.
+    u wraps around; v is clamped to the centres of the first and last row.
     """
     height, width = texels.shape[:2]
     row, column = v * height - 0.5, u * width - 0.5
@@ -349,14 +366,14 @@ def between(texels: Floats, u: Doubles, v: Doubles) -> Floats:
     return light
 
 
-def _refuse_knife_edges(glass: Glazing, across: Doubles) -> None:
-    """A wedged pane has thickness, and clear air behind it, at all these places (n,) across the first surface."""
+def _check_wedges(glass: Glazing, across: Doubles) -> None:
+    """Checks that wedged panes have thickness and do not touch at these x coordinates (n,) on the first surface."""
     for number, pane in enumerate(glass.panes):
         more = across * math.tan(math.radians(pane.wedge_deg))
         is_last = number == len(glass.panes) - 1
         if (pane.thickness_mm + more).min() <= 0 or (not is_last and (glass.gap_mm - more).min() <= 0):
             raise RecipeError(
-                f"the wedge of {pane.wedge_deg:g} degrees makes pane {number + 1} meet another surface in the view",
-                "its surfaces stay apart from all others",
-                "reduce wedge_deg, or enlarge thickness_mm and gap_mm",
+                f"the wedge of {pane.wedge_deg:g} degrees makes pane {number + 1} meet another surface",
+                "the surfaces must not meet in the view",
+                "reduce wedge_deg, or increase thickness_mm and gap_mm",
             )

@@ -1,1 +1,1 @@
-"""What rays meet: stacks of glass, rough surfaces, light all around, and chance."""
+"""Light transport through glass: layered panes, rough surfaces, emitters, defocus and sampling."""

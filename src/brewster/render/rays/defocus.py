@@ -1,7 +1,8 @@
-"""A thin lens over far content: where light depends on direction alone, defocus is a convolution with a disc.
+"""Defocus of distant content by a thin lens, as a convolution.
 
-A ray from the lens point l through the focus of pixel p has the direction p - l / f, in the plane at distance 1:
-so the picture is the pinhole's, averaged over a disc of radius aperture / (2 f).
+The ray from lens point l through the focus point of pixel p has the direction p - l / f in the plane at distance 1,
+with f the focus distance. Light from infinity depends on direction alone, so the image is the pinhole image averaged
+over a disc of radius aperture / (2 f). Near content has no such kernel, because its blur depends on depth.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from torch.nn import functional
 
 from brewster.scene.camera import Camera
 
-_FINENESS = 8  # places per pixel and direction where the disc is tested
-_SMALLEST_PX = 0.1
+_SUPERSAMPLING = 8  # points per pixel and axis at which the disc is tested
+_MIN_RADIUS_PX = 0.1  # smaller blur is not visible: the camera counts as a pinhole
 
 
 def _radius_px(camera: Camera) -> float:
@@ -23,29 +24,30 @@ def _radius_px(camera: Camera) -> float:
 
 
 def margin_px(camera: Camera) -> int:
-    """How many pixels around the picture the lens reaches for; 0 for a pinhole."""
+    """How many pixels beyond the image border the blur needs; 0 for a pinhole."""
     radius = _radius_px(camera)
-    return math.ceil(radius + 0.5) if radius > _SMALLEST_PX else 0
+    return math.ceil(radius + 0.5) if radius > _MIN_RADIUS_PX else 0
 
 
-def blurred(picture: Tensor, camera: Camera, margin: int) -> Tensor:
-    """The picture (3, H + 2 margin, W + 2 margin) through the lens: (3, H, W)."""
+def defocus_blur(image: Tensor, camera: Camera, margin: int) -> Tensor:
+    """Blurs an image (3, H + 2 margin, W + 2 margin) by the lens and removes the margin: (3, H, W)."""
     if margin == 0:
-        return picture
-    kernel = _disc(_radius_px(camera), margin).to(picture.device)
-    height, width = (side + 2 * margin for side in picture.shape[1:])
-    spectrum = torch.fft.rfft2(picture.double(), (height, width)) * torch.fft.rfft2(kernel, (height, width))
-    full = torch.fft.irfft2(spectrum, (height, width)).to(picture.dtype)  # the sun needs double precision
-    low, high = 2 * margin, full.shape[1] - 2 * margin
-    seen: Tensor = full[:, low:high, 2 * margin : full.shape[2] - 2 * margin].clamp(min=0)
-    return seen
+        return image
+    kernel = _disc_kernel(_radius_px(camera), margin).to(image.device)
+    height, width = (side + 2 * margin for side in image.shape[1:])
+    # Rounding errors of an FFT scale with the brightest pixel: with a sun in the image, float32 would lose the shadows.
+    spectrum = torch.fft.rfft2(image.double(), (height, width)) * torch.fft.rfft2(kernel, (height, width))
+    convolved = torch.fft.irfft2(spectrum, (height, width)).to(image.dtype)
+    low, high = 2 * margin, convolved.shape[1] - 2 * margin
+    blurred: Tensor = convolved[:, low:high, 2 * margin : convolved.shape[2] - 2 * margin].clamp(min=0)
+    return blurred
 
 
-def _disc(radius_px: float, reach: int) -> Tensor:
-    """Shares of a disc in the pixels of a (2 reach + 1) square, summing to 1."""
-    side = (2 * reach + 1) * _FINENESS
-    place = (torch.arange(side) + 0.5) / _FINENESS - reach - 0.5
-    inside = (place[:, None] ** 2 + place**2 <= radius_px**2).double()
-    disc = functional.avg_pool2d(inside[None], _FINENESS)[0]
-    shares: Tensor = disc / disc.sum()
-    return shares
+def _disc_kernel(radius_px: float, half_size: int) -> Tensor:
+    """An antialiased disc on a square of 2 half_size + 1 pixels; the values sum to 1."""
+    side = (2 * half_size + 1) * _SUPERSAMPLING
+    position = (torch.arange(side) + 0.5) / _SUPERSAMPLING - half_size - 0.5
+    inside = (position[:, None] ** 2 + position**2 <= radius_px**2).double()
+    disc = functional.avg_pool2d(inside[None], _SUPERSAMPLING)[0]
+    kernel: Tensor = disc / disc.sum()
+    return kernel

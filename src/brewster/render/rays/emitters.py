@@ -1,8 +1,9 @@
-"""The light of one side as a renderer asks for it: along any ray, filtered to the size of what is asked.
+"""The light on one side of the glass, evaluated along rays and filtered to their footprint.
 
-All geometry is in the glass's frame, in millimetres: the first surface is z = 0, the camera stands at z > 0.
-Vectors are (3, N). Far light depends on direction alone; near light (a dome, a plane) on the whole ray. One look
-stands for a share of a pixel, and of its circle of confusion; light is filtered to that size before it is looked up.
+Geometry is in the glass frame, in millimetres: the first surface is z = 0, the camera is at z > 0. Vectors are (3, N).
+Light from a map at infinity depends on the direction alone; light from a dome (a map at a finite radius) or a plane
+depends on the whole ray. A ray has a footprint, its share of a pixel and of its circle of confusion: textures are
+filtered to that size before the lookup.
 """
 
 from __future__ import annotations
@@ -15,19 +16,19 @@ from torch import Tensor
 from torch.nn import functional
 
 from brewster.environments.assets import Assets
-from brewster.render.rays.envmap_sampling import EnvmapDistribution, lat_long
-from brewster.render.rays.vectors import dot, unit
+from brewster.render.rays.envmap_sampling import EnvmapDistribution, direction_to_uv
+from brewster.render.rays.vectors import dot, normalize
 from brewster.scene.camera import axes
 from brewster.scene.world import Plane, Side
 
 Device = torch.device | str
 
-_BETWEEN = 1.2
-"""Texels that one look may stand for before it turns to the next halving: above, a sun would sparkle."""
+_MAX_TEXELS_PER_LOOKUP = 1.2
+"""A lookup with a larger footprint uses a coarser mipmap level; with more texels, a sun of one texel would flicker."""
 
 
 class MipmappedTexture:
-    """A picture (H, W, 3) with its halvings, sampled between texel centres; a map also wraps around."""
+    """An image (H, W, 3) with mipmap levels and bilinear lookup; a latitude-longitude map wraps around."""
 
     def __init__(self, texels: Tensor, *, wraps: bool) -> None:
         self.width, self.wraps = texels.shape[1], wraps
@@ -38,22 +39,23 @@ class MipmappedTexture:
 
     @property
     def texels(self) -> Tensor:
-        """The picture itself, (3, H, W)."""
+        """The image at full resolution, (3, H, W)."""
         return self._levels[0][0]
 
-    def __call__(self, u: Tensor, v: Tensor, span: float) -> Tensor:
-        """Values (3, N) at (u, v) in 0..1, where one sample stands for `span` texels of the full picture."""
-        level = min(math.ceil(math.log2(max(span / _BETWEEN, 1.0))), len(self._levels) - 1)
+    def __call__(self, u: Tensor, v: Tensor, footprint: float) -> Tensor:
+        """Values (3, N) at texture coordinates u and v, (N,) in 0..1; `footprint` is in texels of the full image."""
+        level = min(math.ceil(math.log2(max(footprint / _MAX_TEXELS_PER_LOOKUP, 1.0))), len(self._levels) - 1)
         texels = self._level(level)
         if self.wraps:
             width = self._levels[level].shape[3]
-            u = (u * width + 1) / (width + 2)
+            u = (u * width + 1) / (width + 2)  # the level has one more column on either side
         grid = torch.stack([u, v], dim=-1)[None, None] * 2 - 1
         return functional.grid_sample(
             texels, grid, mode="bilinear", padding_mode="border", align_corners=False
         )[0, :, 0]
 
     def _level(self, level: int) -> Tensor:
+        """The texels of a level, with a column of the opposite edge on either side if the texture wraps."""
         if not self.wraps:
             return self._levels[level]
         if level not in self._padded:
@@ -63,7 +65,7 @@ class MipmappedTexture:
 
 @dataclass(frozen=True)
 class _PlaneEmitter:
-    """A plane in the glass's frame: where its centre is, its axes, and half its sides, in mm."""
+    """A textured rectangle in the glass frame: its centre, its axes and half its sides, in mm."""
 
     texture: MipmappedTexture
     centre: Tensor
@@ -75,181 +77,205 @@ class _PlaneEmitter:
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays with origins and unit directions, (3, N) each; each stands for this share of a pixel's side."""
+    """Rays with origins and unit directions, (3, N) each; `footprint_px` is the width of each in pixels."""
 
     origin: Tensor
     direction: Tensor
-    share: float
+    footprint_px: float
 
 
 @dataclass(frozen=True)
 class CameraView:
-    """How a camera `height_mm` above the glass sees: its pixels' angle, and its lens (0: none to filter for)."""
+    """What determines the footprint of a pixel: height above the glass, angle of a pixel, and the thin lens.
+
+    An aperture of 0 means that the lens does not widen the footprint.
+    """
 
     height_mm: float
     pixel_rad: float
     aperture_mm: float
     focus_mm: float
 
-    def span_mm(self, beyond_mm: float) -> float:
-        """What a pixel and its circle of confusion span on a surface this far beyond the glass (thin lens)."""
-        away = self.height_mm + beyond_mm
-        return self.pixel_rad * away + self.aperture_mm * abs(1 - away / self.focus_mm)
+    def footprint_mm(self, beyond_mm: float) -> float:
+        """Width of a pixel plus its circle of confusion at this distance beyond the glass (thin lens)."""
+        distance = self.height_mm + beyond_mm
+        return self.pixel_rad * distance + self.aperture_mm * abs(1 - distance / self.focus_mm)
 
-    def span_rad(self) -> float:
-        """The same for what is infinitely far, as an angle."""
+    def footprint_rad(self) -> float:
+        """The same at infinity, as an angle."""
         return self.pixel_rad + self.aperture_mm / self.focus_mm
 
 
 class SideEmitters:
-    """All the light of one side."""
+    """The light sources of one side: an environment map or dome, and a plane in front of it; both are optional."""
 
     def __init__(
         self, side: Side, assets: Assets, view: CameraView, *, behind: bool, to_world: Tensor, device: Device
     ) -> None:
-        self._drawn: EnvmapDistribution | None = None
+        self._distribution: EnvmapDistribution | None = None
         self.radius_mm = side.map.radius_mm if side.map else math.inf
-        self.map = (
+        self.envmap = (
             MipmappedTexture(torch.from_numpy(assets.map_light(side.map)).to(device), wraps=True)
             if side.map
             else None
         )
         self._view = view
-        self._turn = -(side.map.heading_deg if side.map else 0.0) / 360
+        self._u_offset = -(side.map.heading_deg if side.map else 0.0) / 360
         self._behind = behind
         self._to_world = to_world
-        self.board = _board(side.plane, assets, behind, device) if side.plane else None
-        self.plane_mm = side.plane.distance_mm if side.plane else math.inf
+        self.plane = _plane_emitter(side.plane, assets, behind, device) if side.plane else None
+        self.plane_distance_mm = side.plane.distance_mm if side.plane else math.inf
         self.distance_mm = side.distance_mm
 
     @property
     def is_dome(self) -> bool:
-        """Whether the map has parallax."""
-        return self.map is not None and math.isfinite(self.radius_mm)
+        """Whether the map is at a finite radius, and so has parallax."""
+        return self.envmap is not None and math.isfinite(self.radius_mm)
 
     @property
     def is_near(self) -> bool:
-        """Whether any of this light depends on where a ray starts."""
-        return self.is_dome or self.board is not None
+        """Whether any light of this side depends on the origin of a ray."""
+        return self.is_dome or self.plane is not None
 
     def texels_per_pixel(self) -> float:
-        """How many texels a pixel spans at most: what a grid of looks must not miss."""
-        return max(self._map_span(1.0), self._board_span(1.0))
+        """The largest number of texels across a pixel: the rays of a pixel must be dense enough for it."""
+        return max(self._map_footprint(1.0), self._plane_footprint(1.0))
 
-    def _map_span(self, share: float) -> float:
-        if self.map is None:
+    def _map_footprint(self, footprint_px: float) -> float:
+        """In texels of the map."""
+        if self.envmap is None:
             return 0.0
-        angle = self._view.span_mm(self.radius_mm) / self.radius_mm if self.is_dome else self._view.span_rad()
-        return share * angle * self.map.width / (2 * math.pi)
-
-    def _board_span(self, share: float) -> float:
-        if self.board is None:
-            return 0.0
-        return (
-            share * self._view.span_mm(self.plane_mm) * self.board.texture.width / (2 * self.board.half_width)
+        angle = (
+            self._view.footprint_mm(self.radius_mm) / self.radius_mm
+            if self.is_dome
+            else self._view.footprint_rad()
         )
+        return footprint_px * angle * self.envmap.width / (2 * math.pi)
 
-    def far(self, direction: Tensor, share: float) -> Tensor | None:
-        """Light from infinity along unit directions (3, N); None where there is none."""
-        if self.map is None or self.is_dome:
+    def _plane_footprint(self, footprint_px: float) -> float:
+        """In texels of the plane's image."""
+        if self.plane is None:
+            return 0.0
+        width_mm = self._view.footprint_mm(self.plane_distance_mm)
+        return footprint_px * width_mm * self.plane.texture.width / (2 * self.plane.half_width)
+
+    def far_radiance(self, direction: Tensor, footprint_px: float) -> Tensor | None:
+        """Light from infinity along unit directions (3, N): (3, N); None if this side has none."""
+        if self.envmap is None or self.is_dome:
             return None
-        return self.look_up(direction, share)
+        return self.lookup_map(direction, footprint_px)
 
-    def near(self, origin: Tensor, direction: Tensor, share: float) -> tuple[Tensor, Tensor | None]:
-        """Near light along rays, (3, N), and how much of the far light is seen past it, (N,) or None for nothing."""
-        seen, clear = torch.zeros_like(direction), None
+    def near_radiance(
+        self, origin: Tensor, direction: Tensor, footprint_px: float
+    ) -> tuple[Tensor, Tensor | None]:
+        """Light of the dome and the plane along rays, and how much of the far light passes the plane.
+
+        Returns:
+            Radiance (3, N), and visibility (N,) in 0..1 or None if there is no far light.
+        """
+        radiance, visibility = torch.zeros_like(direction), None
         if self.is_dome:
-            place, _ = self._on_dome(origin, direction)
-            seen = self.look_up(place, share)
-        elif self.map is not None:
-            clear = torch.ones_like(direction[0])
-        if self.board is not None:
-            picture, covered = self._before(self.board, origin, direction, share)
-            seen = seen + covered * (picture - seen)
-            clear = None if clear is None else clear * (1 - covered)
-        return seen, clear
+            point, _ = self._intersect_dome(origin, direction)
+            radiance = self.lookup_map(point, footprint_px)
+        elif self.envmap is not None:
+            visibility = torch.ones_like(direction[0])
+        if self.plane is not None:
+            image, coverage = self._plane_radiance(self.plane, origin, direction, footprint_px)
+            radiance = radiance + coverage * (image - radiance)
+            visibility = None if visibility is None else visibility * (1 - coverage)
+        return radiance, visibility
 
-    def along(self, origin: Tensor, direction: Tensor, share: float) -> Tensor:
-        """All light along rays from `origin` to unit `direction`, both (3, N): (3, N)."""
-        return self.before(self.far(direction, share), origin, direction, share)
+    def radiance(self, origin: Tensor, direction: Tensor, footprint_px: float) -> Tensor:
+        """All light along rays from `origin` in unit `direction`, (3, N) each: (3, N)."""
+        return self.add_near(self.far_radiance(direction, footprint_px), origin, direction, footprint_px)
 
-    def before(self, far: Tensor | None, origin: Tensor, direction: Tensor, share: float) -> Tensor:
-        """All light along rays whose `far` light, (3, N), is known already."""
+    def add_near(self, far: Tensor | None, origin: Tensor, direction: Tensor, footprint_px: float) -> Tensor:
+        """All light along rays, (3, N), from their far light, as `far_radiance` returns it.
+
+        Rays that differ in their origins only share one lookup of the far light.
+        """
         if not self.is_near:
             return torch.zeros_like(direction) if far is None else far
-        seen, clear = self.near(origin, direction, share)
-        return seen if far is None or clear is None else seen + clear * far
+        near, visibility = self.near_radiance(origin, direction, footprint_px)
+        return near if far is None or visibility is None else near + visibility * far
 
-    def look_up(self, direction: Tensor, share: float) -> Tensor:
-        """The map along unit directions (3, N) from its centre."""
-        assert self.map is not None
-        u, v = lat_long(self._to_world @ direction, self._turn)
-        return self.map(u, v, self._map_span(share))
+    def lookup_map(self, direction: Tensor, footprint_px: float) -> Tensor:
+        """The map along unit directions (3, N) from its centre: (3, N)."""
+        assert self.envmap is not None
+        u, v = direction_to_uv(self._to_world @ direction, self._u_offset)
+        return self.envmap(u, v, self._map_footprint(footprint_px))
 
-    def draw(self, origin: Tensor, pair: Tensor) -> tuple[Tensor, Tensor]:
-        """Directions (3, N) from `origin` to the map, bright places more often, and their density, (N,).
+    def sample(self, origin: Tensor, uniforms: Tensor) -> tuple[Tensor, Tensor]:
+        """Samples directions from `origin` towards bright parts of the map.
 
-        `pair` is (2, N) in 0..1. Densities are per solid angle at `origin`.
+        `uniforms` are random numbers in [0, 1), (2, N).
+
+        Returns:
+            Unit directions (3, N) and their densities per steradian at `origin`, (N,).
         """
-        place = self._to_world.T @ self._odds().draw(pair, self._turn)
-        direction = place * self.radius_mm - origin if self.is_dome else place
-        direction = unit(direction)
-        return direction, self.density(origin, direction)
+        point = self._to_world.T @ self._map_distribution().sample(uniforms, self._u_offset)
+        direction = point * self.radius_mm - origin if self.is_dome else point
+        direction = normalize(direction)
+        return direction, self.pdf(origin, direction)
 
-    def density(self, origin: Tensor, direction: Tensor) -> Tensor:
-        """How densely `draw` goes along unit directions (3, N), per solid angle at `origin`: (N,)."""
+    def pdf(self, origin: Tensor, direction: Tensor) -> Tensor:
+        """The density of `sample` at unit directions (3, N), per steradian at `origin`: (N,)."""
         if not self.is_dome:
-            return self._odds().density(self._to_world @ direction, self._turn)
-        place, away = self._on_dome(origin, direction)
-        facing = dot(place, direction).clamp(min=1e-6)
+            return self._map_distribution().pdf(self._to_world @ direction, self._u_offset)
+        point, distance = self._intersect_dome(origin, direction)
+        # The same area of the dome has the solid angle A / r^2 at the centre and A cos / distance^2 at `origin`.
+        cosine = dot(point, direction).clamp(min=1e-6)
         return (
-            self._odds().density(self._to_world @ place, self._turn) * (away / self.radius_mm) ** 2 / facing
+            self._map_distribution().pdf(self._to_world @ point, self._u_offset)
+            * (distance / self.radius_mm) ** 2
+            / cosine
         )
 
-    def _on_dome(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """Where rays meet the dome, as unit directions from its centre, (3, N), and how far away, (N,) in mm."""
+    def _intersect_dome(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
+        """Where rays meet the dome: unit directions from its centre, (3, N), and distances in mm, (N,)."""
         along = dot(origin, direction)
-        away = torch.sqrt((along**2 - dot(origin, origin) + self.radius_mm**2).clamp(min=0)) - along
-        return (origin + away * direction) / self.radius_mm, away
+        distance = torch.sqrt((along**2 - dot(origin, origin) + self.radius_mm**2).clamp(min=0)) - along
+        return (origin + distance * direction) / self.radius_mm, distance
 
-    def _odds(self) -> EnvmapDistribution:
-        """The map's bright places on its own side of the glass; made when first needed."""
-        if self._drawn is None:
-            assert self.map is not None
+    def _map_distribution(self) -> EnvmapDistribution:
+        """The distribution of the map's light on this side of the glass; computed at the first call."""
+        if self._distribution is None:
+            assert self.envmap is not None
             outward = self._to_world @ self._to_world.new_tensor([0, 0, -1 if self._behind else 1])
-            self._drawn = EnvmapDistribution(self.map.texels, outward, self._turn)
-        return self._drawn
+            self._distribution = EnvmapDistribution(self.envmap.texels, outward, self._u_offset)
+        return self._distribution
 
-    def _before(
-        self, board: _PlaneEmitter, origin: Tensor, direction: Tensor, share: float
+    def _plane_radiance(
+        self, plane: _PlaneEmitter, origin: Tensor, direction: Tensor, footprint_px: float
     ) -> tuple[Tensor, Tensor]:
-        normal = torch.linalg.cross(board.right, board.up)
-        towards = normal @ direction
-        away = normal @ (board.centre[:, None] - origin) / torch.where(towards == 0, 1e-9, towards)
-        place = origin + away * direction - board.centre[:, None]
-        across, upward = board.right @ place, board.up @ place
-        u, v = across / (2 * board.half_width) + 0.5, 0.5 - upward / (2 * board.half_height)
-        edge_mm = share * self._view.span_mm(self.plane_mm)
-        covered = (
-            ((board.half_width - across.abs()) / edge_mm + 0.5).clamp(0, 1)
-            * ((board.half_height - upward.abs()) / edge_mm + 0.5).clamp(0, 1)
-            * (away > 0)
+        """The plane's light along rays, (3, N), and how much of each footprint it covers, (N,) in 0..1."""
+        normal = torch.linalg.cross(plane.right, plane.up)
+        cosine = normal @ direction
+        distance = normal @ (plane.centre[:, None] - origin) / torch.where(cosine == 0, 1e-9, cosine)
+        point = origin + distance * direction - plane.centre[:, None]
+        x, y = plane.right @ point, plane.up @ point
+        u, v = x / (2 * plane.half_width) + 0.5, 0.5 - y / (2 * plane.half_height)
+        edge_mm = footprint_px * self._view.footprint_mm(self.plane_distance_mm)
+        coverage = (
+            ((plane.half_width - x.abs()) / edge_mm + 0.5).clamp(0, 1)
+            * ((plane.half_height - y.abs()) / edge_mm + 0.5).clamp(0, 1)
+            * (distance > 0)
         )
-        return board.texture(u, v, self._board_span(share)), covered
+        return plane.texture(u, v, self._plane_footprint(footprint_px)), coverage
 
 
-def _board(plane: Plane, assets: Assets, behind: bool, device: Device) -> _PlaneEmitter:
-    """The plane's frame: it faces the glass, and is turned about the glass's own upright axis."""
-    picture = torch.from_numpy(assets.plane_light(plane)).to(device)
+def _plane_emitter(plane: Plane, assets: Assets, behind: bool, device: Device) -> _PlaneEmitter:
+    """The plane in the glass frame: it faces the glass, and its heading turns it about the glass's vertical axis."""
+    image = torch.from_numpy(assets.plane_light(plane)).to(device)
     facing = 1.0 if behind else -1.0
-    side = torch.tensor([facing, 1.0, facing], device=device)
+    mirrored = torch.tensor([facing, 1.0, facing], device=device)
     right, up, _ = (
-        torch.tensor(axis, device=device) * side for axis in axes(plane.heading_deg, plane.pitch_deg)
+        torch.tensor(axis, device=device) * mirrored for axis in axes(plane.heading_deg, plane.pitch_deg)
     )
     x, y = plane.offset_mm
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     return _PlaneEmitter(
-        texture=MipmappedTexture(picture, wraps=False),
+        texture=MipmappedTexture(image, wraps=False),
         centre=torch.tensor([x, y, -facing * plane.distance_mm], device=device),
         right=right,
         up=up,

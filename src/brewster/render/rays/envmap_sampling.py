@@ -1,4 +1,8 @@
-"""Drawing directions from a lat-long map as often as they are bright, so that the sun is found."""
+"""Importance sampling of an environment map: directions are drawn with a density proportional to brightness.
+
+Source: Pharr, Jakob and Humphreys, "Physically Based Rendering", image infinite lights. Inversion of the cumulative
+sum of luminance times solid angle finds a small sun in every sample.
+"""
 
 from __future__ import annotations
 
@@ -10,61 +14,69 @@ from torch.nn import functional
 
 from brewster.srgb import REC709_LUMINANCE
 
-_LEAST = 1e-3  # of the mean, so that no light is ever out of reach
-_OVER_THE_EDGE = -0.05  # cosine: lights just behind the pane's plane may be seen from a dome's other points
+_MIN_WEIGHT = 1e-3
+"""Added to each texel, as a share of the mean: wherever there may be light, the density must be above 0."""
+_MIN_COSINE = -0.05
+"""A dome is seen from points other than its centre: directions slightly beyond the glass plane still count."""
 
 
-def lat_long(direction: Tensor, turn: float) -> tuple[Tensor, Tensor]:
-    """Where unit directions (3, N) lie in a map: u = atan2(x, -z) / 2 pi + turn, wrapped, and v = acos(y) / pi."""
+def direction_to_uv(direction: Tensor, u_offset: float) -> tuple[Tensor, Tensor]:
+    """Texture coordinates of unit directions (3, N) in a latitude-longitude map, (N,) each in 0..1.
+
+    u = atan2(x, -z) / 2 pi + u_offset, wrapped; v = acos(y) / pi.
+    """
     x, y, z = direction
-    u = torch.atan2(x, -z) / (2 * math.pi) + turn
+    u = torch.atan2(x, -z) / (2 * math.pi) + u_offset
     return u - u.floor(), 0.5 - torch.asin(y.clamp(-1, 1)) / math.pi
 
 
 class EnvmapDistribution:
-    """A map's texels (3, H, W) as a distribution over directions, on the `outward` side alone."""
+    """The texels (3, H, W) of a map as a distribution of directions, restricted to the `outward` side of the glass."""
 
-    def __init__(self, texels: Tensor, outward: Tensor, turn: float) -> None:
+    def __init__(self, texels: Tensor, outward: Tensor, u_offset: float) -> None:
         _, height, width = texels.shape
         luminance = (texels * texels.new_tensor(REC709_LUMINANCE)[:, None, None]).sum(0)
-        spread = functional.avg_pool2d(
+        # Bilinear lookups spread a bright texel over its neighbours, so the density must be high there too.
+        smoothed = functional.avg_pool2d(
             functional.pad(luminance[None, None], (1, 1, 1, 1), mode="replicate"), 3, 1
         )[0, 0]
-        self._latitude = (torch.arange(height, device=texels.device) + 0.5) / height * math.pi
-        solid_angle = self._latitude.sin() * (math.pi / height) * (2 * math.pi / width)
+        self._polar = (torch.arange(height, device=texels.device) + 0.5) / height * math.pi
+        solid_angle = self._polar.sin() * (math.pi / height) * (2 * math.pi / width)
         u = (torch.arange(width, device=texels.device) + 0.5) / width
-        facing = _direction(u[None], self._latitude[:, None] / math.pi, turn)
-        allowed = torch.tensordot(outward, facing, 1) > _OVER_THE_EDGE
-        weight = (spread + _LEAST * spread.mean() + 1e-12) * solid_angle[:, None] * allowed
-        share = weight.double() / weight.double().sum()
-        self._density = (share / solid_angle[:, None]).float()
-        self._running = share.flatten().cumsum(0)
+        centres = uv_to_direction(u[None], self._polar[:, None] / math.pi, u_offset)
+        is_outward = torch.tensordot(outward, centres, 1) > _MIN_COSINE
+        weight = (smoothed + _MIN_WEIGHT * smoothed.mean() + 1e-12) * solid_angle[:, None] * is_outward
+        # float64: a float32 cumulative sum over a million texels would lose the dark ones.
+        probability = weight.double() / weight.double().sum()
+        self._pdf = (probability / solid_angle[:, None]).float()
+        self._cdf = probability.flatten().cumsum(0)
 
-    def draw(self, pair: Tensor, turn: float) -> Tensor:
-        """Unit directions (3, N) for uniform pairs (2, N)."""
-        height, width = self._density.shape
-        first = pair[0].double() * self._running[-1]
-        cell = torch.searchsorted(self._running, first, right=True).clamp(max=height * width - 1)
-        low = torch.where(cell > 0, self._running[cell - 1], 0.0)
-        inside = ((first - low) / (self._running[cell] - low)).float()
+    def sample(self, uniforms: Tensor, u_offset: float) -> Tensor:
+        """Unit directions (3, N) for random numbers in [0, 1), (2, N)."""
+        height, width = self._pdf.shape
+        target = uniforms[0].double() * self._cdf[-1]
+        cell = torch.searchsorted(self._cdf, target, right=True).clamp(max=height * width - 1)
+        low = torch.where(cell > 0, self._cdf[cell - 1], 0.0)
+        inside = ((target - low) / (self._cdf[cell] - low)).float()
         u = (cell % width + inside.clamp(0, 1)) / width
         row = torch.div(cell, width, rounding_mode="floor")
+        # Uniform in the cosine of the polar angle, which is uniform in solid angle within the texel.
         top, bottom = (((row + edge) / height * math.pi).cos() for edge in (0, 1))
-        v = torch.acos((top + (bottom - top) * pair[1]).clamp(-1, 1)) / math.pi
-        return _direction(u, v, turn)
+        v = torch.acos((top + (bottom - top) * uniforms[1]).clamp(-1, 1)) / math.pi
+        return uv_to_direction(u, v, u_offset)
 
-    def density(self, direction: Tensor, turn: float) -> Tensor:
-        """How densely `draw` goes along unit directions (3, N), per solid angle: (N,)."""
-        height, width = self._density.shape
-        u, v = lat_long(direction, turn)
+    def pdf(self, direction: Tensor, u_offset: float) -> Tensor:
+        """The density of `sample` at unit directions (3, N), per steradian: (N,)."""
+        height, width = self._pdf.shape
+        u, v = direction_to_uv(direction, u_offset)
         row, column = (v * height).long().clamp(0, height - 1), (u * width).long().clamp(0, width - 1)
-        density: Tensor = self._density[row, column]
-        return density
+        pdf: Tensor = self._pdf[row, column]
+        return pdf
 
 
-def _direction(u: Tensor, v: Tensor, turn: float) -> Tensor:
-    """The inverse of `lat_long`, (3, ...)."""
-    heading, latitude = (u - turn) * (2 * math.pi), v * math.pi
-    across = latitude.sin()
-    x, z = across * heading.sin(), -across * heading.cos()
-    return torch.stack([x, latitude.cos().expand_as(x), z])
+def uv_to_direction(u: Tensor, v: Tensor, u_offset: float) -> Tensor:
+    """The inverse of `direction_to_uv`: unit directions (3, ...)."""
+    azimuth, polar = (u - u_offset) * (2 * math.pi), v * math.pi
+    sine = polar.sin()
+    x, z = sine * azimuth.sin(), -sine * azimuth.cos()
+    return torch.stack([x, polar.cos().expand_as(x), z])

@@ -1,6 +1,8 @@
-"""Rough surfaces: GGX facets seen from a direction, their shadowing, and how densely they send light anywhere.
+"""GGX microfacets: sampling of visible normals, Smith masking and the density of the samples.
 
-Sources: Walter et al. 2007 (microfacet refraction); Heitz 2018 (sampling visible normals). Vectors are (3, N).
+Sources: Walter et al. 2007, "Microfacet Models for Refraction through Rough Surfaces"; Heitz 2018, "Sampling the GGX
+Distribution of Visible Normals". Vectors are (3, N) and of unit length. `wi` points from the surface back along the
+incoming path, as i does in Walter et al. `alpha` is the GGX roughness.
 """
 
 from __future__ import annotations
@@ -10,41 +12,54 @@ import math
 import torch
 from torch import Tensor
 
-from brewster.render.rays.vectors import dot, unit
+from brewster.render.rays.vectors import dot, normalize
 
 
-def visible_facet(towards: Tensor, normal: Tensor, alpha: float, pair: Tensor) -> Tensor:
-    """A facet's normal, (3, N), drawn as often as it is seen from unit `towards`; `pair` is uniform, (2, N)."""
+def sample_visible_normal(wi: Tensor, normal: Tensor, alpha: float, uniforms: Tensor) -> Tensor:
+    """Microfacet normals, (3, N), distributed as the facets that are visible from `wi` (Heitz 2018).
+
+    `uniforms` are random numbers in [0, 1), (2, N).
+    """
     x_axis, y_axis = _tangents(normal)
-    x, y, z = dot(towards, x_axis) * alpha, dot(towards, y_axis) * alpha, dot(towards, normal)
+    # Stretch wi by alpha: the rough surface becomes a hemisphere.
+    x, y, z = dot(wi, x_axis) * alpha, dot(wi, y_axis) * alpha, dot(wi, normal)
     length = torch.sqrt(x**2 + y**2 + z**2)
     x, y, z = x / length, y / length, z / length
-    across = torch.sqrt((x**2 + y**2).clamp(min=1e-20))
-    radius, angle = pair[0].sqrt(), 2 * math.pi * pair[1]
-    one, two = radius * angle.cos(), radius * angle.sin()
+    sine = torch.sqrt((x**2 + y**2).clamp(min=1e-20))
+    # Sample the projection of the hemisphere towards wi: a half disc joined to a half ellipse.
+    radius, angle = uniforms[0].sqrt(), 2 * math.pi * uniforms[1]
+    t1, t2 = radius * angle.cos(), radius * angle.sin()
     lift = (1 + z) / 2
-    two = (1 - lift) * (1 - one**2).clamp(min=0).sqrt() + lift * two
-    three = (1 - one**2 - two**2).clamp(min=0).sqrt()
-    nx = -y / across * one - x * z / across * two + x * three
-    ny = x / across * one - y * z / across * two + y * three
-    nz = (across * two + z * three).clamp(min=1e-6)
-    return unit(x_axis * (alpha * nx) + y_axis * (alpha * ny) + normal * nz)
+    t2 = (1 - lift) * (1 - t1**2).clamp(min=0).sqrt() + lift * t2
+    t3 = (1 - t1**2 - t2**2).clamp(min=0).sqrt()
+    # Back from the frame of wi to the frame of the surface, and undo the stretch.
+    nx = -y / sine * t1 - x * z / sine * t2 + x * t3
+    ny = x / sine * t1 - y * z / sine * t2 + y * t3
+    nz = (sine * t2 + z * t3).clamp(min=1e-6)
+    return normalize(x_axis * (alpha * nx) + y_axis * (alpha * ny) + normal * nz)
 
 
-def shadowing(cosine: Tensor, alpha: float) -> Tensor:
-    """Smith's share of facets that are seen (or lit) from this cosine to the surface's normal."""
-    tangent = (1 - cosine**2).clamp(min=0) / cosine.clamp(min=1e-4) ** 2
-    return 2 / (1 + torch.sqrt(1 + alpha**2 * tangent))
+def smith_g1(cosine: Tensor, alpha: float) -> Tensor:
+    """Smith's masking function G1: the visible share of the facets from a direction (Walter et al. 2007, eq. 34).
+
+    `cosine` is that of the angle between the direction and the surface normal. The shape of the result is the same.
+    """
+    tangent_squared = (1 - cosine**2).clamp(min=0) / cosine.clamp(min=1e-4) ** 2
+    return 2 / (1 + torch.sqrt(1 + alpha**2 * tangent_squared))
 
 
-def seen_density(towards: Tensor, normal: Tensor, facet: Tensor, alpha: float) -> Tensor:
-    """How densely `visible_facet` draws this facet, over its cosine to `towards`: D G1 / cos, (N,)."""
-    cosine, tilt = dot(towards, normal).clamp(min=1e-4), dot(facet, normal)
-    spread = alpha**2 / (math.pi * ((tilt**2) * (alpha**2 - 1) + 1) ** 2)
-    return torch.where(tilt > 0, spread * shadowing(cosine, alpha) / cosine, 0.0)
+def vndf_over_cosine(wi: Tensor, normal: Tensor, facet: Tensor, alpha: float) -> Tensor:
+    """The density of `sample_visible_normal` at `facet`, divided by dot(wi, facet): D G1 / dot(wi, normal), (N,).
+
+    D is the GGX distribution (Walter et al. 2007, eq. 33). The division is left out of the product because the
+    Jacobian of a reflection has the same factor in its denominator.
+    """
+    cosine, facet_cosine = dot(wi, normal).clamp(min=1e-4), dot(facet, normal)
+    ndf = alpha**2 / (math.pi * ((facet_cosine**2) * (alpha**2 - 1) + 1) ** 2)
+    return torch.where(facet_cosine > 0, ndf * smith_g1(cosine, alpha) / cosine, 0.0)
 
 
 def _tangents(normal: Tensor) -> tuple[Tensor, Tensor]:
-    """Two axes across unit normals (3, 1) or (3, N)."""
-    x_axis = unit(torch.stack([normal[2], torch.zeros_like(normal[0]), -normal[0]]))
+    """Two axes perpendicular to the unit normals, (3, 1) or (3, N)."""
+    x_axis = normalize(torch.stack([normal[2], torch.zeros_like(normal[0]), -normal[0]]))
     return x_axis, torch.linalg.cross(normal, x_axis, dim=0)

@@ -1,7 +1,9 @@
-"""What a stack of flat panes does to a ray: Fresnel, Beer-Lambert, and the table of its orders.
+"""Smooth parallel panes: Fresnel reflectance, Beer-Lambert absorption and the table of reflection orders.
 
-Light is carried as s- and p-polarised parts, each with its own reflectance at every surface, and averaged at the
-end: for unpolarised light that is exact, where averaging at each surface is not. Nothing here knows of pictures.
+s- and p-polarised light are computed separately, each with its own reflectance at every surface, and averaged at the
+end. For unpolarised light this is exact; an average at each surface is not, because the mean of a product is not the
+product of the means. Intensities add up, not amplitudes: a pane is thousands of wavelengths thick, so interference
+averages out. Angles are given by their cosines, of any shape (...), measured in air.
 """
 
 from __future__ import annotations
@@ -17,97 +19,113 @@ from torch import Tensor
 
 from brewster.scene.glass import Glazing, Pane
 
-FAINTEST = 1e-5
-"""Orders of less weight are not followed; what they carry goes to the last that is."""
+MIN_ORDER_WEIGHT = 1e-5
+"""Orders with less weight are not enumerated; the last order of their side gets their light."""
 
 
-def inner_cosine(cosine: Tensor, index: float) -> Tensor:
-    """Cosine of the angle inside the glass, from the one outside (Snell's law)."""
+def refracted_cosine(cosine: Tensor, index: float) -> Tensor:
+    """Cosine of the angle inside the glass, from the cosine in air (Snell's law)."""
     return (1 - (1 - cosine**2) / index**2).clamp(min=1e-9).sqrt()
 
 
 def fresnel(cosine: Tensor, index: float) -> tuple[Tensor, Tensor]:
     """Reflectance of one surface between air and glass for s- and p-polarised light (Fresnel's equations).
 
-    `cosine`, of any shape, is that of the angle in the air; light that comes from inside is reflected alike.
+    The reflectance from inside the glass, at the refracted angle, is the same (Stokes' relations).
     """
-    inside = inner_cosine(cosine, index)
+    inside = refracted_cosine(cosine, index)
     s = (cosine - index * inside) / (cosine + index * inside)
     p = (index * cosine - inside) / (index * cosine + inside)
     return s**2, p**2
 
 
-def pass_once(pane: Pane, cosine: Tensor) -> Tensor:
-    """What one traversal of the pane leaves of light, (3, ...) for cosines (...) (Beer-Lambert)."""
+def internal_transmittance(pane: Pane, cosine: Tensor) -> Tensor:
+    """Share of the light left after one traversal of the pane, (3, ...) for RGB (Beer-Lambert law)."""
     absorption = torch.tensor(pane.absorption_per_m, dtype=cosine.dtype, device=cosine.device)
-    path_m = pane.thickness_mm / 1000 / inner_cosine(cosine, pane.index)
+    path_m = pane.thickness_mm / 1000 / refracted_cosine(cosine, pane.index)
     return torch.exp(-absorption.view(3, *[1] * cosine.ndim) * path_m)
 
 
 @dataclass(frozen=True)
 class Throughput:
-    """How much of the light of the two sides a glazing sends along a camera ray; each (3, ...) or (...)."""
+    """Transmittance and reflectance of a glazing along a camera ray; each (3, ...) if tinted, else (...)."""
 
     transmitted: Tensor
     reflected: Tensor
 
 
 def all_orders(glazing: Glazing, cosine: Tensor) -> Throughput:
-    """The sum of all orders in closed form: panes joined by the adding formula, s and p apart."""
-    return _averaged([_add_up([_pane(r, a) for r, a in lane]) for lane in _lanes(glazing, cosine)])
+    """The sum of all orders in closed form; panes are combined by the adding method."""
+    return _average_polarisations(
+        [_combine([_slab(r, a) for r, a in panes]) for panes in _by_polarisation(glazing, cosine)]
+    )
 
 
 def paper_orders(glazing: Glazing, cosine: Tensor) -> Throughput:
-    """T without any reflection; R of all that never enters the last pane (the paper's two layers)."""
-    return _averaged([_paper_pair(lane) for lane in _lanes(glazing, cosine)])
+    """The paper's layers: T without any reflection, and R of all light that never enters the last pane."""
+    return _average_polarisations([_paper_layers(panes) for panes in _by_polarisation(glazing, cosine)])
 
 
-_Pair = tuple[Tensor, Tensor]
-_Lane = list[tuple[Tensor, Tensor | float]]
+_TransmittanceReflectance = tuple[Tensor, Tensor]
+_SurfaceAndInterior = tuple[Tensor, Tensor | float]
+"""Of one pane and polarisation: the reflectance r of a surface, and the internal transmittance a."""
 
 
-def _lanes(glazing: Glazing, cosine: Tensor) -> list[_Lane]:
-    """For s and for p: each pane's reflectance at a surface, and what one traversal leaves."""
-    left = [pass_once(pane, cosine) if any(pane.absorption_per_m) else 1.0 for pane in glazing.panes]
-    both = [fresnel(cosine, pane.index) for pane in glazing.panes]
-    return [[(r[which], a) for r, a in zip(both, left, strict=True)] for which in (0, 1)]
+def _by_polarisation(glazing: Glazing, cosine: Tensor) -> list[list[_SurfaceAndInterior]]:
+    """The panes for s-polarised light, then for p-polarised light."""
+    interiors = [
+        internal_transmittance(pane, cosine) if any(pane.absorption_per_m) else 1.0 for pane in glazing.panes
+    ]
+    surfaces = [fresnel(cosine, pane.index) for pane in glazing.panes]
+    return [[(r[which], a) for r, a in zip(surfaces, interiors, strict=True)] for which in (0, 1)]
 
 
-def _pane(r: Tensor, a: Tensor | float) -> _Pair:
-    """Transmittance and reflectance of a pane whose surfaces reflect r and whose glass leaves a."""
-    through = (1 - r) ** 2 * a / (1 - (r * a) ** 2)
-    return through, r + through * r * a
+def _slab(r: Tensor, a: Tensor | float) -> _TransmittanceReflectance:
+    """Transmittance and reflectance of one pane: the paper's two series of light paths, summed.
+
+    T = (1 - r)^2 a (1 + (r a)^2 + (r a)^4 + ...) and R = r + (1 - r)^2 r a^2 (1 + (r a)^2 + ...) are geometric series.
+    """
+    transmittance = (1 - r) ** 2 * a / (1 - (r * a) ** 2)
+    return transmittance, r + transmittance * r * a
 
 
-def _add_up(pairs: list[_Pair]) -> _Pair:
-    """Stacks of layers, each the same from both sides: T = T1 T2 / (1 - R1 R2'), from the camera on."""
-    through, back = pairs[-1]
-    for t, r in reversed(pairs[:-1]):
-        echo = 1 / (1 - r * back)
-        through, back = t * through * echo, r + t**2 * back * echo
-    return through, back
+def _combine(layers: list[_TransmittanceReflectance]) -> _TransmittanceReflectance:
+    """The adding method (Stokes 1862): T = T1 T2 / (1 - R1 R2), R = R1 + T1^2 R2 / (1 - R1 R2).
+
+    It needs layers that are symmetric front to back, which uniform panes are. The first layer is nearest to the camera.
+    """
+    transmittance, reflectance = layers[-1]
+    for t, r in reversed(layers[:-1]):
+        interreflection = 1 / (1 - r * reflectance)
+        transmittance, reflectance = (
+            t * transmittance * interreflection,
+            r + t**2 * reflectance * interreflection,
+        )
+    return transmittance, reflectance
 
 
-def _paper_pair(lane: _Lane) -> _Pair:
-    through: Tensor | float = 1.0
-    for r, a in lane:
-        through = through * (1 - r) ** 2 * a
-    first_surface, _ = lane[-1]
-    before = [_pane(*panes) for panes in lane[:-1]]
-    assert isinstance(through, Tensor)
-    return through, _add_up([*before, (through, first_surface)])[1]
+def _paper_layers(panes: list[_SurfaceAndInterior]) -> _TransmittanceReflectance:
+    transmittance: Tensor | float = 1.0
+    for r, a in panes:
+        transmittance = transmittance * (1 - r) ** 2 * a
+    # R ends at the last pane's first surface: that surface alone replaces the pane.
+    first_surface, _ = panes[-1]
+    before = [_slab(*pane) for pane in panes[:-1]]
+    assert isinstance(transmittance, Tensor)
+    return transmittance, _combine([*before, (transmittance, first_surface)])[1]
 
 
-def _averaged(lanes: list[_Pair]) -> Throughput:
-    (s_through, s_back), (p_through, p_back) = lanes
-    return Throughput((s_through + p_through) / 2, (s_back + p_back) / 2)
+def _average_polarisations(polarised: list[_TransmittanceReflectance]) -> Throughput:
+    (s_transmitted, s_reflected), (p_transmitted, p_reflected) = polarised
+    return Throughput((s_transmitted + p_transmitted) / 2, (s_reflected + p_reflected) / 2)
 
 
 @dataclass(frozen=True)
 class ReflectionOrder:
-    """Paths through a parallel stack that end alike: `count` of them, on one side, shifted and weakened equally.
+    """Light paths through a parallel stack with the same exit side, lateral shift and throughput; `count` of them.
 
-    `reflections` and `transmissions` are counted per pane, `traversals` per layer: pane, gap, pane...
+    `reflections` and `transmissions` at surfaces are counted per pane, `traversals` per layer: pane, gap, pane...
+    `behind` is true for light that comes from behind the glass.
     """
 
     behind: bool
@@ -118,92 +136,108 @@ class ReflectionOrder:
 
     @property
     def in_paper(self) -> bool:
-        """Whether the paper's T or R has it."""
+        """Whether the paper's T or R contains this order."""
         return sum(self.reflections) == 0 if self.behind else self.traversals[-1] == 0
 
 
 @lru_cache(maxsize=256)
-def orders(reflectances: tuple[float, ...]) -> tuple[ReflectionOrder, ...]:
-    """The orders of panes whose surfaces reflect about this much, the brightest paths first.
+def enumerate_orders(reflectances: tuple[float, ...]) -> tuple[ReflectionOrder, ...]:
+    """The orders of panes whose surfaces have these reflectances, from the brightest to the faintest.
 
-    Every path is a word of reflections and transmissions at the 2 N surfaces; words that end alike are merged.
+    A breadth-first search: at each of the 2 N surfaces a path is reflected or transmitted, and paths in the same state
+    are merged. Without merging, their number would grow exponentially with the number of reflections.
     """
     surfaces = 2 * len(reflectances)
-    nothing = (0,) * len(reflectances), (0,) * len(reflectances), (0,) * (surfaces - 1)
-    reached: dict[_State, int] = {(0, True, *nothing): 1}
-    ended: defaultdict[tuple[bool, _Counts, _Counts, _Counts], int] = defaultdict(int)
-    while reached:
+    zeros = (0,) * len(reflectances), (0,) * len(reflectances), (0,) * (surfaces - 1)
+    frontier: dict[_State, int] = {(0, True, *zeros): 1}
+    exited: defaultdict[tuple[bool, _Counts, _Counts, _Counts], int] = defaultdict(int)
+    while frontier:
         following: defaultdict[_State, int] = defaultdict(int)
-        for state, count in reached.items():
-            for surface, down, *counts in _next(state):
+        for state, count in frontier.items():
+            for surface, down, *counts in _branches(state):
                 if surface in (-1, surfaces):
-                    ended[surface == surfaces, *counts] += count  # type: ignore[index]
-                elif count * _weight(counts, reflectances) > FAINTEST:
+                    exited[surface == surfaces, *counts] += count  # type: ignore[index]
+                elif count * _weight(counts, reflectances) > MIN_ORDER_WEIGHT:
                     following[(surface, down, *counts)] += count  # type: ignore[index]
-        reached = following
-    found = [ReflectionOrder(*key, count) for key, count in ended.items()]
+        frontier = following
+    orders = [ReflectionOrder(*key, count) for key, count in exited.items()]
     return tuple(
-        sorted(found, key=lambda o: -o.count * _weight((o.reflections, o.transmissions), reflectances))
+        sorted(orders, key=lambda o: -o.count * _weight((o.reflections, o.transmissions), reflectances))
     )
 
 
 _Counts = tuple[int, ...]
 _State = tuple[int, bool, _Counts, _Counts, _Counts]
+"""The next surface, whether the path goes down (away from the camera), reflections, transmissions, traversals."""
 
 
-def _next(state: _State) -> list[_State]:
-    """A path that meets a surface goes on through it, or turns back."""
+def _branches(state: _State) -> list[_State]:
+    """The path transmitted and the path reflected at its surface."""
     surface, down, reflections, transmissions, traversals = state
     pane = surface // 2
     ahead, back = (surface + 1, surface - 1) if down else (surface - 1, surface + 1)
     return [
-        (ahead, down, reflections, _more(transmissions, pane), _crossed(traversals, surface, ahead)),
-        (back, not down, _more(reflections, pane), transmissions, _crossed(traversals, surface, back)),
+        (ahead, down, reflections, _incremented(transmissions, pane), _traversed(traversals, surface, ahead)),
+        (
+            back,
+            not down,
+            _incremented(reflections, pane),
+            transmissions,
+            _traversed(traversals, surface, back),
+        ),
     ]
 
 
-def _more(counts: _Counts, which: int) -> _Counts:
+def _incremented(counts: _Counts, which: int) -> _Counts:
     return (*counts[:which], counts[which] + 1, *counts[which + 1 :])
 
 
-def _crossed(traversals: _Counts, surface: int, following: int) -> _Counts:
+def _traversed(traversals: _Counts, surface: int, following: int) -> _Counts:
+    """The traversals after a path went from one surface to the next; no layer lies outside the stack."""
     layer = min(surface, following)
-    return _more(traversals, layer) if 0 <= layer < len(traversals) else traversals
+    return _incremented(traversals, layer) if 0 <= layer < len(traversals) else traversals
 
 
 def _weight(counts: tuple[_Counts, _Counts] | list[_Counts], reflectances: tuple[float, ...]) -> float:
     reflections, transmissions = counts[:2]
     return math.prod(
-        r**reflected * (1 - r) ** through
-        for r, reflected, through in zip(reflectances, reflections, transmissions, strict=True)
+        r**reflected * (1 - r) ** transmitted
+        for r, reflected, transmitted in zip(reflectances, reflections, transmissions, strict=True)
     )
 
 
-def order_shares(glazing: Glazing, cosine: Tensor, table: Sequence[ReflectionOrder]) -> list[Tensor]:
-    """Each order's share of its light, (3, ...) or (...); per side they sum to `all_orders`."""
-    left = [
-        _powers(pass_once(pane, cosine)) if any(pane.absorption_per_m) else None for pane in glazing.panes
+def order_throughputs(glazing: Glazing, cosine: Tensor, table: Sequence[ReflectionOrder]) -> list[Tensor]:
+    """The throughput of each order, (3, ...) or (...).
+
+    For each side they sum to `all_orders`: the last order of a side also gets the light of all fainter orders, so
+    that no energy is lost.
+    """
+    interiors = [
+        _powers(internal_transmittance(pane, cosine)) if any(pane.absorption_per_m) else None
+        for pane in glazing.panes
     ]
-    lanes = [
-        [(_powers(r), _powers(1 - r)) for r in polarised]
-        for polarised in zip(*(fresnel(cosine, pane.index) for pane in glazing.panes), strict=True)
+    polarised = [
+        [(_powers(r), _powers(1 - r)) for r in surfaces]
+        for surfaces in zip(*(fresnel(cosine, pane.index) for pane in glazing.panes), strict=True)
     ]
-    shares = []
+    throughputs = []
     for order in table:
-        share = sum((_surfaces(order, lane) for lane in lanes), torch.zeros_like(cosine)) * (order.count / 2)
-        for powers, times in zip(left, order.traversals[::2], strict=True):
-            share = share * powers(times) if powers and times else share
-        shares.append(share)
-    whole = all_orders(glazing, cosine)
-    for behind, total in ((True, whole.transmitted), (False, whole.reflected)):
-        mine = [i for i, order in enumerate(table) if order.behind == behind]
-        if mine:
-            shares[mine[-1]] = shares[mine[-1]] + (total - sum(shares[i] for i in mine))
-    return shares
+        throughput = sum(
+            (_surface_throughput(order, panes) for panes in polarised), torch.zeros_like(cosine)
+        ) * (order.count / 2)
+        for powers, times in zip(interiors, order.traversals[::2], strict=True):
+            throughput = throughput * powers(times) if powers and times else throughput
+        throughputs.append(throughput)
+    closed_form = all_orders(glazing, cosine)
+    for behind, total in ((True, closed_form.transmitted), (False, closed_form.reflected)):
+        side = [i for i, order in enumerate(table) if order.behind == behind]
+        if side:
+            throughputs[side[-1]] = throughputs[side[-1]] + (total - sum(throughputs[i] for i in side))
+    return throughputs
 
 
 def _powers(base: Tensor) -> Callable[[int], Tensor]:
-    """The base's powers, each multiplied out once."""
+    """A function that returns integer powers of the base; each is computed once."""
     known = [torch.ones_like(base), base]
 
     def power(exponent: int) -> Tensor:
@@ -214,14 +248,14 @@ def _powers(base: Tensor) -> Callable[[int], Tensor]:
     return power
 
 
-def _surfaces(
-    order: ReflectionOrder, lane: list[tuple[Callable[[int], Tensor], Callable[[int], Tensor]]]
+def _surface_throughput(
+    order: ReflectionOrder, panes: list[tuple[Callable[[int], Tensor], Callable[[int], Tensor]]]
 ) -> Tensor:
-    """What the surfaces leave to one path of an order, for one polarisation."""
+    """The product of all reflectances and transmittances along one path of an order, for one polarisation."""
     factors = [
         power(times)
         for (reflect, transmit), reflections, transmissions in zip(
-            lane, order.reflections, order.transmissions, strict=True
+            panes, order.reflections, order.transmissions, strict=True
         )
         for power, times in ((reflect, reflections), (transmit, transmissions))
         if times
@@ -229,11 +263,11 @@ def _surfaces(
     return reduce(torch.mul, factors)
 
 
-def shift_per_traversal(glazing: Glazing, cosine: Tensor) -> list[Tensor]:
-    """How far along the glass one traversal of each layer (pane, gap, pane...) takes a ray, in mm."""
+def lateral_shifts_mm(glazing: Glazing, cosine: Tensor) -> list[Tensor]:
+    """How far one traversal of each layer (pane, gap, pane...) moves a ray along the glass, in mm, (...) each."""
     shifts = []
     for pane in glazing.panes:
-        inside = inner_cosine(cosine, pane.index)
+        inside = refracted_cosine(cosine, pane.index)
         shifts += [pane.thickness_mm * _tangent(inside), glazing.gap_mm * _tangent(cosine)]
     return shifts[:-1]
 
@@ -243,6 +277,6 @@ def _tangent(cosine: Tensor) -> Tensor:
 
 
 def ghost_distance_mm(pane: Pane, incidence_deg: float) -> float:
-    """How far apart the mirror images of a pane's two surfaces are: 2 t tan(theta_t) cos(theta_i)."""
+    """Distance between the mirror images in a pane's two surfaces, across the view: 2 t tan(theta_t) cos(theta_i)."""
     cosine = torch.tensor(math.cos(math.radians(incidence_deg)), dtype=torch.float64)
-    return float(2 * pane.thickness_mm * _tangent(inner_cosine(cosine, pane.index)) * cosine)
+    return float(2 * pane.thickness_mm * _tangent(refracted_cosine(cosine, pane.index)) * cosine)

@@ -1,8 +1,8 @@
-"""Rough or wedged panes: each order is followed surface by surface, at each rough surface through a random facet.
+"""Rough or wedged panes: each order is traced surface by surface, through one sampled microfacet per rough surface.
 
-All orders of a ray are followed (no chance decides between reflection and transmission); where a path leaves
-through a rough surface into light from a map, light drawn from the map joins in (multiple importance sampling,
-Veach 1995), or a small sun would be noise.
+Every path is split into a reflected and a transmitted one at each surface; no random choice decides between them.
+A path that leaves through a rough surface towards a map uses multiple importance sampling (Veach 1997, chapter 9):
+microfacet samples alone would find a small sun so rarely that it is noise.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ import torch
 from torch import Tensor
 
 from brewster.render.rays.emitters import Rays, SideEmitters
-from brewster.render.rays.ggx import seen_density, shadowing, visible_facet
+from brewster.render.rays.ggx import sample_visible_normal, smith_g1, vndf_over_cosine
 from brewster.render.rays.layered_glass import fresnel
 from brewster.render.rays.sobol import SobolPoints
-from brewster.render.rays.vectors import dot, unit
+from brewster.render.rays.vectors import dot, normalize
 from brewster.scene.glass import Glazing
 
-FAINTEST: Final = 1e-4
-"""Orders whose rays carry less on average are not followed: rough glass has very many."""
-_FARTHEST_MM: Final = 1e7
-_WORTH_LIGHT: Final = 3e-3
-"""Orders fainter than this are lit by chance alone."""
+MIN_PATH_WEIGHT: Final = 1e-4
+"""Orders with a smaller mean weight end. It is larger than `layered_glass.MIN_ORDER_WEIGHT`: here paths cannot merge."""
+_MAX_DISTANCE_MM: Final = 1e7
+_MIN_LIGHT_SAMPLING_WEIGHT: Final = 3e-3
+"""Orders with a smaller mean weight use microfacet samples only; their noise is too faint to see."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """One side of a pane: a point on its axis, its normal towards the camera, (3, 1), and what is below it."""
+    """One surface of a pane: its height on the z axis, its normal towards the camera, (3, 1), and what is below it."""
 
     height_mm: float
     normal: Tensor
@@ -38,26 +38,28 @@ class Surface:
     index: float
     glass_is_below: bool
     absorption: Tensor
-    """Of the pane it belongs to, per mm, (3, 1)."""
+    """Absorption of the pane that the surface belongs to, per mm, (3, 1)."""
 
 
 @dataclass(frozen=True)
 class _PathState:
-    """Rays on their way: where, whereto, and their weights (3, N) for s and p light."""
+    """Rays on one order: origins, directions and weights for s- and p-polarised light, (3, N) each."""
 
     origin: Tensor
     direction: Tensor
     s: Tensor
     p: Tensor
     surface: int
+    """The surface that the rays meet next; -1 or the number of surfaces when they have left the glass."""
     down: bool
+    """Whether they go away from the camera."""
     reflections: int
-    entered_last: bool
+    entered_last_pane: bool
 
 
 @dataclass(frozen=True)
 class ExitingLight:
-    """What one order brings from one side, (3, N)."""
+    """The light of one order from one side, (3, N); `in_paper` says whether the paper's T or R contains it."""
 
     behind: bool
     in_paper: bool
@@ -65,170 +67,217 @@ class ExitingLight:
 
 
 def surfaces(glass: Glazing, like: Tensor) -> list[Surface]:
-    """The glazing's surfaces from the camera on, in its own frame; a wedge turns a pane's far surface."""
-    found, height = [], 0.0
+    """The surfaces of a glazing in its own frame, from the camera on; tensors have the dtype and device of `like`.
+
+    A wedge rotates the pane's far surface.
+    """
+    stack, height = [], 0.0
     for pane in glass.panes:
         absorption = like.new_tensor(pane.absorption_per_m)[:, None] / 1000
         for far in (False, True):
             wedge = torch.tensor(pane.wedge_deg if far else 0.0).deg2rad()
             normal = like.new_tensor([wedge.sin(), 0, wedge.cos()])[:, None]
             height -= pane.thickness_mm if far else 0.0
-            alpha = pane.roughness if pane.index > 1 else 0.0  # what does not bend light does not scatter it
-            found.append(Surface(height, normal, alpha, pane.index, not far, absorption))
+            alpha = pane.roughness if pane.index > 1 else 0.0  # without refraction there is no scattering
+            stack.append(Surface(height, normal, alpha, pane.index, not far, absorption))
         height -= glass.gap_mm
-    return found
+    return stack
 
 
-def follow(
-    glass: Glazing, rays: Rays, behind: SideEmitters, front: SideEmitters, chance: SobolPoints
+def trace_orders(
+    glass: Glazing, rays: Rays, behind: SideEmitters, front: SideEmitters, sobol: SobolPoints
 ) -> Iterator[ExitingLight]:
-    """Every order of the rays until it is too faint, and what light it meets behind or in front."""
+    """Traces every order of the rays until its weight is too small; yields the light of each order that exits.
+
+    Radiance is scaled by the squared index ratio at each refraction. These factors cancel and are left out: every
+    path starts and ends in air.
+    """
     stack = surfaces(glass, rays.direction)
     ones = torch.ones_like(rays.direction)
-    waiting = [_PathState(rays.origin, rays.direction, ones, ones, 0, True, 0, False)]
-    while waiting:
-        path = waiting.pop()
-        for following, meeting in _meet(path, stack, chance):
+    pending = [_PathState(rays.origin, rays.direction, ones, ones, 0, True, 0, False)]
+    while pending:
+        path = pending.pop()
+        for following, interaction in _interact(path, stack, sobol):
             if 0 <= following.surface < len(stack):
-                if _remaining(following) > FAINTEST:
-                    waiting.append(following)
+                if _mean_weight(following) > MIN_PATH_WEIGHT:
+                    pending.append(following)
                 continue
             is_behind = following.surface > 0
-            light = _arriving(following, meeting, behind if is_behind else front, rays.share, chance)
-            in_paper = following.reflections == 0 if is_behind else not following.entered_last
+            emitters = behind if is_behind else front
+            light = _exit_radiance(following, interaction, emitters, rays.footprint_px, sobol)
+            in_paper = following.reflections == 0 if is_behind else not following.entered_last_pane
             yield ExitingLight(is_behind, in_paper, light)
 
 
-def _remaining(path: _PathState) -> float:
-    """The mean weight of the rays: facets may turn some to where glass reflects all, so none is typical."""
+def _mean_weight(path: _PathState) -> float:
+    """The mean over all rays: microfacets turn some of them to total reflection, so a single ray is not typical."""
     return float((path.s + path.p).mean()) / 2
 
 
 @dataclass(frozen=True)
 class _SurfaceInteraction:
-    """A ray at a surface: what a light sample needs to know of it."""
+    """Rays at a surface, and all that is needed to evaluate another direction there (for light sampling)."""
 
-    towards: Tensor
+    wi: Tensor
+    """Unit directions back along the rays, (3, N)."""
     normal: Tensor
+    """Surface normal on the side of `wi`, (3, 1)."""
     alpha: float
-    index_here: float
-    index_beyond: float
+    index_in: float
+    """Refractive index on the side of `wi`."""
+    index_out: float
     reflects: bool
     before: _PathState
-    """The path as it arrives, with the weights it has there."""
+    """The path as it arrives, with its weights before the surface."""
 
 
-def _meet(
-    path: _PathState, stack: list[Surface], chance: SobolPoints
+def _interact(
+    path: _PathState, stack: list[Surface], sobol: SobolPoints
 ) -> Iterator[tuple[_PathState, _SurfaceInteraction]]:
-    """A path reflected and a path transmitted at the surface that it comes to."""
+    """Splits a path at its next surface: yields the reflected path, then the transmitted one."""
     surface = stack[path.surface]
     in_glass = surface.glass_is_below != path.down
-    away = (_height(surface) - dot(surface.normal, path.origin)) / dot(surface.normal, path.direction)
-    away = away.nan_to_num(0, 0, 0).clamp(0, _FARTHEST_MM)  # paths of no weight may run along the glass
-    point = path.origin + away * path.direction
-    left = torch.exp(-surface.absorption * away) if in_glass else torch.ones_like(surface.absorption)
+    distance = (_plane_offset(surface) - dot(surface.normal, path.origin)) / dot(
+        surface.normal, path.direction
+    )
+    # Paths of weight 0 may run parallel to the glass: their distance must stay finite, or 0 * inf gives NaN.
+    distance = distance.nan_to_num(0, 0, 0).clamp(0, _MAX_DISTANCE_MM)
+    point = path.origin + distance * path.direction
+    # Beer-Lambert law over the length of each ray.
+    left = torch.exp(-surface.absorption * distance) if in_glass else torch.ones_like(surface.absorption)
     before = replace(path, origin=point, s=path.s * left, p=path.p * left)
     normal = surface.normal if path.down else -surface.normal
-    towards = -path.direction
-    facet = visible_facet(towards, normal, surface.alpha, chance.pair()) if surface.alpha else normal
-    here, beyond = (surface.index, 1.0) if in_glass else (1.0, surface.index)
+    wi = -path.direction
+    facet = sample_visible_normal(wi, normal, surface.alpha, sobol.next_2d()) if surface.alpha else normal
+    index_in, index_out = (surface.index, 1.0) if in_glass else (1.0, surface.index)
     for reflects in (True, False):
-        meeting = _SurfaceInteraction(towards, normal, surface.alpha, here, beyond, reflects, before)
-        direction = _turned(meeting, facet)
-        shares = _shares(meeting, facet, direction)
-        yield _onward(meeting, direction, shares, last=path.surface == len(stack) - 2), meeting
+        interaction = _SurfaceInteraction(wi, normal, surface.alpha, index_in, index_out, reflects, before)
+        direction = _scattered_direction(interaction, facet)
+        weights = _facet_weights(interaction, facet, direction)
+        is_last_pane = path.surface == len(stack) - 2
+        yield _continued(interaction, direction, weights, is_last_pane=is_last_pane), interaction
 
 
-def _onward(
-    meeting: _SurfaceInteraction, direction: Tensor, shares: tuple[Tensor, Tensor], *, last: bool
+def _continued(
+    interaction: _SurfaceInteraction,
+    direction: Tensor,
+    weights: tuple[Tensor, Tensor],
+    *,
+    is_last_pane: bool,
 ) -> _PathState:
-    """The path that leaves a surface; `last` says that the surface is the last pane's first."""
-    before, down = meeting.before, meeting.before.down != meeting.reflects
+    """The path after a surface; `is_last_pane` marks the first surface of the last pane."""
+    before, down = interaction.before, interaction.before.down != interaction.reflects
     return _PathState(
         before.origin,
         direction,
-        before.s * shares[0],
-        before.p * shares[1],
+        before.s * weights[0],
+        before.p * weights[1],
         before.surface + (1 if down else -1),
         down,
-        before.reflections + meeting.reflects,
-        before.entered_last or (last and before.down and not meeting.reflects),
+        before.reflections + interaction.reflects,
+        before.entered_last_pane or (is_last_pane and before.down and not interaction.reflects),
     )
 
 
-def _height(surface: Surface) -> Tensor:
+def _plane_offset(surface: Surface) -> Tensor:
+    """d of the plane equation dot(normal, x) = d."""
     return surface.normal[2] * surface.height_mm
 
 
-def _turned(meeting: _SurfaceInteraction, facet: Tensor) -> Tensor:
-    """The direction after reflection or refraction at facets; where there is none (total reflection), any."""
-    cosine = dot(meeting.towards, facet)
-    if meeting.reflects:
-        return 2 * cosine * facet - meeting.towards
-    ratio = meeting.index_here / meeting.index_beyond
-    beyond = (1 - ratio**2 * (1 - cosine**2)).clamp(min=0).sqrt()
-    return (ratio * cosine - beyond) * facet - ratio * meeting.towards
+def _scattered_direction(interaction: _SurfaceInteraction, facet: Tensor) -> Tensor:
+    """The direction after reflection or refraction at microfacets (Walter et al. 2007, eq. 39 and 40).
+
+    Where total reflection leaves no refracted direction, the result is arbitrary; its weight is 0.
+    """
+    cosine = dot(interaction.wi, facet)
+    if interaction.reflects:
+        return 2 * cosine * facet - interaction.wi
+    ratio = interaction.index_in / interaction.index_out
+    cosine_out = (1 - ratio**2 * (1 - cosine**2)).clamp(min=0).sqrt()
+    return (ratio * cosine - cosine_out) * facet - ratio * interaction.wi
 
 
-def _shares(meeting: _SurfaceInteraction, facet: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """Weights of a drawn facet for s and p light: Fresnel's share, and the shadowing on the way out."""
-    cosine = dot(meeting.towards, facet)
-    reflected = _reflectances(cosine, meeting.index_here, meeting.index_beyond)
-    leaving = dot(direction, meeting.normal) * (1 if meeting.reflects else -1)
-    lit = (leaving > 0) & (cosine > 0)
-    seen = shadowing(leaving, meeting.alpha) * lit if meeting.alpha else lit.float()
-    s, p = ((r if meeting.reflects else 1 - r) * seen for r in reflected)
+def _facet_weights(
+    interaction: _SurfaceInteraction, facet: Tensor, direction: Tensor
+) -> tuple[Tensor, Tensor]:
+    """BSDF times cosine over density, for s- and p-polarised light, (N,) each.
+
+    With visible normals and the separable Smith term G1(wi) G1(wo), all but Fresnel's factor and G1(wo) cancels
+    (Heitz 2018).
+    """
+    cosine = dot(interaction.wi, facet)
+    reflected = _reflectances(cosine, interaction.index_in, interaction.index_out)
+    cosine_out = dot(direction, interaction.normal) * (1 if interaction.reflects else -1)
+    # Facets that are seen from behind, or that send light through the wrong side of the surface, carry nothing.
+    valid = (cosine_out > 0) & (cosine > 0)
+    visible = smith_g1(cosine_out, interaction.alpha) * valid if interaction.alpha else valid.float()
+    s, p = ((r if interaction.reflects else 1 - r) * visible for r in reflected)
     return s, p
 
 
-def _reflectances(cosine: Tensor, here: float, beyond: float) -> tuple[Tensor, Tensor]:
-    """Fresnel's reflectances from either side, 1 where the reflection is total."""
-    if here <= beyond:
-        return fresnel(cosine.clamp(1e-4, 1), beyond)
-    squared = 1 - here**2 * (1 - cosine**2)
-    s, p = fresnel(squared.clamp(min=1e-8).sqrt(), here)
+def _reflectances(cosine: Tensor, index_in: float, index_out: float) -> tuple[Tensor, Tensor]:
+    """Fresnel reflectances for s- and p-polarised light from either side; 1 under total reflection."""
+    if index_in <= index_out:
+        return fresnel(cosine.clamp(1e-4, 1), index_out)
+    # From inside, evaluate at the refracted angle in air: both directions of a path have the same reflectance.
+    squared = 1 - index_in**2 * (1 - cosine**2)
+    s, p = fresnel(squared.clamp(min=1e-8).sqrt(), index_in)
     return torch.where(squared <= 0, 1.0, s), torch.where(squared <= 0, 1.0, p)
 
 
-def _arriving(
-    path: _PathState, meeting: _SurfaceInteraction, light: SideEmitters, share: float, chance: SobolPoints
+def _exit_radiance(
+    path: _PathState,
+    interaction: _SurfaceInteraction,
+    emitters: SideEmitters,
+    footprint_px: float,
+    sobol: SobolPoints,
 ) -> Tensor:
-    """The light that an order brings: along its own direction, joined by light drawn from the map."""
+    """The light of an order, (3, N): a microfacet sample and a light sample, joined by the balance heuristic.
+
+    The heuristic weighs a sample by its density over the sum of both densities (Veach 1997, eq. 9.8).
+    """
     weight = (path.s + path.p) / 2
-    seen = light.along(path.origin, path.direction, share)
-    if not (meeting.alpha and light.map and _remaining(path) > _WORTH_LIGHT):
-        return weight * seen
-    own = _density(meeting, path.direction)
-    balance = own / (own + light.density(path.origin, path.direction)).clamp(min=1e-20)
-    direction, density = light.draw(path.origin, chance.pair())
-    facet = _half(meeting, direction)
-    s, p = _shares(meeting, facet, direction)
-    own = _density(meeting, direction)
-    other = own / (density + own).clamp(min=1e-20)
-    weight_drawn = (meeting.before.s * s + meeting.before.p * p) / 2 * other
-    return weight * seen * balance + weight_drawn * light.along(path.origin, direction, share)
+    radiance = emitters.radiance(path.origin, path.direction, footprint_px)
+    if not (interaction.alpha and emitters.envmap and _mean_weight(path) > _MIN_LIGHT_SAMPLING_WEIGHT):
+        return weight * radiance
+    facet_pdf = _scattering_pdf(interaction, path.direction)
+    balance = facet_pdf / (facet_pdf + emitters.pdf(path.origin, path.direction)).clamp(min=1e-20)
+    direction, light_pdf = emitters.sample(path.origin, sobol.next_2d())
+    facet = _half_vector(interaction, direction)
+    s, p = _facet_weights(interaction, facet, direction)
+    facet_pdf = _scattering_pdf(interaction, direction)
+    # The weights s and p are f cos / facet_pdf. The light sample needs f cos / light_pdf, times the heuristic's
+    # light_pdf / (light_pdf + facet_pdf): light_pdf cancels.
+    ratio = facet_pdf / (light_pdf + facet_pdf).clamp(min=1e-20)
+    light_weight = (interaction.before.s * s + interaction.before.p * p) / 2 * ratio
+    return weight * radiance * balance + light_weight * emitters.radiance(
+        path.origin, direction, footprint_px
+    )
 
 
-def _half(meeting: _SurfaceInteraction, direction: Tensor) -> Tensor:
-    """The facet that sends light between the two directions."""
-    if meeting.reflects:
-        half = meeting.towards + direction
+def _half_vector(interaction: _SurfaceInteraction, direction: Tensor) -> Tensor:
+    """Normals of the facets that scatter `wi` into `direction` (Walter et al. 2007, eq. 13 and 16)."""
+    if interaction.reflects:
+        half = interaction.wi + direction
     else:
-        half = -(meeting.index_here * meeting.towards + meeting.index_beyond * direction)
-    half = unit(half)
-    return half * torch.sign(dot(half, meeting.normal))
+        half = -(interaction.index_in * interaction.wi + interaction.index_out * direction)
+    half = normalize(half)
+    return half * torch.sign(dot(half, interaction.normal))
 
 
-def _density(meeting: _SurfaceInteraction, direction: Tensor) -> Tensor:
-    """How densely facets send light into `direction`, per solid angle, (N,)."""
-    facet = _half(meeting, direction)
-    cosine, leaving = dot(meeting.towards, facet), dot(direction, facet)
-    seen = seen_density(meeting.towards, meeting.normal, facet, meeting.alpha)
-    if meeting.reflects:
-        density, right = seen / 4, leaving > 0
+def _scattering_pdf(interaction: _SurfaceInteraction, direction: Tensor) -> Tensor:
+    """The density of microfacet samples at `direction`, per steradian, (N,).
+
+    The density of the facet's normal times the Jacobian of the half vector (Walter et al. 2007, eq. 14 and 17).
+    """
+    facet = _half_vector(interaction, direction)
+    cosine, cosine_out = dot(interaction.wi, facet), dot(direction, facet)
+    normal_pdf = vndf_over_cosine(interaction.wi, interaction.normal, facet, interaction.alpha)
+    if interaction.reflects:
+        # The Jacobian 1 / (4 cosine) cancels the cosine that `vndf_over_cosine` leaves out.
+        pdf, is_right_side = normal_pdf / 4, cosine_out > 0
     else:
-        span = meeting.index_here * cosine + meeting.index_beyond * leaving
-        jacobian = meeting.index_beyond**2 * leaving.abs() / span.square().clamp(min=1e-12)
-        density, right = seen * cosine * jacobian, leaving < 0
-    return torch.where(right & (cosine > 0), density, 0.0)
+        denominator = interaction.index_in * cosine + interaction.index_out * cosine_out
+        jacobian = interaction.index_out**2 * cosine_out.abs() / denominator.square().clamp(min=1e-12)
+        pdf, is_right_side = normal_pdf * cosine * jacobian, cosine_out < 0
+    return torch.where(is_right_side & (cosine > 0), pdf, 0.0)

@@ -1,7 +1,8 @@
-"""Random numbers for a renderer: low-discrepancy, different in every pixel, the same on every device.
+"""Quasi-random numbers for Monte Carlo rendering: well distributed in each pixel, and equal on every device.
 
-Each pair of numbers is a Sobol' point of its own scramble for each sample, turned by a random shift a pixel
-(Cranley-Patterson), so that samples of one pixel spread evenly and neighbouring pixels do not repeat each other.
+Every pair of dimensions is a 2-D Sobol' sequence with its own scrambling (Kollig and Keller 2002). Each pixel adds
+a random shift modulo 1 (Cranley and Patterson 1976), so that neighbouring pixels have uncorrelated noise.
+The numbers are drawn on the CPU, because torch's generators differ between devices.
 """
 
 from __future__ import annotations
@@ -14,39 +15,44 @@ from torch.quasirandom import SobolEngine
 
 
 class SobolPoints:
-    """Pairs of numbers in 0..1 for N pixels; in each sample, the same sequence of questions gets fresh answers."""
+    """2-D points in [0, 1) for N pixels; each call of `next_2d` within a sample takes the next two dimensions."""
 
     def __init__(self, seed: int, index: int, pixels: int, samples: int, device: torch.device | str) -> None:
         self._generator = torch.Generator().manual_seed(seed * 1_000_003 + index)
-        self._pixels, self._samples, self._device = pixels, samples, device
-        self._pairs: list[tuple[Tensor, Tensor]] = []
-        self.turn_to(0, slice(0, pixels))
+        self._pixel_count, self._sample_count, self._device = pixels, samples, device
+        self._sequences: list[tuple[Tensor, Tensor]] = []
+        self.start_sample(0, slice(0, pixels))
 
-    def turn_to(self, number: int, pixels: slice) -> None:
-        """Starts the sample of this number, 0 up to `samples`, for some of the pixels."""
-        self._number, self._some, self._asked = number, pixels, 0
+    def start_sample(self, number: int, pixels: slice) -> None:
+        """Selects sample `number` (0 to `samples` - 1) of the pixels in the slice, and restarts at the first dimension."""
+        self._sample, self._pixels, self._next = number, pixels, 0
 
-    def pair(self) -> Tensor:
-        """Two numbers for each of the pixels, (2, n) in 0..1."""
-        if self._asked == len(self._pairs):
-            self._pairs.append(self._fresh())
-        points, shift = self._pairs[self._asked]
-        self._asked += 1
-        turned = points[self._number][:, None] + shift[:, self._some]
-        return turned - turned.floor()
+    def next_2d(self) -> Tensor:
+        """The next point of each selected pixel, (2, n) in [0, 1)."""
+        if self._next == len(self._sequences):
+            self._sequences.append(self._new_sequence())
+        points, shift = self._sequences[self._next]
+        self._next += 1
+        shifted = points[self._sample][:, None] + shift[:, self._pixels]
+        return shifted - shifted.floor()
 
-    def disc(self) -> Tensor:
-        """A point on the unit disc for each of the pixels, (2, n), uniform by area (Shirley and Chiu 1997)."""
-        x, y = self.pair() * 2 - 1
-        wide = x.abs() > y.abs()
-        radius = torch.where(wide, x, y)
-        ratio = torch.where(wide, y, x) / torch.where(radius == 0, 1, radius)
-        angle = torch.where(wide, ratio * (math.pi / 4), math.pi / 2 - ratio * (math.pi / 4))
+    def next_disc(self) -> Tensor:
+        """A point on the unit disc for each selected pixel, (2, n), uniform by area.
+
+        The concentric map (Shirley and Chiu 1997) keeps points that are close in the square close on the disc, so
+        the low discrepancy of the sequence survives.
+        """
+        x, y = self.next_2d() * 2 - 1
+        x_is_larger = x.abs() > y.abs()
+        radius = torch.where(x_is_larger, x, y)
+        ratio = torch.where(x_is_larger, y, x) / torch.where(radius == 0, 1, radius)
+        angle = torch.where(x_is_larger, ratio * (math.pi / 4), math.pi / 2 - ratio * (math.pi / 4))
         return torch.stack([radius * angle.cos(), radius * angle.sin()])
 
-    def _fresh(self) -> tuple[Tensor, Tensor]:
+    def _new_sequence(self) -> tuple[Tensor, Tensor]:
         scramble = int(torch.randint(2**31, (), generator=self._generator))
-        points = SobolEngine(2, scramble=True, seed=scramble).draw(self._samples)  # type: ignore[no-untyped-call]
-        points = points[torch.randperm(self._samples, generator=self._generator)]  # or pairs would go in step
-        shift = torch.rand(2, self._pixels, generator=self._generator)
+        points = SobolEngine(2, scramble=True, seed=scramble).draw(self._sample_count)  # type: ignore[no-untyped-call]
+        # Without a random order, sample i would have similar points in all pairs of dimensions: pairs would correlate.
+        points = points[torch.randperm(self._sample_count, generator=self._generator)]
+        shift = torch.rand(2, self._pixel_count, generator=self._generator)
         return points.to(self._device), shift.to(self._device)

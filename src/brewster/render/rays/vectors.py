@@ -1,15 +1,15 @@
-"""Vectors in bulk: (3, N), one a column."""
+"""Arrays of 3-D vectors: (3, N), one vector per column."""
 
 from __future__ import annotations
 
 from torch import Tensor
 
 
-def dot(one: Tensor, other: Tensor) -> Tensor:
+def dot(a: Tensor, b: Tensor) -> Tensor:
     """Inner products, (N,)."""
-    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def unit(vectors: Tensor) -> Tensor:
-    """The same directions with length 1; zero stays zero."""
+def normalize(vectors: Tensor) -> Tensor:
+    """The vectors scaled to length 1; zero vectors stay zero."""
     return vectors * dot(vectors, vectors).clamp(min=1e-30).rsqrt()

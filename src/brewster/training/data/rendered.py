@@ -21,7 +21,7 @@ from torch import Tensor
 from brewster.environments.assets import naming
 from brewster.errors import RecipeError
 from brewster.photo import Photo
-from brewster.render.camera_response import jpeg, to_bytes
+from brewster.render.camera_response import encode_jpeg, to_uint8
 from brewster.rendered.store import SCENE, StoredSample, key, read_cause, read_set
 from brewster.scene.values import Range
 from brewster.srgb import to_encoded
@@ -165,8 +165,8 @@ def _blend(entry: StoredSample) -> Tensor:
         scene = read_cause(entry)
     background, mirror = (_picture(entry, name).permute(2, 0, 1) / 255 for name in ("background", "mirror"))
     photo, *layers = blended_layers(background, mirror, scene)
-    seen = Photo.open(jpeg(photo, scene.development.jpeg_quality)).pixels.copy()
-    return torch.cat([torch.from_numpy(picture) for picture in (seen, *map(to_bytes, layers))], dim=2)
+    seen = Photo.open(encode_jpeg(photo, scene.development.jpeg_quality)).pixels.copy()
+    return torch.cat([torch.from_numpy(picture) for picture in (seen, *map(to_uint8, layers))], dim=2)
 
 
 def _picture(entry: StoredSample, layer: str) -> Tensor:

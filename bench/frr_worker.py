@@ -1,4 +1,7 @@
-"""Runs fast-reflection-removal over the arrays named on standard input; its environment needs numpy below 2."""
+"""Runs fast-reflection-removal on .npy files whose paths come on standard input, and overwrites them with the result.
+
+bench/quality.py starts it in a separate environment, because the package needs numpy below 2.
+"""
 
 import sys
 

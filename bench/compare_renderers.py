@@ -1,9 +1,9 @@
-"""The analytic renderer beside Mitsuba: the same scenes, means and errors, with Mitsuba's own noise told apart.
+"""Compares the analytic renderer with Mitsuba on the same scenes: means, PSNR, and error relative to noise.
 
-    python bench/judge.py [SAMPLES]
+    python bench/compare_renderers.py [SAMPLES] [NAME]
 
-Two independent Mitsuba pictures tell how much of their difference to ours is their noise: with r the mean of
-both, mse(ours - r) should be mse(r1 - r2) / 4, plus our own noise where chance is needed.
+Each scene is rendered twice by both, with different random numbers, to estimate the noise. If only noise separates
+the renderers, mse(a - b) of the two means a and b equals mse(a1 - a2) / 4 + mse(b1 - b2) / 4: the last column is 1.
 """
 
 from __future__ import annotations
@@ -62,34 +62,34 @@ SCENES = {
 
 
 @contextmanager
-def averaged_at_every_surface() -> Iterator[None]:
-    """Our rough glass as Mitsuba's colour variants have theirs: s and p averaged at every facet."""
+def averaged_polarisations() -> Iterator[None]:
+    """Averages s- and p-polarised light at every microfacet of our rough glass, as Mitsuba's colour variants do."""
 
     def averaged(cosine: Tensor, here: float, beyond: float) -> tuple[Tensor, Tensor]:
-        s, p = apart(cosine, here, beyond)
+        s, p = separate(cosine, here, beyond)
         return (s + p) / 2, (s + p) / 2
 
-    apart = rough_glass._reflectances
+    separate = rough_glass._reflectances
     rough_glass._reflectances = averaged
     try:
         yield
     finally:
-        rough_glass._reflectances = apart
+        rough_glass._reflectances = separate
 
 
-def compared(scene: Scene, assets: Assets, samples: int) -> list[str]:
-    """For I, T, B, R and MR: ratio of the means, its standard error, and error over what noise explains."""
-    with averaged_at_every_surface():
+def compare(scene: Scene, assets: Assets, samples: int) -> list[str]:
+    """One row each for I, T, B, R and MR: ratio of the means - 1, its standard error, PSNR and error over noise."""
+    with averaged_polarisations():
         ours, again = render(scene, assets), render(_reseeded(scene, 1), assets)
     polarised = scene.camera.heading_deg > 30
     first, second = (
-        trace(_reseeded(scene, seed), assets, noise=0, most_samples=samples, polarised=polarised)
+        trace(_reseeded(scene, seed), assets, noise=0, max_samples=samples, polarised=polarised)
         for seed in (2, 3)
     )
-    return [_line(name, ours, again, first, second) for name in LAYERS]
+    return [_row(name, ours, again, first, second) for name in LAYERS]
 
 
-def _line(name: str, ours: LightSample, again: LightSample, first: LightSample, second: LightSample) -> str:
+def _row(name: str, ours: LightSample, again: LightSample, first: LightSample, second: LightSample) -> str:
     one, two, a, b = (getattr(sample, name).double() for sample in (ours, again, first, second))
     mine, theirs = (one + two) / 2, (a + b) / 2
     error = (mine - theirs).square().mean()
@@ -106,16 +106,18 @@ def _reseeded(scene: Scene, seed: int) -> Scene:
 
 
 def main() -> None:
-    """Prints the table in Markdown."""
+    """Prints a Markdown table of the scenes whose name contains NAME, or of all."""
     torch.set_num_threads(2)
     samples = int(sys.argv[1]) if len(sys.argv) > 1 else 1024
     assets = Assets()
-    print("mean %: ours over Mitsuba - 1 (standard error) | PSNR dB | squared error over what noise explains")
+    print(
+        "mean, %: ours / Mitsuba - 1 (standard error) | PSNR, dB | squared error / error expected from noise"
+    )
     for name, scene in SCENES.items():
         if len(sys.argv) > 2 and sys.argv[2] not in name:
             continue
         print(f"| {name} |", flush=True)
-        for layer, line in zip(LAYERS, compared(scene, assets, samples), strict=True):
+        for layer, line in zip(LAYERS, compare(scene, assets, samples), strict=True):
             print(f"|   {layer} | {line} |", flush=True)
 
 
