@@ -11,7 +11,7 @@ import pytest
 from brewster import Photo
 from brewster.errors import BrewsterError, TargetError
 from brewster.user_study.create import StudyOptions, create
-from brewster.user_study.degrade import spoil
+from brewster.user_study.degrade import degrade
 from brewster.user_study.study import read_study
 from small_studies import made, write_pictures
 
@@ -32,7 +32,7 @@ def test_a_study_is_read_as_it_was_made(tmp_path):
     assert study.description.datasets == ("nature", "real")
     assert [row.name for row in study.description.comparisons] == ["1", "1", "2", "10"]
     assert study.description.pairs == 4  # fewer than 40, as there are no more
-    assert not list(study.changed())
+    assert not list(study.changed_pictures())
 
 
 def test_the_first_method_is_compared_with_each_other_or_all_with_all(tmp_path):
@@ -68,7 +68,7 @@ def test_a_picture_is_kept_to_the_last_value_whatever_its_format(tmp_path, folde
     write_pictures(inputs, ["real/1"], suffix=".tif", seed=5)
     study = create(tmp_path / "study", inputs, methods)
     row = next(row for row in study.description.comparisons if (row.dataset, row.name) == ("real", "1"))
-    kept = Photo.open(study.file(row.photo))
+    kept = Photo.open(study.picture_file(row.photo))
     assert np.array_equal(kept.pixels, Photo.open(inputs / "real/1.tif").pixels)
     about = study.picture(row.photo)
     assert about.source_sha256 == hashlib.sha256((inputs / "real/1.tif").read_bytes()).hexdigest()
@@ -158,9 +158,9 @@ def test_a_study_is_never_written_over(tmp_path, folders):
 
 def test_a_changed_picture_is_noticed(tmp_path):
     study = made(tmp_path)
-    study.file(study.description.comparisons[0].outputs[0]).write_bytes(b"other")
+    study.picture_file(study.description.comparisons[0].outputs[0]).write_bytes(b"other")
     with pytest.raises(BrewsterError, match="missing or changed"):
-        study.refuse_changed()
+        study.verify_pictures()
 
 
 def test_a_description_that_is_none_is_refused_with_its_place(tmp_path):
@@ -182,7 +182,7 @@ def test_catch_pictures_are_the_output_spoilt_beyond_doubt(tmp_path):
     study = made(tmp_path, size=(96, 72))
     for catch in study.description.catch_pool:
         good, spoilt = (
-            Photo.open(study.file(name)).pixels.astype(float) for name in (catch.good, catch.spoilt)
+            Photo.open(study.picture_file(name)).pixels.astype(float) for name in (catch.good, catch.spoilt)
         )
         assert good.shape == spoilt.shape
         assert 10 * np.log10(255**2 / np.mean((good - spoilt) ** 2)) < 22
@@ -194,17 +194,17 @@ def test_catch_pictures_are_the_output_spoilt_beyond_doubt(tmp_path):
 def test_spoiling_is_worse_in_light_and_dark_and_keeps_the_mean(random):
     for level in (20, 128, 235):
         flat = np.full((60, 80, 3), level, np.uint8)
-        spoilt = spoil(flat, 1)
+        spoilt = degrade(flat, 1)
         assert spoilt.astype(float).std() > 10
         assert abs(spoilt.mean() - level) < 12
-    assert np.array_equal(spoil(flat, 1), spoilt)
+    assert np.array_equal(degrade(flat, 1), spoilt)
 
 
 def test_a_study_that_was_moved_is_the_same_study(tmp_path):
     study = made(tmp_path)
     moved = study.folder.rename(tmp_path / "elsewhere")
     assert read_study(moved) == replace(study, folder=moved)
-    read_study(moved).refuse_changed()
+    read_study(moved).verify_pictures()
 
 
 def test_pictures_beside_folders_of_pictures_are_named_and_refused_unless_datasets_are_named(

@@ -6,14 +6,14 @@ from itertools import islice
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brewster.user_study.assignment import draw, walk
+from brewster.user_study.assignment import comparison_sequence, draw_trials
 from small_studies import described
 
 SIZES = st.integers(1, 60).flatmap(lambda count: st.tuples(st.just(count), st.integers(1, count)))
 
 
 def shown(count, pairs, seed, people):
-    row = list(islice(walk(count, pairs, seed), people * pairs))
+    row = list(islice(comparison_sequence(count, pairs, seed), people * pairs))
     return [row[i * pairs : (i + 1) * pairs] for i in range(people)]
 
 
@@ -54,23 +54,24 @@ def test_the_paper_s_study_is_balanced_to_a_hair():
 
 def test_a_draw_depends_on_seed_and_number_only_and_differs_between_both():
     study = described()
-    trials = [draw(study, number) for number in range(6)]
-    assert trials == [draw(study, number) for number in range(6)]
+    trials = [draw_trials(study, number) for number in range(6)]
+    assert trials == [draw_trials(study, number) for number in range(6)]
     assert len(set(trials)) == 6
-    assert draw(described(seed=8), 0) != trials[0]
+    assert draw_trials(described(seed=8), 0) != trials[0]
 
 
 def test_a_draw_of_this_version_is_the_draw_of_every_version():
     """Links are sent out, and a study may last longer than an installation."""
     first = [
-        (trial.comparison, trial.flipped) for trial in draw(described(pictures=4, pairs=4, catches=0), 0)
+        (trial.comparison, trial.flipped)
+        for trial in draw_trials(described(pictures=4, pairs=4, catches=0), 0)
     ]
     assert first == [(4, False), (1, True), (5, False), (7, True)]
 
 
 def test_sides_and_pictures_agree_with_what_the_trial_says():
     study = described()
-    for trial in draw(study, 3):
+    for trial in draw_trials(study, 3):
         if trial.comparison is not None:
             row = study.comparisons[trial.comparison]
             assert row.photo == trial.photo
@@ -80,7 +81,7 @@ def test_sides_and_pictures_agree_with_what_the_trial_says():
 def test_catch_trials_are_of_both_kinds_and_on_photos_that_are_not_the_participant_s_own():
     study = described(catches=4)
     for number in range(20):
-        trials = draw(study, number)
+        trials = draw_trials(study, number)
         catches = [trial for trial in trials if trial.expected]
         assert Counter("equal" if trial.left == trial.right else "spoilt" for trial in catches) == {
             "equal": 2,
@@ -99,7 +100,7 @@ def test_the_order_does_not_tell_the_catch_trials():
     places = Counter(
         place
         for number in range(120)
-        for place, trial in enumerate(draw(described(), number))
+        for place, trial in enumerate(draw_trials(described(), number))
         if trial.expected
     )
     assert len(places) == 10

@@ -91,7 +91,7 @@ def test_the_keyboard_alone_leads_from_consent_to_thanks(open_page, url, store):
         press(page, key)
     expect(page.get_by_role("heading", name="Thank you.")).to_be_focused()
     expect(page.get_by_text("All 4 answers are saved.")).to_be_visible()
-    ((_, answers),) = store.everything()
+    ((_, answers),) = store.all_answers()
     given = [answer.choice for answer in answers.values()]
     assert given == ["left", "similar", "right", "left"]
     assert all(0.3 < answer.seconds < 60 for answer in answers.values())
@@ -114,11 +114,11 @@ def test_who_stops_goes_on_with_the_same_link_elsewhere_and_with_no_other(open_p
 def test_what_is_seen_are_the_pictures_of_the_trial_on_their_sides_and_all_has_a_name(open_page, url, store):
     page = open_page(url, viewport={"width": 1280, "height": 800})
     begin(page)
-    ((person, _),) = store.everything()
+    ((person, _),) = store.all_answers()
     page.wait_for_timeout(300)  # until they have faded in
     for side in ("left", "photo", "right"):
         seen = Photo.open(page.locator(f".{side} .frame").screenshot()).linear()
-        truth = Photo.open(store.study.file(getattr(person.trials[0], side)))
+        truth = Photo.open(store.study.picture_file(getattr(person.trials[0], side)))
         assert (
             np.median(np.abs(seen - truth.small(*seen.shape[1::-1]))) < 0.002
         )  # not the mean: edges are smoothed
@@ -183,7 +183,7 @@ def test_an_answer_that_the_network_swallows_is_sent_until_it_is_kept(open_page,
     expect(page.get_by_text("Not saved yet")).to_be_visible()
     page.keyboard.press("3")  # does nothing meanwhile
     expect(page.get_by_text("Pair 2 of 4").first).to_be_visible(timeout=15_000)
-    ((_, answers),) = store.everything()
+    ((_, answers),) = store.all_answers()
     assert [answer.choice for answer in answers.values()] == ["left"]
     assert len(posts) == 2
 
@@ -206,7 +206,7 @@ def test_a_phone_shows_all_without_scrolling_sideways_and_takes_fingers(open_pag
     page.wait_for_timeout(320)
     buttons[2].tap()
     expect(page.get_by_text("Pair 2 of 4").first).to_be_visible()
-    ((_, answers),) = store.everything()
+    ((_, answers),) = store.all_answers()
     assert answers[0].choice == "right"
 
 
@@ -232,7 +232,7 @@ def test_arrows_up_and_down_scroll_and_the_focus_stays_where_it_was(open_page, u
     page.wait_for_timeout(320)
     page.keyboard.down("Enter")  # still: a repeat
     page.wait_for_timeout(200)
-    ((_, answers),) = store.everything()
+    ((_, answers),) = store.all_answers()
     assert [answer.choice for answer in answers.values()] == ["similar"] * 3
 
 

@@ -47,7 +47,7 @@ def answer_all(study, people, rng):
         person = store.participant(store.admit())
         for number, trial in enumerate(person.trials):
             choice = trial.expected or choice_for(trial, rng.choice(3, p=[0.6, 0.2, 0.2]))
-            store.answer(person, number, choice, seconds=4)
+            store.record_answer(person, number, choice, seconds=4)
     store.close()
 
 

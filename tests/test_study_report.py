@@ -11,14 +11,26 @@ import pytest
 
 from brewster import Photo
 from brewster.errors import BrewsterError
-from brewster.user_study.assignment import TrialDraw, draw
+from brewster.user_study.assignment import TrialDraw, draw_trials
 from brewster.user_study.report import figure
 from brewster.user_study.report.bradley_terry import strengths
 from brewster.user_study.report.figure import plot
 from brewster.user_study.report.krippendorff import alpha
-from brewster.user_study.report.participants import ExclusionRule, ParticipantAnswers, outcome, people
+from brewster.user_study.report.participants import (
+    ExclusionRule,
+    ParticipantAnswers,
+    collect_answers,
+    outcome,
+)
 from brewster.user_study.report.results import AVERAGES, summarise, write
-from brewster.user_study.report.statistics import averages, correlation, interval, rates, resampled, summed
+from brewster.user_study.report.statistics import (
+    averages,
+    bootstrap_interval,
+    bootstrap_weights,
+    intraclass_correlation,
+    rates,
+    resampled_counts,
+)
 from brewster.user_study.report.tables import to_csv, to_latex, to_markdown
 from brewster.user_study.store import Participant, StoredAnswer
 from brewster.user_study.study import Study
@@ -85,7 +97,9 @@ def test_rates_are_told_of_each_dataset_and_in_three_averages():
 def intervals(counts):
     """Of studies that nobody shares: (2, studies, 4)."""
     people, studies = counts.shape[:2]
-    return interval(rates(summed(resampled(people, 1000), counts), np.ones((studies, 1))), people)[:, :, 0]
+    return bootstrap_interval(
+        rates(resampled_counts(bootstrap_weights(people, 1000), counts), np.ones((studies, 1))), people
+    )[:, :, 0]
 
 
 @pytest.mark.parametrize("people", [100, 12])
@@ -108,7 +122,9 @@ def test_intervals_that_forgot_the_participants_would_be_too_narrow():
 def test_a_dataset_that_nobody_answered_has_no_rate_and_hurts_no_other():
     counts = np.zeros((10, 1, 2, 3))
     counts[:, 0, 0] = [3, 1, 1]
-    low, high = interval(rates(summed(resampled(10, 200), counts), np.array([[5.0, 5]])), 10)
+    low, high = bootstrap_interval(
+        rates(resampled_counts(bootstrap_weights(10, 200), counts), np.array([[5.0, 5]])), 10
+    )
     assert low[0, 0, :3] == pytest.approx([0.6, 0.2, 0.2])
     assert high[0, 0, :3] == pytest.approx([0.6, 0.2, 0.2])
     assert np.isnan(low[0, 1]).all()
@@ -116,9 +132,9 @@ def test_a_dataset_that_nobody_answered_has_no_rate_and_hurts_no_other():
 
 def test_the_correlation_within_participants_is_found_again():
     counts = simulated(np.random.default_rng(3), 4000, 1, correlation=0.08)[:, 0, 0]
-    assert correlation(counts) == pytest.approx(0.08, abs=0.01)
-    assert correlation(counts[:1]) is None
-    assert correlation(np.tile([0.0, 3, 0], (5, 1))) is None
+    assert intraclass_correlation(counts) == pytest.approx(0.08, abs=0.01)
+    assert intraclass_correlation(counts[:1]) is None
+    assert intraclass_correlation(np.tile([0.0, 3, 0], (5, 1))) is None
 
 
 # --- strengths
@@ -210,7 +226,7 @@ def test_the_rule_leaves_out_who_does_not_look_and_nobody_else(about, reason):
 
 def answered(description, number, rng, chances, *, catches=1.0, seconds=6.0, trials=None):
     """A participant whose wishes have these chances, who passes this share of the catch trials."""
-    row = draw(description, number)
+    row = draw_trials(description, number)
     answers = {}
     for i, trial in enumerate(row[:trials]):
         if trial.expected is None:
@@ -240,7 +256,7 @@ def hundred(tmp_path_factory):
         for number in range(100)
     ]
     study = Study(tmp_path_factory.mktemp("hundred"), description)
-    who = people(everybody)
+    who = collect_answers(everybody)
     return study, who, summarise(study, who, ExclusionRule())
 
 
@@ -338,7 +354,7 @@ def test_a_rule_that_leaves_nobody_still_tells_of_everyone(hundred):
 def named(tmp_path, datasets, methods):
     description = described(pictures=3, datasets=datasets, methods=methods, catches=0)
     rng, study = np.random.default_rng(5), Study(tmp_path, description)
-    return study, people([answered(description, number, rng, TRUTH) for number in range(6)])
+    return study, collect_answers([answered(description, number, rng, TRUTH) for number in range(6)])
 
 
 def test_a_dataset_that_is_called_average_is_told_from_the_average(tmp_path):

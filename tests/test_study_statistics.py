@@ -7,15 +7,24 @@ import numpy as np
 import pytest
 from scipy.stats import binom, binomtest
 
-from brewster.user_study.report.statistics import interval, least, rates, resampled, summed, widened
+from brewster.user_study.report.statistics import (
+    agreement_bounds,
+    bootstrap_interval,
+    bootstrap_weights,
+    rates,
+    resampled_counts,
+    with_agreement_bounds,
+)
 
 
 def estimated(*counts, pictures=(1.0,)):
     """Means and the two ends of the intervals, of the counts (datasets, 3) of each participant: (3, rows, 4)."""
     counts, pictures = np.array(counts, float)[:, None], np.array([pictures], float)
     means = rates(counts.sum(axis=0), pictures)
-    ends = interval(rates(summed(resampled(len(counts), 500), counts), pictures), len(counts))
-    return np.stack([means, *widened(means, ends, least(counts, pictures))])[:, 0]
+    ends = bootstrap_interval(
+        rates(resampled_counts(bootstrap_weights(len(counts), 500), counts), pictures), len(counts)
+    )
+    return np.stack([means, *with_agreement_bounds(means, ends, agreement_bounds(counts, pictures))])[:, 0]
 
 
 @pytest.mark.parametrize("people", [2, 10, 30])
@@ -70,6 +79,6 @@ def test_near_1_the_interval_of_few_participants_holds_the_truth_in_19_of_20():
 def test_intervals_of_few_participants_are_as_wide_as_students_t(participants, quantile):
     """Resamples of n spread too little by sqrt((n - 1) / n); `quantile` is that of t with n - 1 degrees of freedom."""
     draws = np.array([NormalDist().inv_cdf((i + 0.5) / 50_000) for i in range(50_000)])
-    low, high = interval(draws[:, None], participants)[:, 0]
+    low, high = bootstrap_interval(draws[:, None], participants)[:, 0]
     assert high == pytest.approx(quantile * math.sqrt(participants / (participants - 1)), rel=0.02)
     assert low == pytest.approx(-high, rel=0.02)

@@ -60,7 +60,7 @@ def test_who_agrees_gets_a_link_and_is_led_through_all_trials(app, store):
         assert answer["kept"] == "similar"
         state = answer["next"]
     assert state["trial"] is None
-    ((_, answers),) = store.everything()
+    ((_, answers),) = store.all_answers()
     assert [answer.seconds for answer in answers.values()] == [2.5] * 8
 
 
@@ -70,7 +70,7 @@ def test_the_pictures_of_a_trial_are_those_that_were_drawn(app, store, study):
     for number, trial in enumerate(person.trials):
         for side in ("photo", "left", "right"):
             answer = ask(app, "GET", f"{link}/pictures/{number}/{side}")
-            assert answer.content == study.file(getattr(trial, side)).read_bytes()
+            assert answer.content == study.picture_file(getattr(trial, side)).read_bytes()
             assert answer.headers["content-type"] == "image/png"
 
 
@@ -94,7 +94,7 @@ def test_an_answer_sent_twice_is_kept_once_and_the_first_one_stays(app, store):
     assert reply(app, link, 0, "left").json()["kept"] == "left"
     again = reply(app, link, 0, "right").json()
     assert (again["kept"], again["next"]["trial"]) == ("left", 1)
-    ((_, answers),) = store.everything()
+    ((_, answers),) = store.all_answers()
     assert len(answers) == 1
 
 
@@ -112,13 +112,13 @@ def test_an_answer_that_is_none_is_refused_in_a_sentence(app, store, wrong):
     answer = ask(app, "POST", f"{begin(app)}/answers", json=wrong)
     assert answer.status_code == 422
     assert answer.json()["error"]
-    assert [len(answers) for _, answers in store.everything()] == [0]
+    assert [len(answers) for _, answers in store.all_answers()] == [0]
 
 
 def test_without_agreement_there_is_no_link(app, store):
     for body in ({}, {"agreed": False}, {"agreed": True, "name": "Jo"}):
         assert ask(app, "POST", "/participants", json=body).status_code == 422
-    assert store.count() == 0
+    assert store.count_participants() == 0
 
 
 def test_a_link_that_nobody_has_is_told_so(app):
@@ -140,7 +140,9 @@ def test_trials_beyond_the_last_are_told_so(app):
 
 
 def test_a_full_study_lets_nobody_else_in_and_those_inside_go_on(study, store):
-    app = application(participants(study, store, most=1), guard=RequestLimits(), home="study.html")
+    app = application(
+        participants(study, store, max_participants=1), guard=RequestLimits(), home="study.html"
+    )
     link = begin(app)
     assert not ask(app, "GET", "/invitation").json()["is_open"]
     refused = ask(app, "POST", "/participants", json={"agreed": True})
@@ -200,7 +202,7 @@ def test_a_picture_that_is_gone_is_told_so_and_not_as_a_failure_that_passes(tmp_
         app = application(participants(study, store), guard=RequestLimits(), home="study.html")
         link = begin(app)
         trial = store.participant(link.removeprefix("/s/")).trials[0]
-        study.file(trial.left).unlink()
+        study.picture_file(trial.left).unlink()
         answer = ask(app, "GET", f"{link}/pictures/0/left")
     assert answer.status_code == 410  # the page asks again after 500 and more
     assert answer.json()["error"].startswith("a picture is missing on the server")

@@ -10,38 +10,38 @@ from typing import Final
 
 from brewster.errors import BrewsterError, TargetError
 
-_WHOLE: Final = re.compile(r"[A-Za-z0-9_-]{16,200}")
+_PATTERN: Final = re.compile(r"[A-Za-z0-9_-]{16,200}")
 
 
-def kept_token(folder: Path) -> str:
+def load_or_create_token(folder: Path) -> str:
     """The token in the folder of a study, made where there is none, in a file that only its owner may read.
 
     Raises:
         BrewsterError: what is there is none.
         TargetError: it cannot be read or written.
     """
-    place = folder / "token"
+    path = folder / "token"
     try:
-        if not place.exists():
-            _write(place, secrets.token_urlsafe(16))
-        token = place.read_text("latin-1").strip()
+        if not path.exists():
+            _write(path, secrets.token_urlsafe(16))
+        token = path.read_text("latin-1").strip()
     except OSError as error:
         raise TargetError(
-            f"{place} cannot be used ({error.strerror or error})",
+            f"{path} cannot be used ({error.strerror or error})",
             "a token that is kept is read and written there",
             "mend that, or give the token itself: --token TOKEN",
         ) from error
-    if not _WHOLE.fullmatch(token):
+    if not _PATTERN.fullmatch(token):
         raise BrewsterError(
-            f"{place} holds no token",
+            f"{path} holds no token",
             "16 letters or more, of A-Z a-z 0-9 _ and -",
             "remove it for a new one; links that were sent out hold only with the old one",
         )
     return token
 
 
-def _write(place: Path, token: str) -> None:
-    with os.fdopen(os.open(place, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+def _write(path: Path, token: str) -> None:
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
         file.write(f"{token}\n")
         file.flush()
         os.fsync(file.fileno())

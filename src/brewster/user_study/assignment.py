@@ -15,7 +15,6 @@ from typing import Final, Literal, final
 
 from brewster.user_study.study import CatchTrial, StudyDescription
 
-Side = Literal["left", "right"]
 Choice = Literal["left", "similar", "right"]
 CHOICES: Final[tuple[Choice, ...]] = ("left", "similar", "right")
 
@@ -36,22 +35,22 @@ class TrialDraw:
     expected: Choice | None = None
 
 
-def draw(description: StudyDescription, number: int) -> tuple[TrialDraw, ...]:
+def draw_trials(description: StudyDescription, number: int) -> tuple[TrialDraw, ...]:
     """The trials of the participant of this number (from 0), in their order.
 
     Walks the row from its start: 0.3 s for the ten-thousandth participant.
     """
     count, pairs = len(description.comparisons), description.pairs
-    row = walk(count, pairs, description.seed)
-    own = list(itertools.islice(row, number * pairs, (number + 1) * pairs))
+    sequence = comparison_sequence(count, pairs, description.seed)
+    own = list(itertools.islice(sequence, number * pairs, (number + 1) * pairs))
     rng = Random(f"{description.seed}/participant/{number}")  # noqa: S311  (no secret: a published seed)
-    trials = [_compared(description, comparison, flipped) for comparison, flipped in own]
-    trials += _catches(description, {comparison for comparison, _ in own}, rng)
+    trials = [_comparison_trial(description, comparison, flipped) for comparison, flipped in own]
+    trials += _catch_trials(description, {comparison for comparison, _ in own}, rng)
     rng.shuffle(trials)
     return tuple(trials)
 
 
-def walk(count: int, pairs: int, seed: int) -> Iterator[tuple[int, bool]]:
+def comparison_sequence(count: int, pairs: int, seed: int) -> Iterator[tuple[int, bool]]:
     """The row without end: numbers of comparisons, and whether their sides are swapped.
 
     Each `pairs` of it (at most `count`) are a participant's, and hold no comparison twice. Sides are as many left as
@@ -59,16 +58,19 @@ def walk(count: int, pairs: int, seed: int) -> Iterator[tuple[int, bool]]:
     """
     flips: dict[int, bool] = {}
     order: list[int] = []
-    for turn in itertools.count():
-        rng = Random(f"{seed}/round/{turn}")  # noqa: S311
-        begun = turn * count % pairs  # of these pairs, the last round has given so many to somebody
-        seen, missing = set(order[len(order) - begun :]), -begun % pairs
-        order = _spared(rng.sample(range(count), count), seen, missing)
-        if turn % 2:  # the sides are those of the round before, swapped; left and right by turns
-            halves = [
-                _spared([c for c in order if flips[c] is flip], seen, missing // 2) for flip in (False, True)
+    for round_number in itertools.count():
+        rng = Random(f"{seed}/round/{round_number}")  # noqa: S311
+        handed_out = (
+            round_number * count % pairs
+        )  # of these pairs, the last round has given so many to somebody
+        seen, missing = set(order[len(order) - handed_out :]), -handed_out % pairs
+        order = _unseen_first(rng.sample(range(count), count), seen, missing)
+        if round_number % 2:  # the sides are those of the round before, swapped; left and right by turns
+            sides = [
+                _unseen_first([c for c in order if flips[c] is flip], seen, missing // 2)
+                for flip in (False, True)
             ]
-            order = _spared(_by_turns(*halves), seen, missing)
+            order = _unseen_first(_interleave(*sides), seen, missing)
             flips = {comparison: not flip for comparison, flip in flips.items()}
         else:
             start = rng.random() < 0.5
@@ -76,33 +78,33 @@ def walk(count: int, pairs: int, seed: int) -> Iterator[tuple[int, bool]]:
         yield from ((comparison, flips[comparison]) for comparison in order)
 
 
-def _spared(order: Sequence[int], seen: Collection[int], count: int) -> list[int]:
+def _unseen_first(order: Sequence[int], seen: Collection[int], count: int) -> list[int]:
     """The same with `count` in front that were not seen: who has begun in the round before gets none twice."""
     front = dict.fromkeys([comparison for comparison in order if comparison not in seen][:count])
     return [*front, *(comparison for comparison in order if comparison not in front)]
 
 
-def _by_turns(first: Sequence[int], second: Sequence[int]) -> list[int]:
+def _interleave(first: Sequence[int], second: Sequence[int]) -> list[int]:
     longer, shorter = (first, second) if len(first) >= len(second) else (second, first)
-    turns = itertools.chain.from_iterable(itertools.zip_longest(longer, shorter))
-    return [comparison for comparison in turns if comparison is not None]
+    interleaved = itertools.chain.from_iterable(itertools.zip_longest(longer, shorter))
+    return [comparison for comparison in interleaved if comparison is not None]
 
 
-def _compared(description: StudyDescription, number: int, flipped: bool) -> TrialDraw:
+def _comparison_trial(description: StudyDescription, number: int, flipped: bool) -> TrialDraw:
     comparison = description.comparisons[number]
     left, right = comparison.outputs[::-1] if flipped else comparison.outputs
     return TrialDraw(comparison.photo, left, right, number, flipped)
 
 
-def _catches(description: StudyDescription, own: Collection[int], rng: Random) -> list[TrialDraw]:
+def _catch_trials(description: StudyDescription, own: Collection[int], rng: Random) -> list[TrialDraw]:
     """As many as the study asks for, one half of each kind, on photos that are not the participant's own if possible."""
     photos = {description.comparisons[number].photo for number in own}
     pool = rng.sample(description.catch_pool, len(description.catch_pool))
     pool.sort(key=lambda catch: catch.photo in photos)
-    return [_catch(catch, i, rng) for i, catch in enumerate(pool[: description.catches])]
+    return [_catch_trial(catch, i, rng) for i, catch in enumerate(pool[: description.catches])]
 
 
-def _catch(catch: CatchTrial, i: int, rng: Random) -> TrialDraw:
+def _catch_trial(catch: CatchTrial, i: int, rng: Random) -> TrialDraw:
     if i % 2 == 0:
         return TrialDraw(catch.photo, catch.good, catch.good, expected="similar")
     if rng.random() < 0.5:

@@ -11,13 +11,13 @@ from typing import Final
 
 from brewster.errors import BrewsterError
 from brewster.files import SUFFIXES
-from brewster.user_study.study import ONE
+from brewster.user_study.study import UNNAMED_DATASET
 
 Key = tuple[str, str]
 """Dataset and stem."""
 
-_SHOWN: Final = 8
-_CLEAR: Final = ".transmission"
+_MAX_LISTED: Final = 8
+_TRANSMISSION: Final = ".transmission"
 
 
 def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]:
@@ -32,73 +32,83 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
     """
     if not folder.is_dir():
         raise BrewsterError(f"{folder} is no folder", "one with pictures is needed", "name another")
-    rooms = {_plain(room.name): room for room in folder.iterdir() if room.is_dir() and room.name[0] != "."}
-    rooms = {name: rooms[name] for name in sorted(rooms, key=_natural)}
-    parts = {name: stems for name, room in rooms.items() if (stems := _stems(room))}
-    if missing := [name for name in datasets if name not in parts]:
+    subfolders = {
+        _normalised(subfolder.name): subfolder
+        for subfolder in folder.iterdir()
+        if subfolder.is_dir() and subfolder.name[0] != "."
+    }
+    subfolders = {name: subfolders[name] for name in sorted(subfolders, key=_natural_key)}
+    stems_by_dataset = {
+        name: stems for name, subfolder in subfolders.items() if (stems := _list_pictures(subfolder))
+    }
+    if missing := [name for name in datasets if name not in stems_by_dataset]:
         raise BrewsterError(
             f"{folder} has no dataset {missing[0]!r}",
-            f"a folder with pictures in it; there {'is' if len(parts) == 1 else 'are'} {', '.join(parts) or 'none'}",
+            f"a folder with pictures in it; there {'is' if len(stems_by_dataset) == 1 else 'are'} {', '.join(stems_by_dataset) or 'none'}",
             "check the name",
         )
-    if not datasets and (own := _stems(folder)):
-        _refuse_both(folder, list(parts), list(own))
-        parts = {ONE: own}
+    if not datasets and (own := _list_pictures(folder)):
+        _require_one_layout(folder, list(stems_by_dataset), list(own))
+        stems_by_dataset = {UNNAMED_DATASET: own}
     found: defaultdict[Key, list[Path]] = defaultdict(list)
-    for name in dict.fromkeys(datasets or parts):
-        for path, stem in parts[name].items():
+    for name in dict.fromkeys(datasets or stems_by_dataset):
+        for path, stem in stems_by_dataset[name].items():
             found[name, stem].append(path)
-    _refuse(folder, found)
+    _require_unique_names(folder, found)
     return {key: paths[0] for key, paths in found.items()}
 
 
-def listed(words: Sequence[str]) -> str:
+def shorten_list(items: Sequence[str]) -> str:
     """The first few of them, and how many more there are."""
-    more = len(words) - _SHOWN
-    return "; ".join(words[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
+    remaining = len(items) - _MAX_LISTED
+    return "; ".join(items[:_MAX_LISTED]) + (f"; and {remaining} more" if remaining > 0 else "")
 
 
-def _refuse(folder: Path, found: dict[Key, list[Path]]) -> None:
+def _require_unique_names(folder: Path, found: dict[Key, list[Path]]) -> None:
     if not found:
         raise BrewsterError(
             f"{folder} holds no picture", "pictures, or folders of them", "name another folder"
         )
-    doubles = [" and ".join(sorted(map(str, paths))) for paths in found.values() if len(paths) > 1]
-    if doubles:
+    duplicates = [" and ".join(sorted(map(str, paths))) for paths in found.values() if len(paths) > 1]
+    if duplicates:
         raise BrewsterError(
-            f"{listed(doubles)} share a name",
+            f"{shorten_list(duplicates)} share a name",
             "pictures are paired by name, whatever their format",
             "remove all but one of each",
         )
 
 
-def _refuse_both(folder: Path, rooms: Sequence[str], own: Sequence[Path]) -> None:
-    if rooms:
+def _require_one_layout(folder: Path, subfolders: Sequence[str], own: Sequence[Path]) -> None:
+    if subfolders:
         raise BrewsterError(
-            f"{folder} holds pictures ({listed([path.name for path in own])}) beside folders of them ({', '.join(rooms)})",
+            f"{folder} holds pictures ({shorten_list([path.name for path in own])}) beside folders of them ({', '.join(subfolders)})",
             "pictures lie in a folder, or in its folders, one for each dataset",
             "move them into one of these folders, or name those that are meant: --dataset NAME",
         )
 
 
-def _stems(folder: Path) -> dict[Path, str]:
+def _list_pictures(folder: Path) -> dict[Path, str]:
     """What each picture of a folder is called, in natural order; without the other layers of one that is there."""
     pictures = {
-        path: _plain(path.stem)
+        path: _normalised(path.stem)
         for path in folder.iterdir()
         if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
     }
-    clear = {stem.removesuffix(_CLEAR) for stem in pictures.values() if stem.endswith(_CLEAR)}
-    others = {f"{stem}{layer}" for stem in clear for layer in (".reflection", ".confidence")}
-    stems = {path: stem.removesuffix(_CLEAR) for path, stem in pictures.items() if stem not in others}
-    return dict(sorted(stems.items(), key=lambda pair: (_natural(pair[1]), pair[0])))
+    separated = {
+        stem.removesuffix(_TRANSMISSION) for stem in pictures.values() if stem.endswith(_TRANSMISSION)
+    }
+    other_layers = {f"{stem}{layer}" for stem in separated for layer in (".reflection", ".confidence")}
+    stems = {
+        path: stem.removesuffix(_TRANSMISSION) for path, stem in pictures.items() if stem not in other_layers
+    }
+    return dict(sorted(stems.items(), key=lambda pair: (_natural_key(pair[1]), pair[0])))
 
 
-def _plain(name: str) -> str:
+def _normalised(name: str) -> str:
     """A name in one spelling: some systems write an accented letter as two characters."""
     return unicodedata.normalize("NFC", name)
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
+def _natural_key(name: str) -> list[tuple[int, str]]:
     """Sorts 2 before 10."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]

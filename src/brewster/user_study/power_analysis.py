@@ -1,6 +1,6 @@
 """How many participants a study needs, before anybody is asked.
 
-plan(difference=0.1, tie=0.25).participants    # 45
+required_participants(difference=0.1, tie=0.25).participants    # 45
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class PowerAnalysis:
     deviation: float
 
 
-def plan(
+def required_participants(
     *,
     difference: float,
     tie: float,
@@ -65,8 +65,8 @@ def plan(
             "choose a smaller difference, or fewer ties",
         )
     variance = 1 - tie - difference**2
-    effect = 1 + (pairs - 1) * correlation
+    design_effect = 1 + (pairs - 1) * correlation
     critical, reached = NormalDist().inv_cdf(1 - level / 2), NormalDist().inv_cdf(power)
-    least = (critical + reached) ** 2 * variance * effect / (pairs * difference**2) + critical**2 / 2
-    count = math.ceil(least)
-    return PowerAnalysis(count, count * pairs, win, lose, effect, math.sqrt(variance * correlation))
+    minimum = (critical + reached) ** 2 * variance * design_effect / (pairs * difference**2) + critical**2 / 2
+    count = math.ceil(minimum)
+    return PowerAnalysis(count, count * pairs, win, lose, design_effect, math.sqrt(variance * correlation))

@@ -21,11 +21,11 @@ from pydantic import TypeAdapter, ValidationError
 from brewster.errors import BrewsterError
 from brewster.files import write_atomically
 
-DESCRIPTION: Final = "study.json"
+DESCRIPTION_FILE: Final = "study.json"
 PICTURES: Final = "pictures"
-ANSWERS: Final = "answers.sqlite"
+ANSWERS_FILE: Final = "answers.sqlite"
 FORMAT: Final = 1
-ONE: Final = ""
+UNNAMED_DATASET: Final = ""
 """What the only dataset is called where the folders have no folders in them."""
 
 
@@ -100,7 +100,7 @@ class Study:
     folder: Path
     description: StudyDescription
 
-    def file(self, picture: str) -> Path:
+    def picture_file(self, picture: str) -> Path:
         """Where a picture lies."""
         return self.folder / PICTURES / picture
 
@@ -109,29 +109,29 @@ class Study:
         return self._by_name[name]
 
     @property
-    def answers(self) -> Path:
+    def answers_file(self) -> Path:
         """Where the answers are kept."""
-        return self.folder / ANSWERS
+        return self.folder / ANSWERS_FILE
 
     @property
     def pairs_of_methods(self) -> tuple[tuple[str, str], ...]:
         """The methods that are compared with each other, in the order of the tables."""
         return tuple(dict.fromkeys(comparison.methods for comparison in self.description.comparisons))
 
-    def changed(self) -> Iterator[str]:
+    def changed_pictures(self) -> Iterator[str]:
         """The names of pictures that are missing or are not what they were."""
         for picture in self.description.pictures:
-            path = self.file(picture.name)
+            path = self.picture_file(picture.name)
             if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != picture.sha256:
                 yield picture.name
 
-    def refuse_changed(self) -> None:
+    def verify_pictures(self) -> None:
         """Refuses a study whose pictures are not those that it was made with.
 
         Raises:
             BrewsterError: so it is.
         """
-        changed = list(self.changed())
+        changed = list(self.changed_pictures())
         if changed:
             raise BrewsterError(
                 f"{self.folder / PICTURES / changed[0]} is missing or changed, as are {len(changed) - 1} others",
@@ -151,7 +151,7 @@ def write_study(folder: Path, description: StudyDescription) -> None:
         TargetError: it is there already, or cannot be written.
     """
     text = json.dumps(asdict(description), indent=1, ensure_ascii=False)
-    write_atomically(folder / DESCRIPTION, f"{text}\n".encode())
+    write_atomically(folder / DESCRIPTION_FILE, f"{text}\n".encode())
 
 
 def read_study(folder: Path) -> Study:
@@ -160,25 +160,25 @@ def read_study(folder: Path) -> Study:
     Raises:
         BrewsterError: there is none, or its description is not one that this version understands.
     """
-    place = folder / DESCRIPTION
+    path = folder / DESCRIPTION_FILE
     try:
-        description = _DESCRIPTION.validate_json(place.read_bytes(), extra="forbid")
+        description = _DESCRIPTION.validate_json(path.read_bytes(), extra="forbid")
     except OSError as error:
         raise BrewsterError(
-            f"{place} cannot be read ({error.strerror or error})",
+            f"{path} cannot be read ({error.strerror or error})",
             "a folder that `brewster study create` has written",
             "name that folder",
         ) from error
     except ValidationError as error:
         first = error.errors()[0]
         raise BrewsterError(
-            f"{place} is no description of a study ({'.'.join(map(str, first['loc']))}: {first['msg']})",
+            f"{path} is no description of a study ({'.'.join(map(str, first['loc']))}: {first['msg']})",
             "it stays as `brewster study create` has written it",
             "create the study again",
         ) from error
     if description.format != FORMAT:
         raise BrewsterError(
-            f"{place} has format {description.format}",
+            f"{path} has format {description.format}",
             f"this version reads format {FORMAT}",
             f"use brewster {description.brewster}",
         )

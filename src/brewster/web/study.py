@@ -80,10 +80,10 @@ Side = Literal["photo", "left", "right"]
 
 
 def participants(
-    study: Study, store: AnswerStore, *, most: int | None = None, token: str | None = None
+    study: Study, store: AnswerStore, *, max_participants: int | None = None, token: str | None = None
 ) -> APIRouter:
     """The routes of a study that admits at most so many; personal links carry the guard's token, if there is one."""
-    door, router = _StudyRoutes(study, store, most, token), APIRouter(tags=["study"])
+    door, router = _StudyRoutes(study, store, max_participants, token), APIRouter(tags=["study"])
     router.get("/invitation")(door.invitation)
     router.post("/participants", status_code=201)(door.admit)
     router.get("/s/{person}", include_in_schema=False)(door.begin)
@@ -101,20 +101,20 @@ class _StudyRoutes:
 
     study: Study
     store: AnswerStore
-    most: int | None
+    max_participants: int | None
     token: str | None
 
     def invitation(self) -> Invitation:
         """What the study is about."""
         description = self.study.description
-        is_open = self.most is None or self.store.count() < self.most
+        is_open = self.max_participants is None or self.store.count_participants() < self.max_participants
         return Invitation(
             consent=description.consent, trials=description.pairs + description.catches, is_open=is_open
         )
 
     def admit(self, _agreement: Annotated[ConsentRequest, Body()]) -> PersonalLink:
         """Admits somebody who agrees to take part, and gives them a link of their own."""
-        person = self.store.admit(most=self.most)
+        person = self.store.admit(max_participants=self.max_participants)
         if person is None:
             raise HTTPException(403, "the study has all the participants that it needs; thank you for coming")
         return self._link(person)
@@ -139,7 +139,7 @@ class _StudyRoutes:
         """A picture of a trial."""
         shown = _shown(self._participant(person), trial)
         try:
-            data = self.study.file(getattr(shown, side)).read_bytes()
+            data = self.study.picture_file(getattr(shown, side)).read_bytes()
         except (
             FileNotFoundError
         ) as error:  # it does not come back by itself: the page must not ask again and again
@@ -152,7 +152,7 @@ class _StudyRoutes:
         """Keeps an answer on the disk. The first one to a trial stays: sent again, it changes nothing."""
         participant = self._participant(person)
         _shown(participant, given.trial)
-        kept = self.store.answer(participant, given.trial, given.choice, seconds=given.seconds)
+        kept = self.store.record_answer(participant, given.trial, given.choice, seconds=given.seconds)
         return AnswerResponse(kept=kept, next=self._next(participant))
 
     def _link(self, person: str) -> PersonalLink:

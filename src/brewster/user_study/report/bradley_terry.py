@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from jaxtyping import Float64
 
 Floats = NDArray[np.float64]
-_STEPS: Final = 200
-_PRECISION: Final = 1e-10
+_MAX_ITERATIONS: Final = 200
+_TOLERANCE: Final = 1e-10
 
 
 def strengths(wins: Float64[Floats, "... m m"]) -> Float64[Floats, "... m"]:
@@ -27,20 +27,20 @@ def strengths(wins: Float64[Floats, "... m m"]) -> Float64[Floats, "... m"]:
     """
     wins = wins * (1 - np.eye(wins.shape[-1]))
     total = wins + np.swapaxes(wins, -1, -2)
-    known = connected(wins)
-    worth = np.zeros(wins.shape[:-1])
-    for _ in range(_STEPS):
-        chance = 1 / (1 + np.exp(worth[..., None, :] - worth[..., :, None]))
-        slope = (wins - total * chance).sum(axis=-1)
-        bend = total * chance * (1 - chance)
-        curve = _laplacian(np.where(known[..., None, None], bend, 1.0))
-        step = np.linalg.solve(curve, slope[..., None])[..., 0]
+    is_bounded = all_connected(wins)
+    strength = np.zeros(wins.shape[:-1])
+    for _ in range(_MAX_ITERATIONS):
+        probability = 1 / (1 + np.exp(strength[..., None, :] - strength[..., :, None]))
+        gradient = (wins - total * probability).sum(axis=-1)
+        curvature = total * probability * (1 - probability)
+        hessian = _laplacian(np.where(is_bounded[..., None, None], curvature, 1.0))
+        step = np.linalg.solve(hessian, gradient[..., None])[..., 0]
         length = np.abs(step).max(axis=-1, keepdims=True)
-        worth = worth + np.where(known[..., None], step / (1 + length), 0.0)
-        if length[known].max(initial=0.0) < _PRECISION:
+        strength = strength + np.where(is_bounded[..., None], step / (1 + length), 0.0)
+        if length[is_bounded].max(initial=0.0) < _TOLERANCE:
             break
-    worth -= worth.mean(axis=-1, keepdims=True)
-    return np.where(known[..., None], worth, np.nan)
+    strength -= strength.mean(axis=-1, keepdims=True)
+    return np.where(is_bounded[..., None], strength, np.nan)
 
 
 def _laplacian(weights: Floats) -> Floats:
@@ -49,7 +49,7 @@ def _laplacian(weights: Floats) -> Floats:
     return laplacian
 
 
-def connected(wins: Float64[Floats, "... m m"]) -> NDArray[np.bool_]:
+def all_connected(wins: Float64[Floats, "... m m"]) -> NDArray[np.bool_]:
     """Whether every method has beaten every other, directly or through others, for each table."""
     reach = (wins > 0) | np.eye(wins.shape[-1], dtype=bool)
     for _ in range(wins.shape[-1].bit_length()):

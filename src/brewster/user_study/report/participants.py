@@ -38,35 +38,37 @@ class ParticipantAnswers:
 class ExclusionRule:
     """Who is left out: who fails more than this share of the catch trials, or is faster than this median time."""
 
-    most_failed: float = 0.25
-    least_seconds: float = 1.5
+    max_failed: float = 0.25
+    min_seconds: float = 1.5
 
     def __str__(self) -> str:
         return (
-            f"left out is who answers more than {self.most_failed:.0%} of the catch trials wrongly, or takes less "
-            f"than {self.least_seconds:g} s for half of all trials"
+            f"left out is who answers more than {self.max_failed:.0%} of the catch trials wrongly, or takes less "
+            f"than {self.min_seconds:g} s for half of all trials"
         )
 
-    def reason(self, person: ParticipantAnswers) -> Reason | None:
+    def reason(self, participant: ParticipantAnswers) -> Reason | None:
         """Why somebody is left out; None if they are not."""
-        if person.failed > self.most_failed * person.catches:
+        if participant.failed > self.max_failed * participant.catches:
             return "failed"
-        return "fast" if person.seconds < self.least_seconds else None
+        return "fast" if participant.seconds < self.min_seconds else None
 
 
-def people(everything: Iterable[tuple[Participant, Mapping[int, StoredAnswer]]]) -> list[ParticipantAnswers]:
+def collect_answers(
+    records: Iterable[tuple[Participant, Mapping[int, StoredAnswer]]],
+) -> list[ParticipantAnswers]:
     """All participants who answered anything; what they did answer counts, whether or not they came to the end."""
-    return [_person(participant, answers) for participant, answers in everything if answers]
+    return [_participant_answers(participant, answers) for participant, answers in records if answers]
 
 
-def _person(participant: Participant, answers: Mapping[int, StoredAnswer]) -> ParticipantAnswers:
+def _participant_answers(participant: Participant, answers: Mapping[int, StoredAnswer]) -> ParticipantAnswers:
     shown = [(participant.trials[trial], answer.choice) for trial, answer in answers.items()]
-    caught = [trial.expected == choice for trial, choice in shown if trial.expected]
+    passed = [trial.expected == choice for trial, choice in shown if trial.expected]
     return ParticipantAnswers(
         participant.number,
         {trial.comparison: outcome(trial, choice) for trial, choice in shown if trial.comparison is not None},
-        len(caught),
-        caught.count(False),
+        len(passed),
+        passed.count(False),
         median(answer.seconds for answer in answers.values()),
         len(answers) == len(participant.trials),
     )

@@ -22,7 +22,7 @@ _EQUAL: Final = 1e-9
 Floats = NDArray[np.float64]
 
 
-def resampled(participants: int, resamples: int = RESAMPLES) -> Float64[Floats, "r p"]:
+def bootstrap_weights(participants: int, resamples: int = RESAMPLES) -> Float64[Floats, "r p"]:
     """How often each participant is in each resample.
 
     Cluster bootstrap (Davison and Hinkley 1997, section 3.8): as many participants as there are, drawn with
@@ -32,9 +32,9 @@ def resampled(participants: int, resamples: int = RESAMPLES) -> Float64[Floats, 
     return rng.multinomial(participants, np.full(participants, 1 / participants), resamples).astype(float)
 
 
-def summed(times: Floats, counts: Floats) -> Floats:
+def resampled_counts(weights: Floats, counts: Floats) -> Floats:
     """The counts (p, ...) of each resample, (r, ...)."""
-    totals: Floats = (times @ counts.reshape(len(counts), -1)).reshape(len(times), *counts.shape[1:])
+    totals: Floats = (weights @ counts.reshape(len(counts), -1)).reshape(len(weights), *counts.shape[1:])
     return totals
 
 
@@ -61,7 +61,7 @@ def averages(
     return np.stack([(shares * weights[..., None]).sum(axis=-2), shares.mean(axis=-2)], axis=-2)
 
 
-def interval(draws: Float64[Floats, "r ..."], participants: int) -> Float64[Floats, "2 ..."]:
+def bootstrap_interval(draws: Float64[Floats, "r ..."], participants: int) -> Float64[Floats, "2 ..."]:
     """The 95 % interval of each column of resamples of so many participants, without those that have no value in it.
 
     The expanded percentile interval (Hesterberg 2015, section 4.3.2): slightly wider percentiles, so that few
@@ -69,7 +69,7 @@ def interval(draws: Float64[Floats, "r ..."], participants: int) -> Float64[Floa
     """
     if participants < 2:
         return np.full((2, *draws.shape[1:]), np.nan)
-    ends = _percentiles(participants)
+    ends = _expanded_percentiles(participants)
     if np.isfinite(draws).all():
         return np.percentile(draws, ends, axis=0)
     columns = [column[np.isfinite(column)] for column in draws.reshape(len(draws), -1).T]
@@ -77,7 +77,7 @@ def interval(draws: Float64[Floats, "r ..."], participants: int) -> Float64[Floa
     return np.array(found).T.reshape(2, *draws.shape[1:])
 
 
-def least(
+def agreement_bounds(
     counts: Float64[Floats, "p ... d 3"], pictures: Float64[Floats, "... d"]
 ) -> Float64[Floats, "... d+3"]:
     """The lower 95 % bound of a rate that all answers agree on, of each row of `rates`; NaN where nobody answered.
@@ -93,17 +93,17 @@ def least(
     return np.concatenate([bounds, averages(bounds[..., None], pictures)[..., 0], pooled[..., None]], axis=-1)
 
 
-def widened(
+def with_agreement_bounds(
     rows: Float64[Floats, "... 4"], ends: Float64[Floats, "2 ... 4"], bounds: Floats
 ) -> Float64[Floats, "2 ... 4"]:
-    """The intervals of `rates`, where those without width, of resamples that are all alike, are those of `least`.
+    """The intervals of `rates`, where those without width, of resamples that are all alike, are those of `agreement_bounds`.
 
     NaN where there is no width though answers differ, as when a single participant has answered about a dataset.
     """
     bound, shares = bounds[..., None], rows[..., :3]
-    is_all, is_none = shares > 1 - _EQUAL, shares < _EQUAL
-    lows = np.where(is_all, bound, np.where(is_none, 0.0, np.nan))
-    highs = np.where(is_all, 1.0, np.where(is_none, 1 - bound, np.nan))
+    is_one, is_zero = shares > 1 - _EQUAL, shares < _EQUAL
+    lows = np.where(is_one, bound, np.where(is_zero, 0.0, np.nan))
+    highs = np.where(is_one, 1.0, np.where(is_zero, 1 - bound, np.nan))
     lows, highs = (
         np.concatenate([own, own[..., :1] - other[..., 2:]], axis=-1)
         for own, other in ((lows, highs), (highs, lows))
@@ -111,7 +111,7 @@ def widened(
     return np.where(ends[1] - ends[0] < _EQUAL, np.stack([lows, highs]), ends)
 
 
-def _percentiles(participants: int) -> tuple[float, float]:
+def _expanded_percentiles(participants: int) -> tuple[float, float]:
     """Where 95 % of t with one degree of freedom less lie in a bootstrap, whose spread is too small by sqrt((n - 1) / n).
 
     The quantile of t is that of Abramowitz and Stegun 1972, 26.7.5.
@@ -122,7 +122,7 @@ def _percentiles(participants: int) -> tuple[float, float]:
     return tail, 100 - tail
 
 
-def correlation(counts: Float64[Floats, "p 3"]) -> float | None:
+def intraclass_correlation(counts: Float64[Floats, "p 3"]) -> float | None:
     """How alike the answers of one participant are: the intraclass correlation of scores 1, 0, -1 for win, tie, lose.
 
     The estimator from the analysis of variance (Donner 1986, equation 2.1), which may fall below 0 by chance; None where

@@ -10,7 +10,7 @@ from typing import Any, Final
 from brewster.latex import escaped
 
 _GROUPS: Final = {"included": "After the rule", "everyone": "Everyone"}
-_CHOICES: Final = """\
+_DEFINITIONS: Final = """\
 Rates are shares of the answers about a pair of methods. Average weights each dataset by its number of pictures, as the \
 paper's Table 3 does; the plain mean of the datasets and the rates of all answers together stand below.
 Intervals are 95 % expanded percentile intervals of 10,000 bootstrap resamples of whole participants; where all answers \
@@ -35,7 +35,7 @@ def to_markdown(results: Results) -> str:
             [
                 "## How it was measured",
                 "",
-                *(f"- {line}" for line in (_rule(results), *_CHOICES.splitlines())),
+                *(f"- {line}" for line in (_rule(results), *_DEFINITIONS.splitlines())),
             ]
         ),
     ]
@@ -48,26 +48,29 @@ def overview(results: Results) -> str:
 
 
 def _rule(results: Results) -> str:
-    gone = results["excluded"]
+    excluded = results["excluded"]
     rule = results["rule"]
     return (
-        f"{rule[0].upper()}{rule[1:]}: {gone['failed']} for wrong answers, {gone['fast']} for haste. "
+        f"{rule[0].upper()}{rule[1:]}: {excluded['failed']} for wrong answers, {excluded['fast']} for haste. "
         "Who stopped early counts with what they answered."
     )
 
 
 def _group(results: Results, key: str, heading: str) -> str:
     group = results[key]
-    parts = [f"## {heading}", _counted(group)]
+    parts = [f"## {heading}", _counts_line(group)]
     parts += [_table(table) for table in group["tables"]]
     if group["strengths"]:
-        rows = [["Method", "Strength"], *([name, _signed(row)] for name, row in group["strengths"].items())]
+        rows = [
+            ["Method", "Strength"],
+            *([name, _strength_text(row)] for name, row in group["strengths"].items()),
+        ]
         agreement = "has no value" if group["agreement"] is None else f"is {group['agreement']:.3f}"
-        parts += [_grid(rows), f"Krippendorff's alpha {agreement}."]
+        parts += [_markdown_table(rows), f"Krippendorff's alpha {agreement}."]
     return "\n\n".join(parts)
 
 
-def _counted(group: Mapping[str, Any]) -> str:
+def _counts_line(group: Mapping[str, Any]) -> str:
     return (
         f"{group['participants']} participants ({group['complete']} to the end), {group['answers']} answers; "
         f"{group['failed']} of {group['catches']} catch trials failed."
@@ -80,29 +83,29 @@ def _table(table: Mapping[str, Any]) -> str:
         [row["title"], *(_percent(row[name]) for name in ("win", "tie", "lose")), _percent(row["difference"], "+"), str(row["answers"])]
         for row in table["rows"]
     ]  # fmt: skip
-    alike = "" if table["correlation"] is None else f"\n\nAlike: {table['correlation']:.3f}"
-    return f"### {table['first']} and {table['second']}\n\n{_grid(rows)}{alike}"
+    correlation = "" if table["correlation"] is None else f"\n\nAlike: {table['correlation']:.3f}"
+    return f"### {table['first']} and {table['second']}\n\n{_markdown_table(rows)}{correlation}"
 
 
 def _percent(entry: Mapping[str, Any], sign: str = "") -> str:
     if entry["mean"] is None:
         return "-"
     mean = f"{100 * entry['mean']:{sign}.2f} %"
-    return mean if entry["low"] is None else f"{mean} ({_ends(entry, sign)})"
+    return mean if entry["low"] is None else f"{mean} ({_interval_text(entry, sign)})"
 
 
-def _ends(entry: Mapping[str, Any], sign: str = "", join: str = " to ") -> str:
+def _interval_text(entry: Mapping[str, Any], sign: str = "", join: str = " to ") -> str:
     return join.join(f"{100 * entry[end]:{sign}.1f}" for end in ("low", "high"))
 
 
-def _signed(entry: Mapping[str, Any]) -> str:
+def _strength_text(entry: Mapping[str, Any]) -> str:
     if entry["mean"] is None:
         return "without bound: a method has only won, or only lost"
     mean = f"{entry['mean']:+.3f}"
     return mean if entry["low"] is None else f"{mean} ({entry['low']:+.3f} to {entry['high']:+.3f})"
 
 
-def _grid(rows: Iterable[Iterable[str]]) -> str:
+def _markdown_table(rows: Iterable[Iterable[str]]) -> str:
     head, *body = [[cell.replace("|", "\\|") for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(head, *body, strict=True)]
     lines = [head, [":" + "-" * max(2, width - 1) for width in widths], *body]
@@ -145,7 +148,10 @@ def _latex_row(tables: Iterable[Mapping[str, Any]], key: str) -> str:
     rows = [next(row for row in table["rows"] if row["key"] == key) for table in tables]
     entries = [row[name] for row in rows for name in ("win", "tie", "lose")]
     above = ["--" if entry["mean"] is None else f"{100 * entry['mean']:.2f}\\%" for entry in entries]
-    below = ["" if entry["low"] is None else f"\\scriptsize {_ends(entry, join='--')}" for entry in entries]
+    below = [
+        "" if entry["low"] is None else f"\\scriptsize {_interval_text(entry, join='--')}"
+        for entry in entries
+    ]
     return " & ".join([escaped(rows[0]["title"]), *above]) + " \\\\\n" + " & ".join(["", *below]) + r" \\"
 
 
