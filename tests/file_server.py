@@ -9,7 +9,7 @@ from threading import Thread
 class _Answers(BaseHTTPRequestHandler):
     def do_GET(self):
         files = self.server.content
-        files.asked.append((self.path, self.headers["Range"]))
+        files.requests.append((self.path, self.headers["Range"]))
         body, fault = files.bodies.get(self.path), files.faults.pop(0) if files.faults else None
         if body is None or isinstance(fault, int):
             return self.head(fault or 404)
@@ -32,7 +32,7 @@ class Files:
     """What the server gives by path, what was asked of it, and its next faults: "cut" or a status code."""
 
     def __init__(self, url):
-        self.url, self.bodies, self.asked, self.faults = url, {}, [], []
+        self.url, self.bodies, self.requests, self.faults = url, {}, [], []
 
 
 def loopback_only(monkeypatch):
@@ -63,7 +63,7 @@ def served():
     return on_loopback(_Answers, Files)
 
 
-def unheard():
+def unused_address():
     """An address on this machine where nobody listens."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))

@@ -38,10 +38,10 @@ def picture(width=60, height=40, container="jpeg", seed=1):
     return Photo.from_array(array, encoding="srgb").encode(container)
 
 
-def as_user(*args, **how):
+def as_user(*args, **kwargs):
     """The same in a process of its own."""
     return subprocess.run(
-        [sys.executable, "-m", "brewster", *map(str, args)], capture_output=True, check=False, **how
+        [sys.executable, "-m", "brewster", *map(str, args)], capture_output=True, check=False, **kwargs
     )
 
 

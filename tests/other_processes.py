@@ -8,20 +8,20 @@ from pathlib import Path
 
 
 @contextlib.contextmanager
-def started(command, **how):
+def started(command, **kwargs):
     """A process that is killed in the end, if it has not ended by itself; Ctrl-C reaches it.
 
     A shell starts background jobs with SIGINT ignored, and children inherit that.
     """
     command = [*map(str, command)]
-    with subprocess.Popen(command, preexec_fn=_heed_interrupts, **how) as process:  # noqa: PLW1509
+    with subprocess.Popen(command, preexec_fn=_restore_sigint, **kwargs) as process:  # noqa: PLW1509
         try:
             yield process
         finally:
             process.kill()
 
 
-def _heed_interrupts():
+def _restore_sigint():
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 

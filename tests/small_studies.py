@@ -14,7 +14,7 @@ from brewster.user_study.study import (
 )
 
 
-def described(
+def make_description(
     pictures=20, *, methods=("ours", "RDNet"), datasets=("real", "nature"), pairs=8, catches=2, seed=7
 ):
     """A description without pictures: `pictures` of each dataset, the first method against each other one."""
@@ -30,7 +30,7 @@ def described(
         for dataset, name in photos
         for other in methods[1:]
     ]
-    catches_there = [CatchTrial(*photo, "-".join(photo), "good", "spoilt") for photo in photos]
+    catch_pool = [CatchTrial(*photo, "-".join(photo), "good", "spoilt") for photo in photos]
     names = {name for row in comparisons for name in (row.photo, *row.outputs)}
     return StudyDescription(
         brewster="0",
@@ -42,14 +42,14 @@ def described(
         datasets=tuple(datasets),
         pictures=tuple(StudyPicture(name, 3, 2, "", "") for name in sorted(names)),
         comparisons=tuple(comparisons),
-        catch_pool=tuple(catches_there),
+        catch_pool=tuple(catch_pool),
     )
 
 
-def empty(folder, **asked):
+def make_empty_study(folder, **options):
     """The same as a study in a folder, without its files."""
     folder.mkdir(parents=True, exist_ok=True)
-    return Study(folder, described(**asked))
+    return Study(folder, make_description(**options))
 
 
 def write_pictures(
@@ -64,13 +64,13 @@ def write_pictures(
     return folder
 
 
-def made(
+def make_study(
     folder,
     *,
     methods=("Secretlus", "Rivalino"),
     names=("real/1", "real/2", "real/10", "nature/1"),
     size=(24, 18),
-    **choices,
+    **options,
 ):
     """A study of little pictures, with its files."""
     inputs = write_pictures(folder / "inputs", names, size=size)
@@ -78,7 +78,7 @@ def made(
         method: write_pictures(folder / method, names, size=size, seed=i + 1)
         for i, method in enumerate(methods)
     }
-    return create(folder / "study", inputs, outputs, StudyOptions(**{"seed": 3} | choices))
+    return create(folder / "study", inputs, outputs, StudyOptions(**{"seed": 3} | options))
 
 
 def choice_for(trial, outcome):
@@ -88,7 +88,7 @@ def choice_for(trial, outcome):
     return "left" if (outcome == 0) != trial.flipped else "right"
 
 
-def beside(study, folder):
+def copy_without_answers(study, folder):
     """The same study without answers in another folder, which shares its pictures."""
     folder.mkdir()
     (folder / PICTURES).symlink_to(study.folder / PICTURES)

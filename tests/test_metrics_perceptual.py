@@ -17,7 +17,7 @@ from brewster.download import Downloader, RemoteFile
 from brewster.errors import DownloadError, MissingExtra, ModelError
 from brewster.metrics import Lpips, lpips, perceptual
 from brewster.metrics.weights import FILE, NAMES, digest_of, load_backbone, read_backbone, read_heads
-from file_server import loopback_only, served, unheard
+from file_server import loopback_only, served, unused_address
 
 SHAPES = ((64, 3, 11), (192, 64, 5), (384, 192, 3), (256, 384, 3), (256, 256, 3))
 STEPS = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))  # stride and padding; the second and third pool before
@@ -255,7 +255,7 @@ def test_the_cache_comes_first_then_the_data_then_the_server(server, state, cach
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "data"))
     saved(state, tmp_path / "data" / "weights" / FILE)
     load_backbone(promise, digest)
-    assert server.asked == []
+    assert server.requests == []
     assert not cache.exists()
     saved({name: values + 1 for name, values in state.items()}, cache / FILE)
     with pytest.raises(ModelError, match=str(cache)):
@@ -265,7 +265,7 @@ def test_the_cache_comes_first_then_the_data_then_the_server(server, state, cach
 def test_what_was_downloaded_is_kept_without_the_rest_of_the_network(server, state, cache):
     promise, digest = promised(server, saved(state)), digest_of(state)
     first, second = (load_backbone(promise, digest) for _ in range(2))
-    assert [path for path, _ in server.asked] == ["/whole.pth"]
+    assert [path for path, _ in server.requests] == ["/whole.pth"]
     assert [path.name for path in cache.iterdir()] == [FILE]
     assert list(first) == list(second) == list(torch.load(cache / FILE, weights_only=True)) == list(NAMES)
     assert all(torch.equal(first[name], second[name]) for name in NAMES)
@@ -279,11 +279,11 @@ def test_half_a_download_is_taken_up_and_none_is_taken_for_whole(server, state, 
         load_backbone(promise, digest, line=Downloader(pauses_s=()))
     assert [path.name for path in cache.iterdir()] == ["whole.pth.part"]
     load_backbone(promise, digest, line=Downloader(pauses_s=()))
-    assert server.asked[-1] == ("/whole.pth", f"bytes={len(body) // 2}-")
+    assert server.requests[-1] == ("/whole.pth", f"bytes={len(body) // 2}-")
 
 
 def test_a_server_that_is_not_there_is_explained():
-    promise = RemoteFile(f"{unheard()}/whole.pth", 9, "sha256", "0")
+    promise = RemoteFile(f"{unused_address()}/whole.pth", 9, "sha256", "0")
     with pytest.raises(DownloadError, match="check the connection"):
         load_backbone(promise, line=Downloader(pauses_s=()))
 

@@ -35,39 +35,39 @@ def read(data, kind=b"multipart/form-data; boundary=x", cut=False):
     return asyncio.run(read_form(request, MODELS, 1000))
 
 
-def asked(**fields):
+def parse(**fields):
     return read(
         body(("photo", b"bytes", "a.jpg"), *((name, value.encode()) for name, value in fields.items()))
     )
 
 
-def refused(data, **how):
+def refused(data, **kwargs):
     with pytest.raises(HTTPException) as error:
-        read(data, **how)
+        read(data, **kwargs)
     return error.value.status_code, error.value.detail
 
 
 @pytest.mark.parametrize("charset", [b"undefined", b"punycode"])
 def test_a_charset_that_is_no_text_is_a_broken_form(charset):
-    status, said = refused(
+    status, sentence = refused(
         body(("photo", b"", "a.jpg"), ("strength", b"\xff-1")),
         kind=b"multipart/form-data; boundary=x; charset=" + charset,
     )
     assert status == 400
-    assert "UTF-8" in said
+    assert "UTF-8" in sentence
 
 
 # --- values
 
 
 def test_a_photo_alone_is_asked_for_as_on_the_command_line():
-    made = asked()
+    made = parse()
     assert (made.photo, made.name) == (b"bytes", "a.jpg")
     assert made.options == Options(max_pixels=1000)
 
 
 def test_every_option_that_a_client_may_choose_is_read():
-    made = asked(
+    made = parse(
         strength="0.5", quality="best", format="tiff", additive="true", model="mine", layers="reflection"
     )
     assert made.options == Options(
@@ -83,17 +83,17 @@ def test_every_option_that_a_client_may_choose_is_read():
 
 @pytest.mark.parametrize("layers", ["confidence,transmission", "transmission,confidence,transmission"])
 def test_layers_come_each_once_and_in_the_known_order(layers):
-    assert asked(layers=layers).options.layers == ("transmission", "confidence")
+    assert parse(layers=layers).options.layers == ("transmission", "confidence")
     repeated = [("layers", layer.encode()) for layer in layers.split(",")]
     assert read(body(("photo", b"", "a.jpg"), *repeated)).options.layers == ("transmission", "confidence")
 
 
 def test_an_empty_field_is_one_that_was_left_out():
-    assert asked(format="", strength="", model="").options == Options(max_pixels=1000)
+    assert parse(format="", strength="", model="").options == Options(max_pixels=1000)
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("fields", "sentence"),
     [
         ({"strength": "1.5"}, "strength is '1.5'"),
         ({"strength": "nan"}, "strength is 'nan'"),
@@ -111,17 +111,17 @@ def test_an_empty_field_is_one_that_was_left_out():
         ({"quality": "x" * 500}, "'" + "x" * 40 + "'"),
     ],
 )
-def test_a_wrong_value_is_named_in_a_sentence(fields, said):
+def test_a_wrong_value_is_named_in_a_sentence(fields, sentence):
     data = body(("photo", b"bytes", "a.jpg"), *((name, value.encode()) for name, value in fields.items()))
-    status, sentence = refused(data)
+    status, message = refused(data)
     assert status == 422
-    assert said in sentence
-    assert len(sentence) < 300
+    assert sentence in message
+    assert len(message) < 300
 
 
 def test_values_that_do_not_go_together_are_the_options_own_error():
     with pytest.raises(BrewsterError, match="fit only into TIFF and EXR"):
-        asked(additive="true", format="png")
+        parse(additive="true", format="png")
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from brewster.errors import BrewsterError, TargetError
 from brewster.user_study.create import StudyOptions, create
 from brewster.user_study.degrade import degrade
 from brewster.user_study.study import read_study
-from small_studies import made, write_pictures
+from small_studies import make_study, write_pictures
 
 NAMES = ("real/1", "real/2", "real/10", "nature/1")
 
@@ -27,7 +27,7 @@ def folders(tmp_path):
 
 
 def test_a_study_is_read_as_it_was_made(tmp_path):
-    study = made(tmp_path)
+    study = make_study(tmp_path)
     assert read_study(study.folder) == study
     assert study.description.datasets == ("nature", "real")
     assert [row.name for row in study.description.comparisons] == ["1", "1", "2", "10"]
@@ -37,17 +37,17 @@ def test_a_study_is_read_as_it_was_made(tmp_path):
 
 def test_the_first_method_is_compared_with_each_other_or_all_with_all(tmp_path):
     names = ("ours", "RDNet", "DSIT")
-    assert made(tmp_path / "a", methods=names).pairs_of_methods == (("ours", "RDNet"), ("ours", "DSIT"))
-    assert len(made(tmp_path / "b", methods=names, all_pairs=True).pairs_of_methods) == 3
+    assert make_study(tmp_path / "a", methods=names).pairs_of_methods == (("ours", "RDNet"), ("ours", "DSIT"))
+    assert len(make_study(tmp_path / "b", methods=names, all_pairs=True).pairs_of_methods) == 3
 
 
 def test_pictures_without_folders_are_one_dataset(tmp_path):
-    study = made(tmp_path, names=("a", "b"))
+    study = make_study(tmp_path, names=("a", "b"))
     assert study.description.datasets == ("",)
 
 
 def test_named_datasets_are_taken_in_their_order_and_no_others(tmp_path):
-    study = made(tmp_path, datasets=("real",))
+    study = make_study(tmp_path, datasets=("real",))
     assert study.description.datasets == ("real",)
     assert {row.dataset for row in study.description.comparisons} == {"real"}
 
@@ -68,15 +68,15 @@ def test_a_picture_is_kept_to_the_last_value_whatever_its_format(tmp_path, folde
     write_pictures(inputs, ["real/1"], suffix=".tif", seed=5)
     study = create(tmp_path / "study", inputs, methods)
     row = next(row for row in study.description.comparisons if (row.dataset, row.name) == ("real", "1"))
-    kept = Photo.open(study.picture_file(row.photo))
-    assert np.array_equal(kept.pixels, Photo.open(inputs / "real/1.tif").pixels)
+    copied = Photo.open(study.picture_file(row.photo))
+    assert np.array_equal(copied.pixels, Photo.open(inputs / "real/1.tif").pixels)
     about = study.picture(row.photo)
     assert about.source_sha256 == hashlib.sha256((inputs / "real/1.tif").read_bytes()).hexdigest()
-    assert (about.width, about.height) == kept.size
+    assert (about.width, about.height) == copied.size
 
 
 def test_file_names_and_bytes_tell_no_method_and_no_picture(tmp_path):
-    study = made(tmp_path)
+    study = make_study(tmp_path)
     files = list((study.folder / "pictures").iterdir())
     assert len(files) == 4 * 3 + 4  # and the spoilt ones
     for path in files:
@@ -108,14 +108,14 @@ def test_everything_that_does_not_fit_is_named_at_once_and_nothing_is_written(tm
     (methods["RDNet"] / "real/10.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     with pytest.raises(BrewsterError) as caught:
         create(tmp_path / "study", inputs, methods)
-    for told in (
+    for message in (
         f"ours has no {methods['ours'] / 'real/2'}.*",
         f"{methods['ours'] / 'nature/1.png'} has no input",
         f"{methods['RDNet'] / 'real/1.png'} is 12x18, its input 24x18",
         f"{methods['RDNet'] / 'real/10.png'}: ",
         f"RDNet has no {methods['RDNet'] / 'nature/other'}.*",
     ):
-        assert told in str(caught.value)
+        assert message in str(caught.value)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["RDNet", "inputs", "ours"]
 
 
@@ -127,16 +127,16 @@ def test_one_name_in_two_formats_is_refused(tmp_path, folders):
 
 
 @pytest.mark.parametrize(
-    ("choices", "told"),
+    ("options", "message"),
     [
         (StudyOptions(datasets=("wild",)), "no dataset 'wild'"),
         (StudyOptions(pairs=5), "5 pairs .* there are 4"),
         (StudyOptions(catches=5), "5 catch trials .* there are 4"),
     ],
 )
-def test_more_than_there_is_is_refused(tmp_path, folders, choices, told):
-    with pytest.raises(BrewsterError, match=told):
-        create(tmp_path / "study", *folders, choices)
+def test_more_than_there_is_is_refused(tmp_path, folders, options, message):
+    with pytest.raises(BrewsterError, match=message):
+        create(tmp_path / "study", *folders, options)
 
 
 def test_one_method_is_no_study_and_an_empty_folder_none_either(tmp_path, folders):
@@ -157,7 +157,7 @@ def test_a_study_is_never_written_over(tmp_path, folders):
 
 
 def test_a_changed_picture_is_noticed(tmp_path):
-    study = made(tmp_path)
+    study = make_study(tmp_path)
     study.picture_file(study.description.comparisons[0].outputs[0]).write_bytes(b"other")
     with pytest.raises(BrewsterError, match="missing or changed"):
         study.verify_pictures()
@@ -166,20 +166,20 @@ def test_a_changed_picture_is_noticed(tmp_path):
 def test_a_description_that_is_none_is_refused_with_its_place(tmp_path):
     with pytest.raises(BrewsterError, match="cannot be read"):
         read_study(tmp_path)
-    study = made(tmp_path)
+    study = make_study(tmp_path)
     text = json.loads((study.folder / "study.json").read_text())
-    for change, told in (
+    for change, message in (
         ({"pairs": "many"}, "pairs: "),
         ({"surprise": 1}, "surprise: "),
         ({"format": 2}, "format 2"),
     ):
         (study.folder / "study.json").write_text(json.dumps(text | change))
-        with pytest.raises(BrewsterError, match=told):
+        with pytest.raises(BrewsterError, match=message):
             read_study(study.folder)
 
 
 def test_catch_pictures_are_the_output_spoilt_beyond_doubt(tmp_path):
-    study = made(tmp_path, size=(96, 72))
+    study = make_study(tmp_path, size=(96, 72))
     for catch in study.description.catch_pool:
         good, spoilt = (
             Photo.open(study.picture_file(name)).pixels.astype(float) for name in (catch.good, catch.spoilt)
@@ -201,7 +201,7 @@ def test_spoiling_is_worse_in_light_and_dark_and_keeps_the_mean(random):
 
 
 def test_a_study_that_was_moved_is_the_same_study(tmp_path):
-    study = made(tmp_path)
+    study = make_study(tmp_path)
     moved = study.folder.rename(tmp_path / "elsewhere")
     assert read_study(moved) == replace(study, folder=moved)
     read_study(moved).verify_pictures()
@@ -220,5 +220,5 @@ def test_pictures_beside_folders_of_pictures_are_named_and_refused_unless_datase
 
 def test_a_picture_that_is_called_like_a_layer_is_one_where_nothing_was_separated(tmp_path):
     names = ("window.reflection", "window", "b.confidence")
-    study = made(tmp_path, names=names)
+    study = make_study(tmp_path, names=names)
     assert {row.name for row in study.description.comparisons} == set(names)

@@ -7,21 +7,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brewster.user_study.assignment import comparison_sequence, draw_trials
-from small_studies import described
+from small_studies import make_description
 
 SIZES = st.integers(1, 60).flatmap(lambda count: st.tuples(st.just(count), st.integers(1, count)))
 
 
-def shown(count, pairs, seed, people):
-    row = list(islice(comparison_sequence(count, pairs, seed), people * pairs))
-    return [row[i * pairs : (i + 1) * pairs] for i in range(people)]
+def assigned(count, pairs, seed, participants):
+    row = list(islice(comparison_sequence(count, pairs, seed), participants * pairs))
+    return [row[i * pairs : (i + 1) * pairs] for i in range(participants)]
 
 
 @given(SIZES, st.integers(0, 2**32), st.integers(1, 30))
-def test_nobody_sees_a_pair_twice_and_every_pair_is_seen_equally_often_within_one(sizes, seed, people):
+def test_nobody_sees_a_pair_twice_and_every_pair_is_seen_equally_often_within_one(sizes, seed, participants):
     count, pairs = sizes
     seen = Counter(dict.fromkeys(range(count), 0))
-    for own in shown(count, pairs, seed, people):
+    for own in assigned(count, pairs, seed, participants):
         numbers = [comparison for comparison, _ in own]
         assert len(set(numbers)) == pairs
         seen.update(numbers)
@@ -29,48 +29,50 @@ def test_nobody_sees_a_pair_twice_and_every_pair_is_seen_equally_often_within_on
 
 
 @given(SIZES, st.integers(0, 2**32), st.integers(1, 30))
-def test_each_comparison_has_its_first_method_left_and_right_equally_often_within_one(sizes, seed, people):
+def test_each_comparison_has_its_first_method_left_and_right_equally_often_within_one(
+    sizes, seed, participants
+):
     balance = Counter()
-    for own in shown(*sizes, seed, people):
+    for own in assigned(*sizes, seed, participants):
         balance.update({comparison: 1 if flipped else -1 for comparison, flipped in own})
         assert all(abs(value) <= 1 for value in balance.values())
 
 
 @given(SIZES, st.integers(0, 2**32), st.integers(1, 30))
-def test_no_participant_sees_one_method_much_more_often_on_one_side(sizes, seed, people):
-    for own in shown(*sizes, seed, people):
+def test_no_participant_sees_one_method_much_more_often_on_one_side(sizes, seed, participants):
+    for own in assigned(*sizes, seed, participants):
         right = sum(flipped for _, flipped in own)
         assert abs(2 * right - len(own)) <= 4
 
 
 def test_the_paper_s_study_is_balanced_to_a_hair():
     """100 participants, 40 of 2 x 181 pairs."""
-    people = shown(362, 40, 1, 100)
-    rights = [sum(flipped for _, flipped in own) for own in people]
+    participants = assigned(362, 40, 1, 100)
+    rights = [sum(flipped for _, flipped in own) for own in participants]
     assert min(rights) >= 18
     assert max(rights) <= 22
-    assert set(Counter(comparison for own in people for comparison, _ in own).values()) == {11, 12}
+    assert set(Counter(comparison for own in participants for comparison, _ in own).values()) == {11, 12}
 
 
 def test_a_draw_depends_on_seed_and_number_only_and_differs_between_both():
-    study = described()
+    study = make_description()
     trials = [draw_trials(study, number) for number in range(6)]
     assert trials == [draw_trials(study, number) for number in range(6)]
     assert len(set(trials)) == 6
-    assert draw_trials(described(seed=8), 0) != trials[0]
+    assert draw_trials(make_description(seed=8), 0) != trials[0]
 
 
 def test_a_draw_of_this_version_is_the_draw_of_every_version():
     """Links are sent out, and a study may last longer than an installation."""
     first = [
         (trial.comparison, trial.flipped)
-        for trial in draw_trials(described(pictures=4, pairs=4, catches=0), 0)
+        for trial in draw_trials(make_description(pictures=4, pairs=4, catches=0), 0)
     ]
     assert first == [(4, False), (1, True), (5, False), (7, True)]
 
 
 def test_sides_and_pictures_agree_with_what_the_trial_says():
-    study = described()
+    study = make_description()
     for trial in draw_trials(study, 3):
         if trial.comparison is not None:
             row = study.comparisons[trial.comparison]
@@ -79,7 +81,7 @@ def test_sides_and_pictures_agree_with_what_the_trial_says():
 
 
 def test_catch_trials_are_of_both_kinds_and_on_photos_that_are_not_the_participant_s_own():
-    study = described(catches=4)
+    study = make_description(catches=4)
     for number in range(20):
         trials = draw_trials(study, number)
         catches = [trial for trial in trials if trial.expected]
@@ -100,7 +102,7 @@ def test_the_order_does_not_tell_the_catch_trials():
     places = Counter(
         place
         for number in range(120)
-        for place, trial in enumerate(draw_trials(described(), number))
+        for place, trial in enumerate(draw_trials(make_description(), number))
         if trial.expected
     )
     assert len(places) == 10

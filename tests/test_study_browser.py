@@ -8,12 +8,12 @@ from playwright.sync_api import expect
 
 from brewster import Photo
 from brewster.user_study.store import AnswerStore
-from brewster.web.application import application
+from brewster.web.application import create_app
 from brewster.web.middleware import RequestLimits
-from brewster.web.study import participants
+from brewster.web.study import study_router
 from file_server import loopback_only
-from glass_server import on_a_thread
-from small_studies import beside, made
+from glass_server import served_port
+from small_studies import copy_without_answers, make_study
 
 READY = "#trial:not(.waiting):not([hidden])"
 
@@ -32,19 +32,19 @@ def _network_off(monkeypatch):
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory):
-    return made(tmp_path_factory.mktemp("original"), size=(240, 180), catches=0)
+    return make_study(tmp_path_factory.mktemp("original"), size=(240, 180), catches=0)
 
 
 @pytest.fixture
 def store(original, tmp_path):
-    with closing(AnswerStore(beside(original, tmp_path / "study"))) as store:
+    with closing(AnswerStore(copy_without_answers(original, tmp_path / "study"))) as store:
         yield store
 
 
 @pytest.fixture
 def url(store):
-    app = application(participants(store.study, store), guard=RequestLimits(), home="study.html")
-    with on_a_thread(app) as port:
+    app = create_app(study_router(store.study, store), limits=RequestLimits(), index="study.html")
+    with served_port(app) as port:
         yield f"http://127.0.0.1:{port}/"
 
 
@@ -53,8 +53,8 @@ def open_page(chromium):
     """A page of a participant; whatever goes wrong in its scripts fails the test."""
     contexts, errors = [], []
 
-    def open_page(url, **how):
-        context = chromium.new_context(**how)
+    def open_page(url, **kwargs):
+        context = chromium.new_context(**kwargs)
         contexts.append(context)
         context.set_default_timeout(120_000)  # a busy machine is no failure
         page = context.new_page()
@@ -114,11 +114,11 @@ def test_who_stops_goes_on_with_the_same_link_elsewhere_and_with_no_other(open_p
 def test_what_is_seen_are_the_pictures_of_the_trial_on_their_sides_and_all_has_a_name(open_page, url, store):
     page = open_page(url, viewport={"width": 1280, "height": 800})
     begin(page)
-    ((person, _),) = store.all_answers()
+    ((participant, _),) = store.all_answers()
     page.wait_for_timeout(300)  # until they have faded in
     for side in ("left", "photo", "right"):
         seen = Photo.open(page.locator(f".{side} .frame").screenshot()).linear()
-        truth = Photo.open(store.study.picture_file(getattr(person.trials[0], side)))
+        truth = Photo.open(store.study.picture_file(getattr(participant.trials[0], side)))
         assert (
             np.median(np.abs(seen - truth.small(*seen.shape[1::-1]))) < 0.002
         )  # not the mean: edges are smoothed

@@ -41,13 +41,13 @@ def created(bare, folders, tmp_path):
     return read_study(tmp_path / "study")
 
 
-def answer_all(study, people, rng):
+def answer_all(study, participants, rng):
     store = AnswerStore(study)
-    for _ in range(people):
-        person = store.participant(store.admit())
-        for number, trial in enumerate(person.trials):
+    for _ in range(participants):
+        participant = store.participant(store.admit())
+        for number, trial in enumerate(participant.trials):
             choice = trial.expected or choice_for(trial, rng.choice(3, p=[0.6, 0.2, 0.2]))
-            store.record_answer(person, number, choice, seconds=4)
+            store.record_answer(participant, number, choice, seconds=4)
     store.close()
 
 

@@ -1,4 +1,4 @@
-"""What the answers say: on simulated people whose preferences are known, and on numbers that others have computed."""
+"""What the answers say: on simulated participants whose preferences are known, and on numbers that others have computed."""
 
 import csv
 import io
@@ -34,7 +34,7 @@ from brewster.user_study.report.statistics import (
 from brewster.user_study.report.tables import to_csv, to_latex, to_markdown
 from brewster.user_study.store import Participant, StoredAnswer
 from brewster.user_study.study import Study
-from small_studies import choice_for, described
+from small_studies import choice_for, make_description
 
 TRUTH = np.array([0.45, 0.28, 0.27])
 TABLE_3 = {  # the paper's: Real, Nature, Postcard, SolidObject, Wildscene, Average
@@ -58,13 +58,13 @@ TABLE_3 = {  # the paper's: Real, Nature, Postcard, SolidObject, Wildscene, Aver
 PICTURES = np.array([20.0, 20, 20, 20, 101])
 
 
-def simulated(rng, people, studies, *, pairs=40, correlation=0.05):
-    """Counts (people, studies, 1, 3): everybody has chances of their own about the TRUTH, alike by this correlation.
+def simulated(rng, participants, studies, *, pairs=40, correlation=0.05):
+    """Counts (participants, studies, 1, 3): each participant has their own probabilities around TRUTH, with this correlation.
 
-    Of Dirichlet chances with concentration a, every score's intraclass correlation is 1 / (1 + a).
+    Of Dirichlet probabilities with concentration a, every score's intraclass correlation is 1 / (1 + a).
     """
-    chances = rng.dirichlet(TRUTH * (1 / correlation - 1), (people, studies))
-    return rng.multinomial(pairs, chances)[:, :, None].astype(float)
+    probabilities = rng.dirichlet(TRUTH * (1 / correlation - 1), (participants, studies))
+    return rng.multinomial(pairs, probabilities)[:, :, None].astype(float)
 
 
 # --- the paper's Table 3
@@ -96,17 +96,18 @@ def test_rates_are_told_of_each_dataset_and_in_three_averages():
 
 def intervals(counts):
     """Of studies that nobody shares: (2, studies, 4)."""
-    people, studies = counts.shape[:2]
+    participants, studies = counts.shape[:2]
     return bootstrap_interval(
-        rates(resampled_counts(bootstrap_weights(people, 1000), counts), np.ones((studies, 1))), people
+        rates(resampled_counts(bootstrap_weights(participants, 1000), counts), np.ones((studies, 1))),
+        participants,
     )[:, :, 0]
 
 
-@pytest.mark.parametrize("people", [100, 12])
-def test_intervals_cover_the_truth_at_their_stated_rate(people):
+@pytest.mark.parametrize("participants", [100, 12])
+def test_intervals_cover_the_truth_at_their_stated_rate(participants):
     """400 studies, 40 pairs a participant: 95 % within three standard errors, of many participants and of few."""
     studies = 400
-    lows, highs = intervals(simulated(np.random.default_rng(1), people, studies))
+    lows, highs = intervals(simulated(np.random.default_rng(1), participants, studies))
     truth = np.append(TRUTH, TRUTH[0] - TRUTH[2])
     covered = ((lows <= truth) & (truth <= highs)).mean(axis=0)
     assert np.all(np.abs(covered - 0.95) < 3 * np.sqrt(0.95 * 0.05 / studies)), covered
@@ -200,15 +201,15 @@ def test_a_choice_is_the_first_method_s_win_on_whichever_side_it_stood(flipped, 
     assert outcome(TrialDraw("", "", "", 0, flipped), choice) == means
 
 
-def person(**about):
+def participant_answers(**fields):
     return ParticipantAnswers(
         **{"number": 0, "votes": {0: 1}, "catches": 4, "failed": 0, "seconds": 5.0, "is_complete": True}
-        | about
+        | fields
     )
 
 
 @pytest.mark.parametrize(
-    ("about", "reason"),
+    ("fields", "reason"),
     [
         ({}, None),
         ({"failed": 1}, None),
@@ -220,17 +221,17 @@ def person(**about):
         ({"catches": 1, "failed": 1}, "failed"),
     ],
 )
-def test_the_rule_leaves_out_who_does_not_look_and_nobody_else(about, reason):
-    assert ExclusionRule().reason(person(**about)) == reason
+def test_the_rule_leaves_out_who_does_not_look_and_nobody_else(fields, reason):
+    assert ExclusionRule().reason(participant_answers(**fields)) == reason
 
 
-def answered(description, number, rng, chances, *, catches=1.0, seconds=6.0, trials=None):
-    """A participant whose wishes have these chances, who passes this share of the catch trials."""
+def answered(description, number, rng, probabilities, *, catches=1.0, seconds=6.0, trials=None):
+    """A participant whose wishes have these probabilities, who passes this share of the catch trials."""
     row = draw_trials(description, number)
     answers = {}
     for i, trial in enumerate(row[:trials]):
         if trial.expected is None:
-            choice = choice_for(trial, rng.choice(3, p=chances))
+            choice = choice_for(trial, rng.choice(3, p=probabilities))
         else:
             wrong = "left" if trial.expected != "left" else "right"
             choice = trial.expected if rng.random() < catches else wrong
@@ -241,9 +242,9 @@ def answered(description, number, rng, chances, *, catches=1.0, seconds=6.0, tri
 @pytest.fixture(scope="module")
 def hundred(tmp_path_factory):
     """100 participants x 40 pairs of three methods; five of them never look, and five are in haste."""
-    description = described(pictures=50, methods=("ours", "R&D_Net", "DSIT"), pairs=40, catches=4)
+    description = make_description(pictures=50, methods=("ours", "R&D_Net", "DSIT"), pairs=40, catches=4)
     rng = np.random.default_rng(4)
-    everybody = [
+    records = [
         answered(
             description,
             number,
@@ -256,17 +257,17 @@ def hundred(tmp_path_factory):
         for number in range(100)
     ]
     study = Study(tmp_path_factory.mktemp("hundred"), description)
-    who = collect_answers(everybody)
-    return study, who, summarise(study, who, ExclusionRule())
+    participants = collect_answers(records)
+    return study, participants, summarise(study, participants, ExclusionRule())
 
 
 def test_a_hundred_simulated_people_are_understood(hundred):
     _, _, results = hundred
-    kept, everyone = results["included"], results["everyone"]
+    included, everyone = results["included"], results["everyone"]
     assert results["excluded"] == {"failed": 6, "fast": 4}
-    assert (kept["participants"], everyone["participants"], kept["complete"]) == (90, 100, 89)
-    assert everyone["answers"] == kept["answers"] + 400
-    for table in kept["tables"]:
+    assert (included["participants"], everyone["participants"], included["complete"]) == (90, 100, 89)
+    assert everyone["answers"] == included["answers"] + 400
+    for table in included["tables"]:
         row = next(row for row in table["rows"] if row["key"] == "/average")
         found = [row[name]["mean"] for name in ("win", "tie", "lose")]
         assert found == pytest.approx(TRUTH, abs=0.05)
@@ -275,23 +276,25 @@ def test_a_hundred_simulated_people_are_understood(hundred):
         )
         spoilt = next(row for row in everyone["tables"][0]["rows"] if row["key"] == "/average")
         assert spoilt["lose"]["mean"] > row["lose"]["mean"] + 0.03
-    worth = {name: entry["mean"] for name, entry in kept["strengths"].items()}
+    worth = {name: entry["mean"] for name, entry in included["strengths"].items()}
     assert worth["ours"] - worth["DSIT"] == pytest.approx(np.log(0.59 / 0.41), abs=0.15)
-    assert abs(kept["agreement"]) < 0.05
+    assert abs(included["agreement"]) < 0.05
 
 
 def test_results_are_plain_json_and_the_same_in_any_order(hundred):
-    study, who, results = hundred
+    study, participants, results = hundred
     assert json.loads(json.dumps(results, allow_nan=False)) == results
     assert (
-        summarise(study, who[::-1], ExclusionRule())["included"]["tables"][0]["rows"][0]["win"]["mean"]
+        summarise(study, participants[::-1], ExclusionRule())["included"]["tables"][0]["rows"][0]["win"][
+            "mean"
+        ]
         == (results["included"]["tables"][0]["rows"][0]["win"]["mean"])
     )
 
 
 def test_the_files_of_a_report_agree_with_each_other(hundred, tmp_path):
-    study, who, results = hundred
-    write(results, study, who, tmp_path)
+    study, participants, results = hundred
+    write(results, study, participants, tmp_path)
     assert json.loads((tmp_path / "report.json").read_text()) == results
     assert Photo.open(tmp_path / "plot.png").size[0] > 800
     lines = list(csv.DictReader(io.StringIO((tmp_path / "answers.csv").read_text())))
@@ -314,13 +317,13 @@ def test_latex_has_the_layout_of_the_paper_and_no_bare_specials(hundred):
 def test_markdown_says_all_and_csv_has_a_line_for_each_number(hundred):
     _, _, results = hundred
     text = to_markdown(results)
-    for told in (
+    for part in (
         "6 for wrong answers, 4 for haste",
         "## Everyone",
         "Mean of the datasets",
         "Krippendorff's alpha is",
     ):
-        assert told in text
+        assert part in text
     lines = list(csv.DictReader(io.StringIO(to_csv(results))))
     assert len(lines) == 2 * 2 * 5 * 4
     assert {line["group"] for line in lines} == {"included", "everyone"}
@@ -333,15 +336,15 @@ def test_without_answers_there_is_no_report(hundred):
 
 
 def test_one_person_gives_rates_without_intervals(hundred):
-    study, who, _ = hundred
-    row = summarise(study, who[20:21], ExclusionRule())["included"]["tables"][0]["rows"][-1]
+    study, participants, _ = hundred
+    row = summarise(study, participants[20:21], ExclusionRule())["included"]["tables"][0]["rows"][-1]
     assert row["win"]["mean"] is not None
     assert row["win"]["low"] is None
 
 
 def test_a_rule_that_leaves_nobody_still_tells_of_everyone(hundred):
-    study, who, _ = hundred
-    results = summarise(study, who[:5], ExclusionRule())
+    study, participants, _ = hundred
+    results = summarise(study, participants[:5], ExclusionRule())
     assert results["included"]["participants"] == 0
     assert to_latex(results).startswith("% the rule leaves nobody")
     assert plot(results)[1:4] == b"PNG"
@@ -352,17 +355,17 @@ def test_a_rule_that_leaves_nobody_still_tells_of_everyone(hundred):
 
 
 def named(tmp_path, datasets, methods):
-    description = described(pictures=3, datasets=datasets, methods=methods, catches=0)
+    description = make_description(pictures=3, datasets=datasets, methods=methods, catches=0)
     rng, study = np.random.default_rng(5), Study(tmp_path, description)
     return study, collect_answers([answered(description, number, rng, TRUTH) for number in range(6)])
 
 
 def test_a_dataset_that_is_called_average_is_told_from_the_average(tmp_path):
-    study, who = named(tmp_path, ("Average", "real"), ("ours", "RDNet"))
-    results = summarise(study, who, ExclusionRule())
+    study, participants = named(tmp_path, ("Average", "real"), ("ours", "RDNet"))
+    results = summarise(study, participants, ExclusionRule())
     lines = csv.DictReader(io.StringIO(to_csv(results)))
-    told = {line["key"]: line["dataset"] for line in lines}
-    assert told == {"Average": "Average (dataset)", "real": "real"} | AVERAGES
+    titles = {line["key"]: line["dataset"] for line in lines}
+    assert titles == {"Average": "Average (dataset)", "real": "real"} | AVERAGES
     for text in (to_latex(results), to_markdown(results)):
         assert len(re.findall(r"Average +[|&]", text)) in (1, 2)  # of each group
         assert "Average (dataset)" in text
@@ -372,8 +375,8 @@ def test_the_plot_has_a_bar_for_each_row_and_takes_names_as_they_are(tmp_path, m
     axes = []
     draw_bars = figure._bars
     monkeypatch.setattr(figure, "_bars", lambda axis, *rest: (axes.append(axis), draw_bars(axis, *rest)))
-    study, who = named(tmp_path, ("$x^$", "\u96e8"), ("$a_{b$", "RDNet"))
-    results = summarise(study, who, ExclusionRule())
+    study, participants = named(tmp_path, ("$x^$", "\u96e8"), ("$a_{b$", "RDNet"))
+    results = summarise(study, participants, ExclusionRule())
     for row in results["included"]["tables"][0]["rows"]:
         row["title"] = "alike" if row["key"] in ("\u96e8", "/average") else row["title"]
     results["included"]["tables"][0]["second"] = "\u96e8"
@@ -386,17 +389,17 @@ def test_the_plot_has_a_bar_for_each_row_and_takes_names_as_they_are(tmp_path, m
 
 
 def test_a_plot_of_everyone_says_so(hundred, monkeypatch):
-    study, who, _ = hundred
-    said = []
-    monkeypatch.setattr("matplotlib.figure.Figure.suptitle", lambda _self, text, **_how: said.append(text))
+    study, participants, _ = hundred
+    titles = []
+    monkeypatch.setattr("matplotlib.figure.Figure.suptitle", lambda _self, text, **_how: titles.append(text))
     for count in (20, 5):  # of the five, nobody is kept
-        plot(summarise(study, who[:count], ExclusionRule()))
-    assert said == ["Everyone: the rule leaves nobody"]
+        plot(summarise(study, participants[:count], ExclusionRule()))
+    assert titles == ["Everyone: the rule leaves nobody"]
 
 
 def test_answers_csv_says_who_is_left_out_and_why(hundred, tmp_path):
-    study, who, results = hundred
-    write(results, study, who, tmp_path)
+    study, participants, results = hundred
+    write(results, study, participants, tmp_path)
     lines = csv.DictReader(io.StringIO((tmp_path / "answers.csv").read_text()))
     reasons = {int(line["participant"]): line["left_out"] for line in lines}
     assert [reasons[i] for i in range(5)] == ["failed"] * 5
@@ -406,6 +409,6 @@ def test_answers_csv_says_who_is_left_out_and_why(hundred, tmp_path):
 
 def test_strengths_that_are_alike_in_all_resamples_have_no_interval(hundred):
     study, *_ = hundred
-    tied = [person(number=i, votes={0: 1, 1: 1}) for i in range(5)]
+    tied = [participant_answers(number=i, votes={0: 1, 1: 1}) for i in range(5)]
     worth = summarise(study, tied, ExclusionRule())["included"]["strengths"]["ours"]
     assert worth == {"mean": pytest.approx(0), "low": None, "high": None}

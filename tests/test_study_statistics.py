@@ -27,11 +27,11 @@ def estimated(*counts, pictures=(1.0,)):
     return np.stack([means, *with_agreement_bounds(means, ends, agreement_bounds(counts, pictures))])[:, 0]
 
 
-@pytest.mark.parametrize("people", [2, 10, 30])
-def test_where_all_agree_the_bound_is_that_of_clopper_and_pearson(people):
-    exact = binomtest(people, people).proportion_ci(method="exact").low
+@pytest.mark.parametrize("participants", [2, 10, 30])
+def test_where_all_agree_the_bound_is_that_of_clopper_and_pearson(participants):
+    exact = binomtest(participants, participants).proportion_ci(method="exact").low
     for i, own in enumerate(np.eye(3)):
-        _, low, high = estimated(*[[2 * own]] * people)[:, 0]
+        _, low, high = estimated(*[[2 * own]] * participants)[:, 0]
         assert low[:3] == pytest.approx(own * exact)
         assert high[:3] == pytest.approx(own + (1 - own) * (1 - exact))
         ends = [(2 * exact - 1, 1), (exact - 1, 1 - exact), (-1, 1 - 2 * exact)][i]

@@ -16,12 +16,12 @@ from brewster.errors import BrewsterError
 from brewster.user_study.assignment import draw_trials
 from brewster.user_study.store import AnswerStore
 from brewster.user_study.study import read_study, write_study
-from small_studies import described, empty
+from small_studies import make_description, make_empty_study
 
 
 @pytest.fixture
 def store(tmp_path):
-    store = AnswerStore(empty(tmp_path / "study"))
+    store = AnswerStore(make_empty_study(tmp_path / "study"))
     yield store
     store.close()
 
@@ -32,27 +32,27 @@ def answers_by_participant(store):
 
 def test_a_participant_is_shown_what_the_draw_says_and_goes_on_where_they_stopped(store):
     tokens = [store.admit() for _ in range(3)]
-    person = store.participant(tokens[2])
-    assert person.trials == draw_trials(store.study.description, 2)
-    assert store.next_trial(person) == 0
-    for trial in range(len(person.trials)):
-        assert store.next_trial(person) == trial
-        store.record_answer(person, trial, "similar", seconds=2)
-    assert store.next_trial(person) is None
+    participant = store.participant(tokens[2])
+    assert participant.trials == draw_trials(store.study.description, 2)
+    assert store.next_trial(participant) == 0
+    for trial in range(len(participant.trials)):
+        assert store.next_trial(participant) == trial
+        store.record_answer(participant, trial, "similar", seconds=2)
+    assert store.next_trial(participant) is None
 
 
 def test_a_trial_that_was_passed_over_comes_next(store):
-    person = store.participant(store.admit())
-    store.record_answer(person, 1, "left", seconds=2)
-    assert store.next_trial(person) == 0
-    store.record_answer(person, 0, "left", seconds=2)
-    assert store.next_trial(person) == 2
+    participant = store.participant(store.admit())
+    store.record_answer(participant, 1, "left", seconds=2)
+    assert store.next_trial(participant) == 0
+    store.record_answer(participant, 0, "left", seconds=2)
+    assert store.next_trial(participant) == 2
 
 
 def test_the_first_answer_stays(store):
-    person = store.participant(store.admit())
-    assert store.record_answer(person, 0, "left", seconds=2) == "left"
-    assert store.record_answer(person, 0, "right", seconds=9) == "left"
+    participant = store.participant(store.admit())
+    assert store.record_answer(participant, 0, "left", seconds=2) == "left"
+    assert store.record_answer(participant, 0, "right", seconds=9) == "left"
     assert [(answer.choice, answer.seconds) for answer in answers_by_participant(store)[0].values()] == [
         ("left", 2)
     ]
@@ -82,15 +82,15 @@ def test_no_more_are_admitted_than_there_may_be(store):
 
 @pytest.mark.parametrize(("trial", "choice"), [(-1, "left"), (10, "left"), (0, "both")])
 def test_an_answer_to_nothing_is_refused(store, trial, choice):
-    person = store.participant(store.admit())
+    participant = store.participant(store.admit())
     with pytest.raises(BrewsterError, match="was answered with"):
-        store.record_answer(person, trial, choice, seconds=1)
+        store.record_answer(participant, trial, choice, seconds=1)
 
 
 def test_absurd_times_are_cut(store):
-    person = store.participant(store.admit())
-    store.record_answer(person, 0, "left", seconds=-5)
-    store.record_answer(person, 1, "left", seconds=1e9)
+    participant = store.participant(store.admit())
+    store.record_answer(participant, 0, "left", seconds=-5)
+    store.record_answer(participant, 1, "left", seconds=1e9)
     assert [answer.seconds for answer in answers_by_participant(store)[0].values()] == [0, 3600]
 
 
@@ -99,10 +99,10 @@ def test_two_servers_and_many_threads_lose_nothing_and_number_nobody_twice(store
 
     def take_part(number):
         own = (store, other)[number % 2]
-        person = own.participant(own.admit())
-        for trial in range(len(person.trials)):
-            own.record_answer(person, trial, ("left", "right")[number % 2], seconds=number)
-        return person.number
+        participant = own.participant(own.admit())
+        for trial in range(len(participant.trials)):
+            own.record_answer(participant, trial, ("left", "right")[number % 2], seconds=number)
+        return participant.number
 
     with ThreadPoolExecutor(8) as pool:
         numbers = list(pool.map(take_part, range(16)))
@@ -112,7 +112,7 @@ def test_two_servers_and_many_threads_lose_nothing_and_number_nobody_twice(store
 
 
 def test_a_file_that_is_no_database_is_told_in_one_sentence(tmp_path):
-    study = empty(tmp_path / "study")
+    study = make_empty_study(tmp_path / "study")
     study.answers_file.write_bytes(b"no database at all, but long enough to be read as a header" * 20)
     with pytest.raises(BrewsterError, match=r"answers\.sqlite cannot be used"):
         AnswerStore(study)
@@ -127,15 +127,15 @@ from brewster.user_study.study import read_study
 store = AnswerStore(read_study(Path(sys.argv[1])))
 while True:
     token = store.admit()
-    person = store.participant(token)
-    for trial in range(len(person.trials)):
-        store.record_answer(person, trial, "left", seconds=1)
-        print(person.number, trial, flush=True)
+    participant = store.participant(token)
+    for trial in range(len(participant.trials)):
+        store.record_answer(participant, trial, "left", seconds=1)
+        print(participant.number, trial, flush=True)
 """
 
 
 def test_what_was_acknowledged_before_kill_9_is_there_once(tmp_path):
-    write_study(tmp_path, described())
+    write_study(tmp_path, make_description())
     acknowledged = []
     for _ in range(2):
         writer = subprocess.Popen(
@@ -146,17 +146,17 @@ def test_what_was_acknowledged_before_kill_9_is_there_once(tmp_path):
         rest = writer.communicate()[0].splitlines()
         acknowledged += [tuple(map(int, line.split())) for line in rest if re.fullmatch(r"\d+ \d+", line)]
     store = AnswerStore(read_study(tmp_path))
-    kept = answers_by_participant(store)
+    stored = answers_by_participant(store)
     store.close()
     assert len(set(acknowledged)) == len(acknowledged) >= 30
-    assert all(trial in kept[number] for number, trial in acknowledged)
+    assert all(trial in stored[number] for number, trial in acknowledged)
     assert (
-        sum(map(len, kept.values())) <= len(acknowledged) + 2
+        sum(map(len, stored.values())) <= len(acknowledged) + 2
     )  # one of each writer may not have been told of
 
 
 def test_a_copy_of_the_folder_after_kill_9_has_all_answers_and_once_opened_again_the_file_alone(tmp_path):
-    write_study(tmp_path / "study", described())
+    write_study(tmp_path / "study", make_description())
     writer = subprocess.Popen(
         [sys.executable, "-c", WRITER, str(tmp_path / "study")], stdout=subprocess.PIPE, text=True
     )
@@ -181,22 +181,22 @@ def alone(study, folder):
 
 def test_a_store_that_is_closed_leaves_all_in_the_file_though_others_have_it_open(store, tmp_path):
     other = AnswerStore(store.study)
-    person = store.participant(store.admit())
-    store.record_answer(person, 0, "left", seconds=2)
+    participant = store.participant(store.admit())
+    store.record_answer(participant, 0, "left", seconds=2)
     store.close()
     assert len(answers_by_participant(alone(store.study, tmp_path / "alone"))[0]) == 1
     other.close()
 
 
 def test_a_reader_makes_no_database_and_sees_what_a_server_writes(store):
-    person = store.participant(store.admit())
-    store.record_answer(person, 0, "left", seconds=2)
+    participant = store.participant(store.admit())
+    store.record_answer(participant, 0, "left", seconds=2)
     reader = AnswerStore(store.study, read_only=True)
-    store.record_answer(person, 1, "right", seconds=2)
+    store.record_answer(participant, 1, "right", seconds=2)
     assert answers_by_participant(reader) == answers_by_participant(store)
     with pytest.raises(BrewsterError, match="cannot be used"):
         reader.admit()
     reader.close()
-    nobody = empty(store.study.folder / "nobody")
+    nobody = make_empty_study(store.study.folder / "nobody")
     assert answers_by_participant(AnswerStore(nobody, read_only=True)) == {}
     assert not nobody.answers_file.exists()

@@ -171,18 +171,18 @@ def serve(
     from brewster.user_study.study import read_study  # noqa: PLC0415
     from brewster.web import application as web  # noqa: PLC0415  (wakes FastAPI)
     from brewster.web.middleware import RequestLimits, is_loopback  # noqa: PLC0415
-    from brewster.web.study import participants  # noqa: PLC0415
+    from brewster.web.study import study_router  # noqa: PLC0415
 
     made = read_study(folder)
     made.verify_pictures()
     if not is_loopback(host):
         say(_WARNING.format(host=host))
     token = load_or_create_token(folder) if token == AUTO else token
-    guard = RequestLimits.at(host, token=token, max_bytes=_MAX_BYTES)
-    guard = replace(guard, hosts=guard.hosts | {*called})
+    limits = RequestLimits.for_host(host, token=token, max_bytes=_MAX_BYTES)
+    limits = replace(limits, hosts=limits.hosts | {*called})
     store = AnswerStore(made)
-    app = web.application(
-        participants(made, store, max_participants=most, token=token), guard=guard, home="study.html"
+    app = web.create_app(
+        study_router(made, store, max_participants=most, token=token), limits=limits, index="study.html"
     )
     with contextlib.closing(store), contextlib.suppress(KeyboardInterrupt):  # the usual end
         web.serve(app, host=host, port=port, on_ready=lambda url: invite(url, token))

@@ -1,8 +1,8 @@
-"""The desk where work is handed in: few at a time, a short queue, a time limit, and every job can be stopped.
+"""The desk where work is handed in: few at a time, a short queue, a time limit, and every job can be cancelled.
 
-    desk = Desk()
-    with desk.place("a name") as job:
-        answer = await desk.do(job, work, request.receive)
+    job_queue = Desk()
+    with job_queue.reserve("a name") as job:
+        answer = await job_queue.run_job(job, work, request.receive)
 
 `work(on_progress)` runs in a thread. It calls `on_progress(share done)` as often as it can: that is where it is stopped when the
 client goes away or time is over.
@@ -24,7 +24,7 @@ from starlette.types import Receive
 
 from brewster.inference.predictor import ProgressCallback
 
-Answer = TypeVar("Answer")
+Result = TypeVar("Result")
 
 
 @final
@@ -52,15 +52,15 @@ class SeparationJob:
     share: float = 0.0
     is_working: bool = False
     future: Future[Any] | None = None
-    stopped: Event = field(default_factory=Event)
+    cancelled: Event = field(default_factory=Event)
 
     def on_progress(self, share: float) -> None:
         """What the work calls."""
-        if self.stopped.is_set():
+        if self.cancelled.is_set():
             raise JobCancelled
         self.share = share
 
-    def run(self, work: Callable[[ProgressCallback], Answer]) -> Answer:
+    def run(self, work: Callable[[ProgressCallback], Result]) -> Result:
         """The work, in its thread."""
         self.on_progress(0)
         self.is_working = True
@@ -71,9 +71,9 @@ class SeparationJob:
 class JobQueue:
     """Takes jobs within one event loop and has them done in threads."""
 
-    def __init__(self, *, workers: int = 1, queue: int = 16, seconds: float = 300) -> None:
-        self.workers, self.queue, self.seconds = workers, queue, seconds
-        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="desk")
+    def __init__(self, *, workers: int = 1, max_waiting: int = 16, timeout_seconds: float = 300) -> None:
+        self.workers, self.max_waiting, self.timeout_seconds = workers, max_waiting, timeout_seconds
+        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="brewster-job")
         self._jobs: dict[object, SeparationJob] = {}
 
     @property
@@ -90,13 +90,13 @@ class JobQueue:
         return JobProgress("working" if job.is_working else "waiting", ahead, job.share)
 
     @contextmanager
-    def place(self, name: str | None = None) -> Iterator[SeparationJob]:
+    def reserve(self, name: str | None = None) -> Iterator[SeparationJob]:
         """A place for a job, to be taken before its bytes are; it is free again when no thread works on it.
 
         Raises:
             HTTPException: 503: all places are taken; 409: there is a job of this name.
         """
-        if self.jobs >= self.workers + self.queue:
+        if self.jobs >= self.workers + self.max_waiting:
             raise HTTPException(
                 503, f"{self.jobs} photos are waiting already; try again in a moment", {"Retry-After": "5"}
             )
@@ -107,44 +107,45 @@ class JobQueue:
         try:
             yield job
         finally:
-            job.stopped.set()
-            self._free(key, job.future)
+            job.cancelled.set()
+            self._release(key, job.future)
 
-    def _free(self, key: object, future: Future[Any] | None) -> None:
+    def _release(self, key: object, future: Future[Any] | None) -> None:
         if future is None or future.cancel():
             del self._jobs[key]
         else:
             future.add_done_callback(lambda _: self._jobs.pop(key))
 
-    async def do(
-        self, job: SeparationJob, work: Callable[[ProgressCallback], Answer], receive: Receive
-    ) -> Answer:
+    async def run_job(
+        self, job: SeparationJob, work: Callable[[ProgressCallback], Result], receive: Receive
+    ) -> Result:
         """The answer of the work.
 
         Raises:
             HTTPException: 504: it was not done in time.
             ClientDisconnect: nobody waits for the answer any more, as `receive` tells.
         """
-        future: Future[Answer] = self._pool.submit(job.run, work)
+        future: Future[Result] = self._pool.submit(job.run, work)
         job.future, answer = future, asyncio.wrap_future(future)
-        gone = asyncio.ensure_future(_gone(receive))
+        disconnected = asyncio.ensure_future(_wait_for_disconnect(receive))
         try:
             done, _ = await asyncio.wait(
-                (answer, gone), timeout=self.seconds, return_when=asyncio.FIRST_COMPLETED
+                (answer, disconnected), timeout=self.timeout_seconds, return_when=asyncio.FIRST_COMPLETED
             )
             if answer in done:
                 return answer.result()
-            if gone in done:
+            if disconnected in done:
                 raise ClientDisconnect
             raise HTTPException(
-                504, f"it took longer than {self.seconds:g} seconds; try a smaller photo, or quality draft"
+                504,
+                f"it took longer than {self.timeout_seconds:g} seconds; try a smaller photo, or quality draft",
             )
         finally:
-            job.stopped.set()
+            job.cancelled.set()
             answer.cancel()
-            gone.cancel()
+            disconnected.cancel()
 
 
-async def _gone(receive: Receive) -> None:
+async def _wait_for_disconnect(receive: Receive) -> None:
     while (await receive())["type"] != "http.disconnect":
         pass

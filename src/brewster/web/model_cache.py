@@ -53,7 +53,7 @@ class ModelCache:
 
     def rows(self) -> list[ModelRow]:
         """What there is to know of each model."""
-        return [_row(name, source) for name, source in self._sources.items()]
+        return [_model_row(name, source) for name, source in self._sources.items()]
 
     def separator(self, name: str) -> Separator:
         """The separator of a model, loaded when it is first asked for; safe to call from many threads.
@@ -68,7 +68,7 @@ class ModelCache:
             return self._loaded[name]
 
 
-def _row(name: str, source: str) -> ModelRow:
+def _model_row(name: str, source: str) -> ModelRow:
     if zoo.is_large(source):
         return ModelRow(name=name, licence="that of its base", sha256=None, card=None)
     model = zoo.find_model(source)

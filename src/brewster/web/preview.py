@@ -25,10 +25,10 @@ from brewster.srgb import to_encoded
 PREVIEW_PIXELS: Final = 1_400_000
 """Larger photos are made smaller: about as many pixels as a window shows."""
 
-LOWEST, HIGHEST = -1.0, 2.0
+RANGE_MIN, RANGE_MAX = -1.0, 2.0
 """Linear light that the 16-bit numbers of a transmission at full strength stand for, from 0 to 65535."""
 
-_FAINT: Final = 1 / 64
+_SMALL_STRENGTH: Final = 1 / 64
 """Strength asked for in place of 1: layers so faint are not clipped, and grow in proportion."""
 
 
@@ -43,28 +43,33 @@ def preview(
     Raises:
         BrewsterError: as `Separator` does.
     """
-    width, height = _fitting(photo.size)
+    width, height = _preview_size(photo.size)
     small = photo.small(width, height)
-    asked = options.call() | {"strength": _FAINT, "additive": False}
-    shown = Photo.from_array(small[..., : photo.pixels.shape[2]], encoding="linear")  # grey stays grey
-    layers = separator(shown, on_progress=on_progress, **asked)
-    transmission = small + (layers.transmission.linear() - small) / np.float32(_FAINT)
-    reflection = layers.reflection.linear() / np.float32(_FAINT)
-    head = {"width": width, "height": height, "full": photo.size, "range": (LOWEST, HIGHEST)}
+    arguments = options.call() | {"strength": _SMALL_STRENGTH, "additive": False}
+    reduced = Photo.from_array(small[..., : photo.pixels.shape[2]], encoding="linear")  # grey stays grey
+    layers = separator(reduced, on_progress=on_progress, **arguments)
+    transmission = small + (layers.transmission.linear() - small) / np.float32(_SMALL_STRENGTH)
+    reflection = layers.reflection.linear() / np.float32(_SMALL_STRENGTH)
+    head = {"width": width, "height": height, "full": photo.size, "range": (RANGE_MIN, RANGE_MAX)}
     head["doubtful"] = layers.doubtful
-    maps = _srgb(small), _numbers(transmission), _srgb(reflection), layers.confidence.pixels
+    maps = (
+        _to_srgb_bytes(small),
+        _to_uint16(transmission),
+        _to_srgb_bytes(reflection),
+        layers.confidence.pixels,
+    )
     return b"".join((json.dumps(head).encode(), b"\n", *(map_.tobytes() for map_ in maps)))
 
 
-def _fitting(size: tuple[int, int]) -> tuple[int, int]:
+def _preview_size(size: tuple[int, int]) -> tuple[int, int]:
     scale = min(1.0, math.sqrt(PREVIEW_PIXELS / math.prod(size)))
     return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
-def _srgb(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
+def _to_srgb_bytes(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.rint(255 * to_encoded(np.clip(linear, 0, 1))).astype(np.uint8)
 
 
-def _numbers(linear: NDArray[np.float32]) -> NDArray[np.uint16]:
-    share: NDArray[np.float32] = (np.clip(linear, LOWEST, HIGHEST) - LOWEST) / (HIGHEST - LOWEST)
+def _to_uint16(linear: NDArray[np.float32]) -> NDArray[np.uint16]:
+    share: NDArray[np.float32] = (np.clip(linear, RANGE_MIN, RANGE_MAX) - RANGE_MIN) / (RANGE_MAX - RANGE_MIN)
     return np.rint(65535 * share).astype(np.dtype("<u2"), copy=False)

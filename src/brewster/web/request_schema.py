@@ -21,7 +21,7 @@ from brewster.options import Options
 FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
 """The options that a client may choose; the others are the server's own."""
 _OPTIONS: Final = TypeAdapter(Options)
-_LONGEST_NAME: Final = 120
+_MAX_NAME_BYTES: Final = 120
 _PHOTO: Final = {
     "type": "string",
     "contentMediaType": "application/octet-stream",
@@ -39,11 +39,11 @@ class SeparationRequest:
     """The photo's name, safe to write to and never a path."""
     options: Options
 
-    def target(self, layer: str, own: str) -> str:
+    def target(self, layer: str, container: str) -> str:
         """The name of a layer's file as the command line gives it, for a photo whose own container is `own`."""
         source = Path(self.name)
         if source.suffix.lower() not in SUFFIXES:
-            source = Path(f"{self.name}.{own}")
+            source = Path(f"{self.name}.{container}")
         return (
             SeparationPaths(source, Path(), source.stem)
             .target(layer, self.options.suffix(layer, source))
@@ -70,12 +70,12 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
     except ValueError as error:  # Python knows charsets that it cannot read text by
         raise HTTPException(400, "the form's charset cannot be read; send it in UTF-8") from error
     try:
-        return await _asked(form, _options(form, models, max_pixels))
+        return await _build_request(form, _options(form, models, max_pixels))
     finally:
         await form.close()
 
 
-async def _asked(form: FormData, options: Options) -> SeparationRequest:
+async def _build_request(form: FormData, options: Options) -> SeparationRequest:
     photo = form.get("photo")
     if not isinstance(photo, UploadFile):
         raise HTTPException(422, "there is no photo; send its file in the field photo")
@@ -112,11 +112,11 @@ def safe_name(name: str) -> str:
     plain = "".join(letter if letter.isprintable() and letter not in '<>:"|?*' else "_" for letter in last)
     path = Path(plain.strip(". ") or "photo")
     suffix = path.suffix if path.suffix.lower() in SUFFIXES else ""
-    stem = path.name.removesuffix(suffix).encode()[:_LONGEST_NAME].decode(errors="ignore")
+    stem = path.name.removesuffix(suffix).encode()[:_MAX_NAME_BYTES].decode(errors="ignore")
     return stem.rstrip(". ") + suffix
 
 
-def explain(errors: Iterable[Any]) -> str:
+def validation_message(errors: Iterable[Any]) -> str:
     """What pydantic found wrong, in one sentence."""
     found = (
         f"{'.'.join(map(str, error['loc']))} is {str(error['input'])[:40]!r}; {error['msg']}"
@@ -126,23 +126,25 @@ def explain(errors: Iterable[Any]) -> str:
 
 
 def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
-    words = {name: [str(value) for value in form.getlist(name)] for name in form if name != "photo"}
-    unknown = [name for name in words if name not in FIELDS]
+    texts = {name: [str(value) for value in form.getlist(name)] for name in form if name != "photo"}
+    unknown = [name for name in texts if name not in FIELDS]
     if unknown:
         raise HTTPException(
             422, f"there is no field {unknown[0][:40]!r}; the fields are photo, {', '.join(FIELDS)}"
         )
-    asked: dict[str, Any] = {name: values[-1] for name, values in words.items() if values[-1]}
-    if "layers" in words:
-        asked["layers"] = _in_order(",".join(words["layers"]).split(","))
-    if asked.setdefault("model", models[0]) not in models:
-        raise HTTPException(422, f"there is no model {asked['model'][:40]!r}; choose {' or '.join(models)}")
+    values_by_name: dict[str, Any] = {name: values[-1] for name, values in texts.items() if values[-1]}
+    if "layers" in texts:
+        values_by_name["layers"] = _ordered_layers(",".join(texts["layers"]).split(","))
+    if values_by_name.setdefault("model", models[0]) not in models:
+        raise HTTPException(
+            422, f"there is no model {values_by_name['model'][:40]!r}; choose {' or '.join(models)}"
+        )
     try:
-        return _OPTIONS.validate_python(asked | {"max_pixels": max_pixels})
+        return _OPTIONS.validate_python(values_by_name | {"max_pixels": max_pixels})
     except ValidationError as error:
-        raise HTTPException(422, explain(error.errors())) from error
+        raise HTTPException(422, validation_message(error.errors())) from error
 
 
-def _in_order(layers: Sequence[str]) -> list[str]:
+def _ordered_layers(layers: Sequence[str]) -> list[str]:
     """Each once, in the order of the command line; unknown ones last, to be refused."""
     return [layer for layer in dict.fromkeys((*LAYERS, *layers)) if layer in layers]

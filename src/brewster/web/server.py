@@ -1,6 +1,6 @@
 """The server on the wire: uvicorn that says little, waits for no client without end, and ends without noise.
 
-    server(app).run(sockets=[listening])
+    create_server(app).run(sockets=[listening])
 
 A client has its turn when it asks and when it takes the answer; only then is it timed.
 """
@@ -15,15 +15,15 @@ import uvicorn
 from fastapi import FastAPI
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-LOOK_SECONDS: Final = 10.0
+IDLE_CHECK_SECONDS: Final = 10.0
 """Twice this long, at most, a client may neither finish the head of a request nor take a byte of its answer."""
 GRACE_SECONDS: Final = 2.0
 """How long what is under way may go on when the server ends."""
 _BACKLOG: Final = 128
-_KERNEL_BYTES: Final = 1 << 17  # of an answer; more would hide for long that a slow client takes any
+_SEND_BUFFER_BYTES: Final = 1 << 17  # of an answer; more would hide for long that a slow client takes any
 
 
-def server(app: FastAPI) -> uvicorn.Server:
+def create_server(app: FastAPI) -> uvicorn.Server:
     """A server of an application; when it ends, it waits two seconds for what is under way."""
     config = uvicorn.Config(
         app,
@@ -46,17 +46,17 @@ class QuietServer(uvicorn.Server):
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Begins the service."""
         for listening in sockets or []:  # connections inherit it
-            listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _KERNEL_BYTES)
-        asyncio.get_running_loop().set_exception_handler(_tell)
+            listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
+        asyncio.get_running_loop().set_exception_handler(_handle_loop_error)
         await super().startup(sockets)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """Ends the service."""
-        ending = asyncio.get_running_loop().call_later(GRACE_SECONDS, self._cancel)
+        grace_timer = asyncio.get_running_loop().call_later(GRACE_SECONDS, self._cancel)
         try:
             await super().shutdown(sockets)
         finally:
-            ending.cancel()
+            grace_timer.cancel()
 
     def _cancel(self) -> None:
         for connection in list(self.server_state.connections):
@@ -70,8 +70,8 @@ class QuietServer(uvicorn.Server):
 class TimeoutProtocol(H11Protocol):
     """One connection, looked at now and then: one without a sign of life between two looks is ended."""
 
-    _before: tuple[object, int] | None = None
-    _look_later: asyncio.TimerHandle | None = None
+    _previous_state: tuple[object, int] | None = None
+    _idle_timer: asyncio.TimerHandle | None = None
 
     @property
     def is_unanswered(self) -> bool:
@@ -81,26 +81,26 @@ class TimeoutProtocol(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """A client has come."""
         super().connection_made(transport)
-        self._look_later = self.loop.call_later(LOOK_SECONDS, self._look)
+        self._idle_timer = self.loop.call_later(IDLE_CHECK_SECONDS, self._check_idle)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """It has gone."""
         super().connection_lost(exc)
-        if self._look_later:
-            self._look_later.cancel()
+        if self._idle_timer:
+            self._idle_timer.cancel()
 
-    def _look(self) -> None:
-        unsent = self.transport.get_write_buffer_size()
-        is_at_work = self.cycle is not None and not self.cycle.response_complete
-        now = self.cycle, unsent
-        if now == self._before and (unsent or not is_at_work):
+    def _check_idle(self) -> None:
+        unsent_bytes = self.transport.get_write_buffer_size()
+        is_responding = self.cycle is not None and not self.cycle.response_complete
+        state = self.cycle, unsent_bytes
+        if state == self._previous_state and (unsent_bytes or not is_responding):
             self.transport.abort()
             return
-        self._before = now
-        self._look_later = self.loop.call_later(LOOK_SECONDS, self._look)
+        self._previous_state = state
+        self._idle_timer = self.loop.call_later(IDLE_CHECK_SECONDS, self._check_idle)
 
 
-def _tell(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+def _handle_loop_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
     """Too many connections just wait: asyncio would report each of them, each second, and once more at the end."""
     if not any(noise in context["message"] for noise in ("socket.accept()", "_start_serving")):
         loop.default_exception_handler(context)

@@ -1,6 +1,6 @@
 """What a participant's browser talks to: consent, the pictures of a trial, answers.
 
-    application(participants(study, Store(study)), guard=guard, home="study.html")
+    create_app(study_router(study, Store(study)), limits=limits, index="study.html")
 
 Nothing here names a method, a file or a dataset: a picture is a trial's left, right or photo, and only who holds the
 personal link of that trial gets it.
@@ -21,10 +21,10 @@ from brewster.user_study import assignment
 from brewster.user_study.assignment import Choice
 from brewster.user_study.store import AnswerStore, Participant
 from brewster.user_study.study import Study
-from brewster.web.application import page
+from brewster.web.application import page_response
 
-_KEEP: Final = {"Cache-Control": "private, max-age=86400, immutable"}
-_FORGET: Final = {"Cache-Control": "no-store"}
+_CACHED: Final = {"Cache-Control": "private, max-age=86400, immutable"}
+_NOT_CACHED: Final = {"Cache-Control": "no-store"}
 
 
 class _Strict(BaseModel):
@@ -79,18 +79,18 @@ Token = Annotated[str, FromPath(max_length=64)]
 Side = Literal["photo", "left", "right"]
 
 
-def participants(
+def study_router(
     study: Study, store: AnswerStore, *, max_participants: int | None = None, token: str | None = None
 ) -> APIRouter:
     """The routes of a study that admits at most so many; personal links carry the guard's token, if there is one."""
-    door, router = _StudyRoutes(study, store, max_participants, token), APIRouter(tags=["study"])
-    router.get("/invitation")(door.invitation)
-    router.post("/participants", status_code=201)(door.admit)
-    router.get("/s/{person}", include_in_schema=False)(door.begin)
-    router.get("/s/{person}/link")(door.link)
-    router.get("/s/{person}/trial")(door.next_trial)
-    router.get("/s/{person}/pictures/{trial}/{side}", response_class=Response)(door.picture)
-    router.post("/s/{person}/answers")(door.answer)
+    routes, router = _StudyRoutes(study, store, max_participants, token), APIRouter(tags=["study"])
+    router.get("/invitation")(routes.invitation)
+    router.post("/participants", status_code=201)(routes.admit)
+    router.get("/s/{participant_token}", include_in_schema=False)(routes.begin)
+    router.get("/s/{participant_token}/link")(routes.link)
+    router.get("/s/{participant_token}/trial")(routes.next_trial)
+    router.get("/s/{participant_token}/pictures/{trial}/{side}", response_class=Response)(routes.picture)
+    router.post("/s/{participant_token}/answers")(routes.answer)
     return router
 
 
@@ -114,30 +114,30 @@ class _StudyRoutes:
 
     def admit(self, _agreement: Annotated[ConsentRequest, Body()]) -> PersonalLink:
         """Admits somebody who agrees to take part, and gives them a link of their own."""
-        person = self.store.admit(max_participants=self.max_participants)
-        if person is None:
+        participant_token = self.store.admit(max_participants=self.max_participants)
+        if participant_token is None:
             raise HTTPException(403, "the study has all the participants that it needs; thank you for coming")
-        return self._link(person)
+        return self._link(participant_token)
 
-    def begin(self, person: Token) -> Response:
+    def begin(self, participant_token: Token) -> Response:
         """The page behind a personal link; where nobody has it, the same page says so."""
-        answer = page("study.html")
-        answer.status_code = 404 if self.store.participant(person) is None else 200
-        return answer
+        response = page_response("study.html")
+        response.status_code = 404 if self.store.participant(participant_token) is None else 200
+        return response
 
-    def link(self, person: Token) -> PersonalLink:
+    def link(self, participant_token: Token) -> PersonalLink:
         """The personal link, whole: the page's own address has lost the guard's token."""
-        self._participant(person)
-        return self._link(person)
+        self._participant(participant_token)
+        return self._link(participant_token)
 
-    def next_trial(self, person: Token, response: Response) -> TrialResponse:
+    def next_trial(self, participant_token: Token, response: Response) -> TrialResponse:
         """The first trial without an answer."""
-        response.headers.update(_FORGET)
-        return self._next(self._participant(person))
+        response.headers.update(_NOT_CACHED)
+        return self._next(self._participant(participant_token))
 
-    def picture(self, person: Token, trial: int, side: Side) -> Response:
+    def picture(self, participant_token: Token, trial: int, side: Side) -> Response:
         """A picture of a trial."""
-        shown = _shown(self._participant(person), trial)
+        shown = _trial(self._participant(participant_token), trial)
         try:
             data = self.study.picture_file(getattr(shown, side)).read_bytes()
         except (
@@ -146,20 +146,20 @@ class _StudyRoutes:
             raise HTTPException(
                 410, "a picture is missing on the server; please tell whoever runs the study"
             ) from error
-        return Response(data, media_type="image/png", headers=_KEEP)
+        return Response(data, media_type="image/png", headers=_CACHED)
 
-    def answer(self, person: Token, given: Annotated[AnswerRequest, Body()]) -> AnswerResponse:
+    def answer(self, participant_token: Token, answer: Annotated[AnswerRequest, Body()]) -> AnswerResponse:
         """Keeps an answer on the disk. The first one to a trial stays: sent again, it changes nothing."""
-        participant = self._participant(person)
-        _shown(participant, given.trial)
-        kept = self.store.record_answer(participant, given.trial, given.choice, seconds=given.seconds)
-        return AnswerResponse(kept=kept, next=self._next(participant))
+        participant = self._participant(participant_token)
+        _trial(participant, answer.trial)
+        stored = self.store.record_answer(participant, answer.trial, answer.choice, seconds=answer.seconds)
+        return AnswerResponse(kept=stored, next=self._next(participant))
 
-    def _link(self, person: str) -> PersonalLink:
-        return PersonalLink(link=f"/s/{person}" + (f"?token={self.token}" if self.token else ""))
+    def _link(self, participant_token: str) -> PersonalLink:
+        return PersonalLink(link=f"/s/{participant_token}" + (f"?token={self.token}" if self.token else ""))
 
-    def _participant(self, person: str) -> Participant:
-        participant = self.store.participant(person)
+    def _participant(self, participant_token: str) -> Participant:
+        participant = self.store.participant(participant_token)
         if participant is None:
             raise HTTPException(
                 404, "nobody has this link; check that it is whole, or begin at the first page"
@@ -174,7 +174,7 @@ class _StudyRoutes:
         return TrialResponse(trial=trial, trials=count, width=photo.width, height=photo.height)
 
 
-def _shown(participant: Participant, trial: int) -> assignment.TrialDraw:
+def _trial(participant: Participant, trial: int) -> assignment.TrialDraw:
     if not 0 <= trial < len(participant.trials):
         raise HTTPException(404, f"there is no trial {trial}; load the page again")
     return participant.trials[trial]

@@ -19,27 +19,27 @@ export function readMaps(buffer) {
   const head = JSON.parse(new TextDecoder().decode(buffer.slice(0, end)));
   const count = head.width * head.height;
   let at = end + 1;
-  const take = (kind, length) => {
+  const read = (kind, length) => {
     const bytes = length * kind.BYTES_PER_ELEMENT;
     at += bytes;
     return new kind(buffer.slice(at - bytes, at));
   };
-  const photo = take(Uint8Array, 3 * count);
-  const numbers = take(Uint16Array, 3 * count);
-  const mirrored = take(Uint8Array, 3 * count);
+  const photo = read(Uint8Array, 3 * count);
+  const numbers = read(Uint16Array, 3 * count);
+  const reflection = read(Uint8Array, 3 * count);
   const [lowest, highest] = head.range;
   const change = new Float32Array(3 * count);
   for (let i = 0; i < change.length; i++) {
     change[i] = lowest + (numbers[i] / 65535) * (highest - lowest) - LINEAR[photo[i]];
   }
-  return { ...head, photo, change, mirrored, confidence_map: take(Uint8Array, count) };
+  return { ...head, photo, change, reflection, confidence_map: read(Uint8Array, count) };
 }
 
 const VIEWS = {
   photo: (maps) => (i) => maps.photo[i],
   transmission: ({ photo, change }, strength) => (i) => code(LINEAR[photo[i]] + strength * change[i]),
-  reflection: ({ photo, mirrored }, strength) => (i) =>
-    code(Math.min(strength * LINEAR[mirrored[i]], LINEAR[photo[i]])),
+  reflection: ({ photo, reflection }, strength) => (i) =>
+    code(Math.min(strength * LINEAR[reflection[i]], LINEAR[photo[i]])),
   confidence: ({ confidence_map }) => (i) => confidence_map[(i / 3) | 0],
 };
 
