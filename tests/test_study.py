@@ -111,7 +111,7 @@ def test_everything_that_does_not_fit_is_named_at_once_and_nothing_is_written(tm
     for message in (
         f"ours has no {methods['ours'] / 'real/2'}.*",
         f"{methods['ours'] / 'nature/1.png'} has no input",
-        f"{methods['RDNet'] / 'real/1.png'} is 12x18, its input 24x18",
+        f"{methods['RDNet'] / 'real/1.png'} has 12x18 pixels, its input 24x18",
         f"{methods['RDNet'] / 'real/10.png'}: ",
         f"RDNet has no {methods['RDNet'] / 'nature/other'}.*",
     ):
@@ -130,8 +130,8 @@ def test_one_name_in_two_formats_is_refused(tmp_path, folders):
     ("options", "message"),
     [
         (StudyOptions(datasets=("wild",)), "no dataset 'wild'"),
-        (StudyOptions(pairs=5), "5 pairs .* there are 4"),
-        (StudyOptions(catches=5), "5 catch trials .* there are 4"),
+        (StudyOptions(pairs=5), "5 pairs .* at most 4"),
+        (StudyOptions(catches=5), "5 catch trials .* at most 4"),
     ],
 )
 def test_more_than_there_is_is_refused(tmp_path, folders, options, message):
@@ -144,9 +144,9 @@ def test_one_method_is_no_study_and_an_empty_folder_none_either(tmp_path, folder
     with pytest.raises(BrewsterError, match="two or more"):
         create(tmp_path / "study", inputs, {"ours": methods["ours"]})
     (tmp_path / "empty").mkdir()
-    with pytest.raises(BrewsterError, match="holds no picture"):
+    with pytest.raises(BrewsterError, match="contains no picture"):
         create(tmp_path / "study", tmp_path / "empty", methods)
-    with pytest.raises(BrewsterError, match="is no folder"):
+    with pytest.raises(BrewsterError, match="is not a folder"):
         create(tmp_path / "study", tmp_path / "nowhere", methods)
 
 
@@ -212,7 +212,7 @@ def test_pictures_beside_folders_of_pictures_are_named_and_refused_unless_datase
 ):
     inputs, methods = folders
     write_pictures(inputs, ["stray"])
-    with pytest.raises(BrewsterError, match=r"stray\.png\) beside folders of them \(nature, real\)"):
+    with pytest.raises(BrewsterError, match=r"stray\.png\) and subfolders with pictures \(nature, real\)"):
         create(tmp_path / "study", inputs, methods)
     study = create(tmp_path / "study", inputs, methods, StudyOptions(datasets=("nature", "real")))
     assert len(study.description.comparisons) == 4

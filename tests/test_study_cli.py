@@ -77,7 +77,7 @@ def test_report_prints_tables_and_writes_all_files(bare, created, random):
     code, out, err = bare("study", "report", "study")
     assert code == 0
     assert "### ours and RDNet" in out.decode()
-    assert "12 participants (12 to the end), 48 answers; 0 of 48 catch trials failed." in out.decode()
+    assert "12 participants (12 complete), 48 answers; 0 of 48 catch trials failed." in out.decode()
     assert "all of it is in study/report" in err
     names = {path.name for path in (created.folder / "report").iterdir()}
     assert names == {"report.json", "report.md", "table.tex", "table.csv", "answers.csv", "plot.png"}
@@ -170,7 +170,7 @@ def test_a_token_of_its_own_is_kept_for_its_owner_and_links_survive_a_restart(cr
 def test_a_kept_token_that_is_none_is_refused(bare, created):
     (created.folder / "token").write_text("short\n")
     code, _, err = bare("study", "serve", "study", "--token", "auto")
-    assert (code, "holds no token" in err) == (1, True)
+    assert (code, "contains no valid token" in err) == (1, True)
 
 
 @pytest.mark.parametrize(
@@ -210,7 +210,7 @@ def test_create_prints_and_refuses_the_true_number_of_catch_trials(bare, tmp_pat
         write_pictures(tmp_path / name, names, size=(4, 3), seed=seed)
     args = ["--inputs", "inputs", "--method", "ours=ours", "--method", "RDNet=rdnet", "--catches"]
     code, _, err = bare("study", "create", "study", *args, 25)
-    assert (code, "25 catch trials a participant were asked for; there are 24 at most" in err) == (
+    assert (code, "25 catch trials for each participant were requested; at most 24 are available" in err) == (
         1,
         True,
     )

@@ -318,8 +318,8 @@ def test_markdown_says_all_and_csv_has_a_line_for_each_number(hundred):
     _, _, results = hundred
     text = to_markdown(results)
     for part in (
-        "6 for wrong answers, 4 for haste",
-        "## Everyone",
+        "6 for wrong answers, 4 for short times",
+        "## All participants",
         "Mean of the datasets",
         "Krippendorff's alpha is",
     ):
@@ -346,9 +346,9 @@ def test_a_rule_that_leaves_nobody_still_tells_of_everyone(hundred):
     study, participants, _ = hundred
     results = summarise(study, participants[:5], ExclusionRule())
     assert results["included"]["participants"] == 0
-    assert to_latex(results).startswith("% the rule leaves nobody")
+    assert to_latex(results).startswith("% the rule excludes everyone")
     assert plot(results)[1:4] == b"PNG"
-    assert "## Everyone" in to_markdown(results)
+    assert "## All participants" in to_markdown(results)
 
 
 # --- names
@@ -394,7 +394,7 @@ def test_a_plot_of_everyone_says_so(hundred, monkeypatch):
     monkeypatch.setattr("matplotlib.figure.Figure.suptitle", lambda _self, text, **_how: titles.append(text))
     for count in (20, 5):  # of the five, nobody is kept
         plot(summarise(study, participants[:count], ExclusionRule()))
-    assert titles == ["Everyone: the rule leaves nobody"]
+    assert titles == ["All participants: the rule excludes everyone"]
 
 
 def test_answers_csv_says_who_is_left_out_and_why(hundred, tmp_path):

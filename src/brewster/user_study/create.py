@@ -1,9 +1,9 @@
-"""From folders of outputs to a study: every picture paired by name, copied under a name that tells nothing.
+"""Create a study from folders of outputs: pair pictures by name and copy them under random names.
 
     create(Path("out/study"), Path("inputs"), {"ours": Path("out/ours"), "RDNet": Path("out/rdnet")})
 
-Whatever does not fit is refused, all of it named, before anything is written. Pictures are kept as PNG of 8-bit sRGB,
-upright and without metadata: every browser shows them alike, and neither format nor EXIF tells where they come from.
+All files are checked before anything is written; one error lists all problems. Pictures are stored as upright 8-bit sRGB
+PNG without metadata: every browser shows them alike, and neither format nor EXIF reveals the method.
 """
 
 from __future__ import annotations
@@ -50,7 +50,11 @@ nothing else about you or your device."""
 @final
 @dataclass(frozen=True)
 class StudyOptions:
-    """What can be chosen about a study; None takes 40 pairs and 4 catch trials, or fewer where there are not so many."""
+    """Options of a new study.
+
+    `pairs` and `catches` count the comparisons and catch trials of one participant. None takes DEFAULT_PAIRS and
+    DEFAULT_CATCHES, or fewer if the study has fewer pictures.
+    """
 
     datasets: Sequence[str] = ()
     pairs: int | None = None
@@ -63,7 +67,7 @@ class StudyOptions:
 @final
 @dataclass(frozen=True)
 class _StudyFiles:
-    """The files of a study, by photo: the inputs, and each method's outputs."""
+    """The source files of a study by (dataset, stem): the inputs, and the outputs of each method."""
 
     inputs: Mapping[Key, Path]
     outputs: Mapping[str, Mapping[Key, Path]]
@@ -76,13 +80,19 @@ def create(
     options: StudyOptions = StudyOptions(),
     on_progress: Callable[[int], None] = lambda _done: None,
 ) -> Study:
-    """Makes a study of all pictures in the folder of inputs; the first method is compared with each other one.
+    """Create a study of all pictures in the folder `inputs`.
 
-    `on_progress` is called with how many pictures are copied, after each.
+    Args:
+        out: the folder of the new study; it must not exist or be empty.
+        inputs: the folder of photos with reflections.
+        methods: the folder of outputs by method name. The first method is compared with each of the others.
+        options: sizes, seed and consent text.
+        on_progress: called after each copied picture with the number of pictures copied so far.
 
     Raises:
-        BrewsterError: fewer than two methods; names, sizes or files do not fit; more pairs than there are.
-        TargetError: `out` is not empty, or cannot be written.
+        BrewsterError: there are fewer than two methods; files are missing, unreadable or of different sizes; or `options`
+            requests more pairs or catch trials than exist.
+        TargetError: `out` is not empty or cannot be written.
     """
     _require_empty(out)
     files = _pair_pictures(inputs, methods, options.datasets)
@@ -94,7 +104,7 @@ def create(
         options.catches, DEFAULT_CATCHES, min(CATCH_POOL_SIZE, len(files.inputs)), "catch trials"
     )
     with arriving(out) as folder:
-        copier = _Copier(folder / PICTURES, Random(f"{seed}/names"), on_progress)  # noqa: S311  (a published seed)
+        copier = _Copier(folder / PICTURES, Random(f"{seed}/names"), on_progress)  # noqa: S311  (the seed is published)
         comparisons = tuple(_comparisons(files, pairs, copier))
         pool = tuple(_catch_pool(files, copier, Random(f"{seed}/catches")))  # noqa: S311
         description = StudyDescription(
@@ -113,14 +123,14 @@ def create(
     return Study(out, description)
 
 
-# --- what is there, and whether it fits
+# --- checking the source files
 
 
 def _pair_pictures(inputs: Path, methods: Mapping[str, Path], datasets: Sequence[str]) -> _StudyFiles:
     if len(methods) < 2:
         raise BrewsterError(
-            f"{len(methods)} method was named",
-            "a study compares two or more",
+            f"the study has {len(methods)} method",
+            "a study compares two or more methods",
             "add another --method NAME=DIR",
         )
     files = _StudyFiles(
@@ -131,8 +141,8 @@ def _pair_pictures(inputs: Path, methods: Mapping[str, Path], datasets: Sequence
     if misfits:
         raise BrewsterError(
             f"{len(misfits)} {'picture does' if len(misfits) == 1 else 'pictures do'} not fit: {shorten_list(misfits)}",
-            "every input has one output of each method, of its own size",
-            "mend these and run again; nothing was written",
+            "every input has one output of each method, of the same size",
+            "fix these files and run the command again; nothing was written",
         )
     return files
 
@@ -146,7 +156,7 @@ def _unpaired(files: _StudyFiles, inputs: Path, methods: Mapping[str, Path]) -> 
 
 
 def _unfit_files(files: _StudyFiles) -> Iterator[str]:
-    """What cannot be read whole, and outputs of another size than their input."""
+    """Files that cannot be decoded, and outputs whose size differs from that of the input."""
     sizes: dict[Path, tuple[int, int]] = {}
     for path in [
         *files.inputs.values(),
@@ -160,33 +170,31 @@ def _unfit_files(files: _StudyFiles) -> Iterator[str]:
         output = outputs.get(key)
         if output in sizes and photo in sizes and sizes[output] != sizes[photo]:
             (wide, high), (width, height) = sizes[output], sizes[photo]
-            yield f"{output} is {wide}x{high}, its input {width}x{height}"
+            yield f"{output} has {wide}x{high} pixels, its input {width}x{height}"
 
 
 def _limited(requested: int | None, default: int, maximum: int, what: str) -> int:
     if requested is not None and requested > maximum:
         raise BrewsterError(
-            f"{requested} {what} a participant were asked for",
-            f"there are {maximum} at most",
-            "ask for fewer",
+            f"{requested} {what} for each participant were requested",
+            f"at most {maximum} are available",
+            "request fewer",
         )
     return min(default, maximum) if requested is None else requested
 
 
 def _require_empty(out: Path) -> None:
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
-        raise TargetError(
-            f"{out} is not empty", "a study is made once, in a folder of its own", "name another"
-        )
+        raise TargetError(f"{out} is not empty", "a new study needs an empty folder", "choose another folder")
 
 
-# --- the pictures under their new names
+# --- copying pictures under random names
 
 
 @final
 @dataclass(frozen=True)
 class _Copier:
-    """Copies pictures, each once, under names drawn by the rng."""
+    """Copies each picture once, under a random name."""
 
     folder: Path
     rng: Random
@@ -194,7 +202,7 @@ class _Copier:
     pictures: dict[Path, StudyPicture] = field(default_factory=dict)
 
     def copy(self, path: Path) -> str:
-        """The new name of a picture."""
+        """Copy a picture if it is not copied yet; returns its new name."""
         if path not in self.pictures:
             data = path.read_bytes()
             self.pictures[path] = self.write(Photo.open(data), hashlib.sha256(data).hexdigest())
@@ -202,8 +210,8 @@ class _Copier:
         return self.pictures[path].name
 
     def copy_degraded(self, path: Path) -> str:
-        """The new name of a picture, spoilt."""
-        key = path / "degraded"  # no file, but a name of its own
+        """Write a degraded copy of a picture; returns its new name."""
+        key = path / "degraded"  # a key that no source file has
         data = path.read_bytes()
         degraded = Photo.from_array(
             degrade(Photo.open(data).srgb_8bit(), self.rng.getrandbits(32)), encoding="srgb"
@@ -212,7 +220,7 @@ class _Copier:
         return self.pictures[key].name
 
     def write(self, photo: Photo, source: str) -> StudyPicture:
-        """Writes a picture without anything that tells where it comes from."""
+        """Write a picture as PNG without metadata."""
         name = f"{self.rng.getrandbits(64):016x}.png"
         data = Photo.from_array(photo.srgb_8bit(), encoding="srgb").encode("png")
         write_atomically(self.folder / name, data)
@@ -229,7 +237,7 @@ def _comparisons(
 
 
 def _catch_pool(files: _StudyFiles, copier: _Copier, rng: Random) -> Iterator[CatchTrial]:
-    """Photos for catch trials, at most CATCH_POOL_SIZE, each with an output of some method and that output spoilt."""
+    """Photos for catch trials, at most CATCH_POOL_SIZE, each with the output of a random method and a degraded copy of it."""
     for key in rng.sample(list(files.inputs), min(CATCH_POOL_SIZE, len(files.inputs))):
         output = files.outputs[rng.choice(list(files.outputs))][key]
         yield CatchTrial(

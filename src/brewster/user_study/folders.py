@@ -1,4 +1,4 @@
-"""Which pictures a folder holds, by dataset and name: `real/12.png` is the picture 12 of the dataset real."""
+"""Find the pictures of a folder by dataset and name: `real/12.png` is picture 12 of the dataset real."""
 
 from __future__ import annotations
 
@@ -21,17 +21,24 @@ _TRANSMISSION: Final = ".transmission"
 
 
 def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]:
-    """The pictures of a folder in natural order: in its folders, or in itself where these hold none.
+    """Find pictures in the subfolders, one for each dataset, or in the folder itself if no subfolder has pictures.
 
-    Of the `datasets` only and in their order, if any are given. Outputs may be called like those of `brewster -o`:
-    name.transmission.png, beside which name.reflection.png and name.confidence.png are passed over.
+    Outputs may be named as `brewster -o` names them: `name.transmission.png` counts as `name`, and the files
+    `name.reflection.png` and `name.confidence.png` of the same photo are ignored.
+
+    Args:
+        folder: the folder to search; subfolders are searched one level deep.
+        datasets: the datasets to take, in this order; all of them if empty.
+
+    Returns:
+        Paths by (dataset, stem), in natural order (2 before 10).
 
     Raises:
-        BrewsterError: there is no picture, no such dataset, one name has several files, or pictures lie both in the
-            folder and in its folders, and no `datasets` say which.
+        BrewsterError: the folder contains no picture; a dataset is missing; two files have one name; or pictures are both
+            in the folder and in its subfolders, and `datasets` is empty.
     """
     if not folder.is_dir():
-        raise BrewsterError(f"{folder} is no folder", "one with pictures is needed", "name another")
+        raise BrewsterError(f"{folder} is not a folder", "a folder with pictures", "check the path")
     subfolders = {
         _normalised(subfolder.name): subfolder
         for subfolder in folder.iterdir()
@@ -44,7 +51,7 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
     if missing := [name for name in datasets if name not in stems_by_dataset]:
         raise BrewsterError(
             f"{folder} has no dataset {missing[0]!r}",
-            f"a folder with pictures in it; there {'is' if len(stems_by_dataset) == 1 else 'are'} {', '.join(stems_by_dataset) or 'none'}",
+            f"a subfolder with pictures; there {'is' if len(stems_by_dataset) == 1 else 'are'} {', '.join(stems_by_dataset) or 'none'}",
             "check the name",
         )
     if not datasets and (own := _list_pictures(folder)):
@@ -59,7 +66,7 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
 
 
 def shorten_list(items: Sequence[str]) -> str:
-    """The first few of them, and how many more there are."""
+    """Join the first items with semicolons, and add the number of the others."""
     remaining = len(items) - _MAX_LISTED
     return "; ".join(items[:_MAX_LISTED]) + (f"; and {remaining} more" if remaining > 0 else "")
 
@@ -67,28 +74,28 @@ def shorten_list(items: Sequence[str]) -> str:
 def _require_unique_names(folder: Path, found: dict[Key, list[Path]]) -> None:
     if not found:
         raise BrewsterError(
-            f"{folder} holds no picture", "pictures, or folders of them", "name another folder"
+            f"{folder} contains no picture", "pictures, or subfolders with pictures", "check the path"
         )
     duplicates = [" and ".join(sorted(map(str, paths))) for paths in found.values() if len(paths) > 1]
     if duplicates:
         raise BrewsterError(
             f"{shorten_list(duplicates)} share a name",
-            "pictures are paired by name, whatever their format",
-            "remove all but one of each",
+            "pictures are paired by name without the suffix",
+            "keep one file of each name",
         )
 
 
 def _require_one_layout(folder: Path, subfolders: Sequence[str], own: Sequence[Path]) -> None:
     if subfolders:
         raise BrewsterError(
-            f"{folder} holds pictures ({shorten_list([path.name for path in own])}) beside folders of them ({', '.join(subfolders)})",
-            "pictures lie in a folder, or in its folders, one for each dataset",
-            "move them into one of these folders, or name those that are meant: --dataset NAME",
+            f"{folder} contains pictures ({shorten_list([path.name for path in own])}) and subfolders with pictures ({', '.join(subfolders)})",
+            "pictures either in the folder or in subfolders, one for each dataset",
+            "move the pictures into a subfolder, or name the subfolders to take: --dataset NAME",
         )
 
 
 def _list_pictures(folder: Path) -> dict[Path, str]:
-    """What each picture of a folder is called, in natural order; without the other layers of one that is there."""
+    """The stem of each picture in a folder, in natural order, without reflections and confidence maps of separated photos."""
     pictures = {
         path: _normalised(path.stem)
         for path in folder.iterdir()
@@ -105,10 +112,10 @@ def _list_pictures(folder: Path) -> dict[Path, str]:
 
 
 def _normalised(name: str) -> str:
-    """A name in one spelling: some systems write an accented letter as two characters."""
+    """The name in Unicode form NFC; some file systems store an accented letter as two characters."""
     return unicodedata.normalize("NFC", name)
 
 
 def _natural_key(name: str) -> list[tuple[int, str]]:
-    """Sorts 2 before 10."""
+    """A sort key that orders 2 before 10."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]

@@ -1,12 +1,12 @@
-"""The answers, on the disk before they are acknowledged: SQLite with a write-ahead log, each commit synced.
+"""Store the answers of a study in SQLite, with a write-ahead log and a disk sync after each commit.
 
-    store = Store(study)
+    store = AnswerStore(study)
     participant = store.participant(store.admit())
     store.record_answer(participant, 0, "left", seconds=4.2)
 
-A participant is a number and the token of their link: no name, no address, no clock beyond the day of the consent.
-Their trials are drawn once, on admission, and kept, so that no other version of anything can ever change them. The
-first answer to a trial stays: sent again, perhaps because the acknowledgement was lost, it changes nothing.
+For a participant the database has a number, the token of their personal link, and the date of the consent; no name and no
+address. The trials are drawn once, at admission, and stored, so a later version of brewster cannot change them. The first
+answer to a trial is final: a second one, for example after a lost acknowledgement, changes nothing.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ CREATE TABLE IF NOT EXISTS answers (
 @final
 @dataclass(frozen=True)
 class Participant:
-    """Somebody with a link: their number from 0, and what they are shown."""
+    """A participant: their number, counted from 0, and their trials in order."""
 
     number: int
     trials: tuple[TrialDraw, ...]
@@ -52,7 +52,7 @@ class Participant:
 @final
 @dataclass(frozen=True)
 class StoredAnswer:
-    """A choice, and how long the pictures were seen until then."""
+    """A choice, and the seconds for which the pictures were shown before it."""
 
     choice: Choice
     seconds: float
@@ -60,9 +60,9 @@ class StoredAnswer:
 
 @final
 class AnswerStore:
-    """The answers of one study. Thread-safe, and several processes may use one study at once.
+    """The answers of one study; safe to use from many threads and many processes at the same time.
 
-    Where it `read_only`, no answer can be written, and a study that nobody has answered stays without a database.
+    With `read_only`, nothing can be written, and no database file is created for a study without answers.
     """
 
     def __init__(self, study: Study, *, read_only: bool = False) -> None:
@@ -84,25 +84,29 @@ class AnswerStore:
                 self._database.executescript(_SCHEMA)
 
     def close(self) -> None:
-        """Lets the file go, with all answers in it."""
+        """Close the database, after moving all answers from the log into the main file."""
         with self._lock:
             if not self._read_only:
-                with suppress(sqlite3.Error):  # of a full disk, perhaps: then the log has them
+                with suppress(sqlite3.Error):  # for example a full disk; the answers then stay in the log
                     self._checkpoint()
             self._database.close()
 
     def _checkpoint(self) -> None:
-        """Moves into the file what a killed server may have left in the log beside it."""
+        """Move the content of the write-ahead log into the main file; a killed server leaves answers in the log."""
         self._database.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
 
     def count_participants(self) -> int:
-        """How many participants were admitted."""
+        """The number of admitted participants."""
         with self._reading() as database:
             (number,) = database.execute("SELECT count(*) FROM participants").fetchone()
         return int(number)
 
     def admit(self, *, max_participants: int | None = None) -> str | None:
-        """The token of a new participant, who has agreed to take part; None where `max_participants` were admitted already."""
+        """Add a participant who has given consent.
+
+        Returns:
+            The token of the participant's link, or None if `max_participants` are admitted already.
+        """
         with self._writing() as database:
             (number,) = database.execute("SELECT count(*) FROM participants").fetchone()
             if max_participants is not None and number >= max_participants:
@@ -114,7 +118,7 @@ class AnswerStore:
         return token
 
     def participant(self, token: str) -> Participant | None:
-        """Whose link this is; None if it is nobody's."""
+        """The participant with this token, or None."""
         with self._reading() as database:
             row = database.execute(
                 "SELECT number, trials FROM participants WHERE token = ?", (token,)
@@ -122,7 +126,7 @@ class AnswerStore:
         return None if row is None else Participant(row[0], _parse_trials(row[1]))
 
     def next_trial(self, participant: Participant) -> int | None:
-        """The first trial without an answer; None where all have one."""
+        """The index of the first trial without an answer, or None if all trials have one."""
         with self._reading() as database:
             rows = database.execute("SELECT trial FROM answers WHERE participant = ?", (participant.number,))
             answered = {trial for (trial,) in rows}
@@ -131,16 +135,25 @@ class AnswerStore:
     def record_answer(
         self, participant: Participant, trial: int, choice: Choice, *, seconds: float
     ) -> Choice:
-        """Keeps an answer, unless the trial has one; what is kept is on the disk when this returns it.
+        """Store an answer, unless the trial already has one. The answer is synced to the disk on return.
+
+        Args:
+            participant: the participant.
+            trial: the index of the trial, from 0.
+            choice: the participant's choice.
+            seconds: for how long the pictures were shown, clipped to 0..MAX_SECONDS.
+
+        Returns:
+            The stored choice, which is that of the first answer.
 
         Raises:
-            BrewsterError: there is no such trial or choice.
-            TargetError: it cannot be written.
+            BrewsterError: the trial or the choice does not exist.
+            TargetError: the database cannot be written.
         """
         if not 0 <= trial < len(participant.trials) or choice not in CHOICES:
             raise BrewsterError(
                 f"trial {trial} was answered with {choice!r}",
-                f"trials 0 to {len(participant.trials) - 1} and {', '.join(CHOICES)} are known",
+                f"trials 0 to {len(participant.trials) - 1} and {', '.join(CHOICES)} exist",
                 "load the page again",
             )
         seconds_shown = min(max(seconds, 0.0), MAX_SECONDS)
@@ -156,10 +169,10 @@ class AnswerStore:
         return stored
 
     def all_answers(self) -> Iterator[tuple[Participant, dict[int, StoredAnswer]]]:
-        """Every participant with their answers by trial, in order of number; also those with none."""
+        """Yield every participant, in order of number, with their answers by trial; the answers may be empty."""
         with self._reading() as database:
             rows = database.execute("SELECT participant, trial, choice, seconds FROM answers").fetchall()
-            # people second: who answered before is there, whatever another process writes meanwhile
+            # read participants after answers: another process may admit participants in between
             participants = database.execute(
                 "SELECT number, trials FROM participants ORDER BY number"
             ).fetchall()
@@ -176,14 +189,16 @@ class AnswerStore:
 
     @contextmanager
     def _writing(self) -> Iterator[sqlite3.Connection]:
-        """A transaction that no other writer is beside; it is on the disk when this is left."""
+        """An exclusive write transaction; its changes are synced to the disk at the end of the block."""
         with self._reading() as database:
             database.execute("BEGIN IMMEDIATE")
             try:
                 yield database
                 database.execute("COMMIT")
             except BaseException:
-                if database.in_transaction:  # a full disk has ended it already
+                if (
+                    database.in_transaction
+                ):  # SQLite has already rolled back after some errors, such as a full disk
                     database.execute("ROLLBACK")
                 raise
 
@@ -193,16 +208,17 @@ class AnswerStore:
             yield
         except sqlite3.Error as error:
             raise TargetError(
-                f"{ANSWERS_FILE} cannot be used ({error})",  # without its folder: participants may read this
-                "a database that brewster has made, on a disk of this machine with free space",
-                "mend that and start again: what was acknowledged is kept",
+                f"{ANSWERS_FILE} cannot be used ({error})",  # without the folder: participants may see this message
+                "a database created by brewster, on a local disk with free space",
+                "fix the problem and start again; all acknowledged answers are stored",
             ) from error
 
 
 def _read_only_uri(file: Path) -> str:
-    """The address under which SQLite only reads a file; an empty database where there is none.
+    """The SQLite URI that opens a file read-only, or an empty database in memory if the file does not exist.
 
-    A reader keeps a little file beside it, for the log. Where it cannot, and no log is there, none is needed.
+    A reader of a database in WAL mode creates a shared-memory file in the same folder. In a folder that is not writable,
+    `immutable=1` avoids that; it is correct only if the log is empty.
     """
     if not file.exists():
         return "file::memory:"

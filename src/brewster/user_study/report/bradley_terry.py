@@ -1,7 +1,7 @@
-"""How strong methods are, all comparisons together: the model of Bradley and Terry (1952).
+"""The model of Bradley and Terry (1952): one strength for each method, from all comparisons together.
 
-P(a beats b) = 1 / (1 + exp(b's strength - a's)). A tie is half a win for each, so it pulls the two together; strengths
-sum to 0.
+P(a beats b) = 1 / (1 + exp(strength_b - strength_a)). A tie counts as half a win for each of the two methods. Strengths sum
+to 0.
 """
 
 from __future__ import annotations
@@ -20,10 +20,17 @@ _TOLERANCE: Final = 1e-10
 
 
 def strengths(wins: Float64[Floats, "... m m"]) -> Float64[Floats, "... m"]:
-    """The strengths of greatest likelihood for each table; `wins[a, b]` is how often a beat b, ties as halves.
+    """The maximum-likelihood strengths for each table of wins.
 
-    Newton's method, each step shortened so that it always ascends (damped by 1 / (1 + its length); Nesterov 2004,
-    section 4.1.5). NaN where there is no greatest likelihood: some methods never lose to the others (Ford 1957).
+    Damped Newton's method: each step is divided by 1 + its length, so the likelihood always increases (Nesterov 2004,
+    section 4.1.5).
+
+    Args:
+        wins: `wins[a, b]` is the number of wins of method a against method b; a tie adds 0.5 to both orders.
+
+    Returns:
+        The strengths, with mean 0; NaN for a table without a maximum, where some methods never lose to the others
+        (Ford 1957).
     """
     wins = wins * (1 - np.eye(wins.shape[-1]))
     total = wins + np.swapaxes(wins, -1, -2)
@@ -44,13 +51,13 @@ def strengths(wins: Float64[Floats, "... m m"]) -> Float64[Floats, "... m"]:
 
 
 def _laplacian(weights: Floats) -> Floats:
-    """With a 1 added everywhere, which makes it invertible and keeps the steps' sum at 0."""
+    """The graph Laplacian plus 1 in every entry, which makes it invertible and keeps the sum of each step at 0."""
     laplacian: Floats = np.eye(weights.shape[-1]) * weights.sum(axis=-1)[..., None] - weights + 1.0
     return laplacian
 
 
 def all_connected(wins: Float64[Floats, "... m m"]) -> NDArray[np.bool_]:
-    """Whether every method has beaten every other, directly or through others, for each table."""
+    """Whether each method has beaten each other one, directly or through a chain of wins; one value for each table."""
     reach = (wins > 0) | np.eye(wins.shape[-1], dtype=bool)
     for _ in range(wins.shape[-1].bit_length()):
         reach = (reach.astype(np.int64) @ reach.astype(np.int64)) > 0

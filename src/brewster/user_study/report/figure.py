@@ -1,4 +1,4 @@
-"""The results as one plot: a bar for each dataset and pair of methods, win, tie and lose side by side."""
+"""Plot the results: one stacked bar of win, tie and lose rates for each pair of methods and dataset."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ _BAR_COLOURS: Final = {"win": "#1f6f8b", "tie": "#d9d9d4", "lose": "#d98243"}
 _SHARE_COLOURS: Final = {"win": "white", "tie": "#333333", "lose": "#222222"}
 _HEADING_COLOURS: Final = {"win": "#1f6f8b", "tie": "#666666", "lose": "#a8561b"}
 _MIN_LABELLED_SHARE: Final = 0.06
-"""A share too narrow for its number."""
+"""Smaller shares get no label, because it does not fit into the bar."""
 _AVERAGE_KEYS: Final = ("/average",)
-_EVERYONE_TITLE: Final = "Everyone: the rule leaves nobody"
+_EVERYONE_TITLE: Final = "All participants: the rule excludes everyone"
 
 
 def plot(results: Mapping[str, Any]) -> bytes:
-    """A PNG of the group that the rule keeps, or of everyone where it keeps nobody, which it says then."""
-    from matplotlib.figure import Figure  # noqa: PLC0415  (an extra, and slow to wake)
+    """The plot as PNG bytes: participants after the exclusion rule, or all participants if the rule excludes everyone."""
+    from matplotlib.figure import Figure  # noqa: PLC0415  (an optional dependency, and slow to import)
 
     included = results["included"]["tables"]
     tables = included or results["everyone"]["tables"]
@@ -32,21 +32,21 @@ def plot(results: Mapping[str, Any]) -> bytes:
     if not included:
         figure.suptitle(_EVERYONE_TITLE, fontsize=9, color="#a8561b")
     data = io.BytesIO()
-    with warnings.catch_warnings():  # a letter that the font does not have is a box; the tables have the name
+    with warnings.catch_warnings():  # a missing glyph is drawn as a box; the tables have the full name
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         figure.savefig(data, format="png", dpi=160, metadata={"Software": None})
     return data.getvalue()
 
 
 def _plotted_rows(results: Mapping[str, Any], table: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """The datasets, where there are several, and the average."""
+    """The rows of the average and, if there are several, of the datasets; without rows that have no answers."""
     datasets = results["study"]["datasets"]
     keys = [*(datasets if len(datasets) > 1 else ()), *_AVERAGE_KEYS]
     return [row for row in table["rows"] if row["key"] in keys and row["win"]["mean"] is not None]
 
 
 def _bars(axis: Any, table: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> None:  # noqa: ANN401  (matplotlib)
-    positions = range(len(rows))  # not the titles: of two that are alike, matplotlib would make one
+    positions = range(len(rows))  # matplotlib merges bars with equal titles
     starts = [0.0] * len(rows)
     for name, colour in _BAR_COLOURS.items():
         widths = [row[name]["mean"] for row in rows]

@@ -1,9 +1,10 @@
-"""From answers to results, in plain values that JSON keeps for good; and the files of a report.
+"""Compute the results of a study from its answers, as plain JSON values, and write the files of the report.
 
-    results = summarise(study, collect_answers(store.all_answers()), Rule())
-    write(results, Path("report"))
+    participants = collect_answers(store.all_answers())
+    results = summarise(study, participants, ExclusionRule())
+    write(results, study, participants, Path("report"))
 
-Everything is told twice: of those whom the rule keeps, and of everyone.
+All results are given twice: for the participants after the exclusion rule, and for all participants.
 """
 
 from __future__ import annotations
@@ -43,28 +44,36 @@ AVERAGES: Final = {
     "/datasets": "Mean of the datasets",
     "/answers": "All answers together",
 }
-"""The rows below the datasets. No dataset is called so, with a slash.
+"""Keys and titles of the rows below the datasets. Keys begin with a slash, which no dataset name contains.
 
-The first weights each dataset by its number of pictures, as the paper does."""
+The first row weights each dataset by its number of pictures, as the paper does."""
 _DIGITS: Final = 6
 _MIN_SPREAD: Final = 1e-6
 
 Results = dict[str, Any]
-"""What report.json holds: see docs/study.md."""
+"""The content of report.json; docs/study.md describes it."""
 Floats = NDArray[np.float64]
 
 
 def summarise(study: Study, participants: Sequence[ParticipantAnswers], rule: ExclusionRule) -> Results:
-    """The results of a study.
+    """Compute the results of a study.
+
+    Args:
+        study: the study.
+        participants: the answers of all participants.
+        rule: the rule that excludes participants.
+
+    Returns:
+        The content of report.json.
 
     Raises:
-        BrewsterError: nobody has answered yet.
+        BrewsterError: there is no answer yet.
     """
     if not any(participant.votes for participant in participants):
         raise BrewsterError(
             f"{study.folder} has no answers yet",
-            "a report needs some",
-            "send out the address that `brewster study serve` prints",
+            "a report needs at least one answer",
+            "send participants the address that `brewster study serve` prints",
         )
     reasons = [rule.reason(participant) for participant in participants]
     included = [
@@ -100,7 +109,7 @@ def _dataset_title(dataset: str) -> str:
 
 
 def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str, Any]:
-    """All that is said about some of the participants."""
+    """The results of a group of participants."""
     participants = [participant for participant in participants if participant.votes]
     summary = {
         "participants": len(participants),
@@ -128,7 +137,7 @@ def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str
 
 
 def _counts(study: Study, participants: Sequence[ParticipantAnswers]) -> Floats:
-    """How often the first method won, tied, lost: (participants, pairs of methods, datasets, 3)."""
+    """Numbers of wins, ties and losses of the first method: (participants, pairs of methods, datasets, 3)."""
     indices = _table_indices(study)
     shape = len(study.pairs_of_methods), len(study.description.datasets), len(OUTCOMES)
     counts = np.zeros((len(participants), *shape))
@@ -139,21 +148,21 @@ def _counts(study: Study, participants: Sequence[ParticipantAnswers]) -> Floats:
 
 
 def _table_indices(study: Study) -> list[tuple[int, int]]:
-    """Of each comparison, the numbers of its pair of methods and of its dataset."""
+    """For each comparison, the index of its pair of methods and of its dataset."""
     pairs = {pair: i for i, pair in enumerate(study.pairs_of_methods)}
     datasets = {name: i for i, name in enumerate(study.description.datasets)}
     return [(pairs[row.methods], datasets[row.dataset]) for row in study.description.comparisons]
 
 
 def _pictures(study: Study) -> Floats:
-    """How many pictures each pair of methods has of each dataset."""
+    """Number of pictures by pair of methods and dataset."""
     pictures = np.zeros((len(study.pairs_of_methods), len(study.description.datasets)))
     np.add.at(pictures, tuple(np.array(_table_indices(study)).T), 1)
     return pictures
 
 
 def _ratings(study: Study, participants: Sequence[ParticipantAnswers]) -> Floats:
-    """How often each comparison was given each outcome."""
+    """Number of answers by comparison and outcome."""
     ratings = np.zeros((len(study.description.comparisons), len(OUTCOMES)))
     for participant in participants:
         np.add.at(ratings, (list(participant.votes), list(participant.votes.values())), 1)
@@ -194,7 +203,11 @@ def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> 
 
 
 def _strengths(study: Study, counts: Floats, weights: Floats) -> dict[str, Any]:
-    """Of each method; without an interval where a resample has a method that only won or lost, or all are alike."""
+    """The strength of each method.
+
+    There is no interval if the strengths of a resample have no maximum, because a method only won or only lost, or if all
+    resamples are equal.
+    """
     wins = _wins(study, counts)
     means = strengths(wins.sum(axis=0))
     resamples = strengths(resampled_counts(weights, wins))
@@ -210,7 +223,7 @@ def _strengths(study: Study, counts: Floats, weights: Floats) -> dict[str, Any]:
 
 
 def _wins(study: Study, counts: Floats) -> Floats:
-    """How often each method beat each other one, a tie being half a win for both: (participants, m, m)."""
+    """Number of wins of each method against each other one, a tie being half a win: (participants, methods, methods)."""
     methods = study.description.methods
     wins = np.zeros((len(counts), len(methods), len(methods)))
     for i, (first, second) in enumerate(study.pairs_of_methods):
@@ -226,7 +239,7 @@ def _estimate(mean: float, low: float, high: float) -> dict[str, float | None]:
 
 
 def _round(value: float | None) -> float | None:
-    """None for what has no value."""
+    """Round to 6 decimal places; None for None, NaN and infinity."""
     return None if value is None or not math.isfinite(value) else round(float(value), _DIGITS)
 
 
@@ -234,10 +247,10 @@ def _round(value: float | None) -> float | None:
 
 
 def write(results: Results, study: Study, participants: Sequence[ParticipantAnswers], out: Path) -> None:
-    """Writes all files of a report, over those of an earlier one.
+    """Write all files of a report into the folder `out`, and replace those of an earlier report.
 
     Raises:
-        TargetError: one cannot be written.
+        TargetError: a file cannot be written.
     """
     files = {
         "report.json": f"{json.dumps(results, indent=1, ensure_ascii=False)}\n".encode(),
@@ -252,7 +265,7 @@ def write(results: Results, study: Study, participants: Sequence[ParticipantAnsw
 
 
 def _answers_csv(results: Results, study: Study, participants: Sequence[ParticipantAnswers]) -> str:
-    """A line for each answer about a comparison, for other people's statistics; `left_out` says by what rule, if so."""
+    """One line for each answer to a comparison; the column `left_out` has the reason if the participant is excluded."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["participant", "dataset", "name", "first", "second", "outcome", "left_out"])
