@@ -132,7 +132,5 @@ def test_a_port_that_is_taken_is_named():
     with listen("127.0.0.1", 0) as taken:
         port = taken.getsockname()[1]
         assert server_url(taken) == f"http://127.0.0.1:{port}/"
-        with pytest.raises(
-            TargetError, match=f"port {port} cannot be listened on .*; choose others with --host"
-        ):
+        with pytest.raises(TargetError, match=f"port {port} cannot be used .*; choose others with --host"):
             listen("127.0.0.1", port)

@@ -88,7 +88,7 @@ def test_models_that_are_missing_or_share_a_name_are_refused_at_the_start(bare, 
     twin.write_bytes(model.read_bytes())
     code, _, err = bare("serve", "--model", twin)
     assert code == 1
-    assert "both called compact" in err
+    assert "have the same name compact" in err
     assert not served_apps
 
 

@@ -108,7 +108,7 @@ def test_who_stops_goes_on_with_the_same_link_elsewhere_and_with_no_other(open_p
     again = open_page(link)
     expect(again.get_by_text("Pair 3 of 4").first).to_be_visible()
     again.goto(link[:-1])
-    expect(again.get_by_role("alert")).to_contain_text("nobody has this link; check that it is whole")
+    expect(again.get_by_role("alert")).to_contain_text("this link is unknown; check that it is complete")
 
 
 def test_what_is_seen_are_the_pictures_of_the_trial_on_their_sides_and_all_has_a_name(open_page, url, store):

@@ -127,7 +127,7 @@ def test_a_link_that_nobody_has_is_told_so(app):
     for path in ("/s/nobody/trial", "/s/nobody/link", "/s/nobody/pictures/0/left"):
         answer = request(app, "GET", path)
         assert answer.status_code == 404
-        assert "nobody has this link" in answer.json()["error"]
+        assert "this link is unknown" in answer.json()["error"]
     assert reply(app, "/s/nobody", 0).status_code == 404
     whole = request(app, "GET", "/s/nobody")
     assert (whole.status_code, "<title>Compare pictures" in whole.text) == (404, True)

@@ -1,9 +1,9 @@
-"""The HTTP API: a photo in, its layers out.
+"""The HTTP API that separates photos.
 
-    POST /separate    a form with the photo and the options      GET /progress/{job}    how far it is
-    GET /models       what can be asked for                      GET /health            whether the server is well
+    POST /separate    a form with the photo and the options      GET /progress/{job}    the progress of a request
+    GET /models       the available models                       GET /health            the state of the server
 
-Nothing is fetched by URL, and nothing is written to the disk.
+The server fetches nothing by URL and writes nothing to the disk.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from brewster.web.request_schema import SeparationRequest, form_schema, read_for
 _MEDIA: Final = {
     "exr": "image/x-exr",
     "hdr": "image/vnd.radiance",
-}  # the others are image/ and their own name
-_EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # zip has no earlier; the same layers make the same bytes
+}  # other formats: image/ and the name of the format
+_EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # the earliest date of zip; a fixed date makes the archive reproducible
 
 
 @final
 class ErrorResponse(BaseModel):
-    """What every refusal looks like."""
+    """The body of every error response."""
 
     error: str
     """What happened, what was expected, and what to do."""
@@ -48,14 +48,14 @@ class ErrorResponse(BaseModel):
 
 @final
 class HealthResponse(BaseModel):
-    """Whether the server is well."""
+    """The state of the server."""
 
     status: Literal["ok"] = "ok"
     version: str = brewster.__version__
     jobs: int
-    """How many photos are waiting or being worked on."""
+    """Number of photos that wait or are being separated."""
     places: int
-    """How many there can be."""
+    """The maximum of `jobs`."""
 
 
 Handler = Callable[[ModelCache, SeparationRequest, ProgressCallback], Response]
@@ -69,27 +69,36 @@ _RESPONSES: Final[dict[int | str, dict[str, Any]]] = {
 }
 JobName = Annotated[
     str | None,
-    Query(pattern="^[A-Za-z0-9-]{8,64}$", description="A name of your choice, for `GET /progress/{job}`."),
+    Query(
+        pattern="^[A-Za-z0-9-]{8,64}$",
+        description="A name for this request, chosen by the client, for `GET /progress/{job}`.",
+    ),
 ]
 
 
 def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixels: int) -> APIRouter:
-    """The routes of the API, and the page's own previews."""
+    """The routes of the API, and the previews for the page.
+
+    Args:
+        model_cache: the models that clients can choose.
+        job_queue: runs the separations.
+        max_pixels: the limit for the size of a photo.
+    """
     router = APIRouter()
     content = {"multipart/form-data": {"schema": form_schema(model_cache.names)}}
     body = {"requestBody": {"required": True, "content": content}}
 
     async def run(request: Request, job: str | None, handler: Handler) -> Response:
-        """Takes a place, then the bytes, and answers with what `make` makes of them."""
+        """Reserve a place in the queue, read the form, and run the handler."""
         with job_queue.reserve(job) as reserved_job:
             form = await read_form(request, model_cache.names, max_pixels)
             return await job_queue.run_job(reserved_job, partial(handler, model_cache, form), request.receive)
 
     @router.post("/separate", responses=_RESPONSES, response_class=Response, openapi_extra=body)
     async def separate(request: Request, job: JobName = None) -> Response:
-        """The layers of a photo: one is a picture, in the photo's own format and colours; several are a zip.
+        """Separate a photo. One layer is returned as a picture in the format and colour space of the photo, several as a zip.
 
-        A client that goes away stops the work. Files are named as the command line names them.
+        Files are named as on the command line. The work stops if the client disconnects.
         """
         return await run(request, job, _separate)
 
@@ -99,33 +108,35 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
 
     @router.get("/progress/{job}", responses={404: _ERROR})
     async def progress(job: str) -> JobProgress:
-        """How far a job is that a client has named; 404 before it begins and after its end."""
+        """The progress of a job with a name; 404 before the job begins and after its end."""
         found = job_queue.progress(job)
         if found is None:
-            raise HTTPException(404, "there is no such job now; it has ended, or has not arrived yet")
+            raise HTTPException(
+                404, "there is no job with this name now; it has ended or has not arrived yet"
+            )
         return found
 
     @router.get("/models")
     def models() -> list[ModelRow]:
-        """The models that can be asked for, the default first."""
+        """The available models, the default first."""
         return model_cache.rows()
 
     @router.get("/health")
     async def health() -> HealthResponse:
-        """Whether the server is well, and how busy."""
+        """The version of the server and the number of its jobs."""
         return HealthResponse(jobs=job_queue.jobs, places=job_queue.workers + job_queue.max_waiting)
 
     return router
 
 
 def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: ProgressCallback) -> Response:
-    """The layers as files."""
+    """The layers of a photo as files."""
     started = time.perf_counter()
     options = form.options
     separation = model_cache.separator(options.model)(form.photo, on_progress=on_progress, **options.call())
     files = {}
     for layer in options.layers:
-        on_progress(1)  # encoding takes a while, too, and may not be wanted any more
+        on_progress(1)  # raises JobCancelled: encoding takes time too
         name = form.target(layer, separation.photo.file_info.container)
         files[name] = getattr(separation, layer).encode(SUFFIXES[Path(name).suffix.lower()])
     name, data = (
@@ -161,7 +172,7 @@ def _media_type(name: str) -> str:
 
 
 def _zip(files: Mapping[str, bytes]) -> bytes:
-    """Files as one, not compressed: pictures are so already."""
+    """A zip archive of files, stored without compression since pictures are compressed already."""
     archive_file = io.BytesIO()
     with zipfile.ZipFile(archive_file, "w", zipfile.ZIP_STORED) as archive:
         for name, data in files.items():
@@ -170,6 +181,6 @@ def _zip(files: Mapping[str, bytes]) -> bytes:
 
 
 def _content_disposition(name: str) -> str:
-    """A file's name as a header: plain for old clients, whole for the others (RFC 6266)."""
+    """The Content-Disposition header of a download: an ASCII name for old clients and the full name (RFC 6266)."""
     ascii_name = name.encode("ascii", "replace").decode().translate(str.maketrans('"\\?', "___"))
     return f"attachment; filename=\"{ascii_name}\"; filename*=UTF-8''{quote(name, safe='')}"

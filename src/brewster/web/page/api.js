@@ -1,9 +1,9 @@
-// What the page asks of the server. An answer that is no answer becomes an Error whose message is a sentence.
+// The client of the HTTP API. A failed request throws an Error whose message is a sentence for the user.
 
 const POLL_MS = 300;
-const MAX_RETRIES = 60; // times that a full queue is waited for
+const MAX_RETRIES = 60; // how often a request is repeated while the queue of the server is full
 
-// Sends a photo with options to a path, tells `onProgress({state, ahead, share})`, and returns the response.
+// Sends a photo with options to a path and returns the response. Calls `onProgress({state, ahead, share})` meanwhile.
 export async function send(path, file, options, { signal, onProgress }) {
   const form = new FormData();
   for (const [name, value] of Object.entries(options)) form.append(name, value);
@@ -27,7 +27,7 @@ export async function models() {
   return response.json();
 }
 
-// The name that the server gives to what it sends.
+// The file name in the Content-Disposition header of a response.
 export function fileNameOf(response) {
   const name = /filename\*=UTF-8''([^;]+)/.exec(response.headers.get("Content-Disposition") ?? "");
   return name ? decodeURIComponent(name[1]) : "photo";
@@ -50,12 +50,12 @@ function pollProgress(job, onProgress) {
 
 function throwNetworkError(error) {
   if (error.name === "AbortError") throw error;
-  throw new Error("The server does not answer. It may have been stopped: start it again, then try again.");
+  throw new Error("The server does not respond. Start it again if it was stopped, then try again.");
 }
 
 async function errorMessage(response) {
   const body = await response.json().catch(() => ({}));
-  const sentence = body.error ?? `the server answered ${response.status}`;
+  const sentence = body.error ?? `the server returned status ${response.status}`;
   return `${sentence[0].toUpperCase()}${sentence.slice(1).replace(/\.?$/, ".")}`;
 }
 

@@ -1,32 +1,32 @@
-// The page: which photos there are, what becomes of each, and the one that is shown.
+// The page that separates photos: the list of photos, their processing, and the view of the current photo.
 
 import "./compare.js";
 import { models, fileNameOf, send } from "./api.js";
 import { draw, readMaps } from "./light.js";
 import { createZip, readZip } from "./zip.js";
 
-const MAX_CONCURRENT = 2; // one is worked on while the next one travels
+const MAX_CONCURRENT = 2; // one photo is separated while the next one is uploaded
 const LAYER_DESCRIPTIONS = {
-  transmission: "What is behind the glass.",
-  reflection: "What was mirrored in it.",
-  confidence: "White where the separation is sure, black where it is not.",
+  transmission: "The scene behind the glass.",
+  reflection: "The light that the glass reflects.",
+  confidence: "White: the separation is certain. Black: it is uncertain.",
 };
-const TRANSPARENT_PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="; // one clear pixel
-const LAYERS = "transmission,reflection"; // of the zip
+const TRANSPARENT_PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="; // one transparent pixel
+const LAYERS = "transmission,reflection"; // in the zip
 
 const photos = []; // {file, row, state, share, ahead, error, strength, maps, madeWith, controller, isSuperseded}
-let current = null; // the one that is shown
-let shown = null; // its maps
+let current = null; // the photo that is shown
+let shown = null; // the maps of the current photo
 const byId = (id) => document.getElementById(id);
 const compare = byId("compare");
 
-// --- what was chosen
+// --- settings
 
 const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).value;
 const settings = () => ({ quality: chosen("quality"), model: byId("model").value });
 const isFresh = (photo) => photo.madeWith === JSON.stringify(settings());
 
-// --- photos come and go
+// --- adding and removing photos
 
 function add(files) {
   for (const file of files) {
@@ -69,7 +69,7 @@ function newRow(photo) {
   return row;
 }
 
-// Shows a file as the browser itself reads it, or nothing where it cannot.
+// Shows a file as the browser decodes it, or a transparent pixel if it cannot.
 function showFile(image, file) {
   const url = URL.createObjectURL(file);
   const done = () => URL.revokeObjectURL(url);
@@ -78,7 +78,7 @@ function showFile(image, file) {
   image.src = url;
 }
 
-// --- the work, a few at a time, the photo that is shown first
+// --- processing: a few photos at a time, the current photo first
 
 function startNext() {
   const busy = photos.filter((photo) => photo.controller).length;
@@ -99,14 +99,14 @@ async function separate(photo) {
     announce(`${photo.file.name} is separated`);
   } catch (error) {
     const isStopped = error.name === "AbortError";
-    const previousState = isFresh(photo) ? "done" : "waiting"; // the maps that it has may be wanted again
+    const previousState = isFresh(photo) ? "done" : "waiting"; // its old maps may be needed again
     const state = isStopped && photo.isSuperseded ? previousState : "failed";
     Object.assign(photo, { state, error: isStopped ? null : error.message });
     if (photo.error) announce(`${photo.file.name} failed`);
   }
   photo.controller = null;
   if (!photos.includes(photo)) return;
-  if (photo.state === "done" && !isFresh(photo)) photo.state = "waiting"; // the settings have changed meanwhile
+  if (photo.state === "done" && !isFresh(photo)) photo.state = "waiting"; // the settings have changed since the request
   refresh(photo);
   if (photo === current) await show();
   startNext();
@@ -118,7 +118,7 @@ function retry(photo) {
   startNext();
 }
 
-// The settings have changed, perhaps back to those of the maps that a photo has.
+// Called after a change of the settings. A photo whose maps fit the new settings is not processed again.
 function applySettings() {
   for (const photo of photos) {
     photo.controller?.abort();
@@ -134,7 +134,7 @@ function announce(sentence) {
   byId("announcement").textContent = photos.length > 1 ? `${sentence}, ${done} of ${photos.length} are done` : sentence;
 }
 
-// --- the photo that is shown
+// --- the current photo
 
 function select(photo) {
   current = photo;
@@ -157,7 +157,7 @@ async function show() {
   const photo = current;
   if (photo?.state !== "done") return;
   const maps = readMaps(await photo.maps.arrayBuffer());
-  if (photo !== current) return; // another one was chosen meanwhile
+  if (photo !== current) return; // another photo was selected in the meantime
   shown = maps;
   draw(compare.left, maps, "photo");
   refresh();
@@ -206,7 +206,7 @@ function refresh(photo = null) {
   byId("facts").textContent = isReady ? describeMaps(shown) : "";
 }
 
-// A button that is disabled in earnest would lose the focus.
+// Uses aria-disabled: a button with the attribute `disabled` would lose the focus.
 function enable(id, isEnabled) {
   byId(id).setAttribute("aria-disabled", !isEnabled);
 }
@@ -214,7 +214,7 @@ function enable(id, isEnabled) {
 function describeMaps({ full, width, height, doubtful }) {
   const size = `${full.join(" × ")} pixels`;
   const preview = full[0] === width ? "." : `, shown at ${width} × ${height}.`;
-  return size + preview + (doubtful ? " The model redrew it so freely that the layers may be wrong: look closely." : "");
+  return size + preview + (doubtful ? " The model has changed the photo so much that the layers may be wrong. Check them." : "");
 }
 
 function shortStatus({ state, share, error }) {
@@ -224,10 +224,10 @@ function shortStatus({ state, share, error }) {
 
 function statusText({ state, share, ahead }) {
   if (state !== "waiting") return `Separating, ${Math.round(100 * share)} %`;
-  return ahead ? `Waiting, ${ahead} before it` : "Waiting";
+  return ahead ? `Waiting, ${ahead} photos before this one` : "Waiting";
 }
 
-// --- files at full size, as the command line makes them
+// --- downloads at full size, equal to the files of the command line
 
 let exporting = null;
 
@@ -267,7 +267,7 @@ async function exportLayer(signal) {
   return { name: fileNameOf(response), blob: await response.blob() };
 }
 
-// One that fails is left out and named; if all do, there is nothing to save.
+// A photo that fails is left out, and its error is shown. If all photos fail, nothing is saved.
 async function exportAll(signal) {
   const files = [];
   const failed = [];

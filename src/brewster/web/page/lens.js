@@ -1,13 +1,13 @@
-// A lens over several frames that show pictures of one size: zoom and pan move all of them in step.
-// Frames have the shape of their pictures; what is moved is told in shares of the frame, so that all show the same part.
+// Synchronised zoom and pan for several frames that show pictures of one size.
+// A frame has the aspect ratio of its picture. Offsets are shares of the frame, so all frames show the same part.
 
-const MAX_PIXEL_SIZE = 8; // screen pixels for a pixel of the picture, at most
+const MAX_PIXEL_SIZE = 8; // maximum size of a picture pixel in screen pixels
 const ZOOM_STEP = 1.5;
 const PAN_STEP = 0.12;
 
 export class Lens {
   #scale = 1;
-  #x = 0; // where the left and upper edge lie, in shares of the frame: 0 or less
+  #x = 0; // offsets of the left and upper edge, in shares of the frame: 0 or less
   #y = 0;
   #size = [1, 1];
   #pointers = new Map();
@@ -26,25 +26,25 @@ export class Lens {
     new ResizeObserver(() => this.#paint()).observe(box);
   }
 
-  // New pictures of this size in pixels, shown whole.
+  // Shows new pictures of this size in px, without zoom.
   reset(width, height) {
     this.#size = [width, height];
     this.zoom("fit");
   }
 
-  // What a button or a key asks for: in, out, fit or full.
+  // Zooms by the name of a button: in, out, fit or full.
   zoom(kind) {
     if (kind === "in") this.#zoomTo(this.#scale * ZOOM_STEP);
     else if (kind === "out") this.#zoomTo(this.#scale / ZOOM_STEP);
     else this.#zoomTo(kind === "fit" || this.isFull ? 1 : this.#fullScale());
   }
 
-  // Whether a pixel of the picture is a pixel of the screen.
+  // Whether one picture pixel is one screen pixel.
   get isFull() {
     return this.#scale > 1 && Math.abs(this.#scale / this.#fullScale() - 1) < 1e-3;
   }
 
-  // Whether a key was for the lens.
+  // Handles a key; returns whether the key has a function here.
   press(key) {
     const zooms = { "+": "in", "=": "in", "-": "out", _: "out", 0: "fit", f: "full", F: "full" };
     const pans = { "Shift+ArrowLeft": [PAN_STEP, 0], "Shift+ArrowRight": [-PAN_STEP, 0], "Shift+ArrowUp": [0, PAN_STEP], "Shift+ArrowDown": [0, -PAN_STEP] };
@@ -54,7 +54,7 @@ export class Lens {
     return true;
   }
 
-  // The scale at which a pixel of the picture is one of the screen, in the largest frame.
+  // The scale at which one picture pixel is one screen pixel in the largest frame.
   #fullScale() {
     const fits = this.frames.map(({ clientWidth, clientHeight }) =>
       Math.min(clientWidth / this.#size[0], clientHeight / this.#size[1]));

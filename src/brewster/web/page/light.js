@@ -1,4 +1,4 @@
-// Linear light in the browser: reads the maps that web/preview.py sends, and makes any strength of them.
+// Reads the maps of web/preview.py and computes the layers at any strength, in linear light.
 
 const STEPS = 1 << 14;
 const LINEAR = Float32Array.from({ length: 256 }, (_, code) => toLinear(code / 255));
@@ -13,7 +13,8 @@ function toEncoded(linear) {
   return linear <= 0.0031308 ? linear * 12.92 : 1.055 * linear ** (1 / 2.4) - 0.055;
 }
 
-// The maps of a preview. `photo` and `confidence_map` are codes, `change` and `reflection` linear light at strength 1.
+// Parses the maps of a preview. `photo`, `reflection` and `confidence_map` are 8-bit codes; `change` is the transmission at
+// strength 1 minus the photo, in linear light.
 export function readMaps(buffer) {
   const end = new Uint8Array(buffer).indexOf(10);
   const head = JSON.parse(new TextDecoder().decode(buffer.slice(0, end)));
@@ -43,7 +44,7 @@ const VIEWS = {
   confidence: ({ confidence_map }) => (i) => confidence_map[(i / 3) | 0],
 };
 
-// Draws a view of the maps at a strength, 0 to 1, on a canvas of their size.
+// Draws a view of the maps at a strength of 0 to 1. Resizes the canvas to the size of the maps.
 export function draw(canvas, maps, view, strength) {
   canvas.width = maps.width;
   canvas.height = maps.height;

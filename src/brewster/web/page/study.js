@@ -1,19 +1,19 @@
-// The study's page: consent, then trial after trial, then thanks. The server knows where a participant stands; this
-// page asks it, shows three pictures, and goes on when an answer is acknowledged.
+// The page of the user study: consent, trials, end. The server stores the progress of a participant. The page requests
+// the next trial, shows its three pictures, and continues after the server has acknowledged the answer.
 
 import { Lens } from "./lens.js";
 
 const PARTICIPANT_TOKEN = location.pathname.match(/^\/s\/([^/]+)/)?.[1];
-const MIN_ANSWER_DELAY = 300; // ms after new pictures in which no answer is taken: a second click was meant for the last ones
-const KEYS = { 1: "left", 2: "similar", 3: "right", ArrowLeft: "left", ArrowRight: "right" }; // up and down scroll
+const MIN_ANSWER_DELAY = 300; // ms; earlier answers are ignored, because a double click belongs to the previous pictures
+const KEYS = { 1: "left", 2: "similar", 3: "right", ArrowLeft: "left", ArrowRight: "right" }; // the arrows up and down scroll
 
 const byId = (id) => document.getElementById(id);
 const sections = ["invitation", "trial", "finish", "error"];
 const frames = { left: frame("left"), photo: frame("photo"), right: frame("right") };
 const lens = new Lens(byId("pictures"), Object.values(frames));
 const preloaded = []; // keeps the pictures of the next trial in memory
-let state = null; // the trial that is shown, as the server tells it
-let shownAt = null; // when its pictures were there; null while no answer is taken
+let state = null; // the current trial, as returned by the server
+let shownAt = null; // time at which its pictures were shown; null while no answer is accepted
 
 function frame(side) {
   return document.querySelector(`figure.${side} .frame`);
@@ -24,9 +24,9 @@ function show(section) {
   byId("head").hidden = section !== "trial";
 }
 
-// --- talking to the server
+// --- requests
 
-// The answer of the server. What the network swallowed is asked for again until it comes; what is refused is thrown.
+// Sends a request and returns the response data. Repeats it after network and server errors; throws after client errors.
 async function send(path, body) {
   for (let wait = 1; ; wait = Math.min(2 * wait, 15)) {
     try {
@@ -36,7 +36,7 @@ async function send(path, body) {
     } catch (error) {
       if (error instanceof RequestError) throw error;
     }
-    notice(body?.choice ? "Not saved yet: the server does not answer. Trying again…" : "The server does not answer. Trying again…");
+    notice(body?.choice ? "Not saved yet: the server does not respond. Trying again…" : "The server does not respond. Trying again…");
     await new Promise((resolve) => setTimeout(resolve, 1000 * wait));
   }
 }
@@ -66,7 +66,7 @@ function fail(error) {
 
 async function showInvitation() {
   const invitation = await send("/invitation");
-  if (!invitation.is_open) throw new RequestError("The study has all the participants that it needs. Thank you for coming.");
+  if (!invitation.is_open) throw new RequestError("The study has all the participants that it needs. Thank you for your interest.");
   for (const text of [...invitation.consent.split(/\n\s*\n/), `There are ${invitation.trials} comparisons.`]) {
     const paragraph = document.createElement("p");
     paragraph.textContent = text;
@@ -99,9 +99,9 @@ async function loadPicture(source) {
       notice("");
       return picture;
     } catch {
-      const response = await fetch(source).catch(() => null); // a picture does not say why it did not come
+      const response = await fetch(source).catch(() => null); // an image element does not report the reason of a failure
       if (response && isClientError(response)) await parse(response);
-      notice("A picture has not arrived. Trying again…");
+      notice("A picture could not be loaded. Trying again…");
       await new Promise((resolve) => setTimeout(resolve, 1000 * wait));
     }
   }
@@ -128,10 +128,10 @@ async function showTrial(next) {
   shownAt = performance.now();
   preloaded.length = 0;
   const ahead = next.trial + 1 < next.trials ? sides.map((side) => loadPicture(pictureUrl(next.trial + 1, side))) : [];
-  preloaded.push(...ahead.map((loading) => loading.catch(() => {}))); // a failure is shown when its turn comes
+  preloaded.push(...ahead.map((loading) => loading.catch(() => {}))); // an error is shown when the trial is shown
 }
 
-// Says what was chosen, and whether it is too early or too late to choose. A button that is `disabled` would lose the focus.
+// Marks the chosen button, and whether choices are accepted. A button with the attribute `disabled` would lose the focus.
 function updateChoices(choice, closed) {
   for (const button of byId("choices").children) {
     button.setAttribute("aria-disabled", closed);
@@ -163,7 +163,7 @@ for (const button of byId("choices").children) button.addEventListener("click", 
 addEventListener("keydown", (event) => {
   if (byId("trial").hidden || event.ctrlKey || event.metaKey || event.altKey) return;
   const answers = event.key in KEYS ? !event.shiftKey : event.key === "Enter" && byId("choices").contains(event.target);
-  if (event.repeat && answers) return event.preventDefault(); // a key that is held is one answer
+  if (event.repeat && answers) return event.preventDefault(); // a held key counts as one answer
   if (event.shiftKey ? lens.press(`Shift+${event.key}`) || lens.press(event.key) : lens.press(event.key)) event.preventDefault();
   else if (event.key in KEYS && !event.shiftKey) {
     event.preventDefault();
@@ -180,7 +180,7 @@ byId("copy").addEventListener("click", async () => {
   const link = new URL((await send(`/s/${PARTICIPANT_TOKEN}/link`)).link, location.href).href;
   try {
     await navigator.clipboard.writeText(link);
-    notice("Your link is copied. Keep it for yourself.");
+    notice("Your link is copied. Do not share it.");
   } catch {
     notice(`Your link: ${link}`);
   }

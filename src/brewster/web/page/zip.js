@@ -1,4 +1,4 @@
-// Puts the files of several zips, as the server stores them (uncompressed, sizes in front), into one.
+// Merges the zips of the server into one. Their files are uncompressed, and the local headers contain the sizes.
 
 const LOCAL = 0x04034b50;
 const CENTRAL = 0x02014b50;
@@ -21,7 +21,7 @@ export function createZip(files) {
     at += local.length + file.data.byteLength;
   }
   const size = centralRecords.reduce((sum, row) => sum + row.length, 0);
-  if (at + size > LIMIT) throw new Error("The zip would be larger than 4 GB. Download some photos by themselves.");
+  if (at + size > LIMIT) throw new Error("The zip would be larger than 4 GB. Download the photos one by one.");
   const count = [[2, centralRecords.length], [2, centralRecords.length]];
   const end = littleEndian([[4, END], [2, 0], [2, 0], ...count, [4, size], [4, at], [2, 0]]);
   return new Blob([...parts, ...centralRecords, end], { type: "application/zip" });
