@@ -224,7 +224,7 @@ function shortStatus({ state, share, error }) {
 
 function statusText({ state, share, ahead }) {
   if (state !== "waiting") return `Separating, ${Math.round(100 * share)} %`;
-  return ahead ? `Waiting, ${ahead} photos before this one` : "Waiting";
+  return ahead ? `Waiting, ${ahead} before this one` : "Waiting";
 }
 
 // --- downloads at full size, equal to the files of the command line
