@@ -1,4 +1,4 @@
-"""The web server of the tests: applications asked without a network, on a thread, or as a user starts them."""
+"""Web servers for tests: applications without a network, on a thread, or in their own process."""
 
 import asyncio
 import contextlib
@@ -26,7 +26,7 @@ def pane(tile):
 
 
 class FakeModelCache:
-    """What a shelf is, with one backend on it."""
+    """A ModelCache with one backend."""
 
     names = ("pane",)
 
@@ -42,7 +42,7 @@ class FakeModelCache:
 
 
 class BlockingBackend:
-    """A pane that is busy with its first tile until it is told to go on."""
+    """A pane that blocks until `proceed` is set."""
 
     def __init__(self):
         self.tiles, self.started, self.proceed = 0, Event(), Event()
@@ -67,7 +67,7 @@ def client(app, **kwargs):
 
 
 def request(app, method, path, **kwargs):
-    """One request, one answer."""
+    """Sends one request; returns the response."""
 
     async def once():
         async with client(app) as http:
@@ -82,14 +82,14 @@ def form(photo, name="window.png", **fields):
 
 @contextlib.contextmanager
 def served_port(app):
-    """An application on a port of this machine, which is given."""
+    """Runs an application on a thread; yields its port."""
     with running_server(app) as (port, _):
         yield port
 
 
 @contextlib.contextmanager
 def running_server(app):
-    """An application on a thread: its port, and the server."""
+    """Runs an application on a thread; yields its port and the server."""
     with listen("127.0.0.1", 0) as listening:
         running = create_server(app)
         thread = Thread(target=running.run, kwargs={"sockets": [listening]})
@@ -102,7 +102,7 @@ def running_server(app):
 
 
 def raw_exchange(port, *pieces):
-    """What a server answers to these bytes, sent one after another; connected until it closes."""
+    """Sends these bytes and returns all bytes of the server until it closes the connection."""
     with socket.create_connection(("127.0.0.1", port)) as connection:
         for piece in pieces:
             connection.sendall(piece)
@@ -114,7 +114,7 @@ def raw_exchange(port, *pieces):
 
 @contextlib.contextmanager
 def serve_process(*args):
-    """`brewster serve` in a process of its own: its first line, a link; its exit code is checked at the end."""
+    """Runs `brewster serve` in its own process; yields its first line, a link, and checks the exit code at the end."""
     command = [sys.executable, "-m", "brewster", "serve", "--port", "0", "--device", "cpu", *map(str, args)]
     kwargs = {"stdout": subprocess.PIPE, "text": True, "env": {**os.environ, "PYTHONUNBUFFERED": "1"}}
     with started(command, **kwargs) as process:

@@ -1,4 +1,4 @@
-"""Studies to test with: one described but not drawn, one of real little pictures, and people who answer at random."""
+"""Small studies for tests: one without picture files, and one with small pictures."""
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from brewster.user_study.study import (
 def make_description(
     pictures=20, *, methods=("ours", "RDNet"), datasets=("real", "nature"), pairs=8, catches=2, seed=7
 ):
-    """A description without pictures: `pictures` of each dataset, the first method against each other one."""
+    """A description without picture files: `pictures` for each dataset, the first method against each of the others."""
     photos = [(dataset, str(i)) for dataset in datasets for i in range(pictures)]
     comparisons = [
         PairedComparison(
@@ -47,7 +47,7 @@ def make_description(
 
 
 def make_empty_study(folder, **options):
-    """The same as a study in a folder, without its files."""
+    """A study in a folder, without picture files."""
     folder.mkdir(parents=True, exist_ok=True)
     return Study(folder, make_description(**options))
 
@@ -72,7 +72,7 @@ def make_study(
     size=(24, 18),
     **options,
 ):
-    """A study of little pictures, with its files."""
+    """A study of small pictures, with its files."""
     inputs = write_pictures(folder / "inputs", names, size=size)
     outputs = {
         method: write_pictures(folder / method, names, size=size, seed=i + 1)
@@ -82,14 +82,14 @@ def make_study(
 
 
 def choice_for(trial, outcome):
-    """What somebody presses who wants this outcome (0, 1, 2) for the comparison's first method."""
+    """The choice that gives this outcome (0, 1, 2) for the first method of the comparison."""
     if outcome == 1:
         return "similar"
     return "left" if (outcome == 0) != trial.flipped else "right"
 
 
 def copy_without_answers(study, folder):
-    """The same study without answers in another folder, which shares its pictures."""
+    """The same study in another folder, without answers; shares the pictures."""
     folder.mkdir()
     (folder / PICTURES).symlink_to(study.folder / PICTURES)
     return Study(folder, study.description)

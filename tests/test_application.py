@@ -1,4 +1,4 @@
-"""The application behind a real socket: what only bytes on a wire can show."""
+"""The application over a real socket."""
 
 import signal
 import socket
@@ -50,8 +50,8 @@ def test_a_photo_is_separated_over_a_socket():
     assert b"server:" not in answer.lower().partition(b"\r\n\r\n")[0]
 
 
-def test_an_upload_too_long_is_answered_although_nobody_reads_it_whole():
-    """A client that sends all before it reads must find an answer, and no broken connection."""
+def test_an_upload_that_is_too_large_gets_a_response_to_its_end():
+    """A client that sends everything before it reads must receive the response, not a broken connection."""
     with served_port(make_app(limits=RequestLimits(max_bytes=10_000))) as port:
         long = bytes(3_000_000)
         assert status(raw_exchange(port, head(f"Content-Length: {len(long)}"), long)) == 413
@@ -60,15 +60,17 @@ def test_an_upload_too_long_is_answered_although_nobody_reads_it_whole():
         assert status(raw_exchange(port, *post_request())) == 200
 
 
-def test_a_slow_upload_is_given_up():
+def test_a_slow_upload_is_refused():
     with served_port(make_app(limits=RequestLimits(body_seconds=0.1))) as port:
         answer = raw_exchange(port, head(f"Content-Length: {len(FORM)}"), FORM[:50])
         assert status(answer) == 408
         assert b"send it again" in answer
-        assert status(raw_exchange(port, PLAIN)) == 200  # without a body, which might be slow here, too
+        assert (
+            status(raw_exchange(port, PLAIN)) == 200
+        )  # a request without a body: on a slow machine a body could exceed the limit, too
 
 
-def test_an_upload_that_is_cut_off_harms_nobody():
+def test_an_interrupted_upload_releases_its_place():
     job_queue = JobQueue(max_waiting=0)
     with served_port(make_app(job_queue=job_queue)) as port:
         for end in (0, 30, 90, len(FORM) - 3):
@@ -81,7 +83,7 @@ def test_an_upload_that_is_cut_off_harms_nobody():
     assert job_queue.jobs == 0
 
 
-def test_a_connection_that_breaks_stops_the_work():
+def test_a_broken_connection_stops_the_work():
     backend, job_queue = BlockingBackend(), JobQueue()
     with served_port(make_app(backend, job_queue=job_queue)) as port:
         with socket.create_connection(("127.0.0.1", port)) as connection:
@@ -96,7 +98,7 @@ def test_a_connection_that_breaks_stops_the_work():
 @pytest.mark.parametrize(
     "rubbish", [b"\x16\x03\x01\x02\x00", b"GET / HTTP/9\r\n\r\n", b"\r\n\r\nnonsense\r\n\r\n"]
 )
-def test_what_is_no_http_is_answered_and_forgotten(rubbish):
+def test_a_request_that_is_not_http_is_refused(rubbish):
     with served_port(make_app()) as port:
         assert status(raw_exchange(port, rubbish + b"\r\n\r\n")) in (400, None)
         assert status(raw_exchange(port, *post_request())) == 200
@@ -116,7 +118,7 @@ finally:
 
 
 @pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
-def test_a_server_that_is_ended_lets_its_caller_finish(signal_number):
+def test_serve_returns_to_its_caller_after_a_signal(signal_number):
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with started([sys.executable, "-c", SERVING], **pipes) as process:
         url = process.stdout.readline()
@@ -128,7 +130,7 @@ def test_a_server_that_is_ended_lets_its_caller_finish(signal_number):
     assert (process.returncode, out.split(), err) == (0, ["interrupted", "closed"], "")
 
 
-def test_a_port_that_is_taken_is_named():
+def test_a_port_in_use_is_an_error():
     with listen("127.0.0.1", 0) as taken:
         port = taken.getsockname()[1]
         assert server_url(taken) == f"http://127.0.0.1:{port}/"

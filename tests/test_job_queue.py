@@ -10,7 +10,7 @@ from brewster.web.job_queue import JobCancelled, JobQueue
 
 
 class BlockingWork:
-    """Work that goes on until it is let go, and tells how it ended."""
+    """Work that waits for `proceed` and records how it ended."""
 
     def __init__(self):
         self.started, self.proceed, self.ended = Event(), Event(), []
@@ -29,7 +29,7 @@ class BlockingWork:
 
 
 class Client:
-    """A client that stays on the line until it hangs up."""
+    """A client that stays connected until `disconnected` is set."""
 
     def __init__(self):
         self.disconnected = asyncio.Event()
@@ -49,7 +49,7 @@ async def until(is_so):
         await asyncio.sleep(0.001)
 
 
-def test_work_is_answered_and_leaves_its_place():
+def test_a_job_returns_its_result_and_releases_its_place():
     async def scenario(job_queue, work):
         work.proceed.set()
         assert await submit(job_queue, work) == "answer"
@@ -58,7 +58,7 @@ def test_work_is_answered_and_leaves_its_place():
     asyncio.run(scenario(JobQueue(), BlockingWork()))
 
 
-def test_what_the_work_raises_comes_out():
+def test_an_exception_of_the_work_is_raised():
     def fails(on_progress):
         raise KeyError("mine")
 
@@ -66,7 +66,7 @@ def test_what_the_work_raises_comes_out():
         asyncio.run(submit(JobQueue(), fails))
 
 
-def test_a_full_queue_sends_away_with_a_time_to_come_back():
+def test_a_full_queue_refuses_with_retry_after():
     async def scenario(job_queue, work):
         waiting = [asyncio.create_task(submit(job_queue, work)) for _ in range(3)]
         await until(lambda: job_queue.jobs == 3)
@@ -81,7 +81,7 @@ def test_a_full_queue_sends_away_with_a_time_to_come_back():
     assert int(refused.headers["Retry-After"]) > 0
 
 
-def test_a_client_that_hangs_up_stops_its_work_and_no_other():
+def test_a_client_that_disconnects_stops_its_own_work_only():
     async def scenario(job_queue, work, other):
         client = Client()
         leaving = asyncio.create_task(submit(job_queue, work, client))
@@ -90,7 +90,7 @@ def test_a_client_that_hangs_up_stops_its_work_and_no_other():
         client.disconnected.set()
         with pytest.raises(ClientDisconnect):
             await leaving
-        assert job_queue.jobs == 2  # its thread has not noticed yet, and memory is still used
+        assert job_queue.jobs == 2  # the thread still runs and uses memory
         work.proceed.set()
         other.proceed.set()
         assert await staying == "answer"
@@ -100,7 +100,7 @@ def test_a_client_that_hangs_up_stops_its_work_and_no_other():
     assert (work.ended, other.ended) == (["stopped"], ["done"])
 
 
-def test_work_that_still_waits_when_its_client_hangs_up_is_never_begun():
+def test_waiting_work_whose_client_disconnects_never_starts():
     async def scenario(job_queue, work, late):
         first = asyncio.create_task(submit(job_queue, work))
         await until(work.started.is_set)
@@ -132,7 +132,7 @@ def test_work_that_takes_too_long_is_stopped():
     assert work.ended == ["stopped"]
 
 
-def test_a_server_that_ends_stops_the_work():
+def test_a_server_that_stops_cancels_the_work():
     async def scenario(job_queue, work):
         task = asyncio.create_task(submit(job_queue, work))
         await until(work.started.is_set)
@@ -147,7 +147,7 @@ def test_a_server_that_ends_stops_the_work():
     assert work.ended == ["stopped"]
 
 
-def test_progress_tells_the_place_in_the_queue_and_the_share_done():
+def test_progress_contains_the_place_in_the_queue_and_the_share():
     async def scenario(job_queue, works):
         tasks = [
             asyncio.create_task(submit(job_queue, work, name=f"job-{number}"))
@@ -174,7 +174,7 @@ def test_two_jobs_cannot_have_one_name():
     assert not job_queue.jobs
 
 
-def test_a_place_whose_upload_fails_is_free_again():
+def test_a_place_is_released_if_its_upload_fails():
     job_queue = JobQueue()
     with pytest.raises(OSError, match="cut"), job_queue.reserve():
         raise OSError("cut")

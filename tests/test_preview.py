@@ -18,7 +18,7 @@ MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
 
 
 class Maps:
-    """A preview as light.js reads it."""
+    """A preview, parsed as in light.js."""
 
     def __init__(self, data):
         line, rest = data.split(b"\n", 1)
@@ -33,7 +33,7 @@ class Maps:
         self.confidence_map = parts[3].reshape(shape)
 
     def at(self, strength):
-        """Transmission and reflection, in codes, by the formula that light.js uses."""
+        """Transmission and reflection as 8-bit codes, computed as in light.js."""
         photo, reflection = to_linear(self.photo / 255), to_linear(self.reflection / 255)
         layers = photo + strength * (self.transmission - photo), np.minimum(strength * reflection, photo)
         return [np.rint(255 * to_encoded(layer.clip(0, 1))) for layer in layers]
@@ -54,7 +54,7 @@ def mixture(shipped):
 
 
 @pytest.mark.parametrize("strength", [0, 0.25, 0.5, 1])
-def test_what_the_browser_composites_is_what_the_server_makes(shipped, mixture, strength):
+def test_the_browser_s_formula_equals_the_separation_of_the_server(shipped, mixture, strength):
     made = shipped(Photo.open(MIXTURE), strength=strength, quality="draft")
     shown = mixture.at(strength)
     for layer, ours in zip((made.transmission, made.reflection), shown, strict=True):
@@ -65,13 +65,13 @@ def test_what_the_browser_composites_is_what_the_server_makes(shipped, mixture, 
 
 
 def out_of_range(tile):
-    """A backend whose layers leave the range that can be stored, below and above."""
+    """A backend whose layers are below 0 and above 1."""
     change = np.where(tile > 0.4, 0.9, -0.6).astype(np.float32)
     return tile + change, np.minimum(tile + 0.3, 1)
 
 
 @pytest.mark.parametrize("strength", [0.1, 0.5, 0.9])
-def test_layers_that_are_clipped_at_full_strength_are_right_below_it(strength):
+def test_layers_that_are_clipped_at_full_strength_are_correct_below_it(strength):
     data = picture(120, 90, "png")
     made = Separator(out_of_range)(data, strength=strength)
     for layer, ours in zip(
@@ -96,7 +96,7 @@ def test_a_large_photo_is_made_smaller_and_looks_like_its_large_separation(shipp
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 900), (3000, 2)])
-def test_odd_sizes_are_shown_too(size):
+def test_unusual_sizes_work(size):
     maps = maps_of(picture(*size, "png"))
     assert [maps.head["width"], maps.head["height"]] == maps.head["full"] == list(size)
 
@@ -123,10 +123,10 @@ def test_a_wide_gamut_photo_is_shown_in_srgb():
     )
     maps = maps_of(p3.encode("png"))
     assert np.abs(maps.photo.astype(int) - p3.srgb_8bit()).max() <= 1
-    assert maps.photo[0, 0, 0] > 240  # P3's red is redder than sRGB's
+    assert maps.photo[0, 0, 0] > 240  # the red primary of P3 is outside sRGB
 
 
-def test_a_picture_brighter_than_white_is_shown_as_far_as_a_screen_goes():
+def test_a_picture_brighter_than_white_is_clipped_to_the_range():
     light = Photo.from_array(np.full((20, 30, 3), 3.0, np.float32), encoding="linear")
     maps = maps_of(light.encode("tiff"))
     assert maps.photo.min() == 255
@@ -140,7 +140,7 @@ def test_progress_reaches_the_end():
     assert progress[-1] == 1
 
 
-def test_the_server_gives_the_maps_and_refuses_as_it_does_elsewhere():
+def test_the_preview_route_returns_the_maps_and_refuses_invalid_files():
     answer = request(make_app(), "POST", "/preview", **form(picture(60, 40, "png"), quality="draft"))
     assert Maps(answer.content).head["full"] == [60, 40]
     refused = request(make_app(), "POST", "/preview", **form(b"no picture"))

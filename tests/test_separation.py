@@ -41,10 +41,10 @@ def error_of(answer):
     return answer.json()["error"]
 
 
-# --- answers
+# --- responses
 
 
-def test_the_shipped_model_answers_as_the_command_line_does(bare, tmp_path):
+def test_the_server_returns_the_bytes_of_the_command_line(bare, tmp_path):
     app = create_app(
         separation_router(ModelCache(device="cpu"), JobQueue(), max_pixels=10**8), limits=RequestLimits()
     )
@@ -81,7 +81,7 @@ def test_one_layer_is_a_picture_and_several_are_a_zip(app, fields, kind, name):
         assert answer.content == getattr(expected, layer).encode(kind.removeprefix("image/"))
 
 
-def test_how_it_was_made_stands_in_the_headers(app):
+def test_the_headers_describe_the_separation(app):
     headers = separate(app).headers
     assert headers["brewster-model"] == "pane"
     assert headers["brewster-sha256"] == "0" * 64
@@ -103,7 +103,7 @@ def test_a_photo_keeps_its_profile_and_its_camera(app):
 
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(name=st.text())
-def test_no_file_name_harms_the_answer(app, name):
+def test_no_file_name_breaks_the_response(app, name):
     head = f'form-data; name="photo"; filename="{name}"'.replace("\r", "").replace("\n", "")
     data = b"--x\r\nContent-Disposition: %b\r\n\r\n%b\r\n--x--\r\n" % (head.encode(errors="replace"), SMALL)
     kind = {"content-type": "multipart/form-data; boundary=x"}
@@ -126,7 +126,7 @@ def test_a_hostile_name_gives_a_harmless_one(app, name):
     assert Path(unquote(answer.headers["content-disposition"].partition("''")[2])).suffix == ".png"
 
 
-# --- refusals, each with a status and a sentence
+# --- errors, each with a status and a message
 
 
 @pytest.mark.parametrize(
@@ -146,7 +146,7 @@ def test_uploads_that_are_no_photos_are_refused(photo, status, sentence):
         assert sentence in error_of(answer)
 
 
-def test_a_kind_of_picture_that_is_not_taken_is_refused(app):
+def test_an_unsupported_kind_of_picture_is_refused(app):
     from PIL import Image  # noqa: PLC0415
 
     data = io.BytesIO()
@@ -165,14 +165,14 @@ def test_wrong_values_are_refused_before_any_work():
     assert "strength is '7'" in error_of(answer)
 
 
-def test_paths_that_are_not_there_and_other_methods_are_refused(app):
+def test_unknown_paths_and_methods_are_refused(app):
     assert request(app, "GET", "/nothing").status_code == 404
     assert request(app, "GET", "/page/../separation.py").status_code == 404
     assert request(app, "GET", "/page/%2e%2e/separation.py").status_code == 404
     assert request(app, "GET", "/separate").status_code == 405
 
 
-def test_a_bug_is_told_without_its_traceback():
+def test_a_bug_is_reported_without_its_traceback():
     def broken(tile):
         raise ZeroDivisionError("secret")
 
@@ -192,7 +192,7 @@ def test_a_bug_is_told_without_its_traceback():
 # --- the job queue
 
 
-def test_a_client_that_goes_away_stops_the_work():
+def test_a_client_that_disconnects_stops_the_work():
     backend, job_queue = BlockingBackend(), JobQueue()
 
     async def leave():
@@ -213,7 +213,7 @@ def test_a_client_that_goes_away_stops_the_work():
     assert free_backend.tiles > 1
 
 
-def test_a_full_server_says_when_to_come_back_and_goes_on():
+def test_a_full_server_returns_retry_after_and_continues():
     backend, job_queue = BlockingBackend(), JobQueue(max_waiting=1)
 
     async def crowd():
@@ -235,7 +235,7 @@ def test_a_full_server_says_when_to_come_back_and_goes_on():
     assert [answer.status_code for answer in first] == [200, 200]
 
 
-def test_work_beyond_the_time_limit_is_given_up():
+def test_work_beyond_the_time_limit_is_cancelled():
     backend = BlockingBackend()
 
     async def wait():
@@ -249,7 +249,7 @@ def test_work_beyond_the_time_limit_is_given_up():
     assert "draft" in error_of(answer)
 
 
-def test_progress_is_told_while_there_is_any():
+def test_progress_is_available_while_the_job_runs():
     backend = BlockingBackend()
 
     async def watch():
@@ -269,13 +269,13 @@ def test_progress_is_told_while_there_is_any():
     assert "job" in error_of(after)
 
 
-def test_a_job_needs_a_name_that_is_one(app):
+def test_an_invalid_job_name_is_refused(app):
     answer = request(app, "POST", "/separate?job=../x", **form(SMALL))
     assert answer.status_code == 422
     assert "job" in error_of(answer)
 
 
-# --- what is written about it
+# --- OpenAPI
 
 
 def test_openapi_describes_every_field_and_every_refusal(app):
@@ -291,11 +291,13 @@ def test_no_documentation_page_fetches_assets_from_elsewhere(app):
     assert request(app, "GET", "/docs").status_code == request(app, "GET", "/redoc").status_code == 404
 
 
-TRIED = make_app(limits=RequestLimits(hosts=frozenset({"testserver"})))  # as schemathesis calls it
+TRIED = make_app(
+    limits=RequestLimits(hosts=frozenset({"testserver"}))
+)  # the host name that schemathesis uses
 SCHEMA = schemathesis.openapi.from_asgi("/openapi.json", TRIED)
 
 
-UNFIT = [  # no schema tells which options go together, and in a form all is text: 0 is as good a no as false
+UNFIT = [  # the schema cannot express which options contradict each other, and in a form 0 is valid for false
     positive_data_acceptance,
     negative_data_rejection,
 ]
@@ -303,8 +305,8 @@ UNFIT = [  # no schema tells which options go together, and in a form all is tex
 
 @SCHEMA.parametrize()
 @settings(max_examples=12, suppress_health_check=list(HealthCheck))
-def test_the_server_keeps_what_openapi_promises(case):
+def test_the_server_conforms_to_its_openapi_document(case):
     photo = case.body.get("photo") if isinstance(case.body, dict) else None
-    if isinstance(photo, str | bytes):  # chance makes no picture
+    if isinstance(photo, str | bytes):  # random bytes are not a picture
         case.body["photo"] = SMALL
     case.call_and_validate(excluded_checks=UNFIT)

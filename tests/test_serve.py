@@ -13,7 +13,7 @@ from glass_server import serve_process
 
 @pytest.fixture
 def reachable(monkeypatch):
-    """This machine may be reached, by the address that the server prints."""
+    """Allows connections to this machine, for the address that the server prints."""
     import socket  # noqa: PLC0415
 
     monkeypatch.undo()
@@ -29,7 +29,7 @@ def get(url, **headers):
         return error.code, error.read()
 
 
-def test_a_user_starts_it_asks_it_and_stops_it(reachable, model):
+def test_the_command_serves_requests_until_it_is_interrupted(reachable, model):
     with serve_process("--model", model, "--token", "auto") as link:
         url, token = re.fullmatch(r"(http://127\.0\.0\.1:\d+/)\?token=([\w-]{16,})", link).groups()
         assert get(f"{url}health")[0] == 401
@@ -41,7 +41,7 @@ def test_a_user_starts_it_asks_it_and_stops_it(reachable, model):
 
 @pytest.fixture
 def served_apps(monkeypatch, model):
-    """What would have been served: the limits and the address."""
+    """Records the limits and arguments of `serve` instead of serving."""
     import brewster.web.application as web  # noqa: PLC0415
 
     calls = []
@@ -51,7 +51,7 @@ def served_apps(monkeypatch, model):
     return calls
 
 
-def test_another_address_is_warned_of_and_gets_a_token(bare, served_apps):
+def test_another_address_prints_a_warning_and_gets_a_token(bare, served_apps):
     code, _, err = bare("serve", "--host", "0.0.0.0")
     ((limits, kwargs),) = served_apps
     assert code == 0
@@ -61,7 +61,7 @@ def test_another_address_is_warned_of_and_gets_a_token(bare, served_apps):
     assert kwargs["host"] == "0.0.0.0"
 
 
-def test_this_machine_alone_needs_no_token(bare, served_apps):
+def test_a_loopback_address_needs_no_token(bare, served_apps):
     code, _, err = bare("serve", "--max-bytes", "1000")
     ((limits, kwargs),) = served_apps
     assert (code, limits.token, limits.max_bytes, kwargs["host"], kwargs["port"]) == (
@@ -75,7 +75,7 @@ def test_this_machine_alone_needs_no_token(bare, served_apps):
 
 
 @pytest.mark.parametrize("token", ["short", "with space and more", "semi;colon;semi;colon", ""])
-def test_a_token_that_can_be_guessed_or_breaks_a_link_is_a_wrong_usage(bare, served_apps, token):
+def test_a_short_token_or_one_that_breaks_a_link_is_a_wrong_argument(bare, served_apps, token):
     code, _, err = bare("serve", "--token", token)
     assert code == 2
     assert "16 letters" in err

@@ -1,4 +1,4 @@
-"""The page in a real browser, before a real server, as its users have them."""
+"""The page in a real browser with a real server."""
 
 import base64
 import io
@@ -15,7 +15,7 @@ from front_door import picture
 from glass_server import serve_process
 from picture_files import exif_block, file_of, smooth
 
-TIMEOUT_MS = 120_000  # a busy machine is no failure
+TIMEOUT_MS = 120_000  # for slow machines
 MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
 
 
@@ -27,7 +27,7 @@ def link(model):
 
 @pytest.fixture
 def open_page(chromium, link):
-    """Opens the page; in the end nothing must have gone wrong in it, and nothing been fetched from elsewhere."""
+    """Opens the page; an error in its scripts, or a request to another server, fails the test."""
     contexts, failures, requested = [], [], []
 
     def open_page(**kwargs):
@@ -44,7 +44,7 @@ def open_page(chromium, link):
         )
         page.on("request", lambda request: requested.append(request.url))
         page.goto(link)
-        page.wait_for_selector("#model option", state="attached")  # its scripts have run
+        page.wait_for_selector("#model option", state="attached")  # the scripts have run
         assert "token" not in page.url
         return page
 
@@ -57,7 +57,7 @@ def open_page(chromium, link):
 
 
 def upload(page, *files):
-    """Adds (name, bytes), and waits until the last of them is shown or has failed."""
+    """Adds files (name, bytes), and waits until all are done and the current one is shown or has failed."""
     page.set_input_files("#files", [{"name": name, "mimeType": "", "buffer": data} for name, data in files])
     page.wait_for_selector("#photos:not(:has(.waiting, .working)) li")
     page.wait_for_selector("glass-compare:not([hidden]), #error:not([hidden])")
@@ -69,7 +69,7 @@ def settle(page):
 
 
 def canvas(page, side):
-    """The pixels of one of the two pictures that are compared."""
+    """The pixels of one of the two compared pictures."""
     value = page.evaluate("side => document.querySelector('glass-compare')[side].toDataURL()", side)
     return Photo.open(base64.b64decode(value.partition(",")[2])).pixels
 
@@ -89,7 +89,7 @@ def share(page):
     return int(page.get_by_role("slider", name="Line").get_attribute("aria-valuenow"))
 
 
-def test_a_photo_is_uploaded_compared_weakened_and_downloaded_as_the_command_line_makes_it(
+def test_a_photo_is_uploaded_compared_and_downloaded_with_the_bytes_of_the_command_line(
     open_page, bare, tmp_path
 ):
     whole = Photo.open(MIXTURE)
@@ -117,7 +117,7 @@ def test_a_photo_is_uploaded_compared_weakened_and_downloaded_as_the_command_lin
         settle(page)
         (made,) = tmp_path.glob(f"*.{layer}.*")
         shown = Photo.open(made).srgb_8bit()
-        assert np.median(difference(canvas(page, "right"), shown)) <= 1  # JPEG is further off at its edges
+        assert np.median(difference(canvas(page, "right"), shown)) <= 1  # JPEG differs more at edges
         name, data = downloaded(page, page.get_by_role("button", name=f"Download {layer}").click)
         assert (name, data) == (made.name, made.read_bytes())
 
@@ -145,21 +145,19 @@ def test_a_wide_gamut_photo_and_a_rotated_one_look_right(open_page):
     assert difference(canvas(page, "left"), wide.srgb_8bit()).max() <= 1
     assert canvas(page, "left")[0, 0, 0] > 240
     expected = 255 * to_encoded(to_linear(wide.srgb_8bit() / 255) * 0.8)
-    inside = np.s_[
-        5:25, 5:25
-    ]  # the photo's own light goes beyond sRGB, so only what sRGB holds can be compared
+    inside = np.s_[5:25, 5:25]  # red of the photo is outside sRGB, so only green and blue are compared
     assert np.abs(canvas(page, "right")[inside] - expected[inside])[..., 1:].max() <= 2
     page.get_by_role("button", name="Remove p3.png").click()
     upload(page, ("turned.png", file_of(smooth(), "png", exif=exif_block(6))))
     assert (canvas(page, "left") == np.rot90(smooth(), -1)).all()
 
 
-def test_everything_can_be_done_by_keyboard_alone(open_page, run):
+def test_the_page_works_with_the_keyboard_alone(open_page, run):
     data = picture(90, 60, "png")
     file = {"name": "window.png", "mimeType": "image/png", "buffer": data}
     page = open_page()
     page.on("filechooser", lambda choosing: choosing.set_files(file))
-    page.get_by_role("button", name="Choose photos").wait_for()  # and the browser has heard of the line above
+    page.get_by_role("button", name="Choose photos").wait_for()  # the handler above is then registered
     page.keyboard.press("Tab")
     page.keyboard.press("Enter")
     page.wait_for_selector("li.done")
@@ -175,7 +173,7 @@ def test_everything_can_be_done_by_keyboard_alone(open_page, run):
 
     assert "window.png" in page.evaluate(
         focus
-    )  # the button that was pressed is gone: focus is on the new photo
+    )  # the pressed button is hidden, so the focus is on the new photo
     page.evaluate("document.activeElement.blur()")
     tab_to("the photo on the left")
     page.keyboard.press("+")
@@ -188,7 +186,7 @@ def test_everything_can_be_done_by_keyboard_alone(open_page, run):
     assert share(page) == 59
     tab_to("Remove window.png")
     page.keyboard.press("Tab")
-    page.keyboard.press("ArrowRight")  # the next of the views
+    page.keyboard.press("ArrowRight")  # the next view
     assert page.get_by_label("Reflection", exact=True).is_checked()
     page.keyboard.press("Tab")
     for _ in range(50):
@@ -199,7 +197,7 @@ def test_everything_can_be_done_by_keyboard_alone(open_page, run):
     assert made == run("-", "--strength", "0.5", "--layers", "reflection", stdin=data)[1]
 
 
-def test_a_phone_shows_it_all_without_scrolling_sideways(open_page):
+def test_a_phone_shows_everything_without_horizontal_scrolling(open_page):
     page = open_page(viewport={"width": 390, "height": 844}, has_touch=True)
     assert page.evaluate("document.documentElement.scrollWidth") == 390
     long = "a very long name of a photo taken through a window " * 3
@@ -218,7 +216,7 @@ def test_a_phone_shows_it_all_without_scrolling_sideways(open_page):
 
 
 def test_zoom_and_pan_move_both_sides_together(open_page):
-    """A ramp, at strength 0 on both sides: a step between them would show."""
+    """At strength 0 both sides show the same ramp, so an offset between them would be a step."""
     page = open_page()
     ramp = np.repeat(np.linspace(20, 220, 240).astype(np.uint8)[None, :, None], 120, axis=0)
     upload(page, ("a.png", file_of(ramp, "png")))
@@ -237,11 +235,11 @@ def test_zoom_and_pan_move_both_sides_together(open_page):
     assert after[0] > before[0]
     page.mouse.wheel(0, -200)
     settle(page)
-    assert np.ptp(row(page)) < np.ptp(after)  # closer: less of the ramp is seen
+    assert np.ptp(row(page)) < np.ptp(after)  # a smaller part of the ramp is visible
 
 
 def row(page):
-    """What is painted across the middle of the view, line, grip and all apart."""
+    """The pixels of the middle row of the view, without the line and its handle."""
     settle(page)
     value = page.evaluate("""() => {
         const canvas = document.querySelector("glass-compare canvas");
@@ -251,7 +249,7 @@ def row(page):
     return np.array(value).reshape(-1, 4)[:, 0]
 
 
-def test_what_is_no_photo_is_told_in_place_and_can_be_tried_again_or_removed(open_page):
+def test_a_file_that_is_not_a_photo_shows_an_error_and_can_be_retried_or_removed(open_page):
     page = open_page()
     upload(page, ("holiday.jpg", b"not a picture"), ("window.png", picture(90, 60, "png")))
     assert page.get_by_role("heading", name="holiday.jpg could not be separated").is_visible()
@@ -267,7 +265,7 @@ def test_what_is_no_photo_is_told_in_place_and_can_be_tried_again_or_removed(ope
     assert page.evaluate("document.activeElement.id") == "choose"
 
 
-def test_many_photos_come_as_one_zip_with_names_of_their_own(open_page, run):
+def test_many_photos_are_downloaded_as_one_zip_with_unique_names(open_page, run):
     photos = [
         ("a.png", picture(90, 60, "png", 1)),
         ("a.png", picture(90, 60, "png", 2)),
@@ -307,20 +305,20 @@ def test_photos_can_be_pasted_and_dropped(open_page):
     assert "2 of 2 are done" in page.locator("#announcement").inner_text()
 
 
-def test_another_quality_makes_the_preview_anew(open_page):
+def test_a_change_of_quality_repeats_the_preview(open_page):
     page = open_page()
     upload(page, ("a.png", picture(90, 60, "png")))
-    with page.expect_request("**/preview?*") as asked:
+    with page.expect_request("**/preview?*") as request:
         page.get_by_label("Draft", exact=True).check()
-    assert asked.value.method == "POST"
-    for quality in ("Best", "Standard", "Draft"):  # each before the one before it can be done
+    assert request.value.method == "POST"
+    for quality in ("Best", "Standard", "Draft"):  # each before the previous preview is done
         page.get_by_label(quality, exact=True).check()
     page.wait_for_selector("li.done")
     page.wait_for_selector("glass-compare:not([hidden])")
 
 
 def hold_requests(page, path):
-    """What the page sends here gets no answer, until it goes on with `page.unroute(path)`."""
+    """Leaves requests of the page to this path without a response, until `page.unroute(path)`."""
     page.route(path, lambda route: None)
 
 
@@ -329,7 +327,7 @@ def focused(page):
     return page.evaluate("document.activeElement.id")
 
 
-def test_back_to_the_former_quality_shows_what_was_there(open_page):
+def test_the_previous_quality_shows_the_previous_maps_again(open_page):
     page = open_page()
     upload(page, ("a.png", picture(90, 60, "png")), ("b.png", picture(80, 60, "png")))
     hold_requests(page, "**/preview?*")
@@ -338,7 +336,7 @@ def test_back_to_the_former_quality_shows_what_was_there(open_page):
     page.get_by_role("heading", name="Cancelled").wait_for()
     page.get_by_label("Standard", exact=True).check()
     page.wait_for_selector("glass-compare:not([hidden])")
-    page.wait_for_selector("li.done >> nth=1")  # what still ran for b.png is given up, too
+    page.wait_for_selector("li.done >> nth=1")  # the running request for b.png is cancelled, too
     assert page.get_by_role("button", name="Download transmission").is_enabled()
     page.get_by_label("Best", exact=True).check()
     page.get_by_role("button", name="Cancel").wait_for()
@@ -347,7 +345,7 @@ def test_back_to_the_former_quality_shows_what_was_there(open_page):
     page.wait_for_selector("li.done >> nth=1")
 
 
-def test_the_focus_goes_on_when_its_button_goes_away(open_page):
+def test_the_focus_moves_on_when_its_button_disappears(open_page):
     page = open_page()
     hold_requests(page, "**/preview?*")
     page.set_input_files("#files", [{"name": "a.png", "mimeType": "", "buffer": picture(90, 60, "png")}])
@@ -369,7 +367,7 @@ def test_the_focus_goes_on_when_its_button_goes_away(open_page):
     with page.expect_request("**/separate?*"):
         page.keyboard.press("Enter")
     assert page.get_by_role("button", name="Download transmission").is_disabled()
-    page.keyboard.press("Enter")  # once is enough
+    page.keyboard.press("Enter")  # ignored while the download runs
     page.get_by_role("button", name="Stop").focus()
     page.keyboard.press("Enter")
     page.wait_for_selector("#export", state="hidden")
@@ -386,7 +384,7 @@ def test_a_photo_that_is_not_done_shows_its_own_strength(open_page):
     assert page.locator("#amount").inner_text() == "100 %"
 
 
-def test_a_photo_that_fails_is_left_out_of_the_zip_and_named(open_page):
+def test_a_photo_that_fails_is_left_out_of_the_zip_and_its_error_is_shown(open_page):
     page = open_page()
     upload(page, *((f"{name}.png", picture(90, 60, "png", seed)) for seed, name in enumerate("abc")))
 
@@ -408,7 +406,7 @@ def test_a_photo_that_fails_is_left_out_of_the_zip_and_named(open_page):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_words_can_be_read_in_light_and_dark_and_every_control_has_a_name(open_page, scheme):
+def test_text_has_contrast_in_light_and_dark_and_every_control_has_a_name(open_page, scheme):
     page = open_page(color_scheme=scheme, reduced_motion="reduce")
     upload(page, ("a.png", picture(90, 60, "png")), ("b.png", b"none"))
     contrast = page.evaluate("""() => {

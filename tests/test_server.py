@@ -1,4 +1,4 @@
-"""Clients that keep a server waiting, and servers that end, over a real socket."""
+"""Idle clients and the shutdown of the server, over a real socket."""
 
 import asyncio
 import errno
@@ -33,20 +33,20 @@ def _network_off(monkeypatch):
 
 @pytest.fixture
 def frequent_checks(monkeypatch):
-    """A look at each connection ten times a second."""
+    """Sets the interval of the idle check to 0.1 s."""
     monkeypatch.setattr(server, "IDLE_CHECK_SECONDS", 0.1)
 
 
 @pytest.fixture
 def long():
-    """An application with a long answer."""
+    """An application with a long response."""
     router = APIRouter()
     router.get("/long")(lambda: Response(bytes(LONG)))
     return create_app(router, limits=RequestLimits())
 
 
 def slow_client(port, width=1 << 12):
-    """A connection that has asked for the long answer and takes little at once."""
+    """A connection that has requested the long response and has a small receive buffer."""
     connection = socket.socket()
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, width)
     connection.settimeout(30)
@@ -56,7 +56,7 @@ def slow_client(port, width=1 << 12):
 
 
 def read_to_end(connection):
-    """All that comes until the connection ends."""
+    """All bytes until the connection is closed."""
     got = bytearray()
     try:
         while more := connection.recv(1 << 16):
@@ -67,13 +67,13 @@ def read_to_end(connection):
 
 
 @pytest.mark.parametrize("start", [b"", b"G", GET[:-2]])
-def test_a_client_that_does_not_finish_asking_is_given_up(frequent_checks, start):
+def test_a_client_that_does_not_finish_its_request_is_closed(frequent_checks, start):
     with served_port(make_app()) as port:
         assert raw_exchange(port, start) == b""
         assert b"200 OK" in raw_exchange(port, GET)
 
 
-def test_half_a_request_after_a_whole_one_is_given_up_too(frequent_checks):
+def test_half_a_request_after_a_complete_one_is_closed(frequent_checks):
     with (
         served_port(make_app()) as port,
         socket.create_connection(("127.0.0.1", port), timeout=30) as connection,
@@ -86,20 +86,20 @@ def test_half_a_request_after_a_whole_one_is_given_up_too(frequent_checks):
         assert read_to_end(connection) == b""
 
 
-def test_work_may_take_longer_than_a_client(frequent_checks):
+def test_work_may_take_longer_than_the_idle_limit(frequent_checks):
     backend = BlockingBackend()
     with served_port(make_app(backend)) as port:
         answers = []
         client = Thread(target=lambda: answers.append(raw_exchange(port, POST)))
         client.start()
         backend.started.wait()
-        time.sleep(0.5)  # some looks
+        time.sleep(0.5)  # several idle checks
         backend.proceed.set()
         client.join()
     assert b"200 OK" in answers[0]
 
 
-def test_a_client_that_never_reads_is_given_up_and_a_slow_one_is_not(monkeypatch, long):
+def test_a_client_that_never_reads_is_closed_and_a_slow_one_is_not(monkeypatch, long):
     monkeypatch.setattr(server, "IDLE_CHECK_SECONDS", 0.4)
     with running_server(long) as (port, running):
         with slow_client(port) as silent:
@@ -113,14 +113,14 @@ def test_a_client_that_never_reads_is_given_up_and_a_slow_one_is_not(monkeypatch
             assert len(read_to_end(silent)) < LONG
         with slow_client(port, 1 << 16) as slow:
             head = bytearray()
-            for _ in range(60):  # longer than three looks
+            for _ in range(60):  # longer than three idle checks
                 head += slow.recv(1 << 16)
                 time.sleep(0.02)
             assert len(head) < LONG
             assert len(head) + len(read_to_end(slow)) > LONG
 
 
-def test_a_server_that_ends_tells_what_is_under_way(monkeypatch, caplog):
+def test_a_server_that_stops_answers_running_requests(monkeypatch, caplog):
     monkeypatch.setattr(server, "GRACE_SECONDS", 0.1)
     backend, answers = BlockingBackend(), []
     with running_server(make_app(backend)) as (port, running):
@@ -137,7 +137,7 @@ def test_a_server_that_ends_tells_what_is_under_way(monkeypatch, caplog):
     assert not caplog.records
 
 
-def test_a_server_that_ends_amid_an_answer_says_nothing(monkeypatch, caplog, long):
+def test_a_server_that_stops_during_a_response_logs_nothing(monkeypatch, caplog, long):
     monkeypatch.setattr(server, "GRACE_SECONDS", 0.1)
     with running_server(long) as (port, running), slow_client(port) as silent:
         assert silent.recv(100).startswith(b"HTTP/1.1 200")
@@ -147,7 +147,7 @@ def test_a_server_that_ends_amid_an_answer_says_nothing(monkeypatch, caplog, lon
     assert not caplog.records
 
 
-def test_too_many_connections_are_not_reported_one_by_one_and_bugs_are(caplog):
+def test_too_many_connections_are_not_logged_and_bugs_are(caplog):
     async def report():
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(server._handle_loop_error)

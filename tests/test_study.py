@@ -1,4 +1,4 @@
-"""Making a study: what is paired, what is refused, and that nothing tells which method made what."""
+"""Creating a study: pairing, errors, and that nothing reveals the method of a picture."""
 
 import hashlib
 import json
@@ -31,7 +31,7 @@ def test_a_study_is_read_as_it_was_made(tmp_path):
     assert read_study(study.folder) == study
     assert study.description.datasets == ("nature", "real")
     assert [row.name for row in study.description.comparisons] == ["1", "1", "2", "10"]
-    assert study.description.pairs == 4  # fewer than 40, as there are no more
+    assert study.description.pairs == 4  # fewer than the default of 40, because the study has 4
     assert not list(study.changed_pictures())
 
 
@@ -62,7 +62,7 @@ def test_the_outputs_of_brewster_itself_are_found(tmp_path, folders):
     assert len(create(tmp_path / "study", inputs, methods).description.comparisons) == 4
 
 
-def test_a_picture_is_kept_to_the_last_value_whatever_its_format(tmp_path, folders):
+def test_a_picture_is_copied_without_loss_from_any_format(tmp_path, folders):
     inputs, methods = folders
     (inputs / "real/1.png").unlink()
     write_pictures(inputs, ["real/1"], suffix=".tif", seed=5)
@@ -75,16 +75,16 @@ def test_a_picture_is_kept_to_the_last_value_whatever_its_format(tmp_path, folde
     assert (about.width, about.height) == copied.size
 
 
-def test_file_names_and_bytes_tell_no_method_and_no_picture(tmp_path):
+def test_file_names_and_bytes_reveal_neither_method_nor_picture(tmp_path):
     study = make_study(tmp_path)
     files = list((study.folder / "pictures").iterdir())
-    assert len(files) == 4 * 3 + 4  # and the spoilt ones
+    assert len(files) == 4 * 3 + 4  # the last 4 are degraded pictures
     for path in files:
         assert re.fullmatch(r"[0-9a-f]{16}\.png", path.name)
         assert not re.search(rb"Secretlus|Rivalino|brewster|tEXt|eXIf|tIME", path.read_bytes())
 
 
-def test_the_same_seed_makes_the_same_study_and_another_another(tmp_path, folders):
+def test_equal_seeds_make_equal_studies_and_different_seeds_do_not(tmp_path, folders):
     inputs, methods = folders
     first, second, third = (
         create(tmp_path / name, inputs, methods, StudyOptions(seed=seed)).description
@@ -94,12 +94,12 @@ def test_the_same_seed_makes_the_same_study_and_another_another(tmp_path, folder
     assert not {picture.name for picture in first.pictures} & {picture.name for picture in third.pictures}
 
 
-def test_a_study_that_was_not_seeded_has_a_seed_of_its_own(tmp_path, folders):
+def test_a_study_without_a_given_seed_gets_a_random_one(tmp_path, folders):
     seeds = {create(tmp_path / name, *folders).description.seed for name in "ab"}
     assert len(seeds) == 2
 
 
-def test_everything_that_does_not_fit_is_named_at_once_and_nothing_is_written(tmp_path, folders):
+def test_all_problems_of_the_files_are_listed_at_once_and_nothing_is_written(tmp_path, folders):
     inputs, methods = folders
     (methods["ours"] / "real/2.png").unlink()
     (inputs / "nature/1.png").unlink()
@@ -134,12 +134,12 @@ def test_one_name_in_two_formats_is_refused(tmp_path, folders):
         (StudyOptions(catches=5), "5 catch trials .* at most 4"),
     ],
 )
-def test_more_than_there_is_is_refused(tmp_path, folders, options, message):
+def test_requests_beyond_the_available_pictures_are_refused(tmp_path, folders, options, message):
     with pytest.raises(BrewsterError, match=message):
         create(tmp_path / "study", *folders, options)
 
 
-def test_one_method_is_no_study_and_an_empty_folder_none_either(tmp_path, folders):
+def test_one_method_and_empty_folders_are_refused(tmp_path, folders):
     inputs, methods = folders
     with pytest.raises(BrewsterError, match="two or more"):
         create(tmp_path / "study", inputs, {"ours": methods["ours"]})
@@ -150,20 +150,20 @@ def test_one_method_is_no_study_and_an_empty_folder_none_either(tmp_path, folder
         create(tmp_path / "study", tmp_path / "nowhere", methods)
 
 
-def test_a_study_is_never_written_over(tmp_path, folders):
+def test_a_study_is_never_overwritten(tmp_path, folders):
     create(tmp_path / "study", *folders)
     with pytest.raises(TargetError, match="is not empty"):
         create(tmp_path / "study", *folders)
 
 
-def test_a_changed_picture_is_noticed(tmp_path):
+def test_a_changed_picture_is_detected(tmp_path):
     study = make_study(tmp_path)
     study.picture_file(study.description.comparisons[0].outputs[0]).write_bytes(b"other")
     with pytest.raises(BrewsterError, match="missing or changed"):
         study.verify_pictures()
 
 
-def test_a_description_that_is_none_is_refused_with_its_place(tmp_path):
+def test_an_invalid_description_is_refused_with_the_key_of_the_error(tmp_path):
     with pytest.raises(BrewsterError, match="cannot be read"):
         read_study(tmp_path)
     study = make_study(tmp_path)
@@ -178,7 +178,7 @@ def test_a_description_that_is_none_is_refused_with_its_place(tmp_path):
             read_study(study.folder)
 
 
-def test_catch_pictures_are_the_output_spoilt_beyond_doubt(tmp_path):
+def test_catch_pictures_are_clearly_degraded_outputs(tmp_path):
     study = make_study(tmp_path, size=(96, 72))
     for catch in study.description.catch_pool:
         good, spoilt = (
@@ -191,7 +191,7 @@ def test_catch_pictures_are_the_output_spoilt_beyond_doubt(tmp_path):
         assert catch.spoilt not in outputs
 
 
-def test_spoiling_is_worse_in_light_and_dark_and_keeps_the_mean(random):
+def test_degrading_works_in_light_and_dark_and_keeps_the_mean(random):
     for level in (20, 128, 235):
         flat = np.full((60, 80, 3), level, np.uint8)
         spoilt = degrade(flat, 1)
@@ -207,9 +207,7 @@ def test_a_study_that_was_moved_is_the_same_study(tmp_path):
     read_study(moved).verify_pictures()
 
 
-def test_pictures_beside_folders_of_pictures_are_named_and_refused_unless_datasets_are_named(
-    tmp_path, folders
-):
+def test_pictures_next_to_subfolders_with_pictures_are_refused_unless_datasets_are_named(tmp_path, folders):
     inputs, methods = folders
     write_pictures(inputs, ["stray"])
     with pytest.raises(BrewsterError, match=r"stray\.png\) and subfolders with pictures \(nature, real\)"):
@@ -218,7 +216,7 @@ def test_pictures_beside_folders_of_pictures_are_named_and_refused_unless_datase
     assert len(study.description.comparisons) == 4
 
 
-def test_a_picture_that_is_called_like_a_layer_is_one_where_nothing_was_separated(tmp_path):
+def test_a_picture_named_like_a_layer_counts_if_its_photo_has_no_transmission(tmp_path):
     names = ("window.reflection", "window", "b.confidence")
     study = make_study(tmp_path, names=names)
     assert {row.name for row in study.description.comparisons} == set(names)

@@ -1,4 +1,4 @@
-"""The draw: balanced, blind, without repeats, and the same for ever."""
+"""Assignment of trials: balanced, without repeats, and reproducible."""
 
 from collections import Counter
 from itertools import islice
@@ -45,8 +45,8 @@ def test_no_participant_sees_one_method_much_more_often_on_one_side(sizes, seed,
         assert abs(2 * right - len(own)) <= 4
 
 
-def test_the_paper_s_study_is_balanced_to_a_hair():
-    """100 participants, 40 of 2 x 181 pairs."""
+def test_a_study_of_the_paper_s_size_is_balanced():
+    """100 participants with 40 of 2 x 181 pairs each."""
     participants = assigned(362, 40, 1, 100)
     rights = [sum(flipped for _, flipped in own) for own in participants]
     assert min(rights) >= 18
@@ -54,7 +54,7 @@ def test_the_paper_s_study_is_balanced_to_a_hair():
     assert set(Counter(comparison for own in participants for comparison, _ in own).values()) == {11, 12}
 
 
-def test_a_draw_depends_on_seed_and_number_only_and_differs_between_both():
+def test_trials_depend_on_seed_and_number_only():
     study = make_description()
     trials = [draw_trials(study, number) for number in range(6)]
     assert trials == [draw_trials(study, number) for number in range(6)]
@@ -62,8 +62,8 @@ def test_a_draw_depends_on_seed_and_number_only_and_differs_between_both():
     assert draw_trials(make_description(seed=8), 0) != trials[0]
 
 
-def test_a_draw_of_this_version_is_the_draw_of_every_version():
-    """Links are sent out, and a study may last longer than an installation."""
+def test_trials_are_the_same_in_every_version():
+    """Participants keep their links, and a study may continue after an update of brewster."""
     first = [
         (trial.comparison, trial.flipped)
         for trial in draw_trials(make_description(pictures=4, pairs=4, catches=0), 0)
@@ -98,7 +98,7 @@ def test_catch_trials_are_of_both_kinds_and_on_photos_that_are_not_the_participa
             assert (trial.expected == "similar") == (trial.left == trial.right)
 
 
-def test_the_order_does_not_tell_the_catch_trials():
+def test_the_order_does_not_reveal_the_catch_trials():
     places = Counter(
         place
         for number in range(120)

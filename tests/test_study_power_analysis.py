@@ -1,4 +1,4 @@
-"""How many participants it takes: the formula, and studies of that size that were simulated."""
+"""Power analysis: the formula, and simulated studies of the computed size."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from brewster.user_study.report.statistics import (
 
 
 def shown(rng, participants, pairs, chances, correlation, studies):
-    """The share of simulated studies whose interval of the difference does not hold 0."""
+    """The share of simulated studies whose interval of the difference does not contain 0."""
     own = rng.dirichlet(np.array(chances) * (1 / correlation - 1), (participants, studies))
     counts = rng.multinomial(pairs, own)[:, :, None].astype(float)
     draws = rates(resampled_counts(bootstrap_weights(participants, 1000), counts), np.ones((studies, 1)))
@@ -35,7 +35,7 @@ def test_a_study_of_the_planned_size_shows_the_difference_with_the_stated_power(
     assert power == pytest.approx(0.8, abs=3 * np.sqrt(0.8 * 0.2 / 400))
 
 
-def test_without_a_difference_five_percent_show_one():
+def test_without_a_difference_five_percent_of_studies_find_one():
     same = (1 - 0.25) / 2
     assert shown(np.random.default_rng(7), 100, 40, (same, 0.25, same), 0.05, 400) == pytest.approx(
         0.05, abs=0.03
@@ -50,7 +50,7 @@ def test_the_formula_by_hand():
     assert (answer.win, answer.lose) == pytest.approx((0.425, 0.325))
 
 
-def test_smaller_differences_and_people_more_alike_need_more_participants():
+def test_smaller_differences_and_higher_correlations_need_more_participants():
     base = required_participants(difference=0.1, tie=0.25).participants
     assert required_participants(difference=0.05, tie=0.25).participants > 3 * base
     assert required_participants(difference=0.1, tie=0.25, correlation=0.2).participants > 2 * base
@@ -59,6 +59,6 @@ def test_smaller_differences_and_people_more_alike_need_more_participants():
 
 
 @pytest.mark.parametrize(("difference", "tie"), [(0, 0.2), (-0.1, 0.2), (0.9, 0.2), (0.1, 1)])
-def test_rates_that_cannot_be_are_refused(difference, tie):
+def test_impossible_rates_are_refused(difference, tie):
     with pytest.raises(BrewsterError, match="a difference above 0"):
         required_participants(difference=difference, tie=tie)

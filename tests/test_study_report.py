@@ -1,4 +1,4 @@
-"""What the answers say: on simulated participants whose preferences are known, and on numbers that others have computed."""
+"""The report: on simulated participants with known preferences, and against published and independent results."""
 
 import csv
 import io
@@ -37,7 +37,7 @@ from brewster.user_study.study import Study
 from small_studies import choice_for, make_description
 
 TRUTH = np.array([0.45, 0.28, 0.27])
-TABLE_3 = {  # the paper's: Real, Nature, Postcard, SolidObject, Wildscene, Average
+TABLE_3 = {  # of the paper: Real, Nature, Postcard, SolidObject, Wildscene, Average
     "RDNet": [
         (49.38, 21.25, 29.37),
         (35.00, 42.08, 22.92),
@@ -71,7 +71,7 @@ def simulated(rng, participants, studies, *, pairs=40, correlation=0.05):
 
 
 def test_the_average_of_the_paper_weights_datasets_by_their_pictures():
-    """Of DSIT all three are reproduced; of RDNet the loss rate, and win and tie together: 0.76 moved between these."""
+    """Reproduces all rates of DSIT; of RDNet the loss rate and the sum of win and tie, between which 0.76 has moved."""
     by_pictures, by_datasets = averages(np.array(TABLE_3["DSIT"][:5]), PICTURES)
     assert np.abs(by_pictures - TABLE_3["DSIT"][5]).max() < 0.006
     assert np.abs(by_datasets - TABLE_3["DSIT"][5]).max() > 4
@@ -82,7 +82,7 @@ def test_the_average_of_the_paper_weights_datasets_by_their_pictures():
     assert win == pytest.approx(printed[0] - 0.76, abs=0.006)
 
 
-def test_rates_are_told_of_each_dataset_and_in_three_averages():
+def test_rates_have_a_row_for_each_dataset_and_three_averages():
     counts, pictures = np.array([[6.0, 2, 2], [0, 10, 30]]), np.array([30.0, 10])
     rows = rates(counts, pictures)
     assert rows[:2, :3] == pytest.approx(np.array([[0.6, 0.2, 0.2], [0, 0.25, 0.75]]))
@@ -95,7 +95,7 @@ def test_rates_are_told_of_each_dataset_and_in_three_averages():
 
 
 def intervals(counts):
-    """Of studies that nobody shares: (2, studies, 4)."""
+    """Intervals of independent studies: (2, studies, 4)."""
     participants, studies = counts.shape[:2]
     return bootstrap_interval(
         rates(resampled_counts(bootstrap_weights(participants, 1000), counts), np.ones((studies, 1))),
@@ -105,7 +105,7 @@ def intervals(counts):
 
 @pytest.mark.parametrize("participants", [100, 12])
 def test_intervals_cover_the_truth_at_their_stated_rate(participants):
-    """400 studies, 40 pairs a participant: 95 % within three standard errors, of many participants and of few."""
+    """400 studies with 40 pairs for each participant: 95 % within three standard errors."""
     studies = 400
     lows, highs = intervals(simulated(np.random.default_rng(1), participants, studies))
     truth = np.append(TRUTH, TRUTH[0] - TRUTH[2])
@@ -113,14 +113,14 @@ def test_intervals_cover_the_truth_at_their_stated_rate(participants):
     assert np.all(np.abs(covered - 0.95) < 3 * np.sqrt(0.95 * 0.05 / studies)), covered
 
 
-def test_intervals_that_forgot_the_participants_would_be_too_narrow():
+def test_intervals_that_ignore_participants_would_be_too_narrow():
     counts = simulated(np.random.default_rng(2), 100, 50, correlation=0.1)
     lows, highs = intervals(counts)
     naive = 2 * 1.96 * np.sqrt(TRUTH * (1 - TRUTH) / 4000)
     assert (highs - lows)[:, :3].mean(axis=0) / naive == pytest.approx(np.sqrt(1 + 39 * 0.1), rel=0.05)
 
 
-def test_a_dataset_that_nobody_answered_has_no_rate_and_hurts_no_other():
+def test_a_dataset_without_answers_has_no_rate_and_does_not_affect_others():
     counts = np.zeros((10, 1, 2, 3))
     counts[:, 0, 0] = [3, 1, 1]
     low, high = bootstrap_interval(
@@ -131,7 +131,7 @@ def test_a_dataset_that_nobody_answered_has_no_rate_and_hurts_no_other():
     assert np.isnan(low[0, 1]).all()
 
 
-def test_the_correlation_within_participants_is_found_again():
+def test_the_simulated_intraclass_correlation_is_estimated():
     counts = simulated(np.random.default_rng(3), 4000, 1, correlation=0.08)[:, 0, 0]
     assert intraclass_correlation(counts) == pytest.approx(0.08, abs=0.01)
     assert intraclass_correlation(counts[:1]) is None
@@ -165,7 +165,7 @@ def test_strengths_of_many_tables_are_those_of_each(random):
         assert worth == pytest.approx(strengths(table))
 
 
-def test_strengths_are_found_however_lopsided_the_games():
+def test_strengths_converge_for_very_unequal_methods():
     wins = np.array([[0, 5000.0, 0], [0.5, 0, 5000], [0, 0.5, 0]])
     worth = strengths(wins)
     assert np.diff(worth) == pytest.approx([-np.log(10_000)] * 2)
@@ -183,7 +183,7 @@ def test_alpha_is_that_of_krippendorff_s_own_example():
     assert alpha(ratings) == pytest.approx(0.743, abs=5e-4)
 
 
-def test_alpha_is_1_in_full_agreement_0_by_chance_and_nothing_where_nothing_can_be_said(random):
+def test_alpha_is_1_for_agreement_0_for_chance_and_none_where_undefined(random):
     assert alpha(np.array([[4.0, 0, 0], [0, 3, 0]])) == 1
     assert alpha(random.multinomial(20, TRUTH, 2000).astype(float)) == pytest.approx(0, abs=0.01)
     assert alpha(np.array([[4.0, 0, 0], [5, 0, 0]])) is None
@@ -197,7 +197,7 @@ def test_alpha_is_1_in_full_agreement_0_by_chance_and_nothing_where_nothing_can_
     ("flipped", "choice", "means"),
     [(False, "left", 0), (False, "right", 2), (True, "left", 2), (True, "right", 0), (True, "similar", 1)],
 )
-def test_a_choice_is_the_first_method_s_win_on_whichever_side_it_stood(flipped, choice, means):
+def test_the_outcome_of_a_choice_depends_on_the_side_of_the_first_method(flipped, choice, means):
     assert outcome(TrialDraw("", "", "", 0, flipped), choice) == means
 
 
@@ -221,12 +221,12 @@ def participant_answers(**fields):
         ({"catches": 1, "failed": 1}, "failed"),
     ],
 )
-def test_the_rule_leaves_out_who_does_not_look_and_nobody_else(fields, reason):
+def test_the_rule_excludes_inattentive_participants_only(fields, reason):
     assert ExclusionRule().reason(participant_answers(**fields)) == reason
 
 
 def answered(description, number, rng, probabilities, *, catches=1.0, seconds=6.0, trials=None):
-    """A participant whose wishes have these probabilities, who passes this share of the catch trials."""
+    """A participant who chooses outcomes with these probabilities and passes this share of the catch trials."""
     row = draw_trials(description, number)
     answers = {}
     for i, trial in enumerate(row[:trials]):
@@ -241,7 +241,7 @@ def answered(description, number, rng, probabilities, *, catches=1.0, seconds=6.
 
 @pytest.fixture(scope="module")
 def hundred(tmp_path_factory):
-    """100 participants x 40 pairs of three methods; five of them never look, and five are in haste."""
+    """100 participants x 40 pairs of three methods; five fail all catch trials, and five are too fast."""
     description = make_description(pictures=50, methods=("ours", "R&D_Net", "DSIT"), pairs=40, catches=4)
     rng = np.random.default_rng(4)
     records = [
@@ -261,7 +261,7 @@ def hundred(tmp_path_factory):
     return study, participants, summarise(study, participants, ExclusionRule())
 
 
-def test_a_hundred_simulated_people_are_understood(hundred):
+def test_the_results_of_a_hundred_simulated_participants_are_correct(hundred):
     _, _, results = hundred
     included, everyone = results["included"], results["everyone"]
     assert results["excluded"] == {"failed": 6, "fast": 4}
@@ -314,7 +314,7 @@ def test_latex_has_the_layout_of_the_paper_and_no_bare_specials(hundred):
     assert [line.split(" & ")[0] for line in rows[1::2]] == ["real", "nature", "Average"]
 
 
-def test_markdown_says_all_and_csv_has_a_line_for_each_number(hundred):
+def test_markdown_is_complete_and_csv_has_a_line_for_each_number(hundred):
     _, _, results = hundred
     text = to_markdown(results)
     for part in (
@@ -335,14 +335,14 @@ def test_without_answers_there_is_no_report(hundred):
         summarise(study, [], ExclusionRule())
 
 
-def test_one_person_gives_rates_without_intervals(hundred):
+def test_one_participant_gives_rates_without_intervals(hundred):
     study, participants, _ = hundred
     row = summarise(study, participants[20:21], ExclusionRule())["included"]["tables"][0]["rows"][-1]
     assert row["win"]["mean"] is not None
     assert row["win"]["low"] is None
 
 
-def test_a_rule_that_leaves_nobody_still_tells_of_everyone(hundred):
+def test_a_rule_that_excludes_everyone_still_gives_the_results_of_all(hundred):
     study, participants, _ = hundred
     results = summarise(study, participants[:5], ExclusionRule())
     assert results["included"]["participants"] == 0
@@ -360,18 +360,18 @@ def named(tmp_path, datasets, methods):
     return study, collect_answers([answered(description, number, rng, TRUTH) for number in range(6)])
 
 
-def test_a_dataset_that_is_called_average_is_told_from_the_average(tmp_path):
+def test_a_dataset_named_average_differs_from_the_average(tmp_path):
     study, participants = named(tmp_path, ("Average", "real"), ("ours", "RDNet"))
     results = summarise(study, participants, ExclusionRule())
     lines = csv.DictReader(io.StringIO(to_csv(results)))
     titles = {line["key"]: line["dataset"] for line in lines}
     assert titles == {"Average": "Average (dataset)", "real": "real"} | AVERAGES
     for text in (to_latex(results), to_markdown(results)):
-        assert len(re.findall(r"Average +[|&]", text)) in (1, 2)  # of each group
+        assert len(re.findall(r"Average +[|&]", text)) in (1, 2)  # once for each group
         assert "Average (dataset)" in text
 
 
-def test_the_plot_has_a_bar_for_each_row_and_takes_names_as_they_are(tmp_path, monkeypatch, recwarn):
+def test_the_plot_has_a_bar_for_each_row_and_shows_names_literally(tmp_path, monkeypatch, recwarn):
     axes = []
     draw_bars = figure._bars
     monkeypatch.setattr(figure, "_bars", lambda axis, *rest: (axes.append(axis), draw_bars(axis, *rest)))
@@ -388,26 +388,29 @@ def test_the_plot_has_a_bar_for_each_row_and_takes_names_as_they_are(tmp_path, m
     assert not [str(warning.message) for warning in recwarn]
 
 
-def test_a_plot_of_everyone_says_so(hundred, monkeypatch):
+def test_a_plot_of_all_participants_has_a_title(hundred, monkeypatch):
     study, participants, _ = hundred
     titles = []
     monkeypatch.setattr("matplotlib.figure.Figure.suptitle", lambda _self, text, **_how: titles.append(text))
-    for count in (20, 5):  # of the five, nobody is kept
+    for count in (20, 5):  # the rule excludes the first five
         plot(summarise(study, participants[:count], ExclusionRule()))
     assert titles == ["All participants: the rule excludes everyone"]
 
 
-def test_answers_csv_says_who_is_left_out_and_why(hundred, tmp_path):
+def test_answers_csv_has_the_reason_of_each_exclusion(hundred, tmp_path):
     study, participants, results = hundred
     write(results, study, participants, tmp_path)
     lines = csv.DictReader(io.StringIO((tmp_path / "answers.csv").read_text()))
     reasons = {int(line["participant"]): line["left_out"] for line in lines}
     assert [reasons[i] for i in range(5)] == ["failed"] * 5
-    assert {reasons[i] for i in range(5, 10)} == {"failed", "fast"}  # one of those in haste is wrong, too
+    assert {reasons[i] for i in range(5, 10)} == {
+        "failed",
+        "fast",
+    }  # one of the fast ones fails catch trials, too
     assert {reasons[i] for i in range(10, 100)} == {""}
 
 
-def test_strengths_that_are_alike_in_all_resamples_have_no_interval(hundred):
+def test_strengths_that_are_equal_in_all_resamples_have_no_interval(hundred):
     study, *_ = hundred
     tied = [participant_answers(number=i, votes={0: 1, 1: 1}) for i in range(5)]
     worth = summarise(study, tied, ExclusionRule())["included"]["strengths"]["ours"]

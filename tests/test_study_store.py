@@ -1,4 +1,4 @@
-"""Answers: on the disk before they are acknowledged, once, whoever writes beside and whatever is killed."""
+"""The store of answers: durable before the acknowledgement, without duplicates, with concurrent writers and kills."""
 
 import os
 import re
@@ -30,7 +30,7 @@ def answers_by_participant(store):
     return {participant.number: answers for participant, answers in store.all_answers()}
 
 
-def test_a_participant_is_shown_what_the_draw_says_and_goes_on_where_they_stopped(store):
+def test_a_participant_gets_the_assigned_trials_and_continues_where_they_stopped(store):
     tokens = [store.admit() for _ in range(3)]
     participant = store.participant(tokens[2])
     assert participant.trials == draw_trials(store.study.description, 2)
@@ -41,7 +41,7 @@ def test_a_participant_is_shown_what_the_draw_says_and_goes_on_where_they_stoppe
     assert store.next_trial(participant) is None
 
 
-def test_a_trial_that_was_passed_over_comes_next(store):
+def test_a_skipped_trial_comes_next(store):
     participant = store.participant(store.admit())
     store.record_answer(participant, 1, "left", seconds=2)
     assert store.next_trial(participant) == 0
@@ -49,7 +49,7 @@ def test_a_trial_that_was_passed_over_comes_next(store):
     assert store.next_trial(participant) == 2
 
 
-def test_the_first_answer_stays(store):
+def test_the_first_answer_is_final(store):
     participant = store.participant(store.admit())
     assert store.record_answer(participant, 0, "left", seconds=2) == "left"
     assert store.record_answer(participant, 0, "right", seconds=9) == "left"
@@ -58,14 +58,14 @@ def test_the_first_answer_stays(store):
     ]
 
 
-def test_links_cannot_be_guessed_and_nobody_else_s_are_known(store):
+def test_tokens_are_random_and_others_are_unknown(store):
     tokens = {store.admit() for _ in range(20)}
     assert len(tokens) == 20
     assert all(re.fullmatch(r"[\w-]{32}", token) for token in tokens)
     assert store.participant("0") is None
 
 
-def test_nothing_is_kept_of_a_person_but_the_day(store):
+def test_only_the_date_of_a_participant_is_stored(store):
     store.admit()
     with sqlite3.connect(store.study.answers_file) as database:
         columns = [row[1] for row in database.execute("PRAGMA table_info(participants)")]
@@ -75,19 +75,19 @@ def test_nothing_is_kept_of_a_person_but_the_day(store):
     assert re.fullmatch(r"\d{4}-\d\d-\d\d", day)
 
 
-def test_no_more_are_admitted_than_there_may_be(store):
+def test_the_number_of_participants_is_limited(store):
     assert [store.admit(max_participants=2) is not None for _ in range(4)] == [True, True, False, False]
     assert store.count_participants() == 2
 
 
 @pytest.mark.parametrize(("trial", "choice"), [(-1, "left"), (10, "left"), (0, "both")])
-def test_an_answer_to_nothing_is_refused(store, trial, choice):
+def test_an_answer_to_an_unknown_trial_is_refused(store, trial, choice):
     participant = store.participant(store.admit())
     with pytest.raises(BrewsterError, match="was answered with"):
         store.record_answer(participant, trial, choice, seconds=1)
 
 
-def test_absurd_times_are_cut(store):
+def test_impossible_times_are_clipped(store):
     participant = store.participant(store.admit())
     store.record_answer(participant, 0, "left", seconds=-5)
     store.record_answer(participant, 1, "left", seconds=1e9)
@@ -111,7 +111,7 @@ def test_two_servers_and_many_threads_lose_nothing_and_number_nobody_twice(store
     other.close()
 
 
-def test_a_file_that_is_no_database_is_told_in_one_sentence(tmp_path):
+def test_a_file_that_is_not_a_database_is_an_error(tmp_path):
     study = make_empty_study(tmp_path / "study")
     study.answers_file.write_bytes(b"no database at all, but long enough to be read as a header" * 20)
     with pytest.raises(BrewsterError, match=r"answers\.sqlite cannot be used"):
@@ -134,7 +134,7 @@ while True:
 """
 
 
-def test_what_was_acknowledged_before_kill_9_is_there_once(tmp_path):
+def test_acknowledged_answers_survive_kill_9_without_duplicates(tmp_path):
     write_study(tmp_path, make_description())
     acknowledged = []
     for _ in range(2):
@@ -152,10 +152,10 @@ def test_what_was_acknowledged_before_kill_9_is_there_once(tmp_path):
     assert all(trial in stored[number] for number, trial in acknowledged)
     assert (
         sum(map(len, stored.values())) <= len(acknowledged) + 2
-    )  # one of each writer may not have been told of
+    )  # the last answer of each of the two writers may be unacknowledged
 
 
-def test_a_copy_of_the_folder_after_kill_9_has_all_answers_and_once_opened_again_the_file_alone(tmp_path):
+def test_a_copy_after_kill_9_has_all_answers_and_the_file_alone_has_them_after_reopening(tmp_path):
     write_study(tmp_path / "study", make_description())
     writer = subprocess.Popen(
         [sys.executable, "-c", WRITER, str(tmp_path / "study")], stdout=subprocess.PIPE, text=True
@@ -179,7 +179,7 @@ def alone(study, folder):
     return AnswerStore(replace(study, folder=folder))
 
 
-def test_a_store_that_is_closed_leaves_all_in_the_file_though_others_have_it_open(store, tmp_path):
+def test_closing_a_store_moves_all_answers_into_the_file(store, tmp_path):
     other = AnswerStore(store.study)
     participant = store.participant(store.admit())
     store.record_answer(participant, 0, "left", seconds=2)
@@ -188,7 +188,7 @@ def test_a_store_that_is_closed_leaves_all_in_the_file_though_others_have_it_ope
     other.close()
 
 
-def test_a_reader_makes_no_database_and_sees_what_a_server_writes(store):
+def test_a_reader_creates_no_database_and_sees_new_answers(store):
     participant = store.participant(store.admit())
     store.record_answer(participant, 0, "left", seconds=2)
     reader = AnswerStore(store.study, read_only=True)

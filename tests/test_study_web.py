@@ -1,4 +1,4 @@
-"""The study over HTTP: what a participant's browser is told, and what it is never told."""
+"""The HTTP API of the study: what a participant receives, and what no response contains."""
 
 import re
 from contextlib import closing
@@ -51,7 +51,7 @@ def reply(app, link, trial, choice="left", seconds=2.5):
     )
 
 
-def test_who_agrees_gets_a_link_and_is_led_through_all_trials(app, store):
+def test_a_participant_who_agrees_gets_a_link_and_all_trials(app, store):
     invitation = request(app, "GET", "/invitation").json()
     assert invitation == {"consent": "First.\n\n<b>Second</b>.", "trials": 8, "is_open": True}
     link = begin(app)
@@ -76,7 +76,7 @@ def test_the_pictures_of_a_trial_are_those_that_were_drawn(app, store, study):
             assert answer.headers["content-type"] == "image/png"
 
 
-def test_nothing_that_is_sent_names_a_method_a_dataset_or_a_file(app, store, study):
+def test_no_response_contains_a_method_a_dataset_or_a_file_name(app, store, study):
     link = begin(app)
     paths = ["/", link, f"{link}/trial", "/invitation", "/openapi.json"]
     paths += [f"/page/{name}" for name in ("study.js", "study.css", "lens.js", "style.css")]
@@ -87,11 +87,11 @@ def test_nothing_that_is_sent_names_a_method_a_dataset_or_a_file(app, store, stu
         sent = b"\n".join([*(b"%s: %s" % pair for pair in answer.headers.raw), answer.content]).lower()
         for word in ("secretlus", "rivalino", "nature/", *names):
             assert word.encode() not in sent
-        if answer.headers["content-type"] == "image/png":  # not even which file is older
+        if answer.headers["content-type"] == "image/png":  # no header reveals the age of the file
             assert not {"etag", "last-modified", "content-disposition"} & set(answer.headers)
 
 
-def test_an_answer_sent_twice_is_kept_once_and_the_first_one_stays(app, store):
+def test_an_answer_sent_twice_is_stored_once(app, store):
     link = begin(app)
     assert reply(app, link, 0, "left").json()["kept"] == "left"
     again = reply(app, link, 0, "right").json()
@@ -110,7 +110,7 @@ def test_an_answer_sent_twice_is_kept_once_and_the_first_one_stays(app, store):
         {"trial": 0, "choice": "left"},
     ],
 )
-def test_an_answer_that_is_none_is_refused_in_a_sentence(app, store, wrong):
+def test_an_invalid_answer_is_refused_with_a_message(app, store, wrong):
     answer = request(app, "POST", f"{begin(app)}/answers", json=wrong)
     assert answer.status_code == 422
     assert answer.json()["error"]
@@ -123,7 +123,7 @@ def test_without_agreement_there_is_no_link(app, store):
     assert store.count_participants() == 0
 
 
-def test_a_link_that_nobody_has_is_told_so(app):
+def test_an_unknown_link_is_an_error(app):
     for path in ("/s/nobody/trial", "/s/nobody/link", "/s/nobody/pictures/0/left"):
         answer = request(app, "GET", path)
         assert answer.status_code == 404
@@ -133,7 +133,7 @@ def test_a_link_that_nobody_has_is_told_so(app):
     assert (whole.status_code, "<title>Compare pictures" in whole.text) == (404, True)
 
 
-def test_trials_beyond_the_last_are_told_so(app):
+def test_trials_beyond_the_last_are_an_error(app):
     link = begin(app)
     for trial in (-1, 8):
         assert request(app, "GET", f"{link}/pictures/{trial}/left").status_code == 404
@@ -141,7 +141,7 @@ def test_trials_beyond_the_last_are_told_so(app):
     assert reply(app, link, 8).status_code == 404
 
 
-def test_a_full_study_lets_nobody_else_in_and_those_inside_go_on(study, store):
+def test_a_full_study_admits_nobody_and_its_participants_continue(study, store):
     app = create_app(
         study_router(study, store, max_participants=1), limits=RequestLimits(), index="study.html"
     )
@@ -153,7 +153,7 @@ def test_a_full_study_lets_nobody_else_in_and_those_inside_go_on(study, store):
     assert reply(app, link, 0).status_code == 200
 
 
-def test_a_personal_link_carries_the_token_that_the_server_wants(study, store):
+def test_a_personal_link_contains_the_token_of_the_server(study, store):
     limits = RequestLimits(token=TOKEN)
     app = create_app(study_router(study, store, token=TOKEN), limits=limits, index="study.html")
     assert request(app, "POST", "/participants", json={"agreed": True}).status_code == 401
@@ -166,8 +166,8 @@ def test_a_personal_link_carries_the_token_that_the_server_wants(study, store):
     assert "Refresh" in request(app, "GET", link).headers
 
 
-def test_a_wide_and_a_deep_picture_look_as_they_do_elsewhere(tmp_path):
-    """16 bits and a profile: what is shown is 8-bit sRGB, as `brewster evaluate` measures it."""
+def test_a_16_bit_picture_is_shown_as_8_bit_srgb(tmp_path):
+    """The pixels are those that `brewster evaluate` measures."""
     make_study(tmp_path, names=("a",))
     deep = Photo.from_array(np.full((18, 24, 3), 30_000, np.uint16), encoding="srgb")
     for folder in ("inputs", "Secretlus", "Rivalino"):
@@ -181,24 +181,24 @@ def test_a_wide_and_a_deep_picture_look_as_they_do_elsewhere(tmp_path):
     assert np.array_equal(shown.pixels, deep.srgb_8bit())
 
 
-def test_every_word_of_the_page_is_served_by_the_study_itself(app):
+def test_all_assets_of_the_page_are_served_locally(app):
     page = request(app, "GET", "/").text
     links = re.findall(r'(?:src|href)="([^"]+)"', page)
     assert len(links) >= 4
     assert all(link.startswith("/page/") and request(app, "GET", link).status_code == 200 for link in links)
 
 
-def test_an_answer_that_the_disk_refuses_is_not_acknowledged_and_can_be_sent_again(app, store):
+def test_an_answer_that_cannot_be_written_is_not_acknowledged_and_can_be_sent_again(app, store):
     link = begin(app)
-    store._database.execute("PRAGMA query_only = ON")  # as a full disk or one that was mounted read-only
+    store._database.execute("PRAGMA query_only = ON")  # like a full or read-only disk
     refused = reply(app, link, 0)
-    assert refused.status_code == 500  # the page sends again what failed with 500 and more
+    assert refused.status_code == 500  # the page repeats requests that fail with 500 or more
     assert refused.json()["error"].startswith("answers.sqlite cannot be used")
     store._database.execute("PRAGMA query_only = OFF")
     assert reply(app, link, 0, "right").json()["kept"] == "right"
 
 
-def test_a_picture_that_is_gone_is_told_so_and_not_as_a_failure_that_passes(tmp_path):
+def test_a_missing_picture_is_a_permanent_error(tmp_path):
     study = make_study(tmp_path)
     with closing(AnswerStore(study)) as store:
         app = create_app(study_router(study, store), limits=RequestLimits(), index="study.html")
@@ -206,6 +206,6 @@ def test_a_picture_that_is_gone_is_told_so_and_not_as_a_failure_that_passes(tmp_
         trial = store.participant(link.removeprefix("/s/")).trials[0]
         study.picture_file(trial.left).unlink()
         answer = request(app, "GET", f"{link}/pictures/0/left")
-    assert answer.status_code == 410  # the page asks again after 500 and more
+    assert answer.status_code == 410  # the page repeats requests that fail with 500 or more
     assert answer.json()["error"].startswith("a picture is missing on the server")
     assert trial.left.removesuffix(".png") not in answer.text
