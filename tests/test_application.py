@@ -65,9 +65,8 @@ def test_a_slow_upload_is_refused():
         answer = raw_exchange(port, head(f"Content-Length: {len(FORM)}"), FORM[:50])
         assert status(answer) == 408
         assert b"send it again" in answer
-        assert (
-            status(raw_exchange(port, PLAIN)) == 200
-        )  # a request without a body: on a slow machine a body could exceed the limit, too
+        # a request without a body: on a slow machine a body could exceed the limit, too
+        assert status(raw_exchange(port, PLAIN)) == 200
 
 
 def test_an_interrupted_upload_releases_its_place():

@@ -291,9 +291,8 @@ def test_no_documentation_page_fetches_assets_from_elsewhere(app):
     assert request(app, "GET", "/docs").status_code == request(app, "GET", "/redoc").status_code == 404
 
 
-TRIED = make_app(
-    limits=RequestLimits(hosts=frozenset({"testserver"}))
-)  # the host name that schemathesis uses
+TRIED = make_app(limits=RequestLimits(hosts=frozenset({"testserver"})))
+"""An application with the host name that schemathesis uses."""
 SCHEMA = schemathesis.openapi.from_asgi("/openapi.json", TRIED)
 
 

@@ -171,9 +171,8 @@ def test_the_page_works_with_the_keyboard_alone(open_page, run):
             assert len(reached) < 40, reached
             page.keyboard.press("Tab")
 
-    assert "window.png" in page.evaluate(
-        focus
-    )  # the pressed button is hidden, so the focus is on the new photo
+    # the pressed button is hidden, so the focus is on the new photo
+    assert "window.png" in page.evaluate(focus)
     page.evaluate("document.activeElement.blur()")
     tab_to("the photo on the left")
     page.keyboard.press("+")

@@ -79,9 +79,8 @@ def test_report_prints_tables_and_writes_all_files(bare, created, random):
     assert "all of it is in study/report" in err
     names = {path.name for path in (created.folder / "report").iterdir()}
     assert names == {"report.json", "report.md", "table.tex", "table.csv", "answers.csv", "plot.png"}
-    code, out, _ = bare(
-        "study", "report", "study", "--json", "--least-seconds", 99
-    )  # replaces the first report
+    # replaces the first report
+    code, out, _ = bare("study", "report", "study", "--json", "--least-seconds", 99)
     assert json.loads(out)["excluded"] == {"failed": 0, "fast": 12}
 
 
@@ -148,9 +147,8 @@ def test_serving_a_study_whose_pictures_changed_is_refused(bare, created):
 def test_serving_on_another_address_prints_a_warning(created):
     with serve(created.folder, "--host", "0.0.0.0", "--token", "auto") as server:
         link = server.stdout.readline().strip()
-        assert (
-            get(link).status_code < 400
-        )  # the server answers only after it has installed its signal handlers
+        # the server answers only after it has installed its signal handlers
+        assert get(link).status_code < 400
         assert "nothing they send is encrypted" in interrupted(server)
     assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{22}", link)
 

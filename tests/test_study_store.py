@@ -150,9 +150,8 @@ def test_acknowledged_answers_survive_kill_9_without_duplicates(tmp_path):
     store.close()
     assert len(set(acknowledged)) == len(acknowledged) >= 30
     assert all(trial in stored[number] for number, trial in acknowledged)
-    assert (
-        sum(map(len, stored.values())) <= len(acknowledged) + 2
-    )  # the last answer of each of the two writers may be unacknowledged
+    # the last answer of each of the two writers may be unacknowledged
+    assert sum(map(len, stored.values())) <= len(acknowledged) + 2
 
 
 def test_a_copy_after_kill_9_has_all_answers_and_the_file_alone_has_them_after_reopening(tmp_path):

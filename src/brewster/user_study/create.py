@@ -41,10 +41,10 @@ In this study you compare pictures. You see a photo that was taken through glass
 reflection from it. Choose the one that looks better to you, or say that they are similar. There are no right or wrong \
 answers.
 
-Taking part is voluntary. You can stop at any time, and go on later with your personal link.
+Taking part is voluntary. You can stop at any time, and continue later with your personal link.
 
-We keep your choices, how long each took, and the day on which you agreed to take part. We keep no name, no address and \
-nothing else about you or your device."""
+We store your choices, how long each took, and the date on which you agreed to take part. We store no name, no address \
+and nothing else about you or your device."""
 
 
 @final

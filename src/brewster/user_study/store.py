@@ -196,9 +196,8 @@ class AnswerStore:
                 yield database
                 database.execute("COMMIT")
             except BaseException:
-                if (
-                    database.in_transaction
-                ):  # SQLite has already rolled back after some errors, such as a full disk
+                # SQLite has already rolled back after some errors, such as a full disk
+                if database.in_transaction:
                     database.execute("ROLLBACK")
                 raise
 

@@ -55,9 +55,8 @@ def preview(
     width, height = _preview_size(photo.size)
     small = photo.small(width, height)
     arguments = options.call() | {"strength": _SMALL_STRENGTH, "additive": False}
-    reduced = Photo.from_array(
-        small[..., : photo.pixels.shape[2]], encoding="linear"
-    )  # a grey photo keeps one channel
+    channels = photo.pixels.shape[2]  # one for a grey photo
+    reduced = Photo.from_array(small[..., :channels], encoding="linear")
     layers = separator(reduced, on_progress=on_progress, **arguments)
     transmission = small + (layers.transmission.linear() - small) / np.float32(_SMALL_STRENGTH)
     reflection = layers.reflection.linear() / np.float32(_SMALL_STRENGTH)

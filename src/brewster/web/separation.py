@@ -31,10 +31,8 @@ from brewster.web.model_cache import ModelCache, ModelRow
 from brewster.web.preview import preview
 from brewster.web.request_schema import SeparationRequest, form_schema, read_form
 
-_MEDIA: Final = {
-    "exr": "image/x-exr",
-    "hdr": "image/vnd.radiance",
-}  # other formats: image/ and the name of the format
+_MEDIA_TYPES: Final = {"exr": "image/x-exr", "hdr": "image/vnd.radiance"}
+"""Media types by format; those of other formats are image/ and the name of the format."""
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # the earliest date of zip; a fixed date makes the archive reproducible
 
 
@@ -168,7 +166,7 @@ def _media_type(name: str) -> str:
     if name.endswith(".zip"):
         return "application/zip"
     container = SUFFIXES[Path(name).suffix.lower()]
-    return _MEDIA.get(container, f"image/{container}")
+    return _MEDIA_TYPES.get(container, f"image/{container}")
 
 
 def _zip(files: Mapping[str, bytes]) -> bytes:

@@ -162,11 +162,12 @@ def intraclass_correlation(counts: Float64[Floats, "p 3"]) -> float | None:
     """
     counts = counts[counts.sum(axis=1) > 0]
     sizes, sums, squares = counts.sum(axis=1), counts[:, 0] - counts[:, 2], counts[:, 0] + counts[:, 2]
-    people, answers = len(sizes), float(sizes.sum())
-    if people < 2 or answers <= people:
+    participants, answers = len(sizes), float(sizes.sum())
+    if participants < 2 or answers <= participants:
         return None
-    between = ((sums**2 / sizes).sum() - sums.sum() ** 2 / answers) / (people - 1)
-    within = (squares - sums**2 / sizes).sum() / (answers - people)
-    size = (answers - (sizes**2).sum() / answers) / (people - 1)
+    # the mean squares between and within participants, and Donner's mean size of unequal groups
+    between = ((sums**2 / sizes).sum() - sums.sum() ** 2 / answers) / (participants - 1)
+    within = (squares - sums**2 / sizes).sum() / (answers - participants)
+    size = (answers - (sizes**2).sum() / answers) / (participants - 1)
     spread = between + (size - 1) * within
     return float((between - within) / spread) if spread > 0 else None

@@ -11,7 +11,7 @@ const byId = (id) => document.getElementById(id);
 const sections = ["invitation", "trial", "finish", "error"];
 const frames = { left: frame("left"), photo: frame("photo"), right: frame("right") };
 const lens = new Lens(byId("pictures"), Object.values(frames));
-const preloaded = []; // keeps the pictures of the next trial in memory
+const preloaded = []; // the pictures of the next trial, held in memory
 let state = null; // the current trial, as returned by the server
 let shownAt = null; // time at which its pictures were shown; null while no answer is accepted
 
