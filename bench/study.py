@@ -23,7 +23,7 @@ import numpy as np
 
 from brewster import Photo
 from brewster.user_study.create import StudyOptions, create
-from brewster.user_study.report.participants import ExclusionRule, people
+from brewster.user_study.report.participants import ExclusionRule, collect_answers
 from brewster.user_study.report.results import summarise
 from brewster.user_study.store import AnswerStore
 
@@ -127,13 +127,13 @@ def main():
     shutil.rmtree(OUT, ignore_errors=True)
     study = make(OUT)
     participants, kills, seconds = asyncio.run(run(study))
-    with sqlite3.connect(study.answers) as database:
+    with sqlite3.connect(study.answers_file) as database:
         whole = database.execute("PRAGMA integrity_check").fetchone()[0]
         rows = database.execute(
             "SELECT '/s/' || token, trial, choice FROM answers JOIN participants ON number = participant"
         ).fetchall()
     stored = {(link, trial): choice for link, trial, choice in rows}
-    answered = people(AnswerStore(study).everything())
+    answered = collect_answers(AnswerStore(study).all_answers())
     results = summarise(study, answered, ExclusionRule(1.0, 0.0))
     slowest = statistics.quantiles(participants.times, n=100)[98]
     lines = {

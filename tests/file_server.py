@@ -1,4 +1,4 @@
-"""A web server on this machine that gives files, or breaks off, refuses and lies when told to."""
+"""A local web server for files, with programmable faults."""
 
 import contextlib
 import socket
@@ -9,7 +9,7 @@ from threading import Thread
 class _Answers(BaseHTTPRequestHandler):
     def do_GET(self):
         files = self.server.content
-        files.asked.append((self.path, self.headers["Range"]))
+        files.requests.append((self.path, self.headers["Range"]))
         body, fault = files.bodies.get(self.path), files.faults.pop(0) if files.faults else None
         if body is None or isinstance(fault, int):
             return self.head(fault or 404)
@@ -29,14 +29,14 @@ class _Answers(BaseHTTPRequestHandler):
 
 
 class Files:
-    """What the server gives by path, what was asked of it, and its next faults: "cut" or a status code."""
+    """The files of the server by path, its received requests, and its next faults: "cut" or a status code."""
 
     def __init__(self, url):
-        self.url, self.bodies, self.asked, self.faults = url, {}, [], []
+        self.url, self.bodies, self.requests, self.faults = url, {}, [], []
 
 
 def loopback_only(monkeypatch):
-    """What a test file that serves files has as its `_network_off`: this machine may be reached, nothing else."""
+    """Replaces `_network_off` in test files with a server: only this machine may be reached."""
     connect = socket.socket.connect
 
     def loopback(self, address):
@@ -48,7 +48,7 @@ def loopback_only(monkeypatch):
 
 @contextlib.contextmanager
 def on_loopback(answers, content):
-    """A server whose handler finds `content(its address)`, which is given, until it is left."""
+    """Runs a server; yields `content(url)`, which its handler finds as `server.content`."""
     with ThreadingHTTPServer(("127.0.0.1", 0), answers) as server:
         server.content = content(f"http://127.0.0.1:{server.server_port}")
         thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
@@ -59,12 +59,12 @@ def on_loopback(answers, content):
 
 
 def served():
-    """A server of files, until it is left."""
+    """Runs a server of files; yields its `Files`."""
     return on_loopback(_Answers, Files)
 
 
-def unheard():
-    """An address on this machine where nobody listens."""
+def unused_address():
+    """A URL of this machine on which no server listens."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         return f"http://127.0.0.1:{listener.getsockname()[1]}"

@@ -1,4 +1,4 @@
-"""What the tests of the command line share: a model that is a pane, pictures, and the command as a user calls it."""
+"""Shared helpers for tests of the command line: a model of a pane, pictures, and the command in a process."""
 
 import json
 import subprocess
@@ -14,7 +14,7 @@ LAYERS = ("transmission", "reflection")
 
 
 def write_pane(path):
-    """An ONNX model of a pane that lets 80 % through and mirrors 20 %."""
+    """An ONNX model of a pane that transmits 80 % and reflects 20 %."""
     shape = [1, 3, "height", "width"]
     shares = {"transmission": 0.8, "reflection": 0.2}
     graph = helper.make_graph(
@@ -38,10 +38,10 @@ def picture(width=60, height=40, container="jpeg", seed=1):
     return Photo.from_array(array, encoding="srgb").encode(container)
 
 
-def as_user(*args, **how):
-    """The same in a process of its own."""
+def as_user(*args, **kwargs):
+    """Runs the command `brewster` in its own process."""
     return subprocess.run(
-        [sys.executable, "-m", "brewster", *map(str, args)], capture_output=True, check=False, **how
+        [sys.executable, "-m", "brewster", *map(str, args)], capture_output=True, check=False, **kwargs
     )
 
 

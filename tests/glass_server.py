@@ -1,4 +1,4 @@
-"""The web server of the tests: applications asked without a network, on a thread, or as a user starts them."""
+"""Web servers for tests: applications without a network, on a thread, or in their own process."""
 
 import asyncio
 import contextlib
@@ -12,12 +12,12 @@ from threading import Event, Thread
 import httpx
 
 from brewster.inference import Separator
-from brewster.web.application import application, listen
+from brewster.web.application import create_app, listen
 from brewster.web.job_queue import JobQueue
 from brewster.web.middleware import RequestLimits
 from brewster.web.model_cache import ModelRow
-from brewster.web.separation import separation
-from brewster.web.server import server
+from brewster.web.separation import separation_router
+from brewster.web.server import create_server
 from other_processes import started
 
 
@@ -25,8 +25,8 @@ def pane(tile):
     return tile * 0.8, tile * 0.2
 
 
-class OneModel:
-    """What a shelf is, with one backend on it."""
+class FakeModelCache:
+    """A ModelCache with one backend."""
 
     names = ("pane",)
 
@@ -41,37 +41,37 @@ class OneModel:
         return self._separator
 
 
-class Stubborn:
-    """A pane that is busy with its first tile until it is told to go on."""
+class BlockingBackend:
+    """A pane that blocks until `proceed` is set."""
 
     def __init__(self):
-        self.tiles, self.started, self.go = 0, Event(), Event()
+        self.tiles, self.started, self.proceed = 0, Event(), Event()
 
     def __call__(self, tile):
         self.tiles += 1
         self.started.set()
-        assert self.go.wait(30)
+        assert self.proceed.wait(30)
         return pane(tile)
 
 
-def app_of(backend=pane, *, desk=None, max_pixels=10**8, guard=None):
-    return application(
-        separation(OneModel(backend), desk or JobQueue(), max_pixels=max_pixels),
-        guard=guard or RequestLimits(),
+def make_app(backend=pane, *, job_queue=None, max_pixels=10**8, limits=None):
+    return create_app(
+        separation_router(FakeModelCache(backend), job_queue or JobQueue(), max_pixels=max_pixels),
+        limits=limits or RequestLimits(),
     )
 
 
-def client(app, **how):
+def client(app, **kwargs):
     """An HTTP client of an application, without a network."""
-    return httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://localhost:8417", **how)
+    return httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://localhost:8417", **kwargs)
 
 
-def ask(app, method, path, **what):
-    """One request, one answer."""
+def request(app, method, path, **kwargs):
+    """Sends one request; returns the response."""
 
     async def once():
-        async with client(app) as asking:
-            return await asking.request(method, path, **what)
+        async with client(app) as http:
+            return await http.request(method, path, **kwargs)
 
     return asyncio.run(once())
 
@@ -81,17 +81,17 @@ def form(photo, name="window.png", **fields):
 
 
 @contextlib.contextmanager
-def on_a_thread(app):
-    """An application on a port of this machine, which is given."""
-    with served(app) as (port, _):
+def served_port(app):
+    """Runs an application on a thread; yields its port."""
+    with running_server(app) as (port, _):
         yield port
 
 
 @contextlib.contextmanager
-def served(app):
-    """An application on a thread: its port, and the server."""
+def running_server(app):
+    """Runs an application on a thread; yields its port and the server."""
     with listen("127.0.0.1", 0) as listening:
-        running = server(app)
+        running = create_server(app)
         thread = Thread(target=running.run, kwargs={"sockets": [listening]})
         thread.start()
         try:
@@ -101,8 +101,8 @@ def served(app):
             thread.join()
 
 
-def spoken(port, *pieces):
-    """What a server answers to these bytes, sent one after another; connected until it closes."""
+def raw_exchange(port, *pieces):
+    """Sends these bytes and returns all bytes of the server until it closes the connection."""
     with socket.create_connection(("127.0.0.1", port)) as connection:
         for piece in pieces:
             connection.sendall(piece)
@@ -113,11 +113,11 @@ def spoken(port, *pieces):
 
 
 @contextlib.contextmanager
-def as_a_user(*args):
-    """`brewster serve` in a process of its own: its first line, a link; its exit code is checked at the end."""
+def serve_process(*args):
+    """Runs `brewster serve` in its own process; yields its first line, a link, and checks the exit code at the end."""
     command = [sys.executable, "-m", "brewster", "serve", "--port", "0", "--device", "cpu", *map(str, args)]
-    how = {"stdout": subprocess.PIPE, "text": True, "env": {**os.environ, "PYTHONUNBUFFERED": "1"}}
-    with started(command, **how) as process:
+    kwargs = {"stdout": subprocess.PIPE, "text": True, "env": {**os.environ, "PYTHONUNBUFFERED": "1"}}
+    with started(command, **kwargs) as process:
         try:
             yield process.stdout.readline().strip()
         finally:

@@ -1,4 +1,4 @@
-"""Processes that tests start, watch and kill."""
+"""Starts, watches and kills processes."""
 
 import contextlib
 import signal
@@ -8,25 +8,25 @@ from pathlib import Path
 
 
 @contextlib.contextmanager
-def started(command, **how):
-    """A process that is killed in the end, if it has not ended by itself; Ctrl-C reaches it.
+def started(command, **kwargs):
+    """Runs a process that receives Ctrl-C, and kills it at the end if it still runs.
 
     A shell starts background jobs with SIGINT ignored, and children inherit that.
     """
     command = [*map(str, command)]
-    with subprocess.Popen(command, preexec_fn=_heed_interrupts, **how) as process:  # noqa: PLW1509
+    with subprocess.Popen(command, preexec_fn=_restore_sigint, **kwargs) as process:  # noqa: PLW1509
         try:
             yield process
         finally:
             process.kill()
 
 
-def _heed_interrupts():
+def _restore_sigint():
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def wait_for(condition, process=None):
-    """Waits until something is so, while this process runs; only the time limit of the test ends it before."""
+    """Waits until a condition is true while the process runs; only the time limit of the test stops the wait."""
     while not condition():
         assert process is None or process.poll() is None, f"it ended, with exit code {process.returncode}"
         time.sleep(0.01)

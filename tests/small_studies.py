@@ -1,4 +1,4 @@
-"""Studies to test with: one described but not drawn, one of real little pictures, and people who answer at random."""
+"""Small studies for tests: one without picture files, and one with small pictures."""
 
 import numpy as np
 
@@ -14,10 +14,10 @@ from brewster.user_study.study import (
 )
 
 
-def described(
+def make_description(
     pictures=20, *, methods=("ours", "RDNet"), datasets=("real", "nature"), pairs=8, catches=2, seed=7
 ):
-    """A description without pictures: `pictures` of each dataset, the first method against each other one."""
+    """A description without picture files: `pictures` for each dataset, the first method against each of the others."""
     photos = [(dataset, str(i)) for dataset in datasets for i in range(pictures)]
     comparisons = [
         PairedComparison(
@@ -30,7 +30,7 @@ def described(
         for dataset, name in photos
         for other in methods[1:]
     ]
-    catches_there = [CatchTrial(*photo, "-".join(photo), "good", "spoilt") for photo in photos]
+    catch_pool = [CatchTrial(*photo, "-".join(photo), "good", "spoilt") for photo in photos]
     names = {name for row in comparisons for name in (row.photo, *row.outputs)}
     return StudyDescription(
         brewster="0",
@@ -42,14 +42,14 @@ def described(
         datasets=tuple(datasets),
         pictures=tuple(StudyPicture(name, 3, 2, "", "") for name in sorted(names)),
         comparisons=tuple(comparisons),
-        catch_pool=tuple(catches_there),
+        catch_pool=tuple(catch_pool),
     )
 
 
-def empty(folder, **asked):
-    """The same as a study in a folder, without its files."""
+def make_empty_study(folder, **options):
+    """A study in a folder, without picture files."""
     folder.mkdir(parents=True, exist_ok=True)
-    return Study(folder, described(**asked))
+    return Study(folder, make_description(**options))
 
 
 def write_pictures(
@@ -64,32 +64,32 @@ def write_pictures(
     return folder
 
 
-def made(
+def make_study(
     folder,
     *,
     methods=("Secretlus", "Rivalino"),
     names=("real/1", "real/2", "real/10", "nature/1"),
     size=(24, 18),
-    **choices,
+    **options,
 ):
-    """A study of little pictures, with its files."""
+    """A study of small pictures, with its files."""
     inputs = write_pictures(folder / "inputs", names, size=size)
     outputs = {
         method: write_pictures(folder / method, names, size=size, seed=i + 1)
         for i, method in enumerate(methods)
     }
-    return create(folder / "study", inputs, outputs, StudyOptions(**{"seed": 3} | choices))
+    return create(folder / "study", inputs, outputs, StudyOptions(**{"seed": 3} | options))
 
 
 def choice_for(trial, outcome):
-    """What somebody presses who wants this outcome (0, 1, 2) for the comparison's first method."""
+    """The choice that gives this outcome (0, 1, 2) for the first method of the comparison."""
     if outcome == 1:
         return "similar"
     return "left" if (outcome == 0) != trial.flipped else "right"
 
 
-def beside(study, folder):
-    """The same study without answers in another folder, which shares its pictures."""
+def copy_without_answers(study, folder):
+    """The same study in another folder, without answers; shares the pictures."""
     folder.mkdir()
     (folder / PICTURES).symlink_to(study.folder / PICTURES)
     return Study(folder, study.description)

@@ -1,4 +1,4 @@
-"""The application behind a real socket: what only bytes on a wire can show."""
+"""The application over a real socket."""
 
 import signal
 import socket
@@ -8,12 +8,12 @@ import sys
 import pytest
 
 from brewster.errors import TargetError
-from brewster.web.application import address, listen
+from brewster.web.application import listen, server_url
 from brewster.web.job_queue import JobQueue
 from brewster.web.middleware import RequestLimits
 from file_server import loopback_only
 from front_door import picture
-from glass_server import Stubborn, app_of, on_a_thread, spoken
+from glass_server import BlockingBackend, make_app, raw_exchange, served_port
 from other_processes import started
 
 HEAD = "POST /separate HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Type: multipart/form-data; boundary=x\r\n"
@@ -31,7 +31,7 @@ def head(*more):
     return "".join([HEAD, *(f"{line}\r\n" for line in more), "\r\n"]).encode()
 
 
-def whole(body=FORM):
+def post_request(body=FORM):
     return head(f"Content-Length: {len(body)}"), body
 
 
@@ -44,69 +44,71 @@ def chunk(data):
 
 
 def test_a_photo_is_separated_over_a_socket():
-    with on_a_thread(app_of()) as port:
-        answer = spoken(port, *whole())
+    with served_port(make_app()) as port:
+        answer = raw_exchange(port, *post_request())
     assert status(answer) == 200
     assert b"server:" not in answer.lower().partition(b"\r\n\r\n")[0]
 
 
-def test_an_upload_too_long_is_answered_although_nobody_reads_it_whole():
-    """A client that sends all before it reads must find an answer, and no broken connection."""
-    with on_a_thread(app_of(guard=RequestLimits(max_bytes=10_000))) as port:
+def test_an_upload_that_is_too_large_gets_a_response_to_its_end():
+    """A client that sends everything before it reads must receive the response, not a broken connection."""
+    with served_port(make_app(limits=RequestLimits(max_bytes=10_000))) as port:
         long = bytes(3_000_000)
-        assert status(spoken(port, head(f"Content-Length: {len(long)}"), long)) == 413
+        assert status(raw_exchange(port, head(f"Content-Length: {len(long)}"), long)) == 413
         chunked = [chunk(bytes(100_000)) for _ in range(30)]
-        assert status(spoken(port, head("Transfer-Encoding: chunked"), *chunked, chunk(b""))) == 413
-        assert status(spoken(port, *whole())) == 200
+        assert status(raw_exchange(port, head("Transfer-Encoding: chunked"), *chunked, chunk(b""))) == 413
+        assert status(raw_exchange(port, *post_request())) == 200
 
 
-def test_a_slow_upload_is_given_up():
-    with on_a_thread(app_of(guard=RequestLimits(body_seconds=0.1))) as port:
-        answer = spoken(port, head(f"Content-Length: {len(FORM)}"), FORM[:50])
+def test_a_slow_upload_is_refused():
+    with served_port(make_app(limits=RequestLimits(body_seconds=0.1))) as port:
+        answer = raw_exchange(port, head(f"Content-Length: {len(FORM)}"), FORM[:50])
         assert status(answer) == 408
         assert b"send it again" in answer
-        assert status(spoken(port, PLAIN)) == 200  # without a body, which might be slow here, too
+        # a request without a body: on a slow machine a body could exceed the limit, too
+        assert status(raw_exchange(port, PLAIN)) == 200
 
 
-def test_an_upload_that_is_cut_off_harms_nobody():
-    desk = JobQueue(queue=0)
-    with on_a_thread(app_of(desk=desk)) as port:
+def test_an_interrupted_upload_releases_its_place():
+    job_queue = JobQueue(max_waiting=0)
+    with served_port(make_app(job_queue=job_queue)) as port:
         for end in (0, 30, 90, len(FORM) - 3):
             with socket.create_connection(("127.0.0.1", port)) as connection:
                 connection.sendall(head(f"Content-Length: {len(FORM)}") + FORM[:end])
-        while status(answer := spoken(port, *whole())) == 503:  # the last one's place is not free yet
+        # the server has not yet released the place of the last upload
+        while status(answer := raw_exchange(port, *post_request())) == 503:
             assert b"Retry-After" in answer or b"retry-after" in answer
         assert status(answer) == 200
-    assert desk.jobs == 0
+    assert job_queue.jobs == 0
 
 
-def test_a_connection_that_breaks_stops_the_work():
-    backend, desk = Stubborn(), JobQueue()
-    with on_a_thread(app_of(backend, desk=desk)) as port:
+def test_a_broken_connection_stops_the_work():
+    backend, job_queue = BlockingBackend(), JobQueue()
+    with served_port(make_app(backend, job_queue=job_queue)) as port:
         with socket.create_connection(("127.0.0.1", port)) as connection:
-            connection.sendall(b"".join(whole()))
+            connection.sendall(b"".join(post_request()))
             backend.started.wait()
-            (job,) = desk._jobs.values()
-        job.stopped.wait()
-        backend.go.set()
+            (job,) = job_queue._jobs.values()
+        job.cancelled.wait()
+        backend.proceed.set()
     assert backend.tiles == 1
 
 
 @pytest.mark.parametrize(
     "rubbish", [b"\x16\x03\x01\x02\x00", b"GET / HTTP/9\r\n\r\n", b"\r\n\r\nnonsense\r\n\r\n"]
 )
-def test_what_is_no_http_is_answered_and_forgotten(rubbish):
-    with on_a_thread(app_of()) as port:
-        assert status(spoken(port, rubbish + b"\r\n\r\n")) in (400, None)
-        assert status(spoken(port, *whole())) == 200
+def test_a_request_that_is_not_http_is_refused(rubbish):
+    with served_port(make_app()) as port:
+        assert status(raw_exchange(port, rubbish + b"\r\n\r\n")) in (400, None)
+        assert status(raw_exchange(port, *post_request())) == 200
 
 
 SERVING = """
 from fastapi import APIRouter
-from brewster.web.application import application, serve
+from brewster.web.application import create_app, serve
 from brewster.web.middleware import RequestLimits
 try:
-    serve(application(APIRouter(), guard=RequestLimits()), host="127.0.0.1", port=0, on_ready=lambda url: print(url, flush=True))
+    serve(create_app(APIRouter(), limits=RequestLimits()), host="127.0.0.1", port=0, on_ready=lambda url: print(url, flush=True))
 except KeyboardInterrupt:
     print("interrupted")
 finally:
@@ -114,23 +116,22 @@ finally:
 """
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
-def test_a_server_that_is_ended_lets_its_caller_finish(how):
+@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
+def test_serve_returns_to_its_caller_after_a_signal(signal_number):
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with started([sys.executable, "-c", SERVING], **pipes) as process:
         url = process.stdout.readline()
-        spoken(int(url.split(":")[2].strip("/\n")), PLAIN)  # it has an answer only when it heeds signals
-        process.send_signal(how)
+        # the server answers only after it has installed its signal handlers
+        raw_exchange(int(url.split(":")[2].strip("/\n")), PLAIN)
+        process.send_signal(signal_number)
         out, err = process.communicate()
     assert url.startswith("http://127.0.0.1:")
     assert (process.returncode, out.split(), err) == (0, ["interrupted", "closed"], "")
 
 
-def test_a_port_that_is_taken_is_named():
+def test_a_port_in_use_is_an_error():
     with listen("127.0.0.1", 0) as taken:
         port = taken.getsockname()[1]
-        assert address(taken) == f"http://127.0.0.1:{port}/"
-        with pytest.raises(
-            TargetError, match=f"port {port} cannot be listened on .*; choose others with --host"
-        ):
+        assert server_url(taken) == f"http://127.0.0.1:{port}/"
+        with pytest.raises(TargetError, match=f"port {port} cannot be used .*; choose others with --host"):
             listen("127.0.0.1", port)

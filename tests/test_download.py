@@ -9,7 +9,7 @@ import pytest
 
 from brewster.download import Downloader, RemoteFile, digest_of
 from brewster.errors import DownloadError, TargetError
-from file_server import loopback_only, served, unheard
+from file_server import loopback_only, served, unused_address
 
 BODY = hashlib.sha256(b"light").digest() * 10_000
 
@@ -64,7 +64,12 @@ def test_a_line_that_breaks_is_taken_up_where_it_was(server, line, promise, targ
     line.fetch(promise, target)
     assert target.read_bytes() == BODY
     assert waited == [1, 2, 4]
-    assert [start for _, start in server.asked] == [None, "bytes=160000-", "bytes=160000-", "bytes=240000-"]
+    assert [start for _, start in server.requests] == [
+        None,
+        "bytes=160000-",
+        "bytes=160000-",
+        "bytes=240000-",
+    ]
 
 
 def test_what_came_of_half_a_file_is_kept_for_the_next_call(server, promise, target):
@@ -73,7 +78,7 @@ def test_what_came_of_half_a_file_is_kept_for_the_next_call(server, promise, tar
         Downloader(pauses_s=()).fetch(promise, target)
     assert [path.name for path in target.parent.iterdir()] == ["map.part"]
     Downloader(pauses_s=()).fetch(promise, target)
-    assert server.asked[-1] == ("/map", "bytes=160000-")
+    assert server.requests[-1] == ("/map", "bytes=160000-")
 
 
 def test_a_file_that_is_another_is_dropped(server, line, promise, target):
@@ -85,7 +90,7 @@ def test_a_file_that_is_another_is_dropped(server, line, promise, target):
 
 def test_a_server_that_is_not_there_is_asked_five_times(line, waited):
     with pytest.raises(DownloadError, match=r"in 5 attempts .*refused.*check the connection"):
-        line.read(unheard())
+        line.read(unused_address())
     assert waited == [1, 2, 4, 8]
 
 

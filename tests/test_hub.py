@@ -17,7 +17,7 @@ from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion.tensors import read_metadata, read_tensors
 from brewster.training.lora.model_card import write_card
 from brewster.training.recipe import LoraRecipe
-from file_server import loopback_only, unheard
+from file_server import loopback_only, unused_address
 
 REPO = "somebody/sees-through-glass"
 VALUES = {
@@ -222,7 +222,7 @@ def test_a_server_that_is_not_a_hub_is_explained(write, hub):
 
 
 def test_a_missing_network_connection_is_explained(write, monkeypatch):
-    monkeypatch.setattr(huggingface_hub.constants, "ENDPOINT", unheard())
+    monkeypatch.setattr(huggingface_hub.constants, "ENDPOINT", unused_address())
     with pytest.raises(DownloadError, match=r"the hub cannot be reached .*; a network"):
         push(plan_push(write(), REPO), token="hf_right")
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)

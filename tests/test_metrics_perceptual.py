@@ -24,7 +24,7 @@ from brewster.metrics.weights import (
     read_alexnet,
     read_heads,
 )
-from file_server import loopback_only, served, unheard
+from file_server import loopback_only, served, unused_address
 
 SHAPES = ((64, 3, 11), (192, 64, 5), (384, 192, 3), (256, 384, 3), (256, 256, 3))
 STEPS = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))  # stride and padding; the second and third pool before
@@ -266,7 +266,7 @@ def test_the_cache_is_searched_first_then_the_data_folder_then_the_server(
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "data"))
     saved(state, tmp_path / "data" / "weights" / WEIGHTS_FILE)
     load_alexnet(remote, digest)
-    assert server.asked == []
+    assert server.requests == []
     assert not cache.exists()
     saved({name: values + 1 for name, values in state.items()}, cache / WEIGHTS_FILE)
     with pytest.raises(ModelError, match=str(cache)):
@@ -276,7 +276,7 @@ def test_the_cache_is_searched_first_then_the_data_folder_then_the_server(
 def test_a_download_is_stored_without_the_rest_of_the_network(server, state, cache):
     remote, digest = remote_file(server, saved(state)), digest_of(state)
     first, second = (load_alexnet(remote, digest) for _ in range(2))
-    assert [path for path, _ in server.asked] == ["/whole.pth"]
+    assert [path for path, _ in server.requests] == ["/whole.pth"]
     assert [path.name for path in cache.iterdir()] == [WEIGHTS_FILE]
     assert (
         list(first)
@@ -295,11 +295,11 @@ def test_an_interrupted_download_is_resumed_and_not_used_before(server, state, c
         load_alexnet(remote, digest, downloader=Downloader(pauses_s=()))
     assert [path.name for path in cache.iterdir()] == ["whole.pth.part"]
     load_alexnet(remote, digest, downloader=Downloader(pauses_s=()))
-    assert server.asked[-1] == ("/whole.pth", f"bytes={len(body) // 2}-")
+    assert server.requests[-1] == ("/whole.pth", f"bytes={len(body) // 2}-")
 
 
 def test_an_unreachable_server_is_explained():
-    remote = RemoteFile(f"{unheard()}/whole.pth", 9, "sha256", "0")
+    remote = RemoteFile(f"{unused_address()}/whole.pth", 9, "sha256", "0")
     with pytest.raises(DownloadError, match="check the connection"):
         load_alexnet(remote, downloader=Downloader(pauses_s=()))
 

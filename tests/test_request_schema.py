@@ -17,7 +17,7 @@ HEAD = b'--x\r\nContent-Disposition: form-data; name="%b"%b\r\n\r\n'
 
 
 def body(*parts):
-    """A form of (name, value) and (name, value, file name)."""
+    """The body of a form with parts (name, value) or (name, value, file name)."""
     rows = [
         HEAD % (name.encode(), b'; filename="%b"' % more[0].encode() if more else b"") + value + b"\r\n"
         for name, value, *more in parts
@@ -35,39 +35,39 @@ def read(data, kind=b"multipart/form-data; boundary=x", cut=False):
     return asyncio.run(read_form(request, MODELS, 1000))
 
 
-def asked(**fields):
+def parse(**fields):
     return read(
         body(("photo", b"bytes", "a.jpg"), *((name, value.encode()) for name, value in fields.items()))
     )
 
 
-def refused(data, **how):
+def refused(data, **kwargs):
     with pytest.raises(HTTPException) as error:
-        read(data, **how)
+        read(data, **kwargs)
     return error.value.status_code, error.value.detail
 
 
 @pytest.mark.parametrize("charset", [b"undefined", b"punycode"])
-def test_a_charset_that_is_no_text_is_a_broken_form(charset):
-    status, said = refused(
+def test_an_unusable_charset_is_a_damaged_form(charset):
+    status, sentence = refused(
         body(("photo", b"", "a.jpg"), ("strength", b"\xff-1")),
         kind=b"multipart/form-data; boundary=x; charset=" + charset,
     )
     assert status == 400
-    assert "UTF-8" in said
+    assert "UTF-8" in sentence
 
 
 # --- values
 
 
-def test_a_photo_alone_is_asked_for_as_on_the_command_line():
-    made = asked()
+def test_a_photo_alone_gets_the_default_options():
+    made = parse()
     assert (made.photo, made.name) == (b"bytes", "a.jpg")
     assert made.options == Options(max_pixels=1000)
 
 
-def test_every_option_that_a_client_may_choose_is_read():
-    made = asked(
+def test_every_client_option_is_read():
+    made = parse(
         strength="0.5", quality="best", format="tiff", additive="true", model="mine", layers="reflection"
     )
     assert made.options == Options(
@@ -82,18 +82,18 @@ def test_every_option_that_a_client_may_choose_is_read():
 
 
 @pytest.mark.parametrize("layers", ["confidence,transmission", "transmission,confidence,transmission"])
-def test_layers_come_each_once_and_in_the_known_order(layers):
-    assert asked(layers=layers).options.layers == ("transmission", "confidence")
+def test_layers_are_unique_and_in_the_standard_order(layers):
+    assert parse(layers=layers).options.layers == ("transmission", "confidence")
     repeated = [("layers", layer.encode()) for layer in layers.split(",")]
     assert read(body(("photo", b"", "a.jpg"), *repeated)).options.layers == ("transmission", "confidence")
 
 
-def test_an_empty_field_is_one_that_was_left_out():
-    assert asked(format="", strength="", model="").options == Options(max_pixels=1000)
+def test_an_empty_field_counts_as_omitted():
+    assert parse(format="", strength="", model="").options == Options(max_pixels=1000)
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("fields", "sentence"),
     [
         ({"strength": "1.5"}, "strength is '1.5'"),
         ({"strength": "nan"}, "strength is 'nan'"),
@@ -111,17 +111,17 @@ def test_an_empty_field_is_one_that_was_left_out():
         ({"quality": "x" * 500}, "'" + "x" * 40 + "'"),
     ],
 )
-def test_a_wrong_value_is_named_in_a_sentence(fields, said):
+def test_a_wrong_value_is_named_in_the_message(fields, sentence):
     data = body(("photo", b"bytes", "a.jpg"), *((name, value.encode()) for name, value in fields.items()))
-    status, sentence = refused(data)
+    status, message = refused(data)
     assert status == 422
-    assert said in sentence
-    assert len(sentence) < 300
+    assert sentence in message
+    assert len(message) < 300
 
 
-def test_values_that_do_not_go_together_are_the_options_own_error():
+def test_contradicting_options_raise_the_error_of_options():
     with pytest.raises(BrewsterError, match="fit only into TIFF and EXR"):
-        asked(additive="true", format="png")
+        parse(additive="true", format="png")
 
 
 @pytest.mark.parametrize(
@@ -138,18 +138,18 @@ def test_values_that_do_not_go_together_are_the_options_own_error():
         (b"no form at all", 400),
     ],
 )
-def test_a_form_that_is_none_is_refused(data, status):
+def test_an_invalid_form_is_refused(data, status):
     assert refused(data)[0] == status
 
 
 @pytest.mark.parametrize(
     "kind", [b"application/json", b"", b"multipart/form-data", b"multipart/form-data; boundary="]
 )
-def test_another_kind_of_body_is_refused(kind):
+def test_a_body_that_is_not_a_form_is_refused(kind):
     assert refused(body(("photo", b"", "a.jpg")), kind=kind)[0] in (400, 415)
 
 
-def test_the_schema_holds_the_options_words_and_limits():
+def test_the_schema_has_the_descriptions_and_limits_of_options():
     fields = form_schema(MODELS)["properties"]
     assert set(fields) == {"photo", *FIELDS}
     assert (fields["strength"]["minimum"], fields["strength"]["maximum"]) == (0, 1)
@@ -163,7 +163,7 @@ def test_the_schema_holds_the_options_words_and_limits():
 
 
 @given(name=st.text())
-def test_a_name_is_never_a_path_and_fits_every_disk(name):
+def test_a_safe_name_is_never_a_path_and_fits_every_file_system(name):
     safe = safe_name(name)
     assert safe.strip(". ") == safe != ""
     assert safe.isprintable()
@@ -174,7 +174,7 @@ def test_a_name_is_never_a_path_and_fits_every_disk(name):
 
 
 @given(stem=st.text(string.ascii_letters + string.digits + "äöü日本 -_()", min_size=1).filter(str.strip))
-def test_a_harmless_name_stays_as_it_is(stem):
+def test_a_harmless_name_stays_unchanged(stem):
     name = f"{stem.strip()[:30].strip()}.jpg"
     assert safe_name(name) == name
 
@@ -192,7 +192,7 @@ def test_a_harmless_name_stays_as_it_is(stem):
         ("x" * 1000 + ".JPG", "x" * 120 + ".JPG"),
     ],
 )
-def test_hostile_names_are_disarmed(name, safe):
+def test_hostile_names_become_safe(name, safe):
     assert safe_name(name) == safe
 
 

@@ -14,13 +14,13 @@ from schemathesis.specs.openapi.checks import negative_data_rejection, positive_
 import brewster
 from brewster import Photo
 from brewster.inference import Separator
-from brewster.web.application import application
+from brewster.web.application import create_app
 from brewster.web.job_queue import JobQueue
 from brewster.web.middleware import RequestLimits
 from brewster.web.model_cache import ModelCache
-from brewster.web.separation import separation
+from brewster.web.separation import separation_router
 from front_door import picture
-from glass_server import Stubborn, app_of, ask, client, form, pane
+from glass_server import BlockingBackend, client, form, make_app, pane, request
 from picture_files import exif_block, file_of, smooth
 
 MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
@@ -29,11 +29,11 @@ SMALL = picture(40, 30, "png")
 
 @pytest.fixture
 def app():
-    return app_of()
+    return make_app()
 
 
 def separate(app, photo=SMALL, name="window.png", **fields):
-    return ask(app, "POST", "/separate", **form(photo, name, **fields))
+    return request(app, "POST", "/separate", **form(photo, name, **fields))
 
 
 def error_of(answer):
@@ -41,12 +41,12 @@ def error_of(answer):
     return answer.json()["error"]
 
 
-# --- answers
+# --- responses
 
 
-def test_the_shipped_model_answers_as_the_command_line_does(bare, tmp_path):
-    app = application(
-        separation(ModelCache(device="cpu"), JobQueue(), max_pixels=10**8), guard=RequestLimits()
+def test_the_server_returns_the_bytes_of_the_command_line(bare, tmp_path):
+    app = create_app(
+        separation_router(ModelCache(device="cpu"), JobQueue(), max_pixels=10**8), limits=RequestLimits()
     )
     answer = separate(app, MIXTURE.read_bytes(), MIXTURE.name, quality="draft", strength="0.7")
     bare(MIXTURE, "-o", tmp_path, "--quality", "draft", "--strength", "0.7", "--device", "cpu")
@@ -55,7 +55,7 @@ def test_the_shipped_model_answers_as_the_command_line_does(bare, tmp_path):
         made = {name: archive.read(name) for name in archive.namelist()}
     assert made == {path.name: path.read_bytes() for path in tmp_path.glob("*.jpg")}
     assert len(made) == 2
-    (row,) = ask(app, "GET", "/models").json()
+    (row,) = request(app, "GET", "/models").json()
     assert answer.headers["brewster-sha256"] == row["sha256"]
     assert "where it fails" in row["card"].lower()
 
@@ -81,7 +81,7 @@ def test_one_layer_is_a_picture_and_several_are_a_zip(app, fields, kind, name):
         assert answer.content == getattr(expected, layer).encode(kind.removeprefix("image/"))
 
 
-def test_how_it_was_made_stands_in_the_headers(app):
+def test_the_headers_describe_the_separation(app):
     headers = separate(app).headers
     assert headers["brewster-model"] == "pane"
     assert headers["brewster-sha256"] == "0" * 64
@@ -103,16 +103,16 @@ def test_a_photo_keeps_its_profile_and_its_camera(app):
 
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(name=st.text())
-def test_no_file_name_harms_the_answer(app, name):
+def test_no_file_name_breaks_the_response(app, name):
     head = f'form-data; name="photo"; filename="{name}"'.replace("\r", "").replace("\n", "")
     data = b"--x\r\nContent-Disposition: %b\r\n\r\n%b\r\n--x--\r\n" % (head.encode(errors="replace"), SMALL)
     kind = {"content-type": "multipart/form-data; boundary=x"}
-    answer = ask(app, "POST", "/separate", content=data, headers=kind)
+    answer = request(app, "POST", "/separate", content=data, headers=kind)
     assert answer.status_code in (200, 400, 422)
     if answer.status_code == 200:
-        (said,) = answer.headers.get_list("content-disposition")
-        assert said.isprintable()
-        given_name = unquote(said.partition("''")[2])
+        (sentence,) = answer.headers.get_list("content-disposition")
+        assert sentence.isprintable()
+        given_name = unquote(sentence.partition("''")[2])
         assert given_name.endswith(".zip")
         assert not set(given_name) & set('/\\\r\n"')
 
@@ -126,11 +126,11 @@ def test_a_hostile_name_gives_a_harmless_one(app, name):
     assert Path(unquote(answer.headers["content-disposition"].partition("''")[2])).suffix == ".png"
 
 
-# --- refusals, each with a status and a sentence
+# --- errors, each with a status and a message
 
 
 @pytest.mark.parametrize(
-    ("photo", "status", "said"),
+    ("photo", "status", "sentence"),
     [
         (b"", 422, "empty"),
         (b"hello", 422, "no picture"),
@@ -139,14 +139,14 @@ def test_a_hostile_name_gives_a_harmless_one(app, name):
         (file_of(smooth(200, 300), "png"), 413, "pixels"),
     ],
 )
-def test_uploads_that_are_no_photos_are_refused(photo, status, said):
-    answer = separate(app_of(max_pixels=5000), photo)
+def test_uploads_that_are_no_photos_are_refused(photo, status, sentence):
+    answer = separate(make_app(max_pixels=5000), photo)
     assert answer.status_code == status
-    if said:
-        assert said in error_of(answer)
+    if sentence:
+        assert sentence in error_of(answer)
 
 
-def test_a_kind_of_picture_that_is_not_taken_is_refused(app):
+def test_an_unsupported_kind_of_picture_is_refused(app):
     from PIL import Image  # noqa: PLC0415
 
     data = io.BytesIO()
@@ -160,28 +160,28 @@ def test_wrong_values_are_refused_before_any_work():
     def never(tile):
         raise AssertionError
 
-    answer = separate(app_of(never), strength="7")
+    answer = separate(make_app(never), strength="7")
     assert answer.status_code == 422
     assert "strength is '7'" in error_of(answer)
 
 
-def test_paths_that_are_not_there_and_other_methods_are_refused(app):
-    assert ask(app, "GET", "/nothing").status_code == 404
-    assert ask(app, "GET", "/page/../separation.py").status_code == 404
-    assert ask(app, "GET", "/page/%2e%2e/separation.py").status_code == 404
-    assert ask(app, "GET", "/separate").status_code == 405
+def test_unknown_paths_and_methods_are_refused(app):
+    assert request(app, "GET", "/nothing").status_code == 404
+    assert request(app, "GET", "/page/../separation.py").status_code == 404
+    assert request(app, "GET", "/page/%2e%2e/separation.py").status_code == 404
+    assert request(app, "GET", "/separate").status_code == 405
 
 
-def test_a_bug_is_told_without_its_traceback():
+def test_a_bug_is_reported_without_its_traceback():
     def broken(tile):
         raise ZeroDivisionError("secret")
 
     async def once():
         import httpx  # noqa: PLC0415
 
-        transport = httpx.ASGITransport(app_of(broken), raise_app_exceptions=False)
-        async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as asking:
-            return await asking.post("/separate", **form(SMALL))
+        transport = httpx.ASGITransport(make_app(broken), raise_app_exceptions=False)
+        async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as http:
+            return await http.post("/separate", **form(SMALL))
 
     answer = asyncio.run(once())
     assert answer.status_code == 500
@@ -189,42 +189,42 @@ def test_a_bug_is_told_without_its_traceback():
     assert "secret" not in answer.text
 
 
-# --- the desk
+# --- the job queue
 
 
-def test_a_client_that_goes_away_stops_the_work():
-    backend, desk = Stubborn(), JobQueue()
+def test_a_client_that_disconnects_stops_the_work():
+    backend, job_queue = BlockingBackend(), JobQueue()
 
     async def leave():
-        async with client(app_of(backend, desk=desk)) as asking:
-            task = asyncio.create_task(asking.post("/separate", **form(SMALL, quality="best")))
+        async with client(make_app(backend, job_queue=job_queue)) as http:
+            task = asyncio.create_task(http.post("/separate", **form(SMALL, quality="best")))
             await asyncio.to_thread(backend.started.wait)
             task.cancel()
             await asyncio.wait([task])
-        backend.go.set()
-        while desk.jobs:
+        backend.proceed.set()
+        while job_queue.jobs:
             await asyncio.sleep(0.001)
 
     asyncio.run(leave())
     assert backend.tiles == 1
-    backend_in_peace = Stubborn()
-    backend_in_peace.go.set()
-    assert separate(app_of(backend_in_peace), quality="best").status_code == 200
-    assert backend_in_peace.tiles > 1
+    free_backend = BlockingBackend()
+    free_backend.proceed.set()
+    assert separate(make_app(free_backend), quality="best").status_code == 200
+    assert free_backend.tiles > 1
 
 
-def test_a_full_server_says_when_to_come_back_and_goes_on():
-    backend, desk = Stubborn(), JobQueue(queue=1)
+def test_a_full_server_returns_retry_after_and_continues():
+    backend, job_queue = BlockingBackend(), JobQueue(max_waiting=1)
 
     async def crowd():
-        async with client(app_of(backend, desk=desk)) as asking:
-            first = [asyncio.create_task(asking.post("/separate", **form(SMALL))) for _ in range(2)]
+        async with client(make_app(backend, job_queue=job_queue)) as http:
+            first = [asyncio.create_task(http.post("/separate", **form(SMALL))) for _ in range(2)]
             await asyncio.to_thread(backend.started.wait)
-            while desk.jobs < 2:
+            while job_queue.jobs < 2:
                 await asyncio.sleep(0.001)
-            health = (await asking.get("/health")).json()
-            late = await asking.post("/separate", **form(SMALL))
-            backend.go.set()
+            health = (await http.get("/health")).json()
+            late = await http.post("/separate", **form(SMALL))
+            backend.proceed.set()
             return health, late, await asyncio.gather(*first)
 
     health, late, first = asyncio.run(crowd())
@@ -235,13 +235,13 @@ def test_a_full_server_says_when_to_come_back_and_goes_on():
     assert [answer.status_code for answer in first] == [200, 200]
 
 
-def test_work_beyond_the_time_limit_is_given_up():
-    backend = Stubborn()
+def test_work_beyond_the_time_limit_is_cancelled():
+    backend = BlockingBackend()
 
     async def wait():
-        async with client(app_of(backend, desk=JobQueue(seconds=0.01))) as asking:
-            answer = await asking.post("/separate", **form(SMALL))
-            backend.go.set()
+        async with client(make_app(backend, job_queue=JobQueue(timeout_seconds=0.01))) as http:
+            answer = await http.post("/separate", **form(SMALL))
+            backend.proceed.set()
             return answer
 
     answer = asyncio.run(wait())
@@ -249,18 +249,18 @@ def test_work_beyond_the_time_limit_is_given_up():
     assert "draft" in error_of(answer)
 
 
-def test_progress_is_told_while_there_is_any():
-    backend = Stubborn()
+def test_progress_is_available_while_the_job_runs():
+    backend = BlockingBackend()
 
     async def watch():
-        async with client(app_of(backend)) as asking:
-            task = asyncio.create_task(asking.post("/separate?job=my-own-job", **form(SMALL)))
+        async with client(make_app(backend)) as http:
+            task = asyncio.create_task(http.post("/separate?job=my-own-job", **form(SMALL)))
             await asyncio.to_thread(backend.started.wait)
-            during = await asking.get("/progress/my-own-job")
-            again = await asking.post("/separate?job=my-own-job", **form(SMALL))
-            backend.go.set()
+            during = await http.get("/progress/my-own-job")
+            again = await http.post("/separate?job=my-own-job", **form(SMALL))
+            backend.proceed.set()
             await task
-            return during, again, await asking.get("/progress/my-own-job")
+            return during, again, await http.get("/progress/my-own-job")
 
     during, again, after = asyncio.run(watch())
     assert during.json() == {"state": "working", "ahead": 0, "share": 0.0}
@@ -269,17 +269,17 @@ def test_progress_is_told_while_there_is_any():
     assert "job" in error_of(after)
 
 
-def test_a_job_needs_a_name_that_is_one(app):
-    answer = ask(app, "POST", "/separate?job=../x", **form(SMALL))
+def test_an_invalid_job_name_is_refused(app):
+    answer = request(app, "POST", "/separate?job=../x", **form(SMALL))
     assert answer.status_code == 422
     assert "job" in error_of(answer)
 
 
-# --- what is written about it
+# --- OpenAPI
 
 
 def test_openapi_describes_every_field_and_every_refusal(app):
-    api = ask(app, "GET", "/openapi.json").json()
+    api = request(app, "GET", "/openapi.json").json()
     assert set(api["paths"]) == {"/separate", "/progress/{job}", "/models", "/health"}
     post = api["paths"]["/separate"]["post"]
     assert {"413", "415", "422", "503", "504"} <= set(post["responses"])
@@ -288,14 +288,15 @@ def test_openapi_describes_every_field_and_every_refusal(app):
 
 
 def test_no_documentation_page_fetches_assets_from_elsewhere(app):
-    assert ask(app, "GET", "/docs").status_code == ask(app, "GET", "/redoc").status_code == 404
+    assert request(app, "GET", "/docs").status_code == request(app, "GET", "/redoc").status_code == 404
 
 
-TRIED = app_of(guard=RequestLimits(hosts=frozenset({"testserver"})))  # as schemathesis calls it
+TRIED = make_app(limits=RequestLimits(hosts=frozenset({"testserver"})))
+"""An application with the host name that schemathesis uses."""
 SCHEMA = schemathesis.openapi.from_asgi("/openapi.json", TRIED)
 
 
-UNFIT = [  # no schema tells which options go together, and in a form all is text: 0 is as good a no as false
+UNFIT = [  # the schema cannot express which options contradict each other, and in a form 0 is valid for false
     positive_data_acceptance,
     negative_data_rejection,
 ]
@@ -303,8 +304,8 @@ UNFIT = [  # no schema tells which options go together, and in a form all is tex
 
 @SCHEMA.parametrize()
 @settings(max_examples=12, suppress_health_check=list(HealthCheck))
-def test_the_server_keeps_what_openapi_promises(case):
+def test_the_server_conforms_to_its_openapi_document(case):
     photo = case.body.get("photo") if isinstance(case.body, dict) else None
-    if isinstance(photo, str | bytes):  # chance makes no picture
+    if isinstance(photo, str | bytes):  # random bytes are not a picture
         case.body["photo"] = SMALL
     case.call_and_validate(excluded_checks=UNFIT)

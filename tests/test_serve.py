@@ -8,12 +8,12 @@ import pytest
 from brewster.cli import serve as command
 from brewster.cli.serve import serve
 from file_server import loopback_only
-from glass_server import as_a_user
+from glass_server import serve_process
 
 
 @pytest.fixture
 def reachable(monkeypatch):
-    """This machine may be reached, by the address that the server prints."""
+    """Allows connections to this machine, for the address that the server prints."""
     import socket  # noqa: PLC0415
 
     monkeypatch.undo()
@@ -29,8 +29,8 @@ def get(url, **headers):
         return error.code, error.read()
 
 
-def test_a_user_starts_it_asks_it_and_stops_it(reachable, model):
-    with as_a_user("--model", model, "--token", "auto") as link:
+def test_the_command_serves_requests_until_it_is_interrupted(reachable, model):
+    with serve_process("--model", model, "--token", "auto") as link:
         url, token = re.fullmatch(r"(http://127\.0\.0\.1:\d+/)\?token=([\w-]{16,})", link).groups()
         assert get(f"{url}health")[0] == 401
         status, body = get(f"{url}models", Authorization=f"Bearer {token}")
@@ -40,31 +40,31 @@ def test_a_user_starts_it_asks_it_and_stops_it(reachable, model):
 
 
 @pytest.fixture
-def served(monkeypatch, model):
-    """What would have been served: the guard and the address."""
+def served_apps(monkeypatch, model):
+    """Records the limits and arguments of `serve` instead of serving."""
     import brewster.web.application as web  # noqa: PLC0415
 
     calls = []
     monkeypatch.setattr(
-        web, "serve", lambda app, **how: calls.append((app.user_middleware[0].kwargs["guard"], how))
+        web, "serve", lambda app, **kwargs: calls.append((app.user_middleware[0].kwargs["limits"], kwargs))
     )
     return calls
 
 
-def test_another_address_is_warned_of_and_gets_a_token(bare, served):
+def test_another_address_prints_a_warning_and_gets_a_token(bare, served_apps):
     code, _, err = bare("serve", "--host", "0.0.0.0")
-    ((guard, how),) = served
+    ((limits, kwargs),) = served_apps
     assert code == 0
     assert "warning: whoever reaches 0.0.0.0" in err
-    assert guard.any_address
-    assert len(guard.token) >= 16
-    assert how["host"] == "0.0.0.0"
+    assert limits.any_address
+    assert len(limits.token) >= 16
+    assert kwargs["host"] == "0.0.0.0"
 
 
-def test_this_machine_alone_needs_no_token(bare, served):
+def test_a_loopback_address_needs_no_token(bare, served_apps):
     code, _, err = bare("serve", "--max-bytes", "1000")
-    ((guard, how),) = served
-    assert (code, guard.token, guard.max_bytes, how["host"], how["port"]) == (
+    ((limits, kwargs),) = served_apps
+    assert (code, limits.token, limits.max_bytes, kwargs["host"], kwargs["port"]) == (
         0,
         None,
         1000,
@@ -75,21 +75,21 @@ def test_this_machine_alone_needs_no_token(bare, served):
 
 
 @pytest.mark.parametrize("token", ["short", "with space and more", "semi;colon;semi;colon", ""])
-def test_a_token_that_can_be_guessed_or_breaks_a_link_is_a_wrong_usage(bare, served, token):
+def test_a_short_token_or_one_that_breaks_a_link_is_a_wrong_argument(bare, served_apps, token):
     code, _, err = bare("serve", "--token", token)
     assert code == 2
     assert "16 letters" in err
-    assert not served
+    assert not served_apps
 
 
-def test_models_that_are_missing_or_share_a_name_are_refused_at_the_start(bare, served, model, tmp_path):
+def test_models_that_are_missing_or_share_a_name_are_refused_at_the_start(bare, served_apps, model, tmp_path):
     assert bare("serve", "--model", "missing.onnx")[0] == 1
     twin = tmp_path / "compact.onnx"
     twin.write_bytes(model.read_bytes())
     code, _, err = bare("serve", "--model", twin)
     assert code == 1
-    assert "both called compact" in err
-    assert not served
+    assert "have the same name compact" in err
+    assert not served_apps
 
 
 def test_a_port_that_is_taken_is_an_error_and_no_traceback(bare, reachable):

@@ -1,4 +1,4 @@
-"""The page in a real browser, before a real server, as its users have them."""
+"""The page in a real browser with a real server."""
 
 import base64
 import io
@@ -12,52 +12,55 @@ from brewster import Photo
 from brewster.photo.file_info import FileInfo
 from brewster.srgb import to_encoded, to_linear
 from front_door import picture
-from glass_server import as_a_user
+from glass_server import serve_process
 from picture_files import exif_block, file_of, smooth
 
-PATIENCE_MS = 120_000  # a busy machine is no failure
+TIMEOUT_MS = 120_000  # for slow machines
 MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
 
 
 @pytest.fixture(scope="module")
 def link(model):
-    with as_a_user("--model", model, "--token", "auto") as link:
+    with serve_process("--model", model, "--token", "auto") as link:
         yield link
 
 
 @pytest.fixture
-def visit(chromium, link):
-    """Opens the page; in the end nothing must have gone wrong in it, and nothing been fetched from elsewhere."""
-    contexts, wrong, asked = [], [], []
+def open_page(chromium, link):
+    """Opens the page; an error in its scripts, or a request to another server, fails the test."""
+    contexts, failures, requested = [], [], []
 
-    def visit(**how):
+    def open_page(**kwargs):
         context = chromium.new_context(
-            **{"viewport": {"width": 1100, "height": 760}, "accept_downloads": True, **how}
+            **{"viewport": {"width": 1100, "height": 760}, "accept_downloads": True, **kwargs}
         )
         contexts.append(context)
-        context.set_default_timeout(PATIENCE_MS)
+        context.set_default_timeout(TIMEOUT_MS)
         page = context.new_page()
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("console", lambda said: wrong.append(said.text) if "Content Security" in said.text else None)
-        page.on("request", lambda request: asked.append(request.url))
+        page.on("pageerror", lambda error: failures.append(str(error)))
+        page.on(
+            "console",
+            lambda message: failures.append(message.text) if "Content Security" in message.text else None,
+        )
+        page.on("request", lambda request: requested.append(request.url))
         page.goto(link)
-        page.wait_for_selector("#model option", state="attached")  # its scripts have run
+        page.wait_for_selector("#model option", state="attached")  # the scripts have run
         assert "token" not in page.url
         return page
 
-    yield visit
+    yield open_page
     for context in contexts:
         context.close()
-    assert not wrong
+    assert not failures
     here = link.partition("?")[0]
-    assert [url for url in asked if not url.startswith((here, "blob:"))] == []
+    assert [url for url in requested if not url.startswith((here, "blob:"))] == []
 
 
 def upload(page, *files):
-    """Adds (name, bytes), and waits until the last of them is shown or has failed."""
+    """Adds files (name, bytes), and waits until all are done and the current one is shown or has failed."""
     page.set_input_files("#files", [{"name": name, "mimeType": "", "buffer": data} for name, data in files])
     page.wait_for_selector("#photos:not(:has(.waiting, .working)) li")
-    page.wait_for_selector("glass-compare:not([hidden]), #trouble:not([hidden])")
+    page.wait_for_selector("glass-compare:not([hidden]), #error:not([hidden])")
     settle(page)
 
 
@@ -66,9 +69,9 @@ def settle(page):
 
 
 def canvas(page, side):
-    """The pixels of one of the two pictures that are compared."""
-    told = page.evaluate("side => document.querySelector('glass-compare')[side].toDataURL()", side)
-    return Photo.open(base64.b64decode(told.partition(",")[2])).pixels
+    """The pixels of one of the two compared pictures."""
+    value = page.evaluate("side => document.querySelector('glass-compare')[side].toDataURL()", side)
+    return Photo.open(base64.b64decode(value.partition(",")[2])).pixels
 
 
 def downloaded(page, press):
@@ -77,7 +80,7 @@ def downloaded(page, press):
     return waiting.value.suggested_filename, Path(waiting.value.path()).read_bytes()
 
 
-def apart(one, other):
+def difference(one, other):
     assert one.shape == other.shape
     return np.abs(one.astype(int) - other.astype(int))
 
@@ -86,13 +89,13 @@ def share(page):
     return int(page.get_by_role("slider", name="Line").get_attribute("aria-valuenow"))
 
 
-def test_a_photo_is_uploaded_compared_weakened_and_downloaded_as_the_command_line_makes_it(
-    visit, bare, tmp_path
+def test_a_photo_is_uploaded_compared_and_downloaded_with_the_bytes_of_the_command_line(
+    open_page, bare, tmp_path
 ):
     whole = Photo.open(MIXTURE)
     photo = tmp_path / "window.jpg"
     photo.write_bytes(Photo(whole.pixels[:150, :200].copy(), None, whole.file_info).encode())
-    page = visit()
+    page = open_page()
     upload(page, (photo.name, photo.read_bytes()))
     page.get_by_label("Model").select_option("compact")
     page.wait_for_selector("li.done")
@@ -114,14 +117,14 @@ def test_a_photo_is_uploaded_compared_weakened_and_downloaded_as_the_command_lin
         settle(page)
         (made,) = tmp_path.glob(f"*.{layer}.*")
         shown = Photo.open(made).srgb_8bit()
-        assert np.median(apart(canvas(page, "right"), shown)) <= 1  # JPEG is further off at its edges
+        assert np.median(difference(canvas(page, "right"), shown)) <= 1  # JPEG differs more at edges
         name, data = downloaded(page, page.get_by_role("button", name=f"Download {layer}").click)
         assert (name, data) == (made.name, made.read_bytes())
 
 
-def test_the_layers_on_the_page_are_those_of_the_server_to_two_code_values(visit, run):
+def test_the_layers_on_the_page_are_those_of_the_server_to_two_code_values(open_page, run):
     data = picture(90, 60, "png")
-    page = visit()
+    page = open_page()
     upload(page, ("window.png", data))
     for strength in (0.3, 1):
         page.get_by_label("Strength").fill(str(strength))
@@ -129,34 +132,32 @@ def test_the_layers_on_the_page_are_those_of_the_server_to_two_code_values(visit
             page.get_by_label(layer.capitalize(), exact=True).check()
             settle(page)
             _, made, _ = run("-", "--strength", strength, "--layers", layer, stdin=data)
-            assert apart(canvas(page, "right"), Photo.open(made).pixels).max() <= 2
+            assert difference(canvas(page, "right"), Photo.open(made).pixels).max() <= 2
 
 
-def test_a_wide_gamut_photo_and_a_rotated_one_look_right(visit):
+def test_a_wide_gamut_photo_and_a_rotated_one_look_right(open_page):
     import pyvips  # noqa: PLC0415
 
     colours = np.kron(np.array([[[230, 60, 60], [60, 200, 60]]], np.uint8), np.ones((30, 30, 1), np.uint8))
     wide = Photo(colours, None, FileInfo(icc=pyvips.Image.profile_load("p3")))
-    page = visit()
+    page = open_page()
     upload(page, ("p3.png", wide.encode("png")))
-    assert apart(canvas(page, "left"), wide.srgb_8bit()).max() <= 1
+    assert difference(canvas(page, "left"), wide.srgb_8bit()).max() <= 1
     assert canvas(page, "left")[0, 0, 0] > 240
     expected = 255 * to_encoded(to_linear(wide.srgb_8bit() / 255) * 0.8)
-    inside = np.s_[
-        5:25, 5:25
-    ]  # the photo's own light goes beyond sRGB, so only what sRGB holds can be compared
+    inside = np.s_[5:25, 5:25]  # red of the photo is outside sRGB, so only green and blue are compared
     assert np.abs(canvas(page, "right")[inside] - expected[inside])[..., 1:].max() <= 2
     page.get_by_role("button", name="Remove p3.png").click()
     upload(page, ("turned.png", file_of(smooth(), "png", exif=exif_block(6))))
     assert (canvas(page, "left") == np.rot90(smooth(), -1)).all()
 
 
-def test_everything_can_be_done_by_keyboard_alone(visit, run):
+def test_the_page_works_with_the_keyboard_alone(open_page, run):
     data = picture(90, 60, "png")
     file = {"name": "window.png", "mimeType": "image/png", "buffer": data}
-    page = visit()
+    page = open_page()
     page.on("filechooser", lambda choosing: choosing.set_files(file))
-    page.get_by_role("button", name="Choose photos").wait_for()  # and the browser has heard of the line above
+    page.get_by_role("button", name="Choose photos").wait_for()  # the handler above is then registered
     page.keyboard.press("Tab")
     page.keyboard.press("Enter")
     page.wait_for_selector("li.done")
@@ -170,9 +171,8 @@ def test_everything_can_be_done_by_keyboard_alone(visit, run):
             assert len(reached) < 40, reached
             page.keyboard.press("Tab")
 
-    assert "window.png" in page.evaluate(
-        focus
-    )  # the button that was pressed is gone: focus is on the new photo
+    # the pressed button is hidden, so the focus is on the new photo
+    assert "window.png" in page.evaluate(focus)
     page.evaluate("document.activeElement.blur()")
     tab_to("the photo on the left")
     page.keyboard.press("+")
@@ -185,7 +185,7 @@ def test_everything_can_be_done_by_keyboard_alone(visit, run):
     assert share(page) == 59
     tab_to("Remove window.png")
     page.keyboard.press("Tab")
-    page.keyboard.press("ArrowRight")  # the next of the views
+    page.keyboard.press("ArrowRight")  # the next view
     assert page.get_by_label("Reflection", exact=True).is_checked()
     page.keyboard.press("Tab")
     for _ in range(50):
@@ -196,8 +196,8 @@ def test_everything_can_be_done_by_keyboard_alone(visit, run):
     assert made == run("-", "--strength", "0.5", "--layers", "reflection", stdin=data)[1]
 
 
-def test_a_phone_shows_it_all_without_scrolling_sideways(visit):
-    page = visit(viewport={"width": 390, "height": 844}, has_touch=True)
+def test_a_phone_shows_everything_without_horizontal_scrolling(open_page):
+    page = open_page(viewport={"width": 390, "height": 844}, has_touch=True)
     assert page.evaluate("document.documentElement.scrollWidth") == 390
     long = "a very long name of a photo taken through a window " * 3
     upload(page, *((f"{number} {long}.png", picture(300, 200, "png", number)) for number in range(4)))
@@ -214,9 +214,9 @@ def test_a_phone_shows_it_all_without_scrolling_sideways(visit):
     assert share(page) > before + 20
 
 
-def test_zoom_and_pan_move_both_sides_together(visit):
-    """A ramp, at strength 0 on both sides: a step between them would show."""
-    page = visit()
+def test_zoom_and_pan_move_both_sides_together(open_page):
+    """At strength 0 both sides show the same ramp, so an offset between them would be a step."""
+    page = open_page()
     ramp = np.repeat(np.linspace(20, 220, 240).astype(np.uint8)[None, :, None], 120, axis=0)
     upload(page, ("a.png", file_of(ramp, "png")))
     page.get_by_label("Strength").fill("0")
@@ -234,29 +234,29 @@ def test_zoom_and_pan_move_both_sides_together(visit):
     assert after[0] > before[0]
     page.mouse.wheel(0, -200)
     settle(page)
-    assert np.ptp(row(page)) < np.ptp(after)  # closer: less of the ramp is seen
+    assert np.ptp(row(page)) < np.ptp(after)  # a smaller part of the ramp is visible
 
 
 def row(page):
-    """What is painted across the middle of the view, line, grip and all apart."""
+    """The pixels of the middle row of the view, without the line and its handle."""
     settle(page)
-    told = page.evaluate("""() => {
+    value = page.evaluate("""() => {
         const canvas = document.querySelector("glass-compare canvas");
         const y = Math.round(canvas.height / 2);
         return Array.from(canvas.getContext("2d").getImageData(0, y, canvas.width, 1).data);
     }""")
-    return np.array(told).reshape(-1, 4)[:, 0]
+    return np.array(value).reshape(-1, 4)[:, 0]
 
 
-def test_what_is_no_photo_is_told_in_place_and_can_be_tried_again_or_removed(visit):
-    page = visit()
+def test_a_file_that_is_not_a_photo_shows_an_error_and_can_be_retried_or_removed(open_page):
+    page = open_page()
     upload(page, ("holiday.jpg", b"not a picture"), ("window.png", picture(90, 60, "png")))
     assert page.get_by_role("heading", name="holiday.jpg could not be separated").is_visible()
     assert "no picture brewster knows" in page.get_by_role("alert").inner_text()
     assert page.get_by_role("button", name="Download transmission").is_disabled()
     assert page.get_by_role("button", name="Download all").is_enabled()
     page.get_by_role("button", name="Try again").click()
-    page.wait_for_selector("#trouble:not([hidden])")
+    page.wait_for_selector("#error:not([hidden])")
     page.get_by_role("button", name="Remove", exact=True).click()
     page.wait_for_selector("glass-compare:not([hidden])")
     assert page.get_by_role("listitem").count() == 1
@@ -264,13 +264,13 @@ def test_what_is_no_photo_is_told_in_place_and_can_be_tried_again_or_removed(vis
     assert page.evaluate("document.activeElement.id") == "choose"
 
 
-def test_many_photos_come_as_one_zip_with_names_of_their_own(visit, run):
+def test_many_photos_are_downloaded_as_one_zip_with_unique_names(open_page, run):
     photos = [
         ("a.png", picture(90, 60, "png", 1)),
         ("a.png", picture(90, 60, "png", 2)),
         ("ä.jpg", picture(60, 50)),
     ]
-    page = visit()
+    page = open_page()
     upload(page, *photos)
     name, data = downloaded(page, page.get_by_role("button", name="Download all").click)
     assert name == "brewster.zip"
@@ -288,8 +288,8 @@ def test_many_photos_come_as_one_zip_with_names_of_their_own(visit, run):
         assert made[name] == run("-", stdin=photo)[1]
 
 
-def test_photos_can_be_pasted_and_dropped(visit):
-    page = visit()
+def test_photos_can_be_pasted_and_dropped(open_page):
+    page = open_page()
     give = """([kind, bytes]) => {
         const carried = new DataTransfer();
         carried.items.add(new File([new Uint8Array(bytes)], `${kind}.png`, { type: "image/png" }));
@@ -301,23 +301,23 @@ def test_photos_can_be_pasted_and_dropped(visit):
         page.evaluate(give, [kind, list(picture(60, 40, "png"))])
         page.get_by_role("button", name=f"{kind}.png").first.wait_for()
     page.wait_for_selector("li.done >> nth=1")
-    assert "2 of 2 are done" in page.locator("#news").inner_text()
+    assert "2 of 2 are done" in page.locator("#announcement").inner_text()
 
 
-def test_another_quality_makes_the_preview_anew(visit):
-    page = visit()
+def test_a_change_of_quality_repeats_the_preview(open_page):
+    page = open_page()
     upload(page, ("a.png", picture(90, 60, "png")))
-    with page.expect_request("**/preview?*") as asked:
+    with page.expect_request("**/preview?*") as request:
         page.get_by_label("Draft", exact=True).check()
-    assert asked.value.method == "POST"
-    for quality in ("Best", "Standard", "Draft"):  # each before the one before it can be done
+    assert request.value.method == "POST"
+    for quality in ("Best", "Standard", "Draft"):  # each before the previous preview is done
         page.get_by_label(quality, exact=True).check()
     page.wait_for_selector("li.done")
     page.wait_for_selector("glass-compare:not([hidden])")
 
 
-def held(page, path):
-    """What the page sends here gets no answer, until it goes on with `page.unroute(path)`."""
+def hold_requests(page, path):
+    """Leaves requests of the page to this path without a response, until `page.unroute(path)`."""
     page.route(path, lambda route: None)
 
 
@@ -326,16 +326,16 @@ def focused(page):
     return page.evaluate("document.activeElement.id")
 
 
-def test_back_to_the_former_quality_shows_what_was_there(visit):
-    page = visit()
+def test_the_previous_quality_shows_the_previous_maps_again(open_page):
+    page = open_page()
     upload(page, ("a.png", picture(90, 60, "png")), ("b.png", picture(80, 60, "png")))
-    held(page, "**/preview?*")
+    hold_requests(page, "**/preview?*")
     page.get_by_label("Best", exact=True).check()
     page.get_by_role("button", name="Cancel").click()
     page.get_by_role("heading", name="Cancelled").wait_for()
     page.get_by_label("Standard", exact=True).check()
     page.wait_for_selector("glass-compare:not([hidden])")
-    page.wait_for_selector("li.done >> nth=1")  # what still ran for b.png is given up, too
+    page.wait_for_selector("li.done >> nth=1")  # the running request for b.png is cancelled, too
     assert page.get_by_role("button", name="Download transmission").is_enabled()
     page.get_by_label("Best", exact=True).check()
     page.get_by_role("button", name="Cancel").wait_for()
@@ -344,15 +344,15 @@ def test_back_to_the_former_quality_shows_what_was_there(visit):
     page.wait_for_selector("li.done >> nth=1")
 
 
-def test_the_focus_goes_on_when_its_button_goes_away(visit):
-    page = visit()
-    held(page, "**/preview?*")
+def test_the_focus_moves_on_when_its_button_disappears(open_page):
+    page = open_page()
+    hold_requests(page, "**/preview?*")
     page.set_input_files("#files", [{"name": "a.png", "mimeType": "", "buffer": picture(90, 60, "png")}])
     page.get_by_role("button", name="Cancel").focus()
-    for heir in ("again", "cancel", "again"):
+    for successor in ("retry", "cancel", "retry"):
         page.keyboard.press("Enter")
-        page.wait_for_selector(f"#{heir}:visible")
-        assert focused(page) == heir
+        page.wait_for_selector(f"#{successor}:visible")
+        assert focused(page) == successor
     page.unroute("**/preview?*")
     page.keyboard.press("Enter")
     page.wait_for_selector("glass-compare:not([hidden])")
@@ -360,31 +360,31 @@ def test_the_focus_goes_on_when_its_button_goes_away(visit):
 
     page.get_by_role("button", name="Download transmission").focus()
     downloaded(page, lambda: page.keyboard.press("Enter"))
-    page.wait_for_selector("#making", state="hidden")
+    page.wait_for_selector("#export", state="hidden")
     assert focused(page) == "download"
-    held(page, "**/separate?*")
+    hold_requests(page, "**/separate?*")
     with page.expect_request("**/separate?*"):
         page.keyboard.press("Enter")
     assert page.get_by_role("button", name="Download transmission").is_disabled()
-    page.keyboard.press("Enter")  # once is enough
+    page.keyboard.press("Enter")  # ignored while the download runs
     page.get_by_role("button", name="Stop").focus()
     page.keyboard.press("Enter")
-    page.wait_for_selector("#making", state="hidden")
+    page.wait_for_selector("#export", state="hidden")
     assert focused(page) == "download"
 
 
-def test_a_photo_that_is_not_done_shows_its_own_strength(visit):
-    page = visit()
+def test_a_photo_that_is_not_done_shows_its_own_strength(open_page):
+    page = open_page()
     upload(page, ("a.png", picture(90, 60, "png")))
     page.get_by_label("Strength").fill("0.3")
-    held(page, "**/preview?*")
+    hold_requests(page, "**/preview?*")
     page.set_input_files("#files", [{"name": "b.png", "mimeType": "", "buffer": picture(90, 60, "png")}])
     page.locator(".pick").nth(1).click()
     assert page.locator("#amount").inner_text() == "100 %"
 
 
-def test_a_photo_that_fails_is_left_out_of_the_zip_and_named(visit):
-    page = visit()
+def test_a_photo_that_fails_is_left_out_of_the_zip_and_its_error_is_shown(open_page):
+    page = open_page()
     upload(page, *((f"{name}.png", picture(90, 60, "png", seed)) for seed, name in enumerate("abc")))
 
     def refuse(route):
@@ -397,7 +397,7 @@ def test_a_photo_that_fails_is_left_out_of_the_zip_and_named(visit):
     _, data = downloaded(page, page.get_by_role("button", name="Download all").click)
     names = zipfile.ZipFile(io.BytesIO(data)).namelist()
     assert [name[0] for name in names] == ["a", "a", "c", "c"]
-    alert = page.locator("#failed")
+    alert = page.locator("#export-error")
     assert alert.inner_text() == "b.png is not in the zip. Its layers cannot be written."
     page.locator(".pick").nth(1).click()
     page.get_by_role("button", name="Download transmission").click()
@@ -405,8 +405,8 @@ def test_a_photo_that_fails_is_left_out_of_the_zip_and_named(visit):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_words_can_be_read_in_light_and_dark_and_every_control_has_a_name(visit, scheme):
-    page = visit(color_scheme=scheme, reduced_motion="reduce")
+def test_text_has_contrast_in_light_and_dark_and_every_control_has_a_name(open_page, scheme):
+    page = open_page(color_scheme=scheme, reduced_motion="reduce")
     upload(page, ("a.png", picture(90, 60, "png")), ("b.png", b"none"))
     contrast = page.evaluate("""() => {
         const canvas = document.createElement("canvas").getContext("2d", { willReadFrequently: true });

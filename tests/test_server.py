@@ -1,4 +1,4 @@
-"""Clients that keep a server waiting, and servers that end, over a real socket."""
+"""Idle clients and the shutdown of the server, over a real socket."""
 
 import asyncio
 import errno
@@ -10,11 +10,11 @@ import pytest
 from fastapi import APIRouter, Response
 
 from brewster.web import server
-from brewster.web.application import application
+from brewster.web.application import create_app
 from brewster.web.middleware import RequestLimits
 from file_server import loopback_only
 from front_door import picture
-from glass_server import Stubborn, app_of, on_a_thread, served, spoken
+from glass_server import BlockingBackend, make_app, raw_exchange, running_server, served_port
 
 PHOTO = picture(40, 30, "png")
 FORM = b'--x\r\nContent-Disposition: form-data; name="photo"; filename="a.png"\r\n\r\n%b\r\n--x--\r\n' % PHOTO
@@ -32,21 +32,21 @@ def _network_off(monkeypatch):
 
 
 @pytest.fixture
-def impatient(monkeypatch):
-    """A look at each connection ten times a second."""
-    monkeypatch.setattr(server, "LOOK_SECONDS", 0.1)
+def frequent_checks(monkeypatch):
+    """Sets the interval of the idle check to 0.1 s."""
+    monkeypatch.setattr(server, "IDLE_CHECK_SECONDS", 0.1)
 
 
 @pytest.fixture
 def long():
-    """An application with a long answer."""
+    """An application with a long response."""
     router = APIRouter()
     router.get("/long")(lambda: Response(bytes(LONG)))
-    return application(router, guard=RequestLimits())
+    return create_app(router, limits=RequestLimits())
 
 
-def narrow(port, width=1 << 12):
-    """A connection that has asked for the long answer and takes little at once."""
+def slow_client(port, width=1 << 12):
+    """A connection that has requested the long response and has a small receive buffer."""
     connection = socket.socket()
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, width)
     connection.settimeout(30)
@@ -55,8 +55,8 @@ def narrow(port, width=1 << 12):
     return connection
 
 
-def rest(connection):
-    """All that comes until the connection ends."""
+def read_to_end(connection):
+    """All bytes until the connection is closed."""
     got = bytearray()
     try:
         while more := connection.recv(1 << 16):
@@ -67,15 +67,15 @@ def rest(connection):
 
 
 @pytest.mark.parametrize("start", [b"", b"G", GET[:-2]])
-def test_a_client_that_does_not_finish_asking_is_given_up(impatient, start):
-    with on_a_thread(app_of()) as port:
-        assert spoken(port, start) == b""
-        assert b"200 OK" in spoken(port, GET)
+def test_a_client_that_does_not_finish_its_request_is_closed(frequent_checks, start):
+    with served_port(make_app()) as port:
+        assert raw_exchange(port, start) == b""
+        assert b"200 OK" in raw_exchange(port, GET)
 
 
-def test_half_a_request_after_a_whole_one_is_given_up_too(impatient):
+def test_half_a_request_after_a_complete_one_is_closed(frequent_checks):
     with (
-        on_a_thread(app_of()) as port,
+        served_port(make_app()) as port,
         socket.create_connection(("127.0.0.1", port), timeout=30) as connection,
     ):
         connection.sendall(GET)
@@ -83,26 +83,26 @@ def test_half_a_request_after_a_whole_one_is_given_up_too(impatient):
         while not answer.endswith(b"}"):
             answer += connection.recv(1 << 16)
         connection.sendall(GET[:20])
-        assert rest(connection) == b""
+        assert read_to_end(connection) == b""
 
 
-def test_work_may_take_longer_than_a_client(impatient):
-    backend = Stubborn()
-    with on_a_thread(app_of(backend)) as port:
+def test_work_may_take_longer_than_the_idle_limit(frequent_checks):
+    backend = BlockingBackend()
+    with served_port(make_app(backend)) as port:
         answers = []
-        asking = Thread(target=lambda: answers.append(spoken(port, POST)))
-        asking.start()
+        client = Thread(target=lambda: answers.append(raw_exchange(port, POST)))
+        client.start()
         backend.started.wait()
-        time.sleep(0.5)  # some looks
-        backend.go.set()
-        asking.join()
+        time.sleep(0.5)  # several idle checks
+        backend.proceed.set()
+        client.join()
     assert b"200 OK" in answers[0]
 
 
-def test_a_client_that_never_reads_is_given_up_and_a_slow_one_is_not(monkeypatch, long):
-    monkeypatch.setattr(server, "LOOK_SECONDS", 0.4)
-    with served(long) as (port, running):
-        with narrow(port) as deaf:
+def test_a_client_that_never_reads_is_closed_and_a_slow_one_is_not(monkeypatch, long):
+    monkeypatch.setattr(server, "IDLE_CHECK_SECONDS", 0.4)
+    with running_server(long) as (port, running):
+        with slow_client(port) as silent:
             while not running.server_state.connections:
                 time.sleep(0.01)
             for _ in range(1000):
@@ -110,26 +110,26 @@ def test_a_client_that_never_reads_is_given_up_and_a_slow_one_is_not(monkeypatch
                     break
                 time.sleep(0.01)
             assert not running.server_state.connections
-            assert len(rest(deaf)) < LONG
-        with narrow(port, 1 << 16) as slow:
+            assert len(read_to_end(silent)) < LONG
+        with slow_client(port, 1 << 16) as slow:
             head = bytearray()
-            for _ in range(60):  # longer than three looks
+            for _ in range(60):  # longer than three idle checks
                 head += slow.recv(1 << 16)
                 time.sleep(0.02)
             assert len(head) < LONG
-            assert len(head) + len(rest(slow)) > LONG
+            assert len(head) + len(read_to_end(slow)) > LONG
 
 
-def test_a_server_that_ends_tells_what_is_under_way(monkeypatch, caplog):
+def test_a_server_that_stops_answers_running_requests(monkeypatch, caplog):
     monkeypatch.setattr(server, "GRACE_SECONDS", 0.1)
-    backend, answers = Stubborn(), []
-    with served(app_of(backend)) as (port, running):
-        asking = Thread(target=lambda: answers.append(spoken(port, POST)))
-        asking.start()
+    backend, answers = BlockingBackend(), []
+    with running_server(make_app(backend)) as (port, running):
+        client = Thread(target=lambda: answers.append(raw_exchange(port, POST)))
+        client.start()
         backend.started.wait()
         running.should_exit = True
-        asking.join()
-        backend.go.set()
+        client.join()
+        backend.proceed.set()
     (answer,) = answers
     assert answer.startswith(b"HTTP/1.1 503")
     assert b"being stopped" in answer
@@ -137,24 +137,24 @@ def test_a_server_that_ends_tells_what_is_under_way(monkeypatch, caplog):
     assert not caplog.records
 
 
-def test_a_server_that_ends_amid_an_answer_says_nothing(monkeypatch, caplog, long):
+def test_a_server_that_stops_during_a_response_logs_nothing(monkeypatch, caplog, long):
     monkeypatch.setattr(server, "GRACE_SECONDS", 0.1)
-    with served(long) as (port, running), narrow(port) as deaf:
-        assert deaf.recv(100).startswith(b"HTTP/1.1 200")
+    with running_server(long) as (port, running), slow_client(port) as silent:
+        assert silent.recv(100).startswith(b"HTTP/1.1 200")
         running.should_exit = True
         while running.server_state.connections:
             time.sleep(0.01)
     assert not caplog.records
 
 
-def test_too_many_connections_are_not_reported_one_by_one_and_bugs_are(caplog):
-    async def hear():
+def test_too_many_connections_are_not_logged_and_bugs_are(caplog):
+    async def report():
         loop = asyncio.get_running_loop()
-        loop.set_exception_handler(server._tell)
+        loop.set_exception_handler(server._handle_loop_error)
         full = OSError(errno.EMFILE, "Too many open files")
         loop.call_exception_handler({"message": "socket.accept() out of system resource", "exception": full})
         assert not caplog.records
         loop.call_exception_handler({"message": "a bug", "exception": KeyError()})
 
-    asyncio.run(hear())
+    asyncio.run(report())
     assert [record.message.splitlines()[0] for record in caplog.records] == ["a bug"]

@@ -1,4 +1,4 @@
-"""Making a study: what is paired, what is refused, and that nothing tells which method made what."""
+"""Creating a study: pairing, errors, and that nothing reveals the method of a picture."""
 
 import hashlib
 import json
@@ -11,9 +11,9 @@ import pytest
 from brewster import Photo
 from brewster.errors import BrewsterError, TargetError
 from brewster.user_study.create import StudyOptions, create
-from brewster.user_study.degrade import spoil
+from brewster.user_study.degrade import degrade
 from brewster.user_study.study import read_study
-from small_studies import made, write_pictures
+from small_studies import make_study, write_pictures
 
 NAMES = ("real/1", "real/2", "real/10", "nature/1")
 
@@ -27,27 +27,27 @@ def folders(tmp_path):
 
 
 def test_a_study_is_read_as_it_was_made(tmp_path):
-    study = made(tmp_path)
+    study = make_study(tmp_path)
     assert read_study(study.folder) == study
     assert study.description.datasets == ("nature", "real")
     assert [row.name for row in study.description.comparisons] == ["1", "1", "2", "10"]
-    assert study.description.pairs == 4  # fewer than 40, as there are no more
-    assert not list(study.changed())
+    assert study.description.pairs == 4  # fewer than the default of 40, because the study has 4
+    assert not list(study.changed_pictures())
 
 
 def test_the_first_method_is_compared_with_each_other_or_all_with_all(tmp_path):
     names = ("ours", "RDNet", "DSIT")
-    assert made(tmp_path / "a", methods=names).pairs_of_methods == (("ours", "RDNet"), ("ours", "DSIT"))
-    assert len(made(tmp_path / "b", methods=names, all_pairs=True).pairs_of_methods) == 3
+    assert make_study(tmp_path / "a", methods=names).pairs_of_methods == (("ours", "RDNet"), ("ours", "DSIT"))
+    assert len(make_study(tmp_path / "b", methods=names, all_pairs=True).pairs_of_methods) == 3
 
 
 def test_pictures_without_folders_are_one_dataset(tmp_path):
-    study = made(tmp_path, names=("a", "b"))
+    study = make_study(tmp_path, names=("a", "b"))
     assert study.description.datasets == ("",)
 
 
 def test_named_datasets_are_taken_in_their_order_and_no_others(tmp_path):
-    study = made(tmp_path, datasets=("real",))
+    study = make_study(tmp_path, datasets=("real",))
     assert study.description.datasets == ("real",)
     assert {row.dataset for row in study.description.comparisons} == {"real"}
 
@@ -62,29 +62,29 @@ def test_the_outputs_of_brewster_itself_are_found(tmp_path, folders):
     assert len(create(tmp_path / "study", inputs, methods).description.comparisons) == 4
 
 
-def test_a_picture_is_kept_to_the_last_value_whatever_its_format(tmp_path, folders):
+def test_a_picture_is_copied_without_loss_from_any_format(tmp_path, folders):
     inputs, methods = folders
     (inputs / "real/1.png").unlink()
     write_pictures(inputs, ["real/1"], suffix=".tif", seed=5)
     study = create(tmp_path / "study", inputs, methods)
     row = next(row for row in study.description.comparisons if (row.dataset, row.name) == ("real", "1"))
-    kept = Photo.open(study.file(row.photo))
-    assert np.array_equal(kept.pixels, Photo.open(inputs / "real/1.tif").pixels)
+    copied = Photo.open(study.picture_file(row.photo))
+    assert np.array_equal(copied.pixels, Photo.open(inputs / "real/1.tif").pixels)
     about = study.picture(row.photo)
     assert about.source_sha256 == hashlib.sha256((inputs / "real/1.tif").read_bytes()).hexdigest()
-    assert (about.width, about.height) == kept.size
+    assert (about.width, about.height) == copied.size
 
 
-def test_file_names_and_bytes_tell_no_method_and_no_picture(tmp_path):
-    study = made(tmp_path)
+def test_file_names_and_bytes_reveal_neither_method_nor_picture(tmp_path):
+    study = make_study(tmp_path)
     files = list((study.folder / "pictures").iterdir())
-    assert len(files) == 4 * 3 + 4  # and the spoilt ones
+    assert len(files) == 4 * 3 + 4  # the last 4 are degraded pictures
     for path in files:
         assert re.fullmatch(r"[0-9a-f]{16}\.png", path.name)
         assert not re.search(rb"Secretlus|Rivalino|brewster|tEXt|eXIf|tIME", path.read_bytes())
 
 
-def test_the_same_seed_makes_the_same_study_and_another_another(tmp_path, folders):
+def test_equal_seeds_make_equal_studies_and_different_seeds_do_not(tmp_path, folders):
     inputs, methods = folders
     first, second, third = (
         create(tmp_path / name, inputs, methods, StudyOptions(seed=seed)).description
@@ -94,12 +94,12 @@ def test_the_same_seed_makes_the_same_study_and_another_another(tmp_path, folder
     assert not {picture.name for picture in first.pictures} & {picture.name for picture in third.pictures}
 
 
-def test_a_study_that_was_not_seeded_has_a_seed_of_its_own(tmp_path, folders):
+def test_a_study_without_a_given_seed_gets_a_random_one(tmp_path, folders):
     seeds = {create(tmp_path / name, *folders).description.seed for name in "ab"}
     assert len(seeds) == 2
 
 
-def test_everything_that_does_not_fit_is_named_at_once_and_nothing_is_written(tmp_path, folders):
+def test_all_problems_of_the_files_are_listed_at_once_and_nothing_is_written(tmp_path, folders):
     inputs, methods = folders
     (methods["ours"] / "real/2.png").unlink()
     (inputs / "nature/1.png").unlink()
@@ -108,14 +108,14 @@ def test_everything_that_does_not_fit_is_named_at_once_and_nothing_is_written(tm
     (methods["RDNet"] / "real/10.png").write_bytes(b"\x89PNG\r\n\x1a\n")
     with pytest.raises(BrewsterError) as caught:
         create(tmp_path / "study", inputs, methods)
-    for told in (
+    for message in (
         f"ours has no {methods['ours'] / 'real/2'}.*",
         f"{methods['ours'] / 'nature/1.png'} has no input",
-        f"{methods['RDNet'] / 'real/1.png'} is 12x18, its input 24x18",
+        f"{methods['RDNet'] / 'real/1.png'} has 12x18 pixels, its input 24x18",
         f"{methods['RDNet'] / 'real/10.png'}: ",
         f"RDNet has no {methods['RDNet'] / 'nature/other'}.*",
     ):
-        assert told in str(caught.value)
+        assert message in str(caught.value)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["RDNet", "inputs", "ours"]
 
 
@@ -127,62 +127,62 @@ def test_one_name_in_two_formats_is_refused(tmp_path, folders):
 
 
 @pytest.mark.parametrize(
-    ("choices", "told"),
+    ("options", "message"),
     [
         (StudyOptions(datasets=("wild",)), "no dataset 'wild'"),
-        (StudyOptions(pairs=5), "5 pairs .* there are 4"),
-        (StudyOptions(catches=5), "5 catch trials .* there are 4"),
+        (StudyOptions(pairs=5), "5 pairs .* at most 4"),
+        (StudyOptions(catches=5), "5 catch trials .* at most 4"),
     ],
 )
-def test_more_than_there_is_is_refused(tmp_path, folders, choices, told):
-    with pytest.raises(BrewsterError, match=told):
-        create(tmp_path / "study", *folders, choices)
+def test_requests_beyond_the_available_pictures_are_refused(tmp_path, folders, options, message):
+    with pytest.raises(BrewsterError, match=message):
+        create(tmp_path / "study", *folders, options)
 
 
-def test_one_method_is_no_study_and_an_empty_folder_none_either(tmp_path, folders):
+def test_one_method_and_empty_folders_are_refused(tmp_path, folders):
     inputs, methods = folders
     with pytest.raises(BrewsterError, match="two or more"):
         create(tmp_path / "study", inputs, {"ours": methods["ours"]})
     (tmp_path / "empty").mkdir()
-    with pytest.raises(BrewsterError, match="holds no picture"):
+    with pytest.raises(BrewsterError, match="contains no picture"):
         create(tmp_path / "study", tmp_path / "empty", methods)
-    with pytest.raises(BrewsterError, match="is no folder"):
+    with pytest.raises(BrewsterError, match="is not a folder"):
         create(tmp_path / "study", tmp_path / "nowhere", methods)
 
 
-def test_a_study_is_never_written_over(tmp_path, folders):
+def test_a_study_is_never_overwritten(tmp_path, folders):
     create(tmp_path / "study", *folders)
     with pytest.raises(TargetError, match="is not empty"):
         create(tmp_path / "study", *folders)
 
 
-def test_a_changed_picture_is_noticed(tmp_path):
-    study = made(tmp_path)
-    study.file(study.description.comparisons[0].outputs[0]).write_bytes(b"other")
+def test_a_changed_picture_is_detected(tmp_path):
+    study = make_study(tmp_path)
+    study.picture_file(study.description.comparisons[0].outputs[0]).write_bytes(b"other")
     with pytest.raises(BrewsterError, match="missing or changed"):
-        study.refuse_changed()
+        study.verify_pictures()
 
 
-def test_a_description_that_is_none_is_refused_with_its_place(tmp_path):
+def test_an_invalid_description_is_refused_with_the_key_of_the_error(tmp_path):
     with pytest.raises(BrewsterError, match="cannot be read"):
         read_study(tmp_path)
-    study = made(tmp_path)
+    study = make_study(tmp_path)
     text = json.loads((study.folder / "study.json").read_text())
-    for change, told in (
+    for change, message in (
         ({"pairs": "many"}, "pairs: "),
         ({"surprise": 1}, "surprise: "),
         ({"format": 2}, "format 2"),
     ):
         (study.folder / "study.json").write_text(json.dumps(text | change))
-        with pytest.raises(BrewsterError, match=told):
+        with pytest.raises(BrewsterError, match=message):
             read_study(study.folder)
 
 
-def test_catch_pictures_are_the_output_spoilt_beyond_doubt(tmp_path):
-    study = made(tmp_path, size=(96, 72))
+def test_catch_pictures_are_clearly_degraded_outputs(tmp_path):
+    study = make_study(tmp_path, size=(96, 72))
     for catch in study.description.catch_pool:
         good, spoilt = (
-            Photo.open(study.file(name)).pixels.astype(float) for name in (catch.good, catch.spoilt)
+            Photo.open(study.picture_file(name)).pixels.astype(float) for name in (catch.good, catch.spoilt)
         )
         assert good.shape == spoilt.shape
         assert 10 * np.log10(255**2 / np.mean((good - spoilt) ** 2)) < 22
@@ -191,34 +191,32 @@ def test_catch_pictures_are_the_output_spoilt_beyond_doubt(tmp_path):
         assert catch.spoilt not in outputs
 
 
-def test_spoiling_is_worse_in_light_and_dark_and_keeps_the_mean(random):
+def test_degrading_works_in_light_and_dark_and_keeps_the_mean(random):
     for level in (20, 128, 235):
         flat = np.full((60, 80, 3), level, np.uint8)
-        spoilt = spoil(flat, 1)
+        spoilt = degrade(flat, 1)
         assert spoilt.astype(float).std() > 10
         assert abs(spoilt.mean() - level) < 12
-    assert np.array_equal(spoil(flat, 1), spoilt)
+    assert np.array_equal(degrade(flat, 1), spoilt)
 
 
 def test_a_study_that_was_moved_is_the_same_study(tmp_path):
-    study = made(tmp_path)
+    study = make_study(tmp_path)
     moved = study.folder.rename(tmp_path / "elsewhere")
     assert read_study(moved) == replace(study, folder=moved)
-    read_study(moved).refuse_changed()
+    read_study(moved).verify_pictures()
 
 
-def test_pictures_beside_folders_of_pictures_are_named_and_refused_unless_datasets_are_named(
-    tmp_path, folders
-):
+def test_pictures_next_to_subfolders_with_pictures_are_refused_unless_datasets_are_named(tmp_path, folders):
     inputs, methods = folders
     write_pictures(inputs, ["stray"])
-    with pytest.raises(BrewsterError, match=r"stray\.png\) beside folders of them \(nature, real\)"):
+    with pytest.raises(BrewsterError, match=r"stray\.png\) and subfolders with pictures \(nature, real\)"):
         create(tmp_path / "study", inputs, methods)
     study = create(tmp_path / "study", inputs, methods, StudyOptions(datasets=("nature", "real")))
     assert len(study.description.comparisons) == 4
 
 
-def test_a_picture_that_is_called_like_a_layer_is_one_where_nothing_was_separated(tmp_path):
+def test_a_picture_named_like_a_layer_counts_if_its_photo_has_no_transmission(tmp_path):
     names = ("window.reflection", "window", "b.confidence")
-    study = made(tmp_path, names=names)
+    study = make_study(tmp_path, names=names)
     assert {row.name for row in study.description.comparisons} == set(names)

@@ -1,4 +1,4 @@
-"""The draw: balanced, blind, without repeats, and the same for ever."""
+"""Assignment of trials: balanced, without repeats, and reproducible."""
 
 from collections import Counter
 from itertools import islice
@@ -6,22 +6,22 @@ from itertools import islice
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brewster.user_study.assignment import draw, walk
-from small_studies import described
+from brewster.user_study.assignment import comparison_sequence, draw_trials
+from small_studies import make_description
 
 SIZES = st.integers(1, 60).flatmap(lambda count: st.tuples(st.just(count), st.integers(1, count)))
 
 
-def shown(count, pairs, seed, people):
-    row = list(islice(walk(count, pairs, seed), people * pairs))
-    return [row[i * pairs : (i + 1) * pairs] for i in range(people)]
+def assigned(count, pairs, seed, participants):
+    row = list(islice(comparison_sequence(count, pairs, seed), participants * pairs))
+    return [row[i * pairs : (i + 1) * pairs] for i in range(participants)]
 
 
 @given(SIZES, st.integers(0, 2**32), st.integers(1, 30))
-def test_nobody_sees_a_pair_twice_and_every_pair_is_seen_equally_often_within_one(sizes, seed, people):
+def test_nobody_sees_a_pair_twice_and_every_pair_is_seen_equally_often_within_one(sizes, seed, participants):
     count, pairs = sizes
     seen = Counter(dict.fromkeys(range(count), 0))
-    for own in shown(count, pairs, seed, people):
+    for own in assigned(count, pairs, seed, participants):
         numbers = [comparison for comparison, _ in own]
         assert len(set(numbers)) == pairs
         seen.update(numbers)
@@ -29,48 +29,51 @@ def test_nobody_sees_a_pair_twice_and_every_pair_is_seen_equally_often_within_on
 
 
 @given(SIZES, st.integers(0, 2**32), st.integers(1, 30))
-def test_each_comparison_has_its_first_method_left_and_right_equally_often_within_one(sizes, seed, people):
+def test_each_comparison_has_its_first_method_left_and_right_equally_often_within_one(
+    sizes, seed, participants
+):
     balance = Counter()
-    for own in shown(*sizes, seed, people):
+    for own in assigned(*sizes, seed, participants):
         balance.update({comparison: 1 if flipped else -1 for comparison, flipped in own})
         assert all(abs(value) <= 1 for value in balance.values())
 
 
 @given(SIZES, st.integers(0, 2**32), st.integers(1, 30))
-def test_no_participant_sees_one_method_much_more_often_on_one_side(sizes, seed, people):
-    for own in shown(*sizes, seed, people):
+def test_no_participant_sees_one_method_much_more_often_on_one_side(sizes, seed, participants):
+    for own in assigned(*sizes, seed, participants):
         right = sum(flipped for _, flipped in own)
         assert abs(2 * right - len(own)) <= 4
 
 
-def test_the_paper_s_study_is_balanced_to_a_hair():
-    """100 participants, 40 of 2 x 181 pairs."""
-    people = shown(362, 40, 1, 100)
-    rights = [sum(flipped for _, flipped in own) for own in people]
+def test_a_study_of_the_paper_s_size_is_balanced():
+    """100 participants with 40 of 2 x 181 pairs each."""
+    participants = assigned(362, 40, 1, 100)
+    rights = [sum(flipped for _, flipped in own) for own in participants]
     assert min(rights) >= 18
     assert max(rights) <= 22
-    assert set(Counter(comparison for own in people for comparison, _ in own).values()) == {11, 12}
+    assert set(Counter(comparison for own in participants for comparison, _ in own).values()) == {11, 12}
 
 
-def test_a_draw_depends_on_seed_and_number_only_and_differs_between_both():
-    study = described()
-    trials = [draw(study, number) for number in range(6)]
-    assert trials == [draw(study, number) for number in range(6)]
+def test_trials_depend_on_seed_and_number_only():
+    study = make_description()
+    trials = [draw_trials(study, number) for number in range(6)]
+    assert trials == [draw_trials(study, number) for number in range(6)]
     assert len(set(trials)) == 6
-    assert draw(described(seed=8), 0) != trials[0]
+    assert draw_trials(make_description(seed=8), 0) != trials[0]
 
 
-def test_a_draw_of_this_version_is_the_draw_of_every_version():
-    """Links are sent out, and a study may last longer than an installation."""
+def test_trials_are_the_same_in_every_version():
+    """Participants keep their links, and a study may continue after an update of brewster."""
     first = [
-        (trial.comparison, trial.flipped) for trial in draw(described(pictures=4, pairs=4, catches=0), 0)
+        (trial.comparison, trial.flipped)
+        for trial in draw_trials(make_description(pictures=4, pairs=4, catches=0), 0)
     ]
     assert first == [(4, False), (1, True), (5, False), (7, True)]
 
 
 def test_sides_and_pictures_agree_with_what_the_trial_says():
-    study = described()
-    for trial in draw(study, 3):
+    study = make_description()
+    for trial in draw_trials(study, 3):
         if trial.comparison is not None:
             row = study.comparisons[trial.comparison]
             assert row.photo == trial.photo
@@ -78,9 +81,9 @@ def test_sides_and_pictures_agree_with_what_the_trial_says():
 
 
 def test_catch_trials_are_of_both_kinds_and_on_photos_that_are_not_the_participant_s_own():
-    study = described(catches=4)
+    study = make_description(catches=4)
     for number in range(20):
-        trials = draw(study, number)
+        trials = draw_trials(study, number)
         catches = [trial for trial in trials if trial.expected]
         assert Counter("equal" if trial.left == trial.right else "spoilt" for trial in catches) == {
             "equal": 2,
@@ -95,11 +98,11 @@ def test_catch_trials_are_of_both_kinds_and_on_photos_that_are_not_the_participa
             assert (trial.expected == "similar") == (trial.left == trial.right)
 
 
-def test_the_order_does_not_tell_the_catch_trials():
+def test_the_order_does_not_reveal_the_catch_trials():
     places = Counter(
         place
         for number in range(120)
-        for place, trial in enumerate(draw(described(), number))
+        for place, trial in enumerate(draw_trials(make_description(), number))
         if trial.expected
     )
     assert len(places) == 10

@@ -1,4 +1,4 @@
-"""The study in a real browser: with the keyboard alone, on a phone, interrupted, and against a failing server."""
+"""The page of the study in a real browser: keyboard, phone, interruptions, and a failing server."""
 
 from contextlib import closing
 
@@ -8,12 +8,12 @@ from playwright.sync_api import expect
 
 from brewster import Photo
 from brewster.user_study.store import AnswerStore
-from brewster.web.application import application
+from brewster.web.application import create_app
 from brewster.web.middleware import RequestLimits
-from brewster.web.study import participants
+from brewster.web.study import study_router
 from file_server import loopback_only
-from glass_server import on_a_thread
-from small_studies import beside, made
+from glass_server import served_port
+from small_studies import copy_without_answers, make_study
 
 READY = "#trial:not(.waiting):not([hidden])"
 
@@ -22,7 +22,7 @@ NAMED = {
     "button": ["Zoom in", "Zoom out", "Show all", "Full size", "Copy your personal link"],
     "progressbar": ["Pair 1 of 4"],
 }
-"""What a screen reader finds, by role."""
+"""Accessible names by role."""
 
 
 @pytest.fixture(autouse=True)
@@ -32,31 +32,31 @@ def _network_off(monkeypatch):
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory):
-    return made(tmp_path_factory.mktemp("original"), size=(240, 180), catches=0)
+    return make_study(tmp_path_factory.mktemp("original"), size=(240, 180), catches=0)
 
 
 @pytest.fixture
 def store(original, tmp_path):
-    with closing(AnswerStore(beside(original, tmp_path / "study"))) as store:
+    with closing(AnswerStore(copy_without_answers(original, tmp_path / "study"))) as store:
         yield store
 
 
 @pytest.fixture
 def url(store):
-    app = application(participants(store.study, store), guard=RequestLimits(), home="study.html")
-    with on_a_thread(app) as port:
+    app = create_app(study_router(store.study, store), limits=RequestLimits(), index="study.html")
+    with served_port(app) as port:
         yield f"http://127.0.0.1:{port}/"
 
 
 @pytest.fixture
 def open_page(chromium):
-    """A page of a participant; whatever goes wrong in its scripts fails the test."""
+    """Opens the page of a participant; an error in its scripts fails the test."""
     contexts, errors = [], []
 
-    def open_page(url, **how):
-        context = chromium.new_context(**how)
+    def open_page(url, **kwargs):
+        context = chromium.new_context(**kwargs)
         contexts.append(context)
-        context.set_default_timeout(120_000)  # a busy machine is no failure
+        context.set_default_timeout(120_000)  # for slow machines
         page = context.new_page()
         page.on("pageerror", lambda error: errors.append(error))  # noqa: PLW0108  (playwright marks its handlers)
         page.goto(url)
@@ -69,7 +69,7 @@ def open_page(chromium):
 
 
 def press(page, key):
-    """A key, once the pictures have been there for long enough to be meant."""
+    """Presses a key after the time in which the page ignores answers."""
     page.wait_for_selector(READY)
     page.wait_for_timeout(320)
     page.keyboard.press(key)
@@ -81,7 +81,7 @@ def begin(page):
     page.wait_for_selector(READY)
 
 
-def test_the_keyboard_alone_leads_from_consent_to_thanks(open_page, url, store):
+def test_the_whole_study_works_with_the_keyboard_alone(open_page, url, store):
     page = open_page(url)
     page.wait_for_selector("#invitation:not([hidden])")
     for key in ("Tab", "Space", "Tab", "Enter"):
@@ -91,13 +91,13 @@ def test_the_keyboard_alone_leads_from_consent_to_thanks(open_page, url, store):
         press(page, key)
     expect(page.get_by_role("heading", name="Thank you.")).to_be_focused()
     expect(page.get_by_text("All 4 answers are saved.")).to_be_visible()
-    ((_, answers),) = store.everything()
+    ((_, answers),) = store.all_answers()
     given = [answer.choice for answer in answers.values()]
     assert given == ["left", "similar", "right", "left"]
     assert all(0.3 < answer.seconds < 60 for answer in answers.values())
 
 
-def test_who_stops_goes_on_with_the_same_link_elsewhere_and_with_no_other(open_page, url):
+def test_a_participant_continues_with_their_link_on_another_device_and_with_no_other_link(open_page, url):
     page = open_page(url)
     begin(page)
     press(page, "1")
@@ -108,20 +108,19 @@ def test_who_stops_goes_on_with_the_same_link_elsewhere_and_with_no_other(open_p
     again = open_page(link)
     expect(again.get_by_text("Pair 3 of 4").first).to_be_visible()
     again.goto(link[:-1])
-    expect(again.get_by_role("alert")).to_contain_text("nobody has this link; check that it is whole")
+    expect(again.get_by_role("alert")).to_contain_text("this link is unknown; check that it is complete")
 
 
-def test_what_is_seen_are_the_pictures_of_the_trial_on_their_sides_and_all_has_a_name(open_page, url, store):
+def test_the_pictures_of_the_trial_are_shown_on_their_sides_and_have_names(open_page, url, store):
     page = open_page(url, viewport={"width": 1280, "height": 800})
     begin(page)
-    ((person, _),) = store.everything()
-    page.wait_for_timeout(300)  # until they have faded in
+    ((participant, _),) = store.all_answers()
+    page.wait_for_timeout(300)  # the fade-in of the pictures
     for side in ("left", "photo", "right"):
         seen = Photo.open(page.locator(f".{side} .frame").screenshot()).linear()
-        truth = Photo.open(store.study.file(getattr(person.trials[0], side)))
-        assert (
-            np.median(np.abs(seen - truth.small(*seen.shape[1::-1]))) < 0.002
-        )  # not the mean: edges are smoothed
+        truth = Photo.open(store.study.picture_file(getattr(participant.trials[0], side)))
+        difference = np.abs(seen - truth.small(*seen.shape[1::-1]))
+        assert np.median(difference) < 0.002  # not the mean, because the browser smooths edges
     places = [page.locator(f".{side} .frame").bounding_box()["x"] for side in ("left", "photo", "right")]
     assert places == sorted(places)
     for role, names in NAMED.items():
@@ -130,7 +129,7 @@ def test_what_is_seen_are_the_pictures_of_the_trial_on_their_sides_and_all_has_a
     assert page.get_by_role("heading", level=1).all_inner_texts() == ["Which result looks better?"]
 
 
-def test_zoom_and_pan_move_all_three_in_step_and_new_pictures_are_shown_whole(open_page, url):
+def test_zoom_and_pan_apply_to_all_three_pictures_and_are_reset_for_new_ones(open_page, url):
     page = open_page(url)
     begin(page)
 
@@ -165,7 +164,7 @@ def test_zoom_and_pan_move_all_three_in_step_and_new_pictures_are_shown_whole(op
     assert transforms() == whole
 
 
-def test_an_answer_that_the_network_swallows_is_sent_until_it_is_kept(open_page, url, store):
+def test_an_answer_lost_by_the_network_is_sent_until_it_is_stored(open_page, url, store):
     page = open_page(url)
     begin(page)
     posts = []
@@ -174,21 +173,21 @@ def test_an_answer_that_the_network_swallows_is_sent_until_it_is_kept(open_page,
         posts.append(route)
         if len(posts) > 1:
             route.continue_()
-        else:  # kept by the server, but the acknowledgement never comes
+        else:  # the server stores it, but the acknowledgement is lost
             route.fetch()
             route.abort()
 
     page.route("**/answers", fail)
     press(page, "1")
     expect(page.get_by_text("Not saved yet")).to_be_visible()
-    page.keyboard.press("3")  # does nothing meanwhile
+    page.keyboard.press("3")  # ignored while the first answer is sent
     expect(page.get_by_text("Pair 2 of 4").first).to_be_visible(timeout=15_000)
-    ((_, answers),) = store.everything()
+    ((_, answers),) = store.all_answers()
     assert [answer.choice for answer in answers.values()] == ["left"]
     assert len(posts) == 2
 
 
-def test_a_phone_shows_all_without_scrolling_sideways_and_takes_fingers(open_page, url, store):
+def test_a_phone_shows_everything_without_horizontal_scrolling_and_accepts_touch(open_page, url, store):
     page = open_page(
         url, viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True, color_scheme="dark"
     )
@@ -206,11 +205,11 @@ def test_a_phone_shows_all_without_scrolling_sideways_and_takes_fingers(open_pag
     page.wait_for_timeout(320)
     buttons[2].tap()
     expect(page.get_by_text("Pair 2 of 4").first).to_be_visible()
-    ((_, answers),) = store.everything()
+    ((_, answers),) = store.all_answers()
     assert answers[0].choice == "right"
 
 
-def test_arrows_up_and_down_scroll_and_the_focus_stays_where_it_was(open_page, url, store):
+def test_arrows_up_and_down_scroll_and_the_focus_stays(open_page, url, store):
     page = open_page(url, viewport={"width": 390, "height": 500})
     begin(page)
     similar = page.get_by_role("button", name="Similar", exact=True)
@@ -230,13 +229,13 @@ def test_arrows_up_and_down_scroll_and_the_focus_stays_where_it_was(open_page, u
     expect(page.get_by_text("Pair 4 of 4").first).to_be_visible()
     page.wait_for_selector(READY)
     page.wait_for_timeout(320)
-    page.keyboard.down("Enter")  # still: a repeat
+    page.keyboard.down("Enter")  # a repeat of the held key
     page.wait_for_timeout(200)
-    ((_, answers),) = store.everything()
+    ((_, answers),) = store.all_answers()
     assert [answer.choice for answer in answers.values()] == ["similar"] * 3
 
 
-def test_a_picture_that_is_gone_from_the_server_is_told_when_its_turn_comes(open_page, url, store):
+def test_a_missing_picture_is_reported_when_its_trial_is_shown(open_page, url, store):
     page = open_page(url)
     gone = {"status": 410, "json": {"error": "a picture is missing on the server"}}
     page.route("**/pictures/1/left", lambda route: route.fulfill(**gone))

@@ -1,4 +1,4 @@
-"""`brewster study`, as a user types it."""
+"""The command `brewster study`."""
 
 import json
 import os
@@ -18,9 +18,7 @@ from file_server import loopback_only
 from other_processes import started
 from small_studies import choice_for, write_pictures
 
-get, post = (
-    partial(ask, timeout=None) for ask in (httpx.get, httpx.post)
-)  # the test has a time limit itself
+get, post = (partial(ask, timeout=None) for ask in (httpx.get, httpx.post))  # the test has its own time limit
 
 
 @pytest.fixture(autouse=True)
@@ -41,30 +39,30 @@ def created(bare, folders, tmp_path):
     return read_study(tmp_path / "study")
 
 
-def answer_all(study, people, rng):
+def answer_all(study, participants, rng):
     store = AnswerStore(study)
-    for _ in range(people):
-        person = store.participant(store.admit())
-        for number, trial in enumerate(person.trials):
+    for _ in range(participants):
+        participant = store.participant(store.admit())
+        for number, trial in enumerate(participant.trials):
             choice = trial.expected or choice_for(trial, rng.choice(3, p=[0.6, 0.2, 0.2]))
-            store.answer(person, number, choice, seconds=4)
+            store.record_answer(participant, number, choice, seconds=4)
     store.close()
 
 
-def test_create_says_what_was_made_and_what_comes_next(bare, folders):
+def test_create_prints_a_summary_and_the_next_command(bare, folders):
     code, out, err = bare("study", "create", "study", *folders, "--seed", 4, "--pairs", 3, "--catches", 2)
     assert (code, out) == (0, b"")
     assert "4 comparisons of 2 methods; a participant sees 3 of them and 2 catch trials (seed 4)" in err
     assert "next: brewster study serve study" in err
 
 
-def test_create_takes_a_consent_text_of_one_s_own(bare, folders, tmp_path):
+def test_create_accepts_a_consent_text(bare, folders, tmp_path):
     (tmp_path / "consent.txt").write_text("Our own words.\n")
     bare("study", "create", "study", *folders, "--consent", "consent.txt")
     assert read_study(tmp_path / "study").description.consent == "Our own words."
 
 
-def test_create_refuses_what_does_not_fit_with_exit_code_1_and_a_wrong_use_with_2(bare, folders, tmp_path):
+def test_create_exits_with_1_for_wrong_files_and_with_2_for_wrong_arguments(bare, folders, tmp_path):
     assert bare("study", "create", "study", *folders[:4])[0] == 1
     code, _, err = bare("study", "create", "study", *folders, "--method", "ours=rdnet")
     assert (code, "share a name" in err) == (1, True)
@@ -77,22 +75,23 @@ def test_report_prints_tables_and_writes_all_files(bare, created, random):
     code, out, err = bare("study", "report", "study")
     assert code == 0
     assert "### ours and RDNet" in out.decode()
-    assert "12 participants (12 to the end), 48 answers; 0 of 48 catch trials failed." in out.decode()
+    assert "12 participants (12 complete), 48 answers; 0 of 48 catch trials failed." in out.decode()
     assert "all of it is in study/report" in err
     names = {path.name for path in (created.folder / "report").iterdir()}
     assert names == {"report.json", "report.md", "table.tex", "table.csv", "answers.csv", "plot.png"}
-    code, out, _ = bare("study", "report", "study", "--json", "--least-seconds", 99)  # over the first
+    # replaces the first report
+    code, out, _ = bare("study", "report", "study", "--json", "--least-seconds", 99)
     assert json.loads(out)["excluded"] == {"failed": 0, "fast": 12}
 
 
-def test_report_without_answers_or_without_a_study_says_so(bare, created):
+def test_report_without_answers_or_without_a_study_is_an_error(bare, created):
     code, _, err = bare("study", "report", "study")
     assert (code, "has no answers yet" in err) == (1, True)
     code, _, err = bare("study", "report", "nowhere")
     assert (code, "cannot be read" in err) == (1, True)
 
 
-def test_plan_answers_in_words_and_in_json(bare):
+def test_plan_prints_text_or_json(bare):
     code, out, _ = bare("study", "plan", "--difference", 0.1)
     assert (code, out.decode().startswith("45 participants (1800 answers)")) == (0, True)
     assert json.loads(bare("study", "plan", "--difference", 0.1, "--json")[1])["participants"] == 45
@@ -108,23 +107,23 @@ listen = application.listen
 application.listen = lambda host, port: listen("127.0.0.1", port)
 sys.exit(main(sys.argv[1:]))
 """
-"""The command line, whose servers are reached from this machine only, whatever --host says."""
+"""The command line with servers that always bind to a loopback address, whatever --host is."""
 
 
 def serve(folder, *args):
-    """A server in a process, which is killed in the end if it still runs; its first line is a link."""
+    """A server in its own process, killed at the end if it still runs; its first line of output is a link."""
     command = [sys.executable, "-c", ON_LOOPBACK, "study", "serve", folder, "--port", "0", *args]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return started(command, **pipes, env={**os.environ, "PYTHONUNBUFFERED": "1"})
 
 
 def interrupted(server):
-    """What a server says on standard error until Ctrl-C has ended it."""
+    """Stops a server with Ctrl-C; returns its standard error."""
     server.send_signal(signal.SIGINT)
     return server.communicate()[1]
 
 
-def test_a_server_goes_on_where_a_killed_one_was_and_ends_with_ctrl_c(created):
+def test_a_server_continues_after_a_kill_and_stops_with_ctrl_c(created):
     with serve(created.folder) as first:
         url = first.stdout.readline().strip()
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", url)
@@ -145,15 +144,16 @@ def test_serving_a_study_whose_pictures_changed_is_refused(bare, created):
     assert (code, "missing or changed" in err) == (1, True)
 
 
-def test_another_address_is_served_with_a_warning(created):
+def test_serving_on_another_address_prints_a_warning(created):
     with serve(created.folder, "--host", "0.0.0.0", "--token", "auto") as server:
         link = server.stdout.readline().strip()
-        assert get(link).status_code < 400  # it has an answer only when it heeds signals
+        # the server answers only after it has installed its signal handlers
+        assert get(link).status_code < 400
         assert "nothing they send is encrypted" in interrupted(server)
     assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{22}", link)
 
 
-def test_a_token_of_its_own_is_kept_for_its_owner_and_links_survive_a_restart(created):
+def test_an_automatic_token_is_stored_for_its_owner_only_and_links_survive_a_restart(created):
     with serve(created.folder, "--token", "auto") as first:
         url, _, token = first.stdout.readline().strip().partition("?token=")
         bearer = {"Authorization": f"Bearer {token}"}
@@ -167,16 +167,16 @@ def test_a_token_of_its_own_is_kept_for_its_owner_and_links_survive_a_restart(cr
         interrupted(second)
 
 
-def test_a_kept_token_that_is_none_is_refused(bare, created):
+def test_an_invalid_token_file_is_refused(bare, created):
     (created.folder / "token").write_text("short\n")
     code, _, err = bare("study", "serve", "study", "--token", "auto")
-    assert (code, "holds no token" in err) == (1, True)
+    assert (code, "contains no valid token" in err) == (1, True)
 
 
 @pytest.mark.parametrize(
     "name", ["study.example.org:443", "https://study.example.org", "study.example.org/", "", "bücher.example"]
 )
-def test_a_name_that_no_browser_calls_is_wrong_use(bare, created, name):
+def test_a_name_that_no_host_header_contains_is_a_wrong_argument(bare, created, name):
     code, _, err = bare("study", "serve", "study", "--called", name, "--port", 0)
     assert (code, "no bare name of a host" in err) == (2, True)
 
@@ -189,7 +189,7 @@ def test_report_without_answers_makes_no_database(bare, created):
 @pytest.mark.skipif(
     os.geteuid() == 0 and not shutil.which("setpriv"), reason="root writes to read-only folders"
 )
-def test_a_study_that_may_only_be_read_is_reported_elsewhere(created, random, tmp_path):
+def test_a_read_only_study_is_reported_into_another_folder(created, random, tmp_path):
     answer_all(created, 3, random)
     created.folder.chmod(0o555)
     tame = ["setpriv", "--inh-caps=-all", "--bounding-set=-all"] if os.geteuid() == 0 else []
@@ -201,16 +201,16 @@ def test_a_study_that_may_only_be_read_is_reported_elsewhere(created, random, tm
     created.folder.chmod(0o755)
     assert done.returncode == 0, done.stderr
     assert "3 participants" in done.stdout
-    assert refused.returncode == 1  # so it was read-only indeed
+    assert refused.returncode == 1  # checks that the folder was read-only
 
 
-def test_create_prints_and_refuses_the_true_number_of_catch_trials(bare, tmp_path):
+def test_create_limits_the_number_of_catch_trials(bare, tmp_path):
     names = [f"{i}" for i in range(26)]
     for seed, name in enumerate(("inputs", "ours", "rdnet")):
         write_pictures(tmp_path / name, names, size=(4, 3), seed=seed)
     args = ["--inputs", "inputs", "--method", "ours=ours", "--method", "RDNet=rdnet", "--catches"]
     code, _, err = bare("study", "create", "study", *args, 25)
-    assert (code, "25 catch trials a participant were asked for; there are 24 at most" in err) == (
+    assert (code, "25 catch trials for each participant were requested; at most 24 are available" in err) == (
         1,
         True,
     )

@@ -1,19 +1,24 @@
-"""How many participants it takes: the formula, and studies of that size that were simulated."""
+"""Power analysis: the formula, and simulated studies of the computed size."""
 
 import numpy as np
 import pytest
 
 from brewster.errors import BrewsterError
-from brewster.user_study.power_analysis import plan
-from brewster.user_study.report.statistics import interval, rates, resampled, summed
+from brewster.user_study.power_analysis import required_participants
+from brewster.user_study.report.statistics import (
+    bootstrap_interval,
+    bootstrap_weights,
+    rates,
+    resampled_counts,
+)
 
 
 def shown(rng, participants, pairs, chances, correlation, studies):
-    """The share of simulated studies whose interval of the difference does not hold 0."""
+    """The share of simulated studies whose interval of the difference does not contain 0."""
     own = rng.dirichlet(np.array(chances) * (1 / correlation - 1), (participants, studies))
     counts = rng.multinomial(pairs, own)[:, :, None].astype(float)
-    draws = rates(summed(resampled(participants, 1000), counts), np.ones((studies, 1)))
-    lows, highs = interval(draws, participants)[..., 0, 3]
+    draws = rates(resampled_counts(bootstrap_weights(participants, 1000), counts), np.ones((studies, 1)))
+    lows, highs = bootstrap_interval(draws, participants)[..., 0, 3]
     return ((lows > 0) | (highs < 0)).mean()
 
 
@@ -24,13 +29,13 @@ def shown(rng, participants, pairs, chances, correlation, studies):
 def test_a_study_of_the_planned_size_shows_the_difference_with_the_stated_power(
     difference, tie, pairs, correlation
 ):
-    answer = plan(difference=difference, tie=tie, pairs=pairs, correlation=correlation)
+    answer = required_participants(difference=difference, tie=tie, pairs=pairs, correlation=correlation)
     rng = np.random.default_rng(6)
     power = shown(rng, answer.participants, pairs, (answer.win, tie, answer.lose), correlation, 400)
     assert power == pytest.approx(0.8, abs=3 * np.sqrt(0.8 * 0.2 / 400))
 
 
-def test_without_a_difference_five_percent_show_one():
+def test_without_a_difference_five_percent_of_studies_find_one():
     same = (1 - 0.25) / 2
     assert shown(np.random.default_rng(7), 100, 40, (same, 0.25, same), 0.05, 400) == pytest.approx(
         0.05, abs=0.03
@@ -39,21 +44,21 @@ def test_without_a_difference_five_percent_show_one():
 
 def test_the_formula_by_hand():
     """(1.95996 + 0.84162)^2 x 0.74 x 2.95 / (40 x 0.01) + 1.95996^2 / 2 = 42.84 + 1.92."""
-    answer = plan(difference=0.1, tie=0.25)
+    answer = required_participants(difference=0.1, tie=0.25)
     assert (answer.participants, answer.answers) == (45, 1800)
     assert answer.design_effect == pytest.approx(2.95)
     assert (answer.win, answer.lose) == pytest.approx((0.425, 0.325))
 
 
-def test_smaller_differences_and_people_more_alike_need_more_participants():
-    base = plan(difference=0.1, tie=0.25).participants
-    assert plan(difference=0.05, tie=0.25).participants > 3 * base
-    assert plan(difference=0.1, tie=0.25, correlation=0.2).participants > 2 * base
-    assert plan(difference=0.1, tie=0.25, power=0.9).participants > base
-    assert plan(difference=0.1, tie=0.6).participants < base
+def test_smaller_differences_and_higher_correlations_need_more_participants():
+    base = required_participants(difference=0.1, tie=0.25).participants
+    assert required_participants(difference=0.05, tie=0.25).participants > 3 * base
+    assert required_participants(difference=0.1, tie=0.25, correlation=0.2).participants > 2 * base
+    assert required_participants(difference=0.1, tie=0.25, power=0.9).participants > base
+    assert required_participants(difference=0.1, tie=0.6).participants < base
 
 
 @pytest.mark.parametrize(("difference", "tie"), [(0, 0.2), (-0.1, 0.2), (0.9, 0.2), (0.1, 1)])
-def test_rates_that_cannot_be_are_refused(difference, tie):
+def test_impossible_rates_are_refused(difference, tie):
     with pytest.raises(BrewsterError, match="a difference above 0"):
-        plan(difference=difference, tie=tie)
+        required_participants(difference=difference, tie=tie)

@@ -1,4 +1,4 @@
-"""Intervals where all answers agree, and resamples therefore tell nothing: the exact bound, and what it holds."""
+"""Intervals if all answers agree and resamples have no spread: the exact bound and its coverage."""
 
 import math
 from statistics import NormalDist
@@ -7,22 +7,31 @@ import numpy as np
 import pytest
 from scipy.stats import binom, binomtest
 
-from brewster.user_study.report.statistics import interval, least, rates, resampled, summed, widened
+from brewster.user_study.report.statistics import (
+    agreement_bounds,
+    bootstrap_interval,
+    bootstrap_weights,
+    rates,
+    resampled_counts,
+    with_agreement_bounds,
+)
 
 
 def estimated(*counts, pictures=(1.0,)):
-    """Means and the two ends of the intervals, of the counts (datasets, 3) of each participant: (3, rows, 4)."""
+    """Means and both ends of the intervals, (3, rows, 4), from the counts (datasets, 3) of each participant."""
     counts, pictures = np.array(counts, float)[:, None], np.array([pictures], float)
     means = rates(counts.sum(axis=0), pictures)
-    ends = interval(rates(summed(resampled(len(counts), 500), counts), pictures), len(counts))
-    return np.stack([means, *widened(means, ends, least(counts, pictures))])[:, 0]
+    ends = bootstrap_interval(
+        rates(resampled_counts(bootstrap_weights(len(counts), 500), counts), pictures), len(counts)
+    )
+    return np.stack([means, *with_agreement_bounds(means, ends, agreement_bounds(counts, pictures))])[:, 0]
 
 
-@pytest.mark.parametrize("people", [2, 10, 30])
-def test_where_all_agree_the_bound_is_that_of_clopper_and_pearson(people):
-    exact = binomtest(people, people).proportion_ci(method="exact").low
+@pytest.mark.parametrize("participants", [2, 10, 30])
+def test_where_all_agree_the_bound_is_that_of_clopper_and_pearson(participants):
+    exact = binomtest(participants, participants).proportion_ci(method="exact").low
     for i, own in enumerate(np.eye(3)):
-        _, low, high = estimated(*[[2 * own]] * people)[:, 0]
+        _, low, high = estimated(*[[2 * own]] * participants)[:, 0]
         assert low[:3] == pytest.approx(own * exact)
         assert high[:3] == pytest.approx(own + (1 - own) * (1 - exact))
         ends = [(2 * exact - 1, 1), (exact - 1, 1 - exact), (-1, 1 - 2 * exact)][i]
@@ -49,7 +58,7 @@ def test_averages_of_what_all_agree_on_average_the_bounds_of_the_datasets():
     )
 
 
-def test_a_dataset_about_which_a_single_participant_was_of_two_minds_has_no_interval():
+def test_a_dataset_with_different_answers_of_one_participant_has_no_interval():
     one, none = [[1, 1, 0], [2, 1, 1]], [[5, 0, 1], [0, 0, 0]]
     _, low, high = estimated(one, none, none, pictures=(1.0, 1))
     assert np.isnan(low[1]).all()
@@ -57,8 +66,8 @@ def test_a_dataset_about_which_a_single_participant_was_of_two_minds_has_no_inte
     assert np.isfinite(low[0]).all()
 
 
-def test_near_1_the_interval_of_few_participants_holds_the_truth_in_19_of_20():
-    """The exact coverage of 30 participants with one answer each, at a true rate of 0.95: 78 % without the bound."""
+def test_near_1_the_interval_of_few_participants_contains_the_truth_in_19_of_20():
+    """The exact coverage for 30 participants with one answer each and a true rate of 0.95; 78 % without the bound."""
     held = 0.0
     for wins in range(20, 31):
         _, low, high = estimated(*[[[1, 0, 0]]] * wins, *[[[0, 0, 1]]] * (30 - wins))[:, 0, 0]
@@ -68,8 +77,8 @@ def test_near_1_the_interval_of_few_participants_holds_the_truth_in_19_of_20():
 
 @pytest.mark.parametrize(("participants", "quantile"), [(5, 2.776), (20, 2.093), (1000, 1.962)])
 def test_intervals_of_few_participants_are_as_wide_as_students_t(participants, quantile):
-    """Resamples of n spread too little by sqrt((n - 1) / n); `quantile` is that of t with n - 1 degrees of freedom."""
+    """The spread of resamples is too small by sqrt((n - 1) / n); `quantile` is that of t with n - 1 degrees of freedom."""
     draws = np.array([NormalDist().inv_cdf((i + 0.5) / 50_000) for i in range(50_000)])
-    low, high = interval(draws[:, None], participants)[:, 0]
+    low, high = bootstrap_interval(draws[:, None], participants)[:, 0]
     assert high == pytest.approx(quantile * math.sqrt(participants / (participants - 1)), rel=0.02)
     assert low == pytest.approx(-high, rel=0.02)

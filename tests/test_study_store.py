@@ -1,4 +1,4 @@
-"""Answers: on the disk before they are acknowledged, once, whoever writes beside and whatever is killed."""
+"""The store of answers: durable before the acknowledgement, without duplicates, with concurrent writers and kills."""
 
 import os
 import re
@@ -13,59 +13,61 @@ from dataclasses import replace
 import pytest
 
 from brewster.errors import BrewsterError
-from brewster.user_study.assignment import draw
+from brewster.user_study.assignment import draw_trials
 from brewster.user_study.store import AnswerStore
 from brewster.user_study.study import read_study, write_study
-from small_studies import described, empty
+from small_studies import make_description, make_empty_study
 
 
 @pytest.fixture
 def store(tmp_path):
-    store = AnswerStore(empty(tmp_path / "study"))
+    store = AnswerStore(make_empty_study(tmp_path / "study"))
     yield store
     store.close()
 
 
-def all_answers(store):
-    return {participant.number: answers for participant, answers in store.everything()}
+def answers_by_participant(store):
+    return {participant.number: answers for participant, answers in store.all_answers()}
 
 
-def test_a_participant_is_shown_what_the_draw_says_and_goes_on_where_they_stopped(store):
+def test_a_participant_gets_the_assigned_trials_and_continues_where_they_stopped(store):
     tokens = [store.admit() for _ in range(3)]
-    person = store.participant(tokens[2])
-    assert person.trials == draw(store.study.description, 2)
-    assert store.next_trial(person) == 0
-    for trial in range(len(person.trials)):
-        assert store.next_trial(person) == trial
-        store.answer(person, trial, "similar", seconds=2)
-    assert store.next_trial(person) is None
+    participant = store.participant(tokens[2])
+    assert participant.trials == draw_trials(store.study.description, 2)
+    assert store.next_trial(participant) == 0
+    for trial in range(len(participant.trials)):
+        assert store.next_trial(participant) == trial
+        store.record_answer(participant, trial, "similar", seconds=2)
+    assert store.next_trial(participant) is None
 
 
-def test_a_trial_that_was_passed_over_comes_next(store):
-    person = store.participant(store.admit())
-    store.answer(person, 1, "left", seconds=2)
-    assert store.next_trial(person) == 0
-    store.answer(person, 0, "left", seconds=2)
-    assert store.next_trial(person) == 2
+def test_a_skipped_trial_comes_next(store):
+    participant = store.participant(store.admit())
+    store.record_answer(participant, 1, "left", seconds=2)
+    assert store.next_trial(participant) == 0
+    store.record_answer(participant, 0, "left", seconds=2)
+    assert store.next_trial(participant) == 2
 
 
-def test_the_first_answer_stays(store):
-    person = store.participant(store.admit())
-    assert store.answer(person, 0, "left", seconds=2) == "left"
-    assert store.answer(person, 0, "right", seconds=9) == "left"
-    assert [(answer.choice, answer.seconds) for answer in all_answers(store)[0].values()] == [("left", 2)]
+def test_the_first_answer_is_final(store):
+    participant = store.participant(store.admit())
+    assert store.record_answer(participant, 0, "left", seconds=2) == "left"
+    assert store.record_answer(participant, 0, "right", seconds=9) == "left"
+    assert [(answer.choice, answer.seconds) for answer in answers_by_participant(store)[0].values()] == [
+        ("left", 2)
+    ]
 
 
-def test_links_cannot_be_guessed_and_nobody_else_s_are_known(store):
+def test_tokens_are_random_and_others_are_unknown(store):
     tokens = {store.admit() for _ in range(20)}
     assert len(tokens) == 20
     assert all(re.fullmatch(r"[\w-]{32}", token) for token in tokens)
     assert store.participant("0") is None
 
 
-def test_nothing_is_kept_of_a_person_but_the_day(store):
+def test_only_the_date_of_a_participant_is_stored(store):
     store.admit()
-    with sqlite3.connect(store.study.answers) as database:
+    with sqlite3.connect(store.study.answers_file) as database:
         columns = [row[1] for row in database.execute("PRAGMA table_info(participants)")]
         ((day,),) = database.execute("SELECT consented_on FROM participants").fetchall()
     database.close()
@@ -73,23 +75,23 @@ def test_nothing_is_kept_of_a_person_but_the_day(store):
     assert re.fullmatch(r"\d{4}-\d\d-\d\d", day)
 
 
-def test_no_more_are_admitted_than_there_may_be(store):
-    assert [store.admit(most=2) is not None for _ in range(4)] == [True, True, False, False]
-    assert store.count() == 2
+def test_the_number_of_participants_is_limited(store):
+    assert [store.admit(max_participants=2) is not None for _ in range(4)] == [True, True, False, False]
+    assert store.count_participants() == 2
 
 
 @pytest.mark.parametrize(("trial", "choice"), [(-1, "left"), (10, "left"), (0, "both")])
-def test_an_answer_to_nothing_is_refused(store, trial, choice):
-    person = store.participant(store.admit())
+def test_an_answer_to_an_unknown_trial_is_refused(store, trial, choice):
+    participant = store.participant(store.admit())
     with pytest.raises(BrewsterError, match="was answered with"):
-        store.answer(person, trial, choice, seconds=1)
+        store.record_answer(participant, trial, choice, seconds=1)
 
 
-def test_absurd_times_are_cut(store):
-    person = store.participant(store.admit())
-    store.answer(person, 0, "left", seconds=-5)
-    store.answer(person, 1, "left", seconds=1e9)
-    assert [answer.seconds for answer in all_answers(store)[0].values()] == [0, 3600]
+def test_impossible_times_are_clipped(store):
+    participant = store.participant(store.admit())
+    store.record_answer(participant, 0, "left", seconds=-5)
+    store.record_answer(participant, 1, "left", seconds=1e9)
+    assert [answer.seconds for answer in answers_by_participant(store)[0].values()] == [0, 3600]
 
 
 def test_two_servers_and_many_threads_lose_nothing_and_number_nobody_twice(store):
@@ -97,21 +99,21 @@ def test_two_servers_and_many_threads_lose_nothing_and_number_nobody_twice(store
 
     def take_part(number):
         own = (store, other)[number % 2]
-        person = own.participant(own.admit())
-        for trial in range(len(person.trials)):
-            own.answer(person, trial, ("left", "right")[number % 2], seconds=number)
-        return person.number
+        participant = own.participant(own.admit())
+        for trial in range(len(participant.trials)):
+            own.record_answer(participant, trial, ("left", "right")[number % 2], seconds=number)
+        return participant.number
 
     with ThreadPoolExecutor(8) as pool:
         numbers = list(pool.map(take_part, range(16)))
     assert sorted(numbers) == list(range(16))
-    assert [len(answers) for answers in all_answers(other).values()] == [10] * 16
+    assert [len(answers) for answers in answers_by_participant(other).values()] == [10] * 16
     other.close()
 
 
-def test_a_file_that_is_no_database_is_told_in_one_sentence(tmp_path):
-    study = empty(tmp_path / "study")
-    study.answers.write_bytes(b"no database at all, but long enough to be read as a header" * 20)
+def test_a_file_that_is_not_a_database_is_an_error(tmp_path):
+    study = make_empty_study(tmp_path / "study")
+    study.answers_file.write_bytes(b"no database at all, but long enough to be read as a header" * 20)
     with pytest.raises(BrewsterError, match=r"answers\.sqlite cannot be used"):
         AnswerStore(study)
 
@@ -125,15 +127,15 @@ from brewster.user_study.study import read_study
 store = AnswerStore(read_study(Path(sys.argv[1])))
 while True:
     token = store.admit()
-    person = store.participant(token)
-    for trial in range(len(person.trials)):
-        store.answer(person, trial, "left", seconds=1)
-        print(person.number, trial, flush=True)
+    participant = store.participant(token)
+    for trial in range(len(participant.trials)):
+        store.record_answer(participant, trial, "left", seconds=1)
+        print(participant.number, trial, flush=True)
 """
 
 
-def test_what_was_acknowledged_before_kill_9_is_there_once(tmp_path):
-    write_study(tmp_path, described())
+def test_acknowledged_answers_survive_kill_9_without_duplicates(tmp_path):
+    write_study(tmp_path, make_description())
     acknowledged = []
     for _ in range(2):
         writer = subprocess.Popen(
@@ -144,17 +146,16 @@ def test_what_was_acknowledged_before_kill_9_is_there_once(tmp_path):
         rest = writer.communicate()[0].splitlines()
         acknowledged += [tuple(map(int, line.split())) for line in rest if re.fullmatch(r"\d+ \d+", line)]
     store = AnswerStore(read_study(tmp_path))
-    kept = all_answers(store)
+    stored = answers_by_participant(store)
     store.close()
     assert len(set(acknowledged)) == len(acknowledged) >= 30
-    assert all(trial in kept[number] for number, trial in acknowledged)
-    assert (
-        sum(map(len, kept.values())) <= len(acknowledged) + 2
-    )  # one of each writer may not have been told of
+    assert all(trial in stored[number] for number, trial in acknowledged)
+    # the last answer of each of the two writers may be unacknowledged
+    assert sum(map(len, stored.values())) <= len(acknowledged) + 2
 
 
-def test_a_copy_of_the_folder_after_kill_9_has_all_answers_and_once_opened_again_the_file_alone(tmp_path):
-    write_study(tmp_path / "study", described())
+def test_a_copy_after_kill_9_has_all_answers_and_the_file_alone_has_them_after_reopening(tmp_path):
+    write_study(tmp_path / "study", make_description())
     writer = subprocess.Popen(
         [sys.executable, "-c", WRITER, str(tmp_path / "study")], stdout=subprocess.PIPE, text=True
     )
@@ -163,38 +164,38 @@ def test_a_copy_of_the_folder_after_kill_9_has_all_answers_and_once_opened_again
     os.kill(writer.pid, signal.SIGKILL)
     writer.communicate()
     shutil.copytree(tmp_path / "study", tmp_path / "copy")
-    copied = all_answers(AnswerStore(read_study(tmp_path / "copy"), only_reads=True))
+    copied = answers_by_participant(AnswerStore(read_study(tmp_path / "copy"), read_only=True))
     assert sum(map(len, copied.values())) >= 15
     store = AnswerStore(read_study(tmp_path / "study"))
-    assert all_answers(alone(store.study, tmp_path / "alone")) == copied
+    assert answers_by_participant(alone(store.study, tmp_path / "alone")) == copied
     store.close()
 
 
 def alone(study, folder):
     """The answers of a copy of answers.sqlite without its log."""
     folder.mkdir()
-    shutil.copy(study.answers, folder)
+    shutil.copy(study.answers_file, folder)
     return AnswerStore(replace(study, folder=folder))
 
 
-def test_a_store_that_is_closed_leaves_all_in_the_file_though_others_have_it_open(store, tmp_path):
+def test_closing_a_store_moves_all_answers_into_the_file(store, tmp_path):
     other = AnswerStore(store.study)
-    person = store.participant(store.admit())
-    store.answer(person, 0, "left", seconds=2)
+    participant = store.participant(store.admit())
+    store.record_answer(participant, 0, "left", seconds=2)
     store.close()
-    assert len(all_answers(alone(store.study, tmp_path / "alone"))[0]) == 1
+    assert len(answers_by_participant(alone(store.study, tmp_path / "alone"))[0]) == 1
     other.close()
 
 
-def test_a_reader_makes_no_database_and_sees_what_a_server_writes(store):
-    person = store.participant(store.admit())
-    store.answer(person, 0, "left", seconds=2)
-    reader = AnswerStore(store.study, only_reads=True)
-    store.answer(person, 1, "right", seconds=2)
-    assert all_answers(reader) == all_answers(store)
+def test_a_reader_creates_no_database_and_sees_new_answers(store):
+    participant = store.participant(store.admit())
+    store.record_answer(participant, 0, "left", seconds=2)
+    reader = AnswerStore(store.study, read_only=True)
+    store.record_answer(participant, 1, "right", seconds=2)
+    assert answers_by_participant(reader) == answers_by_participant(store)
     with pytest.raises(BrewsterError, match="cannot be used"):
         reader.admit()
     reader.close()
-    nobody = empty(store.study.folder / "nobody")
-    assert all_answers(AnswerStore(nobody, only_reads=True)) == {}
-    assert not nobody.answers.exists()
+    nobody = make_empty_study(store.study.folder / "nobody")
+    assert answers_by_participant(AnswerStore(nobody, read_only=True)) == {}
+    assert not nobody.answers_file.exists()

@@ -143,16 +143,18 @@ def serve(
     from brewster.web.job_queue import JobQueue  # noqa: PLC0415
     from brewster.web.middleware import RequestLimits, is_loopback  # noqa: PLC0415
     from brewster.web.model_cache import ModelCache  # noqa: PLC0415
-    from brewster.web.separation import separation  # noqa: PLC0415
+    from brewster.web.separation import separation_router  # noqa: PLC0415
 
     if not is_loopback(host):
         say(_WARNING.format(host=host))
         token = token or AUTO
     token = secrets.token_urlsafe(16) if token == AUTO else token
-    shelf = ModelCache(models, device=device)
-    shelf.separator(shelf.names[0])  # what is wrong with the model is said now
-    router = separation(shelf, JobQueue(queue=queue, seconds=timeout), max_pixels=max_pixels)
-    app = web.application(router, guard=RequestLimits.at(host, token=token, max_bytes=max_bytes))
+    model_cache = ModelCache(models, device=device)
+    model_cache.separator(model_cache.names[0])  # what is wrong with the model is said now
+    router = separation_router(
+        model_cache, JobQueue(max_waiting=queue, timeout_seconds=timeout), max_pixels=max_pixels
+    )
+    app = web.create_app(router, limits=RequestLimits.for_host(host, token=token, max_bytes=max_bytes))
     with contextlib.suppress(KeyboardInterrupt):  # the usual end
         web.serve(app, host=host, port=port, on_ready=lambda url: invite(url, token, opens=opens))
     say("stopped")

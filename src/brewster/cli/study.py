@@ -97,7 +97,7 @@ def create(
     and nature, DIR/12.png to the only one. What is missing, double, unreadable or of another size is named, and nothing
     is written. The study holds copies of all pictures, and can be moved.
     """
-    from brewster.user_study.create import CATCH_POOL, CONSENT, StudyOptions  # noqa: PLC0415  (wakes pyvips)
+    from brewster.user_study.create import CATCH_POOL_SIZE, DEFAULT_CONSENT, StudyOptions  # noqa: PLC0415  (wakes pyvips)
     from brewster.user_study.create import create as freeze  # noqa: PLC0415
     from brewster.user_study.folders import find_pictures  # noqa: PLC0415
 
@@ -108,11 +108,11 @@ def create(
             "tables tell methods apart by name",
             "give each its own",
         )
-    text = CONSENT if consent is None else _text(consent)
+    text = DEFAULT_CONSENT if consent is None else _text(consent)
     chosen = StudyOptions(
         datasets=datasets, pairs=pairs, catches=catches, all_pairs=all_pairs, seed=seed, consent=text
     )
-    total = len(find_pictures(inputs, datasets)) * (1 + len(folders)) + CATCH_POOL
+    total = len(find_pictures(inputs, datasets)) * (1 + len(folders)) + CATCH_POOL_SIZE
     with progress(total, shown=True) as advance:
         made = freeze(out, inputs, folders, chosen, lambda done: advance(done, "copying")).description
     say(
@@ -166,22 +166,24 @@ def serve(
     Every answer is on the disk before it is acknowledged. A server that was stopped or killed goes on where it was.
     """
     require_extra("web", "serving", without=frozenset({"matplotlib"}))
-    from brewster.user_study.access_token import kept_token  # noqa: PLC0415
+    from brewster.user_study.access_token import load_or_create_token  # noqa: PLC0415
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415
     from brewster.user_study.study import read_study  # noqa: PLC0415
     from brewster.web import application as web  # noqa: PLC0415  (wakes FastAPI)
     from brewster.web.middleware import RequestLimits, is_loopback  # noqa: PLC0415
-    from brewster.web.study import participants  # noqa: PLC0415
+    from brewster.web.study import study_router  # noqa: PLC0415
 
     made = read_study(folder)
-    made.refuse_changed()
+    made.verify_pictures()
     if not is_loopback(host):
         say(_WARNING.format(host=host))
-    token = kept_token(folder) if token == AUTO else token
-    guard = RequestLimits.at(host, token=token, max_bytes=_MAX_BYTES)
-    guard = replace(guard, hosts=guard.hosts | {*called})
+    token = load_or_create_token(folder) if token == AUTO else token
+    limits = RequestLimits.for_host(host, token=token, max_bytes=_MAX_BYTES)
+    limits = replace(limits, hosts=limits.hosts | {*called})
     store = AnswerStore(made)
-    app = web.application(participants(made, store, most=most, token=token), guard=guard, home="study.html")
+    app = web.create_app(
+        study_router(made, store, max_participants=most, token=token), limits=limits, index="study.html"
+    )
     with contextlib.closing(store), contextlib.suppress(KeyboardInterrupt):  # the usual end
         web.serve(app, host=host, port=port, on_ready=lambda url: invite(url, token))
     say("stopped; all answers are kept")
@@ -218,15 +220,15 @@ def report(
     answers.csv and plot.png into a folder. The server may be running meanwhile.
     """
     require_extra("web", "reporting", without=frozenset({"fastapi", "python-multipart", "uvicorn"}))
-    from brewster.user_study.report.participants import ExclusionRule, people  # noqa: PLC0415
+    from brewster.user_study.report.participants import ExclusionRule, collect_answers  # noqa: PLC0415
     from brewster.user_study.report.results import summarise, write  # noqa: PLC0415
     from brewster.user_study.report.tables import overview  # noqa: PLC0415
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415
     from brewster.user_study.study import read_study  # noqa: PLC0415
 
     made = read_study(folder)
-    with contextlib.closing(AnswerStore(made, only_reads=True)) as store:
-        answered = people(store.everything())
+    with contextlib.closing(AnswerStore(made, read_only=True)) as store:
+        answered = collect_answers(store.all_answers())
     results = summarise(made, answered, ExclusionRule(most_failed, least_seconds))
     out = folder / "report" if out is None else out
     write(results, made, answered, out)
@@ -265,9 +267,11 @@ def plan(
     *, difference: float, tie: float, pairs: int, correlation: float, power: float, as_json: bool
 ) -> None:
     """Say how many participants a difference needs, at the 5 % level."""
-    from brewster.user_study.power_analysis import plan as planned  # noqa: PLC0415
+    from brewster.user_study.power_analysis import required_participants  # noqa: PLC0415
 
-    answer = planned(difference=difference, tie=tie, pairs=pairs, correlation=correlation, power=power)
+    answer = required_participants(
+        difference=difference, tie=tie, pairs=pairs, correlation=correlation, power=power
+    )
     if as_json:
         print_out(json.dumps(asdict(answer)))
         return

@@ -1,1 +1,1 @@
-"""Which of two results do people prefer? A study that anyone can run, and what its answers say."""
+"""A user study with blind paired comparisons: its files, its answers, and the statistics of the answers."""

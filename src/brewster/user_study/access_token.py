@@ -1,4 +1,4 @@
-"""The token of a study, kept beside it: the personal links that carry it hold when the server starts again."""
+"""The access token of a study, stored in its folder so that personal links stay valid when the server restarts."""
 
 from __future__ import annotations
 
@@ -10,38 +10,41 @@ from typing import Final
 
 from brewster.errors import BrewsterError, TargetError
 
-_WHOLE: Final = re.compile(r"[A-Za-z0-9_-]{16,200}")
+_PATTERN: Final = re.compile(r"[A-Za-z0-9_-]{16,200}")
 
 
-def kept_token(folder: Path) -> str:
-    """The token in the folder of a study, made where there is none, in a file that only its owner may read.
+def load_or_create_token(folder: Path) -> str:
+    """Read the token from the study folder, or create it in a file with permissions 0600.
+
+    Returns:
+        The token, 16 to 200 URL-safe characters.
 
     Raises:
-        BrewsterError: what is there is none.
-        TargetError: it cannot be read or written.
+        BrewsterError: the file exists but does not contain a valid token.
+        TargetError: the file cannot be read or written.
     """
-    place = folder / "token"
+    path = folder / "token"
     try:
-        if not place.exists():
-            _write(place, secrets.token_urlsafe(16))
-        token = place.read_text("latin-1").strip()
+        if not path.exists():
+            _write(path, secrets.token_urlsafe(16))
+        token = path.read_text("latin-1").strip()
     except OSError as error:
         raise TargetError(
-            f"{place} cannot be used ({error.strerror or error})",
-            "a token that is kept is read and written there",
-            "mend that, or give the token itself: --token TOKEN",
+            f"{path} cannot be used ({error.strerror or error})",
+            "the token of the study is stored in this file",
+            "make it readable and writable, or pass a token: --token TOKEN",
         ) from error
-    if not _WHOLE.fullmatch(token):
+    if not _PATTERN.fullmatch(token):
         raise BrewsterError(
-            f"{place} holds no token",
-            "16 letters or more, of A-Z a-z 0-9 _ and -",
-            "remove it for a new one; links that were sent out hold only with the old one",
+            f"{path} contains no valid token",
+            "16 to 200 characters of A-Z a-z 0-9 _ and -",
+            "delete the file to create a new token; links sent out earlier need the old token",
         )
     return token
 
 
-def _write(place: Path, token: str) -> None:
-    with os.fdopen(os.open(place, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+def _write(path: Path, token: str) -> None:
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
         file.write(f"{token}\n")
         file.flush()
         os.fsync(file.fileno())

@@ -1,8 +1,9 @@
-"""The draw: what a participant is shown, blind, as a function of the seed and their number alone.
+"""Assignment of comparisons to participants, a function of the study's seed and the participant's number only.
 
-All participants walk along one endless row: round after round, each a shuffle of all comparisons. So at any time every
-comparison was given out equally often, or once more; in every second round each has its sides swapped, so both methods
-stood on either side equally often, too. Nothing needs to be remembered to go on with it.
+All participants share one infinite sequence of rounds. Each round is a random permutation of all comparisons, and each
+participant takes the next `pairs` items. At any time the counts of two comparisons differ by at most 1. Every second
+round swaps the sides of each comparison, so each method is shown left and right equally often. The sequence is computed
+again from the seed; no state is stored.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ from typing import Final, Literal, final
 
 from brewster.user_study.study import CatchTrial, StudyDescription
 
-Side = Literal["left", "right"]
 Choice = Literal["left", "similar", "right"]
 CHOICES: Final[tuple[Choice, ...]] = ("left", "similar", "right")
 
@@ -23,9 +23,10 @@ CHOICES: Final[tuple[Choice, ...]] = ("left", "similar", "right")
 @final
 @dataclass(frozen=True)
 class TrialDraw:
-    """Three pictures, by name, and what they are: the `comparison` by its number, or a catch with its right answer.
+    """One trial: the names of three pictures and their origin.
 
-    `flipped` says that the comparison's first method is on the right.
+    A normal trial has the number of its `comparison`; `flipped` is true if the comparison's first method is on the right.
+    A catch trial has `comparison` None and the `expected` choice.
     """
 
     photo: str
@@ -36,39 +37,46 @@ class TrialDraw:
     expected: Choice | None = None
 
 
-def draw(description: StudyDescription, number: int) -> tuple[TrialDraw, ...]:
-    """The trials of the participant of this number (from 0), in their order.
+def draw_trials(description: StudyDescription, number: int) -> tuple[TrialDraw, ...]:
+    """The trials of one participant, in the order of presentation; `number` counts participants from 0.
 
-    Walks the row from its start: 0.3 s for the ten-thousandth participant.
+    Computes the sequence from its start: 0.3 s for participant 10,000.
     """
     count, pairs = len(description.comparisons), description.pairs
-    row = walk(count, pairs, description.seed)
-    own = list(itertools.islice(row, number * pairs, (number + 1) * pairs))
-    rng = Random(f"{description.seed}/participant/{number}")  # noqa: S311  (no secret: a published seed)
-    trials = [_compared(description, comparison, flipped) for comparison, flipped in own]
-    trials += _catches(description, {comparison for comparison, _ in own}, rng)
+    sequence = comparison_sequence(count, pairs, description.seed)
+    own = list(itertools.islice(sequence, number * pairs, (number + 1) * pairs))
+    rng = Random(f"{description.seed}/participant/{number}")  # noqa: S311  (not a secret: the seed is published)
+    trials = [_comparison_trial(description, comparison, flipped) for comparison, flipped in own]
+    trials += _catch_trials(description, {comparison for comparison, _ in own}, rng)
     rng.shuffle(trials)
     return tuple(trials)
 
 
-def walk(count: int, pairs: int, seed: int) -> Iterator[tuple[int, bool]]:
-    """The row without end: numbers of comparisons, and whether their sides are swapped.
+def comparison_sequence(count: int, pairs: int, seed: int) -> Iterator[tuple[int, bool]]:
+    """The infinite sequence of (comparison number, sides swapped).
 
-    Each `pairs` of it (at most `count`) are a participant's, and hold no comparison twice. Sides are as many left as
-    right within one in each comparison at any time, and nearly so in each participant.
+    Items `n * pairs` to `(n + 1) * pairs` belong to participant n and contain no comparison twice. For each comparison,
+    the counts of both orders differ by at most 1 at any time; for each participant they are nearly equal.
+
+    Args:
+        count: number of comparisons.
+        pairs: comparisons for each participant, at most `count`.
+        seed: the study's seed.
     """
     flips: dict[int, bool] = {}
     order: list[int] = []
-    for turn in itertools.count():
-        rng = Random(f"{seed}/round/{turn}")  # noqa: S311
-        begun = turn * count % pairs  # of these pairs, the last round has given so many to somebody
-        seen, missing = set(order[len(order) - begun :]), -begun % pairs
-        order = _spared(rng.sample(range(count), count), seen, missing)
-        if turn % 2:  # the sides are those of the round before, swapped; left and right by turns
-            halves = [
-                _spared([c for c in order if flips[c] is flip], seen, missing // 2) for flip in (False, True)
+    for round_number in itertools.count():
+        rng = Random(f"{seed}/round/{round_number}")  # noqa: S311
+        # the previous round ended with this many comparisons of a participant who continues in this round
+        handed_out = round_number * count % pairs
+        seen, missing = set(order[len(order) - handed_out :]), -handed_out % pairs
+        order = _unseen_first(rng.sample(range(count), count), seen, missing)
+        if round_number % 2:  # swap the sides of the previous round, and alternate left and right
+            sides = [
+                _unseen_first([c for c in order if flips[c] is flip], seen, missing // 2)
+                for flip in (False, True)
             ]
-            order = _spared(_by_turns(*halves), seen, missing)
+            order = _unseen_first(_interleave(*sides), seen, missing)
             flips = {comparison: not flip for comparison, flip in flips.items()}
         else:
             start = rng.random() < 0.5
@@ -76,33 +84,36 @@ def walk(count: int, pairs: int, seed: int) -> Iterator[tuple[int, bool]]:
         yield from ((comparison, flips[comparison]) for comparison in order)
 
 
-def _spared(order: Sequence[int], seen: Collection[int], count: int) -> list[int]:
-    """The same with `count` in front that were not seen: who has begun in the round before gets none twice."""
+def _unseen_first(order: Sequence[int], seen: Collection[int], count: int) -> list[int]:
+    """Move the first `count` unseen comparisons to the front.
+
+    A participant whose items span two rounds then gets no comparison twice.
+    """
     front = dict.fromkeys([comparison for comparison in order if comparison not in seen][:count])
     return [*front, *(comparison for comparison in order if comparison not in front)]
 
 
-def _by_turns(first: Sequence[int], second: Sequence[int]) -> list[int]:
+def _interleave(first: Sequence[int], second: Sequence[int]) -> list[int]:
     longer, shorter = (first, second) if len(first) >= len(second) else (second, first)
-    turns = itertools.chain.from_iterable(itertools.zip_longest(longer, shorter))
-    return [comparison for comparison in turns if comparison is not None]
+    interleaved = itertools.chain.from_iterable(itertools.zip_longest(longer, shorter))
+    return [comparison for comparison in interleaved if comparison is not None]
 
 
-def _compared(description: StudyDescription, number: int, flipped: bool) -> TrialDraw:
+def _comparison_trial(description: StudyDescription, number: int, flipped: bool) -> TrialDraw:
     comparison = description.comparisons[number]
     left, right = comparison.outputs[::-1] if flipped else comparison.outputs
     return TrialDraw(comparison.photo, left, right, number, flipped)
 
 
-def _catches(description: StudyDescription, own: Collection[int], rng: Random) -> list[TrialDraw]:
-    """As many as the study asks for, one half of each kind, on photos that are not the participant's own if possible."""
+def _catch_trials(description: StudyDescription, own: Collection[int], rng: Random) -> list[TrialDraw]:
+    """The participant's catch trials, half of each kind, on photos that they do not see otherwise, if possible."""
     photos = {description.comparisons[number].photo for number in own}
     pool = rng.sample(description.catch_pool, len(description.catch_pool))
     pool.sort(key=lambda catch: catch.photo in photos)
-    return [_catch(catch, i, rng) for i, catch in enumerate(pool[: description.catches])]
+    return [_catch_trial(catch, i, rng) for i, catch in enumerate(pool[: description.catches])]
 
 
-def _catch(catch: CatchTrial, i: int, rng: Random) -> TrialDraw:
+def _catch_trial(catch: CatchTrial, i: int, rng: Random) -> TrialDraw:
     if i % 2 == 0:
         return TrialDraw(catch.photo, catch.good, catch.good, expected="similar")
     if rng.random() < 0.5:

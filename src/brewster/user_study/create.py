@@ -1,9 +1,9 @@
-"""From folders of outputs to a study: every picture paired by name, copied under a name that tells nothing.
+"""Create a study from folders of outputs: pair pictures by name and copy them under random names.
 
     create(Path("out/study"), Path("inputs"), {"ours": Path("out/ours"), "RDNet": Path("out/rdnet")})
 
-Whatever does not fit is refused, all of it named, before anything is written. Pictures are kept as PNG of 8-bit sRGB,
-upright and without metadata: every browser shows them alike, and neither format nor EXIF tells where they come from.
+All files are checked before anything is written; one error lists all problems. Pictures are stored as upright 8-bit sRGB
+PNG without metadata: every browser shows them alike, and neither format nor EXIF reveals the method.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ import brewster
 from brewster.errors import BrewsterError, PhotoError, TargetError
 from brewster.files import arriving, write_atomically
 from brewster.photo import Photo
-from brewster.user_study.degrade import spoil
-from brewster.user_study.folders import Key, find_pictures, listed
+from brewster.user_study.degrade import degrade
+from brewster.user_study.folders import Key, find_pictures, shorten_list
 from brewster.user_study.study import (
     PICTURES,
     CatchTrial,
@@ -33,37 +33,41 @@ from brewster.user_study.study import (
     write_study,
 )
 
-PAIRS: Final = 40
-CATCHES: Final = 4
-CATCH_POOL: Final = 24
-CONSENT: Final = """\
+DEFAULT_PAIRS: Final = 40
+DEFAULT_CATCHES: Final = 4
+CATCH_POOL_SIZE: Final = 24
+DEFAULT_CONSENT: Final = """\
 In this study you compare pictures. You see a photo that was taken through glass, and two results of removing the \
 reflection from it. Choose the one that looks better to you, or say that they are similar. There are no right or wrong \
 answers.
 
-Taking part is voluntary. You can stop at any time, and go on later with your personal link.
+Taking part is voluntary. You can stop at any time, and continue later with your personal link.
 
-We keep your choices, how long each took, and the day on which you agreed to take part. We keep no name, no address and \
-nothing else about you or your device."""
+We store your choices, how long each took, and the date on which you agreed to take part. We store no name, no address \
+and nothing else about you or your device."""
 
 
 @final
 @dataclass(frozen=True)
 class StudyOptions:
-    """What can be chosen about a study; None takes 40 pairs and 4 catch trials, or fewer where there are not so many."""
+    """Options of a new study.
+
+    `pairs` and `catches` count the comparisons and catch trials of one participant. None takes DEFAULT_PAIRS and
+    DEFAULT_CATCHES, or fewer if the study has fewer pictures.
+    """
 
     datasets: Sequence[str] = ()
     pairs: int | None = None
     catches: int | None = None
     all_pairs: bool = False
     seed: int | None = None
-    consent: str = CONSENT
+    consent: str = DEFAULT_CONSENT
 
 
 @final
 @dataclass(frozen=True)
 class _StudyFiles:
-    """The files of a study, by photo: the inputs, and each method's outputs."""
+    """The source files of a study by (dataset, stem): the inputs, and the outputs of each method."""
 
     inputs: Mapping[Key, Path]
     outputs: Mapping[str, Mapping[Key, Path]]
@@ -73,118 +77,124 @@ def create(
     out: Path,
     inputs: Path,
     methods: Mapping[str, Path],
-    choices: StudyOptions = StudyOptions(),
+    options: StudyOptions = StudyOptions(),
     on_progress: Callable[[int], None] = lambda _done: None,
 ) -> Study:
-    """Makes a study of all pictures in the folder of inputs; the first method is compared with each other one.
+    """Create a study of all pictures in the folder `inputs`.
 
-    `on_progress` is called with how many pictures are copied, after each.
+    Args:
+        out: the folder of the new study; it must not exist or be empty.
+        inputs: the folder of photos with reflections.
+        methods: the folder of outputs by method name. The first method is compared with each of the others.
+        options: sizes, seed and consent text.
+        on_progress: called after each copied picture with the number of pictures copied so far.
 
     Raises:
-        BrewsterError: fewer than two methods; names, sizes or files do not fit; more pairs than there are.
-        TargetError: `out` is not empty, or cannot be written.
+        BrewsterError: there are fewer than two methods; files are missing, unreadable or of different sizes; or `options`
+            requests more pairs or catch trials than exist.
+        TargetError: `out` is not empty or cannot be written.
     """
-    _refuse_taken(out)
-    found = _found(inputs, methods, choices.datasets)
-    every = list(combinations(methods, 2))
-    pairs = every if choices.all_pairs else every[: len(methods) - 1]
-    seed = secrets.randbelow(1 << 32) if choices.seed is None else choices.seed
-    shown = _fitting(choices.pairs, PAIRS, len(pairs) * len(found.inputs), "pairs")
-    catches = _fitting(choices.catches, CATCHES, min(CATCH_POOL, len(found.inputs)), "catch trials")
-    with arriving(out) as part:
-        copier = _Copier(part / PICTURES, Random(f"{seed}/names"), on_progress)  # noqa: S311  (a published seed)
-        comparisons = tuple(_comparisons(found, pairs, copier))
-        pool = tuple(_catch_pool(found, copier, Random(f"{seed}/catches")))  # noqa: S311
+    _require_empty(out)
+    files = _pair_pictures(inputs, methods, options.datasets)
+    all_pairs = list(combinations(methods, 2))
+    pairs = all_pairs if options.all_pairs else all_pairs[: len(methods) - 1]
+    seed = secrets.randbelow(1 << 32) if options.seed is None else options.seed
+    pairs_each = _limited(options.pairs, DEFAULT_PAIRS, len(pairs) * len(files.inputs), "pairs")
+    catches = _limited(
+        options.catches, DEFAULT_CATCHES, min(CATCH_POOL_SIZE, len(files.inputs)), "catch trials"
+    )
+    with arriving(out) as folder:
+        copier = _Copier(folder / PICTURES, Random(f"{seed}/names"), on_progress)  # noqa: S311  (the seed is published)
+        comparisons = tuple(_comparisons(files, pairs, copier))
+        pool = tuple(_catch_pool(files, copier, Random(f"{seed}/catches")))  # noqa: S311
         description = StudyDescription(
             brewster=brewster.__version__,
             seed=seed,
-            pairs=shown,
+            pairs=pairs_each,
             catches=catches,
-            consent=choices.consent,
+            consent=options.consent,
             methods=tuple(methods),
-            datasets=tuple(dict.fromkeys(dataset for dataset, _ in found.inputs)),
+            datasets=tuple(dict.fromkeys(dataset for dataset, _ in files.inputs)),
             pictures=tuple(sorted(copier.pictures.values(), key=lambda picture: picture.name)),
             comparisons=comparisons,
             catch_pool=pool,
         )
-        write_study(part, description)
+        write_study(folder, description)
     return Study(out, description)
 
 
-# --- what is there, and whether it fits
+# --- checking the source files
 
 
-def _found(inputs: Path, methods: Mapping[str, Path], datasets: Sequence[str]) -> _StudyFiles:
+def _pair_pictures(inputs: Path, methods: Mapping[str, Path], datasets: Sequence[str]) -> _StudyFiles:
     if len(methods) < 2:
         raise BrewsterError(
-            f"{len(methods)} method was named",
-            "a study compares two or more",
+            f"the study has {len(methods)} method",
+            "a study compares two or more methods",
             "add another --method NAME=DIR",
         )
-    found = _StudyFiles(
+    files = _StudyFiles(
         find_pictures(inputs, datasets),
         {name: find_pictures(path, datasets) for name, path in methods.items()},
     )
-    misfits = [*_missing(found, inputs, methods), *_unequal(found)]
+    misfits = [*_unpaired(files, inputs, methods), *_unfit_files(files)]
     if misfits:
         raise BrewsterError(
-            f"{len(misfits)} {'picture does' if len(misfits) == 1 else 'pictures do'} not fit: {listed(misfits)}",
-            "every input has one output of each method, of its own size",
-            "mend these and run again; nothing was written",
+            f"{len(misfits)} {'picture does' if len(misfits) == 1 else 'pictures do'} not fit: {shorten_list(misfits)}",
+            "every input has one output of each method, of the same size",
+            "fix these files and run the command again; nothing was written",
         )
-    return found
+    return files
 
 
-def _missing(found: _StudyFiles, inputs: Path, methods: Mapping[str, Path]) -> Iterator[str]:
-    for name, outputs in found.outputs.items():
-        for dataset, stem in found.inputs.keys() - outputs.keys():
+def _unpaired(files: _StudyFiles, inputs: Path, methods: Mapping[str, Path]) -> Iterator[str]:
+    for name, outputs in files.outputs.items():
+        for dataset, stem in files.inputs.keys() - outputs.keys():
             yield f"{name} has no {methods[name] / dataset / stem}.*"
-        for key in outputs.keys() - found.inputs.keys():
+        for key in outputs.keys() - files.inputs.keys():
             yield f"{outputs[key]} has no input in {inputs / key[0]}"
 
 
-def _unequal(found: _StudyFiles) -> Iterator[str]:
-    """What cannot be read whole, and outputs of another size than their input."""
+def _unfit_files(files: _StudyFiles) -> Iterator[str]:
+    """Files that cannot be decoded, and outputs whose size differs from that of the input."""
     sizes: dict[Path, tuple[int, int]] = {}
     for path in [
-        *found.inputs.values(),
-        *(path for paths in found.outputs.values() for path in paths.values()),
+        *files.inputs.values(),
+        *(path for paths in files.outputs.values() for path in paths.values()),
     ]:
         try:
             sizes[path] = Photo.open(path).size
         except PhotoError as error:
             yield f"{path}: {error}".rstrip(".")
-    for outputs, (key, photo) in product(found.outputs.values(), found.inputs.items()):
+    for outputs, (key, photo) in product(files.outputs.values(), files.inputs.items()):
         output = outputs.get(key)
         if output in sizes and photo in sizes and sizes[output] != sizes[photo]:
             (wide, high), (width, height) = sizes[output], sizes[photo]
-            yield f"{output} is {wide}x{high}, its input {width}x{height}"
+            yield f"{output} has {wide}x{high} pixels, its input {width}x{height}"
 
 
-def _fitting(asked: int | None, usual: int, most: int, what: str) -> int:
-    if asked is not None and asked > most:
+def _limited(requested: int | None, default: int, maximum: int, what: str) -> int:
+    if requested is not None and requested > maximum:
         raise BrewsterError(
-            f"{asked} {what} a participant were asked for",
-            f"there are {most} at most",
-            "ask for fewer",
+            f"{requested} {what} for each participant were requested",
+            f"at most {maximum} are available",
+            "request fewer",
         )
-    return min(usual, most) if asked is None else asked
+    return min(default, maximum) if requested is None else requested
 
 
-def _refuse_taken(out: Path) -> None:
+def _require_empty(out: Path) -> None:
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
-        raise TargetError(
-            f"{out} is not empty", "a study is made once, in a folder of its own", "name another"
-        )
+        raise TargetError(f"{out} is not empty", "a new study needs an empty folder", "choose another folder")
 
 
-# --- the pictures under their new names
+# --- copying pictures under random names
 
 
 @final
 @dataclass(frozen=True)
 class _Copier:
-    """Copies pictures, each once, under names drawn by the rng."""
+    """Copies each picture once, under a random name."""
 
     folder: Path
     rng: Random
@@ -192,25 +202,25 @@ class _Copier:
     pictures: dict[Path, StudyPicture] = field(default_factory=dict)
 
     def copy(self, path: Path) -> str:
-        """The new name of a picture."""
+        """Copy a picture if it is not copied yet; returns its new name."""
         if path not in self.pictures:
             data = path.read_bytes()
             self.pictures[path] = self.write(Photo.open(data), hashlib.sha256(data).hexdigest())
             self.on_progress(len(self.pictures))
         return self.pictures[path].name
 
-    def copy_spoilt(self, path: Path) -> str:
-        """The new name of a picture, spoilt."""
-        place = path / "spoilt"  # no file, but a name of its own
+    def copy_degraded(self, path: Path) -> str:
+        """Write a degraded copy of a picture; returns its new name."""
+        key = path / "degraded"  # a key that no source file has
         data = path.read_bytes()
-        spoilt = Photo.from_array(
-            spoil(Photo.open(data).srgb_8bit(), self.rng.getrandbits(32)), encoding="srgb"
+        degraded = Photo.from_array(
+            degrade(Photo.open(data).srgb_8bit(), self.rng.getrandbits(32)), encoding="srgb"
         )
-        self.pictures[place] = self.write(spoilt, hashlib.sha256(data).hexdigest())
-        return self.pictures[place].name
+        self.pictures[key] = self.write(degraded, hashlib.sha256(data).hexdigest())
+        return self.pictures[key].name
 
     def write(self, photo: Photo, source: str) -> StudyPicture:
-        """Writes a picture without anything that tells where it comes from."""
+        """Write a picture as PNG without metadata."""
         name = f"{self.rng.getrandbits(64):016x}.png"
         data = Photo.from_array(photo.srgb_8bit(), encoding="srgb").encode("png")
         write_atomically(self.folder / name, data)
@@ -218,18 +228,18 @@ class _Copier:
 
 
 def _comparisons(
-    found: _StudyFiles, pairs: Sequence[tuple[str, str]], copier: _Copier
+    files: _StudyFiles, pairs: Sequence[tuple[str, str]], copier: _Copier
 ) -> Iterator[PairedComparison]:
-    for key, photo in found.inputs.items():
+    for key, photo in files.inputs.items():
         for first, second in pairs:
-            outputs = (copier.copy(found.outputs[first][key]), copier.copy(found.outputs[second][key]))
+            outputs = (copier.copy(files.outputs[first][key]), copier.copy(files.outputs[second][key]))
             yield PairedComparison(*key, (first, second), copier.copy(photo), outputs)
 
 
-def _catch_pool(found: _StudyFiles, copier: _Copier, rng: Random) -> Iterator[CatchTrial]:
-    """Photos for catch trials, at most CATCH_POOL, each with an output of some method and that output spoilt."""
-    for key in rng.sample(list(found.inputs), min(CATCH_POOL, len(found.inputs))):
-        output = found.outputs[rng.choice(list(found.outputs))][key]
+def _catch_pool(files: _StudyFiles, copier: _Copier, rng: Random) -> Iterator[CatchTrial]:
+    """Photos for catch trials, at most CATCH_POOL_SIZE, each with the output of a random method and a degraded copy of it."""
+    for key in rng.sample(list(files.inputs), min(CATCH_POOL_SIZE, len(files.inputs))):
+        output = files.outputs[rng.choice(list(files.outputs))][key]
         yield CatchTrial(
-            *key, copier.copy(found.inputs[key]), copier.copy(output), copier.copy_spoilt(output)
+            *key, copier.copy(files.inputs[key]), copier.copy(output), copier.copy_degraded(output)
         )

@@ -1,4 +1,4 @@
-"""A picture made obviously worse, for catch trials: blurred so that shapes remain, and noisy."""
+"""Degrade a picture for catch trials: a strong blur, which keeps large shapes, and noise."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-_BLUR: Final = 0.02
-"""Half the width of the blur, as a share of the longer side."""
-_NOISE: Final = 28.0
-"""Standard deviation of the noise, of 255."""
+_BLUR_SHARE: Final = 0.02
+"""Half the width of the box blur, as a share of the longer side."""
+_NOISE_STD: Final = 28.0
+"""Standard deviation of the noise in 8-bit code values."""
 
 
-def spoil(picture: NDArray[np.uint8], seed: int) -> NDArray[np.uint8]:
-    """The same picture (H, W, 3), sRGB, blurred twice by a box and with grey noise; the same bytes for the same seed."""
-    half = max(2, round(_BLUR * max(picture.shape[:2])))
+def degrade(picture: NDArray[np.uint8], seed: int) -> NDArray[np.uint8]:
+    """Blur an sRGB picture (H, W, 3) twice with a box filter and add grey noise; deterministic for a seed."""
+    half = max(2, round(_BLUR_SHARE * max(picture.shape[:2])))
     blurred = picture.astype(np.float32)
     for axis in (0, 1, 0, 1):
-        blurred = _box(blurred, half, axis)
-    noise = np.random.default_rng(seed).normal(0, _NOISE, (*picture.shape[:2], 1))
+        blurred = _box_blur(blurred, half, axis)
+    noise = np.random.default_rng(seed).normal(0, _NOISE_STD, (*picture.shape[:2], 1))
     return np.rint(blurred + noise).clip(0, 255).astype(np.uint8)
 
 
-def _box(values: NDArray[np.float32], half: int, axis: int) -> NDArray[np.float32]:
-    """Means over 2 half + 1 values along an axis, the edge going on beyond the picture."""
+def _box_blur(values: NDArray[np.float32], half: int, axis: int) -> NDArray[np.float32]:
+    """Moving mean over 2 half + 1 values along an axis; edge values are repeated beyond the border."""
     padding = [(0, 0)] * values.ndim
     padding[axis] = (half + 1, half)
     sums = np.cumsum(np.pad(values, padding, mode="edge"), axis=axis, dtype=np.float64)

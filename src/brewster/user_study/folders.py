@@ -1,4 +1,4 @@
-"""Which pictures a folder holds, by dataset and name: `real/12.png` is the picture 12 of the dataset real."""
+"""Find the pictures of a folder by dataset and name: `real/12.png` is picture 12 of the dataset real."""
 
 from __future__ import annotations
 
@@ -11,94 +11,111 @@ from typing import Final
 
 from brewster.errors import BrewsterError
 from brewster.files import SUFFIXES
-from brewster.user_study.study import ONE
+from brewster.user_study.study import UNNAMED_DATASET
 
 Key = tuple[str, str]
 """Dataset and stem."""
 
-_SHOWN: Final = 8
-_CLEAR: Final = ".transmission"
+_MAX_LISTED: Final = 8
+_TRANSMISSION: Final = ".transmission"
 
 
 def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]:
-    """The pictures of a folder in natural order: in its folders, or in itself where these hold none.
+    """Find pictures in the subfolders, one for each dataset, or in the folder itself if no subfolder has pictures.
 
-    Of the `datasets` only and in their order, if any are given. Outputs may be called like those of `brewster -o`:
-    name.transmission.png, beside which name.reflection.png and name.confidence.png are passed over.
+    Outputs may be named as `brewster -o` names them: `name.transmission.png` counts as `name`, and the files
+    `name.reflection.png` and `name.confidence.png` of the same photo are ignored.
+
+    Args:
+        folder: the folder to search; subfolders are searched one level deep.
+        datasets: the datasets to take, in this order; all of them if empty.
+
+    Returns:
+        Paths by (dataset, stem), in natural order (2 before 10).
 
     Raises:
-        BrewsterError: there is no picture, no such dataset, one name has several files, or pictures lie both in the
-            folder and in its folders, and no `datasets` say which.
+        BrewsterError: the folder contains no picture; a dataset is missing; two files have one name; or pictures are both
+            in the folder and in its subfolders, and `datasets` is empty.
     """
     if not folder.is_dir():
-        raise BrewsterError(f"{folder} is no folder", "one with pictures is needed", "name another")
-    rooms = {_plain(room.name): room for room in folder.iterdir() if room.is_dir() and room.name[0] != "."}
-    rooms = {name: rooms[name] for name in sorted(rooms, key=_natural)}
-    parts = {name: stems for name, room in rooms.items() if (stems := _stems(room))}
-    if missing := [name for name in datasets if name not in parts]:
+        raise BrewsterError(f"{folder} is not a folder", "a folder with pictures", "check the path")
+    subfolders = {
+        _normalised(subfolder.name): subfolder
+        for subfolder in folder.iterdir()
+        if subfolder.is_dir() and subfolder.name[0] != "."
+    }
+    subfolders = {name: subfolders[name] for name in sorted(subfolders, key=_natural_key)}
+    stems_by_dataset = {
+        name: stems for name, subfolder in subfolders.items() if (stems := _list_pictures(subfolder))
+    }
+    if missing := [name for name in datasets if name not in stems_by_dataset]:
         raise BrewsterError(
             f"{folder} has no dataset {missing[0]!r}",
-            f"a folder with pictures in it; there {'is' if len(parts) == 1 else 'are'} {', '.join(parts) or 'none'}",
+            f"a subfolder with pictures; there {'is' if len(stems_by_dataset) == 1 else 'are'} {', '.join(stems_by_dataset) or 'none'}",
             "check the name",
         )
-    if not datasets and (own := _stems(folder)):
-        _refuse_both(folder, list(parts), list(own))
-        parts = {ONE: own}
+    if not datasets and (own := _list_pictures(folder)):
+        _require_one_layout(folder, list(stems_by_dataset), list(own))
+        stems_by_dataset = {UNNAMED_DATASET: own}
     found: defaultdict[Key, list[Path]] = defaultdict(list)
-    for name in dict.fromkeys(datasets or parts):
-        for path, stem in parts[name].items():
+    for name in dict.fromkeys(datasets or stems_by_dataset):
+        for path, stem in stems_by_dataset[name].items():
             found[name, stem].append(path)
-    _refuse(folder, found)
+    _require_unique_names(folder, found)
     return {key: paths[0] for key, paths in found.items()}
 
 
-def listed(words: Sequence[str]) -> str:
-    """The first few of them, and how many more there are."""
-    more = len(words) - _SHOWN
-    return "; ".join(words[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
+def shorten_list(items: Sequence[str]) -> str:
+    """Join the first items with semicolons, and add the number of the others."""
+    remaining = len(items) - _MAX_LISTED
+    return "; ".join(items[:_MAX_LISTED]) + (f"; and {remaining} more" if remaining > 0 else "")
 
 
-def _refuse(folder: Path, found: dict[Key, list[Path]]) -> None:
+def _require_unique_names(folder: Path, found: dict[Key, list[Path]]) -> None:
     if not found:
         raise BrewsterError(
-            f"{folder} holds no picture", "pictures, or folders of them", "name another folder"
+            f"{folder} contains no picture", "pictures, or subfolders with pictures", "check the path"
         )
-    doubles = [" and ".join(sorted(map(str, paths))) for paths in found.values() if len(paths) > 1]
-    if doubles:
+    duplicates = [" and ".join(sorted(map(str, paths))) for paths in found.values() if len(paths) > 1]
+    if duplicates:
         raise BrewsterError(
-            f"{listed(doubles)} share a name",
-            "pictures are paired by name, whatever their format",
-            "remove all but one of each",
+            f"{shorten_list(duplicates)} share a name",
+            "pictures are paired by name without the suffix",
+            "keep one file of each name",
         )
 
 
-def _refuse_both(folder: Path, rooms: Sequence[str], own: Sequence[Path]) -> None:
-    if rooms:
+def _require_one_layout(folder: Path, subfolders: Sequence[str], own: Sequence[Path]) -> None:
+    if subfolders:
         raise BrewsterError(
-            f"{folder} holds pictures ({listed([path.name for path in own])}) beside folders of them ({', '.join(rooms)})",
-            "pictures lie in a folder, or in its folders, one for each dataset",
-            "move them into one of these folders, or name those that are meant: --dataset NAME",
+            f"{folder} contains pictures ({shorten_list([path.name for path in own])}) and subfolders with pictures ({', '.join(subfolders)})",
+            "pictures either in the folder or in subfolders, one for each dataset",
+            "move the pictures into a subfolder, or name the subfolders to take: --dataset NAME",
         )
 
 
-def _stems(folder: Path) -> dict[Path, str]:
-    """What each picture of a folder is called, in natural order; without the other layers of one that is there."""
+def _list_pictures(folder: Path) -> dict[Path, str]:
+    """The stem of each picture in a folder, in natural order, without reflections and confidence maps of separated photos."""
     pictures = {
-        path: _plain(path.stem)
+        path: _normalised(path.stem)
         for path in folder.iterdir()
         if path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
     }
-    clear = {stem.removesuffix(_CLEAR) for stem in pictures.values() if stem.endswith(_CLEAR)}
-    others = {f"{stem}{layer}" for stem in clear for layer in (".reflection", ".confidence")}
-    stems = {path: stem.removesuffix(_CLEAR) for path, stem in pictures.items() if stem not in others}
-    return dict(sorted(stems.items(), key=lambda pair: (_natural(pair[1]), pair[0])))
+    separated = {
+        stem.removesuffix(_TRANSMISSION) for stem in pictures.values() if stem.endswith(_TRANSMISSION)
+    }
+    other_layers = {f"{stem}{layer}" for stem in separated for layer in (".reflection", ".confidence")}
+    stems = {
+        path: stem.removesuffix(_TRANSMISSION) for path, stem in pictures.items() if stem not in other_layers
+    }
+    return dict(sorted(stems.items(), key=lambda pair: (_natural_key(pair[1]), pair[0])))
 
 
-def _plain(name: str) -> str:
-    """A name in one spelling: some systems write an accented letter as two characters."""
+def _normalised(name: str) -> str:
+    """The name in Unicode form NFC; some file systems store an accented letter as two characters."""
     return unicodedata.normalize("NFC", name)
 
 
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Sorts 2 before 10."""
+def _natural_key(name: str) -> list[tuple[int, str]]:
+    """A sort key that orders 2 before 10."""
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]

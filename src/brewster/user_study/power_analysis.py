@@ -1,6 +1,6 @@
-"""How many participants a study needs, before anybody is asked.
+"""Power analysis: the number of participants that a study needs.
 
-plan(difference=0.1, tie=0.25).participants    # 45
+required_participants(difference=0.1, tie=0.25).participants    # 45
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from brewster.errors import BrewsterError
 @final
 @dataclass(frozen=True)
 class PowerAnalysis:
-    """The number of participants and what it follows from.
+    """The required number of participants, and the quantities that it is computed from.
 
-    `design_effect` is how many answers of people do what one independent answer would; `deviation` is how far
-    participants' own differences scatter about the mean.
+    `win` and `lose` are the assumed rates. `design_effect` is the number of real answers that carry as much information
+    as one independent answer. `deviation` is the standard deviation of the difference between participants.
     """
 
     participants: int
@@ -30,7 +30,7 @@ class PowerAnalysis:
     deviation: float
 
 
-def plan(
+def required_participants(
     *,
     difference: float,
     tie: float,
@@ -39,34 +39,34 @@ def plan(
     power: float = 0.8,
     level: float = 0.05,
 ) -> PowerAnalysis:
-    """The least number of participants that shows a difference between win and lose rate with this power.
+    """The smallest number of participants that detects a difference between win and lose rate with the given power.
 
     An answer scores 1, 0 or -1 (win, tie, lose), with mean d and variance s^2 = 1 - tie - d^2. Answers of one
-    participant are alike by the intra-participant `correlation` r, so that k of them are worth k / (1 + (k - 1) r)
-    (design effect: Donner and Klar 2000, section 5.2). Two-sided z test, with Guenther's 1981 correction for the variance
-    being estimated: n = (z_level + z_power)^2 s^2 (1 + (k - 1) r) / (k d^2) + z_level^2 / 2.
+    participant have the intraclass `correlation` r, so k of them are worth k / (1 + (k - 1) r) independent answers
+    (design effect: Donner and Klar 2000, section 5.2). Two-sided z test, with the correction of Guenther 1981 for an
+    estimated variance: n = (z_level + z_power)^2 s^2 (1 + (k - 1) r) / (k d^2) + z_level^2 / 2.
 
     Args:
-        difference: the win rate less the lose rate, 0 to 1.
+        difference: the win rate minus the lose rate, 0 to 1.
         tie: the rate of "similar", 0 to 1.
-        pairs: how many pairs of these two methods a participant sees.
-        correlation: of the scores of one participant; reports estimate it.
-        power: the probability of showing the difference if it is there.
-        level: the probability of showing one that is not.
+        pairs: number of pairs of these two methods that a participant sees.
+        correlation: intraclass correlation of the scores of one participant; reports estimate it.
+        power: the probability of detecting the difference if it exists.
+        level: the significance level, the probability of detecting a difference that does not exist.
 
     Raises:
-        BrewsterError: the rates are none.
+        BrewsterError: `difference` is not above 0, or the rates do not sum to 1.
     """
     win, lose = (1 - tie + difference) / 2, (1 - tie - difference) / 2
     if not (0 < difference <= 1 and 0 <= tie < 1 and lose >= 0):
         raise BrewsterError(
-            f"a difference of {difference:g} with {tie:g} ties would be {win:.0%} wins and {lose:.0%} losses",
+            f"a difference of {difference:g} with a tie rate of {tie:g} means {win:.0%} wins and {lose:.0%} losses",
             "a difference above 0 and rates that sum to 1",
-            "choose a smaller difference, or fewer ties",
+            "choose a smaller difference or a smaller tie rate",
         )
     variance = 1 - tie - difference**2
-    effect = 1 + (pairs - 1) * correlation
+    design_effect = 1 + (pairs - 1) * correlation
     critical, reached = NormalDist().inv_cdf(1 - level / 2), NormalDist().inv_cdf(power)
-    least = (critical + reached) ** 2 * variance * effect / (pairs * difference**2) + critical**2 / 2
-    count = math.ceil(least)
-    return PowerAnalysis(count, count * pairs, win, lose, effect, math.sqrt(variance * correlation))
+    minimum = (critical + reached) ** 2 * variance * design_effect / (pairs * difference**2) + critical**2 / 2
+    count = math.ceil(minimum)
+    return PowerAnalysis(count, count * pairs, win, lose, design_effect, math.sqrt(variance * correlation))

@@ -1,12 +1,12 @@
-"""The answers, on the disk before they are acknowledged: SQLite with a write-ahead log, each commit synced.
+"""Store the answers of a study in SQLite, with a write-ahead log and a disk sync after each commit.
 
-    store = Store(study)
+    store = AnswerStore(study)
     participant = store.participant(store.admit())
-    store.answer(participant, 0, "left", seconds=4.2)
+    store.record_answer(participant, 0, "left", seconds=4.2)
 
-A participant is a number and the token of their link: no name, no address, no clock beyond the day of the consent.
-Their trials are drawn once, on admission, and kept, so that no other version of anything can ever change them. The
-first answer to a trial stays: sent again, perhaps because the acknowledgement was lost, it changes nothing.
+For a participant the database has a number, the token of their personal link, and the date of the consent; no name and no
+address. The trials are drawn once, at admission, and stored, so a later version of brewster cannot change them. The first
+answer to a trial is final: a second one, for example after a lost acknowledgement, changes nothing.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from threading import Lock
 from typing import Final, final
 
 from brewster.errors import BrewsterError, TargetError
-from brewster.user_study.assignment import CHOICES, Choice, TrialDraw, draw
-from brewster.user_study.study import ANSWERS, Study
+from brewster.user_study.assignment import CHOICES, Choice, TrialDraw, draw_trials
+from brewster.user_study.study import ANSWERS_FILE, Study
 
-LONGEST_SECONDS: Final = 3600.0
-_PATIENCE_SECONDS: Final = 30.0
+MAX_SECONDS: Final = 3600.0
+_TIMEOUT_SECONDS: Final = 30.0
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS participants (
     number INTEGER PRIMARY KEY, token TEXT NOT NULL UNIQUE, consented_on TEXT NOT NULL, trials TEXT NOT NULL
@@ -43,7 +43,7 @@ CREATE TABLE IF NOT EXISTS answers (
 @final
 @dataclass(frozen=True)
 class Participant:
-    """Somebody with a link: their number from 0, and what they are shown."""
+    """A participant: their number, counted from 0, and their trials in order."""
 
     number: int
     trials: tuple[TrialDraw, ...]
@@ -52,7 +52,7 @@ class Participant:
 @final
 @dataclass(frozen=True)
 class StoredAnswer:
-    """A choice, and how long the pictures were seen until then."""
+    """A choice, and the seconds for which the pictures were shown before it."""
 
     choice: Choice
     seconds: float
@@ -60,152 +60,171 @@ class StoredAnswer:
 
 @final
 class AnswerStore:
-    """The answers of one study. Thread-safe, and several processes may use one study at once.
+    """The answers of one study; safe to use from many threads and many processes at the same time.
 
-    Where it `only_reads`, no answer can be written, and a study that nobody has answered stays without a database.
+    With `read_only`, nothing can be written, and no database file is created for a study without answers.
     """
 
-    def __init__(self, study: Study, *, only_reads: bool = False) -> None:
+    def __init__(self, study: Study, *, read_only: bool = False) -> None:
         self.study = study
-        self._lock, self._only_reads = Lock(), only_reads
-        with self._told():
+        self._lock, self._read_only = Lock(), read_only
+        with self._database_errors():
             self._database = sqlite3.connect(
-                _readable(study.answers) if only_reads else study.answers,
-                timeout=_PATIENCE_SECONDS,
+                _read_only_uri(study.answers_file) if read_only else study.answers_file,
+                timeout=_TIMEOUT_SECONDS,
                 check_same_thread=False,
                 isolation_level=None,
-                uri=only_reads,
+                uri=read_only,
             )
-            if not only_reads:
+            if not read_only:
                 self._database.execute("PRAGMA journal_mode = WAL")
                 self._database.execute("PRAGMA synchronous = FULL")
-                self._gather()
-            if not only_reads or not study.answers.exists():
+                self._checkpoint()
+            if not read_only or not study.answers_file.exists():
                 self._database.executescript(_SCHEMA)
 
     def close(self) -> None:
-        """Lets the file go, with all answers in it."""
+        """Close the database, after moving all answers from the log into the main file."""
         with self._lock:
-            if not self._only_reads:
-                with suppress(sqlite3.Error):  # of a full disk, perhaps: then the log has them
-                    self._gather()
+            if not self._read_only:
+                with suppress(sqlite3.Error):  # for example a full disk; the answers then stay in the log
+                    self._checkpoint()
             self._database.close()
 
-    def _gather(self) -> None:
-        """Moves into the file what a killed server may have left in the log beside it."""
+    def _checkpoint(self) -> None:
+        """Move the content of the write-ahead log into the main file; a killed server leaves answers in the log."""
         self._database.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
 
-    def count(self) -> int:
-        """How many participants were admitted."""
+    def count_participants(self) -> int:
+        """The number of admitted participants."""
         with self._reading() as database:
             (number,) = database.execute("SELECT count(*) FROM participants").fetchone()
         return int(number)
 
-    def admit(self, *, most: int | None = None) -> str | None:
-        """The token of a new participant, who has agreed to take part; None where `most` were admitted already."""
+    def admit(self, *, max_participants: int | None = None) -> str | None:
+        """Add a participant who has given consent.
+
+        Returns:
+            The token of the participant's link, or None if `max_participants` are admitted already.
+        """
         with self._writing() as database:
             (number,) = database.execute("SELECT count(*) FROM participants").fetchone()
-            if most is not None and number >= most:
+            if max_participants is not None and number >= max_participants:
                 return None
             token = secrets.token_urlsafe(24)
-            trials = json.dumps([asdict(trial) for trial in draw(self.study.description, number)])
-            day = datetime.now(UTC).date().isoformat()
-            database.execute("INSERT INTO participants VALUES (?, ?, ?, ?)", (number, token, day, trials))
+            trials = json.dumps([asdict(trial) for trial in draw_trials(self.study.description, number)])
+            today = datetime.now(UTC).date().isoformat()
+            database.execute("INSERT INTO participants VALUES (?, ?, ?, ?)", (number, token, today, trials))
         return token
 
     def participant(self, token: str) -> Participant | None:
-        """Whose link this is; None if it is nobody's."""
+        """The participant with this token, or None."""
         with self._reading() as database:
             row = database.execute(
                 "SELECT number, trials FROM participants WHERE token = ?", (token,)
             ).fetchone()
-        return None if row is None else Participant(row[0], _trials(row[1]))
+        return None if row is None else Participant(row[0], _parse_trials(row[1]))
 
     def next_trial(self, participant: Participant) -> int | None:
-        """The first trial without an answer; None where all have one."""
+        """The index of the first trial without an answer, or None if all trials have one."""
         with self._reading() as database:
             rows = database.execute("SELECT trial FROM answers WHERE participant = ?", (participant.number,))
             answered = {trial for (trial,) in rows}
         return next((trial for trial in range(len(participant.trials)) if trial not in answered), None)
 
-    def answer(self, participant: Participant, trial: int, choice: Choice, *, seconds: float) -> Choice:
-        """Keeps an answer, unless the trial has one; what is kept is on the disk when this returns it.
+    def record_answer(
+        self, participant: Participant, trial: int, choice: Choice, *, seconds: float
+    ) -> Choice:
+        """Store an answer, unless the trial already has one. The answer is synced to the disk on return.
+
+        Args:
+            participant: the participant.
+            trial: the index of the trial, from 0.
+            choice: the participant's choice.
+            seconds: for how long the pictures were shown, clipped to 0..MAX_SECONDS.
+
+        Returns:
+            The stored choice, which is that of the first answer.
 
         Raises:
-            BrewsterError: there is no such trial or choice.
-            TargetError: it cannot be written.
+            BrewsterError: the trial or the choice does not exist.
+            TargetError: the database cannot be written.
         """
         if not 0 <= trial < len(participant.trials) or choice not in CHOICES:
             raise BrewsterError(
                 f"trial {trial} was answered with {choice!r}",
-                f"trials 0 to {len(participant.trials) - 1} and {', '.join(CHOICES)} are known",
+                f"trials 0 to {len(participant.trials) - 1} and {', '.join(CHOICES)} exist",
                 "load the page again",
             )
-        spent = min(max(seconds, 0.0), LONGEST_SECONDS)
+        seconds_shown = min(max(seconds, 0.0), MAX_SECONDS)
         with self._writing() as database:
             database.execute(
                 "INSERT INTO answers VALUES (?, ?, ?, ?) ON CONFLICT DO NOTHING",
-                (participant.number, trial, choice, spent),
+                (participant.number, trial, choice, seconds_shown),
             )
             row = database.execute(
                 "SELECT choice FROM answers WHERE participant = ? AND trial = ?", (participant.number, trial)
             ).fetchone()
-        kept: Choice = row[0]
-        return kept
+        stored: Choice = row[0]
+        return stored
 
-    def everything(self) -> Iterator[tuple[Participant, dict[int, StoredAnswer]]]:
-        """Every participant with their answers by trial, in order of number; also those with none."""
+    def all_answers(self) -> Iterator[tuple[Participant, dict[int, StoredAnswer]]]:
+        """Yield every participant, in order of number, with their answers by trial; the answers may be empty."""
         with self._reading() as database:
             rows = database.execute("SELECT participant, trial, choice, seconds FROM answers").fetchall()
-            # people second: who answered before is there, whatever another process writes meanwhile
-            people = database.execute("SELECT number, trials FROM participants ORDER BY number").fetchall()
-        answers: dict[int, dict[int, StoredAnswer]] = {number: {} for number, _ in people}
+            # read participants after answers: another process may admit participants in between
+            participants = database.execute(
+                "SELECT number, trials FROM participants ORDER BY number"
+            ).fetchall()
+        answers: dict[int, dict[int, StoredAnswer]] = {number: {} for number, _ in participants}
         for number, trial, choice, seconds in rows:
             answers[number][trial] = StoredAnswer(choice, seconds)
-        for number, trials in people:
-            yield Participant(number, _trials(trials)), dict(sorted(answers[number].items()))
+        for number, trials in participants:
+            yield Participant(number, _parse_trials(trials)), dict(sorted(answers[number].items()))
 
     @contextmanager
     def _reading(self) -> Iterator[sqlite3.Connection]:
-        with self._told(), self._lock:
+        with self._database_errors(), self._lock:
             yield self._database
 
     @contextmanager
     def _writing(self) -> Iterator[sqlite3.Connection]:
-        """A transaction that no other writer is beside; it is on the disk when this is left."""
+        """An exclusive write transaction; its changes are synced to the disk at the end of the block."""
         with self._reading() as database:
             database.execute("BEGIN IMMEDIATE")
             try:
                 yield database
                 database.execute("COMMIT")
             except BaseException:
-                if database.in_transaction:  # a full disk has ended it already
+                # SQLite has already rolled back after some errors, such as a full disk
+                if database.in_transaction:
                     database.execute("ROLLBACK")
                 raise
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
+    def _database_errors(self) -> Iterator[None]:
         try:
             yield
         except sqlite3.Error as error:
             raise TargetError(
-                f"{ANSWERS} cannot be used ({error})",  # without its folder: participants may read this
-                "a database that brewster has made, on a disk of this machine with free space",
-                "mend that and start again: what was acknowledged is kept",
+                f"{ANSWERS_FILE} cannot be used ({error})",  # without the folder: participants may see this message
+                "a database created by brewster, on a local disk with free space",
+                "fix the problem and start again; all acknowledged answers are stored",
             ) from error
 
 
-def _readable(file: Path) -> str:
-    """The address under which SQLite only reads a file; an empty database where there is none.
+def _read_only_uri(file: Path) -> str:
+    """The SQLite URI that opens a file read-only, or an empty database in memory if the file does not exist.
 
-    A reader keeps a little file beside it, for the log. Where it cannot, and no log is there, none is needed.
+    A reader of a database in WAL mode creates a shared-memory file in the same folder. In a folder that is not writable,
+    `immutable=1` avoids that; it is correct only if the log is empty.
     """
     if not file.exists():
         return "file::memory:"
     log = file.with_name(f"{file.name}-wal")
-    is_still = not os.access(file.parent, os.W_OK) and not (log.exists() and log.stat().st_size)
-    return f"{file.resolve().as_uri()}?mode=ro{'&immutable=1' if is_still else ''}"
+    is_immutable = not os.access(file.parent, os.W_OK) and not (log.exists() and log.stat().st_size)
+    return f"{file.resolve().as_uri()}?mode=ro{'&immutable=1' if is_immutable else ''}"
 
 
-def _trials(text: str) -> tuple[TrialDraw, ...]:
+def _parse_trials(text: str) -> tuple[TrialDraw, ...]:
     return tuple(TrialDraw(**row) for row in json.loads(text))

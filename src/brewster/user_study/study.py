@@ -1,9 +1,9 @@
-"""A study as it is frozen: its pictures, what is compared with what, and how much of that a participant sees.
+"""The description of a study: its pictures, its comparisons, and the number of trials of a participant.
 
     study = read_study(Path("out/study"))
-    study.picture(study.comparisons[0].photo)    # where that picture lies
+    study.picture(study.comparisons[0].photo)    # digest and size of that picture
 
-`create` writes it, once; nothing changes it afterwards. It alone knows which method made which picture.
+`create` writes the description once; it never changes. No other file says which method made which picture.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from pydantic import TypeAdapter, ValidationError
 from brewster.errors import BrewsterError
 from brewster.files import write_atomically
 
-DESCRIPTION: Final = "study.json"
+DESCRIPTION_FILE: Final = "study.json"
 PICTURES: Final = "pictures"
-ANSWERS: Final = "answers.sqlite"
+ANSWERS_FILE: Final = "answers.sqlite"
 FORMAT: Final = 1
-ONE: Final = ""
-"""What the only dataset is called where the folders have no folders in them."""
+UNNAMED_DATASET: Final = ""
+"""The name of the only dataset if the source folders have no subfolders."""
 
 
 @final
 @dataclass(frozen=True)
 class StudyPicture:
-    """A picture of the study: a PNG of 8-bit sRGB under a name that tells nothing.
+    """A picture of the study: an 8-bit sRGB PNG with a random name.
 
-    `sha256` is the digest of that file, `source_sha256` that of the file it was made from.
+    `width` and `height` are in px; `sha256` is the digest of the PNG file, `source_sha256` that of its source file.
     """
 
     name: str
@@ -47,7 +47,7 @@ class StudyPicture:
 @final
 @dataclass(frozen=True)
 class PairedComparison:
-    """Two methods on one photo, with the names of the three pictures."""
+    """Two methods on one photo: dataset and name of the photo, and the names of the three pictures."""
 
     dataset: str
     name: str
@@ -59,7 +59,7 @@ class PairedComparison:
 @final
 @dataclass(frozen=True)
 class CatchTrial:
-    """What tells whether somebody looks: an output that is shown beside itself, or beside what we spoilt of it."""
+    """Pictures for a catch trial, which tests attention: an output is compared with itself or with a degraded copy."""
 
     dataset: str
     name: str
@@ -71,9 +71,10 @@ class CatchTrial:
 @final
 @dataclass(frozen=True)
 class StudyDescription:
-    """All that is decided before the first answer.
+    """Everything that is fixed before the first answer; the content of study.json.
 
-    `pairs` and `catches` are a participant's; `consent` is what they agree to, paragraphs with an empty line between.
+    `pairs` and `catches` count the comparisons and catch trials of one participant. `consent` is the text that participants
+    agree to, with an empty line between paragraphs.
     """
 
     brewster: str
@@ -95,48 +96,48 @@ _DESCRIPTION: Final = TypeAdapter(StudyDescription)
 @final
 @dataclass(frozen=True)
 class Study:
-    """A description and the folder where it lies."""
+    """A study: its folder and its description."""
 
     folder: Path
     description: StudyDescription
 
-    def file(self, picture: str) -> Path:
-        """Where a picture lies."""
+    def picture_file(self, picture: str) -> Path:
+        """The path of a picture."""
         return self.folder / PICTURES / picture
 
     def picture(self, name: str) -> StudyPicture:
-        """A picture by its name."""
+        """The description of a picture by its name."""
         return self._by_name[name]
 
     @property
-    def answers(self) -> Path:
-        """Where the answers are kept."""
-        return self.folder / ANSWERS
+    def answers_file(self) -> Path:
+        """The path of the database of answers."""
+        return self.folder / ANSWERS_FILE
 
     @property
     def pairs_of_methods(self) -> tuple[tuple[str, str], ...]:
-        """The methods that are compared with each other, in the order of the tables."""
+        """The pairs of methods that are compared, in the order of the tables."""
         return tuple(dict.fromkeys(comparison.methods for comparison in self.description.comparisons))
 
-    def changed(self) -> Iterator[str]:
-        """The names of pictures that are missing or are not what they were."""
+    def changed_pictures(self) -> Iterator[str]:
+        """Yield the names of pictures that are missing or whose digest differs from the description."""
         for picture in self.description.pictures:
-            path = self.file(picture.name)
+            path = self.picture_file(picture.name)
             if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != picture.sha256:
                 yield picture.name
 
-    def refuse_changed(self) -> None:
-        """Refuses a study whose pictures are not those that it was made with.
+    def verify_pictures(self) -> None:
+        """Check that all pictures exist and are unchanged.
 
         Raises:
-            BrewsterError: so it is.
+            BrewsterError: a picture is missing, or its digest differs from the description.
         """
-        changed = list(self.changed())
+        changed = list(self.changed_pictures())
         if changed:
             raise BrewsterError(
-                f"{self.folder / PICTURES / changed[0]} is missing or changed, as are {len(changed) - 1} others",
-                "everybody in a study sees the same pictures",
-                "copy the study again from where it was made",
+                f"{self.folder / PICTURES / changed[0]} is missing or changed, and {len(changed) - 1} others",
+                "all participants of a study see the same pictures",
+                "copy the study again from its original folder",
             )
 
     @cached_property
@@ -145,40 +146,40 @@ class Study:
 
 
 def write_study(folder: Path, description: StudyDescription) -> None:
-    """Writes the description.
+    """Write the description into a folder.
 
     Raises:
-        TargetError: it is there already, or cannot be written.
+        TargetError: the file exists already or cannot be written.
     """
     text = json.dumps(asdict(description), indent=1, ensure_ascii=False)
-    write_atomically(folder / DESCRIPTION, f"{text}\n".encode())
+    write_atomically(folder / DESCRIPTION_FILE, f"{text}\n".encode())
 
 
 def read_study(folder: Path) -> Study:
-    """The study in a folder.
+    """Read the study in a folder.
 
     Raises:
-        BrewsterError: there is none, or its description is not one that this version understands.
+        BrewsterError: the description cannot be read, is invalid, or has a format of another version.
     """
-    place = folder / DESCRIPTION
+    path = folder / DESCRIPTION_FILE
     try:
-        description = _DESCRIPTION.validate_json(place.read_bytes(), extra="forbid")
+        description = _DESCRIPTION.validate_json(path.read_bytes(), extra="forbid")
     except OSError as error:
         raise BrewsterError(
-            f"{place} cannot be read ({error.strerror or error})",
-            "a folder that `brewster study create` has written",
-            "name that folder",
+            f"{path} cannot be read ({error.strerror or error})",
+            "a folder created by `brewster study create`",
+            "check the path",
         ) from error
     except ValidationError as error:
         first = error.errors()[0]
         raise BrewsterError(
-            f"{place} is no description of a study ({'.'.join(map(str, first['loc']))}: {first['msg']})",
-            "it stays as `brewster study create` has written it",
+            f"{path} is not a valid description of a study ({'.'.join(map(str, first['loc']))}: {first['msg']})",
+            "an unchanged file written by `brewster study create`",
             "create the study again",
         ) from error
     if description.format != FORMAT:
         raise BrewsterError(
-            f"{place} has format {description.format}",
+            f"{path} has format {description.format}",
             f"this version reads format {FORMAT}",
             f"use brewster {description.brewster}",
         )

@@ -1,1 +1,1 @@
-"""The front doors in a browser: a page that separates photos, and the study; fastapi is used in this room only."""
+"""The web server for two browser pages: one separates photos, one runs the user study. Only this package uses FastAPI."""

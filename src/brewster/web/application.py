@@ -1,8 +1,8 @@
-"""The application behind both front doors: routers, a guard, the files of the page, and errors as sentences.
+"""The FastAPI application of both pages: routers, request limits, page files, and errors as JSON.
 
-    serve(application(router, guard=Guard.at("127.0.0.1")), host="127.0.0.1", port=8417)
+    serve(create_app(router, limits=RequestLimits.for_host("127.0.0.1")), host="127.0.0.1", port=8417)
 
-Everything comes from this package: no remote asset, so that it works offline.
+All assets are files of this package, so the pages work offline.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ from brewster.errors import (
     UnreadablePhoto,
     UnsupportedPhoto,
 )
-from brewster.web.middleware import HEADERS, LimitMiddleware, RequestLimits
-from brewster.web.request_schema import explain
-from brewster.web.server import server
+from brewster.web.middleware import SECURITY_HEADERS, LimitMiddleware, RequestLimits
+from brewster.web.request_schema import validation_message
+from brewster.web.server import create_server
 
 PAGE: Final = Path(__file__).parent / "page"
-_STATUSES: Final[dict[type[BrewsterError], int]] = {
+_STATUS_CODES: Final[dict[type[BrewsterError], int]] = {
     PhotoTooLarge: 413,
     UnreadablePhoto: 422,
     UnsupportedPhoto: 415,
@@ -48,53 +48,59 @@ _STATUSES: Final[dict[type[BrewsterError], int]] = {
     TargetError: 500,
     DownloadError: 502,
 }
-"""Of errors that are not named here, the asker is to blame: 422."""
+"""HTTP status by error class; other BrewsterErrors are caused by the request and get 422."""
 
 
-def application(*routers: APIRouter, guard: RequestLimits, home: str = "index.html") -> FastAPI:
-    """An application of these routers whose first page is the file `home` in web/page/, behind the guard."""
+def create_app(*routers: APIRouter, limits: RequestLimits, index: str = "index.html") -> FastAPI:
+    """Create an application.
+
+    Args:
+        routers: the routes of the API.
+        limits: checked before every request.
+        index: the file in web/page/ that is served at `/`.
+    """
     app = FastAPI(title="brewster", version=brewster.__version__, docs_url=None, redoc_url=None)
-    app.add_middleware(LimitMiddleware, guard=guard)
+    app.add_middleware(LimitMiddleware, limits=limits)
     for kind in (ClientDisconnect, HTTPException, RequestValidationError, BrewsterError, Exception):
-        app.add_exception_handler(kind, _explain)
+        app.add_exception_handler(kind, _error_response)
     for router in routers:
         app.include_router(router)
-    _show(app, "/", home)
+    _add_page(app, "/", index)
     for file in sorted(PAGE.iterdir()):
-        _show(app, f"/page/{file.name}", file.name)
+        _add_page(app, f"/page/{file.name}", file.name)
     return app
 
 
-def page(name: str) -> Response:
-    """A file of web/page/, to be asked for again each time."""
+def page_response(name: str) -> Response:
+    """A file of web/page/; browsers revalidate it on each use."""
     return FileResponse(PAGE / name, headers={"Cache-Control": "no-cache"})
 
 
-def _show(app: FastAPI, path: str, name: str) -> None:
-    app.get(path, include_in_schema=False)(lambda: page(name))
+def _add_page(app: FastAPI, path: str, name: str) -> None:
+    app.get(path, include_in_schema=False)(lambda: page_response(name))
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A socket that listens; port 0 takes a free one.
+    """Open a listening socket; port 0 takes a free port.
 
     Raises:
-        TargetError: the address cannot be had.
+        TargetError: the address or the port cannot be used.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         return socket.create_server((host, port), family=family, backlog=128)
     except OSError as error:
         raise TargetError(
-            f"{host} port {port} cannot be listened on ({error.strerror})",
+            f"{host} port {port} cannot be used ({error.strerror})",
             "an address of this machine and a free port",
             "choose others with --host and --port",
         ) from error
 
 
-def address(listening: socket.socket) -> str:
-    """The URL of a listening socket, as a browser takes it."""
+def server_url(listening: socket.socket) -> str:
+    """The URL of a listening socket for a browser; a wildcard address becomes a loopback address."""
     host, port = listening.getsockname()[:2]
-    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104  (read, not bound)
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)  # noqa: S104  (nothing is bound here)
     return f"http://[{host}]:{port}/" if ":" in host else f"http://{host}:{port}/"
 
 
@@ -105,42 +111,48 @@ def serve(
     port: int,
     on_ready: Callable[[str], None] = print,
 ) -> None:
-    """Serves until it is interrupted; `on_ready` is told the URL when browsers may come. For a main thread only.
+    """Serve the application until it is interrupted. Call this in the main thread, because it handles signals.
+
+    Args:
+        app: the application.
+        host: the address to bind to.
+        port: the port; 0 takes a free port.
+        on_ready: called with the URL when the socket is open.
 
     Raises:
-        KeyboardInterrupt: the usual end, by Ctrl-C or SIGTERM.
-        TargetError: the address cannot be had.
+        KeyboardInterrupt: Ctrl-C or SIGTERM has ended the server.
+        TargetError: the address or the port cannot be used.
     """
-    with _terminated_as_interrupted(), listen(host, port) as listening:
-        on_ready(address(listening))
-        server(app).run(sockets=[listening])
+    with _sigterm_as_sigint(), listen(host, port) as listening:
+        on_ready(server_url(listening))
+        create_server(app).run(sockets=[listening])
 
 
 @contextmanager
-def _terminated_as_interrupted() -> Iterator[None]:
-    """SIGTERM does what Ctrl-C does: uvicorn sends itself the signal once more when it has ended, to die of it."""
-    former = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+def _sigterm_as_sigint() -> Iterator[None]:
+    """Handle SIGTERM like Ctrl-C. uvicorn raises the signal again after its shutdown, which would kill the process."""
+    previous_handler = signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, former)
+        signal.signal(signal.SIGTERM, previous_handler)
 
 
-async def _explain(request: Request, error: Exception) -> Response:
-    """Every error as JSON, `{"error": sentence}`."""
+async def _error_response(request: Request, error: Exception) -> Response:
+    """Any error as JSON, `{"error": message}`."""
     if isinstance(error, ClientDisconnect):
-        return Response(status_code=499)  # nobody reads it
+        return Response(status_code=499)  # the client does not read it
     if isinstance(error, HTTPException):
-        return JSONResponse({"error": _sentence(request, error)}, error.status_code, error.headers)
+        return JSONResponse({"error": _http_error_message(request, error)}, error.status_code, error.headers)
     if isinstance(error, RequestValidationError):
-        return JSONResponse({"error": explain(error.errors())}, 422)
+        return JSONResponse({"error": validation_message(error.errors())}, 422)
     if isinstance(error, BrewsterError):
-        return JSONResponse({"error": str(error)}, _STATUSES.get(type(error), 422))
-    told = {"error": f"brewster stumbled ({type(error).__name__}); please report it"}
-    return JSONResponse(told, 500, HEADERS)  # this answer does not pass the guard
+        return JSONResponse({"error": str(error)}, _STATUS_CODES.get(type(error), 422))
+    body = {"error": f"brewster has an internal error ({type(error).__name__}); please report it"}
+    return JSONResponse(body, 500, SECURITY_HEADERS)  # Starlette sends this response outside LimitMiddleware
 
 
-def _sentence(request: Request, error: HTTPException) -> str:
+def _http_error_message(request: Request, error: HTTPException) -> str:
     if error.detail != HTTPStatus(error.status_code).phrase:
         return error.detail
-    return f"there is no {request.method} {request.url.path} here; GET /openapi.json tells what there is"
+    return f"{request.method} {request.url.path} does not exist; GET /openapi.json lists the routes"

@@ -1,11 +1,11 @@
-"""The desk where work is handed in: few at a time, a short queue, a time limit, and every job can be stopped.
+"""A job queue with a few worker threads, a limited number of waiting jobs, a time limit, and cancellation.
 
-    desk = Desk()
-    with desk.place("a name") as job:
-        answer = await desk.do(job, work, request.receive)
+    job_queue = JobQueue()
+    with job_queue.reserve("a name") as job:
+        result = await job_queue.run_job(job, work, request.receive)
 
-`work(on_progress)` runs in a thread. It calls `on_progress(share done)` as often as it can: that is where it is stopped when the
-client goes away or time is over.
+`work(on_progress)` runs in a thread and calls `on_progress(share)` often. This call raises JobCancelled if the client has
+disconnected or the time limit is exceeded.
 """
 
 from __future__ import annotations
@@ -24,44 +24,44 @@ from starlette.types import Receive
 
 from brewster.inference.predictor import ProgressCallback
 
-Answer = TypeVar("Answer")
+Result = TypeVar("Result")
 
 
 @final
 class JobCancelled(Exception):
-    """Raised within the work, to end it."""
+    """Raised inside the work function to stop it."""
 
 
 @final
 @dataclass(frozen=True)
 class JobProgress:
-    """How a job stands."""
+    """The progress of a job."""
 
     state: Literal["waiting", "working"]
     ahead: int
-    """How many others are waiting or worked on before it, while it waits."""
+    """Number of jobs before this one while it waits, running jobs included; 0 while it runs."""
     share: float
-    """How much of it is done, 0..1."""
+    """The completed share, 0..1."""
 
 
 @final
 @dataclass(eq=False)
 class SeparationJob:
-    """One piece of work, from the moment it has a place until its thread has let it go."""
+    """One job, from the reservation of its place until its thread has finished."""
 
     share: float = 0.0
     is_working: bool = False
     future: Future[Any] | None = None
-    stopped: Event = field(default_factory=Event)
+    cancelled: Event = field(default_factory=Event)
 
     def on_progress(self, share: float) -> None:
-        """What the work calls."""
-        if self.stopped.is_set():
+        """Record the completed share; raises JobCancelled if the job is cancelled."""
+        if self.cancelled.is_set():
             raise JobCancelled
         self.share = share
 
-    def run(self, work: Callable[[ProgressCallback], Answer]) -> Answer:
-        """The work, in its thread."""
+    def run(self, work: Callable[[ProgressCallback], Result]) -> Result:
+        """Run the work function; called in a worker thread."""
         self.on_progress(0)
         self.is_working = True
         return work(self.on_progress)
@@ -69,82 +69,99 @@ class SeparationJob:
 
 @final
 class JobQueue:
-    """Takes jobs within one event loop and has them done in threads."""
+    """Runs jobs of one event loop in worker threads.
 
-    def __init__(self, *, workers: int = 1, queue: int = 16, seconds: float = 300) -> None:
-        self.workers, self.queue, self.seconds = workers, queue, seconds
-        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="desk")
+    Args:
+        workers: number of threads.
+        max_waiting: number of jobs that may wait; more are refused.
+        timeout_seconds: how long a job may wait and run in total.
+    """
+
+    def __init__(self, *, workers: int = 1, max_waiting: int = 16, timeout_seconds: float = 300) -> None:
+        self.workers, self.max_waiting, self.timeout_seconds = workers, max_waiting, timeout_seconds
+        self._pool = ThreadPoolExecutor(workers, thread_name_prefix="brewster-job")
         self._jobs: dict[object, SeparationJob] = {}
 
     @property
     def jobs(self) -> int:
-        """How many jobs have a place."""
+        """Number of waiting and running jobs."""
         return len(self._jobs)
 
     def progress(self, name: str) -> JobProgress | None:
-        """How the job of this name stands; None if there is none."""
-        job, names = self._jobs.get(name), list(self._jobs)  # a thread may end a job at any time
+        """The progress of the job with this name, or None if there is no such job."""
+        job, names = self._jobs.get(name), list(self._jobs)  # another thread may remove a job at any time
         if job is None or name not in names:
             return None
         ahead = 0 if job.is_working else names.index(name)
         return JobProgress("working" if job.is_working else "waiting", ahead, job.share)
 
     @contextmanager
-    def place(self, name: str | None = None) -> Iterator[SeparationJob]:
-        """A place for a job, to be taken before its bytes are; it is free again when no thread works on it.
+    def reserve(self, name: str | None = None) -> Iterator[SeparationJob]:
+        """Reserve a place for a job, before its upload is read. The place is released when no thread works on the job.
 
         Raises:
-            HTTPException: 503: all places are taken; 409: there is a job of this name.
+            HTTPException: 503 if the queue is full; 409 if a job with this name exists.
         """
-        if self.jobs >= self.workers + self.queue:
+        if self.jobs >= self.workers + self.max_waiting:
             raise HTTPException(
-                503, f"{self.jobs} photos are waiting already; try again in a moment", {"Retry-After": "5"}
+                503,
+                f"the queue is full with {self.jobs} photos; try again in a few seconds",
+                {"Retry-After": "5"},
             )
         if name in self._jobs:
-            raise HTTPException(409, f"there is a job {name} already; choose another name")
+            raise HTTPException(409, f"a job with the name {name} exists already; choose another name")
         job, key = SeparationJob(), name or object()
         self._jobs[key] = job
         try:
             yield job
         finally:
-            job.stopped.set()
-            self._free(key, job.future)
+            job.cancelled.set()
+            self._release(key, job.future)
 
-    def _free(self, key: object, future: Future[Any] | None) -> None:
+    def _release(self, key: object, future: Future[Any] | None) -> None:
         if future is None or future.cancel():
             del self._jobs[key]
         else:
             future.add_done_callback(lambda _: self._jobs.pop(key))
 
-    async def do(
-        self, job: SeparationJob, work: Callable[[ProgressCallback], Answer], receive: Receive
-    ) -> Answer:
-        """The answer of the work.
+    async def run_job(
+        self, job: SeparationJob, work: Callable[[ProgressCallback], Result], receive: Receive
+    ) -> Result:
+        """Run a work function in a worker thread.
+
+        Args:
+            job: the reserved job.
+            work: the function to run.
+            receive: the ASGI receive channel of the request; it reports when the client disconnects.
+
+        Returns:
+            The result of `work`.
 
         Raises:
-            HTTPException: 504: it was not done in time.
-            ClientDisconnect: nobody waits for the answer any more, as `receive` tells.
+            HTTPException: 504 if the time limit is exceeded.
+            ClientDisconnect: the client has disconnected.
         """
-        future: Future[Answer] = self._pool.submit(job.run, work)
+        future: Future[Result] = self._pool.submit(job.run, work)
         job.future, answer = future, asyncio.wrap_future(future)
-        gone = asyncio.ensure_future(_gone(receive))
+        disconnected = asyncio.ensure_future(_wait_for_disconnect(receive))
         try:
             done, _ = await asyncio.wait(
-                (answer, gone), timeout=self.seconds, return_when=asyncio.FIRST_COMPLETED
+                (answer, disconnected), timeout=self.timeout_seconds, return_when=asyncio.FIRST_COMPLETED
             )
             if answer in done:
                 return answer.result()
-            if gone in done:
+            if disconnected in done:
                 raise ClientDisconnect
             raise HTTPException(
-                504, f"it took longer than {self.seconds:g} seconds; try a smaller photo, or quality draft"
+                504,
+                f"the separation took longer than {self.timeout_seconds:g} seconds; try a smaller photo or quality draft",
             )
         finally:
-            job.stopped.set()
+            job.cancelled.set()
             answer.cancel()
-            gone.cancel()
+            disconnected.cancel()
 
 
-async def _gone(receive: Receive) -> None:
+async def _wait_for_disconnect(receive: Receive) -> None:
     while (await receive())["type"] != "http.disconnect":
         pass

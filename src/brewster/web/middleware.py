@@ -1,9 +1,9 @@
-"""Who may ask, and how much: the checks before every request, whatever application stands behind them.
+"""ASGI middleware that checks host, origin, token and body size of every request.
 
-    app.add_middleware(Guarded, guard=Guard.at("127.0.0.1"))
+    app.add_middleware(LimitMiddleware, limits=RequestLimits.for_host("127.0.0.1"))
 
-A page from elsewhere must not reach a server on this machine through its reader's browser: a foreign Host (DNS
-rebinding) is refused, and so is a post from a foreign page. There is no CORS at all.
+A page of another site must not use a local server through the user's browser. So a request with a foreign Host header (DNS
+rebinding) is refused, and so is a POST from a foreign origin. There are no CORS headers.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from starlette.responses import HTMLResponse, JSONResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 LOOPBACK: Final = frozenset({"127.0.0.1", "localhost", "::1"})
-_SAFE: Final = ("GET", "HEAD", "OPTIONS")
+_SAFE_METHODS: Final = ("GET", "HEAD", "OPTIONS")
 _DRAIN_SECONDS: Final = 10.0
-_DIGITS: Final = 18  # of a length in bytes; Python reads no endless ones
-HEADERS: Final = {
+_MAX_LENGTH_DIGITS: Final = 18  # of Content-Length; int() refuses very long numbers
+SECURITY_HEADERS: Final = {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
         "connect-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
@@ -39,196 +39,202 @@ HEADERS: Final = {
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
 }
-"""What every answer says to a browser."""
+"""Headers of every response."""
 _HOST: Final = re.compile(r"(\[[0-9a-fA-F:.]+\]|[^\[\]:@/?#\s]+)(:[0-9]{1,5})?")
-_ENTRANCE: Final = '<!doctype html><title>brewster</title><p>The token fits. <a href="{0}">Go on</a>.</p>'
+_REDIRECT_PAGE: Final = (
+    '<!doctype html><title>brewster</title><p>The token is valid. <a href="{0}">Continue</a>.</p>'
+)
 
 
 @final
 @dataclass(frozen=True)
 class RequestLimits:
-    """What is let in."""
+    """Limits for the requests to a server."""
 
     hosts: frozenset[str] = LOOPBACK
-    """Names and addresses that a request may call this server by."""
+    """Host names and addresses that a Host header may contain."""
     any_address: bool = False
-    """Whether every bare address will do as well: DNS cannot bend one, as it bends a name."""
+    """Whether the Host header may contain any IP address. DNS rebinding needs a name, so this is safe."""
     token: str | None = None
-    """What a request must bring: in `Authorization: Bearer`, once as `?token=`, or in the cookie that this gives."""
+    """The token that every request needs: in `Authorization: Bearer`, or in the cookie that a GET with `?token=` sets."""
     max_bytes: int = 100_000_000
-    """The longest body."""
+    """The maximum size of a request body."""
     body_seconds: float = 120
-    """How long a body may take to arrive."""
+    """The time limit for receiving a request body."""
 
     @property
-    def cookie(self) -> str:
-        """What the cookie is called: servers of one host share their cookies, whatever their ports."""
+    def cookie_name(self) -> str:
+        """The name of the cookie, different for each token: servers on one host share cookies, even with different ports."""
         return f"brewster-{hashlib.sha256((self.token or '').encode()).hexdigest()[:8]}"
 
     @classmethod
-    def at(cls, host: str, *, token: str | None = None, max_bytes: int = 100_000_000) -> RequestLimits:
-        """The guard of a server bound to an address: it is called by that, by its own name, or by loopback."""
+    def for_host(cls, host: str, *, token: str | None = None, max_bytes: int = 100_000_000) -> RequestLimits:
+        """Limits of a server bound to an address; it may be called by this address, its host name, or a loopback address."""
         if is_loopback(host):
             return cls(LOOPBACK | {host}, token=token, max_bytes=max_bytes)
         names = {host.lower(), socket.gethostname().lower()}
-        everywhere = host in ("0.0.0.0", "::")  # noqa: S104  (compared, not bound)
-        return cls(LOOPBACK | names, everywhere, token, max_bytes)
+        is_wildcard = host in ("0.0.0.0", "::")  # noqa: S104  (nothing is bound here)
+        return cls(LOOPBACK | names, is_wildcard, token, max_bytes)
 
-    def knows(self, host: str) -> bool:
-        """Whether a Host header, port and all, is one of ours."""
-        called = _HOST.fullmatch(host)
-        name = called[1].strip("[]").lower() if called else ""
-        return name in self.hosts or (self.any_address and _is_address(name))
+    def allows_host(self, host: str) -> bool:
+        """Whether a Host header, with or without a port, names this server."""
+        match = _HOST.fullmatch(host)
+        name = match[1].strip("[]").lower() if match else ""
+        return name in self.hosts or (self.any_address and _is_ip_address(name))
 
-    def opens_to(self, token: str | None) -> bool:
-        """Whether a token, or none, is enough."""
+    def accepts_token(self, token: str | None) -> bool:
+        """Whether the token is correct, or none is needed. The comparison takes constant time."""
         if self.token is None or token is None:
             return self.token is None
         return secrets.compare_digest(token.encode(), self.token.encode())
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address to bind to can be reached from this machine only."""
-    return host in LOOPBACK or (_is_address(host) and ipaddress.ip_address(host).is_loopback)
+    """Whether only this machine can reach a server bound to this address."""
+    return host in LOOPBACK or (_is_ip_address(host) and ipaddress.ip_address(host).is_loopback)
 
 
 @final
 class LimitMiddleware:
-    """Pure ASGI: lets a request through to `app`, or answers it itself with a status and `{"error": sentence}`."""
+    """Pure ASGI middleware: passes a request to `app`, or refuses it with a status and `{"error": message}`."""
 
-    def __init__(self, app: ASGIApp, *, guard: RequestLimits) -> None:
-        self.app, self.guard = app, guard
+    def __init__(self, app: ASGIApp, *, limits: RequestLimits) -> None:
+        self.app, self.limits = app, limits
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request."""
+        """Handle one request."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        exchange = _Exchange(self.guard, receive, send)
+        exchange = _Exchange(self.limits, receive, send)
         try:
-            answer = self._answer(scope, Headers(scope=scope)) or self.app
-            await answer(scope, exchange.receive, exchange.send)
-        except HTTPException as error:  # of an application that does not answer them itself
-            await _no(error.status_code, error.detail)(scope, exchange.receive, exchange.send)
-        except asyncio.CancelledError:  # nobody cancels a request but a server that ends
-            if not exchange.has_begun:
-                await _no(503, "the server is being stopped; start it again, then try again")(
-                    scope, exchange.receive, exchange.pass_on
-                )
+            response = self._refusal(scope, Headers(scope=scope)) or self.app
+            await response(scope, exchange.receive, exchange.send)
+        except HTTPException as error:  # from an application without its own handler
+            await _error_response(error.status_code, error.detail)(scope, exchange.receive, exchange.send)
+        except asyncio.CancelledError:  # only the shutdown of the server cancels a request
+            if not exchange.has_started:
+                await _error_response(
+                    503, "the server is being stopped; start it again and repeat the request"
+                )(scope, exchange.receive, exchange.forward)
 
-    def _answer(self, scope: Scope, headers: Headers) -> Response | None:
-        """What is said to a request that goes no further; None lets it through."""
-        guard, method = self.guard, scope["method"]
-        if not guard.knows(headers.get("host", "")):
-            return _no(
-                421, "this server was called by a name that is not its own; use the address it printed"
+    def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
+        """The response that refuses a request, or None to pass it on."""
+        limits, method = self.limits, scope["method"]
+        if not limits.allows_host(headers.get("host", "")):
+            return _error_response(
+                421, "the Host header does not name this server; use the address that the server printed"
             )
-        if method not in _SAFE and not _comes_from_here(headers):
-            return _no(403, "the request comes from another site; only this server's own page may send here")
-        offered = parse_qs(scope["query_string"].decode("latin-1")).get("token", [None])[0]
-        if guard.token and offered and method == "GET" and guard.opens_to(offered):
-            return _entrance(scope["path"], guard)
-        if not guard.opens_to(_brought(headers, guard.cookie)):
-            return _no(
-                401, "a token is needed; open the link that the server printed, or send it as a Bearer"
+        if method not in _SAFE_METHODS and not _is_same_origin(headers):
+            return _error_response(
+                403, "the request comes from another site; only the page of this server may send it"
+            )
+        query_token = parse_qs(scope["query_string"].decode("latin-1")).get("token", [None])[0]
+        if limits.token and query_token and method == "GET" and limits.accepts_token(query_token):
+            return _redirect_with_cookie(scope["path"], limits)
+        if not limits.accepts_token(_request_token(headers, limits.cookie_name)):
+            return _error_response(
+                401,
+                "a token is needed; open the link that the server printed, or send the token as a Bearer token",
             )
         length = headers.get("content-length", "0")
-        if not length.isdecimal() or len(length) > _DIGITS or int(length) > guard.max_bytes:
-            raise _too_long(guard)
+        if not length.isdecimal() or len(length) > _MAX_LENGTH_DIGITS or int(length) > limits.max_bytes:
+            raise _body_too_long(limits)
         return None
 
 
 @final
 class _Exchange:
-    """One request and its answer: counts and times the body, and adds the headers that every answer has."""
+    """One request and its response: limits size and time of the body, and adds SECURITY_HEADERS to the response."""
 
-    def __init__(self, guard: RequestLimits, receive: Receive, send: Send) -> None:
-        self._guard, self._receive, self._send = guard, receive, send
-        self._bytes, self._is_whole, self._is_drained = 0, False, False
-        self.has_begun = False
-        self._deadline = asyncio.get_running_loop().time() + guard.body_seconds
+    def __init__(self, limits: RequestLimits, receive: Receive, send: Send) -> None:
+        self._limits, self._receive, self._send = limits, receive, send
+        self._bytes, self._is_complete, self._is_draining = 0, False, False
+        self.has_started = False
+        self._deadline = asyncio.get_running_loop().time() + limits.body_seconds
 
     async def receive(self) -> Message:
-        """The next piece of the body; afterwards the end of the connection.
+        """Receive the next part of the body; after its end, the disconnection of the client.
 
         Raises:
-            HTTPException: 413, 408: the body is too long, or takes too long.
+            HTTPException: 413 if the body is too large; 408 if it takes too long.
         """
-        if self._is_whole:
+        if self._is_complete:
             return await self._receive()
         try:
             async with asyncio.timeout_at(self._deadline):
                 message = await self._receive()
         except TimeoutError as error:
-            self._is_whole = True  # no more of it is waited for
+            self._is_complete = True  # do not wait for the rest
             raise HTTPException(
-                408, f"the upload took longer than {self._guard.body_seconds:g} seconds; send it again"
+                408, f"the upload took longer than {self._limits.body_seconds:g} seconds; send it again"
             ) from error
         self._bytes += len(message.get("body", b""))
-        self._is_whole = not message.get("more_body", False)
-        if self._bytes > self._guard.max_bytes and not self._is_drained:
-            raise _too_long(self._guard)
+        self._is_complete = not message.get("more_body", False)
+        if self._bytes > self._limits.max_bytes and not self._is_draining:
+            raise _body_too_long(self._limits)
         return message
 
     async def send(self, message: Message) -> None:
-        """Passes the answer on. Its end waits for the rest of the body: a client that is cut off reads no answer."""
+        """Send a message. The last one waits for the rest of the body: a client whose upload is cut off reads no response."""
         is_end = message["type"] == "http.response.body" and not message.get("more_body", False)
-        if not is_end or self._is_whole:
-            await self.pass_on(message)
+        if not is_end or self._is_complete:
+            await self.forward(message)
             return
         await self._send({**message, "more_body": True})
         await self._drain()
         await self._send({"type": "http.response.body", "body": b""})
 
-    async def pass_on(self, message: Message) -> None:
-        """Passes the answer on and waits for nothing."""
+    async def forward(self, message: Message) -> None:
+        """Send a message without waiting for the rest of the body."""
         if message["type"] == "http.response.start":
-            self.has_begun = True
+            self.has_started = True
             headers = MutableHeaders(scope=message)
-            for name, value in HEADERS.items():
+            for name, value in SECURITY_HEADERS.items():
                 headers.setdefault(name, value)
         await self._send(message)
 
     async def _drain(self) -> None:
-        self._is_drained = True
+        self._is_draining = True
         self._deadline = asyncio.get_running_loop().time() + _DRAIN_SECONDS
         try:
-            while not self._is_whole:
+            while not self._is_complete:
                 await self.receive()
         except HTTPException:
             return
 
 
-def _no(status: int, sentence: str) -> Response:
+def _error_response(status: int, sentence: str) -> Response:
     return JSONResponse({"error": sentence}, status)
 
 
-def _too_long(guard: RequestLimits) -> HTTPException:
-    limit = f"{guard.max_bytes / 1e6:g} MB"
-    return HTTPException(413, f"the upload is longer than {limit}; send a smaller one")
+def _body_too_long(limits: RequestLimits) -> HTTPException:
+    limit = f"{limits.max_bytes / 1e6:g} MB"
+    return HTTPException(413, f"the upload is larger than {limit}; send a smaller file")
 
 
-def _entrance(path: str, guard: RequestLimits) -> Response:
-    """Gives the cookie and goes on without the token in the address.
+def _redirect_with_cookie(path: str, limits: RequestLimits) -> Response:
+    """A page that sets the cookie and loads the address without the token.
 
-    This is a page and no redirect: browsers bring a strict cookie only where this server's own page sent them.
+    This is a page with a refresh and not an HTTP redirect: browsers send a SameSite=strict cookie only with a navigation
+    that starts on a page of this server.
     """
-    place = "/" + quote(path.lstrip("/"))
-    answer = HTMLResponse(_ENTRANCE.format(place), headers={"Refresh": f"0; url={place}"})
-    answer.set_cookie(guard.cookie, guard.token or "", httponly=True, samesite="strict")
-    return answer
+    target = "/" + quote(path.lstrip("/"))
+    response = HTMLResponse(_REDIRECT_PAGE.format(target), headers={"Refresh": f"0; url={target}"})
+    response.set_cookie(limits.cookie_name, limits.token or "", httponly=True, samesite="strict")
+    return response
 
 
-def _brought(headers: Headers, cookie: str) -> str | None:
-    """The token in the header or the cookie."""
+def _request_token(headers: Headers, cookie: str) -> str | None:
+    """The token of the Authorization header or the cookie, or None."""
     kind, _, token = headers.get("authorization", "").partition(" ")
     if kind.lower() == "bearer":
         return token.strip()
     return cookie_parser(headers.get("cookie", "")).get(cookie)
 
 
-def _comes_from_here(headers: Headers) -> bool:
-    """Browsers say where a post comes from. Where nothing is said there is no browser, hence no page behind it."""
+def _is_same_origin(headers: Headers) -> bool:
+    """Whether a POST comes from a page of this server, or from a client that is not a browser and sends no origin."""
     origin = headers.get("origin")
     if origin is not None:
         return _netloc(origin) == headers["host"]
@@ -238,11 +244,11 @@ def _comes_from_here(headers: Headers) -> bool:
 def _netloc(origin: str) -> str | None:
     try:
         return urlsplit(origin).netloc
-    except ValueError:  # such as [ without ]
+    except ValueError:  # for example "[" without "]"
         return None
 
 
-def _is_address(name: str) -> bool:
+def _is_ip_address(name: str) -> bool:
     try:
         ipaddress.ip_address(name)
     except ValueError:

@@ -1,4 +1,4 @@
-"""The models that a server knows: those named when it was started and those of the zoo, each loaded once."""
+"""The models of a server: those of its command line and those of the zoo, each loaded once."""
 
 from __future__ import annotations
 
@@ -16,18 +16,23 @@ from brewster.models import zoo
 
 @final
 class ModelRow(BaseModel):
-    """A model that can be asked for."""
+    """A model that clients can choose."""
 
     name: str
     licence: str
     sha256: str | None
     card: str | None
-    """Markdown: what it was trained on, what it scores, where it fails."""
+    """The model card in Markdown: training data, scores, limits."""
 
 
 @final
 class ModelCache:
-    """Models by name, the default first. A client names a model, never a path."""
+    """Models by name, the default first. Clients choose a model by name, never by path.
+
+    Args:
+        models: names or paths of models, before those of the zoo.
+        device: the device for all models, as in `Separator.load`.
+    """
 
     def __init__(self, models: Sequence[str] = (), *, device: str = "auto") -> None:
         self._sources: dict[str, str] = {}
@@ -40,27 +45,27 @@ class ModelCache:
         name = Path(source).name if zoo.is_large(source) else zoo.find_model(source).name
         if name in self._sources:
             raise ModelError(
-                f"{source} and {self._sources[name]} are both called {name}",
+                f"{source} and {self._sources[name]} have the same name {name}",
                 "clients choose models by name",
-                "rename the file",
+                "rename one of the files",
             )
         self._sources[name] = source
 
     @property
     def names(self) -> list[str]:
-        """What can be asked for, the default first."""
+        """The names of the models, the default first."""
         return list(self._sources)
 
     def rows(self) -> list[ModelRow]:
-        """What there is to know of each model."""
-        return [_row(name, source) for name, source in self._sources.items()]
+        """Name, licence, digest and card of each model."""
+        return [_model_row(name, source) for name, source in self._sources.items()]
 
     def separator(self, name: str) -> Separator:
-        """The separator of a model, loaded when it is first asked for; safe to call from many threads.
+        """The separator of a model, loaded on first use; safe to call from many threads.
 
         Raises:
-            ModelError: its file is damaged.
-            DeviceError: the server's device is not available.
+            ModelError: the model file is damaged.
+            DeviceError: the device is not available.
         """
         with self._lock:
             if name not in self._loaded:
@@ -68,12 +73,12 @@ class ModelCache:
             return self._loaded[name]
 
 
-def _row(name: str, source: str) -> ModelRow:
+def _model_row(name: str, source: str) -> ModelRow:
     if zoo.is_large(source):
         return ModelRow(name=name, licence="that of its base", sha256=None, card=None)
     model = zoo.find_model(source)
     try:
         card = model.card()
-    except ModelError:  # a user's own file needs none
+    except ModelError:  # a model file of the user has no card
         card = None
     return ModelRow(name=name, licence=model.licence, sha256=model.sha256, card=card)

@@ -1,7 +1,7 @@
-"""What the page shows of a separation: maps small enough to be composited in the browser at any strength.
+"""Small maps of a separation, from which the browser computes the layers at any strength.
 
-The photo is made smaller first and then separated in floats, so that nothing is rounded or clipped. The browser
-computes, in linear light (page/light.js does the same sums):
+The photo is reduced first and then separated in floating point, so the layers are not rounded or clipped. The browser
+computes in linear light, in page/light.js:
 
     transmission = max(photo + strength x (transmission at 1 - photo), 0)
     reflection   = min(strength x reflection at 1, photo)
@@ -23,48 +23,63 @@ from brewster.photo import Photo
 from brewster.srgb import to_encoded
 
 PREVIEW_PIXELS: Final = 1_400_000
-"""Larger photos are made smaller: about as many pixels as a window shows."""
+"""Larger photos are reduced to about this number of pixels, which fills a window."""
 
-LOWEST, HIGHEST = -1.0, 2.0
-"""Linear light that the 16-bit numbers of a transmission at full strength stand for, from 0 to 65535."""
+RANGE_MIN, RANGE_MAX = -1.0, 2.0
+"""The linear light of the 16-bit values 0 and 65535 in the transmission map."""
 
-_FAINT: Final = 1 / 64
-"""Strength asked for in place of 1: layers so faint are not clipped, and grow in proportion."""
+_SMALL_STRENGTH: Final = 1 / 64
+"""The strength of the separation. At so small a strength no layer is clipped, and the layers scale linearly to 1."""
 
 
 def preview(
     separator: Separator, photo: Photo, options: Options, on_progress: Callable[[float], None]
 ) -> bytes:
-    """Four maps of one size after a line of JSON: `width`, `height`, `full` (the photo's own size), `range`, `doubtful`.
+    """Separate a photo for the page.
 
-    Each goes row by row: the photo (3 bytes a pixel, sRGB), the transmission at strength 1 (3 little-endian 16-bit
-    numbers, linear over `range`), the reflection at 1 (3 bytes, sRGB), and confidence (1 byte).
+    Args:
+        separator: the model.
+        photo: the photo at full size.
+        options: the options of the request; `strength` and `additive` are ignored.
+        on_progress: called with the completed share, 0..1.
+
+    Returns:
+        One line of JSON with `width`, `height`, `full` (the size of the photo), `range` and `doubtful`, and then four maps of
+        width x height pixels, row by row: the photo (3 bytes for each pixel, sRGB), the transmission at strength 1 (3
+        little-endian 16-bit values, linear over `range`), the reflection at strength 1 (3 bytes, sRGB), and the confidence
+        (1 byte).
 
     Raises:
         BrewsterError: as `Separator` does.
     """
-    width, height = _fitting(photo.size)
+    width, height = _preview_size(photo.size)
     small = photo.small(width, height)
-    asked = options.call() | {"strength": _FAINT, "additive": False}
-    shown = Photo.from_array(small[..., : photo.pixels.shape[2]], encoding="linear")  # grey stays grey
-    layers = separator(shown, on_progress=on_progress, **asked)
-    transmission = small + (layers.transmission.linear() - small) / np.float32(_FAINT)
-    reflection = layers.reflection.linear() / np.float32(_FAINT)
-    head = {"width": width, "height": height, "full": photo.size, "range": (LOWEST, HIGHEST)}
+    arguments = options.call() | {"strength": _SMALL_STRENGTH, "additive": False}
+    channels = photo.pixels.shape[2]  # one for a grey photo
+    reduced = Photo.from_array(small[..., :channels], encoding="linear")
+    layers = separator(reduced, on_progress=on_progress, **arguments)
+    transmission = small + (layers.transmission.linear() - small) / np.float32(_SMALL_STRENGTH)
+    reflection = layers.reflection.linear() / np.float32(_SMALL_STRENGTH)
+    head = {"width": width, "height": height, "full": photo.size, "range": (RANGE_MIN, RANGE_MAX)}
     head["doubtful"] = layers.doubtful
-    maps = _srgb(small), _numbers(transmission), _srgb(reflection), layers.confidence.pixels
+    maps = (
+        _to_srgb_bytes(small),
+        _to_uint16(transmission),
+        _to_srgb_bytes(reflection),
+        layers.confidence.pixels,
+    )
     return b"".join((json.dumps(head).encode(), b"\n", *(map_.tobytes() for map_ in maps)))
 
 
-def _fitting(size: tuple[int, int]) -> tuple[int, int]:
+def _preview_size(size: tuple[int, int]) -> tuple[int, int]:
     scale = min(1.0, math.sqrt(PREVIEW_PIXELS / math.prod(size)))
     return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
-def _srgb(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
+def _to_srgb_bytes(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.rint(255 * to_encoded(np.clip(linear, 0, 1))).astype(np.uint8)
 
 
-def _numbers(linear: NDArray[np.float32]) -> NDArray[np.uint16]:
-    share: NDArray[np.float32] = (np.clip(linear, LOWEST, HIGHEST) - LOWEST) / (HIGHEST - LOWEST)
+def _to_uint16(linear: NDArray[np.float32]) -> NDArray[np.uint16]:
+    share: NDArray[np.float32] = (np.clip(linear, RANGE_MIN, RANGE_MAX) - RANGE_MIN) / (RANGE_MAX - RANGE_MIN)
     return np.rint(65535 * share).astype(np.dtype("<u2"), copy=False)

@@ -1,4 +1,4 @@
-"""What a client asks for: one multipart form, checked by `Options`, whose fields are written nowhere else."""
+"""The multipart form of a request. `Options` defines and validates its fields."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ from brewster.files import LAYERS, SUFFIXES, SeparationPaths
 from brewster.options import Options
 
 FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
-"""The options that a client may choose; the others are the server's own."""
+"""The options that a client may set; the server sets the others."""
 _OPTIONS: Final = TypeAdapter(Options)
-_LONGEST_NAME: Final = 120
+_MAX_NAME_BYTES: Final = 120
 _PHOTO: Final = {
     "type": "string",
     "contentMediaType": "application/octet-stream",
-    "description": "The file of the photo.",
+    "description": "The photo as an image file.",
 }
 
 
 @final
 @dataclass(frozen=True)
 class SeparationRequest:
-    """A photo's file, and what to do with it."""
+    """The uploaded photo and its options."""
 
     photo: bytes
     name: str
-    """The photo's name, safe to write to and never a path."""
+    """The file name of the photo: a safe name without a path."""
     options: Options
 
-    def target(self, layer: str, own: str) -> str:
-        """The name of a layer's file as the command line gives it, for a photo whose own container is `own`."""
+    def target(self, layer: str, container: str) -> str:
+        """The file name of a layer, as the command line names it; `container` is the format of the photo."""
         source = Path(self.name)
         if source.suffix.lower() not in SUFFIXES:
-            source = Path(f"{self.name}.{own}")
+            source = Path(f"{self.name}.{container}")
         return (
             SeparationPaths(source, Path(), source.stem)
             .target(layer, self.options.suffix(layer, source))
@@ -52,45 +52,52 @@ class SeparationRequest:
 
 
 async def read_form(request: Request, models: Sequence[str], max_pixels: int) -> SeparationRequest:
-    """What a request asks for; its bytes stay in memory.
+    """Parse and validate the form of a request, in memory.
+
+    Args:
+        request: the request.
+        models: the names of the models, the default first.
+        max_pixels: the limit for the size of the photo.
 
     Raises:
-        HTTPException: 415, 400, 422: no form, a broken one, or values that are none of ours.
-        BrewsterError: values that do not go together.
-        ClientDisconnect: the upload was cut off.
+        HTTPException: 415 if the body is not a form; 400 if the form is damaged; 422 if a field or value is invalid.
+        BrewsterError: two options contradict each other.
+        ClientDisconnect: the upload is incomplete.
     """
     if not request.headers.get("content-type", "").lower().startswith("multipart/form-data"):
-        raise HTTPException(415, "the photo is sent as multipart/form-data; its field is called photo")
+        raise HTTPException(
+            415, "the body is not a form; send multipart/form-data with the photo in the field photo"
+        )
     try:
         form = await _InMemoryParser(request.headers, request.stream(), max_fields=32, max_files=1).parse()
     except MultiPartException as error:
         raise HTTPException(
             400, f"the form cannot be read ({error.message.rstrip('.')}); send it again"
         ) from error
-    except ValueError as error:  # Python knows charsets that it cannot read text by
-        raise HTTPException(400, "the form's charset cannot be read; send it in UTF-8") from error
+    except ValueError as error:  # some charsets known to Python cannot decode text
+        raise HTTPException(400, "the charset of the form cannot be decoded; send it in UTF-8") from error
     try:
-        return await _asked(form, _options(form, models, max_pixels))
+        return await _build_request(form, _options(form, models, max_pixels))
     finally:
         await form.close()
 
 
-async def _asked(form: FormData, options: Options) -> SeparationRequest:
+async def _build_request(form: FormData, options: Options) -> SeparationRequest:
     photo = form.get("photo")
     if not isinstance(photo, UploadFile):
-        raise HTTPException(422, "there is no photo; send its file in the field photo")
+        raise HTTPException(422, "the form contains no photo; send its file in the field photo")
     return SeparationRequest(await photo.read(), safe_name(photo.filename or ""), options)
 
 
 @final
 class _InMemoryParser(MultiPartParser):
-    """Files stay in memory, whatever their size: the guard has limited it."""
+    """Keeps files of any size in memory; LimitMiddleware has limited the size already."""
 
     spool_max_size = 0
 
 
 def form_schema(models: Sequence[str]) -> dict[str, Any]:
-    """The JSON schema of the form, for OpenAPI."""
+    """The JSON schema of the form, for the OpenAPI document."""
     known = _OPTIONS.json_schema()["properties"]
     fields = {"photo": _PHOTO, **{name: _as_field(known[name]) for name in FIELDS}}
     about = "The model to use, one of `GET /models`."
@@ -99,7 +106,7 @@ def form_schema(models: Sequence[str]) -> dict[str, Any]:
 
 
 def _as_field(schema: dict[str, Any]) -> dict[str, Any]:
-    """A form has no null: what may be null may be left out."""
+    """The schema without null: a form has no null, and an optional field is omitted instead."""
     if "anyOf" not in schema:
         return schema
     (kind,) = (kind for kind in schema["anyOf"] if kind["type"] != "null")
@@ -107,17 +114,17 @@ def _as_field(schema: dict[str, Any]) -> dict[str, Any]:
 
 
 def safe_name(name: str) -> str:
-    """The last part of a client's name for a file, as every disk and header takes it: no path, no control letters."""
+    """The last component of a file name, without characters that file systems or headers forbid, and limited in length."""
     last = unicodedata.normalize("NFC", re.split(r"[/\\]", name)[-1])
     plain = "".join(letter if letter.isprintable() and letter not in '<>:"|?*' else "_" for letter in last)
     path = Path(plain.strip(". ") or "photo")
     suffix = path.suffix if path.suffix.lower() in SUFFIXES else ""
-    stem = path.name.removesuffix(suffix).encode()[:_LONGEST_NAME].decode(errors="ignore")
+    stem = path.name.removesuffix(suffix).encode()[:_MAX_NAME_BYTES].decode(errors="ignore")
     return stem.rstrip(". ") + suffix
 
 
-def explain(errors: Iterable[Any]) -> str:
-    """What pydantic found wrong, in one sentence."""
+def validation_message(errors: Iterable[Any]) -> str:
+    """The validation errors of pydantic as one message."""
     found = (
         f"{'.'.join(map(str, error['loc']))} is {str(error['input'])[:40]!r}; {error['msg']}"
         for error in errors
@@ -126,23 +133,23 @@ def explain(errors: Iterable[Any]) -> str:
 
 
 def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
-    words = {name: [str(value) for value in form.getlist(name)] for name in form if name != "photo"}
-    unknown = [name for name in words if name not in FIELDS]
+    texts = {name: [str(value) for value in form.getlist(name)] for name in form if name != "photo"}
+    unknown = [name for name in texts if name not in FIELDS]
     if unknown:
+        raise HTTPException(422, f"there is no field {unknown[0][:40]!r}; use photo, {', '.join(FIELDS)}")
+    values_by_name: dict[str, Any] = {name: values[-1] for name, values in texts.items() if values[-1]}
+    if "layers" in texts:
+        values_by_name["layers"] = _ordered_layers(",".join(texts["layers"]).split(","))
+    if values_by_name.setdefault("model", models[0]) not in models:
         raise HTTPException(
-            422, f"there is no field {unknown[0][:40]!r}; the fields are photo, {', '.join(FIELDS)}"
+            422, f"there is no model {values_by_name['model'][:40]!r}; choose {' or '.join(models)}"
         )
-    asked: dict[str, Any] = {name: values[-1] for name, values in words.items() if values[-1]}
-    if "layers" in words:
-        asked["layers"] = _in_order(",".join(words["layers"]).split(","))
-    if asked.setdefault("model", models[0]) not in models:
-        raise HTTPException(422, f"there is no model {asked['model'][:40]!r}; choose {' or '.join(models)}")
     try:
-        return _OPTIONS.validate_python(asked | {"max_pixels": max_pixels})
+        return _OPTIONS.validate_python(values_by_name | {"max_pixels": max_pixels})
     except ValidationError as error:
-        raise HTTPException(422, explain(error.errors())) from error
+        raise HTTPException(422, validation_message(error.errors())) from error
 
 
-def _in_order(layers: Sequence[str]) -> list[str]:
-    """Each once, in the order of the command line; unknown ones last, to be refused."""
+def _ordered_layers(layers: Sequence[str]) -> list[str]:
+    """Each layer once, in the order of the command line; unknown names come last, for the validation to refuse."""
     return [layer for layer in dict.fromkeys((*LAYERS, *layers)) if layer in layers]

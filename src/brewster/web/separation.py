@@ -1,9 +1,9 @@
-"""The HTTP API: a photo in, its layers out.
+"""The HTTP API that separates photos.
 
-    POST /separate    a form with the photo and the options      GET /progress/{job}    how far it is
-    GET /models       what can be asked for                      GET /health            whether the server is well
+    POST /separate    a form with the photo and the options      GET /progress/{job}    the progress of a request
+    GET /models       the available models                       GET /health            the state of the server
 
-Nothing is fetched by URL, and nothing is written to the disk.
+The server fetches nothing by URL and writes nothing to the disk.
 """
 
 from __future__ import annotations
@@ -31,16 +31,14 @@ from brewster.web.model_cache import ModelCache, ModelRow
 from brewster.web.preview import preview
 from brewster.web.request_schema import SeparationRequest, form_schema, read_form
 
-_MEDIA: Final = {
-    "exr": "image/x-exr",
-    "hdr": "image/vnd.radiance",
-}  # the others are image/ and their own name
-_EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # zip has no earlier; the same layers make the same bytes
+_MEDIA_TYPES: Final = {"exr": "image/x-exr", "hdr": "image/vnd.radiance"}
+"""Media types by format; those of other formats are image/ and the name of the format."""
+_EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # the earliest date of zip; a fixed date makes the archive reproducible
 
 
 @final
 class ErrorResponse(BaseModel):
-    """What every refusal looks like."""
+    """The body of every error response."""
 
     error: str
     """What happened, what was expected, and what to do."""
@@ -48,91 +46,102 @@ class ErrorResponse(BaseModel):
 
 @final
 class HealthResponse(BaseModel):
-    """Whether the server is well."""
+    """The state of the server."""
 
     status: Literal["ok"] = "ok"
     version: str = brewster.__version__
     jobs: int
-    """How many photos are waiting or being worked on."""
+    """Number of photos that wait or are being separated."""
     places: int
-    """How many there can be."""
+    """The maximum of `jobs`."""
 
 
-Make = Callable[[ModelCache, SeparationRequest, ProgressCallback], Response]
-_TROUBLE: Final[dict[str, Any]] = {"model": ErrorResponse}
-_ANSWERS: Final[dict[int | str, dict[str, Any]]] = {
+Handler = Callable[[ModelCache, SeparationRequest, ProgressCallback], Response]
+_ERROR: Final[dict[str, Any]] = {"model": ErrorResponse}
+_RESPONSES: Final[dict[int | str, dict[str, Any]]] = {
     200: {
         "description": "One layer, or a zip of several.",
         "content": {"image/*": {}, "application/zip": {}},
     },
-    **dict.fromkeys((400, 401, 403, 408, 409, 413, 415, 421, 422, 500, 501, 503, 504), _TROUBLE),
+    **dict.fromkeys((400, 401, 403, 408, 409, 413, 415, 421, 422, 500, 501, 503, 504), _ERROR),
 }
 JobName = Annotated[
     str | None,
-    Query(pattern="^[A-Za-z0-9-]{8,64}$", description="A name of your choice, for `GET /progress/{job}`."),
+    Query(
+        pattern="^[A-Za-z0-9-]{8,64}$",
+        description="A name for this request, chosen by the client, for `GET /progress/{job}`.",
+    ),
 ]
 
 
-def separation(shelf: ModelCache, desk: JobQueue, *, max_pixels: int) -> APIRouter:
-    """The routes of the API, and the page's own previews."""
+def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixels: int) -> APIRouter:
+    """The routes of the API, and the previews for the page.
+
+    Args:
+        model_cache: the models that clients can choose.
+        job_queue: runs the separations.
+        max_pixels: the limit for the size of a photo.
+    """
     router = APIRouter()
-    form = {"multipart/form-data": {"schema": form_schema(shelf.names)}}
-    body = {"requestBody": {"required": True, "content": form}}
+    content = {"multipart/form-data": {"schema": form_schema(model_cache.names)}}
+    body = {"requestBody": {"required": True, "content": content}}
 
-    async def work(request: Request, job: str | None, make: Make) -> Response:
-        """Takes a place, then the bytes, and answers with what `make` makes of them."""
-        with desk.place(job) as place:
-            asked = await read_form(request, shelf.names, max_pixels)
-            return await desk.do(place, partial(make, shelf, asked), request.receive)
+    async def run(request: Request, job: str | None, handler: Handler) -> Response:
+        """Reserve a place in the queue, read the form, and run the handler."""
+        with job_queue.reserve(job) as reserved_job:
+            form = await read_form(request, model_cache.names, max_pixels)
+            return await job_queue.run_job(reserved_job, partial(handler, model_cache, form), request.receive)
 
-    @router.post("/separate", responses=_ANSWERS, response_class=Response, openapi_extra=body)
+    @router.post("/separate", responses=_RESPONSES, response_class=Response, openapi_extra=body)
     async def separate(request: Request, job: JobName = None) -> Response:
-        """The layers of a photo: one is a picture, in the photo's own format and colours; several are a zip.
+        """Separate a photo. One layer is returned as a picture in the format and colour space of the photo, several as a zip.
 
-        A client that goes away stops the work. Files are named as the command line names them.
+        Files are named as on the command line. The work stops if the client disconnects.
         """
-        return await work(request, job, _separate)
+        return await run(request, job, _separate)
 
     @router.post("/preview", include_in_schema=False)
-    async def show(request: Request, job: JobName = None) -> Response:
-        return await work(request, job, _preview)
+    async def preview_maps(request: Request, job: JobName = None) -> Response:
+        return await run(request, job, _preview)
 
-    @router.get("/progress/{job}", responses={404: _TROUBLE})
+    @router.get("/progress/{job}", responses={404: _ERROR})
     async def progress(job: str) -> JobProgress:
-        """How far a job is that a client has named; 404 before it begins and after its end."""
-        found = desk.progress(job)
+        """The progress of a job with a name; 404 before the job begins and after its end."""
+        found = job_queue.progress(job)
         if found is None:
-            raise HTTPException(404, "there is no such job now; it has ended, or has not arrived yet")
+            raise HTTPException(
+                404, "there is no job with this name now; it has ended or has not arrived yet"
+            )
         return found
 
     @router.get("/models")
     def models() -> list[ModelRow]:
-        """The models that can be asked for, the default first."""
-        return shelf.rows()
+        """The available models, the default first."""
+        return model_cache.rows()
 
     @router.get("/health")
     async def health() -> HealthResponse:
-        """Whether the server is well, and how busy."""
-        return HealthResponse(jobs=desk.jobs, places=desk.workers + desk.queue)
+        """The version of the server and the number of its jobs."""
+        return HealthResponse(jobs=job_queue.jobs, places=job_queue.workers + job_queue.max_waiting)
 
     return router
 
 
-def _separate(shelf: ModelCache, asked: SeparationRequest, on_progress: ProgressCallback) -> Response:
-    """The layers as files."""
+def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: ProgressCallback) -> Response:
+    """The layers of a photo as files."""
     started = time.perf_counter()
-    options = asked.options
-    separation = shelf.separator(options.model)(asked.photo, on_progress=on_progress, **options.call())
+    options = form.options
+    separation = model_cache.separator(options.model)(form.photo, on_progress=on_progress, **options.call())
     files = {}
     for layer in options.layers:
-        on_progress(1)  # encoding takes a while, too, and may not be wanted any more
-        name = asked.target(layer, separation.photo.file_info.container)
+        on_progress(1)  # raises JobCancelled: encoding takes time too
+        name = form.target(layer, separation.photo.file_info.container)
         files[name] = getattr(separation, layer).encode(SUFFIXES[Path(name).suffix.lower()])
     name, data = (
-        next(iter(files.items())) if len(files) == 1 else (f"{Path(asked.name).stem}.zip", _zip(files))
+        next(iter(files.items())) if len(files) == 1 else (f"{Path(form.name).stem}.zip", _zip(files))
     )
     headers = {
-        "Content-Disposition": _attachment(name),
+        "Content-Disposition": _content_disposition(name),
         "Brewster-Model": quote(separation.model),
         "Brewster-SHA256": separation.sha256 or "",
         "Brewster-Device": separation.device,
@@ -144,32 +153,32 @@ def _separate(shelf: ModelCache, asked: SeparationRequest, on_progress: Progress
             "Brewster-Reconstruction-Error": f"{separation.reconstruction_error:.6f}",
             "Brewster-Doubtful": str(separation.doubtful).lower(),
         }
-    return Response(data, headers=headers, media_type=_media(name))
+    return Response(data, headers=headers, media_type=_media_type(name))
 
 
-def _preview(shelf: ModelCache, asked: SeparationRequest, on_progress: ProgressCallback) -> Response:
-    photo = Photo.open(asked.photo, max_pixels=asked.options.max_pixels)
-    maps = preview(shelf.separator(asked.options.model), photo, asked.options, on_progress)
+def _preview(model_cache: ModelCache, form: SeparationRequest, on_progress: ProgressCallback) -> Response:
+    photo = Photo.open(form.photo, max_pixels=form.options.max_pixels)
+    maps = preview(model_cache.separator(form.options.model), photo, form.options, on_progress)
     return Response(maps, media_type="application/octet-stream")
 
 
-def _media(name: str) -> str:
+def _media_type(name: str) -> str:
     if name.endswith(".zip"):
         return "application/zip"
     container = SUFFIXES[Path(name).suffix.lower()]
-    return _MEDIA.get(container, f"image/{container}")
+    return _MEDIA_TYPES.get(container, f"image/{container}")
 
 
 def _zip(files: Mapping[str, bytes]) -> bytes:
-    """Files as one, not compressed: pictures are so already."""
-    whole = io.BytesIO()
-    with zipfile.ZipFile(whole, "w", zipfile.ZIP_STORED) as archive:
+    """A zip archive of files, stored without compression since pictures are compressed already."""
+    archive_file = io.BytesIO()
+    with zipfile.ZipFile(archive_file, "w", zipfile.ZIP_STORED) as archive:
         for name, data in files.items():
             archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
-    return whole.getvalue()
+    return archive_file.getvalue()
 
 
-def _attachment(name: str) -> str:
-    """A file's name as a header: plain for old clients, whole for the others (RFC 6266)."""
-    plain = name.encode("ascii", "replace").decode().translate(str.maketrans('"\\?', "___"))
-    return f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(name, safe='')}"
+def _content_disposition(name: str) -> str:
+    """The Content-Disposition header of a download: an ASCII name for old clients and the full name (RFC 6266)."""
+    ascii_name = name.encode("ascii", "replace").decode().translate(str.maketrans('"\\?', "___"))
+    return f"attachment; filename=\"{ascii_name}\"; filename*=UTF-8''{quote(name, safe='')}"

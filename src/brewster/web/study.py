@@ -1,9 +1,9 @@
-"""What a participant's browser talks to: consent, the pictures of a trial, answers.
+"""The HTTP API of the user study: consent, the pictures of a trial, answers.
 
-    application(participants(study, Store(study)), guard=guard, home="study.html")
+    create_app(study_router(study, AnswerStore(study)), limits=limits, index="study.html")
 
-Nothing here names a method, a file or a dataset: a picture is a trial's left, right or photo, and only who holds the
-personal link of that trial gets it.
+No response contains the name of a method, file or dataset: a picture is the left, right or photo of a trial, and only the
+personal link of the participant gives access to it.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from brewster.user_study import assignment
 from brewster.user_study.assignment import Choice
 from brewster.user_study.store import AnswerStore, Participant
 from brewster.user_study.study import Study
-from brewster.web.application import page
+from brewster.web.application import page_response
 
-_KEEP: Final = {"Cache-Control": "private, max-age=86400, immutable"}
-_FORGET: Final = {"Cache-Control": "no-store"}
+_CACHED: Final = {"Cache-Control": "private, max-age=86400, immutable"}
+_NOT_CACHED: Final = {"Cache-Control": "no-store"}
 
 
 class _Strict(BaseModel):
@@ -32,7 +32,7 @@ class _Strict(BaseModel):
 
 
 class Invitation(_Strict):
-    """What somebody is told before they take part: the text, and how many trials there are."""
+    """The information before the consent: the consent text, and the number of trials."""
 
     consent: str
     trials: int
@@ -40,19 +40,19 @@ class Invitation(_Strict):
 
 
 class ConsentRequest(_Strict):
-    """That somebody takes part."""
+    """The agreement to take part."""
 
     agreed: Literal[True]
 
 
 class PersonalLink(_Strict):
-    """The personal link, from the server's root."""
+    """The personal link of a participant, relative to the root of the server."""
 
     link: str
 
 
 class TrialResponse(_Strict):
-    """The first trial without an answer, from 0, and the size of its pictures in px; no trial where all are answered."""
+    """The first trial without an answer, counted from 0, and the size of its pictures in px; no trial if all have answers."""
 
     trial: int | None
     trials: int
@@ -61,7 +61,7 @@ class TrialResponse(_Strict):
 
 
 class AnswerRequest(_Strict):
-    """An answer, and for how many seconds the pictures were seen."""
+    """An answer, and the seconds for which the pictures were shown."""
 
     trial: Annotated[int, Field(ge=0)]
     choice: Choice
@@ -69,7 +69,7 @@ class AnswerRequest(_Strict):
 
 
 class AnswerResponse(_Strict):
-    """What is on the disk now, which is the first answer that came, and what is next."""
+    """The stored choice, which is that of the first answer to the trial, and the next trial."""
 
     kept: Choice
     next: TrialResponse
@@ -79,90 +79,98 @@ Token = Annotated[str, FromPath(max_length=64)]
 Side = Literal["photo", "left", "right"]
 
 
-def participants(
-    study: Study, store: AnswerStore, *, most: int | None = None, token: str | None = None
+def study_router(
+    study: Study, store: AnswerStore, *, max_participants: int | None = None, token: str | None = None
 ) -> APIRouter:
-    """The routes of a study that admits at most so many; personal links carry the guard's token, if there is one."""
-    door, router = _StudyRoutes(study, store, most, token), APIRouter(tags=["study"])
-    router.get("/invitation")(door.invitation)
-    router.post("/participants", status_code=201)(door.admit)
-    router.get("/s/{person}", include_in_schema=False)(door.begin)
-    router.get("/s/{person}/link")(door.link)
-    router.get("/s/{person}/trial")(door.next_trial)
-    router.get("/s/{person}/pictures/{trial}/{side}", response_class=Response)(door.picture)
-    router.post("/s/{person}/answers")(door.answer)
+    """The routes of a study.
+
+    Args:
+        study: the study.
+        store: its answers.
+        max_participants: how many participants are admitted at most.
+        token: the token of the server, which is added to personal links.
+    """
+    routes, router = _StudyRoutes(study, store, max_participants, token), APIRouter(tags=["study"])
+    router.get("/invitation")(routes.invitation)
+    router.post("/participants", status_code=201)(routes.admit)
+    router.get("/s/{participant_token}", include_in_schema=False)(routes.begin)
+    router.get("/s/{participant_token}/link")(routes.link)
+    router.get("/s/{participant_token}/trial")(routes.next_trial)
+    router.get("/s/{participant_token}/pictures/{trial}/{side}", response_class=Response)(routes.picture)
+    router.post("/s/{participant_token}/answers")(routes.answer)
     return router
 
 
 @final
 @dataclass(frozen=True)
 class _StudyRoutes:
-    """What the routes do, each in a thread, as the disk is waited for."""
+    """The handlers of the routes. FastAPI runs them in threads, since they wait for the disk."""
 
     study: Study
     store: AnswerStore
-    most: int | None
+    max_participants: int | None
     token: str | None
 
     def invitation(self) -> Invitation:
-        """What the study is about."""
+        """The consent text and the number of trials."""
         description = self.study.description
-        is_open = self.most is None or self.store.count() < self.most
+        is_open = self.max_participants is None or self.store.count_participants() < self.max_participants
         return Invitation(
             consent=description.consent, trials=description.pairs + description.catches, is_open=is_open
         )
 
     def admit(self, _agreement: Annotated[ConsentRequest, Body()]) -> PersonalLink:
-        """Admits somebody who agrees to take part, and gives them a link of their own."""
-        person = self.store.admit(most=self.most)
-        if person is None:
-            raise HTTPException(403, "the study has all the participants that it needs; thank you for coming")
-        return self._link(person)
-
-    def begin(self, person: Token) -> Response:
-        """The page behind a personal link; where nobody has it, the same page says so."""
-        answer = page("study.html")
-        answer.status_code = 404 if self.store.participant(person) is None else 200
-        return answer
-
-    def link(self, person: Token) -> PersonalLink:
-        """The personal link, whole: the page's own address has lost the guard's token."""
-        self._participant(person)
-        return self._link(person)
-
-    def next_trial(self, person: Token, response: Response) -> TrialResponse:
-        """The first trial without an answer."""
-        response.headers.update(_FORGET)
-        return self._next(self._participant(person))
-
-    def picture(self, person: Token, trial: int, side: Side) -> Response:
-        """A picture of a trial."""
-        shown = _shown(self._participant(person), trial)
-        try:
-            data = self.study.file(getattr(shown, side)).read_bytes()
-        except (
-            FileNotFoundError
-        ) as error:  # it does not come back by itself: the page must not ask again and again
+        """Admit a participant who agrees to take part; returns their personal link."""
+        participant_token = self.store.admit(max_participants=self.max_participants)
+        if participant_token is None:
             raise HTTPException(
-                410, "a picture is missing on the server; please tell whoever runs the study"
+                403, "the study has all the participants that it needs; thank you for your interest"
+            )
+        return self._link(participant_token)
+
+    def begin(self, participant_token: Token) -> Response:
+        """The page of a personal link. For an unknown link the status is 404, and the page shows the error."""
+        response = page_response("study.html")
+        response.status_code = 404 if self.store.participant(participant_token) is None else 200
+        return response
+
+    def link(self, participant_token: Token) -> PersonalLink:
+        """The personal link with the token of the server, which the address of the page no longer contains."""
+        self._participant(participant_token)
+        return self._link(participant_token)
+
+    def next_trial(self, participant_token: Token, response: Response) -> TrialResponse:
+        """The first trial without an answer."""
+        response.headers.update(_NOT_CACHED)
+        return self._next(self._participant(participant_token))
+
+    def picture(self, participant_token: Token, trial: int, side: Side) -> Response:
+        """A picture of a trial."""
+        shown = _trial(self._participant(participant_token), trial)
+        try:
+            data = self.study.picture_file(getattr(shown, side)).read_bytes()
+        except FileNotFoundError as error:
+            raise HTTPException(
+                410,  # not 500: the page repeats requests that fail with 500 or more
+                "a picture is missing on the server; please inform the person who runs the study",
             ) from error
-        return Response(data, media_type="image/png", headers=_KEEP)
+        return Response(data, media_type="image/png", headers=_CACHED)
 
-    def answer(self, person: Token, given: Annotated[AnswerRequest, Body()]) -> AnswerResponse:
-        """Keeps an answer on the disk. The first one to a trial stays: sent again, it changes nothing."""
-        participant = self._participant(person)
-        _shown(participant, given.trial)
-        kept = self.store.answer(participant, given.trial, given.choice, seconds=given.seconds)
-        return AnswerResponse(kept=kept, next=self._next(participant))
+    def answer(self, participant_token: Token, answer: Annotated[AnswerRequest, Body()]) -> AnswerResponse:
+        """Store an answer. The first answer to a trial is final; a second one changes nothing."""
+        participant = self._participant(participant_token)
+        _trial(participant, answer.trial)
+        stored = self.store.record_answer(participant, answer.trial, answer.choice, seconds=answer.seconds)
+        return AnswerResponse(kept=stored, next=self._next(participant))
 
-    def _link(self, person: str) -> PersonalLink:
-        return PersonalLink(link=f"/s/{person}" + (f"?token={self.token}" if self.token else ""))
+    def _link(self, participant_token: str) -> PersonalLink:
+        return PersonalLink(link=f"/s/{participant_token}" + (f"?token={self.token}" if self.token else ""))
 
-    def _participant(self, person: str) -> Participant:
-        participant = self.store.participant(person)
+    def _participant(self, participant_token: str) -> Participant:
+        participant = self.store.participant(participant_token)
         if participant is None:
             raise HTTPException(
-                404, "nobody has this link; check that it is whole, or begin at the first page"
+                404, "this link is unknown; check that it is complete, or begin at the start page"
             )
         return participant
 
@@ -174,7 +182,7 @@ class _StudyRoutes:
         return TrialResponse(trial=trial, trials=count, width=photo.width, height=photo.height)
 
 
-def _shown(participant: Participant, trial: int) -> assignment.TrialDraw:
+def _trial(participant: Participant, trial: int) -> assignment.TrialDraw:
     if not 0 <= trial < len(participant.trials):
         raise HTTPException(404, f"there is no trial {trial}; load the page again")
     return participant.trials[trial]

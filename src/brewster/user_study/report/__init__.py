@@ -1,1 +1,1 @@
-"""What the answers of a study say: rates with intervals, strengths, agreement; as tables, files and a plot."""
+"""The report of a study: rates with intervals, strengths and agreement, as tables, files and a plot."""

@@ -1,7 +1,7 @@
-"""How strong methods are, all comparisons together: the model of Bradley and Terry (1952).
+"""The model of Bradley and Terry (1952): one strength for each method, from all comparisons together.
 
-P(a beats b) = 1 / (1 + exp(b's strength - a's)). A tie is half a win for each, so it pulls the two together; strengths
-sum to 0.
+P(a beats b) = 1 / (1 + exp(strength_b - strength_a)). A tie counts as half a win for each of the two methods. Strengths sum
+to 0.
 """
 
 from __future__ import annotations
@@ -15,42 +15,49 @@ if TYPE_CHECKING:
     from jaxtyping import Float64
 
 Floats = NDArray[np.float64]
-_STEPS: Final = 200
-_PRECISION: Final = 1e-10
+_MAX_ITERATIONS: Final = 200
+_TOLERANCE: Final = 1e-10
 
 
 def strengths(wins: Float64[Floats, "... m m"]) -> Float64[Floats, "... m"]:
-    """The strengths of greatest likelihood for each table; `wins[a, b]` is how often a beat b, ties as halves.
+    """The maximum-likelihood strengths for each table of wins.
 
-    Newton's method, each step shortened so that it always ascends (damped by 1 / (1 + its length); Nesterov 2004,
-    section 4.1.5). NaN where there is no greatest likelihood: some methods never lose to the others (Ford 1957).
+    Damped Newton's method: each step is divided by 1 + its length, so the likelihood always increases (Nesterov 2004,
+    section 4.1.5).
+
+    Args:
+        wins: `wins[a, b]` is the number of wins of method a against method b; a tie adds 0.5 to both orders.
+
+    Returns:
+        The strengths, with mean 0; NaN for a table without a maximum, where some methods never lose to the others
+        (Ford 1957).
     """
     wins = wins * (1 - np.eye(wins.shape[-1]))
     total = wins + np.swapaxes(wins, -1, -2)
-    known = connected(wins)
-    worth = np.zeros(wins.shape[:-1])
-    for _ in range(_STEPS):
-        chance = 1 / (1 + np.exp(worth[..., None, :] - worth[..., :, None]))
-        slope = (wins - total * chance).sum(axis=-1)
-        bend = total * chance * (1 - chance)
-        curve = _laplacian(np.where(known[..., None, None], bend, 1.0))
-        step = np.linalg.solve(curve, slope[..., None])[..., 0]
+    is_bounded = all_connected(wins)
+    strength = np.zeros(wins.shape[:-1])
+    for _ in range(_MAX_ITERATIONS):
+        probability = 1 / (1 + np.exp(strength[..., None, :] - strength[..., :, None]))
+        gradient = (wins - total * probability).sum(axis=-1)
+        curvature = total * probability * (1 - probability)
+        hessian = _laplacian(np.where(is_bounded[..., None, None], curvature, 1.0))
+        step = np.linalg.solve(hessian, gradient[..., None])[..., 0]
         length = np.abs(step).max(axis=-1, keepdims=True)
-        worth = worth + np.where(known[..., None], step / (1 + length), 0.0)
-        if length[known].max(initial=0.0) < _PRECISION:
+        strength = strength + np.where(is_bounded[..., None], step / (1 + length), 0.0)
+        if length[is_bounded].max(initial=0.0) < _TOLERANCE:
             break
-    worth -= worth.mean(axis=-1, keepdims=True)
-    return np.where(known[..., None], worth, np.nan)
+    strength -= strength.mean(axis=-1, keepdims=True)
+    return np.where(is_bounded[..., None], strength, np.nan)
 
 
 def _laplacian(weights: Floats) -> Floats:
-    """With a 1 added everywhere, which makes it invertible and keeps the steps' sum at 0."""
+    """The graph Laplacian plus 1 in every entry, which makes it invertible and keeps the sum of each step at 0."""
     laplacian: Floats = np.eye(weights.shape[-1]) * weights.sum(axis=-1)[..., None] - weights + 1.0
     return laplacian
 
 
-def connected(wins: Float64[Floats, "... m m"]) -> NDArray[np.bool_]:
-    """Whether every method has beaten every other, directly or through others, for each table."""
+def all_connected(wins: Float64[Floats, "... m m"]) -> NDArray[np.bool_]:
+    """Whether each method has beaten each other one, directly or through a chain of wins; one value for each table."""
     reach = (wins > 0) | np.eye(wins.shape[-1], dtype=bool)
     for _ in range(wins.shape[-1].bit_length()):
         reach = (reach.astype(np.int64) @ reach.astype(np.int64)) > 0

@@ -1,4 +1,4 @@
-"""The results as one plot: a bar for each dataset and pair of methods, win, tie and lose side by side."""
+"""Plot the results: one stacked bar of win, tie and lose rates for each pair of methods and dataset."""
 
 from __future__ import annotations
 
@@ -7,57 +7,57 @@ import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-_COLOURS: Final = {"win": "#1f6f8b", "tie": "#d9d9d4", "lose": "#d98243"}
-_INSIDE: Final = {"win": "white", "tie": "#333333", "lose": "#222222"}
-_INKS: Final = {"win": "#1f6f8b", "tie": "#666666", "lose": "#a8561b"}
-_NARROW: Final = 0.06
-"""A share too narrow for its number."""
-_SHOWN: Final = ("/average",)
-_EVERYONE: Final = "Everyone: the rule leaves nobody"
+_BAR_COLOURS: Final = {"win": "#1f6f8b", "tie": "#d9d9d4", "lose": "#d98243"}
+_SHARE_COLOURS: Final = {"win": "white", "tie": "#333333", "lose": "#222222"}
+_HEADING_COLOURS: Final = {"win": "#1f6f8b", "tie": "#666666", "lose": "#a8561b"}
+_MIN_LABELLED_SHARE: Final = 0.06
+"""Smaller shares get no label, because it does not fit into the bar."""
+_AVERAGE_KEYS: Final = ("/average",)
+_EVERYONE_TITLE: Final = "All participants: the rule excludes everyone"
 
 
 def plot(results: Mapping[str, Any]) -> bytes:
-    """A PNG of the group that the rule keeps, or of everyone where it keeps nobody, which it says then."""
-    from matplotlib.figure import Figure  # noqa: PLC0415  (an extra, and slow to wake)
+    """The plot as PNG bytes: participants after the exclusion rule, or all participants if the rule excludes everyone."""
+    from matplotlib.figure import Figure  # noqa: PLC0415  (an optional dependency, and slow to import)
 
-    kept = results["included"]["tables"]
-    tables = kept or results["everyone"]["tables"]
-    shown = [_shown(results, table) for table in tables]
-    heights = [len(rows) + 0.9 for rows in shown]
-    height = 0.36 * sum(heights) + (0.3 if kept else 0.7)
+    included = results["included"]["tables"]
+    tables = included or results["everyone"]["tables"]
+    rows_of_tables = [_plotted_rows(results, table) for table in tables]
+    heights = [len(rows) + 0.9 for rows in rows_of_tables]
+    height = 0.36 * sum(heights) + (0.3 if included else 0.7)
     figure = Figure(figsize=(7.2, height), layout="constrained")
     axes = figure.subplots(len(tables), 1, squeeze=False, gridspec_kw={"height_ratios": heights})[:, 0]
-    for table, rows, axis in zip(tables, shown, axes, strict=True):
+    for table, rows, axis in zip(tables, rows_of_tables, axes, strict=True):
         _bars(axis, table, rows)
-    if not kept:
-        figure.suptitle(_EVERYONE, fontsize=9, color="#a8561b")
+    if not included:
+        figure.suptitle(_EVERYONE_TITLE, fontsize=9, color="#a8561b")
     data = io.BytesIO()
-    with warnings.catch_warnings():  # a letter that the font does not have is a box; the tables have the name
+    with warnings.catch_warnings():  # a missing glyph is drawn as a box; the tables have the full name
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         figure.savefig(data, format="png", dpi=160, metadata={"Software": None})
     return data.getvalue()
 
 
-def _shown(results: Mapping[str, Any], table: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """The datasets, where there are several, and the average."""
+def _plotted_rows(results: Mapping[str, Any], table: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """The rows of the average and, if there are several, of the datasets; without rows that have no answers."""
     datasets = results["study"]["datasets"]
-    keys = [*(datasets if len(datasets) > 1 else ()), *_SHOWN]
+    keys = [*(datasets if len(datasets) > 1 else ()), *_AVERAGE_KEYS]
     return [row for row in table["rows"] if row["key"] in keys and row["win"]["mean"] is not None]
 
 
 def _bars(axis: Any, table: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> None:  # noqa: ANN401  (matplotlib)
-    places = range(len(rows))  # not the titles: of two that are alike, matplotlib would make one
+    positions = range(len(rows))  # matplotlib merges bars with equal titles
     starts = [0.0] * len(rows)
-    for name, colour in _COLOURS.items():
+    for name, colour in _BAR_COLOURS.items():
         widths = [row[name]["mean"] for row in rows]
-        axis.barh(places, widths, left=starts, color=colour, height=0.72, edgecolor="white", linewidth=0.8)
+        axis.barh(positions, widths, left=starts, color=colour, height=0.72, edgecolor="white", linewidth=0.8)
         for i, (start, width) in enumerate(zip(starts, widths, strict=True)):
-            if width >= _NARROW:
+            if width >= _MIN_LABELLED_SHARE:
                 axis.text(
                     start + width / 2,
                     i,
                     f"{100 * width:.0f} %",
-                    color=_INSIDE[name],
+                    color=_SHARE_COLOURS[name],
                     ha="center",
                     va="center",
                     fontsize=8,
@@ -65,21 +65,21 @@ def _bars(axis: Any, table: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]
         starts = [start + width for start, width in zip(starts, widths, strict=True)]
     axis.invert_yaxis()
     axis.set(xlim=(0, 1), xticks=[])
-    axis.set_yticks(places, [row["title"] for row in rows], parse_math=False)
+    axis.set_yticks(positions, [row["title"] for row in rows], parse_math=False)
     axis.tick_params(left=False, labelsize=9)
     axis.spines[:].set_visible(False)
-    heads = (
-        (0.0, "left", f"{table['first']} better", _INKS["win"]),
-        (0.5, "center", "similar", _INKS["tie"]),
-        (1.0, "right", f"{table['second']} better", _INKS["lose"]),
+    headings = (
+        (0.0, "left", f"{table['first']} better", _HEADING_COLOURS["win"]),
+        (0.5, "center", "similar", _HEADING_COLOURS["tie"]),
+        (1.0, "right", f"{table['second']} better", _HEADING_COLOURS["lose"]),
     )
-    for place, side, text, colour in heads:
+    for x, alignment, text, colour in headings:
         axis.text(
-            place,
+            x,
             1.02,
             text,
             transform=axis.transAxes,
-            ha=side,
+            ha=alignment,
             color=colour,
             fontsize=9,
             weight="bold",

@@ -1,4 +1,4 @@
-"""Do raters agree? Krippendorff's alpha for names without order, where not everybody has rated everything."""
+"""Krippendorff's alpha: agreement of raters on nominal categories, with missing ratings."""
 
 from __future__ import annotations
 
@@ -12,12 +12,15 @@ if TYPE_CHECKING:
 
 
 def alpha(ratings: Float64[NDArray[np.float64], "u c"]) -> float | None:
-    """1 where all agree, 0 where they agree as chance would; None where nobody rated the same, or all said one thing.
+    """Krippendorff's alpha for nominal data: 1 - observed / expected disagreement.
+
+    Krippendorff 2011, "Computing Krippendorff's alpha-reliability", part D.
 
     Args:
-        ratings: how often each unit was given each category. Units with fewer than two ratings do not count.
+        ratings: number of ratings by unit and category. Units with fewer than two ratings are ignored.
 
-    Krippendorff 2011, "Computing Krippendorff's alpha-reliability", part D: 1 - observed / expected disagreement.
+    Returns:
+        1 for perfect agreement, 0 for agreement by chance; None if no unit has two ratings, or all ratings are equal.
     """
     paired = ratings[ratings.sum(axis=1) >= 2]
     sizes, totals = paired.sum(axis=1), paired.sum(axis=0)

@@ -1,4 +1,4 @@
-"""The answers by participant, and who is left out: by a rule that is stated beforehand and nothing else."""
+"""The answers of each participant, and the rule that excludes participants."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from brewster.user_study.assignment import Choice, TrialDraw
 from brewster.user_study.store import Participant, StoredAnswer
 
 OUTCOMES: Final = ("win", "tie", "lose")
-"""Of the first method of a comparison."""
+"""Outcomes from the view of the first method of a comparison."""
 
 Reason = Literal["failed", "fast"]
 
@@ -19,10 +19,10 @@ Reason = Literal["failed", "fast"]
 @final
 @dataclass(frozen=True)
 class ParticipantAnswers:
-    """What a participant answered.
+    """The answers of one participant.
 
-    `votes` has the outcome (0, 1, 2 of OUTCOMES) of each comparison by its number; of `catches` trials they answered,
-    `failed` wrongly. `seconds` is their median time for a trial.
+    `votes` maps the number of a comparison to an index of OUTCOMES. `catches` is the number of answered catch trials,
+    `failed` the number of wrong answers among them. `seconds` is the median time for a trial.
     """
 
     number: int
@@ -36,44 +36,46 @@ class ParticipantAnswers:
 @final
 @dataclass(frozen=True)
 class ExclusionRule:
-    """Who is left out: who fails more than this share of the catch trials, or is faster than this median time."""
+    """Exclude participants who fail more than a share of the catch trials or whose median time is too short."""
 
-    most_failed: float = 0.25
-    least_seconds: float = 1.5
+    max_failed: float = 0.25
+    min_seconds: float = 1.5
 
     def __str__(self) -> str:
         return (
-            f"left out is who answers more than {self.most_failed:.0%} of the catch trials wrongly, or takes less "
-            f"than {self.least_seconds:g} s for half of all trials"
+            f"participants are excluded if they answer more than {self.max_failed:.0%} of the catch trials wrongly, or if "
+            f"their median time for a trial is below {self.min_seconds:g} s"
         )
 
-    def reason(self, person: ParticipantAnswers) -> Reason | None:
-        """Why somebody is left out; None if they are not."""
-        if person.failed > self.most_failed * person.catches:
+    def reason(self, participant: ParticipantAnswers) -> Reason | None:
+        """Why the participant is excluded, or None."""
+        if participant.failed > self.max_failed * participant.catches:
             return "failed"
-        return "fast" if person.seconds < self.least_seconds else None
+        return "fast" if participant.seconds < self.min_seconds else None
 
 
-def people(everything: Iterable[tuple[Participant, Mapping[int, StoredAnswer]]]) -> list[ParticipantAnswers]:
-    """All participants who answered anything; what they did answer counts, whether or not they came to the end."""
-    return [_person(participant, answers) for participant, answers in everything if answers]
+def collect_answers(
+    records: Iterable[tuple[Participant, Mapping[int, StoredAnswer]]],
+) -> list[ParticipantAnswers]:
+    """The answers of all participants with at least one; incomplete participants are included."""
+    return [_participant_answers(participant, answers) for participant, answers in records if answers]
 
 
-def _person(participant: Participant, answers: Mapping[int, StoredAnswer]) -> ParticipantAnswers:
+def _participant_answers(participant: Participant, answers: Mapping[int, StoredAnswer]) -> ParticipantAnswers:
     shown = [(participant.trials[trial], answer.choice) for trial, answer in answers.items()]
-    caught = [trial.expected == choice for trial, choice in shown if trial.expected]
+    passed = [trial.expected == choice for trial, choice in shown if trial.expected]
     return ParticipantAnswers(
         participant.number,
         {trial.comparison: outcome(trial, choice) for trial, choice in shown if trial.comparison is not None},
-        len(caught),
-        caught.count(False),
+        len(passed),
+        passed.count(False),
         median(answer.seconds for answer in answers.values()),
         len(answers) == len(participant.trials),
     )
 
 
 def outcome(trial: TrialDraw, choice: Choice) -> int:
-    """What a choice means for the comparison's first method: 0, 1 or 2 of OUTCOMES."""
+    """The outcome of a choice for the first method of the comparison, as an index of OUTCOMES."""
     if choice == "similar":
         return 1
     return 0 if (choice == "right") == trial.flipped else 2

@@ -1,9 +1,10 @@
-"""From answers to results, in plain values that JSON keeps for good; and the files of a report.
+"""Compute the results of a study from its answers, as plain JSON values, and write the files of the report.
 
-    results = summarise(study, people(store.everything()), Rule())
-    write(results, Path("report"))
+    participants = collect_answers(store.all_answers())
+    results = summarise(study, participants, ExclusionRule())
+    write(results, study, participants, Path("report"))
 
-Everything is told twice: of those whom the rule keeps, and of everyone.
+All results are given twice: for the participants after the exclusion rule, and for all participants.
 """
 
 from __future__ import annotations
@@ -27,13 +28,13 @@ from brewster.user_study.report.figure import plot
 from brewster.user_study.report.krippendorff import alpha
 from brewster.user_study.report.participants import OUTCOMES, ExclusionRule, ParticipantAnswers
 from brewster.user_study.report.statistics import (
-    correlation,
-    interval,
-    least,
+    agreement_bounds,
+    bootstrap_interval,
+    bootstrap_weights,
+    intraclass_correlation,
     rates,
-    resampled,
-    summed,
-    widened,
+    resampled_counts,
+    with_agreement_bounds,
 )
 from brewster.user_study.report.tables import to_csv, to_latex, to_markdown
 from brewster.user_study.study import Study
@@ -43,38 +44,48 @@ AVERAGES: Final = {
     "/datasets": "Mean of the datasets",
     "/answers": "All answers together",
 }
-"""The rows below the datasets. No dataset is called so, with a slash.
+"""Keys and titles of the rows below the datasets. Keys begin with a slash, which no dataset name contains.
 
-The first weights each dataset by its number of pictures, as the paper does."""
+The first row weights each dataset by its number of pictures, as the paper does."""
 _DIGITS: Final = 6
-_EQUAL: Final = 1e-6
+_MIN_SPREAD: Final = 1e-6
 
 Results = dict[str, Any]
-"""What report.json holds: see docs/study.md."""
+"""The content of report.json; docs/study.md describes it."""
 Floats = NDArray[np.float64]
 
 
-def summarise(study: Study, people: Sequence[ParticipantAnswers], rule: ExclusionRule) -> Results:
-    """The results of a study.
+def summarise(study: Study, participants: Sequence[ParticipantAnswers], rule: ExclusionRule) -> Results:
+    """Compute the results of a study.
+
+    Args:
+        study: the study.
+        participants: the answers of all participants.
+        rule: the rule that excludes participants.
+
+    Returns:
+        The content of report.json.
 
     Raises:
-        BrewsterError: nobody has answered yet.
+        BrewsterError: there is no answer yet.
     """
-    if not any(person.votes for person in people):
+    if not any(participant.votes for participant in participants):
         raise BrewsterError(
             f"{study.folder} has no answers yet",
-            "a report needs some",
-            "send out the address that `brewster study serve` prints",
+            "a report needs at least one answer",
+            "send participants the address that `brewster study serve` prints",
         )
-    reasons = [rule.reason(person) for person in people]
-    kept = [person for person, reason in zip(people, reasons, strict=True) if reason is None]
+    reasons = [rule.reason(participant) for participant in participants]
+    included = [
+        participant for participant, reason in zip(participants, reasons, strict=True) if reason is None
+    ]
     description = study.description
     return {
         "brewster": brewster.__version__,
         "study": {
             "seed": description.seed,
             "methods": list(description.methods),
-            "datasets": {name: _titled(name) for name in description.datasets},
+            "datasets": {name: _dataset_title(name) for name in description.datasets},
             "comparisons": len(description.comparisons),
             "pairs": description.pairs,
             "catches": description.catches,
@@ -82,42 +93,42 @@ def summarise(study: Study, people: Sequence[ParticipantAnswers], rule: Exclusio
         "rule": str(rule),
         "excluded": {reason: reasons.count(reason) for reason in ("failed", "fast")},
         "left_out": {
-            str(person.number): reason
-            for person, reason in zip(people, reasons, strict=True)
+            str(participant.number): reason
+            for participant, reason in zip(participants, reasons, strict=True)
             if reason is not None
         },
-        "included": _group(study, kept),
-        "everyone": _group(study, people),
+        "included": _group(study, included),
+        "everyone": _group(study, participants),
     }
 
 
-def _titled(dataset: str) -> str:
+def _dataset_title(dataset: str) -> str:
     if dataset in AVERAGES.values():
         return f"{dataset} (dataset)"
     return dataset or "All pictures"
 
 
-def _group(study: Study, people: Sequence[ParticipantAnswers]) -> dict[str, Any]:
-    """All that is said about some of the participants."""
-    people = [person for person in people if person.votes]
-    told = {
-        "participants": len(people),
-        "complete": sum(person.is_complete for person in people),
-        "answers": sum(len(person.votes) for person in people),
-        "catches": sum(person.catches for person in people),
-        "failed": sum(person.failed for person in people),
+def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str, Any]:
+    """The results of a group of participants."""
+    participants = [participant for participant in participants if participant.votes]
+    summary = {
+        "participants": len(participants),
+        "complete": sum(participant.is_complete for participant in participants),
+        "answers": sum(len(participant.votes) for participant in participants),
+        "catches": sum(participant.catches for participant in participants),
+        "failed": sum(participant.failed for participant in participants),
         "tables": [],
         "strengths": {},
         "agreement": None,
     }
-    if not people:
-        return told
-    counts, pictures = _counts(study, people), _pictures(study)
-    times = resampled(len(people))
-    agreement = alpha(_ratings(study, people))
-    return told | {
-        "tables": _tables(study, counts, pictures, times),
-        "strengths": _strengths(study, counts, times),
+    if not participants:
+        return summary
+    counts, pictures = _counts(study, participants), _pictures(study)
+    weights = bootstrap_weights(len(participants))
+    agreement = alpha(_ratings(study, participants))
+    return summary | {
+        "tables": _tables(study, counts, pictures, weights),
+        "strengths": _strengths(study, counts, weights),
         "agreement": None if agreement is None else round(agreement, _DIGITS),
     }
 
@@ -125,54 +136,54 @@ def _group(study: Study, people: Sequence[ParticipantAnswers]) -> dict[str, Any]
 # --- counting
 
 
-def _counts(study: Study, people: Sequence[ParticipantAnswers]) -> Floats:
-    """How often the first method won, tied, lost: (participants, pairs of methods, datasets, 3)."""
-    places = _places(study)
+def _counts(study: Study, participants: Sequence[ParticipantAnswers]) -> Floats:
+    """Numbers of wins, ties and losses of the first method: (participants, pairs of methods, datasets, 3)."""
+    indices = _table_indices(study)
     shape = len(study.pairs_of_methods), len(study.description.datasets), len(OUTCOMES)
-    counts = np.zeros((len(people), *shape))
-    for i, person in enumerate(people):
-        for comparison, outcome in person.votes.items():
-            counts[i, *places[comparison], outcome] += 1
+    counts = np.zeros((len(participants), *shape))
+    for i, participant in enumerate(participants):
+        for comparison, outcome in participant.votes.items():
+            counts[i, *indices[comparison], outcome] += 1
     return counts
 
 
-def _places(study: Study) -> list[tuple[int, int]]:
-    """Of each comparison, the numbers of its pair of methods and of its dataset."""
+def _table_indices(study: Study) -> list[tuple[int, int]]:
+    """For each comparison, the index of its pair of methods and of its dataset."""
     pairs = {pair: i for i, pair in enumerate(study.pairs_of_methods)}
     datasets = {name: i for i, name in enumerate(study.description.datasets)}
     return [(pairs[row.methods], datasets[row.dataset]) for row in study.description.comparisons]
 
 
 def _pictures(study: Study) -> Floats:
-    """How many pictures each pair of methods has of each dataset."""
+    """Number of pictures by pair of methods and dataset."""
     pictures = np.zeros((len(study.pairs_of_methods), len(study.description.datasets)))
-    np.add.at(pictures, tuple(np.array(_places(study)).T), 1)
+    np.add.at(pictures, tuple(np.array(_table_indices(study)).T), 1)
     return pictures
 
 
-def _ratings(study: Study, people: Sequence[ParticipantAnswers]) -> Floats:
-    """How often each comparison was given each outcome."""
+def _ratings(study: Study, participants: Sequence[ParticipantAnswers]) -> Floats:
+    """Number of answers by comparison and outcome."""
     ratings = np.zeros((len(study.description.comparisons), len(OUTCOMES)))
-    for person in people:
-        np.add.at(ratings, (list(person.votes), list(person.votes.values())), 1)
+    for participant in participants:
+        np.add.at(ratings, (list(participant.votes), list(participant.votes.values())), 1)
     return ratings
 
 
 # --- estimating
 
 
-def _tables(study: Study, counts: Floats, pictures: Floats, times: Floats) -> list[dict[str, Any]]:
+def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> list[dict[str, Any]]:
     """A table for each pair of methods: a row for each dataset, then the averages."""
     means = rates(counts.sum(axis=0), pictures)
-    ends = interval(rates(summed(times, counts), pictures), len(counts))
-    lows, highs = widened(means, ends, least(counts, pictures))
-    titles = {name: _titled(name) for name in study.description.datasets} | AVERAGES
+    ends = bootstrap_interval(rates(resampled_counts(weights, counts), pictures), len(counts))
+    lows, highs = with_agreement_bounds(means, ends, agreement_bounds(counts, pictures))
+    titles = {name: _dataset_title(name) for name in study.description.datasets} | AVERAGES
     answers = counts.sum(axis=(0, 3))
     return [
         {
             "first": first,
             "second": second,
-            "correlation": _rounded(correlation(counts[:, i].sum(axis=1))),
+            "correlation": _round(intraclass_correlation(counts[:, i].sum(axis=1))),
             "rows": [
                 {
                     "key": key,
@@ -191,14 +202,18 @@ def _tables(study: Study, counts: Floats, pictures: Floats, times: Floats) -> li
     ]
 
 
-def _strengths(study: Study, counts: Floats, times: Floats) -> dict[str, Any]:
-    """Of each method; without an interval where a resample has a method that only won or lost, or all are alike."""
+def _strengths(study: Study, counts: Floats, weights: Floats) -> dict[str, Any]:
+    """The strength of each method.
+
+    There is no interval if the strengths of a resample have no maximum, because a method only won or only lost, or if all
+    resamples are equal.
+    """
     wins = _wins(study, counts)
     means = strengths(wins.sum(axis=0))
-    draws = strengths(summed(times, wins))
+    resamples = strengths(resampled_counts(weights, wins))
     lows, highs = (
-        interval(draws, len(counts))
-        if np.isfinite(draws).all() and np.ptp(draws, axis=0).min() > _EQUAL
+        bootstrap_interval(resamples, len(counts))
+        if np.isfinite(resamples).all() and np.ptp(resamples, axis=0).min() > _MIN_SPREAD
         else np.full((2, len(means)), math.nan)
     )
     return {
@@ -208,7 +223,7 @@ def _strengths(study: Study, counts: Floats, times: Floats) -> dict[str, Any]:
 
 
 def _wins(study: Study, counts: Floats) -> Floats:
-    """How often each method beat each other one, a tie being half a win for both: (participants, m, m)."""
+    """Number of wins of each method against each other one, a tie being half a win: (participants, methods, methods)."""
     methods = study.description.methods
     wins = np.zeros((len(counts), len(methods), len(methods)))
     for i, (first, second) in enumerate(study.pairs_of_methods):
@@ -220,43 +235,45 @@ def _wins(study: Study, counts: Floats) -> Floats:
 
 
 def _estimate(mean: float, low: float, high: float) -> dict[str, float | None]:
-    return {"mean": _rounded(mean), "low": _rounded(low), "high": _rounded(high)}
+    return {"mean": _round(mean), "low": _round(low), "high": _round(high)}
 
 
-def _rounded(value: float | None) -> float | None:
-    """None for what has no value."""
+def _round(value: float | None) -> float | None:
+    """Round to 6 decimal places; None for None, NaN and infinity."""
     return None if value is None or not math.isfinite(value) else round(float(value), _DIGITS)
 
 
 # --- writing
 
 
-def write(results: Results, study: Study, people: Sequence[ParticipantAnswers], out: Path) -> None:
-    """Writes all files of a report, over those of an earlier one.
+def write(results: Results, study: Study, participants: Sequence[ParticipantAnswers], out: Path) -> None:
+    """Write all files of a report into the folder `out`, and replace those of an earlier report.
 
     Raises:
-        TargetError: one cannot be written.
+        TargetError: a file cannot be written.
     """
     files = {
         "report.json": f"{json.dumps(results, indent=1, ensure_ascii=False)}\n".encode(),
         "report.md": to_markdown(results).encode(),
         "table.tex": to_latex(results).encode(),
         "table.csv": to_csv(results).encode(),
-        "answers.csv": _answers_csv(results, study, people).encode(),
+        "answers.csv": _answers_csv(results, study, participants).encode(),
         "plot.png": plot(results),
     }
     for name, data in files.items():
         write_atomically(out / name, data, overwrite=True)
 
 
-def _answers_csv(results: Results, study: Study, people: Sequence[ParticipantAnswers]) -> str:
-    """A line for each answer about a comparison, for other people's statistics; `left_out` says by what rule, if so."""
+def _answers_csv(results: Results, study: Study, participants: Sequence[ParticipantAnswers]) -> str:
+    """One line for each answer to a comparison; the column `left_out` has the reason if the participant is excluded."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["participant", "dataset", "name", "first", "second", "outcome", "left_out"])
-    for person in people:
-        reason = results["left_out"].get(str(person.number), "")
-        for number, outcome in sorted(person.votes.items()):
+    for participant in participants:
+        reason = results["left_out"].get(str(participant.number), "")
+        for number, outcome in sorted(participant.votes.items()):
             row = study.description.comparisons[number]
-            table.writerow([person.number, row.dataset, row.name, *row.methods, OUTCOMES[outcome], reason])
+            table.writerow(
+                [participant.number, row.dataset, row.name, *row.methods, OUTCOMES[outcome], reason]
+            )
     return text.getvalue()

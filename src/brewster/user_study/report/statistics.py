@@ -1,6 +1,7 @@
-"""Rates and their uncertainty: whole participants are drawn, since answers of one person are alike.
+"""Rates and their confidence intervals. The bootstrap resamples whole participants, since their answers are correlated.
 
-Arrays of counts are (participants, pairs of methods, datasets, 3): how often the first method won, tied, lost.
+Arrays of counts are (participants, pairs of methods, datasets, 3): wins, ties and losses of the first method. In shapes,
+p is the number of participants, r of resamples and d of datasets.
 """
 
 from __future__ import annotations
@@ -22,28 +23,38 @@ _EQUAL: Final = 1e-9
 Floats = NDArray[np.float64]
 
 
-def resampled(participants: int, resamples: int = RESAMPLES) -> Float64[Floats, "r p"]:
-    """How often each participant is in each resample.
+def bootstrap_weights(participants: int, resamples: int = RESAMPLES) -> Float64[Floats, "r p"]:
+    """Draw resamples of the cluster bootstrap (Davison and Hinkley 1997, section 3.8), with a fixed seed.
 
-    Cluster bootstrap (Davison and Hinkley 1997, section 3.8): as many participants as there are, drawn with
-    replacement, each with all their answers; a fixed seed.
+    Each resample draws as many participants as there are, with replacement, each with all their answers.
+
+    Returns:
+        How often each participant is in each resample.
     """
     rng = np.random.default_rng([SEED, participants])
     return rng.multinomial(participants, np.full(participants, 1 / participants), resamples).astype(float)
 
 
-def summed(times: Floats, counts: Floats) -> Floats:
-    """The counts (p, ...) of each resample, (r, ...)."""
-    totals: Floats = (times @ counts.reshape(len(counts), -1)).reshape(len(times), *counts.shape[1:])
+def resampled_counts(
+    weights: Float64[Floats, "r p"], counts: Float64[Floats, "p ..."]
+) -> Float64[Floats, "r ..."]:
+    """The sum of the counts over the participants of each resample."""
+    totals: Floats = (weights @ counts.reshape(len(counts), -1)).reshape(len(weights), *counts.shape[1:])
     return totals
 
 
 def rates(
     counts: Float64[Floats, "... d 3"], pictures: Float64[Floats, "... d"]
 ) -> Float64[Floats, "... d+3 4"]:
-    """Win, tie and lose rate and win less lose: of each dataset, then the three averages; NaN where nobody answered.
+    """Rates of win, tie and lose, and the difference win - lose.
 
-    The averages: by pictures (the paper's), by datasets, and of all answers together.
+    Args:
+        counts: wins, ties and losses.
+        pictures: number of pictures of each dataset.
+
+    Returns:
+        A row for each dataset, then three averages: weighted by pictures (as in the paper), mean of the datasets, and all
+        answers together. NaN without answers.
     """
     with np.errstate(invalid="ignore"):
         shares = counts / counts.sum(axis=-1, keepdims=True)
@@ -54,22 +65,32 @@ def rates(
 
 
 def averages(
-    shares: Float64[Floats, "... d 3"], pictures: Float64[Floats, "... d"]
-) -> Float64[Floats, "... 2 3"]:
-    """Averages over datasets: weighted by their number of pictures, as in the paper's Table 3; and equally."""
+    shares: Float64[Floats, "... d k"], pictures: Float64[Floats, "... d"]
+) -> Float64[Floats, "... 2 k"]:
+    """Two averages over datasets: weighted by their number of pictures, as in the paper's Table 3, and unweighted.
+
+    The leading axes of the two arguments broadcast: `shares` may have an axis of resamples that `pictures` lacks.
+    """
     weights = pictures / pictures.sum(axis=-1, keepdims=True)
     return np.stack([(shares * weights[..., None]).sum(axis=-2), shares.mean(axis=-2)], axis=-2)
 
 
-def interval(draws: Float64[Floats, "r ..."], participants: int) -> Float64[Floats, "2 ..."]:
-    """The 95 % interval of each column of resamples of so many participants, without those that have no value in it.
+def bootstrap_interval(draws: Float64[Floats, "r ..."], participants: int) -> Float64[Floats, "2 ..."]:
+    """The 95 % expanded percentile interval (Hesterberg 2015, section 4.3.2).
 
-    The expanded percentile interval (Hesterberg 2015, section 4.3.2): slightly wider percentiles, so that few
-    participants do not pass for more than they are. NaN for a single one.
+    Its percentiles are slightly wider than 2.5 and 97.5, because the plain percentile interval is too narrow for few
+    participants.
+
+    Args:
+        draws: a statistic of each resample; values that are not finite are ignored.
+        participants: number of participants in each resample.
+
+    Returns:
+        The lower and the upper ends; NaN for a single participant.
     """
     if participants < 2:
         return np.full((2, *draws.shape[1:]), np.nan)
-    ends = _percentiles(participants)
+    ends = _expanded_percentiles(participants)
     if np.isfinite(draws).all():
         return np.percentile(draws, ends, axis=0)
     columns = [column[np.isfinite(column)] for column in draws.reshape(len(draws), -1).T]
@@ -77,13 +98,14 @@ def interval(draws: Float64[Floats, "r ..."], participants: int) -> Float64[Floa
     return np.array(found).T.reshape(2, *draws.shape[1:])
 
 
-def least(
+def agreement_bounds(
     counts: Float64[Floats, "p ... d 3"], pictures: Float64[Floats, "... d"]
 ) -> Float64[Floats, "... d+3"]:
-    """The lower 95 % bound of a rate that all answers agree on, of each row of `rates`; NaN where nobody answered.
+    """The lower 95 % bound of a rate of 1, for each row of `rates`; NaN without answers.
 
-    Clopper and Pearson 1934 with n of n, 0.025^(1 / n), n being the participants of a dataset: somebody who gives several
-    answers agrees in all of them no more surely than in one. Averages of the bounds bound the averages.
+    If all answers agree, the bootstrap has no spread. The bound is then that of Clopper and Pearson (1934) for n successes of
+    n trials, 0.025^(1 / n). Here n is the number of participants, not of answers, since answers of one participant are not
+    independent. Averages of the bounds bound the averages.
     """
     sizes = counts.sum(axis=-1)
     with np.errstate(divide="ignore"):
@@ -93,17 +115,24 @@ def least(
     return np.concatenate([bounds, averages(bounds[..., None], pictures)[..., 0], pooled[..., None]], axis=-1)
 
 
-def widened(
-    rows: Float64[Floats, "... 4"], ends: Float64[Floats, "2 ... 4"], bounds: Floats
-) -> Float64[Floats, "2 ... 4"]:
-    """The intervals of `rates`, where those without width, of resamples that are all alike, are those of `least`.
+def with_agreement_bounds(
+    rows: Float64[Floats, "... n 4"], ends: Float64[Floats, "2 ... n 4"], bounds: Float64[Floats, "... n"]
+) -> Float64[Floats, "2 ... n 4"]:
+    """The intervals of `rates`, with those of width 0 replaced by intervals from `agreement_bounds`.
 
-    NaN where there is no width though answers differ, as when a single participant has answered about a dataset.
+    Args:
+        rows: the rates.
+        ends: their bootstrap intervals.
+        bounds: the result of `agreement_bounds`.
+
+    Returns:
+        The intervals; NaN if the width is 0 although answers differ, for example if one participant has answered about a
+        dataset.
     """
     bound, shares = bounds[..., None], rows[..., :3]
-    is_all, is_none = shares > 1 - _EQUAL, shares < _EQUAL
-    lows = np.where(is_all, bound, np.where(is_none, 0.0, np.nan))
-    highs = np.where(is_all, 1.0, np.where(is_none, 1 - bound, np.nan))
+    is_one, is_zero = shares > 1 - _EQUAL, shares < _EQUAL
+    lows = np.where(is_one, bound, np.where(is_zero, 0.0, np.nan))
+    highs = np.where(is_one, 1.0, np.where(is_zero, 1 - bound, np.nan))
     lows, highs = (
         np.concatenate([own, own[..., :1] - other[..., 2:]], axis=-1)
         for own, other in ((lows, highs), (highs, lows))
@@ -111,10 +140,11 @@ def widened(
     return np.where(ends[1] - ends[0] < _EQUAL, np.stack([lows, highs]), ends)
 
 
-def _percentiles(participants: int) -> tuple[float, float]:
-    """Where 95 % of t with one degree of freedom less lie in a bootstrap, whose spread is too small by sqrt((n - 1) / n).
+def _expanded_percentiles(participants: int) -> tuple[float, float]:
+    """The percentiles of a bootstrap that match the 95 % interval of Student's t with n - 1 degrees of freedom.
 
-    The quantile of t is that of Abramowitz and Stegun 1972, 26.7.5.
+    They also correct the bootstrap's spread, which is too small by the factor sqrt((n - 1) / n). The quantile of t is the
+    expansion 26.7.5 of Abramowitz and Stegun 1972.
     """
     z, v = NormalDist().inv_cdf(0.975), participants - 1
     t = z + (z**3 + z) / (4 * v) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * v**2)
@@ -122,19 +152,22 @@ def _percentiles(participants: int) -> tuple[float, float]:
     return tail, 100 - tail
 
 
-def correlation(counts: Float64[Floats, "p 3"]) -> float | None:
-    """How alike the answers of one participant are: the intraclass correlation of scores 1, 0, -1 for win, tie, lose.
+def intraclass_correlation(counts: Float64[Floats, "p 3"]) -> float | None:
+    """The intraclass correlation of the scores 1, 0, -1 for win, tie, lose, with participants as classes.
 
-    The estimator from the analysis of variance (Donner 1986, equation 2.1), which may fall below 0 by chance; None where
-    it has no value.
+    The estimator from the analysis of variance (Donner 1986, equation 2.1). It can be below 0 by chance.
+
+    Returns:
+        The correlation; None with fewer than two participants, one answer for each participant, or no variance.
     """
     counts = counts[counts.sum(axis=1) > 0]
     sizes, sums, squares = counts.sum(axis=1), counts[:, 0] - counts[:, 2], counts[:, 0] + counts[:, 2]
-    people, answers = len(sizes), float(sizes.sum())
-    if people < 2 or answers <= people:
+    participants, answers = len(sizes), float(sizes.sum())
+    if participants < 2 or answers <= participants:
         return None
-    between = ((sums**2 / sizes).sum() - sums.sum() ** 2 / answers) / (people - 1)
-    within = (squares - sums**2 / sizes).sum() / (answers - people)
-    size = (answers - (sizes**2).sum() / answers) / (people - 1)
+    # the mean squares between and within participants, and Donner's mean size of unequal groups
+    between = ((sums**2 / sizes).sum() - sums.sum() ** 2 / answers) / (participants - 1)
+    within = (squares - sums**2 / sizes).sum() / (answers - participants)
+    size = (answers - (sizes**2).sum() / answers) / (participants - 1)
     spread = between + (size - 1) * within
     return float((between - within) / spread) if spread > 0 else None

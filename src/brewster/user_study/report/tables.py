@@ -1,4 +1,4 @@
-"""Results as tables: Markdown to read, LaTeX in the layout of the paper's Table 3, CSV to go on with."""
+"""Results as tables: Markdown, LaTeX in the layout of the paper's Table 3, and CSV."""
 
 from __future__ import annotations
 
@@ -7,16 +7,17 @@ import io
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
-_GROUPS: Final = {"included": "After the rule", "everyone": "Everyone"}
-_CHOICES: Final = """\
+_GROUPS: Final = {"included": "After the exclusion rule", "everyone": "All participants"}
+_DEFINITIONS: Final = """\
 Rates are shares of the answers about a pair of methods. Average weights each dataset by its number of pictures, as the \
-paper's Table 3 does; the plain mean of the datasets and the rates of all answers together stand below.
-Intervals are 95 % expanded percentile intervals of 10,000 bootstrap resamples of whole participants; where all answers \
-agree, Clopper and Pearson's with one answer a participant. They speak of other people who see these pictures, not of \
-other pictures.
-Difference is win less lose. Alike is the intra-participant correlation of scores 1, 0, -1, for `brewster study plan`.
-Strength: Bradley and Terry's model over all answers, a tie being half a win for each; 0 is the mean of all methods.
-Agreement: Krippendorff's alpha of win, tie and lose over comparisons; 1 is perfect, 0 is chance."""
+paper's Table 3 does; the rows below it are the unweighted mean of the datasets and the rates of all answers together.
+Intervals are 95 % expanded percentile intervals of 10,000 bootstrap resamples of whole participants; if all answers \
+agree, they are those of Clopper and Pearson with one answer for each participant. They cover other participants who see \
+these pictures, not other pictures.
+Difference is win minus lose. Correlation is the intraclass correlation of the scores 1, 0, -1 of a participant, an input \
+of `brewster study plan`.
+Strength is that of the Bradley-Terry model over all answers; a tie is half a win for each method, and the mean is 0.
+Agreement is Krippendorff's alpha of win, tie and lose over comparisons; 1 is perfect, 0 is chance."""
 
 Results = Mapping[str, Any]
 
@@ -30,15 +31,15 @@ _ESCAPES: Final = str.maketrans(
 
 
 def to_markdown(results: Results) -> str:
-    """All there is to read: who took part, the tables with and without the rule, strengths, agreement, definitions."""
+    """The whole report: participants, tables with and without the exclusion rule, strengths, agreement, definitions."""
     parts = [
         f"# {' · '.join(results['study']['methods'])}",
         *(_group(results, key, heading) for key, heading in _GROUPS.items()),
         "\n".join(
             [
-                "## How it was measured",
+                "## Methods",
                 "",
-                *(f"- {line}" for line in (_rule(results), *_CHOICES.splitlines())),
+                *(f"- {line}" for line in (_rule(results), *_DEFINITIONS.splitlines())),
             ]
         ),
     ]
@@ -46,33 +47,36 @@ def to_markdown(results: Results) -> str:
 
 
 def overview(results: Results) -> str:
-    """What a terminal shows: the group that the rule keeps."""
+    """The text for a terminal: the results after the exclusion rule."""
     return f"{_group(results, 'included', _GROUPS['included'])}\n\n{_rule(results)}\n"
 
 
 def _rule(results: Results) -> str:
-    gone = results["excluded"]
+    excluded = results["excluded"]
     rule = results["rule"]
     return (
-        f"{rule[0].upper()}{rule[1:]}: {gone['failed']} for wrong answers, {gone['fast']} for haste. "
-        "Who stopped early counts with what they answered."
+        f"{rule[0].upper()}{rule[1:]}: {excluded['failed']} for wrong answers, {excluded['fast']} for short times. "
+        "Participants who stopped early are included with the answers they gave."
     )
 
 
 def _group(results: Results, key: str, heading: str) -> str:
     group = results[key]
-    parts = [f"## {heading}", _counted(group)]
+    parts = [f"## {heading}", _counts_line(group)]
     parts += [_table(table) for table in group["tables"]]
     if group["strengths"]:
-        rows = [["Method", "Strength"], *([name, _signed(row)] for name, row in group["strengths"].items())]
+        rows = [
+            ["Method", "Strength"],
+            *([name, _strength_text(row)] for name, row in group["strengths"].items()),
+        ]
         agreement = "has no value" if group["agreement"] is None else f"is {group['agreement']:.3f}"
-        parts += [_grid(rows), f"Krippendorff's alpha {agreement}."]
+        parts += [_markdown_table(rows), f"Krippendorff's alpha {agreement}."]
     return "\n\n".join(parts)
 
 
-def _counted(group: Mapping[str, Any]) -> str:
+def _counts_line(group: Mapping[str, Any]) -> str:
     return (
-        f"{group['participants']} participants ({group['complete']} to the end), {group['answers']} answers; "
+        f"{group['participants']} participants ({group['complete']} complete), {group['answers']} answers; "
         f"{group['failed']} of {group['catches']} catch trials failed."
     )
 
@@ -83,29 +87,29 @@ def _table(table: Mapping[str, Any]) -> str:
         [row["title"], *(_percent(row[name]) for name in ("win", "tie", "lose")), _percent(row["difference"], "+"), str(row["answers"])]
         for row in table["rows"]
     ]  # fmt: skip
-    alike = "" if table["correlation"] is None else f"\n\nAlike: {table['correlation']:.3f}"
-    return f"### {table['first']} and {table['second']}\n\n{_grid(rows)}{alike}"
+    correlation = "" if table["correlation"] is None else f"\n\nCorrelation: {table['correlation']:.3f}"
+    return f"### {table['first']} and {table['second']}\n\n{_markdown_table(rows)}{correlation}"
 
 
 def _percent(entry: Mapping[str, Any], sign: str = "") -> str:
     if entry["mean"] is None:
         return "-"
     mean = f"{100 * entry['mean']:{sign}.2f} %"
-    return mean if entry["low"] is None else f"{mean} ({_ends(entry, sign)})"
+    return mean if entry["low"] is None else f"{mean} ({_interval_text(entry, sign)})"
 
 
-def _ends(entry: Mapping[str, Any], sign: str = "", join: str = " to ") -> str:
+def _interval_text(entry: Mapping[str, Any], sign: str = "", join: str = " to ") -> str:
     return join.join(f"{100 * entry[end]:{sign}.1f}" for end in ("low", "high"))
 
 
-def _signed(entry: Mapping[str, Any]) -> str:
+def _strength_text(entry: Mapping[str, Any]) -> str:
     if entry["mean"] is None:
-        return "without bound: a method has only won, or only lost"
+        return "unbounded: a method has only won or only lost"
     mean = f"{entry['mean']:+.3f}"
     return mean if entry["low"] is None else f"{mean} ({entry['low']:+.3f} to {entry['high']:+.3f})"
 
 
-def _grid(rows: Iterable[Iterable[str]]) -> str:
+def _markdown_table(rows: Iterable[Iterable[str]]) -> str:
     head, *body = [[cell.replace("|", "\\|") for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(head, *body, strict=True)]
     lines = [head, [":" + "-" * max(2, width - 1) for width in widths], *body]
@@ -119,13 +123,14 @@ def _grid(rows: Iterable[Iterable[str]]) -> str:
 
 
 def to_latex(results: Results) -> str:
-    """The layout of the paper's Table 3, of the group that the rule keeps, with the intervals below the rates.
+    """The results after the exclusion rule, in the layout of the paper's Table 3, with intervals below the rates.
 
-    A row a dataset and the average; for each pair of methods win, tie and lose. Needs the package booktabs.
+    One row for each dataset and one for the average; columns win, tie and lose for each pair of methods. Needs the LaTeX
+    package booktabs.
     """
     tables = results["included"]["tables"]
     if not tables:
-        return "% the rule leaves nobody\n"
+        return "% the rule excludes everyone\n"
     heads = [cell for table in tables for cell in (table["first"], "Tie", table["second"])]
     keys = [key for key in results["study"]["datasets"] if len(results["study"]["datasets"]) > 1]
     lines = [_latex_row(tables, key) for key in keys]
@@ -148,7 +153,10 @@ def _latex_row(tables: Iterable[Mapping[str, Any]], key: str) -> str:
     rows = [next(row for row in table["rows"] if row["key"] == key) for table in tables]
     entries = [row[name] for row in rows for name in ("win", "tie", "lose")]
     above = ["--" if entry["mean"] is None else f"{100 * entry['mean']:.2f}\\%" for entry in entries]
-    below = ["" if entry["low"] is None else f"\\scriptsize {_ends(entry, join='--')}" for entry in entries]
+    below = [
+        "" if entry["low"] is None else f"\\scriptsize {_interval_text(entry, join='--')}"
+        for entry in entries
+    ]
     return " & ".join([_escape(rows[0]["title"]), *above]) + " \\\\\n" + " & ".join(["", *below]) + r" \\"
 
 
@@ -156,9 +164,9 @@ def _latex_row(tables: Iterable[Mapping[str, Any]], key: str) -> str:
 
 
 def to_csv(results: Results) -> str:
-    """A line for each group, pair of methods, dataset or average, and rate; shares, not percent.
+    """One line for each group, pair of methods, row (dataset or average) and rate. Rates are shares, not percentages.
 
-    The key is the dataset's own name, or begins with a slash for an average.
+    The key is the name of the dataset, or begins with a slash for an average.
     """
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")

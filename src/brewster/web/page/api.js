@@ -1,39 +1,39 @@
-// What the page asks of the server. An answer that is no answer becomes an Error whose message is a sentence.
+// The client of the HTTP API. A failed request throws an Error whose message is a sentence for the user.
 
 const POLL_MS = 300;
-const PATIENCE = 60; // times that a full queue is waited for
+const MAX_RETRIES = 60; // how often a request is repeated while the queue of the server is full
 
-// Sends a photo with options to a path, tells `onProgress({state, ahead, share})`, and returns the response.
+// Sends a photo with options to a path and returns the response. Calls `onProgress({state, ahead, share})` meanwhile.
 export async function send(path, file, options, { signal, onProgress }) {
   const form = new FormData();
   for (const [name, value] of Object.entries(options)) form.append(name, value);
   form.append("photo", file, file.name);
   for (let tries = 0; ; tries++) {
-    const job = newName();
-    const watched = watch(job, onProgress);
+    const job = randomJobName();
+    const watcher = pollProgress(job, onProgress);
     const response = await fetch(`${path}?job=${job}`, { method: "POST", body: form, signal })
-      .catch((error) => refuse(error))
-      .finally(() => watched.end());
+      .catch((error) => throwNetworkError(error))
+      .finally(() => watcher.stop());
     if (response.ok) return response;
-    if (response.status !== 503 || tries === PATIENCE) throw new Error(await sentenceOf(response));
+    if (response.status !== 503 || tries === MAX_RETRIES) throw new Error(await errorMessage(response));
     onProgress({ state: "waiting", share: 0 });
-    await pause(1000 * Number(response.headers.get("Retry-After") ?? 5), signal);
+    await sleep(1000 * Number(response.headers.get("Retry-After") ?? 5), signal);
   }
 }
 
 export async function models() {
-  const response = await fetch("models").catch(refuse);
-  if (!response.ok) throw new Error(await sentenceOf(response));
+  const response = await fetch("models").catch(throwNetworkError);
+  if (!response.ok) throw new Error(await errorMessage(response));
   return response.json();
 }
 
-// The name that the server gives to what it sends.
-export function nameOf(response) {
+// The file name in the Content-Disposition header of a response.
+export function fileNameOf(response) {
   const name = /filename\*=UTF-8''([^;]+)/.exec(response.headers.get("Content-Disposition") ?? "");
   return name ? decodeURIComponent(name[1]) : "photo";
 }
 
-function watch(job, onProgress) {
+function pollProgress(job, onProgress) {
   let timer = setTimeout(poll, POLL_MS);
   async function poll() {
     const response = await fetch(`progress/${job}`).catch(() => null);
@@ -41,29 +41,29 @@ function watch(job, onProgress) {
     if (timer) timer = setTimeout(poll, POLL_MS);
   }
   return {
-    end() {
+    stop() {
       clearTimeout(timer);
       timer = null;
     },
   };
 }
 
-function refuse(error) {
+function throwNetworkError(error) {
   if (error.name === "AbortError") throw error;
-  throw new Error("The server does not answer. It may have been stopped: start it again, then try again.");
+  throw new Error("The server does not respond. Start it again if it was stopped, then try again.");
 }
 
-async function sentenceOf(response) {
-  const told = await response.json().catch(() => ({}));
-  const sentence = told.error ?? `the server answered ${response.status}`;
+async function errorMessage(response) {
+  const body = await response.json().catch(() => ({}));
+  const sentence = body.error ?? `the server returned status ${response.status}`;
   return `${sentence[0].toUpperCase()}${sentence.slice(1).replace(/\.?$/, ".")}`;
 }
 
-function newName() {
+function randomJobName() {
   return Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, "0")).join("");
 }
 
-function pause(milliseconds, signal) {
+function sleep(milliseconds, signal) {
   return new Promise((resolve, reject) => {
     const timer = setTimeout(resolve, milliseconds);
     signal.addEventListener("abort", () => {

@@ -1,32 +1,32 @@
-// The page: which photos there are, what becomes of each, and the one that is shown.
+// The page that separates photos: the list of photos, their processing, and the view of the current photo.
 
 import "./compare.js";
-import { models, nameOf, send } from "./api.js";
+import { models, fileNameOf, send } from "./api.js";
 import { draw, readMaps } from "./light.js";
-import { filesOf, zipped } from "./zip.js";
+import { createZip, readZip } from "./zip.js";
 
-const AT_ONCE = 2; // one is worked on while the next one travels
-const ABOUT = {
-  transmission: "What is behind the glass.",
-  reflection: "What was mirrored in it.",
-  confidence: "White where the separation is sure, black where it is not.",
+const MAX_CONCURRENT = 2; // one photo is separated while the next one is uploaded
+const LAYER_DESCRIPTIONS = {
+  transmission: "The scene behind the glass.",
+  reflection: "The light that the glass reflects.",
+  confidence: "White: the separation is certain. Black: it is uncertain.",
 };
-const NOTHING = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="; // one clear pixel
-const LAYERS = "transmission,reflection"; // of the zip
+const TRANSPARENT_PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="; // one transparent pixel
+const LAYERS = "transmission,reflection"; // in the zip
 
-const photos = []; // {file, row, state, share, ahead, error, strength, maps, made, stop, isAskedAgain}
-let current = null; // the one that is shown
-let shown = null; // its maps
-const at = (id) => document.getElementById(id);
-const compare = at("compare");
+const photos = []; // {file, row, state, share, ahead, error, strength, maps, madeWith, controller, isSuperseded}
+let current = null; // the photo that is shown
+let shown = null; // the maps of the current photo
+const byId = (id) => document.getElementById(id);
+const compare = byId("compare");
 
-// --- what was chosen
+// --- settings
 
 const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).value;
-const settings = () => ({ quality: chosen("quality"), model: at("model").value });
-const isFresh = (photo) => photo.made === JSON.stringify(settings());
+const settings = () => ({ quality: chosen("quality"), model: byId("model").value });
+const isFresh = (photo) => photo.madeWith === JSON.stringify(settings());
 
-// --- photos come and go
+// --- adding and removing photos
 
 function add(files) {
   for (const file of files) {
@@ -35,25 +35,25 @@ function add(files) {
     photos.push(photo);
   }
   if (!files.length) return;
-  at("news").textContent = files.length === 1 ? `${files[0].name} was added` : `${files.length} photos were added`;
+  byId("announcement").textContent = files.length === 1 ? `${files[0].name} was added` : `${files.length} photos were added`;
   const isFirst = current === null;
   if (isFirst) select(photos[0]);
   if (isFirst) current.row.querySelector("button").focus();
   refresh();
-  next();
+  startNext();
 }
 
 function remove(photo) {
-  photo.stop?.abort();
+  photo.controller?.abort();
   const index = photos.indexOf(photo);
-  const hadFocus = photo.row.contains(document.activeElement) || at("stage").contains(document.activeElement);
+  const hadFocus = photo.row.contains(document.activeElement) || byId("stage").contains(document.activeElement);
   photos.splice(index, 1);
   photo.row.remove();
   if (photo === current) select(photos[Math.min(index, photos.length - 1)] ?? null);
-  if (hadFocus) (current?.row.querySelector("button") ?? at("choose")).focus();
-  at("news").textContent = `${photo.file.name} was removed`;
+  if (hadFocus) (current?.row.querySelector("button") ?? byId("choose")).focus();
+  byId("announcement").textContent = `${photo.file.name} was removed`;
   refresh();
-  next();
+  startNext();
 }
 
 function newRow(photo) {
@@ -64,77 +64,77 @@ function newRow(photo) {
   row.querySelector(".remove").setAttribute("aria-label", `Remove ${photo.file.name}`);
   row.querySelector(".pick").addEventListener("click", () => select(photo));
   row.querySelector(".remove").addEventListener("click", () => remove(photo));
-  sketch(row.querySelector("img"), photo.file);
-  at("photos").append(row);
+  showFile(row.querySelector("img"), photo.file);
+  byId("photos").append(row);
   return row;
 }
 
-// Shows a file as the browser itself reads it, or nothing where it cannot.
-function sketch(image, file) {
+// Shows a file as the browser decodes it, or a transparent pixel if it cannot.
+function showFile(image, file) {
   const url = URL.createObjectURL(file);
   const done = () => URL.revokeObjectURL(url);
   image.onload = done;
-  image.onerror = () => (done(), (image.src = NOTHING), (image.onload = null));
+  image.onerror = () => (done(), (image.src = TRANSPARENT_PIXEL), (image.onload = null));
   image.src = url;
 }
 
-// --- the work, a few at a time, the photo that is shown first
+// --- processing: a few photos at a time, the current photo first
 
-function next() {
-  const busy = photos.filter((photo) => photo.stop).length;
-  const waiting = photos.filter((photo) => photo.state === "waiting" && !photo.stop);
+function startNext() {
+  const busy = photos.filter((photo) => photo.controller).length;
+  const waiting = photos.filter((photo) => photo.state === "waiting" && !photo.controller);
   if (current && waiting.includes(current)) waiting.unshift(current);
-  for (const photo of [...new Set(waiting)].slice(0, AT_ONCE - busy)) separate(photo);
+  for (const photo of [...new Set(waiting)].slice(0, MAX_CONCURRENT - busy)) separate(photo);
 }
 
 async function separate(photo) {
-  const asked = settings();
-  photo.stop = new AbortController();
-  Object.assign(photo, { state: "waiting", share: 0, ahead: 0, error: null, isAskedAgain: false });
+  const requestSettings = settings();
+  photo.controller = new AbortController();
+  Object.assign(photo, { state: "waiting", share: 0, ahead: 0, error: null, isSuperseded: false });
   const onProgress = (progress) => (Object.assign(photo, progress), refresh(photo));
   try {
-    const response = await send("preview", photo.file, asked, { signal: photo.stop.signal, onProgress });
+    const response = await send("preview", photo.file, requestSettings, { signal: photo.controller.signal, onProgress });
     photo.maps = await response.blob();
-    Object.assign(photo, { state: "done", made: JSON.stringify(asked) });
-    news(`${photo.file.name} is separated`);
+    Object.assign(photo, { state: "done", madeWith: JSON.stringify(requestSettings) });
+    announce(`${photo.file.name} is separated`);
   } catch (error) {
     const isStopped = error.name === "AbortError";
-    const asBefore = isFresh(photo) ? "done" : "waiting"; // the maps that it has may be wanted again
-    const state = isStopped && photo.isAskedAgain ? asBefore : "failed";
+    const previousState = isFresh(photo) ? "done" : "waiting"; // its old maps may be needed again
+    const state = isStopped && photo.isSuperseded ? previousState : "failed";
     Object.assign(photo, { state, error: isStopped ? null : error.message });
-    if (photo.error) news(`${photo.file.name} failed`);
+    if (photo.error) announce(`${photo.file.name} failed`);
   }
-  photo.stop = null;
+  photo.controller = null;
   if (!photos.includes(photo)) return;
-  if (photo.state === "done" && !isFresh(photo)) photo.state = "waiting"; // the settings have changed meanwhile
+  if (photo.state === "done" && !isFresh(photo)) photo.state = "waiting"; // the settings have changed since the request
   refresh(photo);
   if (photo === current) await show();
-  next();
+  startNext();
 }
 
-function again(photo) {
+function retry(photo) {
   Object.assign(photo, { state: "waiting", error: null });
   refresh(photo);
-  next();
+  startNext();
 }
 
-// The settings have changed, perhaps back to those of the maps that a photo has.
-function redo() {
+// Called after a change of the settings. A photo whose maps fit the new settings is not processed again.
+function applySettings() {
   for (const photo of photos) {
-    photo.stop?.abort();
-    Object.assign(photo, { state: isFresh(photo) ? "done" : "waiting", error: null, isAskedAgain: true });
+    photo.controller?.abort();
+    Object.assign(photo, { state: isFresh(photo) ? "done" : "waiting", error: null, isSuperseded: true });
   }
   refresh();
   show();
-  next();
+  startNext();
 }
 
-function news(sentence) {
+function announce(sentence) {
   const done = photos.filter((photo) => photo.state === "done").length;
-  at("news").textContent = photos.length > 1 ? `${sentence}, ${done} of ${photos.length} are done` : sentence;
+  byId("announcement").textContent = photos.length > 1 ? `${sentence}, ${done} of ${photos.length} are done` : sentence;
 }
 
-// --- the photo that is shown
+// --- the current photo
 
 function select(photo) {
   current = photo;
@@ -143,37 +143,37 @@ function select(photo) {
   if (photo) {
     photo.row.querySelector(".pick").setAttribute("aria-current", "true");
     photo.row.scrollIntoView({ block: "nearest", inline: "nearest" });
-    at("strength").value = photo.strength;
-    sketch(at("sketch"), photo.file);
+    byId("strength").value = photo.strength;
+    showFile(byId("thumbnail"), photo.file);
     compare.reset();
     paint();
   }
   refresh();
   show();
-  next();
+  startNext();
 }
 
 async function show() {
   const photo = current;
   if (photo?.state !== "done") return;
   const maps = readMaps(await photo.maps.arrayBuffer());
-  if (photo !== current) return; // another one was chosen meanwhile
+  if (photo !== current) return; // another photo was selected in the meantime
   shown = maps;
   draw(compare.left, maps, "photo");
   refresh();
   paint();
 }
 
-let isAsked = false;
+let isPaintScheduled = false;
 
 function paint() {
-  at("amount").textContent = `${Math.round(100 * at("strength").value)} %`;
-  at("about").textContent = ABOUT[chosen("view")];
-  at("download").textContent = `Download ${chosen("view")}`;
-  if (!shown || isAsked) return;
-  isAsked = true;
+  byId("amount").textContent = `${Math.round(100 * byId("strength").value)} %`;
+  byId("layer-description").textContent = LAYER_DESCRIPTIONS[chosen("view")];
+  byId("download").textContent = `Download ${chosen("view")}`;
+  if (!shown || isPaintScheduled) return;
+  isPaintScheduled = true;
   requestAnimationFrame(() => {
-    isAsked = false;
+    isPaintScheduled = false;
     if (!shown) return;
     draw(compare.right, shown, chosen("view"), current.strength);
     compare.show(current.file.name, chosen("view"));
@@ -183,77 +183,77 @@ function paint() {
 function refresh(photo = null) {
   for (const one of photo ? [photo] : photos) {
     one.row.className = one.state;
-    one.row.querySelector(".state").textContent = inShort(one);
+    one.row.querySelector(".state").textContent = shortStatus(one);
   }
-  enable("all", making === null && photos.some((one) => one.state === "done"));
+  enable("all", exporting === null && photos.some((one) => one.state === "done"));
   if (photo && photo !== current) return;
-  const has = current !== null;
-  at("welcome").hidden = has;
-  for (const id of ["stage", "strip", "panel", "add"]) at(id).hidden = !has;
-  if (!has) return;
+  const hasPhoto = current !== null;
+  byId("welcome").hidden = hasPhoto;
+  for (const id of ["stage", "strip", "panel", "add"]) byId(id).hidden = !hasPhoto;
+  if (!hasPhoto) return;
   const isReady = current.state === "done" && shown !== null;
-  const hadFocus = [at("waiting"), at("trouble")].find((part) => part.contains(document.activeElement));
+  const focusedPart = [byId("waiting"), byId("error")].find((part) => part.contains(document.activeElement));
   compare.hidden = !isReady;
-  at("trouble").hidden = current.state !== "failed";
-  at("waiting").hidden = isReady || current.state === "failed";
-  if (hadFocus?.hidden) (isReady ? compare : at(current.state === "failed" ? "again" : "cancel")).focus();
-  enable("download", isReady && making === null);
-  at("step").textContent = inWords(current);
-  if (current.state === "working") at("bar").value = current.share;
-  else at("bar").removeAttribute("value");
-  at("what").textContent = current.error ? `${current.file.name} could not be separated` : "Cancelled";
-  at("why").textContent = current.error ?? "";
-  at("facts").textContent = isReady ? facts(shown) : "";
+  byId("error").hidden = current.state !== "failed";
+  byId("waiting").hidden = isReady || current.state === "failed";
+  if (focusedPart?.hidden) (isReady ? compare : byId(current.state === "failed" ? "retry" : "cancel")).focus();
+  enable("download", isReady && exporting === null);
+  byId("status").textContent = statusText(current);
+  if (current.state === "working") byId("bar").value = current.share;
+  else byId("bar").removeAttribute("value");
+  byId("error-title").textContent = current.error ? `${current.file.name} could not be separated` : "Cancelled";
+  byId("error-text").textContent = current.error ?? "";
+  byId("facts").textContent = isReady ? describeMaps(shown) : "";
 }
 
-// A button that is disabled in earnest would lose the focus.
+// Uses aria-disabled: a button with the attribute `disabled` would lose the focus.
 function enable(id, isEnabled) {
-  at(id).setAttribute("aria-disabled", !isEnabled);
+  byId(id).setAttribute("aria-disabled", !isEnabled);
 }
 
-function facts({ full, width, height, doubtful }) {
+function describeMaps({ full, width, height, doubtful }) {
   const size = `${full.join(" × ")} pixels`;
   const preview = full[0] === width ? "." : `, shown at ${width} × ${height}.`;
-  return size + preview + (doubtful ? " The model redrew it so freely that the layers may be wrong: look closely." : "");
+  return size + preview + (doubtful ? " The model has changed the photo so much that the layers may be wrong. Check them." : "");
 }
 
-function inShort({ state, share, error }) {
+function shortStatus({ state, share, error }) {
   if (state === "failed") return error ? "failed" : "cancelled";
   return { done: "done", working: `${Math.round(100 * share)} %`, waiting: "waiting" }[state];
 }
 
-function inWords({ state, share, ahead }) {
+function statusText({ state, share, ahead }) {
   if (state !== "waiting") return `Separating, ${Math.round(100 * share)} %`;
-  return ahead ? `Waiting, ${ahead} before it` : "Waiting";
+  return ahead ? `Waiting, ${ahead} before this one` : "Waiting";
 }
 
-// --- files at full size, as the command line makes them
+// --- downloads at full size, equal to the files of the command line
 
-let making = null;
+let exporting = null;
 
-async function make(button, work) {
+async function runExport(button, work) {
   if (button.getAttribute("aria-disabled") === "true") return;
-  making = new AbortController();
-  at("failed").hidden = true;
-  at("making").hidden = false;
+  exporting = new AbortController();
+  byId("export-error").hidden = true;
+  byId("export").hidden = false;
   refresh();
   try {
-    const { name, blob, trouble = "" } = await work(making.signal);
+    const { name, blob, problem = "" } = await work(exporting.signal);
     save(name, blob);
-    at("news").textContent = `${name} is ready`;
-    complain(trouble);
+    byId("announcement").textContent = `${name} is ready`;
+    showExportError(problem);
   } catch (error) {
-    complain(error.name === "AbortError" ? "" : error.message);
+    showExportError(error.name === "AbortError" ? "" : error.message);
   }
-  making = null;
-  if (at("making").contains(document.activeElement)) button.focus();
-  at("making").hidden = true;
+  exporting = null;
+  if (byId("export").contains(document.activeElement)) button.focus();
+  byId("export").hidden = true;
   refresh();
 }
 
-function complain(trouble) {
-  at("failed").textContent = trouble;
-  at("failed").hidden = !trouble;
+function showExportError(problem) {
+  byId("export-error").textContent = problem;
+  byId("export-error").hidden = !problem;
 }
 
 const fullSize = (photo, layers, signal, onShare) =>
@@ -262,30 +262,30 @@ const fullSize = (photo, layers, signal, onShare) =>
     onProgress: ({ share }) => onShare(share),
   });
 
-async function one(signal) {
-  const response = await fullSize(current, chosen("view"), signal, (share) => (at("made").value = share));
-  return { name: nameOf(response), blob: await response.blob() };
+async function exportLayer(signal) {
+  const response = await fullSize(current, chosen("view"), signal, (share) => (byId("export-progress").value = share));
+  return { name: fileNameOf(response), blob: await response.blob() };
 }
 
-// One that fails is left out and named; if all do, there is nothing to save.
-async function all(signal) {
+// A photo that fails is left out, and its error is shown. If all photos fail, nothing is saved.
+async function exportAll(signal) {
   const files = [];
   const failed = [];
   const done = photos.filter((photo) => photo.state === "done");
   for (const [index, photo] of done.entries()) {
-    const onShare = (share) => (at("made").value = (index + share) / done.length);
+    const onShare = (share) => (byId("export-progress").value = (index + share) / done.length);
     onShare(0);
     try {
       const response = await fullSize(photo, LAYERS, signal, onShare);
-      files.push(...filesOf(await response.arrayBuffer()));
+      files.push(...readZip(await response.arrayBuffer()));
     } catch (error) {
       if (error.name === "AbortError") throw error;
       failed.push(`${photo.file.name} is not in the zip. ${error.message}`);
     }
   }
-  const trouble = failed.join(" ");
-  if (!files.length) throw new Error(trouble);
-  return { name: "brewster.zip", blob: zipped(files), trouble };
+  const problem = failed.join(" ");
+  if (!files.length) throw new Error(problem);
+  return { name: "brewster.zip", blob: createZip(files), problem };
 }
 
 function save(name, blob) {
@@ -296,46 +296,46 @@ function save(name, blob) {
   setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
 }
 
-// --- hands
+// --- event handlers
 
-at("choose").addEventListener("click", () => at("files").click());
-at("add").addEventListener("click", () => at("files").click());
-at("files").addEventListener("change", () => {
-  add([...at("files").files]);
-  at("files").value = "";
+byId("choose").addEventListener("click", () => byId("files").click());
+byId("add").addEventListener("click", () => byId("files").click());
+byId("files").addEventListener("change", () => {
+  add([...byId("files").files]);
+  byId("files").value = "";
 });
-at("strength").addEventListener("input", () => {
-  current.strength = Number(at("strength").value);
+byId("strength").addEventListener("input", () => {
+  current.strength = Number(byId("strength").value);
   paint();
 });
 for (const input of document.querySelectorAll("input[name=view]")) input.addEventListener("change", paint);
-for (const input of document.querySelectorAll("input[name=quality], #model")) input.addEventListener("change", redo);
-at("cancel").addEventListener("click", () => {
-  if (current.stop) current.stop.abort();
+for (const input of document.querySelectorAll("input[name=quality], #model")) input.addEventListener("change", applySettings);
+byId("cancel").addEventListener("click", () => {
+  if (current.controller) current.controller.abort();
   else (current.state = "failed"), refresh(current);
 });
-at("again").addEventListener("click", () => again(current));
-at("drop").addEventListener("click", () => remove(current));
-at("download").addEventListener("click", (event) => make(event.currentTarget, one));
-at("all").addEventListener("click", (event) => make(event.currentTarget, all));
-at("stop").addEventListener("click", () => making?.abort());
-at("panel").addEventListener("submit", (event) => event.preventDefault());
+byId("retry").addEventListener("click", () => retry(current));
+byId("discard").addEventListener("click", () => remove(current));
+byId("download").addEventListener("click", (event) => runExport(event.currentTarget, exportLayer));
+byId("all").addEventListener("click", (event) => runExport(event.currentTarget, exportAll));
+byId("stop-export").addEventListener("click", () => exporting?.abort());
+byId("panel").addEventListener("submit", (event) => event.preventDefault());
 
 document.addEventListener("paste", (event) => add([...event.clipboardData.files]));
 document.addEventListener("dragover", (event) => {
   event.preventDefault();
-  document.body.classList.add("over");
+  document.body.classList.add("drag-over");
 });
 document.addEventListener("dragleave", (event) => {
-  if (!event.relatedTarget) document.body.classList.remove("over");
+  if (!event.relatedTarget) document.body.classList.remove("drag-over");
 });
 document.addEventListener("drop", (event) => {
   event.preventDefault();
-  document.body.classList.remove("over");
+  document.body.classList.remove("drag-over");
   add([...event.dataTransfer.files]);
 });
 
 paint();
 models()
-  .then((rows) => at("model").append(...rows.map(({ name }) => new Option(name))))
-  .catch((error) => (at("news").textContent = error.message));
+  .then((rows) => byId("model").append(...rows.map(({ name }) => new Option(name))))
+  .catch((error) => (byId("announcement").textContent = error.message));

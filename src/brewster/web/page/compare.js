@@ -1,17 +1,17 @@
-// <glass-compare>: two pictures of one size on either side of a line that can be moved; zoom and pan move both.
-// Draw on its canvases `left` and `right`, call `show(...)`, and `paint()` after each change.
+// <glass-compare>: two pictures of one size, separated by a movable line. Zoom and pan apply to both.
+// Draw on its canvases `left` and `right`, call `show(...)`, and call `paint()` after each change.
 
-const CLOSEST = 8; // screen pixels for a pixel of the picture, at most
-const GRIP = 28; // how near to the line, in CSS pixels, a pointer takes hold of it when the picture is zoomed
+const MAX_PIXEL_SIZE = 8; // maximum size of a picture pixel in screen pixels
+const GRAB_DISTANCE = 28; // distance to the line in CSS pixels within which a pointer drags it while the picture is zoomed
 
 class GlassCompare extends HTMLElement {
   left = document.createElement("canvas");
   right = document.createElement("canvas");
-  #split = 0.5; // where the line is, as a share of the visible width of the picture
-  #zoom = 1; // 1 shows it all
-  #centre = { x: 0.5, y: 0.5 }; // the point of the picture in the middle of the view, as shares
+  #split = 0.5; // position of the line as a share of the visible width of the picture
+  #zoom = 1; // 1 shows the whole picture
+  #centre = { x: 0.5, y: 0.5 }; // the picture point in the middle of the view, as shares of width and height
   #pointers = new Map();
-  #hold = null; // what a pointer has taken hold of: "line" or "picture"
+  #dragged = null; // what the pointer drags: "line" or "picture"
 
   connectedCallback() {
     this.tabIndex = 0;
@@ -35,7 +35,7 @@ class GlassCompare extends HTMLElement {
     new ResizeObserver(() => this.paint()).observe(this);
   }
 
-  // Names both sides, for eyes and for a screen reader.
+  // Sets the labels of both sides, visible and for screen readers.
   show(photo, layer) {
     this.setAttribute("aria-label", `${photo}: the photo on the left, its ${layer} on the right. `
       + "Plus and minus zoom, 0 shows all, arrow keys move the picture.");
@@ -43,31 +43,31 @@ class GlassCompare extends HTMLElement {
     this.paint();
   }
 
-  // Another photo: shown whole, the line in the middle.
+  // Shows the whole picture, with the line in the middle.
   reset() {
     [this.#split, this.#zoom, this.#centre] = [0.5, 1, { x: 0.5, y: 0.5 }];
   }
 
-  // Zooms by a factor around a point of the view, its middle if none is given; 0 shows all.
+  // Zooms by a factor around a point of the view, by default its middle. A factor of 0 shows the whole picture.
   zoomBy(factor, x = this.clientWidth / 2, y = this.clientHeight / 2) {
-    const before = this.#place();
-    const closest = Math.max(1, (CLOSEST * this.left.width) / this.#fit().width / (window.devicePixelRatio || 1));
-    this.#zoom = factor === 0 ? 1 : Math.min(closest, Math.max(1, this.#zoom * factor));
+    const before = this.#placement();
+    const maxZoom = Math.max(1, (MAX_PIXEL_SIZE * this.left.width) / this.#fit().width / (window.devicePixelRatio || 1));
+    this.#zoom = factor === 0 ? 1 : Math.min(maxZoom, Math.max(1, this.#zoom * factor));
     const at = { x: (x - before.left) / before.width, y: (y - before.top) / before.height };
-    const { width, height } = this.#place();
+    const { width, height } = this.#placement();
     this.#centre = { x: at.x - (x - this.clientWidth / 2) / width, y: at.y - (y - this.clientHeight / 2) / height };
     this.paint();
   }
 
-  // The size of the whole picture in the view, in CSS pixels; small ones are enlarged to twice their size.
+  // The size of the whole picture in the view, in CSS pixels. Small pictures are enlarged at most by a factor of 2.
   #fit() {
     const { width, height } = this.left;
     const scale = Math.min(this.clientWidth / width, this.clientHeight / height, 2);
     return { width: width * scale, height: height * scale };
   }
 
-  // Where the picture lies in the view; an edge is never drawn further in than it must be.
-  #place() {
+  // The position and size of the picture in the view, in CSS pixels. Limits the pan, so that the picture covers the view.
+  #placement() {
     const fit = this.#fit();
     const [width, height] = [fit.width * this.#zoom, fit.height * this.#zoom];
     const start = (view, length, centre) =>
@@ -78,29 +78,29 @@ class GlassCompare extends HTMLElement {
     return { left, top, width, height };
   }
 
-  // The ends of what is visible of the picture, and the line between them.
-  #visible(place = this.#place()) {
-    const [from, to] = [Math.max(0, place.left), Math.min(this.clientWidth, place.left + place.width)];
+  // The left and right ends of the visible part of the picture, and the position of the line, in CSS pixels.
+  #visible(placement = this.#placement()) {
+    const [from, to] = [Math.max(0, placement.left), Math.min(this.clientWidth, placement.left + placement.width)];
     return { from, to, line: from + this.#split * (to - from) };
   }
 
   paint() {
     if (!this.canvas || !this.clientWidth || !this.clientHeight) return;
     const density = window.devicePixelRatio || 1;
-    const place = this.#place();
-    const { line } = this.#visible(place);
+    const placement = this.#placement();
+    const { line } = this.#visible(placement);
     this.canvas.width = Math.round(this.clientWidth * density);
     this.canvas.height = Math.round(this.clientHeight * density);
     const context = this.canvas.getContext("2d");
     context.scale(density, density);
-    context.imageSmoothingEnabled = place.width < 4 * this.left.width;
+    context.imageSmoothingEnabled = placement.width < 4 * this.left.width;
     context.imageSmoothingQuality = "high";
     for (const [side, start, end] of [[this.left, 0, line], [this.right, line, this.clientWidth]]) {
       context.save();
       context.beginPath();
       context.rect(start, 0, end - start, this.clientHeight);
       context.clip();
-      if (side.width) context.drawImage(side, place.left, place.top, place.width, place.height);
+      if (side.width) context.drawImage(side, placement.left, placement.top, placement.width, placement.height);
       context.restore();
     }
     this.line.style.left = `${line}px`;
@@ -116,7 +116,7 @@ class GlassCompare extends HTMLElement {
   }
 
   #pan(right, down) {
-    const { width, height } = this.#place();
+    const { width, height } = this.#placement();
     this.#centre = { x: this.#centre.x - right / width, y: this.#centre.y - down / height };
     this.paint();
   }
@@ -131,9 +131,9 @@ class GlassCompare extends HTMLElement {
     const point = this.#point(event);
     this.setPointerCapture(event.pointerId);
     this.#pointers.set(event.pointerId, point);
-    const isNear = Math.abs(point.x - this.#visible().line) < GRIP;
-    this.#hold = this.#zoom === 1 || isNear ? "line" : "picture";
-    if (this.#hold === "line" && this.#pointers.size === 1 && event.pointerType === "mouse") this.#moveLine(point.x);
+    const isNear = Math.abs(point.x - this.#visible().line) < GRAB_DISTANCE;
+    this.#dragged = this.#zoom === 1 || isNear ? "line" : "picture";
+    if (this.#dragged === "line" && this.#pointers.size === 1 && event.pointerType === "mouse") this.#moveLine(point.x);
   }
 
   _pointermove(event) {
@@ -142,16 +142,16 @@ class GlassCompare extends HTMLElement {
     const now = this.#point(event);
     this.#pointers.set(event.pointerId, now);
     if (this.#pointers.size === 2) this.#pinch(event.pointerId, before, now);
-    else if (this.#hold === "line") this.#moveLine(now.x);
+    else if (this.#dragged === "line") this.#moveLine(now.x);
     else this.#pan(now.x - before.x, now.y - before.y);
   }
 
   #pinch(id, before, now) {
     const [other] = [...this.#pointers].filter(([key]) => key !== id).map(([, point]) => point);
-    const reach = (point) => Math.hypot(point.x - other.x, point.y - other.y) || 1;
-    this.zoomBy(reach(now) / reach(before), (now.x + other.x) / 2, (now.y + other.y) / 2);
+    const distance = (point) => Math.hypot(point.x - other.x, point.y - other.y) || 1;
+    this.zoomBy(distance(now) / distance(before), (now.x + other.x) / 2, (now.y + other.y) / 2);
     this.#pan((now.x - before.x) / 2, (now.y - before.y) / 2);
-    this.#hold = "picture";
+    this.#dragged = "picture";
   }
 
   _pointerup(event) {

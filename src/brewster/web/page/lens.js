@@ -1,13 +1,13 @@
-// A lens over several frames that show pictures of one size: zoom and pan move all of them in step.
-// Frames have the shape of their pictures; what is moved is told in shares of the frame, so that all show the same part.
+// Synchronised zoom and pan for several frames that show pictures of one size.
+// A frame has the aspect ratio of its picture. Offsets are shares of the frame, so all frames show the same part.
 
-const CLOSEST = 8; // screen pixels for a pixel of the picture, at most
-const STEP = 1.5;
-const PAN = 0.12;
+const MAX_PIXEL_SIZE = 8; // maximum size of a picture pixel in screen pixels
+const ZOOM_STEP = 1.5;
+const PAN_STEP = 0.12;
 
 export class Lens {
   #scale = 1;
-  #x = 0; // where the left and upper edge lie, in shares of the frame: 0 or less
+  #x = 0; // offsets of the left and upper edge, in shares of the frame: 0 or less
   #y = 0;
   #size = [1, 1];
   #pointers = new Map();
@@ -26,43 +26,43 @@ export class Lens {
     new ResizeObserver(() => this.#paint()).observe(box);
   }
 
-  // New pictures of this size in pixels, shown whole.
+  // Shows new pictures of this size in px, without zoom.
   reset(width, height) {
     this.#size = [width, height];
     this.zoom("fit");
   }
 
-  // What a button or a key asks for: in, out, fit or full.
+  // Zooms by the name of a button: in, out, fit or full.
   zoom(kind) {
-    if (kind === "in") this.#to(this.#scale * STEP);
-    else if (kind === "out") this.#to(this.#scale / STEP);
-    else this.#to(kind === "fit" || this.isFull ? 1 : this.#full());
+    if (kind === "in") this.#zoomTo(this.#scale * ZOOM_STEP);
+    else if (kind === "out") this.#zoomTo(this.#scale / ZOOM_STEP);
+    else this.#zoomTo(kind === "fit" || this.isFull ? 1 : this.#fullScale());
   }
 
-  // Whether a pixel of the picture is a pixel of the screen.
+  // Whether one picture pixel is one screen pixel.
   get isFull() {
-    return this.#scale > 1 && Math.abs(this.#scale / this.#full() - 1) < 1e-3;
+    return this.#scale > 1 && Math.abs(this.#scale / this.#fullScale() - 1) < 1e-3;
   }
 
-  // Whether a key was for the lens.
+  // Handles a key; returns whether the key has a function here.
   press(key) {
     const zooms = { "+": "in", "=": "in", "-": "out", _: "out", 0: "fit", f: "full", F: "full" };
-    const pans = { "Shift+ArrowLeft": [PAN, 0], "Shift+ArrowRight": [-PAN, 0], "Shift+ArrowUp": [0, PAN], "Shift+ArrowDown": [0, -PAN] };
+    const pans = { "Shift+ArrowLeft": [PAN_STEP, 0], "Shift+ArrowRight": [-PAN_STEP, 0], "Shift+ArrowUp": [0, PAN_STEP], "Shift+ArrowDown": [0, -PAN_STEP] };
     if (key in zooms) this.zoom(zooms[key]);
     else if (key in pans) this.#pan(...pans[key]);
     else return false;
     return true;
   }
 
-  // The scale at which a pixel of the picture is one of the screen, in the largest frame.
-  #full() {
+  // The scale at which one picture pixel is one screen pixel in the largest frame.
+  #fullScale() {
     const fits = this.frames.map(({ clientWidth, clientHeight }) =>
       Math.min(clientWidth / this.#size[0], clientHeight / this.#size[1]));
     return Math.max(1, 1 / (Math.max(...fits, 1e-6) * devicePixelRatio));
   }
 
-  #to(scale, x = 0.5, y = 0.5) {
-    const next = Math.min(Math.max(1, scale), CLOSEST * this.#full());
+  #zoomTo(scale, x = 0.5, y = 0.5) {
+    const next = Math.min(Math.max(1, scale), MAX_PIXEL_SIZE * this.#fullScale());
     this.#x = x - ((x - this.#x) * next) / this.#scale;
     this.#y = y - ((y - this.#y) * next) / this.#scale;
     this.#scale = next;
@@ -76,12 +76,12 @@ export class Lens {
   }
 
   #paint() {
-    const inside = (at) => Math.min(0, Math.max(1 - this.#scale, at));
-    [this.#x, this.#y] = [inside(this.#x), inside(this.#y)];
-    const place = `translate(${100 * this.#x}%, ${100 * this.#y}%) scale(${this.#scale})`;
-    for (const frame of this.frames) frame.firstElementChild.style.transform = place;
+    const clamp = (at) => Math.min(0, Math.max(1 - this.#scale, at));
+    [this.#x, this.#y] = [clamp(this.#x), clamp(this.#y)];
+    const transform = `translate(${100 * this.#x}%, ${100 * this.#y}%) scale(${this.#scale})`;
+    for (const frame of this.frames) frame.firstElementChild.style.transform = transform;
     this.box.classList.toggle("zoomed", this.#scale > 1);
-    this.box.classList.toggle("close", this.#scale > 3 * this.#full());
+    this.box.classList.toggle("pixelated", this.#scale > 3 * this.#fullScale());
     this.box.dispatchEvent(new Event("zoomed"));
   }
 
@@ -91,12 +91,12 @@ export class Lens {
   }
 
   #toggle(x, y) {
-    this.#to(this.#scale > 1 ? 1 : Math.max(2, this.#full()), x, y);
+    this.#zoomTo(this.#scale > 1 ? 1 : Math.max(2, this.#fullScale()), x, y);
   }
 
   #wheel(event, frame) {
     event.preventDefault();
-    this.#to(this.#scale * 1.002 ** -event.deltaY, ...this.#point(event, frame));
+    this.#zoomTo(this.#scale * 1.002 ** -event.deltaY, ...this.#point(event, frame));
   }
 
   #down(event, frame) {
@@ -116,8 +116,8 @@ export class Lens {
   }
 
   #pinch(before, now, other) {
-    const reach = ([x, y]) => Math.hypot(x - other[0], y - other[1]) || 1;
-    this.#to((this.#scale * reach(now)) / reach(before), (now[0] + other[0]) / 2, (now[1] + other[1]) / 2);
+    const distance = ([x, y]) => Math.hypot(x - other[0], y - other[1]) || 1;
+    this.#zoomTo((this.#scale * distance(now)) / distance(before), (now[0] + other[0]) / 2, (now[1] + other[1]) / 2);
     this.#pan((now[0] - before[0]) / 2, (now[1] - before[1]) / 2);
   }
 }

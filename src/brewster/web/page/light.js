@@ -1,4 +1,4 @@
-// Linear light in the browser: reads the maps that web/preview.py sends, and makes any strength of them.
+// Reads the maps of web/preview.py and computes the layers at any strength, in linear light.
 
 const STEPS = 1 << 14;
 const LINEAR = Float32Array.from({ length: 256 }, (_, code) => toLinear(code / 255));
@@ -13,37 +13,38 @@ function toEncoded(linear) {
   return linear <= 0.0031308 ? linear * 12.92 : 1.055 * linear ** (1 / 2.4) - 0.055;
 }
 
-// The maps of a preview. `photo` and `confidence_map` are codes, `change` and `reflection` linear light at strength 1.
+// Parses the maps of a preview. `photo`, `reflection` and `confidence_map` are 8-bit codes; `change` is the transmission at
+// strength 1 minus the photo, in linear light.
 export function readMaps(buffer) {
   const end = new Uint8Array(buffer).indexOf(10);
   const head = JSON.parse(new TextDecoder().decode(buffer.slice(0, end)));
   const count = head.width * head.height;
   let at = end + 1;
-  const take = (kind, length) => {
+  const read = (kind, length) => {
     const bytes = length * kind.BYTES_PER_ELEMENT;
     at += bytes;
     return new kind(buffer.slice(at - bytes, at));
   };
-  const photo = take(Uint8Array, 3 * count);
-  const numbers = take(Uint16Array, 3 * count);
-  const mirrored = take(Uint8Array, 3 * count);
+  const photo = read(Uint8Array, 3 * count);
+  const numbers = read(Uint16Array, 3 * count);
+  const reflection = read(Uint8Array, 3 * count);
   const [lowest, highest] = head.range;
   const change = new Float32Array(3 * count);
   for (let i = 0; i < change.length; i++) {
     change[i] = lowest + (numbers[i] / 65535) * (highest - lowest) - LINEAR[photo[i]];
   }
-  return { ...head, photo, change, mirrored, confidence_map: take(Uint8Array, count) };
+  return { ...head, photo, change, reflection, confidence_map: read(Uint8Array, count) };
 }
 
 const VIEWS = {
   photo: (maps) => (i) => maps.photo[i],
   transmission: ({ photo, change }, strength) => (i) => code(LINEAR[photo[i]] + strength * change[i]),
-  reflection: ({ photo, mirrored }, strength) => (i) =>
-    code(Math.min(strength * LINEAR[mirrored[i]], LINEAR[photo[i]])),
+  reflection: ({ photo, reflection }, strength) => (i) =>
+    code(Math.min(strength * LINEAR[reflection[i]], LINEAR[photo[i]])),
   confidence: ({ confidence_map }) => (i) => confidence_map[(i / 3) | 0],
 };
 
-// Draws a view of the maps at a strength, 0 to 1, on a canvas of their size.
+// Draws a view of the maps at a strength of 0 to 1. Resizes the canvas to the size of the maps.
 export function draw(canvas, maps, view, strength) {
   canvas.width = maps.width;
   canvas.height = maps.height;

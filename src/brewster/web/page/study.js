@@ -1,86 +1,86 @@
-// The study's page: consent, then trial after trial, then thanks. The server knows where a participant stands; this
-// page asks it, shows three pictures, and goes on when an answer is acknowledged.
+// The page of the user study: consent, trials, end. The server stores the progress of a participant. The page requests
+// the next trial, shows its three pictures, and continues after the server has acknowledged the answer.
 
 import { Lens } from "./lens.js";
 
-const PERSON = location.pathname.match(/^\/s\/([^/]+)/)?.[1];
-const TOO_SOON = 300; // ms after new pictures in which no answer is taken: a second click was meant for the last ones
-const KEYS = { 1: "left", 2: "similar", 3: "right", ArrowLeft: "left", ArrowRight: "right" }; // up and down scroll
+const PARTICIPANT_TOKEN = location.pathname.match(/^\/s\/([^/]+)/)?.[1];
+const MIN_ANSWER_DELAY = 300; // ms; earlier answers are ignored, because a double click belongs to the previous pictures
+const KEYS = { 1: "left", 2: "similar", 3: "right", ArrowLeft: "left", ArrowRight: "right" }; // the arrows up and down scroll
 
-const get = (id) => document.getElementById(id);
-const sections = ["invitation", "trial", "finish", "trouble"];
+const byId = (id) => document.getElementById(id);
+const sections = ["invitation", "trial", "finish", "error"];
 const frames = { left: frame("left"), photo: frame("photo"), right: frame("right") };
-const lens = new Lens(get("pictures"), Object.values(frames));
-const preloaded = []; // keeps the pictures of the next trial in memory
-let state = null; // the trial that is shown, as the server tells it
-let shownAt = null; // when its pictures were there; null while no answer is taken
+const lens = new Lens(byId("pictures"), Object.values(frames));
+const preloaded = []; // the pictures of the next trial, held in memory
+let state = null; // the current trial, as returned by the server
+let shownAt = null; // time at which its pictures were shown; null while no answer is accepted
 
 function frame(side) {
   return document.querySelector(`figure.${side} .frame`);
 }
 
 function show(section) {
-  for (const id of sections) get(id).hidden = id !== section;
-  get("head").hidden = section !== "trial";
+  for (const id of sections) byId(id).hidden = id !== section;
+  byId("head").hidden = section !== "trial";
 }
 
-// --- talking to the server
+// --- requests
 
-// The answer of the server. What the network swallowed is asked for again until it comes; what is refused is thrown.
-async function ask(path, body) {
+// Sends a request and returns the response data. Repeats it after network and server errors; throws after client errors.
+async function send(path, body) {
   for (let wait = 1; ; wait = Math.min(2 * wait, 15)) {
     try {
       const options = body && { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) };
-      const answer = await fetch(path, options);
-      if (answer.ok || isRefused(answer)) return await read(answer);
+      const response = await fetch(path, options);
+      if (response.ok || isClientError(response)) return await parse(response);
     } catch (error) {
-      if (error instanceof Refused) throw error;
+      if (error instanceof RequestError) throw error;
     }
-    notice(body?.choice ? "Not saved yet: the server does not answer. Trying again…" : "The server does not answer. Trying again…");
+    notice(body?.choice ? "Not saved yet: the server does not respond. Trying again…" : "The server does not respond. Trying again…");
     await new Promise((resolve) => setTimeout(resolve, 1000 * wait));
   }
 }
 
-class Refused extends Error {}
+class RequestError extends Error {}
 
-const isRefused = (answer) => answer.status >= 400 && answer.status < 500 && answer.status !== 408;
+const isClientError = (response) => response.status >= 400 && response.status < 500 && response.status !== 408;
 
-async function read(answer) {
+async function parse(response) {
   notice("");
-  const told = await answer.json();
-  if (!answer.ok) throw new Refused(told.error);
-  return told;
+  const data = await response.json();
+  if (!response.ok) throw new RequestError(data.error);
+  return data;
 }
 
 function notice(text) {
-  get("notice").textContent = text;
-  get("notice").hidden = !text;
+  byId("notice").textContent = text;
+  byId("notice").hidden = !text;
 }
 
 function fail(error) {
-  get("why").textContent = error.message;
-  show("trouble");
+  byId("error-text").textContent = error.message;
+  show("error");
 }
 
 // --- consent
 
-async function invite() {
-  const invitation = await ask("/invitation");
-  if (!invitation.is_open) throw new Refused("The study has all the participants that it needs. Thank you for coming.");
+async function showInvitation() {
+  const invitation = await send("/invitation");
+  if (!invitation.is_open) throw new RequestError("The study has all the participants that it needs. Thank you for your interest.");
   for (const text of [...invitation.consent.split(/\n\s*\n/), `There are ${invitation.trials} comparisons.`]) {
     const paragraph = document.createElement("p");
     paragraph.textContent = text;
-    get("consent").append(paragraph);
+    byId("consent").append(paragraph);
   }
   show("invitation");
 }
 
-get("agreement").addEventListener("submit", async (event) => {
+byId("agreement").addEventListener("submit", async (event) => {
   event.preventDefault();
   const button = event.target.querySelector("button");
   button.disabled = true;
   try {
-    location.assign((await ask("/participants", { agreed: true })).link);
+    location.assign((await send("/participants", { agreed: true })).link);
   } catch (error) {
     fail(error);
   }
@@ -88,9 +88,9 @@ get("agreement").addEventListener("submit", async (event) => {
 
 // --- a trial
 
-const address = (trial, side) => `/s/${PERSON}/pictures/${trial}/${side}`;
+const pictureUrl = (trial, side) => `/s/${PARTICIPANT_TOKEN}/pictures/${trial}/${side}`;
 
-async function load(source) {
+async function loadPicture(source) {
   for (let wait = 1; ; wait = Math.min(2 * wait, 15)) {
     const picture = new Image();
     picture.src = source;
@@ -99,71 +99,71 @@ async function load(source) {
       notice("");
       return picture;
     } catch {
-      const answer = await fetch(source).catch(() => null); // a picture does not say why it did not come
-      if (answer && isRefused(answer)) await read(answer);
-      notice("A picture has not arrived. Trying again…");
+      const response = await fetch(source).catch(() => null); // an image element does not report the reason of a failure
+      if (response && isClientError(response)) await parse(response);
+      notice("A picture could not be loaded. Trying again…");
       await new Promise((resolve) => setTimeout(resolve, 1000 * wait));
     }
   }
 }
 
-async function present(next) {
+async function showTrial(next) {
   state = next;
   if (next.trial === null) return finish(next);
   const number = `Pair ${next.trial + 1} of ${next.trials}`;
-  get("where").textContent = number;
-  get("bar").value = next.trial / next.trials;
-  get("trial").classList.add("waiting");
+  byId("where").textContent = number;
+  byId("bar").value = next.trial / next.trials;
+  byId("trial").classList.add("waiting");
   show("trial");
   const sides = Object.keys(frames);
-  await Promise.all(sides.map((side) => load(address(next.trial, side))));
-  get("pictures").style.setProperty("--ratio", next.width / next.height);
-  get("pictures").classList.toggle("tall", next.width < next.height);
-  for (const side of sides) frames[side].firstElementChild.src = address(next.trial, side);
+  await Promise.all(sides.map((side) => loadPicture(pictureUrl(next.trial, side))));
+  byId("pictures").style.setProperty("--ratio", next.width / next.height);
+  byId("pictures").classList.toggle("tall", next.width < next.height);
+  for (const side of sides) frames[side].firstElementChild.src = pictureUrl(next.trial, side);
   await Promise.all(sides.map((side) => frames[side].firstElementChild.decode()));
   lens.reset(next.width, next.height);
-  get("trial").classList.remove("waiting");
-  mark(null, false);
-  get("news").textContent = number;
+  byId("trial").classList.remove("waiting");
+  updateChoices(null, false);
+  byId("announcement").textContent = number;
   shownAt = performance.now();
   preloaded.length = 0;
-  const ahead = next.trial + 1 < next.trials ? sides.map((side) => load(address(next.trial + 1, side))) : [];
-  preloaded.push(...ahead.map((loading) => loading.catch(() => {}))); // what fails is told when its turn comes
+  const ahead = next.trial + 1 < next.trials ? sides.map((side) => loadPicture(pictureUrl(next.trial + 1, side))) : [];
+  preloaded.push(...ahead.map((loading) => loading.catch(() => {}))); // an error is shown when the trial is shown
 }
 
-// Says what was chosen, and whether it is too early or too late to choose. A button that is `disabled` would lose the focus.
-function mark(choice, closed) {
-  for (const button of get("choices").children) {
+// Marks the chosen button, and whether choices are accepted. A button with the attribute `disabled` would lose the focus.
+function updateChoices(choice, closed) {
+  for (const button of byId("choices").children) {
     button.setAttribute("aria-disabled", closed);
     button.classList.toggle("chosen", button.dataset.choice === choice);
   }
 }
 
 async function choose(choice) {
-  if (shownAt === null || performance.now() - shownAt < TOO_SOON) return;
+  if (shownAt === null || performance.now() - shownAt < MIN_ANSWER_DELAY) return;
   const seconds = (performance.now() - shownAt) / 1000;
   shownAt = null;
-  mark(choice, true);
+  updateChoices(choice, true);
   try {
-    const answer = await ask(`/s/${PERSON}/answers`, { trial: state.trial, choice, seconds });
-    await present(answer.next);
+    const answer = await send(`/s/${PARTICIPANT_TOKEN}/answers`, { trial: state.trial, choice, seconds });
+    await showTrial(answer.next);
   } catch (error) {
     fail(error);
   }
 }
 
 function finish({ trials }) {
-  get("done").textContent = `All ${trials} answers are saved.`;
+  byId("done").textContent = `All ${trials} answers are saved.`;
   show("finish");
-  get("thanks").focus();
+  byId("thanks").focus();
 }
 
-for (const button of get("choices").children) button.addEventListener("click", () => choose(button.dataset.choice));
+for (const button of byId("choices").children) button.addEventListener("click", () => choose(button.dataset.choice));
 
 addEventListener("keydown", (event) => {
-  if (get("trial").hidden || event.ctrlKey || event.metaKey || event.altKey) return;
-  const answers = event.key in KEYS ? !event.shiftKey : event.key === "Enter" && get("choices").contains(event.target);
-  if (event.repeat && answers) return event.preventDefault(); // a key that is held is one answer
+  if (byId("trial").hidden || event.ctrlKey || event.metaKey || event.altKey) return;
+  const answers = event.key in KEYS ? !event.shiftKey : event.key === "Enter" && byId("choices").contains(event.target);
+  if (event.repeat && answers) return event.preventDefault(); // a held key counts as one answer
   if (event.shiftKey ? lens.press(`Shift+${event.key}`) || lens.press(event.key) : lens.press(event.key)) event.preventDefault();
   else if (event.key in KEYS && !event.shiftKey) {
     event.preventDefault();
@@ -171,25 +171,25 @@ addEventListener("keydown", (event) => {
   }
 });
 
-for (const button of get("zoom").children) button.addEventListener("click", () => lens.zoom(button.dataset.zoom));
-get("pictures").addEventListener("zoomed", () => {
+for (const button of byId("zoom").children) button.addEventListener("click", () => lens.zoom(button.dataset.zoom));
+byId("pictures").addEventListener("zoomed", () => {
   document.querySelector("[data-zoom=full]").setAttribute("aria-pressed", lens.isFull);
 });
 
-get("copy").addEventListener("click", async () => {
-  const link = new URL((await ask(`/s/${PERSON}/link`)).link, location.href).href;
+byId("copy").addEventListener("click", async () => {
+  const link = new URL((await send(`/s/${PARTICIPANT_TOKEN}/link`)).link, location.href).href;
   try {
     await navigator.clipboard.writeText(link);
-    notice("Your link is copied. Keep it for yourself.");
+    notice("Your link is copied. Do not share it.");
   } catch {
     notice(`Your link: ${link}`);
   }
   setTimeout(() => notice(""), 8000);
 });
-get("again").addEventListener("click", () => location.reload());
+byId("retry").addEventListener("click", () => location.reload());
 
 try {
-  await (PERSON ? present(await ask(`/s/${PERSON}/trial`)) : invite());
+  await (PARTICIPANT_TOKEN ? showTrial(await send(`/s/${PARTICIPANT_TOKEN}/trial`)) : showInvitation());
 } catch (error) {
   fail(error);
 }

@@ -1,33 +1,33 @@
-// Puts the files of several zips, as the server stores them (uncompressed, sizes in front), into one.
+// Merges the zips of the server into one. Their files are uncompressed, and the local headers contain the sizes.
 
 const LOCAL = 0x04034b50;
 const CENTRAL = 0x02014b50;
 const END = 0x06054b50;
 const LIMIT = 0xffffffff;
 
-// `files` are of `filesOf`; a name that is taken gets a number in front.
-export function zipped(files) {
+// `files` are results of `readZip`; a name that is already used gets a number in front.
+export function createZip(files) {
   const parts = [];
-  const rows = [];
-  const taken = new Set();
+  const centralRecords = [];
+  const usedNames = new Set();
   let at = 0;
   for (const file of files) {
-    const name = new TextEncoder().encode(freeName(file.name, taken));
+    const name = new TextEncoder().encode(uniqueName(file.name, usedNames));
     const common = commonFields(file, name.length);
-    const local = joined(numbers([[4, LOCAL]]), common, numbers([[2, 0]]), name);
-    const more = [[2, 0], [2, 0], [2, 0], [2, 0], [4, 0], [4, at]];
-    rows.push(joined(numbers([[4, CENTRAL], [2, 20]]), common, numbers(more), name));
+    const local = concatenate(littleEndian([[4, LOCAL]]), common, littleEndian([[2, 0]]), name);
+    const centralFields = [[2, 0], [2, 0], [2, 0], [2, 0], [4, 0], [4, at]];
+    centralRecords.push(concatenate(littleEndian([[4, CENTRAL], [2, 20]]), common, littleEndian(centralFields), name));
     parts.push(local, file.data);
     at += local.length + file.data.byteLength;
   }
-  const size = rows.reduce((sum, row) => sum + row.length, 0);
-  if (at + size > LIMIT) throw new Error("The zip would be larger than 4 GB. Download some photos by themselves.");
-  const count = [[2, rows.length], [2, rows.length]];
-  const end = numbers([[4, END], [2, 0], [2, 0], ...count, [4, size], [4, at], [2, 0]]);
-  return new Blob([...parts, ...rows, end], { type: "application/zip" });
+  const size = centralRecords.reduce((sum, row) => sum + row.length, 0);
+  if (at + size > LIMIT) throw new Error("The zip would be larger than 4 GB. Download the photos one by one.");
+  const count = [[2, centralRecords.length], [2, centralRecords.length]];
+  const end = littleEndian([[4, END], [2, 0], [2, 0], ...count, [4, size], [4, at], [2, 0]]);
+  return new Blob([...parts, ...centralRecords, end], { type: "application/zip" });
 }
 
-export function filesOf(buffer) {
+export function readZip(buffer) {
   const view = new DataView(buffer);
   const files = [];
   for (let at = 0; view.getUint32(at, true) === LOCAL; ) {
@@ -47,17 +47,17 @@ export function filesOf(buffer) {
 // Version 2.0, names in UTF-8, stored, 1 January 1980 (APPNOTE 4.4).
 function commonFields({ crc, data }, nameLength) {
   const size = data.byteLength;
-  return numbers([[2, 20], [2, 0x800], [2, 0], [2, 0], [2, 0x21], [4, crc], [4, size], [4, size], [2, nameLength]]);
+  return littleEndian([[2, 20], [2, 0x800], [2, 0], [2, 0], [2, 0x21], [4, crc], [4, size], [4, size], [2, nameLength]]);
 }
 
-function freeName(name, taken) {
-  let free = name;
-  for (let number = 2; taken.has(free); number++) free = `${number}-${name}`;
-  taken.add(free);
-  return free;
+function uniqueName(name, usedNames) {
+  let unique = name;
+  for (let number = 2; usedNames.has(unique); number++) unique = `${number}-${name}`;
+  usedNames.add(unique);
+  return unique;
 }
 
-function numbers(fields) {
+function littleEndian(fields) {
   const view = new DataView(new ArrayBuffer(fields.reduce((sum, [size]) => sum + size, 0)));
   let at = 0;
   for (const [size, value] of fields) {
@@ -68,6 +68,6 @@ function numbers(fields) {
   return new Uint8Array(view.buffer);
 }
 
-function joined(...parts) {
+function concatenate(...parts) {
   return Uint8Array.from(parts.flatMap((part) => [...part]));
 }
