@@ -207,20 +207,20 @@ def cap():
 
 def estimate(name, quantise):
     """The numbers of `brewster train --plan` for the recipe of this name, on the paper's card."""
-    from brewster.training.lora.resource_estimate import CARDS, plan_for  # noqa: PLC0415  (the trainer may lack its libraries)
+    from brewster.training.lora.resource_estimate import CARDS, estimate_resources  # noqa: PLC0415  (the trainer may lack its libraries)
     from brewster.training.recipe import read_recipe  # noqa: PLC0415
 
     card = CARDS["RTX 4090"]
     recipe = read_recipe(Path(__file__).parents[1] / f"recipes/train/{name}.toml")
-    plan = plan_for(recipe, card)
+    plan = estimate_resources(recipe, card)
     forward_s = (
         plan.seconds / 3 / recipe.batch
     )  # of a step's three: forward, once more for the checkpoints, back
     passes = STEPS * (1 if find_family(name).guided_by_embedding else 2)
     return Row(
         name, quantise, "ESTIMATED from meta tensors, not measured", card.name,
-        parameters=plan.parameters / 1e9, lora=plan.lora / 1e6,
-        tokens=f"{plan.generated}, {plan.shown}, {WORDS}", base_gib=plan.memory_gib["base"] + plan.memory_gib["VAE"],
+        parameters=plan.parameters / 1e9, lora=plan.lora_parameters / 1e6,
+        tokens=f"{plan.generated_tokens}, {plan.condition_tokens}, {WORDS}", base_gib=plan.memory_gib["base"] + plan.memory_gib["VAE"],
         learning_gib=plan.total_gib, step_s=plan.seconds, steps_h=plan.seconds * PAPER_STEPS / 3600,
         picture_s=passes * forward_s, fits=plan.total_gib <= card.memory_gib,
     )  # fmt: skip

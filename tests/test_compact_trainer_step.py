@@ -139,8 +139,8 @@ def lora(tmp_path):
 
 def logits(trainer, count=150):
     """The times that it learns at, as log(t / (1 - t))."""
-    encoded = trainer._data(SampleRng(1, 0, 0))
-    times = [trainer._begun(SampleRng(2, number, 0), encoded)[1] for number in range(count)]
+    encoded = trainer._latents(SampleRng(1, 0, 0))
+    times = [trainer._start_and_sigma(SampleRng(2, number, 0), encoded)[1] for number in range(count)]
     return torch.cat(times).double().logit()
 
 
@@ -169,7 +169,7 @@ def test_a_loras_long_gradient_is_shortened_and_its_rate_warms_up(lora):
 def test_who_knows_the_picture_has_no_loss(lora, monkeypatch):
     """At time t a sample is (1 - t) picture + t noise, and the velocity asked for is noise - picture."""
     one = lora()
-    picture = one._data(SampleRng(1, 0, 0)).composite
+    picture = one._latents(SampleRng(1, 0, 0)).composite
 
     def knowing(latents, condition, sigma, prompt, guidance):
         return (latents - picture) / sigma
@@ -182,10 +182,10 @@ def test_who_knows_the_picture_has_no_loss(lora, monkeypatch):
 
 def test_a_reflection_counts_as_much_as_it_is_trusted(lora, monkeypatch):
     one = lora()
-    encoded = one._data(SampleRng(1, 0, 0))
+    encoded = one._latents(SampleRng(1, 0, 0))
     parts = []
     for trust in (1.0, 0.25):
-        monkeypatch.setattr(one, "_data", lambda rng, trust=trust: replace(encoded, trust=trust))
+        monkeypatch.setattr(one, "_latents", lambda rng, trust=trust: replace(encoded, trust=trust))
         parts.append({name: part.item() for name, part in one._losses(SampleRng(1, 0, 0)).items()})
     whole, quarter = parts
     assert quarter["panel_R"] == pytest.approx(whole["panel_R"] / 4, rel=1e-5)

@@ -15,11 +15,11 @@ from brewster.training.data.mixtures import Pairs
 from brewster.training.data.sample_rng import SampleRng
 from brewster.training.lora.latents import (
     LatentEncoder,
-    cropped,
+    crop_sample,
+    fit_sample,
+    layers_from_pair,
+    make_panels,
     open_samples,
-    panel_for,
-    panels_in,
-    with_difference,
 )
 from brewster.training.recipe import LoraRecipe
 from set_folders import make
@@ -73,8 +73,8 @@ def test_panels_are_the_whole_sample_in_its_own_aspect_ratio(recipe, root, backb
     samples = open_samples(wanted)
     assert len(samples) == 3
     for number, entry in enumerate(read_set(root / "set")):
-        fit = panel_for(samples[number].layers, backbone, wanted)
-        panels = panels_in(samples[number].layers, fit)
+        fit = fit_sample(samples[number].layers, backbone, wanted)
+        panels = make_panels(samples[number].layers, fit)
         assert (fit.content, fit.panel) == ((24, 16), (32, 16))
         for letter, name in zip("ITR", ("photo", "transmission", "reflection"), strict=True):
             picture = torch.from_numpy(Photo.open(entry.read(f"{name}.jpg")).pixels.copy())
@@ -136,7 +136,7 @@ def test_a_crop_is_a_window_of_the_samples_shape_and_never_smaller_than_it_is_sh
         reject()
     numbers = torch.arange(height * width).reshape(height, width, 1)
     whole = torch.cat([numbers % 256, numbers // 256 % 256, numbers // 65536], dim=2).byte().repeat(1, 1, 3)
-    crop = cropped(SampleRng(seed, -1, 1), whole, fit)
+    crop = crop_sample(SampleRng(seed, -1, 1), whole, fit)
     rows, columns, _ = crop.shape
     assert max(fit.content[0], width // 2) <= columns <= width
     assert max(fit.content[1], height // 2) <= rows <= height
@@ -149,7 +149,7 @@ def test_a_crop_is_a_window_of_the_samples_shape_and_never_smaller_than_it_is_sh
 def test_real_pairs_come_as_often_as_their_share(recipe, root):
     samples = open_samples(recipe({**RENDERED, "pairs": ["trios"], "pairs_share": 0.25}))
     assert len(samples) == 4
-    chosen = [samples.choose(SampleRng(1, step, 0)) for step in range(200)]
+    chosen = [samples.draw_index(SampleRng(1, step, 0)) for step in range(200)]
     assert set(chosen) == {0, 1, 2, 3}
     assert 30 < chosen.count(3) < 70
 
@@ -166,15 +166,15 @@ def test_pairs_without_reflections_are_refused_where_r_is_a_panel(recipe):
         open_samples(recipe(pairs))
     assert len(open_samples(recipe(pairs, panels=["I", "T"]))) == 1
     (sample,) = open_samples(recipe(pairs, reflections="difference"))
-    assert sample.trust == Pairs.reflection_weight < 1
+    assert sample.reflection_weight == Pairs.reflection_weight < 1
 
 
 def test_a_reflection_that_is_given_is_trusted_and_one_that_is_not_is_the_light_that_is_left(recipe):
     (given,) = open_samples(recipe({"pairs": ["trios"], "pairs_share": 1.0}))
-    assert given.trust == 1
+    assert given.reflection_weight == 1
     assert [given.layers[0, 0, channel].item() for channel in (0, 3, 6)] == [200, 130, 60]
     both = (torch.full((2, 2, 3), value, dtype=torch.uint8) for value in (188, 137))
-    left = with_difference(*both)[0, 0, 6].item()
+    left = layers_from_pair(*both)[0, 0, 6].item()
     assert left == 138  # of half the light, 188, a quarter, 137, is taken away
 
 
@@ -195,6 +195,6 @@ def test_more_samples_than_there_are_are_refused(recipe):
 def test_crops_have_half_to_all_of_the_samples_sides():
     fit = fit_panel((300, 200), PanelLayout(), budget_px=3 * 48 * 32, multiple=16)
     whole = torch.zeros(200, 300, 9, dtype=torch.uint8)
-    shares = [cropped(SampleRng(seed, -1, 1), whole, fit).shape[0] / 200 for seed in range(200)]
+    shares = [crop_sample(SampleRng(seed, -1, 1), whole, fit).shape[0] / 200 for seed in range(200)]
     assert 0.5 <= min(shares) < 0.52
     assert 0.98 < max(shares) <= 1

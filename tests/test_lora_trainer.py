@@ -43,7 +43,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def recipe(folder, monkeypatch):
-    monkeypatch.setattr(module, "_SHOWN", 1)
+    monkeypatch.setattr(module, "_VALIDATION_SAMPLES", 1)
     return lambda **changes: LoraRecipe.model_validate(
         RECIPE | {"data": {"rendered": {"sets": [folder], "target": "transmission"}}} | changes
     )

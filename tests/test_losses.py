@@ -7,7 +7,7 @@ import torch
 
 from brewster.errors import ModelError
 from brewster.training.data.mixtures import TrainingBatch
-from brewster.training.losses import finite, gain_db, separation_loss, tone
+from brewster.training.losses import check_finite, psnr_gain_db, separation_loss, tone_ratio
 
 
 def truth(level=0.4, trust=1.0):
@@ -61,8 +61,8 @@ def test_the_loss_has_four_parts():
 
 def test_a_tenth_of_the_error_is_twenty_decibels_gained():
     wanted = torch.full((1, 3, 8, 8), 0.5)
-    assert gain_db(wanted + 0.02, wanted + 0.2, wanted) == pytest.approx(20, abs=1e-3)
-    assert gain_db(wanted + 0.2, wanted + 0.02, wanted) == pytest.approx(-20, abs=1e-3)
+    assert psnr_gain_db(wanted + 0.02, wanted + 0.2, wanted) == pytest.approx(20, abs=1e-3)
+    assert psnr_gain_db(wanted + 0.2, wanted + 0.02, wanted) == pytest.approx(-20, abs=1e-3)
 
 
 def test_tone_is_the_light_kept_where_nothing_was_added():
@@ -71,12 +71,12 @@ def test_tone_is_the_light_kept_where_nothing_was_added():
     photo, answer = wanted.clone(), torch.full_like(wanted, 0.3611)  # half the linear light of 0.5
     photo[..., :2, :2] = 1
     answer[..., :2, :2] = 1
-    assert tone(answer, photo, wanted) == pytest.approx(0.5, abs=1e-3)
-    assert tone(answer, torch.ones_like(wanted), wanted) == 1
+    assert tone_ratio(answer, photo, wanted) == pytest.approx(0.5, abs=1e-3)
+    assert tone_ratio(answer, torch.ones_like(wanted), wanted) == 1
 
 
 @pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])
 def test_a_value_that_is_no_number_is_refused(value):
     with pytest.raises(ModelError, match=r"gradient is .* at step 7"):
-        finite(torch.tensor(value), 7, "gradient")
-    assert finite(torch.tensor(1.0), 7) == 1
+        check_finite(torch.tensor(value), 7, "gradient")
+    assert check_finite(torch.tensor(1.0), 7) == 1

@@ -251,7 +251,7 @@ def test_a_blend_asks_for_nothing_where_a_stream_gets_no_sample(photos):
 
 def test_a_batch_of_layers_trusts_every_truth():
     layers = torch.rand(2, 9, 8, 8)
-    batch = TrainingBatch.of(layers)
+    batch = TrainingBatch.from_layers(layers)
     pictures = [batch.photo_encoded, batch.transmission_encoded, batch.reflection_encoded]
     assert torch.equal(torch.cat(pictures, dim=1), layers)
     assert (batch.reflection_weight == 1).all()

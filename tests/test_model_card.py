@@ -16,7 +16,7 @@ from brewster.models.diffusion.panels import PanelLayout, condition, split
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
 from brewster.models.diffusion.sampling import sample
 from brewster.models.diffusion.task import DecompositionTask
-from brewster.training.lora.model_card import card_text, with_measured, write_card
+from brewster.training.lora.model_card import card_text, with_benchmark_tables, write_card
 from brewster.training.recipe import LoraRecipe, read_recipe
 from set_folders import make
 
@@ -97,13 +97,13 @@ def test_settings_and_scores_are_told():
 
 
 def test_what_was_measured_takes_its_place_again_and_again():
-    once = with_measured(card(), "| a | 1 |\n")
-    twice = with_measured(once, "### Real20\n\n| b | 2 |")
+    once = with_benchmark_tables(card(), "| a | 1 |\n")
+    twice = with_benchmark_tables(once, "### Real20\n\n| b | 2 |")
     assert "\n## Measured\n\n| a | 1 |\n\n## Limits\n" in once
     assert "\n## Measured\n\n### Real20\n\n| b | 2 |\n\n## Limits\n" in twice
     assert twice.partition("## Measured")[0] == card().partition("## Measured")[0]
     with pytest.raises(ModelError, match="has no part for scores; '## Measured'"):
-        with_measured("# somebody else's", "| a | 1 |")
+        with_benchmark_tables("# somebody else's", "| a | 1 |")
 
 
 def test_what_stock_pipelines_cannot_do_is_not_promised():

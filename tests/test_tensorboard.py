@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from brewster.training.tensorboard import PICTURE, TensorBoardLog
+from brewster.training.tensorboard import IMAGE_TAG, TensorBoardLog
 
 
 def read(folder):
@@ -25,7 +25,7 @@ def test_numbers_and_the_picture_are_read_back_at_their_steps(tmp_path):
         (6, pytest.approx(1 / 6)),
     ]
     assert events.Scalars("gain_db_real/dev")[0].value == -2.5
-    shown = events.Images(PICTURE)
+    shown = events.Images(IMAGE_TAG)
     assert [(event.step, event.width, event.height) for event in shown] == [(3, 6, 4), (6, 6, 4)]
 
 
@@ -42,7 +42,7 @@ def test_a_run_that_goes_on_forgets_what_was_told_of_later_steps(tmp_path):
     assert [(event.step, event.value) for event in events.Scalars("loss")] == [
         (1, 10.0), (2, 5.0), (3, 5.0), (4, 5.0),
     ]  # fmt: skip
-    assert [event.step for event in events.Images(PICTURE)] == [1, 2, 3, 4]
+    assert [event.step for event in events.Images(IMAGE_TAG)] == [1, 2, 3, 4]
 
 
 def test_a_run_with_nothing_to_tell_leaves_no_file(tmp_path):

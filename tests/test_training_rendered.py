@@ -134,7 +134,7 @@ def test_a_damaged_picture_is_named_with_its_sample(folder):
 
 def test_what_was_read_is_kept_while_there_is_room(folder, monkeypatch):
     roomy = RenderedSets([folder], seed=1)
-    monkeypatch.setattr(kept, "KEPT_BYTES", 16 * 24 * 9)
+    monkeypatch.setattr(kept, "CACHE_BYTES", 16 * 24 * 9)
     narrow = RenderedSets([folder], seed=1)
     first = [stream(0, 20, 32) for stream in (roomy, narrow)]
     assert same(*first)
@@ -173,7 +173,7 @@ def test_a_kept_sample_is_shown_as_it_is_or_mirrored():
 
 def test_memory_that_is_full_changes_nothing_but_the_time():
     live = Live()
-    narrow = CachedRendered(live, 4, seed=1, most_bytes=2 * 9 * 8 * 8)
+    narrow = CachedRendered(live, 4, seed=1, max_bytes=2 * 9 * 8 * 8)
     roomy = CachedRendered(Live(), 4, seed=1)
     assert all(same(narrow(step, 4, 8), roomy(step, 4, 8)) for step in range(10))
     assert len(live.asked) > 4

@@ -123,7 +123,7 @@ def ablate(
     return results
 
 
-def _trained(recipe: CompactRecipe | LoraRecipe, folder: Path, tell: loop.Report) -> Path:
+def _trained(recipe: CompactRecipe | LoraRecipe, folder: Path, tell: loop.StepCallback) -> Path:
     """The model of this recipe, in memory no longer than it learns."""
     trainer = open_trainer(recipe)
     loop.run(trainer, folder, tell)

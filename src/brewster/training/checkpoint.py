@@ -15,7 +15,7 @@ import torch
 from brewster.errors import ModelError
 from brewster.files import write_atomically
 
-AFRESH = "delete it to start afresh, or name another folder with -o"
+START_FRESH = "delete it to start afresh, or name another folder with -o"
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Checkpoint:
         write_atomically(path, stream.getvalue(), overwrite=True)
 
     @classmethod
-    def read(cls, path: Path, cure: str = AFRESH) -> Checkpoint:
+    def read(cls, path: Path, cure: str = START_FRESH) -> Checkpoint:
         """Reads a checkpoint; no code in it is run. `cure` is what an error advises.
 
         Raises:
@@ -66,7 +66,7 @@ class Checkpoint:
 
 
 @contextmanager
-def fitting(path: Path, cure: str) -> Iterator[None]:
+def mismatch_as_model_error(path: Path, cure: str) -> Iterator[None]:
     """Tells plainly that the state in a checkpoint does not fit what it is put into.
 
     Raises:

@@ -20,7 +20,7 @@ from torch import Tensor
 from brewster.errors import DeviceError
 from brewster.models.diffusion.lazy_imports import library
 
-_LAUNCHER: Final = ("RANK", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
+_LAUNCHER_VARIABLES: Final = ("RANK", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
 """What a launcher tells each process, beside WORLD_SIZE."""
 _CURE: Final = "start them with torchrun --nproc_per_node"
 
@@ -32,31 +32,31 @@ def initialize() -> None:
         DeviceError: not as many came as were announced.
         MissingExtra: there are some, and accelerate is not installed.
     """
-    _refuse_half_a_launch()
+    _check_launch_variables()
     try:
-        together = _together()
+        state = _partial_state()
     except (NotImplementedError, RuntimeError, ValueError) as error:  # the first: cards that need NCCL told
         raise DeviceError(
-            f"the processes could not meet: {error}", f"{_announced()} that reach each other", _CURE
+            f"the processes could not meet: {error}", f"{_expected_world_size()} that reach each other", _CURE
         ) from error
-    if world_size() != _announced():
+    if world_size() != _expected_world_size():
         raise DeviceError(
-            f"{world_size()} processes have met", f"the {_announced()} that WORLD_SIZE names", _CURE
+            f"{world_size()} processes have met", f"the {_expected_world_size()} that WORLD_SIZE names", _CURE
         )
-    if together:
-        atexit.register(together.destroy_process_group)
+    if state:
+        atexit.register(state.destroy_process_group)
 
 
 def world_size() -> int:
     """How many processes learn together."""
-    together = _together()
-    return int(together.num_processes) if together else 1
+    state = _partial_state()
+    return int(state.num_processes) if state else 1
 
 
 def rank() -> int:
     """Which of them this one is, from 0."""
-    together = _together()
-    return int(together.process_index) if together else 0
+    state = _partial_state()
+    return int(state.process_index) if state else 0
 
 
 def is_main_process() -> bool:
@@ -68,8 +68,8 @@ def best_device() -> torch.device:
     """This process's GPU where torch sees one, else the CPU."""
     if not torch.cuda.is_available():
         return torch.device("cpu")
-    together = _together()
-    return torch.device(together.device) if together else torch.device("cuda")
+    state = _partial_state()
+    return torch.device(state.device) if state else torch.device("cuda")
 
 
 def all_reduce_sum(tensors: Sequence[Tensor]) -> None:
@@ -82,24 +82,24 @@ def all_reduce_sum(tensors: Sequence[Tensor]) -> None:
             tensor.copy_(part.view_as(tensor))
 
 
-def _together() -> Any | None:  # noqa: ANN401 - accelerate's state
+def _partial_state() -> Any | None:  # noqa: ANN401 - accelerate's state
     """accelerate's state of all processes, the same at each call; nothing where this one is alone."""
-    if _announced() == 1:
+    if _expected_world_size() == 1:
         return None
     # Without a GPU, accelerate has to be told so: else each process quietly believes that it is the only one.
     return library("accelerate").PartialState(cpu=not torch.cuda.is_available())
 
 
-def _announced() -> int:
+def _expected_world_size() -> int:
     return int(os.environ.get("WORLD_SIZE", "1"))
 
 
-def _refuse_half_a_launch() -> None:
+def _check_launch_variables() -> None:
     """Several processes were wanted, and the launcher started one, or did not tell it who the others are."""
-    lacking = [name for name in _LAUNCHER if name not in os.environ]
-    if _announced() > 1 and lacking:
+    missing = [name for name in _LAUNCHER_VARIABLES if name not in os.environ]
+    if _expected_world_size() > 1 and missing:
         raise DeviceError(
-            f"WORLD_SIZE is {_announced()}, and {', '.join(lacking)} not set",
+            f"WORLD_SIZE is {_expected_world_size()}, and {', '.join(missing)} not set",
             "all that a launcher sets",
             _CURE,
         )

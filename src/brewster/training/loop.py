@@ -1,4 +1,4 @@
-"""The training loop, the only one: `run(trainer, out, report)` runs or resumes, bit for bit, whatever learns.
+"""The training loop, the only one: `run(trainer, out, on_step)` runs or resumes, bit for bit, whatever learns.
 
 Every step depends on the trainer's state and on (seed, step) alone: no hidden state, so on the CPU a killed run that
 resumes ends with the same weights, to the last bit, as one that never stopped (same machine, same number of threads).
@@ -20,18 +20,18 @@ from brewster.errors import RecipeError
 from brewster.files import write_atomically
 from brewster.photo import Photo
 from brewster.srgb import to_linear
-from brewster.training.checkpoint import AFRESH, Checkpoint, fitting
+from brewster.training.checkpoint import START_FRESH, Checkpoint, mismatch_as_model_error
 from brewster.training.distributed import is_main_process
 from brewster.training.recipe import TrainingRecipe
 from brewster.training.tensorboard import TensorBoardLog
 
-Report = Callable[[int, int, Mapping[str, float], bool], None]
-"""Called with (step, steps, numbers, logged) after every step; `logged` says that the numbers went into the log."""
+StepCallback = Callable[[int, int, Mapping[str, float], bool], None]
+"""Called with (step, steps, metrics, logged) after every step; `logged` says that they went into the log."""
 
 CHECKPOINT: Final = "checkpoint.pt"
 LOG: Final = "log.jsonl"
 SAMPLES: Final = "samples.png"
-_MAY_CHANGE: Final = {"start_from", "steps", "report_every", "checkpoint_every"}
+_NOT_COMPARED: Final = {"start_from", "steps", "report_every", "checkpoint_every"}
 
 
 class Trainer(Protocol):
@@ -67,7 +67,7 @@ class Trainer(Protocol):
         ...
 
 
-def run(trainer: Trainer, out: Path, report: Report) -> None:
+def run(trainer: Trainer, out: Path, on_step: StepCallback) -> None:
     """Trains to the end of the recipe in folder `out`, from its checkpoint if there is one.
 
     Where several processes learn together, the first alone writes.
@@ -84,45 +84,48 @@ def run(trainer: Trainer, out: Path, report: Report) -> None:
     """
     out.mkdir(parents=True, exist_ok=True)
     recipe = trainer.recipe
-    begun = _take_up(trainer, out / CHECKPOINT)
+    completed_steps = _resume_or_initialize(trainer, out / CHECKPOINT)
     if is_main_process():
-        _forget_after(begun, out / LOG)
+        _truncate_log(completed_steps, out / LOG)
     started, steps = time.monotonic(), 0 if recipe.data.is_none else recipe.steps
-    with closing(TensorBoardLog(out, begun)) as board:
-        for step in range(begun + 1, 1 + steps):
-            numbers, last = trainer.training_step(step - 1), step == recipe.steps
+    with closing(TensorBoardLog(out, completed_steps)) as event_log:
+        for step in range(completed_steps + 1, 1 + steps):
+            metrics, last = trainer.training_step(step - 1), step == recipe.steps
             logged = is_main_process() and (last or step % recipe.report_every == 0)
             if logged:
                 scores, picture = trainer.validate()
-                numbers |= scores | {"seconds": time.monotonic() - started}
-                _log(out / LOG, {"step": step, **numbers})
+                metrics |= scores | {"seconds": time.monotonic() - started}
+                _append_log(out / LOG, {"step": step, **metrics})
                 _write_picture(out / SAMPLES, picture)
-                board.log(step, numbers, picture)
+                event_log.log(step, metrics, picture)
             if is_main_process() and (last or step % recipe.checkpoint_every == 0):
                 Checkpoint(step, recipe.model_dump_json(), trainer.state_dict()).write(out / CHECKPOINT)
-            report(step, recipe.steps, numbers, logged)
+            on_step(step, recipe.steps, metrics, logged)
 
 
-def last_numbers(folder: Path) -> dict[str, float]:
+def read_last_metrics(folder: Path) -> dict[str, float]:
     """What a run in this folder logged last; nothing if it has not."""
     log = folder / LOG
     lines = log.read_text().splitlines() if log.exists() else []
     return dict(json.loads(lines[-1])) if lines else {}
 
 
-def _take_up(trainer: Trainer, saved: Path) -> int:
+def _resume_or_initialize(trainer: Trainer, saved: Path) -> int:
     """Goes on with the run if it has begun, else begins it where its recipe says; how many steps are taken."""
     if not saved.exists():
         trainer.initialize()
         return 0
-    checkpoint = _of_this_recipe(Checkpoint.read(saved), trainer.recipe, saved)
-    with fitting(saved, AFRESH):
+    checkpoint = _check_recipe(Checkpoint.read(saved), trainer.recipe, saved)
+    with mismatch_as_model_error(saved, START_FRESH):
         trainer.load_state_dict(checkpoint.state)
     return checkpoint.step
 
 
-def _of_this_recipe(checkpoint: Checkpoint, recipe: TrainingRecipe, path: Path) -> Checkpoint:
-    before, now = _identity(checkpoint.recipe, recipe), _identity(recipe.model_dump_json(), recipe)
+def _check_recipe(checkpoint: Checkpoint, recipe: TrainingRecipe, path: Path) -> Checkpoint:
+    before, now = (
+        _compared_values(checkpoint.recipe, recipe),
+        _compared_values(recipe.model_dump_json(), recipe),
+    )
     if before == now:
         return checkpoint
     changed = ", ".join(name for name in now if before and before.get(name) != now[name])
@@ -133,23 +136,23 @@ def _of_this_recipe(checkpoint: Checkpoint, recipe: TrainingRecipe, path: Path) 
     )
 
 
-def _identity(text: str, recipe: TrainingRecipe) -> dict[str, object]:
+def _compared_values(text: str, recipe: TrainingRecipe) -> dict[str, object]:
     """What a run must keep to be resumed: all but how long it is, how often it reports, and where it started from.
 
     What a recipe does not name, such as a value that is newer than the run, counts as its default.
     """
     try:
-        return type(recipe).model_validate_json(text).model_dump(exclude=_MAY_CHANGE)
+        return type(recipe).model_validate_json(text).model_dump(exclude=_NOT_COMPARED)
     except ValidationError:
         return {}
 
 
-def _log(path: Path, numbers: Mapping[str, float]) -> None:
+def _append_log(path: Path, metrics: Mapping[str, float]) -> None:
     with path.open("a") as stream:
-        stream.write(json.dumps({name: round(value, 5) for name, value in numbers.items()}) + "\n")
+        stream.write(json.dumps({name: round(value, 5) for name, value in metrics.items()}) + "\n")
 
 
-def _forget_after(step: int, log: Path) -> None:
+def _truncate_log(step: int, log: Path) -> None:
     """Drops the lines that a killed run wrote after its last checkpoint, the last of them perhaps half."""
     lines = log.read_text().splitlines() if log.exists() else []
     kept = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= step]

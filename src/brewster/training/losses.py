@@ -15,11 +15,11 @@ from brewster.training.data.mixtures import TrainingBatch
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-_ROUNDING: Final = 1 / (12 * 255**2)
+_QUANTIZATION_MSE: Final = 1 / (12 * 255**2)
 """The mean squared error of rounding to 8 bits; pictures that differ by less are the same, at 58.9 dB."""
 _SCALES = (1, 4, 16)
-_LITTLE = 0.05
-_GOOD_ENOUGH = 1e-3
+_MAX_ADDED_SHARE = 0.05
+_MSE_FLOOR = 1e-3
 """Mean squared error, 30 dB, past which a picture no longer pulls."""
 
 
@@ -37,39 +37,43 @@ def separation_loss(layers: Float[Tensor, "n 6 h w"], batch: TrainingBatch) -> d
     )
     squared = (transmission - batch.transmission_encoded).square().mean(dim=(1, 2, 3))
     return {
-        "transmission": _at_all_scales(transmission - batch.transmission_encoded).mean(),
+        "transmission": _multiscale_error(transmission - batch.transmission_encoded).mean(),
         "reflection": 0.3
-        * (_at_all_scales(reflection - batch.reflection_encoded) * batch.reflection_weight).mean(),
+        * (_multiscale_error(reflection - batch.reflection_encoded) * batch.reflection_weight).mean(),
         "edges": edges,  # type: ignore[dict-item]
-        "psnr": 0.02 * (squared + _GOOD_ENOUGH).log().mean(),
+        "psnr": 0.02 * (squared + _MSE_FLOOR).log().mean(),
     }
 
 
-def _at_all_scales(error: Tensor) -> Float[Tensor, " n"]:
+def _multiscale_error(error: Tensor) -> Float[Tensor, " n"]:
     return sum(  # type: ignore[return-value]
         functional.avg_pool2d(error, scale).abs().mean(dim=(1, 2, 3)) for scale in _SCALES
     )
 
 
-def gain_db(answer: Tensor, photo: Tensor, truth: Tensor) -> float:
-    """How much nearer to the truth the answer is than the photo, in dB of PSNR; encoded pictures in 0..1."""
-    errors = [functional.mse_loss(picture, truth).item() for picture in (photo, answer)]
-    before, after = (max(error, _ROUNDING) for error in errors)
+def psnr_gain_db(prediction: Tensor, photo: Tensor, ground_truth: Tensor) -> float:
+    """How much nearer to the ground truth the prediction is than the photo, in dB of PSNR; encoded pictures in 0..1."""
+    errors = [functional.mse_loss(picture, ground_truth).item() for picture in (photo, prediction)]
+    before, after = (max(error, _QUANTIZATION_MSE) for error in errors)
     return 10 * math.log10(before / after)
 
 
-def tone(answer: Tensor, photo: Tensor, truth: Tensor) -> float:
-    """Light of the answer over that of the photo where the truth says that little was added; 1 if that is nowhere.
+def tone_ratio(prediction: Tensor, photo: Tensor, ground_truth: Tensor) -> float:
+    """Light of the prediction over that of the photo where the ground truth says that little was added; 1 if that is nowhere.
 
     Encoded pictures in 0..1; little is less than a twentieth of the photo's own light in every channel.
     """
-    before, after, wanted = (to_linear(picture) for picture in (photo, answer, truth))
-    untouched = (before - wanted < _LITTLE * before + _LITTLE**2).all(dim=-3, keepdim=True).expand_as(before)
+    before, after, wanted = (to_linear(picture) for picture in (photo, prediction, ground_truth))
+    untouched = (
+        (before - wanted < _MAX_ADDED_SHARE * before + _MAX_ADDED_SHARE**2)
+        .all(dim=-3, keepdim=True)
+        .expand_as(before)
+    )
     light = before[untouched].sum()
     return (after[untouched].sum() / light).item() if light > 0 else 1.0
 
 
-def finite(value: Tensor, step: int, name: str = "loss") -> Tensor:
+def check_finite(value: Tensor, step: int, name: str = "loss") -> Tensor:
     """The loss, or what is named, if it is a number.
 
     Raises:

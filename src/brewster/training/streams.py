@@ -31,8 +31,8 @@ def open_stream(recipe: CompactRecipe, device: torch.device | str = "cpu") -> St
         RecipeError: a folder is missing or empty, pairs do not fit together, or too few samples are rendered.
         PhotoError: a picture cannot be read, or a map cannot light a scene.
     """
-    return _shared(
-        recipe.data.pairs_share, partial(_open_pairs, recipe), partial(_open_others, recipe, device)
+    return _interleave(
+        recipe.data.pairs_share, partial(_open_pairs, recipe), partial(_open_unpaired, recipe, device)
     )
 
 
@@ -47,7 +47,7 @@ def validation_pairs(data: DataRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]
     root = data_folder() if folders else Path()
     return {
         name: read_pairs([root / folder], data.validate_at_most)
-        for name, folder in zip(_short(folders), folders, strict=True)
+        for name, folder in zip(_unique_names(folders), folders, strict=True)
     }
 
 
@@ -60,12 +60,12 @@ def held_out_mixtures(recipe: CompactRecipe) -> Stream | None:
     data = recipe.data
     if not (data.held_out and data.photos):
         return None
-    photos = read_photos(found(data.photos), data.exclude, only=data.held_out)
-    maps = read_maps(found(data.maps), data.exclude, only=data.held_out)
+    photos = read_photos(resolve_folders(data.photos), data.exclude, only=data.held_out)
+    maps = read_maps(resolve_folders(data.maps), data.exclude, only=data.held_out)
     return Mixtures(photos, maps, recipe.mix, seed=recipe.seed + 3)
 
 
-def _short(folders: Sequence[Path]) -> list[str]:
+def _unique_names(folders: Sequence[Path]) -> list[str]:
     """Names for different folders: as much of the end of their paths as tells them apart."""
     for length in range(1, max((len(folder.parts) for folder in folders), default=0)):
         names = ["/".join(folder.parts[-length:]) for folder in folders]
@@ -74,13 +74,13 @@ def _short(folders: Sequence[Path]) -> list[str]:
     return list(map(str, folders))
 
 
-def _open_others(recipe: CompactRecipe, device: torch.device | str) -> Stream:
-    return _shared(
+def _open_unpaired(recipe: CompactRecipe, device: torch.device | str) -> Stream:
+    return _interleave(
         recipe.data.rendered_share, partial(_open_rendered, recipe, device), partial(_open_mixtures, recipe)
     )
 
 
-def _shared(share: float, first: Callable[[], Stream], second: Callable[[], Stream]) -> Stream:
+def _interleave(share: float, first: Callable[[], Stream], second: Callable[[], Stream]) -> Stream:
     """Opens only what has a share."""
     if share in (0, 1):
         return first() if share else second()
@@ -90,11 +90,11 @@ def _shared(share: float, first: Callable[[], Stream], second: Callable[[], Stre
 def _open_mixtures(recipe: CompactRecipe) -> Stream:
     data = recipe.data
     if data.is_none:
-        return _refuse
-    folders = found(data.photos)
+        return _empty_stream
+    folders = resolve_folders(data.photos)
     return Mixtures(
         read_photos(folders, data.never_trained_on),
-        read_maps(found(data.maps), data.never_trained_on),
+        read_maps(resolve_folders(data.maps), data.never_trained_on),
         recipe.mix,
         seed=recipe.seed,
         weights=source_weights(folders, data.never_trained_on),
@@ -102,47 +102,49 @@ def _open_mixtures(recipe: CompactRecipe) -> Stream:
 
 
 def _open_pairs(recipe: CompactRecipe) -> Stream:
-    return Pairs(read_pairs(found(recipe.data.pairs)), recipe.mix.crop, seed=recipe.seed + 1)
+    return Pairs(read_pairs(resolve_folders(recipe.data.pairs)), recipe.mix.crop, seed=recipe.seed + 1)
 
 
 def _open_rendered(recipe: CompactRecipe, device: torch.device | str) -> Stream:
-    wanted, choices = recipe.data.rendered, recipe.seed + 2
-    assert wanted
-    if wanted.sets:
+    rendered, seed = recipe.data.rendered, recipe.seed + 2
+    assert rendered
+    if rendered.sets:
         return RenderedSets(
-            found(wanted.sets),
-            seed=choices,
-            count=wanted.count,
+            resolve_folders(rendered.sets),
+            seed=seed,
+            count=rendered.count,
             crop=recipe.mix.crop,
-            target=wanted.target,
-            mixing=wanted.mixing,
+            target=rendered.target,
+            mixing=rendered.mixing,
         )
-    live = _open_live(recipe, wanted, device)
-    return live if wanted.count is None else CachedRendered(live, wanted.count, seed=choices)
+    live = _open_online(recipe, rendered, device)
+    return live if rendered.count is None else CachedRendered(live, rendered.count, seed=seed)
 
 
-def _open_live(recipe: CompactRecipe, wanted: RenderedRecipe, device: torch.device | str) -> OnlineRendered:
-    maps, photos = found(wanted.maps), found(wanted.photos)
+def _open_online(
+    recipe: CompactRecipe, rendered: RenderedRecipe, device: torch.device | str
+) -> OnlineRendered:
+    maps, photos = resolve_folders(rendered.maps), resolve_folders(rendered.photos)
     catalog, refused = read_catalog(maps, photos, recipe.data.never_trained_on)
     if refused:  # a run of hours has nobody to tell that it learns from less than was asked
         raise refused[0]
     return OnlineRendered(
-        _scenes(wanted),
+        _scene_recipe(rendered),
         catalog,
         Assets([*maps, *photos]),
-        seed=recipe.seed if wanted.seed is None else wanted.seed,
+        seed=recipe.seed if rendered.seed is None else rendered.seed,
         device=device,
-        target=wanted.target,
-        mixing=wanted.mixing,
+        target=rendered.target,
+        mixing=rendered.mixing,
     )
 
 
-def _scenes(wanted: RenderedRecipe) -> SceneRecipe:
-    scenes = read_scene_recipe(wanted.recipe or "")
-    return scenes.model_copy(update={"orders": wanted.orders}) if wanted.orders else scenes
+def _scene_recipe(rendered: RenderedRecipe) -> SceneRecipe:
+    scenes = read_scene_recipe(rendered.recipe or "")
+    return scenes.model_copy(update={"orders": rendered.orders}) if rendered.orders else scenes
 
 
-def _refuse(step: int, count: int, size: int) -> TrainingBatch:  # noqa: ARG001  (a Stream)
+def _empty_stream(step: int, count: int, size: int) -> TrainingBatch:  # noqa: ARG001  (a Stream)
     raise RecipeError(
         "the recipe has nothing to learn from",
         "a share above 0, and a count of rendered samples above 0",
@@ -150,7 +152,7 @@ def _refuse(step: int, count: int, size: int) -> TrainingBatch:  # noqa: ARG001 
     )
 
 
-def found(named: Sequence[Path]) -> list[Path]:
+def resolve_folders(named: Sequence[Path]) -> list[Path]:
     """Where a recipe's folders lie; BREWSTER_DATA is not asked for where no path starts from it.
 
     Raises:

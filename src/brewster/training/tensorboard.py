@@ -14,22 +14,22 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch.utils.tensorboard import SummaryWriter
 
-PICTURE = "samples"
+IMAGE_TAG = "samples"
 
 
 @final
 class TensorBoardLog:
     """Event files in a folder, from the step on that a run goes on from: what was told of later steps is forgotten."""
 
-    def __init__(self, folder: Path, begun: int) -> None:
-        self._folder, self._begun = folder, begun
+    def __init__(self, folder: Path, completed_steps: int) -> None:
+        self._folder, self._completed_steps = folder, completed_steps
 
-    def log(self, step: int, numbers: Mapping[str, float], encoded: Float[Tensor, "h w 3"]) -> None:
+    def log(self, step: int, metrics: Mapping[str, float], picture_encoded: Float[Tensor, "h w 3"]) -> None:
         """Writes each number as a scalar, and the picture, sRGB-encoded in 0..1."""
         if self._writer:
-            for name, value in numbers.items():
+            for name, value in metrics.items():
                 self._writer.add_scalar(name, value, step)
-            self._writer.add_image(PICTURE, encoded.clamp(0, 1), step, dataformats="HWC")
+            self._writer.add_image(IMAGE_TAG, picture_encoded.clamp(0, 1), step, dataformats="HWC")
             self._writer.flush()
 
     def close(self) -> None:
@@ -44,4 +44,4 @@ class TensorBoardLog:
             return None
         from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  (wakes tensorboard)
 
-        return SummaryWriter(self._folder, purge_step=self._begun + 1)
+        return SummaryWriter(self._folder, purge_step=self._completed_steps + 1)

@@ -30,7 +30,7 @@ def export_onnx(network: nn.Module, path: Path, stride: int) -> None:
     """
     height, width = (torch.export.Dim(name, min=1, max=256) for name in ("rows", "columns"))
     example = torch.rand(1, 3, 4 * stride, 5 * stride)
-    with _quietly():
+    with _without_warnings():
         program = torch.onnx.export(
             LinearSeparator(network).eval(),
             (example,),
@@ -66,7 +66,7 @@ def with_half_weights(model: ModelProto) -> ModelProto:
 
 
 @contextmanager
-def _quietly() -> Iterator[None]:
+def _without_warnings() -> Iterator[None]:
     """The exporter warns of a torchvision that nobody needs, and of its own old calls."""
     logger = logging.getLogger("torch.onnx")
     before = logger.level

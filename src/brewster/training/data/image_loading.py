@@ -24,7 +24,7 @@ _PICTURES = SUFFIXES.keys() - _MAPS
 _PHOTO_SIDE_PX = 640
 _MAP_HEIGHT_PX = 512
 _LARGEST_HALF = 65504.0
-_WORD = re.compile(r"[^0-9A-Za-z]")
+_WORD_END = re.compile(r"[^0-9A-Za-z]")
 
 
 def read_photos(
@@ -36,7 +36,7 @@ def read_photos(
         RecipeError: a folder cannot be read, or there is no photo in any of them.
         PhotoError: a photo cannot be read.
     """
-    return [_read_photo(path, _PHOTO_SIDE_PX) for path in _list(folders, _PICTURES, exclude, only)]
+    return [_read_photo(path, _PHOTO_SIDE_PX) for path in _list_pictures(folders, _PICTURES, exclude, only)]
 
 
 def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list[float]:
@@ -48,7 +48,7 @@ def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list
     Raises:
         RecipeError: as `read_photos`.
     """
-    sources = [_WORD.split(path.name)[0] for path in _list(folders, _PICTURES, exclude)]
+    sources = [_WORD_END.split(path.name)[0] for path in _list_pictures(folders, _PICTURES, exclude)]
     counts = Counter(sources)
     return [counts[source] ** -0.5 for source in sources]
 
@@ -62,27 +62,31 @@ def read_maps(
         RecipeError: a folder cannot be read, or there is no map in any of them.
         PhotoError: a map cannot be read.
     """
-    return [_read_map(path) for path in _list(folders, _MAPS, exclude, only)]
+    return [_read_map(path) for path in _list_pictures(folders, _MAPS, exclude, only)]
 
 
-def read_pairs(folders: Sequence[Path], at_most: int | None = None) -> list[tuple[Tensor, Tensor]]:
+def read_pairs(folders: Sequence[Path], max_pairs: int | None = None) -> list[tuple[Tensor, Tensor]]:
     """Aligned (photo, transmission) pairs of folders as `layouts.read_folders` joins them, in order of path.
 
-    Of each folder `at_most` so many are read, evenly spaced.
+    Of each folder at most `max_pairs` are read, evenly spaced.
 
     Raises:
         RecipeError: a folder cannot be read or is empty; a picture has no partner, or one of another size.
         PhotoError: a picture cannot be read.
     """
-    return [_read_pair(trio) for folder in folders for trio in _evenly(_trios(folder), at_most)]
+    return [
+        _read_pair(group)
+        for folder in folders
+        for group in _evenly_spaced(_picture_groups(folder), max_pairs)
+    ]
 
 
-def _evenly(trios: list[PictureGroup], at_most: int | None) -> list[PictureGroup]:
-    count = min(len(trios), at_most or len(trios))
+def _evenly_spaced(trios: list[PictureGroup], max_pairs: int | None) -> list[PictureGroup]:
+    count = min(len(trios), max_pairs or len(trios))
     return [trios[number * len(trios) // count] for number in range(count)]
 
 
-def _trios(folder: Path) -> list[PictureGroup]:
+def _picture_groups(folder: Path) -> list[PictureGroup]:
     try:
         found = read_folders(folder)
     except PhotoError as error:
@@ -97,16 +101,16 @@ def _trios(folder: Path) -> list[PictureGroup]:
             "each photo needs one transmission of its name, and no transmission is left over",
             "add or remove files until the names match",
         )
-    return sorted(found.trios, key=lambda trio: trio.photo)
+    return sorted(found.trios, key=lambda group: group.photo)
 
 
-def _read_pair(trio: PictureGroup) -> tuple[Tensor, Tensor]:
+def _read_pair(group: PictureGroup) -> tuple[Tensor, Tensor]:
     photo, transmission = (
-        torch.from_numpy(Photo.open(path).srgb_8bit().copy()) for path in (trio.photo, trio.transmission)
+        torch.from_numpy(Photo.open(path).srgb_8bit().copy()) for path in (group.photo, group.transmission)
     )
     if photo.shape != transmission.shape:
         raise RecipeError(
-            f"{trio.photo} and {trio.transmission} differ in size",
+            f"{group.photo} and {group.transmission} differ in size",
             "pairs must be aligned pixel by pixel",
             "crop one to the other",
         )
@@ -114,28 +118,28 @@ def _read_pair(trio: PictureGroup) -> tuple[Tensor, Tensor]:
 
 
 def _read_map(path: Path) -> Tensor:
-    linear = np.clip(_at_most(Photo.open(path), 2 * _MAP_HEIGHT_PX), 0, _LARGEST_HALF)
+    linear = np.clip(_downscaled(Photo.open(path), 2 * _MAP_HEIGHT_PX), 0, _LARGEST_HALF)
     return torch.from_numpy(linear.astype(np.float16)).permute(2, 0, 1).contiguous()
 
 
-def _read_photo(path: Path, longest_px: int) -> Tensor:
-    encoded = to_encoded(np.clip(_at_most(Photo.open(path), longest_px), 0, 1))
+def _read_photo(path: Path, max_side_px: int) -> Tensor:
+    encoded = to_encoded(np.clip(_downscaled(Photo.open(path), max_side_px), 0, 1))
     return torch.from_numpy(np.rint(encoded * 255).astype(np.uint8))
 
 
-def _at_most(photo: Photo, longest_px: int) -> NDArray[np.float32]:
-    scale = min(1.0, longest_px / max(photo.size))
+def _downscaled(photo: Photo, max_side_px: int) -> NDArray[np.float32]:
+    scale = min(1.0, max_side_px / max(photo.size))
     width, height = (max(1, round(side * scale)) for side in photo.size)
     return photo.small(width, height)
 
 
-def _list(
+def _list_pictures(
     folders: Iterable[Path], suffixes: set[str], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
 ) -> list[Path]:
     found = sorted(
         path
         for folder in folders
-        for path in _entries(folder)
+        for path in _list_folder(folder)
         if path.suffix.lower() in suffixes and _matches(path, only) and not _matches(path, exclude)
     )
     if folders and not found:
@@ -151,7 +155,7 @@ def _matches(path: Path, patterns: Sequence[str]) -> bool:
     return any(fnmatch(path.name, pattern) for pattern in patterns)
 
 
-def _entries(folder: Path) -> list[Path]:
+def _list_folder(folder: Path) -> list[Path]:
     try:
         return list(folder.iterdir())
     except OSError as error:

@@ -43,7 +43,7 @@ class TrainingBatch:
     reflection_weight: Tensor
 
     @classmethod
-    def of(cls, layers: Tensor) -> TrainingBatch:
+    def from_layers(cls, layers: Tensor) -> TrainingBatch:
         """Samples whose truths are certain, from (N, 9, S, S): photo, transmission and reflection as channels."""
         photo, transmission, reflection = layers.chunk(3, dim=1)
         return cls(photo, transmission, reflection, torch.ones(len(layers), device=layers.device))
@@ -52,9 +52,9 @@ class TrainingBatch:
         """The same batch on another device."""
         return TrainingBatch(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
 
-    def split(self, most: int) -> list[TrainingBatch]:
-        """The same samples in batches of at most so many."""
-        parts = zip(*(getattr(self, name).split(most) for name in self.__dataclass_fields__), strict=True)
+    def split(self, max_size: int) -> list[TrainingBatch]:
+        """The same samples in batches of at most `max_size`."""
+        parts = zip(*(getattr(self, name).split(max_size) for name in self.__dataclass_fields__), strict=True)
         return [TrainingBatch(*tensors) for tensors in parts]
 
 
@@ -156,7 +156,7 @@ class Mixtures:
         background = self._background(rng, size)
         reflection = self._reflection(rng, size) * background.mean()
         if rng.bernoulli(recipe.absent_probability):
-            return _photograph(rng, recipe, background, background, torch.zeros_like(background))
+            return _expose_and_develop(rng, recipe, background, background, torch.zeros_like(background))
         glass = effects.window(rng, size) if rng.bernoulli(recipe.partial_probability) else torch.ones(1)
         transmittance = rng.uniform(recipe.transmittance) * (1 + 0.02 * rng.normal(3, 1, 1))
         transmission, reflection = background * (1 + glass * (transmittance - 1)), reflection * glass
@@ -164,7 +164,7 @@ class Mixtures:
         if rng.bernoulli(recipe.veil_probability):
             photo = photo + glass * rng.uniform(recipe.veil) * photo.mean(dim=(1, 2), keepdim=True)
         target = transmission if recipe.target == "transmission" else background
-        return _photograph(rng, recipe, photo, target, reflection)
+        return _expose_and_develop(rng, recipe, photo, target, reflection)
 
     def _background(self, rng: SampleRng, size: int) -> Picture:
         recipe = self._recipe
@@ -172,15 +172,15 @@ class Mixtures:
         if rng.bernoulli(recipe.shadow_probability):
             view = view * effects.shadow(rng, size)
         level = rng.log_uniform(recipe.background_level_log)
-        return view * _temperature(rng, recipe.temperature) * (level / _mean_without_lamps(view))
+        return view * _temperature(rng, recipe.temperature) * (level / _mean_without_highlights(view))
 
     def _reflection(self, rng: SampleRng, size: int) -> Picture:
         """A reflection for a background of mean 1: blurred, doubled, fading and cut off, in linear light."""
         recipe, scale = self._recipe, size / _REFERENCE_SIZE
         view = self._view(rng, size, recipe.reflection_map_probability)
-        view = view / _mean_without_lamps(view)
+        view = view / _mean_without_highlights(view)
         view = view * (view.mean(dim=0) + 1e-4) ** (rng.log_uniform(recipe.reflection_contrast_log) - 1)
-        view = view / _mean_without_lamps(view) * _temperature(rng, recipe.temperature)
+        view = view / _mean_without_highlights(view) * _temperature(rng, recipe.temperature)
         if rng.bernoulli(recipe.sign_probability):
             view = effects.sign(rng, view)
         if not rng.bernoulli(recipe.sharp_probability):
@@ -197,7 +197,7 @@ class Mixtures:
 
     def _view(self, rng: SampleRng, size: int, map_probability: float) -> Picture:
         if self._maps and rng.bernoulli(map_probability):
-            return _look_into(rng, self._maps[rng.randint(len(self._maps))], size)
+            return _perspective_view(rng, self._maps[rng.randint(len(self._maps))], size)
         crop = random_crop(rng, self._photos[self._choose_photo(rng)], self._recipe.crop, size)
         bright = ((crop.amax(dim=0, keepdim=True) - 0.8) / 0.2).clamp(0, 1)
         return crop * (1 + rng.uniform(self._recipe.highlight_boost) * bright**2)
@@ -250,7 +250,9 @@ class InterleavedStream:
         )
 
 
-def _photograph(rng: SampleRng, recipe: MixRecipe, *layers: Picture) -> tuple[Picture, Picture, Picture]:
+def _expose_and_develop(
+    rng: SampleRng, recipe: MixRecipe, *layers: Picture
+) -> tuple[Picture, Picture, Picture]:
     """One exposure and one tone curve for photo, target and reflection; noise, JPEG and 8 bits for the photo."""
     exposure = min(1.0, rng.uniform(recipe.exposure) / layers[0].clamp(max=1).mean().item())
     if rng.bernoulli(recipe.overexposed_probability):
@@ -282,7 +284,7 @@ def random_crop(rng: SampleRng, picture: Tensor, fraction: Range, size: int) -> 
     rows, columns = (max(8, min(limit, round(length))) for limit, length in (
         (height, side * stretch), (width, side / stretch)))  # fmt: skip
     top, left = rng.randint(height - rows + 1), rng.randint(width - columns + 1)
-    window = _light_of(picture[top : top + rows, left : left + columns]).permute(2, 0, 1)
+    window = _linear_from_bytes(picture[top : top + rows, left : left + columns]).permute(2, 0, 1)
     if rng.bernoulli(0.5):
         window = window.flip(2)
     return functional.interpolate(window[None], (size, size), mode="bilinear", antialias=True)[0].clamp(min=0)
@@ -291,12 +293,12 @@ def random_crop(rng: SampleRng, picture: Tensor, fraction: Range, size: int) -> 
 _LINEAR_OF_BYTE: Final = to_linear(torch.arange(256) / 255)
 
 
-def _light_of(encoded: Tensor) -> Tensor:
+def _linear_from_bytes(encoded: Tensor) -> Tensor:
     """Linear light of sRGB bytes, by a table; in one row, as torch looks up a row much faster than a picture."""
     return _LINEAR_OF_BYTE.index_select(0, encoded.reshape(-1).int()).view(encoded.shape)
 
 
-def _look_into(rng: SampleRng, lat_long: Tensor, size: int) -> Picture:
+def _perspective_view(rng: SampleRng, lat_long: Tensor, size: int) -> Picture:
     """A perspective view into a lat-long map (3, H, 2 H): any heading, level within 20 degrees."""
     half = math.tan(math.radians(rng.uniform((50, 100))) / 2)
     heading, pitch = rng.uniform((-math.pi, math.pi)), math.radians(rng.uniform((-20, 20)))
@@ -310,7 +312,7 @@ def _look_into(rng: SampleRng, lat_long: Tensor, size: int) -> Picture:
     return view[0].clamp(min=0)
 
 
-def _mean_without_lamps(picture: Picture) -> Tensor:
+def _mean_without_highlights(picture: Picture) -> Tensor:
     """The mean of what is not brighter than the 95th percentile, so that a lamp does not set the exposure."""
     return picture.clamp(max=_quantile(picture, 0.95)).mean() + 1e-4
 

@@ -46,7 +46,7 @@ class OnlineRendered:
     ) -> None:
         self._recipe, self._catalog, self._assets = recipe, catalog, assets
         self._seed, self._device, self._target, self._mixing = seed, device, target, mixing
-        self._renders = Lock()
+        self._render_lock = Lock()
 
     def __iter__(self) -> Iterator[DevelopedSample]:
         return (self.sample(index) for index in numbers())
@@ -62,7 +62,7 @@ class OnlineRendered:
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
         """The batch of this step: `count` samples of `size` px a side, none of them ever seen before."""
-        return TrainingBatch.of(
+        return TrainingBatch.from_layers(
             torch.stack([self.layers(step * count + slot, size) for slot in range(count)])
         )
 
@@ -79,7 +79,7 @@ class OnlineRendered:
 
     def _developed(self, recipe: SceneRecipe, index: int) -> DevelopedSample:
         scene = draw(recipe, self._catalog, self._seed, index)
-        with self._renders:
+        with self._render_lock:
             sample = render(scene, self._assets, self._device)
         developed = develop(sample)
         return with_jpeg(developed if self._mixing == "light" else blended(developed))

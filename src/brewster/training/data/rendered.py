@@ -30,7 +30,7 @@ from brewster.training.data.mixtures import Target, TrainingBatch, random_crop
 from brewster.training.data.online import Mixing, OnlineRendered
 from brewster.training.data.sample_rng import SampleRng
 
-KEPT_BYTES: Final = 1 << 30
+CACHE_BYTES: Final = 1 << 30
 """What samples may take in memory, 9 bytes a pixel: 600 of 512x384, 1,800 of 256x256, 7,200 of 128x128. Beyond, the
 oldest are forgotten, and read or rendered again when their turn comes: slower, but the same."""
 
@@ -55,9 +55,9 @@ class RenderedSets:
         target: Target = "background",
         mixing: Mixing = "light",
     ) -> None:
-        self._entries = _first(folders, count)
+        self._entries = _first_entries(folders, count)
         self._seed, self._crop, self._target, self._mixing = seed, crop, target, mixing
-        self._kept = _TensorCache(KEPT_BYTES)
+        self._cache = _TensorCache(CACHE_BYTES)
 
     def __len__(self) -> int:
         return len(self._entries)
@@ -70,7 +70,7 @@ class RenderedSets:
         """
         rng = (SampleRng(self._seed, step, slot) for slot in range(count))
         windows = [random_crop(each, self.sample(each.randint(len(self))), self._crop, size) for each in rng]
-        return TrainingBatch.of(to_encoded(torch.stack(windows)))
+        return TrainingBatch.from_layers(to_encoded(torch.stack(windows)))
 
     def sample(self, number: int) -> Tensor:
         """Photo, target and reflection of a sample whole, as channels: (H, W, 9) sRGB uint8.
@@ -78,22 +78,24 @@ class RenderedSets:
         Raises:
             RecipeError, PhotoError: a file of the sample is missing or damaged.
         """
-        return self._kept.once(number, lambda: self._read(self._entries[number]))
+        return self._cache.get_or_create(number, lambda: self._read(self._entries[number]))
 
     def _read(self, entry: StoredSample) -> Tensor:
         if self._mixing == "8-bit":
-            return _blend(entry)
+            return _blended_sample(entry)
         return torch.cat([_picture(entry, name) for name in ("photo", self._target, "reflection")], dim=2)
 
 
 class CachedRendered:
     """A `Stream` of the first `count` samples of a live one, maybe mirrored; threads may share it.
 
-    Each is rendered once for each size and kept in 8 bits, in `most_bytes` of memory.
+    Each is rendered once for each size and kept in 8 bits, in `max_bytes` of memory.
     """
 
-    def __init__(self, live: OnlineRendered, count: int, *, seed: int, most_bytes: int = KEPT_BYTES) -> None:
-        self._live, self._count, self._seed, self._kept = live, count, seed, _TensorCache(most_bytes)
+    def __init__(
+        self, source: OnlineRendered, count: int, *, seed: int, max_bytes: int = CACHE_BYTES
+    ) -> None:
+        self._source, self._count, self._seed, self._cache = source, count, seed, _TensorCache(max_bytes)
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
         """The batch of this step: `count` samples of `size` px a side.
@@ -103,42 +105,42 @@ class CachedRendered:
             PhotoError: a file cannot be read.
         """
         rng = (SampleRng(self._seed, step, slot) for slot in range(count))
-        return TrainingBatch.of(torch.stack([self._use(each, size) for each in rng]) / 255)
+        return TrainingBatch.from_layers(torch.stack([self._sample(each, size) for each in rng]) / 255)
 
-    def _use(self, rng: SampleRng, size: int) -> Tensor:
+    def _sample(self, rng: SampleRng, size: int) -> Tensor:
         index = rng.randint(self._count)
-        layers = self._kept.once((index, size), lambda: self._render(index, size))
+        layers = self._cache.get_or_create((index, size), lambda: self._render(index, size))
         return layers.flip(2) if rng.bernoulli(0.5) else layers
 
     def _render(self, index: int, size: int) -> Tensor:
         """(9, size, size) uint8, the first time too, so that a sample never changes."""
-        return (self._live.layers(index, size).clamp(0, 1) * 255).round().to(torch.uint8)
+        return (self._source.layers(index, size).clamp(0, 1) * 255).round().to(torch.uint8)
 
 
 class _TensorCache:
     """Tensors that are made once, as long as there is room for them."""
 
-    def __init__(self, most_bytes: int) -> None:
+    def __init__(self, max_bytes: int) -> None:
         self._tensors: dict[Hashable, Tensor] = {}
-        self._bytes, self._most, self._changes = 0, most_bytes, Lock()
+        self._bytes, self._max_bytes, self._lock = 0, max_bytes, Lock()
 
-    def once(self, name: Hashable, make: Callable[[], Tensor]) -> Tensor:
+    def get_or_create(self, name: Hashable, create: Callable[[], Tensor]) -> Tensor:
         found = self._tensors.get(name)
         if found is None:
-            found = make()
-            self._keep(name, found)
+            found = create()
+            self._insert(name, found)
         return found
 
-    def _keep(self, name: Hashable, made: Tensor) -> None:
-        with self._changes:
+    def _insert(self, name: Hashable, tensor: Tensor) -> None:
+        with self._lock:
             if name not in self._tensors:  # or another thread was faster
-                self._tensors[name] = made
-                self._bytes += made.nbytes
-            while self._bytes > self._most:
+                self._tensors[name] = tensor
+                self._bytes += tensor.nbytes
+            while self._bytes > self._max_bytes:
                 self._bytes -= self._tensors.pop(next(iter(self._tensors))).nbytes
 
 
-def _first(folders: Sequence[Path], count: int | None) -> list[StoredSample]:
+def _first_entries(folders: Sequence[Path], count: int | None) -> list[StoredSample]:
     entries = [entry for folder in folders for entry in _entries(folder)]
     if len(entries) < (count or 1):
         raise RecipeError(
@@ -160,8 +162,8 @@ def _entries(folder: Path) -> list[StoredSample]:
         ) from error
 
 
-def _blend(entry: StoredSample) -> Tensor:
-    with _whole(entry, SCENE):
+def _blended_sample(entry: StoredSample) -> Tensor:
+    with _file_errors(entry, SCENE):
         scene = read_cause(entry)
     background, mirror = (_picture(entry, name).permute(2, 0, 1) / 255 for name in ("background", "mirror"))
     photo, *layers = blended_layers(background, mirror, scene)
@@ -172,12 +174,12 @@ def _blend(entry: StoredSample) -> Tensor:
 def _picture(entry: StoredSample, layer: str) -> Tensor:
     """One of a sample's photographs, (H, W, 3) sRGB uint8."""
     name = f"{layer}.jpg"
-    with _whole(entry, name), naming(f"{name} of sample {key(entry.index)} in {entry.place}"):
+    with _file_errors(entry, name), naming(f"{name} of sample {key(entry.index)} in {entry.place}"):
         return torch.from_numpy(Photo.open(entry.read(name)).pixels.copy())
 
 
 @contextmanager
-def _whole(entry: StoredSample, name: str) -> Iterator[None]:
+def _file_errors(entry: StoredSample, name: str) -> Iterator[None]:
     try:
         yield
     except (OSError, KeyError) as error:

@@ -33,15 +33,15 @@ from brewster.training.data.mixtures import Pairs
 from brewster.training.data.rendered import RenderedSets
 from brewster.training.data.sample_rng import SampleRng
 from brewster.training.recipe import LoraRecipe
-from brewster.training.streams import found
+from brewster.training.streams import resolve_folders
 
 if TYPE_CHECKING:
     from jaxtyping import Float, UInt8
 
-KEPT: Final = 2048
+CACHE_SIZE: Final = 2048
 """How many latents stay in memory: 3 GiB at the paper's size (a thousand sets, also mirrored, without crops). Beyond,
 those that were not used for longest are encoded again when their turn comes: slower, but the same."""
-_LEAST_SIDE: Final = 0.5
+_MIN_CROP_SIDE: Final = 0.5
 """Of a crop, over the whole sample's."""
 
 
@@ -50,7 +50,7 @@ class TrainingSample:
     """Photo, transmission and reflection, sRGB uint8 (H, W, 9), and how far the reflection is to be trusted."""
 
     layers: UInt8[Tensor, "h w 9"]
-    trust: float = 1.0
+    reflection_weight: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class EncodedSample:
     composite: Float[Tensor, "1 c h w"]
     condition: Float[Tensor, "1 c p q"]
     start: Float[Tensor, "1 c h w"] | None
-    trust: float
+    reflection_weight: float
 
 
 class SampleSequence:
@@ -72,7 +72,7 @@ class SampleSequence:
     def __init__(
         self, rendered: RenderedSets | None, pairs: Sequence[TrainingSample], pairs_share: float
     ) -> None:
-        self._rendered, self._pairs, self._share = rendered, pairs, pairs_share
+        self._rendered, self._pairs, self._pairs_share = rendered, pairs, pairs_share
         self._first_pair = len(rendered) if rendered else 0
 
     def __len__(self) -> int:
@@ -83,15 +83,15 @@ class SampleSequence:
             return TrainingSample(self._rendered.sample(number))
         return self._pairs[number - self._first_pair]
 
-    def at_hand(self) -> Iterator[UInt8[Tensor, "h w 9"]]:
+    def preloaded(self) -> Iterator[UInt8[Tensor, "h w 9"]]:
         """Layers that need no reading: the first rendered ones, and every pair's."""
         if self._rendered:
             yield self._rendered.sample(0)
         yield from (pair.layers for pair in self._pairs)
 
-    def choose(self, rng: SampleRng) -> int:
+    def draw_index(self, rng: SampleRng) -> int:
         """The number of a sample: a pair as often as their share says."""
-        if rng.bernoulli(self._share):
+        if rng.bernoulli(self._pairs_share):
             return self._first_pair + rng.randint(len(self._pairs))
         return rng.randint(self._first_pair)
 
@@ -105,9 +105,9 @@ class LatentEncoder:
 
     def __init__(self, samples: SampleSequence, backbone: Backbone, recipe: LoraRecipe) -> None:
         self._samples, self._backbone, self._recipe = samples, backbone, recipe
-        for layers in samples.at_hand():  # better now than after an hour
-            panel_for(layers, backbone, recipe)
-        self._encoded = lru_cache(KEPT)(self._encode)
+        for layers in samples.preloaded():  # better now than after an hour
+            fit_sample(layers, backbone, recipe)
+        self._encoded = lru_cache(CACHE_SIZE)(self._encode)
 
     def __call__(self, rng: SampleRng) -> EncodedSample:
         """A sample, maybe mirrored, whole or a crop of it.
@@ -115,34 +115,34 @@ class LatentEncoder:
         Raises:
             RecipeError, PhotoError: its files are missing or damaged, or it is smaller than a panel.
         """
-        number = self._samples.choose(rng)
+        number = self._samples.draw_index(rng)
         mirrored = self._recipe.flip and rng.bernoulli(0.5)
         crops = self._recipe.crops
         return self._encoded(number, mirrored, rng.randint(crops + 1) if crops else 0)
 
     def _encode(self, number: int, mirrored: bool, crop: int) -> EncodedSample:
-        sample, layout, see = self._samples[number], self._recipe.layout, self._backbone.encode
-        fit = panel_for(sample.layers, self._backbone, self._recipe)
-        seen = sample.layers
+        sample, layout, encode = self._samples[number], self._recipe.layout, self._backbone.encode
+        fit = fit_sample(sample.layers, self._backbone, self._recipe)
+        layers = sample.layers
         if crop:
-            seen = cropped(
-                SampleRng(self._recipe.seed, -1 - number, crop), seen, fit
+            layers = crop_sample(
+                SampleRng(self._recipe.seed, -1 - number, crop), layers, fit
             )  # rng that no step throws
-        panels = panels_in(seen.flip(1) if mirrored else seen, fit)
+        panels = make_panels(layers.flip(1) if mirrored else layers, fit)
         many = self._recipe.objective == "flow"
         return EncodedSample(
-            see(compose(panels, layout)).cpu(),
-            see(condition(panels["I"], layout)).cpu(),
+            encode(compose(panels, layout)).cpu(),
+            encode(condition(panels["I"], layout)).cpu(),
             None if many else start(panels["I"], self._backbone, layout).cpu(),
-            sample.trust,
+            sample.reflection_weight,
         )
 
 
-def cropped(rng: SampleRng, layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> UInt8[Tensor, "p q 9"]:
+def crop_sample(rng: SampleRng, layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> UInt8[Tensor, "p q 9"]:
     """A window of the sample's aspect ratio, anywhere, with 0.5 to 1 of its sides, yet no smaller than what `fit` shows."""
     height, width, _ = layers.shape
-    least = max(_LEAST_SIDE, fit.content[0] / width, fit.content[1] / height)
-    side = rng.uniform((least, 1.0))
+    min_side = max(_MIN_CROP_SIDE, fit.content[0] / width, fit.content[1] / height)
+    side = rng.uniform((min_side, 1.0))
     columns, rows = (
         max(shown, round(side * whole)) for shown, whole in zip(fit.content, (width, height), strict=True)
     )
@@ -150,7 +150,7 @@ def cropped(rng: SampleRng, layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> UI
     return layers[top : top + rows, left : left + columns]
 
 
-def panels_in(layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> dict[str, Float[Tensor, "1 3 p q"]]:
+def make_panels(layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> dict[str, Float[Tensor, "1 3 p q"]]:
     """I, T and R, shrunk in linear light until they fit, in [-1, 1]."""
     light = to_linear(layers.permute(2, 0, 1)[None] / 255)
     small = functional.interpolate(light, fit.content[::-1], mode="bilinear", antialias=True)
@@ -158,7 +158,7 @@ def panels_in(layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> dict[str, Float[
     return dict(zip("ITR", padded.chunk(3, dim=1), strict=True))
 
 
-def panel_for(layers: Tensor, backbone: Backbone, recipe: LoraRecipe) -> PanelFit:
+def fit_sample(layers: Tensor, backbone: Backbone, recipe: LoraRecipe) -> PanelFit:
     """How a sample stands in a panel.
 
     Raises:
@@ -175,60 +175,59 @@ def open_samples(recipe: LoraRecipe) -> SampleSequence:
         RecipeError: a folder is missing, empty or without reflections, or too few samples are rendered.
         PhotoError: a picture cannot be read.
     """
-    data, wanted = recipe.data, recipe.data.rendered
-    rendered = None
-    if wanted and data.pairs_share < 1 and data.rendered_share:
-        rendered = RenderedSets(
-            found(wanted.sets),
+    data, rendered, sets = recipe.data, recipe.data.rendered, None
+    if rendered and data.pairs_share < 1 and data.rendered_share:
+        sets = RenderedSets(
+            resolve_folders(rendered.sets),
             seed=recipe.seed,
-            count=wanted.count,
-            target=wanted.target,
-            mixing=wanted.mixing,
+            count=rendered.count,
+            target=rendered.target,
+            mixing=rendered.mixing,
         )
-    folders = found(data.pairs) if data.pairs_share else []
-    pairs = [sample for folder in folders for sample in _pairs(folder, recipe)]
-    return SampleSequence(rendered, pairs, data.pairs_share)
+    folders = resolve_folders(data.pairs) if data.pairs_share else []
+    pairs = [sample for folder in folders for sample in _read_pairs(folder, recipe)]
+    return SampleSequence(sets, pairs, data.pairs_share)
 
 
-def _pairs(folder: Path, recipe: LoraRecipe) -> list[TrainingSample]:
+def _read_pairs(folder: Path, recipe: LoraRecipe) -> list[TrainingSample]:
     pictures = read_pairs([folder])
-    trios = sorted(read_folders(folder).trios, key=lambda trio: trio.photo)
+    trios = sorted(read_folders(folder).trios, key=lambda group: group.photo)
     if "R" in recipe.panels and recipe.reflections == "given":
-        _refuse_without_reflections(folder, trios)
-    return [_whole(trio, *pair) for trio, pair in zip(trios, pictures, strict=True)]
+        _check_reflections(folder, trios)
+    return [_read_sample(group, *pair) for group, pair in zip(trios, pictures, strict=True)]
 
 
-def _refuse_without_reflections(folder: Path, trios: Sequence[PictureGroup]) -> None:
-    lacking = [trio.name for trio in trios if trio.reflection is None]
-    if lacking:
+def _check_reflections(folder: Path, trios: Sequence[PictureGroup]) -> None:
+    missing = [group.name for group in trios if group.reflection is None]
+    if missing:
         raise RecipeError(
-            f"{folder} has no reflection for {lacking[0]} ({len(lacking)} such)",
+            f"{folder} has no reflection for {missing[0]} ({len(missing)} such)",
             "one for each photo, as R is a panel",
             'add a folder reflection_layer, set reflections = "difference", or leave R out of panels',
         )
 
 
-def _whole(trio: PictureGroup, photo: Tensor, transmission: Tensor) -> TrainingSample:
-    if trio.reflection is None:
-        return TrainingSample(with_difference(photo, transmission), Pairs.reflection_weight)
-    reflection = _read(trio.reflection)
+def _read_sample(group: PictureGroup, photo: Tensor, transmission: Tensor) -> TrainingSample:
+    if group.reflection is None:
+        return TrainingSample(layers_from_pair(photo, transmission), Pairs.reflection_weight)
+    reflection = _read_picture(group.reflection)
     if reflection.shape != photo.shape:
         raise RecipeError(
-            f"{trio.photo} and {trio.reflection} differ in size",
+            f"{group.photo} and {group.reflection} differ in size",
             "layers are aligned",
             "crop one to the other",
         )
     return TrainingSample(torch.cat([photo, transmission, reflection], dim=2))
 
 
-def with_difference(photo: Tensor, transmission: Tensor) -> Tensor:
+def layers_from_pair(photo: Tensor, transmission: Tensor) -> Tensor:
     """A pair as (H, W, 9), with the light that the transmission lacks for its reflection."""
     light = to_linear(photo / 255) - to_linear(transmission / 255)
     reflection = (to_encoded(light.clamp(0, 1)) * 255).round().to(torch.uint8)
     return torch.cat([photo, transmission, reflection], dim=2)
 
 
-def _read(path: Path) -> Tensor:
+def _read_picture(path: Path) -> Tensor:
     photo = Photo.open(path)
     encoded = to_encoded(np.clip(photo.small(*photo.size), 0, 1))
     return torch.from_numpy(np.rint(encoded * 255).astype(np.uint8))

@@ -27,7 +27,7 @@ from brewster.models.zoo import TINY
 from brewster.rendered.generation.job import RECORD
 from brewster.rendered.store import read_set
 from brewster.training.recipe import LoraRecipe
-from brewster.training.streams import found
+from brewster.training.streams import resolve_folders
 
 _TAGS: Final = ("lora", "reflection-removal", "image-decomposition", "brewster")
 _PANELS: Final = {
@@ -35,10 +35,10 @@ _PANELS: Final = {
     "T": "what is behind the glass (T, the transmission)",
     "R": "what is mirrored in it (R, the reflection)",
 }
-_SQUARE: Final = (4096, 4096)
+_SQUARE_PHOTO_PX: Final = (4096, 4096)
 """A large square photo, whose panels fill the budget best."""
-_MEASURED: Final = "## Measured"
-_NOT_MEASURED: Final = """Not yet. `brewster evaluate --benchmark NAME=DIR --model lora` measures it, and
+_BENCHMARK_HEADING: Final = "## Measured"
+_NO_BENCHMARKS: Final = """Not yet. `brewster evaluate --benchmark NAME=DIR --model lora` measures it, and
 `brewster models card lora --scores out/evaluate/results.json` puts the tables here."""
 
 _LIMITS: Final = """## Limits
@@ -71,30 +71,30 @@ def card_text(
     """The card of the LoRA that this recipe makes on such a base; `scores` is the last line of the run's log."""
     parts = [
         _front_matter(recipe, base),
-        _what_it_is(recipe, base),
+        _description(recipe, base),
         f"## Prompt\n\nAlways this one; `{PROMPT_FILE}` holds it as the base reads it.\n\n> {prompt}",
-        _use(recipe, base),
+        _usage(recipe, base),
         _data(recipe),
         _settings(recipe),
         _scores(scores),
-        f"{_MEASURED}\n\n{_NOT_MEASURED}",
+        f"{_BENCHMARK_HEADING}\n\n{_NO_BENCHMARKS}",
         _LIMITS,
         f"## Licence\n\n{_licence(recipe, base)}",
     ]
     return "\n\n".join(parts) + "\n"
 
 
-def with_measured(card: str, tables: str) -> str:
+def with_benchmark_tables(card: str, tables: str) -> str:
     """The card with these tables, Markdown, as what was measured, in place of older ones.
 
     Raises:
         ModelError: the card has no such part.
     """
-    before, heading, rest = card.partition(f"\n{_MEASURED}\n")
+    before, heading, rest = card.partition(f"\n{_BENCHMARK_HEADING}\n")
     after = re.search(r"^## ", rest, re.MULTILINE)
     if not (heading and after):
         raise ModelError(
-            "the card has no part for scores", f"{_MEASURED!r} and what follows it", "train again"
+            "the card has no part for scores", f"{_BENCHMARK_HEADING!r} and what follows it", "train again"
         )
     return f"{before}{heading}\n{tables.strip()}\n\n{rest[after.start() :]}"
 
@@ -113,7 +113,7 @@ def _front_matter(recipe: LoraRecipe, base: type[Backbone]) -> str:
     return "\n".join(["---", *lines, "---"])
 
 
-def _what_it_is(recipe: LoraRecipe, base: type[Backbone]) -> str:
+def _description(recipe: LoraRecipe, base: type[Backbone]) -> str:
     shown = ", ".join(_PANELS[panel] for panel in recipe.panels)
     text = f"""# Sees through glass: a LoRA for {_base_title(recipe, base)}
 
@@ -129,7 +129,7 @@ It fits no model that can be downloaded, and it separates nothing."""
     return text
 
 
-def _use(recipe: LoraRecipe, base: type[Backbone]) -> str:
+def _usage(recipe: LoraRecipe, base: type[Backbone]) -> str:
     return f"""## Use
 
 This folder is `lora` below; `hf download OWNER/NAME --local-dir lora` fetches it from the hub.
@@ -145,10 +145,10 @@ separation = Separator.load("lora")("photo.jpg")
 separation.transmission.save("clear.jpg")
 ```
 
-{_stock_use(recipe, base)}"""
+{_stock_usage(recipe, base)}"""
 
 
-def _stock_use(recipe: LoraRecipe, base: type[Backbone]) -> str:
+def _stock_usage(recipe: LoraRecipe, base: type[Backbone]) -> str:
     """How stock diffusers makes the same picture, where it can."""
     if _is_toy(recipe):
         return "Stock diffusers loads the LoRA into the twin that `brewster.models.diffusion.backbones.tiny` builds."
@@ -168,7 +168,7 @@ Both sides of a panel are multiples of {base.multiple}. {stock.caution}
 
 
 def _stock_code(recipe: LoraRecipe, base: type[Backbone], stock: StockCall) -> str:
-    fit = fit_panel(_SQUARE, recipe.layout, budget_px=recipe.budget_px, multiple=base.multiple)
+    fit = fit_panel(_SQUARE_PHOTO_PX, recipe.layout, budget_px=recipe.budget_px, multiple=base.multiple)
     (width, height), (whole, high) = fit.panel, recipe.layout.composite_size(fit.panel)
     corners = {
         panel: (index * width, 0) if recipe.layout.axis == -1 else (0, index * height)
@@ -206,7 +206,7 @@ def _data(recipe: LoraRecipe) -> str:
     rendered = data.rendered
     if rendered and data.rendered_share and data.pairs_share < 1:
         first = f"the first {rendered.count} samples of " if rendered.count else ""
-        sets = "; ".join(_set_told(folder) for folder in rendered.sets)
+        sets = "; ".join(_set_description(folder) for folder in rendered.sets)
         lines.append(
             f"- Rendered by `brewster render`, {1 - data.pairs_share:.0%} of what it saw: {first}{sets}."
         )
@@ -214,7 +214,7 @@ def _data(recipe: LoraRecipe) -> str:
         lines.append(f"  T is the {rendered.target}; the layers are {mixed}.")
     if data.pairs_share:
         lines.append(
-            f"- Real pairs, {data.pairs_share:.0%} of what it saw: {', '.join(map(_called, data.pairs))}."
+            f"- Real pairs, {data.pairs_share:.0%} of what it saw: {', '.join(map(_folder_name, data.pairs))}."
         )
         if recipe.reflections == "difference":
             lines.append(
@@ -225,7 +225,7 @@ def _data(recipe: LoraRecipe) -> str:
     )
     if data.validate_on:
         lines.append(
-            f"- Looked at while training, not learnt from: {', '.join(map(_called, data.validate_on))}."
+            f"- Looked at while training, not learnt from: {', '.join(map(_folder_name, data.validate_on))}."
         )
     return "\n".join(["## Data", "", *lines])
 
@@ -248,13 +248,15 @@ def _settings(recipe: LoraRecipe) -> str:
 
 def _scores(scores: Mapping[str, float]) -> str:
     rows = {
-        _titled(name): f"{value:.4g}" for name, value in scores.items() if name not in {"step", "seconds"}
+        _metric_title(name): f"{value:.4g}"
+        for name, value in scores.items()
+        if name not in {"step", "seconds"}
     }
-    told = _table(("what", "value"), rows) if rows else "None were logged."
-    return f"## Scores\n\nAt the last step of training, on a few pictures:\n\n{told}"
+    table = _table(("what", "value"), rows) if rows else "None were logged."
+    return f"## Scores\n\nAt the last step of training, on a few pictures:\n\n{table}"
 
 
-def _titled(name: str) -> str:
+def _metric_title(name: str) -> str:
     if name.startswith("gain_db_"):
         return f"PSNR gained over the photo itself, {name.removeprefix('gain_db_')}, dB"
     return (
@@ -293,16 +295,16 @@ def _base_title(recipe: LoraRecipe, base: type[Backbone]) -> str:
     return f"[{_base_id(recipe, base)}](https://huggingface.co/{_base_id(recipe, base)})"
 
 
-def _set_told(folder: Path) -> str:
+def _set_description(folder: Path) -> str:
     """A set's name, with its number of samples and their scenes if it is at hand."""
     with suppress(BrewsterError, OSError, ValueError, KeyError):
-        (place,) = found([folder])
+        (place,) = resolve_folders([folder])
         recipe = tomllib.loads((place / RECORD).read_text())["recipe"]
         count = sum(1 for _ in read_set(place))
-        return f"`{_called(folder)}` ({count} samples of the scenes `{recipe['name']}`, orders {recipe['orders']})"
-    return f"`{_called(folder)}`"
+        return f"`{_folder_name(folder)}` ({count} samples of the scenes `{recipe['name']}`, orders {recipe['orders']})"
+    return f"`{_folder_name(folder)}`"
 
 
-def _called(folder: Path) -> str:
+def _folder_name(folder: Path) -> str:
     """A folder's name, without the places of this machine."""
     return folder.name if folder.is_absolute() else folder.as_posix()

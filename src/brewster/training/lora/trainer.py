@@ -1,7 +1,7 @@
 """A LoRA on a large backbone as a trainer: flow matching on the latents of panels (paper, Text-to-image Model Fine-tuning).
 
 trainer = LoraLearner(read_recipe(Path("recipes/train/kontext.toml")))
-run(trainer, Path("out/kontext"), report)
+run(trainer, Path("out/kontext"), on_step)
 
 A batch is learnt one sample after another, so that each keeps its aspect ratio and a batch needs no more memory than
 a sample. Sample, noise and time are functions of (seed, step, slot) alone; several processes divide the slots.
@@ -32,27 +32,27 @@ from brewster.models.diffusion.prompt import PROMPTS, PromptEmbedding, load_prom
 from brewster.models.diffusion.sampling import STEPS
 from brewster.training import distributed
 from brewster.training.data.sample_rng import SampleRng
-from brewster.training.loop import last_numbers
+from brewster.training.loop import read_last_metrics
 from brewster.training.lora.latents import (
     EncodedSample,
     LatentEncoder,
     SampleSequence,
+    layers_from_pair,
+    make_panels,
     open_samples,
-    panels_in,
-    with_difference,
 )
 from brewster.training.lora.model_card import write_card
-from brewster.training.losses import finite, gain_db
+from brewster.training.losses import check_finite, psnr_gain_db
 from brewster.training.recipe import ENCODED, LoraRecipe
 from brewster.training.streams import validation_pairs
 
-FOLDER: Final = "lora"
-RECIPE: Final = "recipe.json"
+LORA_FOLDER: Final = "lora"
+RECIPE_FILE: Final = "recipe.json"
 _MAX_GRADIENT_NORM: Final = 1.0
-_SHOWN: Final = 4
+_VALIDATION_SAMPLES: Final = 4
 """How many pictures of each folder are generated to see how good it is: each takes as long as some steps."""
 _ROW_PX: Final = (160, 240)
-_LOWER: Final = "lower budget_px or rank, quantise the base, or take a smaller backbone (klein)"
+_MEMORY_CURE: Final = "lower budget_px or rank, quantise the base, or take a smaller backbone (klein)"
 
 
 class LoraTrainer:
@@ -64,16 +64,16 @@ class LoraTrainer:
     """
 
     def __init__(self, recipe: LoraRecipe) -> None:
-        _refuse_idle(recipe)
+        _check_batch(recipe)
         self.recipe = recipe
         samples = open_samples(recipe)
-        self._shown = _shown(recipe, samples)
+        self._validation_samples = _validation_samples(recipe, samples)
         device = str(distributed.best_device())
         self.backbone = load_backbone(recipe.backbone, device=device, quantise=recipe.quantise)
-        self._data = LatentEncoder(samples, self.backbone, recipe)
+        self._latents = LatentEncoder(samples, self.backbone, recipe)
         self._parameters = add_lora(self.backbone, rank=recipe.rank, alpha=recipe.alpha, seed=recipe.seed)
         self.backbone.transformer.enable_gradient_checkpointing()
-        self._optimizer = _adamw(self._parameters, recipe)
+        self._optimizer = _create_optimizer(self._parameters, recipe)
         self._prompt: PromptEmbedding | None = None
 
     @property
@@ -88,7 +88,7 @@ class LoraTrainer:
         Raises:
             DownloadError, ModelError, DeviceError, MissingExtra: it cannot be had.
         """
-        self._prompt = _find_prompt(self.recipe, self.backbone)
+        self._prompt = _load_prompt(self.recipe, self.backbone)
 
     def state_dict(self) -> dict[str, Any]:
         """The LoRA, the optimiser's moments, and the prompt: nothing of the base."""
@@ -112,14 +112,14 @@ class LoraTrainer:
             RecipeError, PhotoError: a sample is missing, damaged, or smaller than a panel.
         """
         self._optimizer.zero_grad()
-        with within_memory(_LOWER):
-            parts = self._learn(step)
+        with within_memory(_MEMORY_CURE):
+            parts = self._compute_gradients(step)
         distributed.all_reduce_sum(
             [parameter.grad for parameter in self._parameters if parameter.grad is not None]
         )
         distributed.all_reduce_sum(list(parts.values()))
-        loss = finite(torch.stack(list(parts.values())).sum(), step)
-        finite(nn.utils.clip_grad_norm_(self._parameters, _MAX_GRADIENT_NORM), step, "gradient")
+        loss = check_finite(torch.stack(list(parts.values())).sum(), step)
+        check_finite(nn.utils.clip_grad_norm_(self._parameters, _MAX_GRADIENT_NORM), step, "gradient")
         for group in self._optimizer.param_groups:
             group["lr"] = self.recipe.learning_rate * min(1.0, (step + 1) / self.recipe.warmup_steps)
         self._optimizer.step()
@@ -127,12 +127,12 @@ class LoraTrainer:
 
     @torch.no_grad()
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """Mean PSNR gain in dB of the generated T over the photo, per folder; and rows of truths and panels."""
+        """Mean PSNR gain in dB of the generated T over the photo, per folder; and rows of ground truth and panels."""
         gains, rows = {}, []
-        for name, samples in self._shown.items():
-            answers = [self._answer(layers) for layers in samples]
-            gains[f"gain_db_{name}"] = sum(gain for gain, _ in answers) / len(answers)
-            rows += [row for _, row in answers]
+        for name, samples in self._validation_samples.items():
+            results = [self._validate_sample(layers) for layers in samples]
+            gains[f"gain_db_{name}"] = sum(gain for gain, _ in results) / len(results)
+            rows += [row for _, row in results]
         return gains, torch.cat(rows, dim=1).clamp(0, 1).permute(1, 2, 0)
 
     def export(self, folder: Path) -> Path:
@@ -141,14 +141,14 @@ class LoraTrainer:
         Raises:
             TargetError: it cannot be written.
         """
-        place = folder / FOLDER
+        place = folder / LORA_FOLDER
         base, quantise = self.recipe.backbone, self.recipe.quantise
         if Path(base).is_dir():
             base = str(Path(base).resolve())
         save_lora(place, self.backbone, self.prompt, self.recipe.task, base=base, quantise=quantise)
         text = json.dumps(self.recipe.model_dump(mode="json"), indent=2)
-        write_atomically(place / RECIPE, f"{text}\n".encode(), overwrite=True)
-        write_card(place, self.recipe, last_numbers(folder), type(self.backbone))
+        write_atomically(place / RECIPE_FILE, f"{text}\n".encode(), overwrite=True)
+        write_card(place, self.recipe, read_last_metrics(folder), type(self.backbone))
         return place
 
     def separate(self, photo: Tensor, *, steps: int = STEPS, seed: int = 0) -> Mapping[str, Tensor]:
@@ -161,7 +161,7 @@ class LoraTrainer:
             photo, steps=steps, seeds=[seed]
         )
 
-    def _learn(self, step: int) -> dict[str, Tensor]:
+    def _compute_gradients(self, step: int) -> dict[str, Tensor]:
         """The gradients, and the parts of the loss, of this process's slots of the batch."""
         totals: dict[str, Tensor] = {}
         for slot in range(distributed.rank(), self.recipe.batch, distributed.world_size()):
@@ -173,25 +173,25 @@ class LoraTrainer:
 
     def _losses(self, rng: SampleRng) -> dict[str, Tensor]:
         """The mean squared error of the velocity, start - picture, in each panel, weighted; they add up to the loss."""
-        encoded, device = self._data(rng), self.backbone.device
-        start, sigma = self._begun(rng, encoded)
-        moved = (1 - sigma) * encoded.composite + sigma * start
+        encoded, device = self._latents(rng), self.backbone.device
+        start, sigma = self._start_and_sigma(rng, encoded)
+        noisy = (1 - sigma) * encoded.composite + sigma * start
         velocity = self.backbone.predict(
-            moved.to(device),
+            noisy.to(device),
             encoded.condition.to(device),
             sigma.to(device),
             self.prompt,
             self.recipe.guidance,
         )
         errors = (velocity - (start - encoded.composite).to(device)).square()
-        weights = self._weights()
-        trust = {"R": encoded.trust}
+        weights = self._panel_weights()
+        reliability = {"R": encoded.reflection_weight}
         return {
-            f"panel_{name}": weights[name] * trust.get(name, 1.0) * panel.mean()
+            f"panel_{name}": weights[name] * reliability.get(name, 1.0) * panel.mean()
             for name, panel in split(errors, self.recipe.layout).items()
         }
 
-    def _begun(self, rng: SampleRng, encoded: EncodedSample) -> tuple[Tensor, Tensor]:
+    def _start_and_sigma(self, rng: SampleRng, encoded: EncodedSample) -> tuple[Tensor, Tensor]:
         """Where this sample starts, and at which time from 0 to 1 it is looked at."""
         if encoded.start is not None:
             return encoded.start, torch.ones(1)
@@ -200,29 +200,32 @@ class LoraTrainer:
         sigma = self.backbone.shifted(normal.sigmoid(), grid.shape[2] * grid.shape[3])
         return rng.normal(*grid.shape), sigma
 
-    def _weights(self) -> dict[str, float]:
+    def _panel_weights(self) -> dict[str, float]:
         """How much each panel counts; 1 in all."""
         named = {panel: self.recipe.panel_weights.get(panel, 1.0) for panel in self.recipe.panels}
         return {panel: weight / sum(named.values()) for panel, weight in named.items()}
 
-    def _panels(self, layers: Tensor) -> tuple[dict[str, Tensor], PanelFit]:
+    def _validation_panels(self, layers: Tensor) -> tuple[dict[str, Tensor], PanelFit]:
         """Of a picture that is only looked at: one that is smaller than a panel gets smaller panels."""
         height, width, _ = layers.shape
         fit = self.recipe.task.fit((width, height), self.backbone.multiple)
-        return panels_in(layers, fit), fit
+        return make_panels(layers, fit), fit
 
-    def _answer(self, layers: Tensor) -> tuple[float, Tensor]:
-        """The gain on a sample, and its row: photo and truths, then the panels."""
-        truths, fit = self._panels(layers)
-        made = self.separate(truths["I"])
-        photo, truth, answer = ((fit.cut(panel) + 1) / 2 for panel in (truths["I"], truths["T"], made["T"]))
+    def _validate_sample(self, layers: Tensor) -> tuple[float, Tensor]:
+        """The gain on a sample, and its row: photo and ground truth, then the panels."""
+        ground_truth, fit = self._validation_panels(layers)
+        predicted = self.separate(ground_truth["I"])
+        photo, transmission, prediction = (
+            (fit.cut(panel) + 1) / 2 for panel in (ground_truth["I"], ground_truth["T"], predicted["T"])
+        )
         panels = [
-            functional.interpolate((panel + 1) / 2, _ROW_PX) for panel in (*truths.values(), *made.values())
+            functional.interpolate((panel + 1) / 2, _ROW_PX)
+            for panel in (*ground_truth.values(), *predicted.values())
         ]
-        return gain_db(answer, photo, truth), torch.cat(panels, dim=3)[0]
+        return psnr_gain_db(prediction, photo, transmission), torch.cat(panels, dim=3)[0]
 
 
-def _refuse_idle(recipe: LoraRecipe) -> None:
+def _check_batch(recipe: LoraRecipe) -> None:
     if recipe.batch % distributed.world_size():
         raise RecipeError(
             f"batch = {recipe.batch} is to be divided among {distributed.world_size()} processes",
@@ -231,13 +234,13 @@ def _refuse_idle(recipe: LoraRecipe) -> None:
         )
 
 
-def _find_prompt(recipe: LoraRecipe, backbone: Backbone) -> PromptEmbedding:
+def _load_prompt(recipe: LoraRecipe, backbone: Backbone) -> PromptEmbedding:
     if recipe.prompt.endswith(ENCODED):
         return load_prompt(Path(recipe.prompt), backbone.name)
     return encode_prompt(recipe.backbone, PROMPTS[recipe.prompt])
 
 
-def _adamw(parameters: Sequence[nn.Parameter], recipe: LoraRecipe) -> torch.optim.Optimizer:
+def _create_optimizer(parameters: Sequence[nn.Parameter], recipe: LoraRecipe) -> torch.optim.Optimizer:
     """AdamW, its moments in 8 bits where there is CUDA and bitsandbytes."""
     options: dict[str, Any] = {"lr": recipe.learning_rate, "weight_decay": recipe.weight_decay}
     if parameters[0].is_cuda and importlib.util.find_spec("bitsandbytes"):
@@ -247,9 +250,12 @@ def _adamw(parameters: Sequence[nn.Parameter], recipe: LoraRecipe) -> torch.opti
     return torch.optim.AdamW(parameters, **options)
 
 
-def _shown(recipe: LoraRecipe, samples: SampleSequence) -> dict[str, list[Tensor]]:
+def _validation_samples(recipe: LoraRecipe, samples: SampleSequence) -> dict[str, list[Tensor]]:
     """A few validation pairs of each folder, (H, W, 9), or of the samples that it learns from."""
     folders = validation_pairs(recipe.data)
     if folders:
-        return {name: [with_difference(*pair) for pair in pairs[:_SHOWN]] for name, pairs in folders.items()}
-    return {"training": [samples[number].layers for number in range(min(_SHOWN, len(samples)))]}
+        return {
+            name: [layers_from_pair(*pair) for pair in pairs[:_VALIDATION_SAMPLES]]
+            for name, pairs in folders.items()
+        }
+    return {"training": [samples[number].layers for number in range(min(_VALIDATION_SAMPLES, len(samples)))]}
