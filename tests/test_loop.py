@@ -187,7 +187,7 @@ def test_a_run_resumes_when_the_checkpoint_that_it_started_from_has_moved_away(r
 
 
 def test_a_checkpoint_to_start_from_that_is_missing_is_named_with_its_cure(recipe, tmp_path):
-    with pytest.raises(ModelError, match=r"gone\.pt cannot be read .* mend start_from"):
+    with pytest.raises(ModelError, match=r"gone\.pt cannot be read .* correct start_from"):
         train(recipe.model_copy(update={"start_from": (tmp_path / "gone.pt",)}), tmp_path / "run", silent)
 
 
@@ -204,10 +204,10 @@ def test_a_checkpoint_is_written_every_so_many_steps_and_at_the_end(recipe, tmp_
 def test_a_checkpoint_of_another_network_is_named(recipe, tmp_path):
     other = replace(checkpoint(recipe), state={"network": {}, "average": {}})
     other.write(tmp_path / "checkpoint.pt")
-    with pytest.raises(ModelError, match=r"checkpoint\.pt holds another network; .* with -o"):
+    with pytest.raises(ModelError, match=r"checkpoint\.pt contains another network; .* with -o"):
         train(recipe, tmp_path, silent)
     started = recipe.model_copy(update={"start_from": (tmp_path / "checkpoint.pt",)})
-    with pytest.raises(ModelError, match=r"checkpoint\.pt holds another network; .* mend start_from"):
+    with pytest.raises(ModelError, match=r"checkpoint\.pt contains another network; .* correct start_from"):
         train(started, tmp_path / "run", silent)
 
 

@@ -220,7 +220,9 @@ def test_two_processes_learn_what_one_learns_from_the_whole_batch(recipe, tmp_pa
 
 def test_a_batch_that_cannot_be_divided_is_refused(recipe, monkeypatch):
     monkeypatch.setattr(distributed, "world_size", lambda: 2)
-    with pytest.raises(RecipeError, match=r"batch = 1 is to be divided among 2 processes; .*; raise batch"):
+    with pytest.raises(
+        RecipeError, match=r"batch = 1 cannot be divided equally among 2 processes; .*; raise batch"
+    ):
         LoraTrainer(recipe(batch=1))
 
 

@@ -75,7 +75,7 @@ def test_sets_are_told_with_their_scenes_and_without_their_place(tmp_path, monke
     assert "`window` (3 samples" in card(data=elsewhere)
     assert str(tmp_path) not in card(data=elsewhere)
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "sets"))
-    assert "saw: `sets/window`." in card()
+    assert "of the samples: `sets/window`." in card()
 
 
 def test_pairs_and_their_share_are_told():
@@ -83,15 +83,15 @@ def test_pairs_and_their_share_are_told():
         reflections="difference",
         data={"pairs": ["real/train"], "pairs_share": 0.25, "rendered": {"sets": ["a"], "count": 7}},
     )
-    assert "75% of what it saw: the first 7 samples of `a`." in text
-    assert "Real pairs, 25% of what it saw: real/train." in text
-    assert "what photo minus transmission leaves" in text
+    assert "75% of the samples: the first 7 samples of `a`." in text
+    assert "Real pairs, 25% of the samples: real/train." in text
+    assert "photo minus transmission, in linear light" in text
 
 
 def test_settings_and_scores_are_told():
     text = card(scores={"step": 4000, "loss": 0.25, "panel_T": 0.1, "gain_db_nature": -1.234, "seconds": 9.9})
     assert "| steps, batch | 4000, 1 |" in text
-    assert "| PSNR gained over the photo itself, nature, dB | -1.234 |" in text
+    assert "| PSNR gain over the input, nature, dB | -1.234 |" in text
     assert "| loss, panel T | 0.1 |" in text
     assert "9.9" not in text
 
@@ -102,7 +102,7 @@ def test_what_was_measured_takes_its_place_again_and_again():
     assert "\n## Measured\n\n| a | 1 |\n\n## Limits\n" in once
     assert "\n## Measured\n\n### Real20\n\n| b | 2 |\n\n## Limits\n" in twice
     assert twice.partition("## Measured")[0] == card().partition("## Measured")[0]
-    with pytest.raises(ModelError, match="has no part for scores; '## Measured'"):
+    with pytest.raises(ModelError, match="has no section for benchmarks; the heading '## Measured'"):
         with_benchmark_tables("# somebody else's", "| a | 1 |")
 
 

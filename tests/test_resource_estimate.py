@@ -32,7 +32,7 @@ def test_a_table_tells_tokens_memory_and_time(klein):
     for told in (
         "3.88 billion",
         "rank 16",
-        "3072 generated, 3072 shown",
+        "3072 generated, 3072 condition, 512 text",
         "RTX 4090",
         "4000 steps",
         "estimate",
@@ -61,7 +61,7 @@ def test_a_photo_shown_alone_takes_a_third_of_the_tokens():
 def test_what_does_not_fit_is_refused_with_what_would(klein):
     recipe = with_value(read_recipe(RECIPES / "klein.toml"), "budget_px", 768 * 256)
     for memory, cure in (
-        (7, 'set quantise = "int8", which takes'),
+        (7, 'set quantise = "int8", which needs'),
         (5.5, 'set quantise = "nf4"'),
         (2, "lower budget_px"),
     ):

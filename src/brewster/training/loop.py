@@ -1,7 +1,7 @@
-"""The training loop, the only one: `run(trainer, out, on_step)` runs or resumes, bit for bit, whatever learns.
+"""The training loop: `run(trainer, out, on_step)` starts or resumes a run of any `Trainer`.
 
-Every step depends on the trainer's state and on (seed, step) alone: no hidden state, so on the CPU a killed run that
-resumes ends with the same weights, to the last bit, as one that never stopped (same machine, same number of threads).
+A step depends on the trainer's state and on (seed, step) only. On a CPU, a run that was killed and resumed therefore ends
+with bit-identical weights to an uninterrupted run (same machine, same number of threads).
 """
 
 from __future__ import annotations
@@ -26,60 +26,59 @@ from brewster.training.recipe import TrainingRecipe
 from brewster.training.tensorboard import TensorBoardLog
 
 StepCallback = Callable[[int, int, Mapping[str, float], bool], None]
-"""Called with (step, steps, metrics, logged) after every step; `logged` says that they went into the log."""
+"""Called after every step with (step, steps, metrics, logged); `logged` is true if the metrics were written to the log."""
 
 CHECKPOINT: Final = "checkpoint.pt"
 LOG: Final = "log.jsonl"
 SAMPLES: Final = "samples.png"
 _NOT_COMPARED: Final = {"start_from", "steps", "report_every", "checkpoint_every"}
+"""Recipe values that may change when a run is resumed."""
 
 
 class Trainer(Protocol):
-    """What can be trained: a network with its optimiser and its data, and no memory but its state."""
+    """A network with its optimiser and its data. `state_dict` holds all of its mutable state."""
 
     @property
     def recipe(self) -> TrainingRecipe:
-        """What it learns, and for how long."""
+        """The recipe of the run."""
         ...
 
     def initialize(self) -> None:
-        """Takes up what the recipe starts from; called where there is no run to go on with."""
+        """Loads what the recipe starts from. Called once, when a new run starts, not when a run is resumed."""
         ...
 
     def training_step(self, step: int) -> dict[str, float]:
-        """Learns from this step's batch; its loss, and the parts of it, by name."""
+        """Trains on the batch of `step` (from 0). Returns the loss and its parts by name."""
         ...
 
     def state_dict(self) -> dict[str, Any]:
-        """All that the next step depends on: tensors, numbers and words by name."""
+        """Returns everything that the next step depends on, as tensors, numbers and strings by name."""
         ...
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on from what `state` gave."""
+        """Restores a state that `state_dict` returned."""
         ...
 
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """How good it is, by name, and what it makes of a few photos: (H, W, 3), sRGB-encoded, in 0..1."""
+        """Returns the validation metrics by name, and a picture of sample predictions: (H, W, 3), sRGB-encoded, in 0..1."""
         ...
 
     def export(self, folder: Path) -> Path:
-        """Writes what users need of it into this folder; where that is."""
+        """Writes the model for inference into `folder`. Returns the path of the model."""
         ...
 
 
 def run(trainer: Trainer, out: Path, on_step: StepCallback) -> None:
-    """Trains to the end of the recipe in folder `out`, from its checkpoint if there is one.
+    """Trains until the last step of the recipe; resumes from the checkpoint in `out` if there is one.
 
-    Where several processes learn together, the first alone writes.
-
-    A recipe whose data are none (a count of 0) takes no step: the trainer stays as it starts.
-
-    `out` receives `checkpoint.pt` and, at every report, a line in `log.jsonl`, `samples.png`, and both in a file for
-    TensorBoard, where that is installed.
+    Every `checkpoint_every` steps it writes `checkpoint.pt` into `out`. Every `report_every` steps it validates, appends a
+    line to `log.jsonl`, replaces `samples.png`, and writes both as TensorBoard events if tensorboard is installed. With
+    several processes, only rank 0 writes files. A recipe without data (a count of 0) takes no step: the trainer keeps its
+    initial weights.
 
     Raises:
-        RecipeError: `out` holds a run of another recipe.
-        ModelError: a checkpoint is missing, damaged or of another network, or the loss is not a number.
+        RecipeError: `out` contains a run of another recipe.
+        ModelError: a checkpoint is missing, damaged or of another network, or the loss is NaN or infinite.
         TargetError: `out` cannot be written to.
     """
     out.mkdir(parents=True, exist_ok=True)
@@ -90,33 +89,33 @@ def run(trainer: Trainer, out: Path, on_step: StepCallback) -> None:
     started, steps = time.monotonic(), 0 if recipe.data.is_none else recipe.steps
     with closing(TensorBoardLog(out, completed_steps)) as event_log:
         for step in range(completed_steps + 1, 1 + steps):
-            metrics, last = trainer.training_step(step - 1), step == recipe.steps
-            logged = is_main_process() and (last or step % recipe.report_every == 0)
+            metrics, is_last = trainer.training_step(step - 1), step == recipe.steps
+            logged = is_main_process() and (is_last or step % recipe.report_every == 0)
             if logged:
                 scores, picture = trainer.validate()
                 metrics |= scores | {"seconds": time.monotonic() - started}
                 _append_log(out / LOG, {"step": step, **metrics})
                 _write_picture(out / SAMPLES, picture)
                 event_log.log(step, metrics, picture)
-            if is_main_process() and (last or step % recipe.checkpoint_every == 0):
+            if is_main_process() and (is_last or step % recipe.checkpoint_every == 0):
                 Checkpoint(step, recipe.model_dump_json(), trainer.state_dict()).write(out / CHECKPOINT)
             on_step(step, recipe.steps, metrics, logged)
 
 
 def read_last_metrics(folder: Path) -> dict[str, float]:
-    """What a run in this folder logged last; nothing if it has not."""
+    """Returns the last line of the log in `folder`, or an empty dict if there is no log."""
     log = folder / LOG
     lines = log.read_text().splitlines() if log.exists() else []
     return dict(json.loads(lines[-1])) if lines else {}
 
 
-def _resume_or_initialize(trainer: Trainer, saved: Path) -> int:
-    """Goes on with the run if it has begun, else begins it where its recipe says; how many steps are taken."""
-    if not saved.exists():
+def _resume_or_initialize(trainer: Trainer, path: Path) -> int:
+    """Restores the checkpoint at `path`, or initializes the trainer if there is none. Returns the number of completed steps."""
+    if not path.exists():
         trainer.initialize()
         return 0
-    checkpoint = _check_recipe(Checkpoint.read(saved), trainer.recipe, saved)
-    with mismatch_as_model_error(saved, START_FRESH):
+    checkpoint = _check_recipe(Checkpoint.read(path), trainer.recipe, path)
+    with mismatch_as_model_error(path, START_FRESH):
         trainer.load_state_dict(checkpoint.state)
     return checkpoint.step
 
@@ -130,16 +129,16 @@ def _check_recipe(checkpoint: Checkpoint, recipe: TrainingRecipe, path: Path) ->
         return checkpoint
     changed = ", ".join(name for name in now if before and before.get(name) != now[name])
     raise RecipeError(
-        f"{path} belongs to another recipe{f' (other values: {changed})' if changed else ''}",
-        "a run resumes only with the recipe that it began with",
+        f"{path} belongs to a run of another recipe{f' (different values: {changed})' if changed else ''}",
+        "a run is resumed with the recipe that it started with",
         "choose another folder with -o",
     )
 
 
 def _compared_values(text: str, recipe: TrainingRecipe) -> dict[str, object]:
-    """What a run must keep to be resumed: all but how long it is, how often it reports, and where it started from.
+    """Returns the values that must be equal for a run to resume: all but `_NOT_COMPARED`.
 
-    What a recipe does not name, such as a value that is newer than the run, counts as its default.
+    A value that the stored recipe lacks, because it was added to the schema later, counts as its default.
     """
     try:
         return type(recipe).model_validate_json(text).model_dump(exclude=_NOT_COMPARED)
@@ -153,7 +152,7 @@ def _append_log(path: Path, metrics: Mapping[str, float]) -> None:
 
 
 def _truncate_log(step: int, log: Path) -> None:
-    """Drops the lines that a killed run wrote after its last checkpoint, the last of them perhaps half."""
+    """Removes the lines that a killed run wrote after its last checkpoint. The last line may be incomplete."""
     lines = log.read_text().splitlines() if log.exists() else []
     kept = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= step]
     if kept != lines:

@@ -1,4 +1,4 @@
-"""Opens what a recipe learns from: photos, maps and pairs are read into memory, rendered samples are not.
+"""Opens the training data of a recipe. Photos, maps and pairs are read into memory; rendered samples are not.
 
 stream = open_stream(read_recipe(Path("recipes/train/tiny.toml")))
 batch = stream(step=0, count=2, size=64)
@@ -25,10 +25,10 @@ from brewster.training.recipe import CompactRecipe, DataRecipe, RenderedRecipe, 
 
 
 def open_stream(recipe: CompactRecipe, device: torch.device | str = "cpu") -> Stream:
-    """The recipe's training data: photos, maps and pairs in memory; what is rendered live is so on the device.
+    """Opens the training data of a recipe as one stream. Samples that are rendered online are rendered on `device`.
 
     Raises:
-        RecipeError: a folder is missing or empty, pairs do not fit together, or too few samples are rendered.
+        RecipeError: a folder is missing or empty, pairs do not match, or there are too few rendered samples.
         PhotoError: a picture cannot be read, or a map cannot light a scene.
     """
     return _interleave(
@@ -37,10 +37,13 @@ def open_stream(recipe: CompactRecipe, device: torch.device | str = "cpu") -> St
 
 
 def validation_pairs(data: DataRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]:
-    """Aligned (photo, transmission) pairs, uint8 sRGB (H, W, 3), by names that tell their folders apart.
+    """Reads the aligned (photo, transmission) pairs of `validate_on`, uint8 sRGB (H, W, 3).
+
+    Returns:
+        The pairs of each folder, by a short unique name of the folder.
 
     Raises:
-        RecipeError: a folder is missing or empty, or pairs do not fit together.
+        RecipeError: a folder is missing or empty, or pairs do not match.
         PhotoError: a picture cannot be read.
     """
     folders = tuple(dict.fromkeys(data.validate_on))
@@ -52,10 +55,14 @@ def validation_pairs(data: DataRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]
 
 
 def held_out_mixtures(recipe: CompactRecipe) -> Stream | None:
-    """Mixtures of the recipe's held-out photos and maps, distributed as in training; None if none are held out.
+    """Opens mixtures of the recipe's held-out photos and maps, distributed as in training.
+
+    Returns:
+        The stream, or None if the recipe holds out nothing.
 
     Raises:
-        RecipeError, PhotoError: no photo is held out, or one cannot be read.
+        RecipeError: no photo matches `held_out`.
+        PhotoError: a photo cannot be read.
     """
     data = recipe.data
     if not (data.held_out and data.photos):
@@ -66,7 +73,7 @@ def held_out_mixtures(recipe: CompactRecipe) -> Stream | None:
 
 
 def _unique_names(folders: Sequence[Path]) -> list[str]:
-    """Names for different folders: as much of the end of their paths as tells them apart."""
+    """The shortest ends of the paths that are unique, with an equal number of parts."""
     for length in range(1, max((len(folder.parts) for folder in folders), default=0)):
         names = ["/".join(folder.parts[-length:]) for folder in folders]
         if len(set(names)) == len(names):
@@ -81,7 +88,7 @@ def _open_unpaired(recipe: CompactRecipe, device: torch.device | str) -> Stream:
 
 
 def _interleave(share: float, first: Callable[[], Stream], second: Callable[[], Stream]) -> Stream:
-    """Opens only what has a share."""
+    """Opens only the streams with a share above 0."""
     if share in (0, 1):
         return first() if share else second()
     return InterleavedStream(first(), second(), share)
@@ -117,8 +124,8 @@ def _open_rendered(recipe: CompactRecipe, device: torch.device | str) -> Stream:
             target=rendered.target,
             mixing=rendered.mixing,
         )
-    live = _open_online(recipe, rendered, device)
-    return live if rendered.count is None else CachedRendered(live, rendered.count, seed=seed)
+    online = _open_online(recipe, rendered, device)
+    return online if rendered.count is None else CachedRendered(online, rendered.count, seed=seed)
 
 
 def _open_online(
@@ -126,7 +133,9 @@ def _open_online(
 ) -> OnlineRendered:
     maps, photos = resolve_folders(rendered.maps), resolve_folders(rendered.photos)
     catalog, refused = read_catalog(maps, photos, recipe.data.never_trained_on)
-    if refused:  # a run of hours has nobody to tell that it learns from less than was asked
+    if (
+        refused
+    ):  # a warning in a log of hours would be overlooked, and the run would train on less data than listed
         raise refused[0]
     return OnlineRendered(
         _scene_recipe(rendered),
@@ -146,16 +155,16 @@ def _scene_recipe(rendered: RenderedRecipe) -> SceneRecipe:
 
 def _empty_stream(step: int, count: int, size: int) -> TrainingBatch:  # noqa: ARG001  (a Stream)
     raise RecipeError(
-        "the recipe has nothing to learn from",
+        "the recipe has no training data: every share or count is 0",
         "a share above 0, and a count of rendered samples above 0",
         "raise data.rendered.count, data.rendered.share or data.pairs_share",
     )
 
 
-def resolve_folders(named: Sequence[Path]) -> list[Path]:
-    """Where a recipe's folders lie; BREWSTER_DATA is not asked for where no path starts from it.
+def resolve_folders(folders: Sequence[Path]) -> list[Path]:
+    """Resolves the folders of a recipe: relative paths start from BREWSTER_DATA.
 
     Raises:
-        RecipeError: it is asked for and names no folder.
+        RecipeError: a path is relative, and BREWSTER_DATA is unset or not a folder.
     """
-    return [folder if folder.is_absolute() else data_folder() / folder for folder in named]
+    return [folder if folder.is_absolute() else data_folder() / folder for folder in folders]

@@ -1,4 +1,4 @@
-"""The compact network as a trainer: its losses, optimiser and running average, on the GPU where there is one.
+"""The trainer of the compact network: AdamW, an exponential moving average (EMA) of the weights, on a GPU if there is one.
 
 network = train(read_recipe(Path("recipes/train/compact.toml")), Path("out/compact"), on_step)
 """
@@ -31,39 +31,42 @@ from brewster.training.streams import held_out_mixtures, open_stream, validation
 from brewster.worker_setup import one_thread
 
 ValidationPairs = Mapping[str, list[tuple[Tensor, Tensor]]]
-"""Encoded (photo, ground truth), float (1, 3, h, w) each, by the name of their folder."""
+"""folder -> pairs of photo and ground truth, each float (1, 3, h, w), sRGB-encoded."""
 
 MODEL: Final = "model.onnx"
 _VALIDATION_SIDE_PX: Final = 384
 _HELD_OUT_MIXTURES: Final = 128
 _HELD_OUT_SIDE_PX: Final = 192
 _VISIBLE: Final = 1e-4
-"""Mean squared difference, encoded: a photo at more than 40 dB from its transmission has no visible reflection."""
+"""Mean squared difference of encoded values: at more than 40 dB, photo and transmission show no visible reflection."""
 _MAX_GRADIENT_NORM: Final = 1.0
-_START_FROM_CURE: Final = "train the recipe that makes it first, or mend start_from in this one"
+_START_FROM_CURE: Final = "train the recipe that writes it first, or correct start_from in this recipe"
 
 
 def train(recipe: CompactRecipe, out: Path, on_step: StepCallback) -> nn.Module:
-    """Runs or resumes the recipe in folder `out`, as `loop.run` does; the network that users get.
+    """Trains or resumes the recipe in folder `out`, as `loop.run` does.
+
+    Returns:
+        The network with the averaged weights, which `export` would write.
 
     Raises:
-        RecipeError: data missing, or `out` holds a run of another recipe.
+        RecipeError: data is missing, or `out` contains a run of another recipe.
         PhotoError: a picture cannot be read.
         ModelError, TargetError: as `loop.run`.
     """
     trainer = CompactTrainer(recipe)
-    with one_thread():  # of the caller; the trainer's own threads have one each
+    with one_thread():  # for this thread; the threads of the trainer's pools are limited by their initializer
         run(trainer, out, on_step)
     return trainer.averaged_network()
 
 
 class CompactTrainer:
-    """A `Learner`: the network, the running average of its weights, and AdamW.
+    """The `Trainer` of a compact network: the network, the EMA of its weights, and AdamW.
 
-    `stream` stands in for the recipe's data.
+    `stream` replaces the recipe's data.
 
     Raises:
-        RecipeError, PhotoError: the data are missing or damaged.
+        RecipeError, PhotoError: the data is missing or damaged.
     """
 
     def __init__(self, recipe: CompactRecipe, stream: Stream | None = None) -> None:
@@ -75,8 +78,8 @@ class CompactTrainer:
             validation_pairs(recipe.data), self._entry.stride
         ) | _held_out_pairs(recipe)
         self._data_workers = 1 if self.device.type == "cpu" else os.cpu_count() or 1
-        self._shards = torch.get_num_threads() if self.device.type == "cpu" else 1
-        self._shard_pool = _single_thread_pool(self._shards)
+        self._shard_count = torch.get_num_threads() if self.device.type == "cpu" else 1
+        self._shard_pool = _single_thread_pool(self._shard_count)
         self._data_pool = _single_thread_pool(self._data_workers)
         self._prefetched: dict[int, Future[TrainingBatch]] = {}
         torch.manual_seed(recipe.seed)
@@ -97,9 +100,9 @@ class CompactTrainer:
 
     @torch.no_grad()
     def initialize(self) -> None:
-        """Begins with the averaged weights of other runs, if the recipe names any; of several, with their mean.
+        """Loads the EMA weights of the checkpoints in `start_from`; the mean, if there are several.
 
-        The mean of runs that began alike is often better than each (Wortsman et al. 2022, model soups).
+        The mean of runs with one starting point is often better than each of them (Wortsman et al. 2022, model soups).
 
         Raises:
             ModelError: a checkpoint is missing, damaged or of another network.
@@ -109,12 +112,12 @@ class CompactTrainer:
             with mismatch_as_model_error(path, _START_FROM_CURE):
                 _check_network(path, checkpoint, self.recipe.network)
                 other.load_state_dict(checkpoint.state.get("average", {}))
-            for mine, theirs in zip(self.network.parameters(), other.parameters(), strict=True):
-                mine.lerp_(theirs.to(self.device), 1 / count)
+            for parameter, start in zip(self.network.parameters(), other.parameters(), strict=True):
+                parameter.lerp_(start.to(self.device), 1 / count)
         self._reset_average()
 
     def state_dict(self) -> dict[str, Any]:
-        """Weights, their average, and the optimiser's moments."""
+        """Returns the weights, their EMA, and the state of the optimiser."""
         return {
             "network": self.network.state_dict(),
             "average": self.average,
@@ -122,44 +125,45 @@ class CompactTrainer:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on from such a state."""
+        """Restores a state that `state_dict` returned."""
         self.network.load_state_dict(state["network"])
         self.average = {name: value.to(self.device) for name, value in state["average"].items()}
         self.optimizer.load_state_dict(state["optimizer"])
 
     def training_step(self, step: int) -> dict[str, float]:
-        """One step of AdamW on one batch; returns the parts of the loss.
+        """Runs one step of AdamW on one batch. Returns the loss and its parts.
 
         Raises:
-            ModelError: the loss is not a number; the last checkpoint is still good.
+            ModelError: the loss is NaN or infinite. The last checkpoint is still valid.
         """
         parts = self._compute_gradients(self._batch(step).to(self.device))
         loss = check_finite(torch.stack(list(parts.values())).sum(), step)
         self._set_learning_rates(step)
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
-        if norm.isfinite():  # else this batch is skipped: one infinite gradient would end a run of hours
+        if norm.isfinite():  # otherwise skip the batch: one infinite gradient would destroy the weights
             self.optimizer.step()
             self._update_average(step + 1)
         return {"loss": loss.item(), **{name: part.item() for name, part in parts.items()}}
 
     def _compute_gradients(self, batch: TrainingBatch) -> dict[str, Tensor]:
-        """Sets each parameter's gradient of the loss, a mean over the batch; returns the parts of the loss.
+        """Sets the gradient of the mean loss of the batch on each parameter. Returns the parts of the loss.
 
-        On a CPU each core computes a share of the batch by itself: measured 1.2-1.3 times faster than all cores on
-        one operation after the other (16 x 128 px, two cores).
+        On a CPU the batch is split into one shard per core, each computed by a single thread: measured 1.2-1.3 times faster
+        than splitting each operation over all cores (16 x 128 px, two cores).
         """
         count = len(batch.photo_encoded)
-        shares = list(self._shard_pool.map(self._shard_gradients, batch.split(-(-count // self._shards))))
+        shards = list(
+            self._shard_pool.map(self._shard_gradients, batch.split(-(-count // self._shard_count)))
+        )
         for parameter in self.network.parameters():
-            parameter.grad = torch.zeros_like(
-                parameter
-            )  # the fused optimiser needs the parameter's memory layout
-        for n, _, gradients in shares:
+            # The fused optimiser ignores strides: a gradient needs its parameter's memory layout (docs/training.md).
+            parameter.grad = torch.zeros_like(parameter)
+        for n, _, gradients in shards:
             for parameter, gradient in zip(self.network.parameters(), gradients, strict=True):
                 assert parameter.grad is not None
                 parameter.grad.add_(gradient, alpha=n / count)
-        names = shares[0][1]
-        return {name: torch.stack([part[name] * n / count for n, part, _ in shares]).sum() for name in names}
+        names = shards[0][1]
+        return {name: torch.stack([part[name] * n / count for n, part, _ in shards]).sum() for name in names}
 
     def _shard_gradients(self, batch: TrainingBatch) -> tuple[int, dict[str, Tensor], tuple[Tensor, ...]]:
         with torch.autocast(
@@ -172,22 +176,22 @@ class CompactTrainer:
         return len(batch.photo_encoded), {name: part.detach() for name, part in parts.items()}, gradients
 
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """What the averaged network gains on the recipe's pairs, and what it makes of four of each folder."""
+        """Returns the metrics of the averaged network on the recipe's pairs, and a picture of four predictions per folder."""
         network = self.averaged_network()
         metrics = validate(network, self._validation_pairs, self._shard_pool.map)
         return metrics, _contact_sheet(network, self._validation_pairs or self._training_pairs())
 
     def export(self, folder: Path) -> Path:
-        """Writes model.onnx, which needs no torch.
+        """Writes the averaged network to model.onnx in `folder`. Returns the path of the file.
 
         Raises:
-            TargetError: it cannot be written.
+            TargetError: the file cannot be written.
         """
         export_onnx(self.averaged_network(), folder / MODEL, self._entry.stride)
         return folder / MODEL
 
     def averaged_network(self) -> nn.Module:
-        """The network with the running average of its weights, ready to be used."""
+        """Returns a copy of the network with the EMA of the weights, in evaluation mode."""
         network = self._entry.build().eval()
         network.load_state_dict(self.average)
         return network
@@ -195,13 +199,13 @@ class CompactTrainer:
     def _reset_average(self) -> None:
         self.average = {name: value.clone() for name, value in self.network.state_dict().items()}
 
-    def _batch(self, wanted: int) -> TrainingBatch:
-        """The batch of this step; those of the next steps are made in the background meanwhile."""
-        for step in range(wanted, wanted + 1 + self._data_workers):
-            if step not in self._prefetched:
-                size = self.recipe.size_at(step)
-                self._prefetched[step] = self._data_pool.submit(self.stream, step, self.recipe.batch, size)
-        return self._prefetched.pop(wanted).result()
+    def _batch(self, step: int) -> TrainingBatch:
+        """Returns the batch of this step, and starts making the next batches in background threads."""
+        for ahead in range(step, step + 1 + self._data_workers):
+            if ahead not in self._prefetched:
+                size = self.recipe.size_at(ahead)
+                self._prefetched[ahead] = self._data_pool.submit(self.stream, ahead, self.recipe.batch, size)
+        return self._prefetched.pop(step).result()
 
     def _set_learning_rates(self, step: int) -> None:
         warm = min(1.0, (step + 1) / self.recipe.warmup_steps)
@@ -225,9 +229,11 @@ class CompactTrainer:
 def validate(
     network: Callable[[Tensor], Tensor], pairs: ValidationPairs, map_: Callable[..., Iterable[Any]] = map
 ) -> dict[str, float]:
-    """By folder, at the (small) size of the given pairs: the mean gain in PSNR over the input, in dB; the share of pairs
-    that are worse than the input; and the tone, the light of the prediction over that of the input where nothing was added,
-    which is 1 for a network that leaves the exposure alone. `map_` may be that of a pool of threads.
+    """Validates a network on pairs, at the size of the given pairs. `map_` may be the `map` of a thread pool.
+
+    Returns:
+        For each folder: gain_db_NAME, the mean PSNR gain over the input in dB; worse_NAME, the share of pairs whose
+        prediction is worse than the input; tone_NAME, the mean `tone_ratio`, which is 1 if the exposure is kept.
     """
 
     @torch.no_grad()
@@ -246,7 +252,7 @@ def validate(
 
 @torch.no_grad()
 def _contact_sheet(network: nn.Module, pairs: ValidationPairs) -> Tensor:
-    """Rows of photo, ground truth, transmission and reflection, four of each folder: (H, 960, 3)."""
+    """Rows of photo, ground truth, transmission and reflection, four rows per folder: (H, 960, 3), sRGB-encoded."""
     rows = []
     for photo, ground_truth in (pair for folder in pairs.values() for pair in folder[:4]):
         layers = network(photo)
@@ -262,31 +268,31 @@ def _resize_pairs(folders: ValidationPairs, stride: int) -> dict[str, list[tuple
     }
 
 
-def _check_network(path: Path, checkpoint: Checkpoint, wanted: str) -> None:
-    """Checkpoints of runs older than the recipe's `network` hold the default one."""
+def _check_network(path: Path, checkpoint: Checkpoint, expected: str) -> None:
+    """Checkpoints older than the recipe key `network` contain the default network."""
     found = json.loads(checkpoint.recipe).get("network", DEFAULT_NETWORK)
-    if found != wanted:
+    if found != expected:
         raise ModelError(
-            f"{path} holds the network {found}",
-            f"a checkpoint of {wanted}, the network that the recipe trains",
+            f"{path} contains the network {found}",
+            f"a checkpoint of {expected}, the network that the recipe trains",
             _START_FROM_CURE,
         )
 
 
 def _single_thread_pool(count: int) -> ThreadPoolExecutor:
-    """Threads that compute side by side, each operation in one of them: they never wait for each other."""
+    """A pool whose threads run each torch operation on one core, so that they never wait at a barrier."""
     return ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(1,))
 
 
 def _has_bfloat16(device: torch.device) -> bool:
-    """Whether the processor computes bfloat16 natively; elsewhere it is emulated, 20 to 50 times slower than float32."""
+    """Whether the device computes bfloat16 natively. Emulation is 20 to 50 times slower than float32."""
     if device.type != "cpu":
         return bool(torch.cuda.is_bf16_supported(including_emulation=False))
     return bool(torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported())
 
 
 def _held_out_pairs(recipe: CompactRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]:
-    """Always the same mixtures of what the recipe holds out: those with a visible reflection, and those without."""
+    """Fixed mixtures of the held-out photos: "mixtures" with a visible reflection, "plain" without."""
     stream = held_out_mixtures(recipe)
     if stream is None:
         return {}
@@ -294,13 +300,15 @@ def _held_out_pairs(recipe: CompactRecipe) -> dict[str, list[tuple[Tensor, Tenso
     pairs = list(zip(batch.photo_encoded[:, None], batch.transmission_encoded[:, None], strict=True))
     visible = [functional.mse_loss(*pair).item() > _VISIBLE for pair in pairs]
     return {
-        name: [pair for pair, shown in zip(pairs, visible, strict=True) if shown is wanted]
-        for name, wanted in (("mixtures", True), ("plain", False))
+        name: [
+            pair for pair, has_reflection in zip(pairs, visible, strict=True) if has_reflection is expected
+        ]
+        for name, expected in (("mixtures", True), ("plain", False))
     }
 
 
 def _resize(picture: Tensor, stride: int) -> Tensor:
-    """uint8 (H, W, 3) to float (1, 3, h, w) that the network takes, longest side 384 px."""
+    """Resizes uint8 (H, W, 3) to float (1, 3, h, w) in 0..1, multiples of `stride`, longest side about 384 px."""
     height, width, _ = picture.shape
     scale = _VALIDATION_SIDE_PX / max(height, width)
     size = [max(1, round(side * scale / stride)) * stride for side in (height, width)]

@@ -1,4 +1,4 @@
-"""Reads folders of photos, HDR maps and aligned pairs into memory, small, for the streams in `mix`."""
+"""Reads folders of photos, HDR maps and aligned pairs into memory, at reduced size, for the streams in `mixtures`."""
 
 from __future__ import annotations
 
@@ -25,28 +25,31 @@ _PHOTO_SIDE_PX = 640
 _MAP_HEIGHT_PX = 512
 _LARGEST_HALF = 65504.0
 _WORD_END = re.compile(r"[^0-9A-Za-z]")
+_FOLDER_CURE = "name another folder in the recipe, or set BREWSTER_DATA to the folder of the data"
 
 
 def read_photos(
     folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
 ) -> list[Tensor]:
-    """Every photo of the folders, uint8 sRGB (H, W, 3), longest side at most 640 px, in order of name.
+    """Reads every photo of the folders: uint8 sRGB (H, W, 3), longest side at most 640 px, sorted by path.
+
+    `exclude` and `only` are patterns of file names, as in `fnmatch`.
 
     Raises:
-        RecipeError: a folder cannot be read, or there is no photo in any of them.
-        PhotoError: a photo cannot be read.
+        RecipeError: a folder cannot be read, or none of the folders contains a photo.
+        PhotoError: a photo cannot be decoded.
     """
     return [_read_photo(path, _PHOTO_SIDE_PX) for path in _list_pictures(folders, _PICTURES, exclude, only)]
 
 
 def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list[float]:
-    """Relative frequencies of the photos that `read_photos` returns, so that no single source dominates.
+    """Returns sampling weights for the photos of `read_photos`, so that no single source dominates.
 
-    Photos whose names begin with the same word (letters and digits) are of one source; n of them together weigh
-    sqrt(n).
+    Photos whose file names start with the same word (letters and digits) belong to one source. The n photos of a source have
+    the total weight sqrt(n).
 
     Raises:
-        RecipeError: as `read_photos`.
+        RecipeError: a folder cannot be read, or none of the folders contains a photo.
     """
     sources = [_WORD_END.split(path.name)[0] for path in _list_pictures(folders, _PICTURES, exclude)]
     counts = Counter(sources)
@@ -56,23 +59,25 @@ def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list
 def read_maps(
     folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
 ) -> list[Tensor]:
-    """Every lat-long map of the folders, half precision (3, H, 2 H), at most 512 px high, linear light.
+    """Reads every lat-long map of the folders: half precision (3, H, 2 H), at most 512 px high, linear light.
+
+    `exclude` and `only` are patterns of file names, as in `fnmatch`.
 
     Raises:
-        RecipeError: a folder cannot be read, or there is no map in any of them.
-        PhotoError: a map cannot be read.
+        RecipeError: a folder cannot be read, or none of the folders contains a map.
+        PhotoError: a map cannot be decoded.
     """
     return [_read_map(path) for path in _list_pictures(folders, _MAPS, exclude, only)]
 
 
 def read_pairs(folders: Sequence[Path], max_pairs: int | None = None) -> list[tuple[Tensor, Tensor]]:
-    """Aligned (photo, transmission) pairs of folders as `layouts.read_folders` joins them, in order of path.
+    """Reads aligned pairs (photo, transmission), uint8 sRGB (H, W, 3), sorted by path.
 
-    Of each folder at most `max_pairs` are read, evenly spaced.
+    `pairing.read_folders` matches the files. At most `max_pairs` are read from each folder, evenly spaced.
 
     Raises:
-        RecipeError: a folder cannot be read or is empty; a picture has no partner, or one of another size.
-        PhotoError: a picture cannot be read.
+        RecipeError: a folder cannot be read or is empty, or a photo has no transmission of its name and size.
+        PhotoError: a picture cannot be decoded.
     """
     return [
         _read_pair(group)
@@ -81,9 +86,9 @@ def read_pairs(folders: Sequence[Path], max_pairs: int | None = None) -> list[tu
     ]
 
 
-def _evenly_spaced(trios: list[PictureGroup], max_pairs: int | None) -> list[PictureGroup]:
-    count = min(len(trios), max_pairs or len(trios))
-    return [trios[number * len(trios) // count] for number in range(count)]
+def _evenly_spaced(groups: list[PictureGroup], max_pairs: int | None) -> list[PictureGroup]:
+    count = min(len(groups), max_pairs or len(groups))
+    return [groups[number * len(groups) // count] for number in range(count)]
 
 
 def _picture_groups(folder: Path) -> list[PictureGroup]:
@@ -92,13 +97,13 @@ def _picture_groups(folder: Path) -> list[PictureGroup]:
     except PhotoError as error:
         raise RecipeError(
             error.happened,
-            "blended/ and transmission_layer/ beside each other",
-            "name another folder in the recipe, or set BREWSTER_DATA to where the data lies",
+            "a folder that contains blended/ and transmission_layer/",
+            _FOLDER_CURE,
         ) from error
     if found.refused:
         raise RecipeError(
-            f"{folder}: {found.refused[0]} ({len(found.refused)} such)",
-            "each photo needs one transmission of its name, and no transmission is left over",
+            f"{folder}: {found.refused[0]} (pictures without a partner: {len(found.refused)})",
+            "one transmission with the name of each photo, and no other files",
             "add or remove files until the names match",
         )
     return sorted(found.trios, key=lambda group: group.photo)
@@ -111,8 +116,8 @@ def _read_pair(group: PictureGroup) -> tuple[Tensor, Tensor]:
     if photo.shape != transmission.shape:
         raise RecipeError(
             f"{group.photo} and {group.transmission} differ in size",
-            "pairs must be aligned pixel by pixel",
-            "crop one to the other",
+            "pairs that are aligned pixel by pixel",
+            "crop one to the size of the other",
         )
     return photo, transmission
 
@@ -146,7 +151,7 @@ def _list_pictures(
         raise RecipeError(
             f"no pictures in {', '.join(map(str, folders))}",
             f"files ending in {', '.join(sorted(suffixes))}",
-            "name another folder in the recipe, or set BREWSTER_DATA to where the data lies",
+            _FOLDER_CURE,
         )
     return found
 
@@ -162,5 +167,5 @@ def _list_folder(folder: Path) -> list[Path]:
         raise RecipeError(
             f"{folder} cannot be read ({error.strerror})",
             "a folder with pictures",
-            "name another folder in the recipe, or set BREWSTER_DATA to where the data lies",
+            _FOLDER_CURE,
         ) from error

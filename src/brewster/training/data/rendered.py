@@ -1,9 +1,9 @@
-"""A finite number of rendered samples to learn from again and again: windows of sets on disk, or live ones kept.
+"""Streams of a finite number of rendered samples: crops of sets on disk, or a cache of samples rendered online.
 
-    stream = OnDisk([Path("out/window")], seed=7, count=300)
-    stream = InMemory(Rendered(...), 300, seed=7)
+    stream = RenderedSets([Path("out/window")], seed=7, count=300)
+    stream = CachedRendered(OnlineRendered(...), 300, seed=7)
 
-Which sample fills a slot, and how it is cropped and mirrored, is a function of (seed, step, slot) alone.
+The sample in a slot, its crop and its mirroring are functions of (seed, step, slot) only.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from brewster.training.data.online import Mixing, OnlineRendered
 from brewster.training.data.sample_rng import SampleRng
 
 CACHE_BYTES: Final = 1 << 30
-"""What samples may take in memory, 9 bytes a pixel: 600 of 512x384, 1,800 of 256x256, 7,200 of 128x128. Beyond, the
-oldest are forgotten, and read or rendered again when their turn comes: slower, but the same."""
+"""Memory for cached samples, 9 bytes per pixel: 600 of 512x384, 1,800 of 256x256, 7,200 of 128x128. When it is full, the
+oldest are dropped, and read or rendered again when they are drawn: slower, with the same result."""
 
 
 class RenderedSets:
-    """A `Stream` of random windows, maybe mirrored, of the first `count` samples of rendered sets.
+    """A `Stream` of random crops, mirrored at random, of the first `count` samples of rendered sets. It is thread-safe.
 
-    With `mixing` "8-bit", background and mirror of a sample are blended, and the blend has been through JPEG at the
-    sample's own quality, as its photo has. Threads may share it.
+    With `mixing` "8-bit", the photo is a blend of the sample's background and mirror image. Like the sample's photo, the blend
+    is compressed as JPEG at the sample's quality.
 
     Raises:
-        RecipeError: a set cannot be read, or all of them together hold fewer samples.
+        RecipeError: a set cannot be read, or all sets together have fewer than `count` samples.
     """
 
     def __init__(
@@ -63,7 +63,7 @@ class RenderedSets:
         return len(self._entries)
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """The batch of this step: `count` samples of `size` px a side.
+        """Returns the batch of this step: `count` samples with sides of `size` px.
 
         Raises:
             RecipeError, PhotoError: a file of a sample is missing or damaged.
@@ -73,7 +73,7 @@ class RenderedSets:
         return TrainingBatch.from_layers(to_encoded(torch.stack(windows)))
 
     def sample(self, number: int) -> Tensor:
-        """Photo, target and reflection of a sample whole, as channels: (H, W, 9) sRGB uint8.
+        """Returns photo, target and reflection of a whole sample as channels: (H, W, 9) sRGB uint8.
 
         Raises:
             RecipeError, PhotoError: a file of the sample is missing or damaged.
@@ -87,9 +87,9 @@ class RenderedSets:
 
 
 class CachedRendered:
-    """A `Stream` of the first `count` samples of a live one, maybe mirrored; threads may share it.
+    """A `Stream` of the first `count` samples of `source`, mirrored at random. It is thread-safe.
 
-    Each is rendered once for each size and kept in 8 bits, in `max_bytes` of memory.
+    Each sample is rendered once per size and cached in 8 bits, in at most `max_bytes` of memory.
     """
 
     def __init__(
@@ -98,11 +98,11 @@ class CachedRendered:
         self._source, self._count, self._seed, self._cache = source, count, seed, _TensorCache(max_bytes)
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """The batch of this step: `count` samples of `size` px a side.
+        """Returns the batch of this step: `count` samples with sides of `size` px.
 
         Raises:
-            RecipeError: the recipe gives no possible scene, or a file is missing.
-            PhotoError: a file cannot be read.
+            RecipeError: no valid scene can be drawn from the recipe, or a file is missing.
+            PhotoError: a file cannot be decoded.
         """
         rng = (SampleRng(self._seed, step, slot) for slot in range(count))
         return TrainingBatch.from_layers(torch.stack([self._sample(each, size) for each in rng]) / 255)
@@ -113,12 +113,12 @@ class CachedRendered:
         return layers.flip(2) if rng.bernoulli(0.5) else layers
 
     def _render(self, index: int, size: int) -> Tensor:
-        """(9, size, size) uint8, the first time too, so that a sample never changes."""
+        """Renders (9, size, size) uint8. The first use is quantised too, so that a sample is the same each time."""
         return (self._source.layers(index, size).clamp(0, 1) * 255).round().to(torch.uint8)
 
 
 class _TensorCache:
-    """Tensors that are made once, as long as there is room for them."""
+    """A thread-safe cache of tensors, limited by their size in bytes; the oldest are dropped first."""
 
     def __init__(self, max_bytes: int) -> None:
         self._tensors: dict[Hashable, Tensor] = {}
@@ -133,7 +133,7 @@ class _TensorCache:
 
     def _insert(self, name: Hashable, tensor: Tensor) -> None:
         with self._lock:
-            if name not in self._tensors:  # or another thread was faster
+            if name not in self._tensors:  # another thread may have inserted it
                 self._tensors[name] = tensor
                 self._bytes += tensor.nbytes
             while self._bytes > self._max_bytes:
@@ -145,7 +145,7 @@ def _first_entries(folders: Sequence[Path], count: int | None) -> list[StoredSam
     if len(entries) < (count or 1):
         raise RecipeError(
             f"{', '.join(map(str, folders))}: {len(entries)} rendered samples",
-            f"the recipe learns from {count or 'at least one'}",
+            f"at least {count or 1}, as the recipe states",
             "render more with a larger --count, or lower data.rendered.count",
         )
     return entries[:count]
@@ -157,8 +157,8 @@ def _entries(folder: Path) -> list[StoredSample]:
     except (OSError, ValueError, tarfile.TarError) as error:
         raise RecipeError(
             f"{folder} cannot be read ({getattr(error, 'strerror', None) or error})",
-            "a folder that brewster render made",
-            "name another in data.rendered.sets, or set BREWSTER_DATA to where the data lies",
+            "a folder that brewster render wrote",
+            "name another folder in data.rendered.sets, or set BREWSTER_DATA to the folder of the data",
         ) from error
 
 
@@ -172,7 +172,7 @@ def _blended_sample(entry: StoredSample) -> Tensor:
 
 
 def _picture(entry: StoredSample, layer: str) -> Tensor:
-    """One of a sample's photographs, (H, W, 3) sRGB uint8."""
+    """Reads a layer of a sample, (H, W, 3) sRGB uint8."""
     name = f"{layer}.jpg"
     with _file_errors(entry, name), naming(f"{name} of sample {key(entry.index)} in {entry.place}"):
         return torch.from_numpy(Photo.open(entry.read(name)).pixels.copy())
@@ -185,6 +185,6 @@ def _file_errors(entry: StoredSample, name: str) -> Iterator[None]:
     except (OSError, KeyError) as error:
         raise RecipeError(
             f"{name} of sample {key(entry.index)} in {entry.place} cannot be read",
-            "a sample has five pictures and a scene",
-            "delete that sample and render the set again",
+            "a sample with five pictures and a scene",
+            "delete the sample and render the set again",
         ) from error

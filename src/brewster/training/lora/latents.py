@@ -1,11 +1,10 @@
-"""Samples as a large backbone sees them: whole, in their own aspect ratio, composed of panels, and encoded once.
+"""Training samples of a large backbone: composed of panels in their own aspect ratio, and encoded by its VAE.
 
     samples = open_samples(recipe)
-    encoded = Latents(samples, backbone, recipe)(SampleRng(seed, step, slot))
+    encoded = LatentEncoder(samples, backbone, recipe)(SampleRng(seed, step, slot))
 
-Latents are a function of sample, mirroring and crop, by which they are kept, and of bucket (the size of the panels) and
-VAE, which need not stand beside them: a run has one VAE, frozen, and one budget, so that a sample's shape decides its
-bucket, the same for all crops of it.
+Latents are cached by (sample, flip, crop). They also depend on the VAE and on the size of the panels, which are not part of
+the key: a run has one frozen VAE and one pixel budget, so all crops of a sample have panels of one size.
 """
 
 from __future__ import annotations
@@ -39,15 +38,15 @@ if TYPE_CHECKING:
     from jaxtyping import Float, UInt8
 
 CACHE_SIZE: Final = 2048
-"""How many latents stay in memory: 3 GiB at the paper's size (a thousand sets, also mirrored, without crops). Beyond,
-those that were not used for longest are encoded again when their turn comes: slower, but the same."""
+"""Number of cached latents: 3 GiB at the paper's size, enough for 1,000 samples and their mirror images without crops. The
+least recently used are dropped, and encoded again when they are drawn: slower, with the same result."""
 _MIN_CROP_SIDE: Final = 0.5
-"""Of a crop, over the whole sample's."""
+"""Smallest side of a crop, relative to the side of the sample."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingSample:
-    """Photo, transmission and reflection, sRGB uint8 (H, W, 9), and how far the reflection is to be trusted."""
+    """Photo, transmission and reflection, sRGB uint8 (H, W, 9), and the weight of the reflection in the loss."""
 
     layers: UInt8[Tensor, "h w 9"]
     reflection_weight: float = 1.0
@@ -55,9 +54,9 @@ class TrainingSample:
 
 @dataclass(frozen=True, eq=False)
 class EncodedSample:
-    """Latent grids (1, C, h, w), float32, on the CPU: the composite, what the model is shown, and where it starts.
+    """Latents of a sample, float32, on the CPU: the composite of all panels, and the condition that the model sees.
 
-    `start` is the photo in every panel, where there is one step only; else noise takes its place.
+    `start` is the photo in every panel, for the objective one_step; None for flow, which starts from noise.
     """
 
     composite: Float[Tensor, "1 c h w"]
@@ -67,7 +66,7 @@ class EncodedSample:
 
 
 class SampleSequence:
-    """Rendered sets and real pairs as one sequence: first the sets, then the pairs."""
+    """Rendered samples and real pairs as one sequence: first the rendered samples, then the pairs."""
 
     def __init__(
         self, rendered: RenderedSets | None, pairs: Sequence[TrainingSample], pairs_share: float
@@ -84,36 +83,36 @@ class SampleSequence:
         return self._pairs[number - self._first_pair]
 
     def preloaded(self) -> Iterator[UInt8[Tensor, "h w 9"]]:
-        """Layers that need no reading: the first rendered ones, and every pair's."""
+        """Yields the layers of the first rendered sample and of every pair."""
         if self._rendered:
             yield self._rendered.sample(0)
         yield from (pair.layers for pair in self._pairs)
 
     def draw_index(self, rng: SampleRng) -> int:
-        """The number of a sample: a pair as often as their share says."""
+        """Draws the index of a sample: a pair with the probability `pairs_share`."""
         if rng.bernoulli(self._pairs_share):
             return self._first_pair + rng.randint(len(self._pairs))
         return rng.randint(self._first_pair)
 
 
 class LatentEncoder:
-    """Encodes what the rng choose.
+    """Draws samples and encodes them.
 
     Raises:
-        PhotoError: a pair, or the first of the rendered samples, is smaller than a panel.
+        PhotoError: a pair, or the first rendered sample, is smaller than a panel.
     """
 
     def __init__(self, samples: SampleSequence, backbone: Backbone, recipe: LoraRecipe) -> None:
         self._samples, self._backbone, self._recipe = samples, backbone, recipe
-        for layers in samples.preloaded():  # better now than after an hour
+        for layers in samples.preloaded():  # fail before training, not after an hour
             fit_sample(layers, backbone, recipe)
         self._encoded = lru_cache(CACHE_SIZE)(self._encode)
 
     def __call__(self, rng: SampleRng) -> EncodedSample:
-        """A sample, maybe mirrored, whole or a crop of it.
+        """Draws a sample, its mirroring and its crop, and encodes it.
 
         Raises:
-            RecipeError, PhotoError: its files are missing or damaged, or it is smaller than a panel.
+            RecipeError, PhotoError: a file of the sample is missing or damaged, or the sample is smaller than a panel.
         """
         number = self._samples.draw_index(rng)
         mirrored = self._recipe.flip and rng.bernoulli(0.5)
@@ -125,21 +124,19 @@ class LatentEncoder:
         fit = fit_sample(sample.layers, self._backbone, self._recipe)
         layers = sample.layers
         if crop:
-            layers = crop_sample(
-                SampleRng(self._recipe.seed, -1 - number, crop), layers, fit
-            )  # rng that no step throws
+            # A negative step: no training step draws these random numbers.
+            layers = crop_sample(SampleRng(self._recipe.seed, -1 - number, crop), layers, fit)
         panels = make_panels(layers.flip(1) if mirrored else layers, fit)
-        many = self._recipe.objective == "flow"
         return EncodedSample(
             encode(compose(panels, layout)).cpu(),
             encode(condition(panels["I"], layout)).cpu(),
-            None if many else start(panels["I"], self._backbone, layout).cpu(),
+            None if self._recipe.objective == "flow" else start(panels["I"], self._backbone, layout).cpu(),
             sample.reflection_weight,
         )
 
 
 def crop_sample(rng: SampleRng, layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> UInt8[Tensor, "p q 9"]:
-    """A window of the sample's aspect ratio, anywhere, with 0.5 to 1 of its sides, yet no smaller than what `fit` shows."""
+    """Returns a random window with the sample's aspect ratio and 0.5 to 1 of its sides, at least as large as `fit.content`."""
     height, width, _ = layers.shape
     min_side = max(_MIN_CROP_SIDE, fit.content[0] / width, fit.content[1] / height)
     side = rng.uniform((min_side, 1.0))
@@ -151,7 +148,7 @@ def crop_sample(rng: SampleRng, layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -
 
 
 def make_panels(layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> dict[str, Float[Tensor, "1 3 p q"]]:
-    """I, T and R, shrunk in linear light until they fit, in [-1, 1]."""
+    """Resizes photo, transmission and reflection in linear light and pads them. Returns the panels I, T and R, sRGB in [-1, 1]."""
     light = to_linear(layers.permute(2, 0, 1)[None] / 255)
     small = functional.interpolate(light, fit.content[::-1], mode="bilinear", antialias=True)
     padded = fit.pad(2 * to_encoded(small.clamp(0, 1)) - 1)
@@ -159,20 +156,20 @@ def make_panels(layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> dict[str, Floa
 
 
 def fit_sample(layers: Tensor, backbone: Backbone, recipe: LoraRecipe) -> PanelFit:
-    """How a sample stands in a panel.
+    """Returns the size of a sample's panels and its place in them.
 
     Raises:
-        PhotoError: it is smaller than that.
+        PhotoError: the sample is smaller than a panel.
     """
     height, width, _ = layers.shape
     return fit_panel((width, height), recipe.layout, budget_px=recipe.budget_px, multiple=backbone.multiple)
 
 
 def open_samples(recipe: LoraRecipe) -> SampleSequence:
-    """The recipe's rendered sets and pairs; what has a share of 0 is not read.
+    """Opens the rendered sets and pairs of a recipe. Data with a share of 0 is not read.
 
     Raises:
-        RecipeError: a folder is missing, empty or without reflections, or too few samples are rendered.
+        RecipeError: a folder is missing, empty or without reflections, or there are too few rendered samples.
         PhotoError: a picture cannot be read.
     """
     data, rendered, sets = recipe.data, recipe.data.rendered, None
@@ -191,18 +188,18 @@ def open_samples(recipe: LoraRecipe) -> SampleSequence:
 
 def _read_pairs(folder: Path, recipe: LoraRecipe) -> list[TrainingSample]:
     pictures = read_pairs([folder])
-    trios = sorted(read_folders(folder).trios, key=lambda group: group.photo)
+    groups = sorted(read_folders(folder).trios, key=lambda group: group.photo)
     if "R" in recipe.panels and recipe.reflections == "given":
-        _check_reflections(folder, trios)
-    return [_read_sample(group, *pair) for group, pair in zip(trios, pictures, strict=True)]
+        _check_reflections(folder, groups)
+    return [_read_sample(group, *pair) for group, pair in zip(groups, pictures, strict=True)]
 
 
-def _check_reflections(folder: Path, trios: Sequence[PictureGroup]) -> None:
-    missing = [group.name for group in trios if group.reflection is None]
+def _check_reflections(folder: Path, groups: Sequence[PictureGroup]) -> None:
+    missing = [group.name for group in groups if group.reflection is None]
     if missing:
         raise RecipeError(
-            f"{folder} has no reflection for {missing[0]} ({len(missing)} such)",
-            "one for each photo, as R is a panel",
+            f"{folder} has no reflection for {missing[0]} (photos without one: {len(missing)})",
+            "a reflection for each photo, as R is a panel",
             'add a folder reflection_layer, set reflections = "difference", or leave R out of panels',
         )
 
@@ -214,14 +211,14 @@ def _read_sample(group: PictureGroup, photo: Tensor, transmission: Tensor) -> Tr
     if reflection.shape != photo.shape:
         raise RecipeError(
             f"{group.photo} and {group.reflection} differ in size",
-            "layers are aligned",
-            "crop one to the other",
+            "layers that are aligned pixel by pixel",
+            "crop one to the size of the other",
         )
     return TrainingSample(torch.cat([photo, transmission, reflection], dim=2))
 
 
 def layers_from_pair(photo: Tensor, transmission: Tensor) -> Tensor:
-    """A pair as (H, W, 9), with the light that the transmission lacks for its reflection."""
+    """Returns photo, transmission and reflection as (H, W, 9) sRGB uint8; the reflection is photo - transmission in linear light."""
     light = to_linear(photo / 255) - to_linear(transmission / 255)
     reflection = (to_encoded(light.clamp(0, 1)) * 255).round().to(torch.uint8)
     return torch.cat([photo, transmission, reflection], dim=2)

@@ -1,10 +1,10 @@
-"""What a large recipe will cost, before anything is downloaded: tokens, memory by part, and time, as estimates.
+"""Estimates the tokens, memory and time of a LoRA recipe before anything is downloaded.
 
 estimate = estimate_resources(recipe, CARDS["RTX 4090"])
 print(estimate.table())
 estimate.check_fits()
 
-Parameters and operations are counted on a backbone without memory (torch's device "meta"); memory is arithmetic.
+Parameters and operations are counted on a backbone without storage (torch's device "meta"). Memory is computed from them.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ from brewster.training.recipe import LoraRecipe
 
 _GIB: Final = 1 << 30
 _SQUARE_PHOTO_PX: Final = (4096, 4096)
-"""A large square photo, whose panels fill the budget best."""
+"""A large square photo: its panels fill the pixel budget best."""
 _PROMPT_TOKENS: Final = 512
 _BYTES_PER_WEIGHT: Final = {None: 2.0, "int8": 1.01, "float8": 1.01, "nf4": 0.52}
-"""A weight, with its share of the scales: 22.2, 11.2 and 5.8 GiB were counted for FLUX.1 Kontext."""
+"""Including the quantisation scales: FLUX.1 Kontext has 22.2, 11.2 (8 bits) and 5.8 GiB (4 bits)."""
 _BYTES_PER_LORA_WEIGHT: Final = 16
-"""A weight of the LoRA, its gradient and two moments, all float32; 8-bit moments take 10."""
+"""Weight, gradient and two moments of AdamW, all float32. With 8-bit moments it is 10."""
 _HIDDEN_STATES_PER_BLOCK: Final = 36
-"""What a block keeps while it is computed again, in hidden states; one more for every block is kept throughout."""
+"""Activations of one block while gradient checkpointing recomputes it. Each block also stores its input, one hidden state."""
 _OVERHEAD_GIB: Final = 1.5
-"""CUDA itself, and the VAE at work."""
+"""The CUDA context, and the activations of the VAE."""
 _FORWARD_PASSES_PER_STEP: Final = 3
-"""A step in forward passes: forward, once more for the checkpoints, and back, as the base has no gradients."""
+"""Forward, recomputation for gradient checkpointing, and backward, which costs one pass as the base has no weight gradients."""
 _EFFICIENCY: Final = 0.4
-"""Of a card's greatest speed."""
+"""Assumed share of the peak speed of a card."""
 
 
 @final
 @dataclass(frozen=True)
 class GraphicsCard:
-    """A graphics card: memory in GiB, and its dense bf16 speed in TFLOP a second as its maker states it."""
+    """A graphics card: memory in GiB, and peak dense bf16 speed in TFLOP/s from its data sheet."""
 
     name: str
     memory_gib: float
@@ -59,13 +59,16 @@ CARDS: Final = {
         GraphicsCard("A100", 80, 312), GraphicsCard("H100", 80, 989), GraphicsCard("H200", 141, 989),
     )
 }  # fmt: skip
-"""name -> card. The paper's is the RTX 4090."""
+"""name -> card. The paper uses the RTX 4090."""
 
 
 @final
 @dataclass(frozen=True)
 class ResourceEstimate:
-    """The estimates for a recipe on a card."""
+    """The estimated resources of a recipe on a card.
+
+    `panel` is (width, height) in px, `memory_gib` is by part, `tflop` is for one training step.
+    """
 
     recipe: LoraRecipe
     card: GraphicsCard
@@ -79,34 +82,34 @@ class ResourceEstimate:
 
     @property
     def total_gib(self) -> float:
-        """All parts of the memory."""
+        """Total memory in GiB."""
         return sum(self.memory_gib.values())
 
     @property
     def seconds(self) -> float:
-        """A step on the card."""
+        """Duration of one training step on the card, in seconds."""
         return self.tflop / (_EFFICIENCY * self.card.tflops)
 
     def table(self) -> str:
-        """The estimate in lines of name and value; all memory and time are estimates."""
+        """Returns the estimate as lines of name and value."""
         recipe, (width, height) = self.recipe, self.panel
         rows = {
             "backbone": f"{recipe.backbone}, {self.parameters / 1e9:.2f} billion parameters",
             "LoRA": f"rank {recipe.rank}, {self.lora_parameters / 1e6:.1f} million parameters",
             "panels": f"{' '.join(recipe.panels)}, {width} x {height} each, for a square photo",
-            "tokens": f"{self.generated_tokens} generated, {self.condition_tokens} shown, {_PROMPT_TOKENS} of text",
+            "tokens": f"{self.generated_tokens} generated, {self.condition_tokens} condition, {_PROMPT_TOKENS} text",
             **{f"memory, {name}": f"{gib:.1f} GiB" for name, gib in self.memory_gib.items()},
-            "memory": f"{self.total_gib:.1f} GiB of {self.card.memory_gib:g} on {self.card.name}, as an estimate",
-            "a step": f"{self.tflop:.0f} TFLOP, {self.seconds:.1f} s, as an estimate",
-            "in all": f"{recipe.steps} steps, {self.seconds * recipe.steps / 3600:.1f} hours, as an estimate",
+            "memory": f"{self.total_gib:.1f} GiB of {self.card.memory_gib:g} on {self.card.name} (estimate)",
+            "per step": f"{self.tflop:.0f} TFLOP, {self.seconds:.1f} s (estimate)",
+            "total": f"{recipe.steps} steps, {self.seconds * recipe.steps / 3600:.1f} hours (estimate)",
         }
         return "\n".join(f"{name:24}{value}" for name, value in rows.items())
 
     def check_fits(self) -> None:
-        """Lets pass what fits into the card.
+        """Checks that the recipe fits into the memory of the card.
 
         Raises:
-            DeviceError: it does not (says what would).
+            DeviceError: it does not fit. The message names a change that makes it fit.
         """
         if self.total_gib <= self.card.memory_gib:
             return
@@ -121,15 +124,15 @@ class ResourceEstimate:
             weights = self.parameters * _BYTES_PER_WEIGHT[quantise] / _GIB
             spared = self.memory_gib["base"] - weights
             if spared > 0 and self.total_gib - spared <= self.card.memory_gib:
-                return f'set quantise = "{quantise}", which takes {self.total_gib - spared:.1f} GiB'
+                return f'set quantise = "{quantise}", which needs {self.total_gib - spared:.1f} GiB'
         return "lower budget_px or rank, take a smaller backbone (klein) or a larger card"
 
 
 def find_card(name: str | None = None) -> GraphicsCard:
-    """The card of this name, or the one that is here; without either, the paper's.
+    """Returns the card of this name; without a name, the local GPU, or the RTX 4090 if there is none.
 
     Raises:
-        DeviceError: nobody knows a card of this name.
+        DeviceError: the name is not in `CARDS`.
     """
     if name is None:
         return _local_gpu() if torch.cuda.is_available() else CARDS["RTX 4090"]
@@ -140,20 +143,20 @@ def find_card(name: str | None = None) -> GraphicsCard:
     raise DeviceError(
         f"there is no card {name!r} in the table",
         f"one of {', '.join(CARDS)}",
-        f"did you mean {known[close[0]].name}?" if close else "choose one like yours",
+        f"did you mean {known[close[0]].name}?" if close else "choose the most similar card",
     )
 
 
 def is_local_gpu(card: GraphicsCard) -> bool:
-    """Whether this is the card of this machine."""
+    """Whether this is the GPU of this machine."""
     return torch.cuda.is_available() and card == _local_gpu()
 
 
 def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstimate:
-    """Counts what the recipe takes; some seconds.
+    """Estimates the resources of a recipe on a card. Takes a few seconds.
 
     Raises:
-        ModelError: the backbone is not named as in the table.
+        ModelError: the backbone is not in the table of backbones.
         MissingExtra: diffusers is not installed.
     """
     backbone = _meta_backbone(recipe)
@@ -191,7 +194,7 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
 
 
 def _local_gpu() -> GraphicsCard:
-    """The card that is here, at the speed of a known one of its name; else of the paper's."""
+    """The local GPU. Its speed is that of the card in `CARDS` with its name, or of the RTX 4090 if there is none."""
     found = torch.cuda.get_device_properties(0)
     speed = next(
         (card.tflops for name, card in CARDS.items() if name in found.name), CARDS["RTX 4090"].tflops
@@ -216,7 +219,7 @@ def _count_lora_parameters(backbone: Backbone, recipe: LoraRecipe) -> int:
 
 
 def _activation_bytes(backbone: Backbone, tokens: int) -> int:
-    """Bytes: every block's input, and one whole block, in bf16."""
+    """Memory in bytes of the inputs of all blocks and the activations of one block, in bf16."""
     transformer, config = backbone.transformer, backbone.transformer.config
     blocks = len(transformer.transformer_blocks) + len(getattr(transformer, "single_transformer_blocks", ()))
     hidden: int = config.num_attention_heads * config.attention_head_dim
@@ -224,7 +227,7 @@ def _activation_bytes(backbone: Backbone, tokens: int) -> int:
 
 
 def _forward_tflop(backbone: Backbone, generated_tokens: int, condition_tokens: int) -> float:
-    """TFLOP of one prediction, counted by torch without computing anything."""
+    """TFLOP of one prediction, counted on the device "meta" without computing it."""
     prompt = backbone.random_prompt(backbone.transformer, 0)
     words = {
         name: (tensor[:, :1].expand(1, _PROMPT_TOKENS, -1) if tensor.ndim == 3 else tensor).to("meta")

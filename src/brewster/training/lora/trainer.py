@@ -1,10 +1,11 @@
-"""A LoRA on a large backbone as a trainer: flow matching on the latents of panels (paper, Text-to-image Model Fine-tuning).
+"""The trainer of a LoRA on a large backbone: flow matching on the latents of panels (paper, Text-to-image Model Fine-tuning).
 
-trainer = LoraLearner(read_recipe(Path("recipes/train/kontext.toml")))
+trainer = LoraTrainer(read_recipe(Path("recipes/train/kontext.toml")))
 run(trainer, Path("out/kontext"), on_step)
 
-A batch is learnt one sample after another, so that each keeps its aspect ratio and a batch needs no more memory than
-a sample. Sample, noise and time are functions of (seed, step, slot) alone; several processes divide the slots.
+The gradients of a batch are accumulated one sample at a time, so that each sample keeps its aspect ratio and a batch needs no
+more memory than one sample. Sample, noise and time are functions of (seed, step, slot) only; several processes divide the
+slots.
 """
 
 from __future__ import annotations
@@ -50,16 +51,16 @@ LORA_FOLDER: Final = "lora"
 RECIPE_FILE: Final = "recipe.json"
 _MAX_GRADIENT_NORM: Final = 1.0
 _VALIDATION_SAMPLES: Final = 4
-"""How many pictures of each folder are generated to see how good it is: each takes as long as some steps."""
+"""Validation pictures per folder: generating one takes as long as several training steps."""
 _ROW_PX: Final = (160, 240)
 _MEMORY_CURE: Final = "lower budget_px or rank, quantise the base, or take a smaller backbone (klein)"
 
 
 class LoraTrainer:
-    """A `Learner`: the backbone, frozen, a float32 LoRA on it, and AdamW.
+    """The `Trainer` of a LoRA: a frozen backbone, a float32 LoRA on it, and AdamW.
 
     Raises:
-        RecipeError, PhotoError: the data are missing, damaged or without reflections.
+        RecipeError, PhotoError: the data is missing, damaged or without reflections.
         DownloadError, ModelError, DeviceError, MissingExtra: the backbone cannot be loaded.
     """
 
@@ -78,37 +79,37 @@ class LoraTrainer:
 
     @property
     def prompt(self) -> PromptEmbedding:
-        """What the backbone is told; known once the run has begun."""
-        assert self._prompt, "begin or restore comes first"
+        """The encoded prompt; available after `initialize` or `load_state_dict`."""
+        assert self._prompt, "call initialize or load_state_dict first"
         return self._prompt
 
     def initialize(self) -> None:
-        """Takes up the recipe's prompt; a real backbone's text encoder is loaded for it, and forgotten.
+        """Loads or encodes the recipe's prompt. The text encoder of a real backbone is loaded for this and released.
 
         Raises:
-            DownloadError, ModelError, DeviceError, MissingExtra: it cannot be had.
+            DownloadError, ModelError, DeviceError, MissingExtra: the text encoder or the prompt cannot be loaded.
         """
         self._prompt = _load_prompt(self.recipe, self.backbone)
 
     def state_dict(self) -> dict[str, Any]:
-        """The LoRA, the optimiser's moments, and the prompt: nothing of the base."""
+        """Returns the LoRA, the state of the optimiser, and the prompt; no weights of the base."""
         prompt = {"text": self.prompt.text, **self.prompt.tensors}
         return {
             "lora": lora_state(self.backbone), "optimizer": self._optimizer.state_dict(), "prompt": prompt,
         }  # fmt: skip
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on from such a state."""
+        """Restores a state that `state_dict` returned."""
         load_lora_state(self.backbone, state["lora"])
         self._optimizer.load_state_dict(state["optimizer"])
         self._prompt = PromptEmbedding(self.backbone.name, **state["prompt"])
 
     def training_step(self, step: int) -> dict[str, float]:
-        """One step of AdamW on one batch; the loss, and each panel's part of it.
+        """Runs one step of AdamW on one batch. Returns the loss and the part of each panel.
 
         Raises:
-            ModelError: the loss is not a number; the last checkpoint is still good.
-            DeviceError: out of memory (says what to lower).
+            ModelError: the loss is NaN or infinite. The last checkpoint is still valid.
+            DeviceError: out of memory. The message says which values to lower.
             RecipeError, PhotoError: a sample is missing, damaged, or smaller than a panel.
         """
         self._optimizer.zero_grad()
@@ -127,7 +128,7 @@ class LoraTrainer:
 
     @torch.no_grad()
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """Mean PSNR gain in dB of the generated T over the photo, per folder; and rows of ground truth and panels."""
+        """Returns the mean PSNR gain of the generated T over the photo in dB, by folder, and a picture of the panels."""
         gains, rows = {}, []
         for name, samples in self._validation_samples.items():
             results = [self._validate_sample(layers) for layers in samples]
@@ -136,10 +137,10 @@ class LoraTrainer:
         return gains, torch.cat(rows, dim=1).clamp(0, 1).permute(1, 2, 0)
 
     def export(self, folder: Path) -> Path:
-        """Writes a folder that stock diffusers loads: the LoRA, the prompt, the recipe, and the model card, README.md.
+        """Writes the folder `lora`: LoRA, prompt, recipe and model card. diffusers can load it. Returns its path.
 
         Raises:
-            TargetError: it cannot be written.
+            TargetError: the folder cannot be written.
         """
         place = folder / LORA_FOLDER
         base, quantise = self.recipe.backbone, self.recipe.quantise
@@ -152,17 +153,19 @@ class LoraTrainer:
         return place
 
     def separate(self, photo: Tensor, *, steps: int = STEPS, seed: int = 0) -> Mapping[str, Tensor]:
-        """The panels that it makes of a photo in a panel, (1, 3, h, w) in [-1, 1]; one_step takes one step.
+        """Generates the panels of a photo of the size of a panel, (1, 3, h, w) in [-1, 1].
+
+        `steps` is ignored for the objective one_step.
 
         Raises:
-            DeviceError: out of memory (says what to lower).
+            DeviceError: out of memory. The message says which values to lower.
         """
         return DecompositionPipeline(self.backbone, self.prompt, self.recipe.task)(
             photo, steps=steps, seeds=[seed]
         )
 
     def _compute_gradients(self, step: int) -> dict[str, Tensor]:
-        """The gradients, and the parts of the loss, of this process's slots of the batch."""
+        """Accumulates the gradients of this process's slots of the batch. Returns the parts of the loss."""
         totals: dict[str, Tensor] = {}
         for slot in range(distributed.rank(), self.recipe.batch, distributed.world_size()):
             parts = self._losses(SampleRng(self.recipe.seed, step, slot))
@@ -172,7 +175,7 @@ class LoraTrainer:
         return totals
 
     def _losses(self, rng: SampleRng) -> dict[str, Tensor]:
-        """The mean squared error of the velocity, start - picture, in each panel, weighted; they add up to the loss."""
+        """Returns the weighted mean squared error of the velocity, start - composite, of each panel; the loss is their sum."""
         encoded, device = self._latents(rng), self.backbone.device
         start, sigma = self._start_and_sigma(rng, encoded)
         noisy = (1 - sigma) * encoded.composite + sigma * start
@@ -192,7 +195,10 @@ class LoraTrainer:
         }
 
     def _start_and_sigma(self, rng: SampleRng, encoded: EncodedSample) -> tuple[Tensor, Tensor]:
-        """Where this sample starts, and at which time from 0 to 1 it is looked at."""
+        """Returns the start of the sample's path, noise or the photo, and its time sigma in 0..1.
+
+        Times are logit-normal (Esser et al. 2024), then shifted for the resolution.
+        """
         if encoded.start is not None:
             return encoded.start, torch.ones(1)
         recipe, grid = self.recipe, encoded.composite
@@ -201,18 +207,18 @@ class LoraTrainer:
         return rng.normal(*grid.shape), sigma
 
     def _panel_weights(self) -> dict[str, float]:
-        """How much each panel counts; 1 in all."""
+        """Weights of the panels in the loss; their sum is 1."""
         named = {panel: self.recipe.panel_weights.get(panel, 1.0) for panel in self.recipe.panels}
         return {panel: weight / sum(named.values()) for panel, weight in named.items()}
 
     def _validation_panels(self, layers: Tensor) -> tuple[dict[str, Tensor], PanelFit]:
-        """Of a picture that is only looked at: one that is smaller than a panel gets smaller panels."""
+        """Panels of a validation picture. Unlike in training, a picture smaller than a panel gets smaller panels."""
         height, width, _ = layers.shape
         fit = self.recipe.task.fit((width, height), self.backbone.multiple)
         return make_panels(layers, fit), fit
 
     def _validate_sample(self, layers: Tensor) -> tuple[float, Tensor]:
-        """The gain on a sample, and its row: photo and ground truth, then the panels."""
+        """Returns the PSNR gain on a sample in dB, and a row of photo, ground truth and generated panels."""
         ground_truth, fit = self._validation_panels(layers)
         predicted = self.separate(ground_truth["I"])
         photo, transmission, prediction = (
@@ -228,8 +234,8 @@ class LoraTrainer:
 def _check_batch(recipe: LoraRecipe) -> None:
     if recipe.batch % distributed.world_size():
         raise RecipeError(
-            f"batch = {recipe.batch} is to be divided among {distributed.world_size()} processes",
-            "an equal part for each",
+            f"batch = {recipe.batch} cannot be divided equally among {distributed.world_size()} processes",
+            "a batch that is a multiple of the number of processes",
             "raise batch to a multiple, or start fewer processes",
         )
 
@@ -241,7 +247,7 @@ def _load_prompt(recipe: LoraRecipe, backbone: Backbone) -> PromptEmbedding:
 
 
 def _create_optimizer(parameters: Sequence[nn.Parameter], recipe: LoraRecipe) -> torch.optim.Optimizer:
-    """AdamW, its moments in 8 bits where there is CUDA and bitsandbytes."""
+    """AdamW; with 8-bit moments on CUDA, if bitsandbytes is installed."""
     options: dict[str, Any] = {"lr": recipe.learning_rate, "weight_decay": recipe.weight_decay}
     if parameters[0].is_cuda and importlib.util.find_spec("bitsandbytes"):
         small = importlib.import_module("bitsandbytes.optim").AdamW8bit(parameters, **options)
@@ -251,7 +257,7 @@ def _create_optimizer(parameters: Sequence[nn.Parameter], recipe: LoraRecipe) ->
 
 
 def _validation_samples(recipe: LoraRecipe, samples: SampleSequence) -> dict[str, list[Tensor]]:
-    """A few validation pairs of each folder, (H, W, 9), or of the samples that it learns from."""
+    """The first validation pairs of each folder, (H, W, 9), or the first training samples if the recipe names no folder."""
     folders = validation_pairs(recipe.data)
     if folders:
         return {

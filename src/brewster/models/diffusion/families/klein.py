@@ -36,7 +36,7 @@ class Klein(ClassifierFreeBackbone):
     licence = APACHE_2
     stock_use = StockCall(
         "text_encoder=None, tokenizer=None",
-        'negative_prompt_embeds=words["negative"],',
+        'negative_prompt_embeds=prompt["negative"],',
         "A condition of more than 1024 x 1024 pixels would be rescaled in silence.",
     )
     classes: ClassVar = {

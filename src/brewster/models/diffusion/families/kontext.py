@@ -39,7 +39,7 @@ class Kontext(Backbone):
     )
     stock_use = StockCall(
         "text_encoder=None, text_encoder_2=None, tokenizer=None, tokenizer_2=None",
-        'pooled_prompt_embeds=words["pooled"], max_area={area}, _auto_resize=False,',
+        'pooled_prompt_embeds=prompt["pooled"], max_area={area}, _auto_resize=False,',
         "Without `max_area` and `_auto_resize=False` the pipeline rescales both pictures in silence.",
     )
     classes: ClassVar = {
