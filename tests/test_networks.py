@@ -1,4 +1,4 @@
-"""The table of compact networks: what a row promises to the trainer and to the exported file."""
+"""The table of compact networks: each row works with the trainer and the exported file."""
 
 from dataclasses import replace
 
@@ -32,12 +32,12 @@ def small(monkeypatch):
     return "small"
 
 
-def silent(step, steps, numbers, logged):
+def silent(step, steps, metrics, logged):
     pass
 
 
 @pytest.mark.parametrize("name", list(NETWORKS))
-def test_every_network_keeps_the_promises_of_its_row(name):
+def test_every_network_has_the_interface_of_its_row(name):
     entry = NETWORKS[name]
     assert LARGEST_STRIDE % entry.stride == 0
     fresh, started = entry.build(), entry.pretrained()

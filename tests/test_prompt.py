@@ -27,7 +27,7 @@ def test_the_prompt_names_three_images():
     assert {f"[IMAGE{n}]" for n in (1, 2, 3)} == set(re.findall(r"\[IMAGE.\]", PROMPT))
 
 
-def test_a_saved_prompt_comes_back_to_the_bit(prompt, tmp_path):
+def test_a_saved_prompt_is_restored_bit_for_bit(prompt, tmp_path):
     prompt.save(tmp_path / "prompt.safetensors")
     back = load_prompt(tmp_path / "prompt.safetensors", "kontext")
     assert (back.text, back.sha256, back.negative) == (PROMPT, prompt.sha256, None)
@@ -55,7 +55,7 @@ def test_another_text_or_backbone_or_number_is_another_digest(prompt):
     assert len(digests) == 5
 
 
-def test_moving_a_prompt_keeps_what_it_says(prompt):
+def test_moving_a_prompt_keeps_its_text(prompt):
     moved = prompt.to("cpu", torch.float32)
     assert moved.embeds.dtype == moved.pooled.dtype == torch.float32
     assert moved.text == prompt.text
