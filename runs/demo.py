@@ -1,4 +1,4 @@
-"""What `make demo` plays: separates photographs and lays before and after side by side on a sheet.
+"""The script of `make demo`: separates photos and writes a sheet of photo, transmission and reflection.
 
 .venv/bin/python runs/demo.py tests/pictures
 """
@@ -37,7 +37,7 @@ def main(source: Path) -> int:
 
 
 def separate(separator: Separator, job: SeparationPaths) -> np.ndarray:
-    """Separates one photo, saves its layers and returns its row of the sheet."""
+    """Separates one photo and saves its layers. Returns its row of the sheet."""
     started = time.perf_counter()
     result = separator(job.source)
     targets = [job.target(layer) for layer in ("transmission", "reflection")]

@@ -1,8 +1,8 @@
-"""Draws the pictures of docs/rendering.md: samples of every recipe, and 8-bit mixtures above rendered light.
+"""Writes the figures of docs/rendering.md: samples of every recipe, and 8-bit mixtures above rendered photos.
 
-    BREWSTER_DATA=../shared/data .venv/bin/python runs/figures.py   # CC0 maps there, paintings of our own
+    BREWSTER_DATA=../shared/data .venv/bin/python runs/figures.py   # with the CC0 maps in hdri/
 
-Without BREWSTER_DATA the builtin worlds light everything.
+Without BREWSTER_DATA, the built-in environments light all scenes.
 """
 
 import os

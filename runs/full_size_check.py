@@ -1,8 +1,8 @@
-"""What the paper's size takes: memory and time of learning and of separating, measured on the GPU that is here.
+"""Measures memory and time of training and inference at the paper's size on the local GPU; estimates them without a GPU.
 
-Real architectures, random weights: nothing is downloaded, and nothing but memory and time means anything. The base is
-filled and quantised layer by layer, so that it never stands on the card in 16 bits as a whole. On larger cards memory
-is capped, so that what runs here runs on the paper's 24 GB. See full_size_check.sh for how to call it.
+The architectures are real and the weights random: nothing is downloaded, and only memory and time are meaningful. The base is
+filled and quantised layer by layer, so that it is never on the card in 16 bits as a whole. On larger cards memory is limited
+to that of the paper's 24 GB card. full_size_check.sh runs this script.
 """
 
 import argparse
@@ -26,26 +26,26 @@ from brewster.models.diffusion.prompt import PromptEmbedding
 from brewster.models.diffusion.sampling import GUIDANCE, STEPS, sample
 
 GIB = 1 << 30
-CAP_GIB = 23.0  # a 24 GB card, less what CUDA itself takes
+CAP_GIB = 23.0  # a 24 GB card, minus the CUDA context
 PANEL = (512, 512)
-WORDS = 512
+PROMPT_TOKENS = 512
 RANK = 16
 PAPER_STEPS = 4000
-WARM, TIMED = 2, 5
+WARMUP_STEPS, TIMED_STEPS = 2, 5
 CASES = (("kontext", "int8"), ("klein", None))
 TITLES = {
     "kind": "measured or estimated", "card": "card", "parameters": "parameters, billions",
-    "lora": "LoRA, millions", "tokens": "tokens: generated, shown, text", "optimizer": "optimizer",
-    "base_gib": "base and VAE, GiB", "learning_gib": "peak while learning, GiB",
-    "reserved_gib": "the same, with what the allocator holds, GiB", "step_s": "a step, s",
-    "steps_h": f"{PAPER_STEPS} steps, h", "picture_gib": "peak while separating, GiB",
+    "lora": "LoRA, millions", "tokens": "tokens: generated, condition, text", "optimizer": "optimizer",
+    "base_gib": "base and VAE, GiB", "learning_gib": "peak during training, GiB",
+    "reserved_gib": "peak reserved by the allocator, GiB", "step_s": "training step, s",
+    "steps_h": f"{PAPER_STEPS} steps, h", "picture_gib": "peak during inference, GiB",
     "picture_s": f"a photo in {STEPS} steps, s", "fits": "fits a 24 GB card",
 }  # fmt: skip
 
 
 @dataclass
 class Row:
-    """What one backbone took; None where nobody measured it."""
+    """Results of one backbone; None for values that were not measured."""
 
     backbone: str
     quantise: str | None
@@ -69,16 +69,16 @@ class Row:
 
 
 def measure(name, quantise, device, *, is_tiny):
-    """Learns for a few steps, then separates once."""
-    panel, words, rank = ((32, 32), 8, 2) if is_tiny else (PANEL, WORDS, RANK)
-    row = Row(name, quantise, "rehearsed on a toy twin" if is_tiny else "measured", card_name(device))
+    """Trains for a few steps, then separates one photo."""
+    panel, prompt_tokens, rank = ((32, 32), 8, 2) if is_tiny else (PANEL, PROMPT_TOKENS, RANK)
+    row = Row(name, quantise, "toy twin, not full size" if is_tiny else "measured", gpu_name(device))
     try:
-        backbone = furnished(name, quantise, device, is_tiny=is_tiny)
-        prompt = random_words(backbone, words)
-        row.parameters = weights(backbone.transformer) / 1e9
+        backbone = random_backbone(name, quantise, device, is_tiny=is_tiny)
+        prompt = random_prompt(backbone, prompt_tokens)
+        row.parameters = count_parameters(backbone.transformer) / 1e9
         row.base_gib = allocated(device)
         photo = torch.rand(1, 3, panel[1], panel[0]) * 2 - 1
-        learn(backbone, prompt, photo, rank, row)
+        train(backbone, prompt, photo, rank, row)
         separate(backbone, prompt, photo, row)
         row.fits = True
     except (torch.OutOfMemoryError, DeviceError) as error:
@@ -87,17 +87,17 @@ def measure(name, quantise, device, *, is_tiny):
     return row
 
 
-def furnished(name, quantise, device, *, is_tiny):
-    """A backbone with random weights on the device, and not a moment larger there than in the end."""
+def random_backbone(name, quantise, device, *, is_tiny):
+    """Creates a backbone with random weights on the device; peak memory is its final size."""
     size = find_family(name).tiny if is_tiny else None
     dtype = torch.float32 if device == "cpu" else torch.bfloat16
     backbone = build(name, size, device="meta", dtype=dtype)
-    fill(backbone.vae, device, None)
-    fill(backbone.transformer, device, quantise)
+    fill_randomly(backbone.vae, device, None)
+    fill_randomly(backbone.transformer, device, quantise)
     return backbone
 
 
-def fill(part, device, quantise):
+def fill_randomly(part, device, quantise):
     torchao = import_library("torchao.quantization") if quantise else None
     for module in part.modules():
         for name, parameter in list(module.named_parameters(recurse=False)):
@@ -109,8 +109,8 @@ def fill(part, device, quantise):
             torchao.quantize_(module, torchao.Int8WeightOnlyConfig())
 
 
-def random_words(backbone, count):
-    """A prompt as long as the real one."""
+def random_prompt(backbone, count):
+    """A random prompt with the number of tokens of the real one."""
     few = backbone.random_prompt(backbone.transformer, 0)
     tensors = {
         name: tensor[:, :1].expand(1, count, -1) if tensor.ndim == 3 else tensor
@@ -119,28 +119,31 @@ def random_words(backbone, count):
     return PromptEmbedding(few.backbone, few.text, **tensors).to(backbone.device, backbone.dtype)
 
 
-def learn(backbone, prompt, photo, rank, row):
-    """The steps of train/large/learner.py, without its files: encode once, then flow matching on the LoRA alone."""
+def train(backbone, prompt, photo, rank, row):
+    """The training steps of training/lora/trainer.py, without its files: encode once, then flow matching on the LoRA."""
     parameters = add_lora(backbone, rank=rank, alpha=rank)
     backbone.transformer.enable_gradient_checkpointing()
     optimizer = torch.optim.AdamW(parameters, lr=1e-4)
     row.lora, row.optimizer = sum(each.numel() for each in parameters) / 1e6, "AdamW, float32 moments"
     reset_peak(backbone.device)
-    composite, shown = (backbone.encode(conditioning_image(photo, PanelLayout())) for _ in range(2))
-    cells = composite.shape[2] * composite.shape[3]
-    row.tokens = f"{cells}, {shown.shape[2] * shown.shape[3]}, {prompt.embeds.shape[1]}"
-    times = [timed(lambda: step(backbone, prompt, composite, shown, optimizer)) for _ in range(WARM + TIMED)]
-    row.step_s = statistics.median(times[WARM:])
+    composite, latents = (backbone.encode(conditioning_image(photo, PanelLayout())) for _ in range(2))
+    tokens = composite.shape[2] * composite.shape[3]
+    row.tokens = f"{tokens}, {latents.shape[2] * latents.shape[3]}, {prompt.embeds.shape[1]}"
+    times = [
+        timed(lambda: step(backbone, prompt, composite, latents, optimizer))
+        for _ in range(WARMUP_STEPS + TIMED_STEPS)
+    ]
+    row.step_s = statistics.median(times[WARMUP_STEPS:])
     row.steps_h = row.step_s * PAPER_STEPS / 3600
     row.learning_gib, row.reserved_gib = peak(backbone.device)
 
 
-def step(backbone, prompt, composite, shown, optimizer):
+def step(backbone, prompt, composite, latents, optimizer):
     optimizer.zero_grad()
     noise = torch.randn_like(composite)
     sigma = backbone.shifted(torch.randn(1).sigmoid(), composite.shape[2] * composite.shape[3])
     sigma = sigma.to(composite.device)
-    velocity = backbone.predict((1 - sigma) * composite + sigma * noise, shown, sigma, prompt, 1.0)
+    velocity = backbone.predict((1 - sigma) * composite + sigma * noise, latents, sigma, prompt, 1.0)
     loss = (velocity - (noise - composite)).square().mean()
     loss.backward()
     nn.utils.clip_grad_norm_(optimizer.param_groups[0]["params"], 1.0)
@@ -149,12 +152,12 @@ def step(backbone, prompt, composite, shown, optimizer):
 
 
 def separate(backbone, prompt, photo, row):
-    shown = conditioning_image(photo, PanelLayout())
+    image = conditioning_image(photo, PanelLayout())
     size = PanelLayout().composite_size((photo.shape[3], photo.shape[2]))
     gc.collect()
     reset_peak(backbone.device)
     row.picture_s = timed(
-        lambda: sample(backbone, shown, prompt, size=size, steps=STEPS, guidance=GUIDANCE, seeds=[0])
+        lambda: sample(backbone, image, prompt, size=size, steps=STEPS, guidance=GUIDANCE, seeds=[0])
     )
     row.picture_gib, _ = peak(backbone.device)
 
@@ -178,7 +181,7 @@ def reset_peak(device):
 
 
 def peak(device):
-    """GiB in tensors at most, and in what the allocator held for them; unknown on a CPU."""
+    """Peak memory in GiB, allocated and reserved; None on a CPU."""
     if torch.device(device).type != "cuda":
         return None, None
     return torch.cuda.max_memory_allocated() / GIB, torch.cuda.max_memory_reserved() / GIB
@@ -188,16 +191,16 @@ def allocated(device):
     return torch.cuda.memory_allocated() / GIB if torch.device(device).type == "cuda" else None
 
 
-def weights(part):
+def count_parameters(part):
     return sum(each.numel() for each in part.parameters())
 
 
-def card_name(device):
+def gpu_name(device):
     return torch.cuda.get_device_name() if device == "cuda" else "CPU"
 
 
-def cap():
-    """As if the card had no more than the paper's."""
+def cap_memory():
+    """Limits GPU memory to that of the paper's card."""
     total = torch.cuda.get_device_properties(0).total_memory / GIB
     torch.cuda.set_per_process_memory_fraction(min(1.0, CAP_GIB / total))
 
@@ -206,36 +209,35 @@ def cap():
 
 
 def estimate(name, quantise):
-    """The numbers of `brewster train --plan` for the recipe of this name, on the paper's card."""
-    from brewster.training.lora.resource_estimate import CARDS, plan_for  # noqa: PLC0415  (the trainer may lack its libraries)
+    """The estimate of `brewster train --plan` for the recipe of this name, on the paper's card."""
+    from brewster.training.lora.resource_estimate import CARDS, estimate_resources  # noqa: PLC0415  (its libraries may be missing)
     from brewster.training.recipe import read_recipe  # noqa: PLC0415
 
     card = CARDS["RTX 4090"]
     recipe = read_recipe(Path(__file__).parents[1] / f"recipes/train/{name}.toml")
-    plan = plan_for(recipe, card)
-    forward_s = (
-        plan.seconds / 3 / recipe.batch
-    )  # of a step's three: forward, once more for the checkpoints, back
+    resources = estimate_resources(recipe, card)
+    # A training step costs three passes: forward, recomputation for gradient checkpointing, backward.
+    forward_s = resources.seconds / 3 / recipe.batch
     passes = STEPS * (1 if find_family(name).guided_by_embedding else 2)
     return Row(
         name, quantise, "ESTIMATED from meta tensors, not measured", card.name,
-        parameters=plan.parameters / 1e9, lora=plan.lora / 1e6,
-        tokens=f"{plan.generated}, {plan.shown}, {WORDS}", base_gib=plan.memory_gib["base"] + plan.memory_gib["VAE"],
-        learning_gib=plan.total_gib, step_s=plan.seconds, steps_h=plan.seconds * PAPER_STEPS / 3600,
-        picture_s=passes * forward_s, fits=plan.total_gib <= card.memory_gib,
+        parameters=resources.parameters / 1e9, lora=resources.lora_parameters / 1e6,
+        tokens=f"{resources.generated_tokens}, {resources.condition_tokens}, {PROMPT_TOKENS}", base_gib=resources.memory_gib["base"] + resources.memory_gib["VAE"],
+        learning_gib=resources.total_gib, step_s=resources.seconds, steps_h=resources.seconds * PAPER_STEPS / 3600,
+        picture_s=passes * forward_s, fits=resources.total_gib <= card.memory_gib,
     )  # fmt: skip
 
 
-# --- told
+# --- report
 
 
 def table(rows):
     lines = [["", *(f"{row.backbone}, {row.quantise or 'bf16'}" for row in rows)], ["---"] * (len(rows) + 1)]
-    lines += [[title, *(told(getattr(row, name)) for row in rows)] for name, title in TITLES.items()]
+    lines += [[title, *(format_cell(getattr(row, name)) for row in rows)] for name, title in TITLES.items()]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def told(value):
+def format_cell(value):
     if value is None:
         return "-"
     if isinstance(value, bool):
@@ -246,32 +248,34 @@ def told(value):
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("out/full_size"))
-    parser.add_argument("--tiny", action="store_true", help="the same code on toy twins, on the CPU too")
-    asked = parser.parse_args()
+    parser.add_argument(
+        "--tiny", action="store_true", help="run the same code on toy twins; a CPU is sufficient"
+    )
+    options = parser.parse_args()
     warnings.filterwarnings("ignore", message=".*get_apply_tensor_subclass.*")
-    has_card = torch.cuda.is_available()
-    if has_card:
-        cap()
+    has_gpu = torch.cuda.is_available()
+    if has_gpu:
+        cap_memory()
     rows = []
     for name, quantise in CASES:
-        if has_card or asked.tiny:
-            rows.append(measure(name, quantise, "cuda" if has_card else "cpu", is_tiny=asked.tiny))
+        if has_gpu or options.tiny:
+            rows.append(measure(name, quantise, "cuda" if has_gpu else "cpu", is_tiny=options.tiny))
         else:
             rows.append(estimate(name, quantise))
         gc.collect()
-        if has_card:
+        if has_gpu:
             torch.cuda.empty_cache()
-        save(rows, asked.out)
+        save(rows, options.out)
     print(table(rows))
     return 0 if all(row.fits for row in rows) else 1
 
 
 def save(rows, out):
-    """After each backbone, so that a run that is cut off leaves what it has."""
+    """Writes the results after each backbone, so that an interrupted run keeps the results so far."""
     out.mkdir(parents=True, exist_ok=True)
     versions = {"torch": torch.__version__, "cuda": torch.version.cuda}
-    told = {"versions": versions, "cap_gib": CAP_GIB, "rows": [asdict(row) for row in rows]}
-    (out / "full_size.json").write_text(json.dumps(told, indent=2) + "\n")
+    results = {"versions": versions, "cap_gib": CAP_GIB, "rows": [asdict(row) for row in rows]}
+    (out / "full_size.json").write_text(json.dumps(results, indent=2) + "\n")
     (out / "full_size.md").write_text(table(rows) + "\n")
 
 

@@ -1,12 +1,12 @@
 #!/usr/bin/env bash
-# Does the paper's size fit a 24 GB card, and how long does it take? Real architectures, random weights, no download.
-#     runs/full_size_check.sh            on a GPU: measured, in a few minutes; without one: estimates, and says so
-#     runs/full_size_check.sh --tiny     a rehearsal: the same code on toy twins, on any machine, in half a minute
+# Memory and time of the paper's method at full size on a 24 GB card, with real architectures, random weights and no download.
+#     runs/full_size_check.sh            with a GPU: measures, in a few minutes; without a GPU: prints estimates, marked as such
+#     runs/full_size_check.sh --tiny     a test of this script on toy twins, on any machine, in half a minute
 # FLUX.1 Kontext (11.9 billion weights, int8 by torchao) and FLUX.2 klein (3.9 billion, bf16): a LoRA of rank 16 on a composite
-# of 1536 x 512 and its condition, gradient checkpointing, seven steps; then a photo in 20 steps. Memory is capped at 23 GiB.
-# full_size.json and full_size.md go to $OUT, else to out/full_size. The exit code is 1 if anything did not fit.
-# It needs of brewster only src/, and of the extra `large` torch, diffusers, peft, accelerate, safetensors, torchao and
-# huggingface_hub: on a machine without a network, carry those that it lacks as wheels.
+# of 1536 x 512 and its condition, gradient checkpointing, seven steps; then a photo in 20 steps. Memory is limited to 23 GiB.
+# It writes full_size.json and full_size.md to $OUT, by default out/full_size. The exit code is 1 if a backbone does not fit.
+# It needs src/, and torch, diffusers, peft, accelerate, safetensors, torchao and huggingface_hub from the extra `large`. On a
+# machine without a network, install the missing ones from wheels.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 if [ -x .venv/bin/python ]; then python=.venv/bin/python; else python=python3; fi

@@ -27,22 +27,22 @@ def two_threads():
         torch.set_num_threads(before)
 
 
-def silent(step, steps, numbers, logged):
+def silent(step, steps, metrics, logged):
     pass
 
 
 def checkpoint(recipe):
-    """The state that a run begins with."""
+    """The initial checkpoint of a run."""
     return Checkpoint(0, recipe.model_dump_json(), CompactTrainer(recipe).state_dict())
 
 
-def test_nothing_to_learn_from_leaves_the_network_as_it_starts(rendered, tmp_path):
+def test_without_training_data_the_network_keeps_its_initial_weights(rendered, tmp_path):
     network = train(with_value(rendered, "data.rendered.count", 0), tmp_path, silent)
     photo = torch.rand(1, 3, 64, 64)
     torch.testing.assert_close(network(photo)[:, :3], photo, atol=1e-5, rtol=0)
 
 
-def test_a_photo_that_equals_its_truth_has_no_infinite_score():
+def test_a_photo_that_equals_its_ground_truth_has_a_finite_score():
     photo = torch.rand(1, 3, 32, 32)
     better, worse = (
         validate(lambda _, given=given: given, {"plain": [(photo, photo)]})["gain_db_plain"]
@@ -53,14 +53,14 @@ def test_a_photo_that_equals_its_truth_has_no_infinite_score():
 
 
 def test_pairs_that_became_worse_are_counted():
-    """Of four answers that are black, one is worse than its photo, one equal, and two are better."""
+    """Of four black predictions, one is worse than its photo, one is equal, and two are better."""
     black, grey = torch.zeros(1, 3, 32, 32), torch.full((1, 3, 32, 32), 0.4)
     pairs = [(grey, grey), (black, grey), (grey, black), (grey, black)]
     numbers = validate(torch.zeros_like, {"four": pairs})
     assert numbers["worse_four"] == 1 / 4
 
 
-def test_training_lowers_the_loss_on_a_batch_seen_again_and_again(recipe):
+def test_training_lowers_the_loss_on_a_repeated_batch(recipe):
     stream = open_stream(recipe)
     longer = recipe.model_copy(update={"steps": 40})
     trainer = CompactTrainer(longer, lambda step, count, size: stream(0, 2, 64))
@@ -68,7 +68,7 @@ def test_training_lowers_the_loss_on_a_batch_seen_again_and_again(recipe):
     assert losses[-1] < 0.8 * losses[0]
 
 
-def test_shares_of_a_batch_on_two_cores_make_the_step_of_plain_adamw(recipe):
+def test_shards_of_a_batch_on_two_cores_give_the_step_of_plain_adamw(recipe):
     batch = open_stream(recipe)(0, 3, 64)
     with two_threads():
         trainer = CompactTrainer(recipe, lambda step, count, size: batch)
@@ -93,7 +93,7 @@ def test_shares_of_a_batch_on_two_cores_make_the_step_of_plain_adamw(recipe):
         torch.testing.assert_close(ours, theirs, atol=1e-6, rtol=1e-4, msg=name)
 
 
-def test_a_loss_that_is_not_a_number_stops_the_run_and_keeps_the_weights(recipe):
+def test_a_nan_loss_stops_the_run_and_keeps_the_weights(recipe):
     batch = open_stream(recipe)(0, 2, 64)
     batch.transmission_encoded.fill_(float("nan"))
     trainer = CompactTrainer(recipe, lambda step, count, size: batch)

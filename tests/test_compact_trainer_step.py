@@ -1,4 +1,4 @@
-"""What one training step does to the weights: learning rates, schedule, clipping and the running average."""
+"""The effect of one training step on the weights: learning rates, schedule, clipping and the moving average."""
 
 from dataclasses import replace
 
@@ -15,8 +15,8 @@ from brewster.training.recipe import LoraRecipe
 from set_folders import make
 
 
-def far_from_the_truth(step, count, size):
-    """White photos of striped scenes, without a reflection: the gradient is long."""
+def hard_batch(step, count, size):
+    """White photos of striped scenes, without a reflection: the gradient is large."""
     white, black = torch.ones(count, 3, size, size), torch.zeros(count, 3, size, size)
     stripes = torch.arange(size).remainder(2).float().expand_as(white)
     return TrainingBatch(white, stripes, black, torch.ones(count))
@@ -24,11 +24,11 @@ def far_from_the_truth(step, count, size):
 
 @pytest.fixture
 def trainer(recipe):
-    """Builds the compact network's trainer: 64 px, no weight decay, no warm-up unless a test says otherwise."""
+    """Builds the compact network's trainer: by default 64 px, no weight decay, no warm-up."""
 
     def build(**changes):
         plain = {"steps": 100, "sizes": [(0.0, 64)], "weight_decay": 0.0, "warmup_steps": 1}
-        return CompactTrainer(recipe.model_copy(update=plain | changes), far_from_the_truth)
+        return CompactTrainer(recipe.model_copy(update=plain | changes), hard_batch)
 
     return build
 
@@ -41,10 +41,10 @@ def norm(gradients):
     return float(torch.cat([gradient.flatten() for gradient in gradients]).norm())
 
 
-def test_the_encoder_learns_at_its_own_rate(trainer):
-    """AdamW's first step moves a weight by the learning rate, whatever the gradient."""
+def test_the_encoder_has_its_own_learning_rate(trainer):
+    """The first step of AdamW changes a weight by the learning rate, independent of the gradient."""
     one = trainer(learning_rate=1e-3, encoder_learning_rate=1e-4)
-    torch.nn.init.normal_(one.network.head.weight, std=1e-3)  # zeros let no gradient through to the encoder
+    torch.nn.init.normal_(one.network.head.weight, std=1e-3)  # with zeros, the encoder gets no gradient
     before = copy_of(one.network)
     one.training_step(0)
     moved = {name: float((v - before[name]).abs().max()) for name, v in copy_of(one.network).items()}
@@ -67,7 +67,7 @@ def test_the_learning_rate_falls_along_a_cosine_over_the_last_share_of_the_run(
     assert rates == pytest.approx([1e-4 * share, 1e-3 * share], rel=0.01)
 
 
-def test_the_learning_rate_rises_evenly_while_it_warms_up(trainer):
+def test_the_learning_rate_rises_linearly_during_warm_up(trainer):
     one = trainer(learning_rate=1e-3, warmup_steps=4, decay_share=0.0)
     rates = []
     for step in range(5):
@@ -76,9 +76,9 @@ def test_the_learning_rate_rises_evenly_while_it_warms_up(trainer):
     assert rates == pytest.approx([0.25e-3, 0.5e-3, 0.75e-3, 1e-3, 1e-3])
 
 
-def test_a_long_gradient_is_shortened_to_length_one(trainer):
+def test_a_large_gradient_is_clipped_to_norm_one(trainer):
     one, seen = trainer(), []
-    batch = far_from_the_truth(0, 2, 64)
+    batch = hard_batch(0, 2, 64)
     loss = sum(separation_loss(one.network(batch.photo_encoded), batch).values())
     raw = torch.autograd.grad(loss, tuple(one.network.parameters()))
     assert norm(raw) > 1.5
@@ -89,18 +89,18 @@ def test_a_long_gradient_is_shortened_to_length_one(trainer):
     assert seen == [pytest.approx(1, rel=1e-3)]
 
 
-@pytest.mark.parametrize(("step", "kept"), [(0, 2 / 11), (99, 0.75)])
-def test_the_average_keeps_the_share_that_the_recipe_says_less_at_first(trainer, step, kept):
-    """After n steps it keeps (n + 1) / (n + 10) of itself, at most `average_decay`."""
+@pytest.mark.parametrize(("step", "decay"), [(0, 2 / 11), (99, 0.75)])
+def test_the_moving_average_has_the_decay_of_the_recipe_and_a_smaller_one_at_first(trainer, step, decay):
+    """After n steps the decay is (n + 1) / (n + 10), at most `average_decay`."""
     one = trainer(average_decay=0.75, decay_share=0.0, learning_rate=0.1, encoder_learning_rate=0.1)
     before = {name: value.clone() for name, value in one.average.items()}
     one.training_step(step)
     for name, new in copy_of(one.network).items():
-        expected = kept * before[name] + (1 - kept) * new
+        expected = decay * before[name] + (1 - decay) * new
         torch.testing.assert_close(one.average[name], expected, atol=1e-6, rtol=1e-6)
 
 
-def test_the_network_that_users_get_has_the_averaged_weights(trainer):
+def test_the_exported_network_has_the_averaged_weights(trainer):
     one = trainer(learning_rate=0.1, encoder_learning_rate=0.1)
     one.training_step(0)
     exported, trained = copy_of(one.averaged_network()), copy_of(one.network)
@@ -109,10 +109,10 @@ def test_the_network_that_users_get_has_the_averaged_weights(trainer):
 
 
 def test_the_loss_is_the_sum_of_its_parts(trainer):
-    told = trainer().training_step(0)
-    assert told["edges"] > 0
-    assert told["loss"] == pytest.approx(
-        sum(told[name] for name in ("transmission", "reflection", "edges", "psnr")), rel=1e-5
+    metrics = trainer().training_step(0)
+    assert metrics["edges"] > 0
+    assert metrics["loss"] == pytest.approx(
+        sum(metrics[name] for name in ("transmission", "reflection", "edges", "psnr")), rel=1e-5
     )
 
 
@@ -138,9 +138,9 @@ def lora(tmp_path):
 
 
 def logits(trainer, count=150):
-    """The times that it learns at, as log(t / (1 - t))."""
-    encoded = trainer._data(SampleRng(1, 0, 0))
-    times = [trainer._begun(SampleRng(2, number, 0), encoded)[1] for number in range(count)]
+    """The logits of the training times, log(t / (1 - t))."""
+    encoded = trainer._latents(SampleRng(1, 0, 0))
+    times = [trainer._start_and_sigma(SampleRng(2, number, 0), encoded)[1] for number in range(count)]
     return torch.cat(times).double().logit()
 
 
@@ -153,7 +153,7 @@ def test_training_times_are_logit_normal_with_the_recipes_mean_and_deviation(lor
     assert logits(one).mean().item() - usual.mean().item() == pytest.approx(0.7, abs=0.2)
 
 
-def test_a_loras_long_gradient_is_shortened_and_its_rate_warms_up(lora):
+def test_a_loras_large_gradient_is_clipped_and_its_learning_rate_warms_up(lora):
     one, seen = lora(panel_weights={"T": 1}), []
     for parameter in one._parameters:
         parameter.register_hook(lambda gradient: gradient * 1e4)
@@ -166,36 +166,36 @@ def test_a_loras_long_gradient_is_shortened_and_its_rate_warms_up(lora):
     assert rates == pytest.approx([0.25e-3, 0.5e-3, 0.75e-3, 1e-3, 1e-3])
 
 
-def test_who_knows_the_picture_has_no_loss(lora, monkeypatch):
-    """At time t a sample is (1 - t) picture + t noise, and the velocity asked for is noise - picture."""
+def test_the_exact_velocity_has_no_loss(lora, monkeypatch):
+    """At time t a sample is (1 - t) picture + t noise, and its velocity is noise - picture."""
     one = lora()
-    picture = one._data(SampleRng(1, 0, 0)).composite
+    picture = one._latents(SampleRng(1, 0, 0)).composite
 
-    def knowing(latents, condition, sigma, prompt, guidance):
+    def exact(latents, condition, sigma, prompt, guidance):
         return (latents - picture) / sigma
 
-    monkeypatch.setattr(one.backbone, "predict", knowing)
+    monkeypatch.setattr(one.backbone, "predict", exact)
     parts = one._losses(SampleRng(1, 0, 0))
     assert parts.keys() == {"panel_I", "panel_T", "panel_R"}
     assert max(float(part) for part in parts.values()) < 1e-6
 
 
-def test_a_reflection_counts_as_much_as_it_is_trusted(lora, monkeypatch):
+def test_the_loss_of_a_reflection_is_scaled_by_its_weight(lora, monkeypatch):
     one = lora()
-    encoded = one._data(SampleRng(1, 0, 0))
+    encoded = one._latents(SampleRng(1, 0, 0))
     parts = []
-    for trust in (1.0, 0.25):
-        monkeypatch.setattr(one, "_data", lambda rng, trust=trust: replace(encoded, trust=trust))
+    for weight in (1.0, 0.25):
+        monkeypatch.setattr(one, "_latents", lambda rng, weight=weight: replace(encoded, weight=weight))
         parts.append({name: part.item() for name, part in one._losses(SampleRng(1, 0, 0)).items()})
     whole, quarter = parts
     assert quarter["panel_R"] == pytest.approx(whole["panel_R"] / 4, rel=1e-5)
     assert quarter["panel_T"] == pytest.approx(whole["panel_T"], rel=1e-5)
 
 
-def test_the_gradients_of_earlier_steps_are_forgotten(lora):
+def test_the_gradients_of_earlier_steps_are_cleared(lora):
     one, seen = lora(learning_rate=1e-12), []
     for parameter in one._parameters:
-        parameter.register_hook(lambda gradient: gradient * 1e-4)  # too short to be clipped
+        parameter.register_hook(lambda gradient: gradient * 1e-4)  # too small to be clipped
     one._optimizer.register_step_pre_hook(lambda *_: seen.append(norm(p.grad for p in one._parameters)))
     one.training_step(0)
     one.training_step(0)

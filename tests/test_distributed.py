@@ -1,4 +1,4 @@
-"""Processes that learn as one: how many there are, what they add up, and launches that went wrong."""
+"""Data-parallel training: the process group, sums over processes, and incomplete launches."""
 
 import os
 import subprocess
@@ -11,18 +11,20 @@ import torch
 from brewster.errors import DeviceError
 from brewster.training import distributed
 
-LAUNCHED = {"RANK": "0", "LOCAL_RANK": "0", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29555"}
+LAUNCHER_VARIABLES = {"RANK": "0", "LOCAL_RANK": "0", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29555"}
 
 
 @pytest.fixture(autouse=True)
 def _not_launched(monkeypatch):
-    for name in ("WORLD_SIZE", "ACCELERATE_MIXED_PRECISION", *LAUNCHED):
+    for name in ("WORLD_SIZE", "ACCELERATE_MIXED_PRECISION", *LAUNCHER_VARIABLES):
         monkeypatch.delenv(name, raising=False)
 
 
 def python(code, *launcher, **variables):
-    """A program, maybe under a launcher: what it printed, what it said, and its exit code."""
-    here = {name: value for name, value in os.environ.items() if name not in {"WORLD_SIZE", *LAUNCHED}}
+    """Runs a program, with or without a launcher: stdout, stderr and exit code."""
+    here = {
+        name: value for name, value in os.environ.items() if name not in {"WORLD_SIZE", *LAUNCHER_VARIABLES}
+    }
     done = subprocess.run(
         [sys.executable, *launcher, *([] if launcher else ["-c"]), str(code)],
         env=here | {"OMP_NUM_THREADS": "1"} | variables,
@@ -34,7 +36,7 @@ def python(code, *launcher, **variables):
     return done.stdout, done.stderr, done.returncode
 
 
-def test_one_process_leads_itself_adds_up_nothing_and_needs_no_accelerate():
+def test_one_process_is_the_main_process_and_needs_no_accelerate():
     code = """
 import sys, torch
 sys.modules["accelerate"] = None
@@ -49,7 +51,7 @@ print(distributed.world_size(), distributed.rank(), distributed.is_main_process(
 
 @pytest.mark.slow
 @pytest.mark.skipif(torch.cuda.is_available(), reason="two processes would want two GPUs")
-def test_two_processes_know_each_other_and_add_up_each_tensor(tmp_path):
+def test_two_processes_have_ranks_and_sum_each_tensor(tmp_path):
     (tmp_path / "two.py").write_text(
         """
 import pathlib, torch
@@ -63,29 +65,31 @@ pathlib.Path(__file__).with_name(f"rank {distributed.rank()}").touch()
 """
     )
     torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
-    _, said, code = python(tmp_path / "two.py", *torchrun)
-    assert code == 0, said
+    _, stderr, code = python(tmp_path / "two.py", *torchrun)
+    assert code == 0, stderr
     assert sorted(path.name for path in tmp_path.glob("rank *")) == ["rank 0", "rank 1"]
 
 
-def test_a_world_that_nobody_launched_is_told_so(monkeypatch):
+def test_a_world_size_without_launcher_variables_is_refused(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
     with pytest.raises(DeviceError, match=r"WORLD_SIZE is 2, and RANK, .* not set; .*torchrun"):
         distributed.initialize()
 
 
-def test_processes_that_did_not_come_are_missed(monkeypatch):
-    accelerate.PartialState(cpu=True)  # as a library does that was imported before the processes have met
-    for name, value in (LAUNCHED | {"WORLD_SIZE": "2"}).items():
+def test_missing_processes_are_reported(monkeypatch):
+    accelerate.PartialState(cpu=True)  # as a library may do before initialize
+    for name, value in (LAUNCHER_VARIABLES | {"WORLD_SIZE": "2"}).items():
         monkeypatch.setenv(name, value)
-    with pytest.raises(DeviceError, match=r"1 processes have met; the 2 that WORLD_SIZE names; .*torchrun"):
+    with pytest.raises(
+        DeviceError, match=r"1 processes have joined; 2 processes, as WORLD_SIZE states; .*torchrun"
+    ):
         distributed.initialize()
     accelerate.PartialState._reset_state()
 
 
-def test_a_launcher_that_quietly_started_one_of_several_processes_is_caught(tmp_path):
+def test_a_launcher_that_started_only_one_of_several_processes_is_reported(tmp_path):
     (tmp_path / "one.py").write_text("from brewster.training import distributed\ndistributed.initialize()\n")
     launch = ["-m", "accelerate.commands.launch", "--cpu", "--num_processes", "2"]
-    _, said, code = python(tmp_path / "one.py", *launch)
+    _, stderr, code = python(tmp_path / "one.py", *launch)
     assert code == 1
-    assert "accelerate launch was asked for several processes and has started one" in said
+    assert "accelerate launch started one process instead of several" in stderr

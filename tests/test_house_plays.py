@@ -1,4 +1,4 @@
-"""The plays in runs/ do what they say: the tiny one from beginning to end, the large ones as far as a CPU can."""
+"""The scripts in runs/ work: the tiny one from beginning to end, the large ones as far as a CPU allows."""
 
 import json
 import os
@@ -68,7 +68,7 @@ def test_the_check_of_the_full_size_runs_on_toy_twins(tmp_path, monkeypatch, cap
     rows = json.loads((tmp_path / "full_size.json").read_text())["rows"]
     assert [(row["backbone"], row["quantise"]) for row in rows] == [("kontext", "int8"), ("klein", None)]
     assert all(row["step_s"] > 0 and row["picture_s"] > 0 and row["fits"] for row in rows)
-    assert told["measured or estimated"] == ["rehearsed on a toy twin"] * 2
+    assert told["measured or estimated"] == ["toy twin, not full size"] * 2
     assert cells((tmp_path / "full_size.md").read_text()) == told
 
 
@@ -77,7 +77,7 @@ def test_without_a_gpu_the_check_of_the_full_size_gives_estimates_and_says_so(tm
     told = cells(play("full_size_check.sh", OUT=str(tmp_path), CUDA_VISIBLE_DEVICES=""))
     assert all(kind.startswith("ESTIMATED") for kind in told["measured or estimated"])
     assert float(told["parameters, billions"][0]) == 11.9
-    assert all(float(peak) < 24 for peak in told["peak while learning, GiB"])
+    assert all(float(peak) < 24 for peak in told["peak during training, GiB"])
 
 
 def test_every_command_of_the_papers_play_is_one_that_brewster_takes(tmp_path):

@@ -1,4 +1,4 @@
-"""What a large backbone learns from: whole samples, composed and encoded once."""
+"""Training samples of a large backbone: panels, crops, encoding and the choice of samples."""
 
 import numpy as np
 import pytest
@@ -15,11 +15,11 @@ from brewster.training.data.mixtures import Pairs
 from brewster.training.data.sample_rng import SampleRng
 from brewster.training.lora.latents import (
     LatentEncoder,
-    cropped,
+    crop_sample,
+    fit_sample,
+    layers_from_pair,
+    make_panels,
     open_samples,
-    panel_for,
-    panels_in,
-    with_difference,
 )
 from brewster.training.recipe import LoraRecipe
 from set_folders import make
@@ -65,7 +65,7 @@ def recipe(root, monkeypatch):
 
 RENDERED = {"rendered": {"sets": ["set"], "target": "transmission"}}
 LARGE = {"pairs": ["large"], "pairs_share": 1.0}
-"""Three samples of twice the panel's side."""
+"""Three samples with twice the side of a panel."""
 
 
 def test_panels_are_the_whole_sample_in_its_own_aspect_ratio(recipe, root, backbone):
@@ -73,8 +73,8 @@ def test_panels_are_the_whole_sample_in_its_own_aspect_ratio(recipe, root, backb
     samples = open_samples(wanted)
     assert len(samples) == 3
     for number, entry in enumerate(read_set(root / "set")):
-        fit = panel_for(samples[number].layers, backbone, wanted)
-        panels = panels_in(samples[number].layers, fit)
+        fit = fit_sample(samples[number].layers, backbone, wanted)
+        panels = make_panels(samples[number].layers, fit)
         assert (fit.content, fit.panel) == ((24, 16), (32, 16))
         for letter, name in zip("ITR", ("photo", "transmission", "reflection"), strict=True):
             picture = torch.from_numpy(Photo.open(entry.read(f"{name}.jpg")).pixels.copy())
@@ -82,7 +82,7 @@ def test_panels_are_the_whole_sample_in_its_own_aspect_ratio(recipe, root, backb
             torch.testing.assert_close(whole, picture.float(), atol=0.01, rtol=0)
 
 
-def test_an_encoded_sample_depends_on_the_dice_alone_and_is_encoded_once(recipe, backbone, monkeypatch):
+def test_an_encoded_sample_depends_on_the_rng_alone_and_is_encoded_once(recipe, backbone, monkeypatch):
     wanted = recipe(RENDERED)
     one, other = (LatentEncoder(open_samples(wanted), backbone, wanted) for _ in range(2))
     for slot in range(4):
@@ -94,7 +94,7 @@ def test_an_encoded_sample_depends_on_the_dice_alone_and_is_encoded_once(recipe,
     assert {tuple(panel.shape[2:]) for panel in split(grid, wanted.layout).values()} == {(1, 2)}
 
 
-def test_mirrored_samples_are_seen_unless_the_recipe_forbids_it(recipe, backbone):
+def test_samples_are_mirrored_at_random_unless_the_recipe_disables_it(recipe, backbone):
     counts = []
     for flip in (True, False):
         wanted = recipe(RENDERED, flip=flip)
@@ -103,7 +103,7 @@ def test_mirrored_samples_are_seen_unless_the_recipe_forbids_it(recipe, backbone
     assert counts == [6, 3]
 
 
-def test_as_many_crops_of_each_sample_are_seen_as_the_recipe_says_beside_the_whole(recipe, backbone):
+def test_each_sample_has_the_whole_and_as_many_crops_as_the_recipe_states(recipe, backbone):
     for crops, seen in ((0, 6), (2, 18)):
         wanted = recipe(LARGE, crops=crops)
         latents = LatentEncoder(open_samples(wanted), backbone, wanted)
@@ -114,7 +114,7 @@ def test_as_many_crops_of_each_sample_are_seen_as_the_recipe_says_beside_the_who
         assert {each.composite.shape for each in encoded.values()} == {(1, 64, 1, 6)}
 
 
-def test_a_crop_depends_on_seed_sample_and_its_number_alone(recipe, backbone):
+def test_a_crop_depends_on_seed_sample_and_crop_number_alone(recipe, backbone):
     def encoded(number, crop, **changes):
         wanted = recipe(LARGE, crops=3, **changes)
         return LatentEncoder(open_samples(wanted), backbone, wanted)._encode(number, False, crop).composite
@@ -125,7 +125,7 @@ def test_a_crop_depends_on_seed_sample_and_its_number_alone(recipe, backbone):
 
 
 @given(st.integers(16, 300), st.integers(16, 300), st.integers(1, 99), st.integers(0, 99))
-def test_a_crop_is_a_window_of_the_samples_shape_and_never_smaller_than_it_is_shown(
+def test_a_crop_has_the_aspect_ratio_of_the_sample_and_is_never_smaller_than_the_panel(
     width, height, cells, seed
 ):
     layout = PanelLayout()
@@ -136,7 +136,7 @@ def test_a_crop_is_a_window_of_the_samples_shape_and_never_smaller_than_it_is_sh
         reject()
     numbers = torch.arange(height * width).reshape(height, width, 1)
     whole = torch.cat([numbers % 256, numbers // 256 % 256, numbers // 65536], dim=2).byte().repeat(1, 1, 3)
-    crop = cropped(SampleRng(seed, -1, 1), whole, fit)
+    crop = crop_sample(SampleRng(seed, -1, 1), whole, fit)
     rows, columns, _ = crop.shape
     assert max(fit.content[0], width // 2) <= columns <= width
     assert max(fit.content[1], height // 2) <= rows <= height
@@ -146,15 +146,15 @@ def test_a_crop_is_a_window_of_the_samples_shape_and_never_smaller_than_it_is_sh
     assert torch.equal(crop, whole[top : top + rows, left : left + columns])
 
 
-def test_real_pairs_come_as_often_as_their_share(recipe, root):
+def test_real_pairs_are_drawn_with_the_probability_pairs_share(recipe, root):
     samples = open_samples(recipe({**RENDERED, "pairs": ["trios"], "pairs_share": 0.25}))
     assert len(samples) == 4
-    chosen = [samples.choose(SampleRng(1, step, 0)) for step in range(200)]
+    chosen = [samples.draw_index(SampleRng(1, step, 0)) for step in range(200)]
     assert set(chosen) == {0, 1, 2, 3}
     assert 30 < chosen.count(3) < 70
 
 
-def test_what_has_no_share_is_not_read(recipe):
+def test_data_without_a_share_is_not_read(recipe):
     gone = {"sets": ["gone"]}
     assert len(open_samples(recipe({**RENDERED, "pairs": ["gone"], "pairs_share": 0.0}))) == 3
     assert len(open_samples(recipe({"rendered": gone, "pairs": ["trios"], "pairs_share": 1.0}))) == 1
@@ -162,20 +162,22 @@ def test_what_has_no_share_is_not_read(recipe):
 
 def test_pairs_without_reflections_are_refused_where_r_is_a_panel(recipe):
     pairs = {"pairs": ["pairs"], "pairs_share": 1.0}
-    with pytest.raises(RecipeError, match=r"pairs has no reflection for a \(1 such\); .*difference"):
+    with pytest.raises(
+        RecipeError, match=r"pairs has no reflection for a \(photos without one: 1\); .*difference"
+    ):
         open_samples(recipe(pairs))
     assert len(open_samples(recipe(pairs, panels=["I", "T"]))) == 1
     (sample,) = open_samples(recipe(pairs, reflections="difference"))
-    assert sample.trust == Pairs.reflection_weight < 1
+    assert sample.reflection_weight == Pairs.reflection_weight < 1
 
 
-def test_a_reflection_that_is_given_is_trusted_and_one_that_is_not_is_the_light_that_is_left(recipe):
+def test_a_given_reflection_has_weight_one_and_a_missing_one_is_the_difference_in_light(recipe):
     (given,) = open_samples(recipe({"pairs": ["trios"], "pairs_share": 1.0}))
-    assert given.trust == 1
+    assert given.reflection_weight == 1
     assert [given.layers[0, 0, channel].item() for channel in (0, 3, 6)] == [200, 130, 60]
     both = (torch.full((2, 2, 3), value, dtype=torch.uint8) for value in (188, 137))
-    left = with_difference(*both)[0, 0, 6].item()
-    assert left == 138  # of half the light, 188, a quarter, 137, is taken away
+    left = layers_from_pair(*both)[0, 0, 6].item()
+    assert left == 138  # in linear light: 188 is a half, 137 a quarter, and so is the difference
 
 
 def test_a_sample_that_is_smaller_than_a_panel_is_refused_with_the_budget_that_fits(recipe, backbone):
@@ -187,14 +189,14 @@ def test_a_sample_that_is_smaller_than_a_panel_is_refused_with_the_budget_that_f
         LatentEncoder(open_samples(pair), backbone, pair)
 
 
-def test_more_samples_than_there_are_are_refused(recipe):
-    with pytest.raises(RecipeError, match="3 rendered samples; the recipe learns from 9"):
+def test_too_few_rendered_samples_are_refused(recipe):
+    with pytest.raises(RecipeError, match="3 rendered samples; at least 9"):
         open_samples(recipe({"rendered": {"sets": ["set"], "count": 9}}))
 
 
 def test_crops_have_half_to_all_of_the_samples_sides():
     fit = fit_panel((300, 200), PanelLayout(), budget_px=3 * 48 * 32, multiple=16)
     whole = torch.zeros(200, 300, 9, dtype=torch.uint8)
-    shares = [cropped(SampleRng(seed, -1, 1), whole, fit).shape[0] / 200 for seed in range(200)]
+    shares = [crop_sample(SampleRng(seed, -1, 1), whole, fit).shape[0] / 200 for seed in range(200)]
     assert 0.5 <= min(shares) < 0.52
     assert 0.98 < max(shares) <= 1

@@ -18,7 +18,7 @@ from front_door import picture
 RECIPES = Path(__file__).parents[1] / "recipes"
 
 
-def silent(step, steps, numbers, logged):
+def silent(step, steps, metrics, logged):
     pass
 
 
@@ -26,22 +26,22 @@ class Killed(Exception):
     pass
 
 
-def die_after(last):
-    def report(step, steps, numbers, logged):
+def kill_after(last):
+    def report(step, steps, metrics, logged):
         if step == last:
             raise Killed
 
     return report
 
 
-class Counting:
-    """The least that can learn: it counts its steps."""
+class CountingTrainer:
+    """A minimal trainer that records its steps."""
 
     def __init__(self, recipe):
-        self.recipe, self.steps, self.begun = recipe, [], False
+        self.recipe, self.steps, self.initialized = recipe, [], False
 
     def initialize(self):
-        self.begun = True
+        self.initialized = True
 
     def training_step(self, step):
         self.steps.append(step)
@@ -61,7 +61,7 @@ class Counting:
 
 
 def checkpoint(recipe):
-    """The state that a run begins with."""
+    """The initial checkpoint of a run."""
     return Checkpoint(0, recipe.model_dump_json(), CompactTrainer(recipe).state_dict())
 
 
@@ -69,55 +69,55 @@ def logged_steps(out):
     return [json.loads(line)["step"] for line in (out / "log.jsonl").read_text().splitlines()]
 
 
-def test_the_loop_knows_no_network(recipe, tmp_path):
-    told, trainer = [], Counting(recipe)
-    run(trainer, tmp_path, lambda step, steps, numbers, logged: told.append((step, steps, logged)))
-    assert trainer.begun
+def test_the_loop_runs_any_trainer(recipe, tmp_path):
+    calls, trainer = [], CountingTrainer(recipe)
+    run(trainer, tmp_path, lambda step, steps, metrics, logged: calls.append((step, steps, logged)))
+    assert trainer.initialized
     assert trainer.steps == list(range(6))
-    assert told == [(step, 6, step in {3, 6}) for step in range(1, 7)]
+    assert calls == [(step, 6, step in {3, 6}) for step in range(1, 7)]
     assert json.loads((tmp_path / "log.jsonl").read_text().splitlines()[0]).keys() == {
         "step", "loss", "gain", "seconds",
     }  # fmt: skip
-    again = Counting(recipe)
+    again = CountingTrainer(recipe)
     run(again, tmp_path, silent)
-    assert not again.begun
+    assert not again.initialized
     assert again.steps == trainer.steps
 
 
-def test_tensorboard_is_told_what_the_log_is_told(recipe, tmp_path):
-    run(Counting(recipe), tmp_path, silent)
+def test_tensorboard_gets_the_values_of_the_log(recipe, tmp_path):
+    run(CountingTrainer(recipe), tmp_path, silent)
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     events = EventAccumulator(str(tmp_path)).Reload()
     assert set(events.Tags()["scalars"]) == lines[0].keys() - {"step"}
     for name in ("loss", "gain"):
-        told = [(event.step, event.value) for event in events.Scalars(name)]
-        assert told == [(line["step"], pytest.approx(line[name], abs=1e-5)) for line in lines]
+        logged = [(event.step, event.value) for event in events.Scalars(name)]
+        assert logged == [(line["step"], pytest.approx(line[name], abs=1e-5)) for line in lines]
     assert [event.step for event in events.Images("samples")] == [3, 6]
-    run(Counting(recipe), tmp_path, silent)
+    run(CountingTrainer(recipe), tmp_path, silent)
     assert len(list(tmp_path.glob("events.out.tfevents.*"))) == 1
 
 
-def test_a_killed_run_ends_with_the_same_weights_to_the_last_bit(recipe, tmp_path):
+def test_a_killed_and_resumed_run_ends_with_bit_identical_weights(recipe, tmp_path):
     undisturbed = train(recipe, tmp_path / "one", silent)
     with pytest.raises(Killed):
-        train(recipe, tmp_path / "two", die_after(5))
+        train(recipe, tmp_path / "two", kill_after(5))
     resumed = train(recipe, tmp_path / "two", silent)
     for name, value in undisturbed.state_dict().items():
         assert torch.equal(value, resumed.state_dict()[name]), name
 
 
-def test_a_killed_run_on_rendered_samples_does_so_too(rendered, tmp_path):
+def test_a_killed_run_on_rendered_samples_ends_with_bit_identical_weights(rendered, tmp_path):
     undisturbed = train(rendered, tmp_path / "one", silent)
     with pytest.raises(Killed):
-        train(rendered, tmp_path / "two", die_after(3))
+        train(rendered, tmp_path / "two", kill_after(3))
     resumed = train(rendered, tmp_path / "two", silent)
     for name, value in undisturbed.state_dict().items():
         assert torch.equal(value, resumed.state_dict()[name]), name
 
 
-def test_a_run_goes_on_though_recipes_have_learnt_new_words_since(recipe, tmp_path):
+def test_a_run_resumes_after_a_key_was_added_to_the_recipe_schema(recipe, tmp_path):
     with pytest.raises(Killed):
-        train(recipe, tmp_path, die_after(5))
+        train(recipe, tmp_path, kill_after(5))
     saved = Checkpoint.read(tmp_path / "checkpoint.pt")
     old = json.loads(saved.recipe)
     del old["data"]["rendered"]
@@ -126,14 +126,14 @@ def test_a_run_goes_on_though_recipes_have_learnt_new_words_since(recipe, tmp_pa
     assert logged_steps(tmp_path) == [3, 6]
 
 
-def test_a_run_of_a_recipe_that_nobody_understands_is_not_continued(recipe, tmp_path):
+def test_a_run_with_an_invalid_stored_recipe_is_not_resumed(recipe, tmp_path):
     fresh = checkpoint(recipe)
     replace(fresh, recipe='{"sparkle": 1}').write(tmp_path / "checkpoint.pt")
     with pytest.raises(RecipeError, match="another recipe"):
         train(recipe, tmp_path, silent)
 
 
-def test_folders_of_one_last_name_are_told_apart(recipe, tmp_path):
+def test_folders_with_equal_last_names_have_unique_log_keys(recipe, tmp_path):
     for place in ("one/real", "two/real"):
         for layer in ("blended", "transmission"):
             folder = tmp_path / "data" / place / layer
@@ -148,13 +148,13 @@ def test_folders_of_one_last_name_are_told_apart(recipe, tmp_path):
     }
 
 
-def test_a_run_leaves_a_log_and_sample_pictures(recipe, tmp_path):
+def test_a_run_writes_a_log_and_sample_pictures(recipe, tmp_path):
     train(recipe, tmp_path / "run", silent)
     assert logged_steps(tmp_path / "run") == [3, 6]
     assert Photo.open(tmp_path / "run" / "samples.png").size[0] == 960
 
 
-def test_a_run_of_another_recipe_is_not_continued(recipe, tmp_path):
+def test_a_run_of_another_recipe_is_not_resumed(recipe, tmp_path):
     train(recipe.model_copy(update={"steps": 1, "learning_rate": 1e-4}), tmp_path, silent)
     with pytest.raises(RecipeError, match="another recipe"):
         train(recipe, tmp_path, silent)
@@ -169,45 +169,45 @@ def test_a_run_can_be_made_longer(recipe, tmp_path):
 def test_a_resumed_run_logs_every_step_once(recipe, tmp_path):
     often = recipe.model_copy(update={"steps": 4, "report_every": 1, "checkpoint_every": 2})
     with pytest.raises(Killed):
-        train(often, tmp_path, die_after(3))
+        train(often, tmp_path, kill_after(3))
     with (tmp_path / "log.jsonl").open("a") as log:
         log.write('{"step": 4, "lo')
     train(often, tmp_path, silent)
     assert logged_steps(tmp_path) == [1, 2, 3, 4]
 
 
-def test_a_run_resumes_when_the_checkpoint_that_it_started_from_has_moved_away(recipe, tmp_path):
+def test_a_run_resumes_when_the_checkpoint_that_it_started_from_is_missing(recipe, tmp_path):
     start = tmp_path / "start.pt"
     checkpoint(recipe).write(start)
     with pytest.raises(Killed):
-        train(recipe.model_copy(update={"start_from": (start,)}), tmp_path / "run", die_after(5))
+        train(recipe.model_copy(update={"start_from": (start,)}), tmp_path / "run", kill_after(5))
     start.unlink()
     train(recipe.model_copy(update={"start_from": (Path("elsewhere.pt"),)}), tmp_path / "run", silent)
     assert logged_steps(tmp_path / "run") == [3, 6]
 
 
-def test_a_checkpoint_to_start_from_that_is_missing_is_named_with_its_cure(recipe, tmp_path):
-    with pytest.raises(ModelError, match=r"gone\.pt cannot be read .* mend start_from"):
+def test_a_missing_checkpoint_in_start_from_is_named_with_its_cure(recipe, tmp_path):
+    with pytest.raises(ModelError, match=r"gone\.pt cannot be read .* correct start_from"):
         train(recipe.model_copy(update={"start_from": (tmp_path / "gone.pt",)}), tmp_path / "run", silent)
 
 
-def test_a_checkpoint_is_written_every_so_many_steps_and_at_the_end(recipe, tmp_path):
+def test_a_checkpoint_is_written_every_checkpoint_every_steps_and_at_the_end(recipe, tmp_path):
     path, steps = tmp_path / "checkpoint.pt", []
 
-    def look(step, steps_in_all, numbers, logged):
+    def record(step, total, metrics, logged):
         steps.append(Checkpoint.read(path).step if path.exists() else 0)
 
-    run(Counting(recipe.model_copy(update={"steps": 5, "checkpoint_every": 2})), tmp_path, look)
+    run(CountingTrainer(recipe.model_copy(update={"steps": 5, "checkpoint_every": 2})), tmp_path, record)
     assert steps == [0, 2, 2, 4, 5]
 
 
 def test_a_checkpoint_of_another_network_is_named(recipe, tmp_path):
     other = replace(checkpoint(recipe), state={"network": {}, "average": {}})
     other.write(tmp_path / "checkpoint.pt")
-    with pytest.raises(ModelError, match=r"checkpoint\.pt holds another network; .* with -o"):
+    with pytest.raises(ModelError, match=r"checkpoint\.pt contains another network; .* with -o"):
         train(recipe, tmp_path, silent)
     started = recipe.model_copy(update={"start_from": (tmp_path / "checkpoint.pt",)})
-    with pytest.raises(ModelError, match=r"checkpoint\.pt holds another network; .* mend start_from"):
+    with pytest.raises(ModelError, match=r"checkpoint\.pt contains another network; .* correct start_from"):
         train(started, tmp_path / "run", silent)
 
 
@@ -217,7 +217,7 @@ def test_a_damaged_checkpoint_is_named(tmp_path):
         Checkpoint.read(tmp_path / "checkpoint.pt")
 
 
-def test_a_photo_is_read_under_every_suffix_that_the_house_knows(tmp_path):
+def test_a_photo_is_read_with_every_known_suffix(tmp_path):
     for name in ("a.jpg", "b.JFIF", "c.txt"):
         (tmp_path / name).write_bytes(picture())
     assert len(read_photos([tmp_path])) == 2

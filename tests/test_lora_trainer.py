@@ -1,4 +1,4 @@
-"""LoRAs learnt on toy twins: what a run keeps, what it leaves, and what stops it."""
+"""Training of LoRAs on toy twins: checkpoints, exported files, and errors."""
 
 import json
 import os
@@ -43,28 +43,28 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def recipe(folder, monkeypatch):
-    monkeypatch.setattr(module, "_SHOWN", 1)
+    monkeypatch.setattr(module, "_VALIDATION_SAMPLES", 1)
     return lambda **changes: LoraRecipe.model_validate(
         RECIPE | {"data": {"rendered": {"sets": [folder], "target": "transmission"}}} | changes
     )
 
 
 @pytest.fixture
-def begun(recipe):
-    def begin(**changes):
+def initialized(recipe):
+    def initialize(**changes):
         trainer = LoraTrainer(recipe(**changes))
         trainer.initialize()
         return trainer
 
-    return begin
+    return initialize
 
 
 class Killed(Exception):
     pass
 
 
-def die_after(last):
-    def report(step, steps, numbers, logged):
+def kill_after(last):
+    def report(step, steps, metrics, logged):
         if step == last:
             raise Killed
 
@@ -73,7 +73,7 @@ def die_after(last):
 
 def train(recipe, out, last=None):
     trainer = open_trainer(recipe)
-    run(trainer, out, die_after(last))
+    run(trainer, out, kill_after(last))
     return trainer
 
 
@@ -81,7 +81,7 @@ def photo(width=48, height=32):
     return torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(3)) * 2 - 1
 
 
-def test_a_killed_run_ends_with_the_same_lora_to_the_last_bit(recipe, folder, tmp_path):
+def test_a_killed_and_resumed_run_ends_with_a_bit_identical_lora(recipe, folder, tmp_path):
     pairs = tmp_path / "pairs"
     for role in ("blended", "transmission", "reflection"):
         (pairs / role).mkdir(parents=True)
@@ -100,7 +100,7 @@ def test_a_killed_run_ends_with_the_same_lora_to_the_last_bit(recipe, folder, tm
         assert all(torch.equal(value, moments[1][index][name]) for name, value in values.items())
 
 
-def test_a_run_leaves_a_log_pictures_and_a_folder_for_stock_diffusers(recipe, tmp_path):
+def test_a_run_writes_a_log_pictures_and_a_folder_for_diffusers(recipe, tmp_path):
     place = train(recipe(), tmp_path).export(tmp_path)
     assert {path.name for path in place.iterdir()} == {
         LORA_FILE, "prompt.safetensors", "recipe.json", "README.md",
@@ -113,25 +113,27 @@ def test_a_run_leaves_a_log_pictures_and_a_folder_for_stock_diffusers(recipe, tm
     assert Photo.open(tmp_path / "samples.png").size == (6 * 240, 160)
 
 
-def test_a_checkpoint_holds_the_lora_and_nothing_of_its_base(begun):
-    state = begun().state_dict()
+def test_a_checkpoint_contains_the_lora_and_no_weights_of_the_base(initialized):
+    state = initialized().state_dict()
     assert state.keys() == {"lora", "optimizer", "prompt"}
     assert all("lora_" in name and tensor.dtype == torch.float32 for name, tensor in state["lora"].items())
 
 
 @pytest.mark.parametrize("backbone", ["kontext", "klein", "qwen"])
 @pytest.mark.parametrize("objective", ["flow", "one_step"])
-def test_learning_lowers_the_loss_of_a_step_taken_again_and_again(begun, backbone, objective):
-    trainer = begun(backbone=f"tiny:{backbone}", objective=objective, batch=1, rank=4, learning_rate=5e-2)
+def test_training_lowers_the_loss_of_a_repeated_step(initialized, backbone, objective):
+    trainer = initialized(
+        backbone=f"tiny:{backbone}", objective=objective, batch=1, rank=4, learning_rate=5e-2
+    )
     losses = [trainer.training_step(0)["loss"] for _ in range(15)]
     assert losses[-1] < 0.9 * losses[0]
 
 
-def test_the_exported_lora_makes_the_same_picture_in_another_backbone(begun, tmp_path):
-    trainer = begun(warmup_steps=1)
+def test_the_exported_lora_generates_the_same_picture_in_another_backbone(initialized, tmp_path):
+    trainer = initialized(warmup_steps=1)
     for step in range(3):
         trainer.training_step(step)
-    made = trainer.separate(photo())
+    panels = trainer.separate(photo())
     backbone, _ = tiny("kontext")
     shown = conditioning_image(photo(), trainer.recipe.layout)
     plain = split(sample(backbone, shown, trainer.prompt, size=(144, 32)), trainer.recipe.layout)
@@ -139,39 +141,39 @@ def test_the_exported_lora_makes_the_same_picture_in_another_backbone(begun, tmp
     again = split(
         sample(backbone, shown, prompt, size=(144, 32), steps=STEPS, guidance=GUIDANCE), card.task.layout
     )
-    assert made.keys() == again.keys() == {"I", "T", "R"}
-    for name, panel in made.items():
+    assert panels.keys() == again.keys() == {"I", "T", "R"}
+    for name, panel in panels.items():
         torch.testing.assert_close(again[name], panel, atol=1e-5, rtol=0)
         assert not torch.allclose(plain[name], panel, atol=1e-3)
 
 
-def test_one_step_goes_from_the_photo_in_every_panel_to_what_it_lacks(begun):
-    trainer = begun(objective="one_step", panels=["T", "R"])
-    see, prompt = trainer.backbone.encode, trainer.prompt
-    start = see(torch.cat([photo(), photo()], dim=3))
+def test_one_step_starts_from_the_photo_in_every_panel_and_subtracts_the_velocity(initialized):
+    trainer = initialized(objective="one_step", panels=["T", "R"])
+    encode, prompt = trainer.backbone.encode, trainer.prompt
+    start = encode(torch.cat([photo(), photo()], dim=3))
     with torch.no_grad():
-        lack = trainer.backbone.predict(start, see(photo()), torch.ones(1), prompt, 1.0)
-        expected = trainer.backbone.decode(start - lack).clamp(-1, 1)
-    made = trainer.separate(photo())
-    torch.testing.assert_close(torch.cat([made["T"], made["R"]], dim=3), expected)
+        velocity = trainer.backbone.predict(start, encode(photo()), torch.ones(1), prompt, 1.0)
+        expected = trainer.backbone.decode(start - velocity).clamp(-1, 1)
+    panels = trainer.separate(photo())
+    torch.testing.assert_close(torch.cat([panels["T"], panels["R"]], dim=3), expected)
 
 
-def test_small_pictures_to_validate_on_are_seen_in_small_panels(begun, tmp_path, monkeypatch):
+def test_small_validation_pictures_get_small_panels(initialized, tmp_path, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
     for role in ("blended", "transmission"):
         (tmp_path / "small" / role).mkdir(parents=True)
         Photo.from_array(np.full((16, 16, 3), 99, np.uint8), encoding="srgb").save(
             tmp_path / "small" / role / "a.png"
         )
-    trainer = begun()
+    trainer = initialized()
     data = trainer.recipe.data.model_copy(update={"validate_on": (Path("small"),)})
-    scores, picture = begun(data=data, panels=["T", "R"], budget_px=2 * 32 * 16).validate()
+    scores, picture = initialized(data=data, panels=["T", "R"], budget_px=2 * 32 * 16).validate()
     assert scores.keys() == {"gain_db_small"}
     assert picture.shape == (160, 5 * 240, 3)
 
 
-def test_a_panel_that_does_not_count_has_no_loss_and_the_others_share_its_weight(begun):
-    equal, uneven = begun(), begun(panel_weights={"I": 0, "T": 3, "R": 1})
+def test_a_panel_of_weight_zero_has_no_loss_and_the_others_share_its_weight(initialized):
+    equal, uneven = initialized(), initialized(panel_weights={"I": 0, "T": 3, "R": 1})
     before, after = equal.training_step(0), uneven.training_step(0)
     assert after["panel_I"] == 0
     assert after["panel_T"] == pytest.approx(before["panel_T"] * 3 * 3 / 4)
@@ -179,8 +181,8 @@ def test_a_panel_that_does_not_count_has_no_loss_and_the_others_share_its_weight
     assert after["loss"] == pytest.approx(after["panel_T"] + after["panel_R"])
 
 
-def test_a_batch_is_the_mean_of_its_samples(begun):
-    trainer = begun(batch=2)
+def test_the_loss_of_a_batch_is_the_mean_of_its_samples(initialized):
+    trainer = initialized(batch=2)
     alone = [trainer._losses(SampleRng(1, 0, slot)) for slot in range(2)]
     expected = sum(part.item() for parts in alone for part in parts.values()) / 2
     assert trainer.training_step(0)["loss"] == pytest.approx(expected)
@@ -191,7 +193,7 @@ ACCELERATE = ["accelerate.commands.launch", "--multi_gpu", "--num_processes", "2
 
 
 def as_two(launcher, path, out):
-    """The command line under a launcher: its exit code and what it said."""
+    """Runs the command line under a launcher: exit code and stderr."""
     done = subprocess.run(
         [sys.executable, "-m", *launcher, "-m", "brewster", "train", str(path), "-o", str(out)],
         env=os.environ | {"OMP_NUM_THREADS": "1"},
@@ -205,11 +207,11 @@ def as_two(launcher, path, out):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", [TORCHRUN, ACCELERATE], ids=["torchrun", "accelerate launch"])
-def test_two_processes_learn_what_one_learns_from_the_whole_batch(recipe, tmp_path, launcher):
+def test_two_processes_train_the_lora_of_one_process_with_the_whole_batch(recipe, tmp_path, launcher):
     (tmp_path / "recipe.toml").write_text(tomli_w.dumps(recipe().model_dump(mode="json", exclude_none=True)))
-    code, told = as_two(launcher, tmp_path / "recipe.toml", tmp_path / "two")
-    assert code == 0, told
-    assert told.count("step 6 of 6") == 1
+    code, stderr = as_two(launcher, tmp_path / "recipe.toml", tmp_path / "two")
+    assert code == 0, stderr
+    assert stderr.count("step 6 of 6") == 1
     alone = train(recipe(), tmp_path / "one").export(tmp_path / "one")
     ends = [read_tensors(place / LORA_FILE)[0] for place in (alone, tmp_path / "two" / "lora")]
     for name, tensor in ends[0].items():
@@ -220,13 +222,13 @@ def test_two_processes_learn_what_one_learns_from_the_whole_batch(recipe, tmp_pa
 
 def test_a_batch_that_cannot_be_divided_is_refused(recipe, monkeypatch):
     monkeypatch.setattr(distributed, "world_size", lambda: 2)
-    with pytest.raises(RecipeError, match=r"batch = 1 is to be divided among 2 processes; .*; raise batch"):
+    with pytest.raises(
+        RecipeError, match=r"batch = 1 cannot be divided equally among 2 processes; .*; raise batch"
+    ):
         LoraTrainer(recipe(batch=1))
 
 
-def test_a_loss_that_is_not_a_number_stops_the_run_and_keeps_the_last_good_checkpoint(
-    recipe, tmp_path, monkeypatch
-):
+def test_a_nan_loss_stops_the_run_and_keeps_the_last_valid_checkpoint(recipe, tmp_path, monkeypatch):
     losses = LoraTrainer._losses
     monkeypatch.setattr(
         LoraTrainer,
@@ -238,7 +240,7 @@ def test_a_loss_that_is_not_a_number_stops_the_run_and_keeps_the_last_good_check
     trainer = open_trainer(recipe())
     trainer.broken = False
 
-    def break_after_2(step, steps, numbers, logged):
+    def break_after_2(step, steps, metrics, logged):
         trainer.broken = step == 2
 
     with pytest.raises(ModelError, match="the loss is nan at step 2; a finite loss; resume from the last"):
@@ -249,8 +251,8 @@ def test_a_loss_that_is_not_a_number_stops_the_run_and_keeps_the_last_good_check
         assert torch.equal(tensor, saved.state["lora"][name])
 
 
-def test_a_gradient_that_is_not_a_number_leaves_the_lora_as_it_was(begun):
-    trainer = begun()
+def test_an_infinite_gradient_does_not_change_the_lora(initialized):
+    trainer = initialized()
     before = {name: tensor.clone() for name, tensor in lora_state(trainer.backbone).items()}
     trainer._parameters[0].register_hook(lambda gradient: gradient * float("inf"))
     with pytest.raises(ModelError, match=r"the gradient is (inf|nan) at step 0"):
@@ -258,7 +260,7 @@ def test_a_gradient_that_is_not_a_number_leaves_the_lora_as_it_was(begun):
     assert all(torch.equal(tensor, before[name]) for name, tensor in lora_state(trainer.backbone).items())
 
 
-def test_a_prompt_that_is_named_is_used_if_it_is_this_backbones(recipe, tmp_path):
+def test_an_encoded_prompt_is_used_if_it_was_encoded_for_this_backbone(recipe, tmp_path):
     for name in ("kontext", "klein"):
         tiny(name, seed=5)[1].save(tmp_path / f"{name}.safetensors")
     trainer = LoraTrainer(recipe(prompt=str(tmp_path / "kontext.safetensors")))
@@ -269,7 +271,7 @@ def test_a_prompt_that_is_named_is_used_if_it_is_this_backbones(recipe, tmp_path
 
 
 @pytest.mark.parametrize("quantise", [None, "int8"])
-def test_a_backbone_in_a_folder_learns_the_same_way_quantised_or_not(recipe, tmp_path, quantise):
+def test_a_backbone_in_a_folder_trains_like_its_twin_quantised_or_not(recipe, tmp_path, quantise):
     backbone, prompt = tiny("kontext")
     backbone.save(tmp_path / "base")
     prompt.save(tmp_path / "prompt.safetensors")
@@ -289,7 +291,7 @@ def test_a_backbone_in_a_folder_learns_the_same_way_quantised_or_not(recipe, tmp
     assert any(tensor.any() for name, tensor in changed.items() if "lora_B" in name)
 
 
-def test_a_twin_of_nothing_is_named():
+def test_a_twin_of_an_unknown_backbone_is_refused():
     data = {"data": {"pairs": ["x"], "pairs_share": 0.0, "rendered": {"sets": ["x"], "count": 0}}}
     with pytest.raises(ModelError, match="there is no backbone 'contekst'"):
         LoraTrainer(LoraRecipe.model_validate(RECIPE | data | {"backbone": "tiny:contekst"}))

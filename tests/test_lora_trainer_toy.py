@@ -1,4 +1,4 @@
-"""Learning that is seen to be learning: toys behind glass that no twin has met before."""
+"""Training improves results on unseen data: toy scenes behind glass that differ from those of pretraining."""
 
 import pytest
 import torch
@@ -9,17 +9,17 @@ from brewster.training.trainers import open_trainer
 from toy_world import SIDE_PX, STRONG, pretrain, psnr, scenes, write_pairs
 
 
-def answers(trainer, photos):
-    """T of each photo."""
+def transmissions(trainer, photos):
+    """The generated T of each photo."""
     return torch.cat([trainer.separate(photo[None])["T"] for photo in photos])
 
 
 def scores(tmp_path, name, *, vae_steps, pretraining, steps, held=96):
-    """PSNR of T in dB on toys that were not learnt from: of the photo itself, of the mean T of those that were, of the
-    base, and with the LoRA."""
+    """PSNR of T in dB on unseen toy scenes, for four predictions: the photo ("copy"), the mean T of the training scenes
+    ("mean"), the base, and the base with the LoRA."""
     prompt = pretrain(name, tmp_path / "base", vae_steps=vae_steps, steps=pretraining)
-    learnt, unseen = scenes(2, 64, "blob", STRONG), scenes(3, held, "blob", STRONG)
-    write_pairs(tmp_path / "pairs", learnt)
+    training, unseen = scenes(2, 64, "blob", STRONG), scenes(3, held, "blob", STRONG)
+    write_pairs(tmp_path / "pairs", training)
     recipe = LoraRecipe.model_validate({
         "backbone": str(tmp_path / "base"), "prompt": str(prompt), "objective": "one_step", "seed": 1,
         "flip": False, "rank": 16, "alpha": 16, "budget_px": 3 * SIDE_PX**2, "steps": steps, "batch": 2,
@@ -29,22 +29,22 @@ def scores(tmp_path, name, *, vae_steps, pretraining, steps, held=96):
     })  # fmt: skip
     trainer = open_trainer(recipe)
     trainer.initialize()
-    made = {"copy": unseen["I"], "mean": learnt["T"].mean(0).expand_as(unseen["T"])}
-    made["base"] = answers(trainer, unseen["I"])
+    predictions = {"copy": unseen["I"], "mean": training["T"].mean(0).expand_as(unseen["T"])}
+    predictions["base"] = transmissions(trainer, unseen["I"])
     run(trainer, tmp_path / "run", lambda *_: None)
-    made["LoRA"] = answers(trainer, unseen["I"])
-    return {key: psnr(pictures, unseen["T"]) for key, pictures in made.items()}
+    predictions["LoRA"] = transmissions(trainer, unseen["I"])
+    return {key: psnr(pictures, unseen["T"]) for key, pictures in predictions.items()}
 
 
-def test_a_lora_brings_a_pretrained_twin_nearer_to_toys_that_it_has_not_seen(tmp_path):
-    """After a minute; how much better than copying the photo that is, the slow test below says."""
+def test_a_lora_improves_a_pretrained_twin_on_unseen_toys(tmp_path):
+    """A minute of training. The slow test below compares the LoRA with copying the photo."""
     found = scores(tmp_path, "kontext", vae_steps=110, pretraining=100, steps=60)
     assert found["LoRA"] > found["base"] + 0.1, found
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["kontext", "klein", "qwen"])
-def test_longer_training_beats_the_mean_of_what_was_learnt_in_every_family(tmp_path, name, capsys):
+def test_longer_training_beats_the_mean_of_the_training_scenes_in_every_family(tmp_path, name, capsys):
     found = scores(tmp_path, name, vae_steps=400, pretraining=400, steps=200)
     with capsys.disabled():
         print(f"\n{name}: " + ", ".join(f"{key} {value:.2f} dB" for key, value in found.items()))

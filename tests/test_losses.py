@@ -1,4 +1,4 @@
-"""The loss, part by part, against numbers worked out by hand."""
+"""The parts of the loss, compared with values computed by hand."""
 
 import math
 
@@ -7,18 +7,18 @@ import torch
 
 from brewster.errors import ModelError
 from brewster.training.data.mixtures import TrainingBatch
-from brewster.training.losses import finite, gain_db, separation_loss, tone
+from brewster.training.losses import check_finite, psnr_gain_db, separation_loss, tone_ratio
 
 
-def truth(level=0.4, trust=1.0):
+def truth(level=0.4, weight=1.0):
     """Two samples of 32 px: photo, transmission and reflection of one grey."""
     grey = torch.full((2, 3, 32, 32), level)
-    return TrainingBatch(grey, grey, grey, torch.full((2,), trust))
+    return TrainingBatch(grey, grey, grey, torch.full((2,), weight))
 
 
-def loss_of(transmission_error=0.0, reflection_error=0.0, *, trust=1.0):
-    """The parts of the loss of an answer that is wrong by so much."""
-    batch = truth(trust=trust)
+def loss_of(transmission_error=0.0, reflection_error=0.0, *, weight=1.0):
+    """The parts of the loss of a prediction with constant errors."""
+    batch = truth(weight=weight)
     zero = torch.zeros_like(batch.photo_encoded)
     layers = [batch.transmission_encoded + transmission_error, batch.reflection_encoded + reflection_error]
     parts = separation_loss(torch.cat([layer + zero for layer in layers], dim=1), batch)
@@ -32,14 +32,14 @@ def test_an_even_error_counts_once_at_each_of_three_scales():
     assert parts["reflection"] == 0
 
 
-def test_a_reflection_counts_three_tenths_of_a_transmission_that_is_as_wrong():
+def test_a_reflection_counts_three_tenths_of_a_transmission_with_the_same_error():
     parts = loss_of(reflection_error=0.1)
     assert parts["reflection"] == pytest.approx(0.3 * 3 * 0.1, rel=1e-5)
     assert parts["transmission"] == parts["edges"] == 0
 
 
-def test_a_reflection_counts_as_much_as_its_truth_is_trusted():
-    assert loss_of(reflection_error=0.1, trust=0.5)["reflection"] == pytest.approx(0.3 * 3 * 0.05, rel=1e-5)
+def test_the_loss_of_a_reflection_is_scaled_by_its_weight():
+    assert loss_of(reflection_error=0.1, weight=0.5)["reflection"] == pytest.approx(0.3 * 3 * 0.05, rel=1e-5)
 
 
 def test_fine_stripes_count_at_the_finest_scale_only_and_as_edges():
@@ -59,24 +59,24 @@ def test_the_loss_has_four_parts():
     assert loss_of().keys() == {"transmission", "reflection", "edges", "psnr"}
 
 
-def test_a_tenth_of_the_error_is_twenty_decibels_gained():
+def test_a_tenth_of_the_error_is_a_gain_of_twenty_decibels():
     wanted = torch.full((1, 3, 8, 8), 0.5)
-    assert gain_db(wanted + 0.02, wanted + 0.2, wanted) == pytest.approx(20, abs=1e-3)
-    assert gain_db(wanted + 0.2, wanted + 0.02, wanted) == pytest.approx(-20, abs=1e-3)
+    assert psnr_gain_db(wanted + 0.02, wanted + 0.2, wanted) == pytest.approx(20, abs=1e-3)
+    assert psnr_gain_db(wanted + 0.2, wanted + 0.02, wanted) == pytest.approx(-20, abs=1e-3)
 
 
-def test_tone_is_the_light_kept_where_nothing_was_added():
-    """A white spot was added to one corner; elsewhere the answer has half of the photo's light."""
+def test_tone_is_the_ratio_of_light_where_the_glass_added_none():
+    """A white spot was added to one corner; elsewhere the prediction has half of the photo's light."""
     wanted = torch.full((1, 3, 8, 8), 0.5)
-    photo, answer = wanted.clone(), torch.full_like(wanted, 0.3611)  # half the linear light of 0.5
+    photo, prediction = wanted.clone(), torch.full_like(wanted, 0.3611)  # half the linear light of 0.5
     photo[..., :2, :2] = 1
-    answer[..., :2, :2] = 1
-    assert tone(answer, photo, wanted) == pytest.approx(0.5, abs=1e-3)
-    assert tone(answer, torch.ones_like(wanted), wanted) == 1
+    prediction[..., :2, :2] = 1
+    assert tone_ratio(prediction, photo, wanted) == pytest.approx(0.5, abs=1e-3)
+    assert tone_ratio(prediction, torch.ones_like(wanted), wanted) == 1
 
 
 @pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])
-def test_a_value_that_is_no_number_is_refused(value):
+def test_a_value_that_is_not_finite_is_refused(value):
     with pytest.raises(ModelError, match=r"gradient is .* at step 7"):
-        finite(torch.tensor(value), 7, "gradient")
-    assert finite(torch.tensor(1.0), 7) == 1
+        check_finite(torch.tensor(value), 7, "gradient")
+    assert check_finite(torch.tensor(1.0), 7) == 1

@@ -46,14 +46,14 @@ def test_light_adds_up_in_linear_light(photos):
     torch.testing.assert_close((transmission + reflection)[inside], photo[inside], atol=0.02, rtol=0)
 
 
-def test_the_reflection_has_the_asked_strength(photos):
+def test_the_reflection_has_the_strength_of_the_recipe(photos):
     recipe = QUIET.model_copy(update={"reflection_ratio_log": (0.25, 0.25)})
     batch = Mixtures(photos, [], recipe, seed=1)(0, 8, 64)
     ratio = to_linear(batch.reflection_encoded).mean() / to_linear(batch.transmission_encoded).mean()
     assert ratio.item() == pytest.approx(0.25, rel=0.15)
 
 
-def test_a_veil_adds_even_light_the_asked_share_of_the_photos_mean(photos):
+def test_a_veil_adds_uniform_light_relative_to_the_photos_mean(photos):
     recipe = QUIET.model_copy(update={"veil_probability": 1.0, "veil": (0.3, 0.3)})
     batch = Mixtures(photos, [], recipe, seed=1)(0, 4, 64)
     photo, transmission, reflection = (
@@ -68,7 +68,7 @@ def test_a_veil_adds_even_light_the_asked_share_of_the_photos_mean(photos):
 
 
 def layers_of(photos, maps=(), **changes):
-    """Photo, transmission and reflection of four samples, encoded; the same numbers are drawn whatever changes."""
+    """Photo, transmission and reflection of four samples, encoded; the random numbers do not depend on the changes."""
     batch = Mixtures(photos, list(maps), QUIET.model_copy(update=changes), seed=1)(0, 4, 64)
     return batch.photo_encoded, batch.transmission_encoded, batch.reflection_encoded
 
@@ -77,7 +77,7 @@ def layers_of(photos, maps=(), **changes):
 def test_a_reflection_that_fades_or_ends_is_darker_somewhere_and_brighter_nowhere(photos, effect):
     _, behind, mirrored = layers_of(photos)
     _, same, faded = layers_of(photos, **{effect: 1.0})
-    assert (same - behind).abs().max() < 0.04  # the pane's own tint is drawn anew
+    assert (same - behind).abs().max() < 0.04  # the tint of the pane uses other random numbers
     assert (faded <= mirrored + 1e-6).all()
     assert faded.mean() < 0.95 * mirrored.mean()
 
@@ -85,7 +85,7 @@ def test_a_reflection_that_fades_or_ends_is_darker_somewhere_and_brighter_nowher
 def test_lamps_are_added_to_the_reflection_alone(photos):
     _, behind, mirrored = layers_of(photos)
     _, same, lit = layers_of(photos, lamp_probability=1.0)
-    assert (same - behind).abs().max() < 0.04  # the pane's own tint is drawn anew
+    assert (same - behind).abs().max() < 0.04  # the tint of the pane uses other random numbers
     assert (lit >= mirrored - 1e-6).all()
     assert lit.amax(dim=(1, 2, 3)).min() > mirrored.amax()
 
@@ -106,7 +106,7 @@ def test_a_reflection_that_is_not_sharp_is_blurred_and_keeps_its_light(photos):
 def test_ghosts_signs_and_contrast_change_the_reflection_alone(photos, changes):
     _, behind, mirrored = layers_of(photos)
     _, same, changed = layers_of(photos, **changes)
-    assert (same - behind).abs().max() < 0.04  # the pane's own tint is drawn anew
+    assert (same - behind).abs().max() < 0.04  # the tint of the pane uses other random numbers
     assert (changed - mirrored).abs().mean() > 0.005
 
 
@@ -127,7 +127,7 @@ def test_a_warmer_light_has_more_red_and_less_blue(photos):
         torch.testing.assert_close(ratio, torch.full_like(ratio, gain), atol=0.01, rtol=0)
 
 
-def test_exposure_is_the_photos_mean_at_most(photos):
+def test_exposure_limits_the_photos_mean(photos):
     photo, behind, mirrored = layers_of(photos, exposure=(0.05, 0.05))
     plain = layers_of(photos)
     assert to_linear(photo).mean(dim=(1, 2, 3)).tolist() == pytest.approx([0.05] * 4, rel=0.03)
@@ -157,7 +157,7 @@ def test_noise_and_jpeg_are_in_the_photo_alone(photos):
         assert all(torch.equal(one, other) for one, other in zip(plain[1:], changed[1:], strict=True))
 
 
-def test_maps_are_seen_as_often_as_the_recipe_says(photos):
+def test_maps_are_drawn_as_often_as_the_recipe_states(photos):
     red = torch.zeros(3, 32, 64)
     red[0] = 1
     for layer, name in ((1, "background"), (2, "reflection")):
@@ -168,7 +168,7 @@ def test_maps_are_seen_as_often_as_the_recipe_says(photos):
         assert layers_of(photos, [red.half()])[layer][:, 1:].any()
 
 
-def test_the_target_is_what_the_pane_lets_through_or_what_is_behind_it(photos):
+def test_the_target_is_the_transmission_or_the_background(photos):
     light = {
         target: to_linear(
             Mixtures(
@@ -180,7 +180,7 @@ def test_the_target_is_what_the_pane_lets_through_or_what_is_behind_it(photos):
     assert (light["transmission"] / light["background"]).item() == pytest.approx(0.8, rel=0.05)
 
 
-def test_glass_that_covers_a_part_leaves_the_rest_as_it_was(photos):
+def test_glass_that_covers_a_part_does_not_change_the_rest(photos):
     recipe = QUIET.model_copy(update={"partial_probability": 1.0, "transmittance": (0.5, 0.5)})
     batch = Mixtures(photos, [], recipe, seed=1)(0, 8, 64)
     same = (batch.photo_encoded - batch.transmission_encoded).abs().amax(dim=1) < 2 / 255
@@ -196,14 +196,14 @@ def test_an_overexposed_background_is_white_in_photo_and_target(photos):
     assert (batch.photo_encoded.amax(dim=1)[white] > 0.99).all()
 
 
-def test_photos_are_drawn_as_often_as_their_weights_say(photos):
+def test_photos_are_drawn_in_proportion_to_their_weights(photos):
     stream = Mixtures(photos, [], QUIET, seed=1, weights=[0, 1, 0, 3])
     drawn = [stream._choose_photo(SampleRng(1, 0, slot)) for slot in range(400)]
     assert set(drawn) == {1, 3}
     assert drawn.count(3) == pytest.approx(300, abs=40)
 
 
-def test_absent_reflections_leave_the_photo_as_it_was(photos):
+def test_samples_without_glass_have_no_reflection(photos):
     recipe = QUIET.model_copy(update={"absent_probability": 1.0})
     batch = Mixtures(photos, [], recipe, seed=1)(0, 4, 64)
     assert not batch.reflection_encoded.any()
@@ -234,14 +234,14 @@ def test_real_pairs_stay_aligned(photos):
     assert (batch.reflection_weight < 1).all()
 
 
-def test_a_blend_takes_its_share_of_each_stream(photos):
+def test_an_interleaved_stream_takes_its_share_of_each_stream(photos):
     mixtures, pairs = Mixtures(photos, [], QUIET, seed=1), Pairs([(photos[0], photos[0])], (1, 1), seed=1)
     batch = InterleavedStream(pairs, mixtures, 0.25)(0, 8, 32)
     assert (batch.reflection_weight < 1).sum() == 2
     assert batch.photo_encoded.shape == (8, 3, 32, 32)
 
 
-def test_a_blend_asks_for_nothing_where_a_stream_gets_no_sample(photos):
+def test_an_interleaved_stream_does_not_call_a_stream_without_samples(photos):
     def never(step, count, size):
         raise AssertionError
 
@@ -249,9 +249,9 @@ def test_a_blend_asks_for_nothing_where_a_stream_gets_no_sample(photos):
     assert batch.photo_encoded.shape == (1, 3, 32, 32)
 
 
-def test_a_batch_of_layers_trusts_every_truth():
+def test_a_batch_from_layers_has_reflection_weights_of_one():
     layers = torch.rand(2, 9, 8, 8)
-    batch = TrainingBatch.of(layers)
+    batch = TrainingBatch.from_layers(layers)
     pictures = [batch.photo_encoded, batch.transmission_encoded, batch.reflection_encoded]
     assert torch.equal(torch.cat(pictures, dim=1), layers)
     assert (batch.reflection_weight == 1).all()

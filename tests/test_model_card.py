@@ -1,4 +1,4 @@
-"""The card of a LoRA: what the hub reads of it, what its words promise, and whether its Python makes the picture."""
+"""The model card of a LoRA: metadata for the hub, text, and the Python example, which is run."""
 
 import re
 from pathlib import Path
@@ -16,7 +16,7 @@ from brewster.models.diffusion.panels import PanelLayout, conditioning_image, sp
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
 from brewster.models.diffusion.sampling import sample
 from brewster.models.diffusion.task import DecompositionTask
-from brewster.training.lora.model_card import card_text, with_measured, write_card
+from brewster.training.lora.model_card import card_text, with_benchmark_tables, write_card
 from brewster.training.recipe import LoraRecipe, read_recipe
 from set_folders import make
 
@@ -35,19 +35,19 @@ def card(name="kontext", scores=None, **changes):
 )
 def test_the_hub_reads_base_and_licence(name, licence):
     read = ModelCard(card(name))
-    told = read.data.to_dict()
-    assert told["base_model"] == BACKBONES[name].hub_id
-    assert (told["base_model_relation"], told["license"]) == ("adapter", licence)
-    assert (told["library_name"], told["pipeline_tag"]) == ("diffusers", "image-to-image")
-    assert "lora" in told["tags"]
+    metadata = read.data.to_dict()
+    assert metadata["base_model"] == BACKBONES[name].hub_id
+    assert (metadata["base_model_relation"], metadata["license"]) == ("adapter", licence)
+    assert (metadata["library_name"], metadata["pipeline_tag"]) == ("diffusers", "image-to-image")
+    assert "lora" in metadata["tags"]
     assert PROMPT in read.text
 
 
-def test_a_non_commercial_licence_is_named_linked_and_said():
+def test_a_non_commercial_licence_is_named_linked_and_stated():
     text = card("kontext")
-    told = ModelCard(text).data.to_dict()
-    assert told["license_name"] == "flux-1-dev-non-commercial-license"
-    assert told["license_link"].endswith("FLUX.1-Kontext-dev/blob/main/LICENSE.md")
+    metadata = ModelCard(text).data.to_dict()
+    assert metadata["license_name"] == "flux-1-dev-non-commercial-license"
+    assert metadata["license_link"].endswith("FLUX.1-Kontext-dev/blob/main/LICENSE.md")
     assert "**Not for commercial use.**" in text
     assert "Not for commercial use" not in card("klein")
 
@@ -59,54 +59,54 @@ def test_a_finetune_of_a_base_is_named_and_a_folder_is_not():
     assert "somebody" not in text
 
 
-def test_a_toy_is_said_to_be_one_and_names_no_base():
+def test_a_toy_is_marked_as_one_and_names_no_base():
     text = card("large-tiny")
     assert "**This is a toy.**" in text
     assert "base_model" not in ModelCard(text).data.to_dict()
     assert "**This is a toy.**" not in card()
 
 
-def test_sets_are_told_with_their_scenes_and_without_their_place(tmp_path, monkeypatch):
+def test_sets_are_listed_with_their_scenes_and_without_local_paths(tmp_path, monkeypatch):
     make(tmp_path / "sets" / "window", count=3)
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
-    told = "`sets/window` (3 samples of the scenes `tiny`, orders all)"
-    assert told in card()
+    listed = "`sets/window` (3 samples of the scenes `tiny`, orders all)"
+    assert listed in card()
     elsewhere = {"rendered": {"sets": [str(tmp_path / "sets" / "window")]}}
     assert "`window` (3 samples" in card(data=elsewhere)
     assert str(tmp_path) not in card(data=elsewhere)
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "sets"))
-    assert "saw: `sets/window`." in card()
+    assert "of the samples: `sets/window`." in card()
 
 
-def test_pairs_and_their_share_are_told():
+def test_pairs_and_their_share_are_listed():
     text = card(
         reflections="difference",
         data={"pairs": ["real/train"], "pairs_share": 0.25, "rendered": {"sets": ["a"], "count": 7}},
     )
-    assert "75% of what it saw: the first 7 samples of `a`." in text
-    assert "Real pairs, 25% of what it saw: real/train." in text
-    assert "what photo minus transmission leaves" in text
+    assert "75% of the samples: the first 7 samples of `a`." in text
+    assert "Real pairs, 25% of the samples: real/train." in text
+    assert "photo minus transmission, in linear light" in text
 
 
-def test_settings_and_scores_are_told():
+def test_settings_and_scores_are_listed():
     text = card(scores={"step": 4000, "loss": 0.25, "panel_T": 0.1, "gain_db_nature": -1.234, "seconds": 9.9})
     assert "| steps, batch | 4000, 1 |" in text
-    assert "| PSNR gained over the photo itself, nature, dB | -1.234 |" in text
+    assert "| PSNR gain over the input, nature, dB | -1.234 |" in text
     assert "| loss, panel T | 0.1 |" in text
     assert "9.9" not in text
 
 
-def test_what_was_measured_takes_its_place_again_and_again():
-    once = with_measured(card(), "| a | 1 |\n")
-    twice = with_measured(once, "### Real20\n\n| b | 2 |")
+def test_benchmark_tables_replace_earlier_ones():
+    once = with_benchmark_tables(card(), "| a | 1 |\n")
+    twice = with_benchmark_tables(once, "### Real20\n\n| b | 2 |")
     assert "\n## Measured\n\n| a | 1 |\n\n## Limits\n" in once
     assert "\n## Measured\n\n### Real20\n\n| b | 2 |\n\n## Limits\n" in twice
     assert twice.partition("## Measured")[0] == card().partition("## Measured")[0]
-    with pytest.raises(ModelError, match="has no part for scores; '## Measured'"):
-        with_measured("# somebody else's", "| a | 1 |")
+    with pytest.raises(ModelError, match="has no section for benchmarks; the heading '## Measured'"):
+        with_benchmark_tables("# somebody else's", "| a | 1 |")
 
 
-def test_what_stock_pipelines_cannot_do_is_not_promised():
+def test_limits_of_the_diffusers_pipelines_are_stated():
     assert "max_area" in card()
     assert "starts from noise" in card(objective="one_step")
     assert "resizes the conditioning image to one megapixel" in card("qwen")
@@ -115,7 +115,7 @@ def test_what_stock_pipelines_cannot_do_is_not_promised():
 
 @pytest.fixture
 def exported(tmp_path):
-    """Writes a base and a LoRA on it, with its card, for a layout; what brewster makes of a photo with them."""
+    """Writes a base, a LoRA and its card for a layout. Returns brewster's T of a photo with them."""
 
     def export(name, layout):
         backbone, prompt = tiny(name, seed=1)
@@ -146,7 +146,9 @@ def exported(tmp_path):
         ("klein", PanelLayout(("T", "R"))),
     ],
 )
-def test_the_python_in_the_card_makes_the_same_picture(exported, tmp_path, monkeypatch, name, layout):
+def test_the_python_example_of_the_card_generates_the_same_picture(
+    exported, tmp_path, monkeypatch, name, layout
+):
     expected = exported(name, layout)
     text = (tmp_path / "lora" / "README.md").read_text()
     (code,) = (block for block in re.findall(r"```python\n(.*?)```", text, re.S) if "diffusers" in block)
@@ -162,17 +164,17 @@ def test_the_python_in_the_card_makes_the_same_picture(exported, tmp_path, monke
     assert expected.std() > 0.01
 
 
-def test_the_card_has_the_words_that_the_lora_was_trained_with(exported, tmp_path):
+def test_the_card_has_the_prompt_of_the_training(exported, tmp_path):
     exported("klein", PanelLayout())
     assert PROMPT in (tmp_path / "lora" / "README.md").read_text()
-    told = PromptEmbedding("klein", "Take the glass away.", **tiny("klein")[1].tensors)
-    told.save(tmp_path / "lora" / "prompt.safetensors")
+    prompt = PromptEmbedding("klein", "Take the glass away.", **tiny("klein")[1].tensors)
+    prompt.save(tmp_path / "lora" / "prompt.safetensors")
     recipe = read_recipe(RECIPES / "klein.toml")
     for _ in range(2):
         write_card(tmp_path / "lora", recipe, {"loss": 1.0}, BACKBONES["klein"])
     text = (tmp_path / "lora" / "README.md").read_text()
     assert "> Take the glass away." in text
     assert PROMPT not in text
-    assert text == card_text(recipe, scores={"loss": 1.0}, base=BACKBONES["klein"], prompt=told.text)
+    assert text == card_text(recipe, scores={"loss": 1.0}, base=BACKBONES["klein"], prompt=prompt.text)
     with pytest.raises(ModelError, match="encoded for klein"):
         write_card(tmp_path / "lora", recipe, {}, BACKBONES["qwen"])

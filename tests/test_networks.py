@@ -32,7 +32,7 @@ def small(monkeypatch):
     return "small"
 
 
-def silent(step, steps, numbers, logged):
+def silent(step, steps, metrics, logged):
     pass
 
 
@@ -73,14 +73,16 @@ def test_a_run_of_one_network_does_not_start_from_a_checkpoint_of_another(recipe
     other = with_value(recipe, "network", small).model_copy(update={"start_from": (tmp_path / "start.pt",)})
     with pytest.raises(
         ModelError,
-        match=r"start.pt holds the network lite2-unet; a checkpoint of small, .*; train the recipe",
+        match=r"start.pt contains the network lite2-unet; a checkpoint of small, .*; train the recipe",
     ):
         CompactTrainer(other).initialize()
 
 
 def test_a_run_of_one_network_is_not_resumed_with_another(recipe, small, tmp_path):
     train(recipe, tmp_path, silent)
-    with pytest.raises(RecipeError, match=r"belongs to another recipe \(other values: network\)"):
+    with pytest.raises(
+        RecipeError, match=r"belongs to a run of another recipe \(different values: network\)"
+    ):
         train(with_value(recipe, "network", small), tmp_path, silent)
 
 

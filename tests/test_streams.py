@@ -32,7 +32,7 @@ def worlds():
 
 @pytest.fixture
 def builtin(worlds, monkeypatch):
-    """Builtin worlds that all tests share, and no data folder."""
+    """Built-in environments that all tests share, and no data folder."""
     monkeypatch.setattr("brewster.training.streams.Assets", lambda folders: worlds)
     monkeypatch.delenv("BREWSTER_DATA", raising=False)
     return worlds
@@ -49,7 +49,7 @@ def root(tmp_path, monkeypatch):
     return tmp_path
 
 
-def learning_from(recipe, **data):
+def with_data(recipe, **data):
     return recipe.model_copy(update={"data": DataRecipe.model_validate(data)})
 
 
@@ -65,19 +65,19 @@ def test_a_folder_that_is_missing_or_without_pictures_is_named(recipe, root, kin
     ):
         data = {"photos": ["photos"], "pairs_share": float(kind == "pairs"), kind: [folder]}
         with pytest.raises(RecipeError, match=complaint):
-            open_stream(learning_from(recipe, **data))
+            open_stream(with_data(recipe, **data))
 
 
-def test_a_data_folder_that_nobody_named_is_an_error(recipe, monkeypatch):
+def test_an_unset_data_folder_is_an_error(recipe, monkeypatch):
     monkeypatch.delenv("BREWSTER_DATA", raising=False)
     with pytest.raises(RecipeError, match="BREWSTER_DATA"):
-        open_stream(learning_from(recipe, photos=["photos"]))
+        open_stream(with_data(recipe, photos=["photos"]))
 
 
-def test_sets_are_found_below_the_data_folder_or_by_their_whole_path(recipe, root):
+def test_sets_have_a_path_in_the_data_folder_or_an_absolute_path(recipe, root):
     make(root / "set", count=3)
     below, absolute = (
-        open_stream(learning_from(recipe, rendered={"sets": [folder], "count": 2}))
+        open_stream(with_data(recipe, rendered={"sets": [folder], "count": 2}))
         for folder in ("set", root / "set")
     )
     assert isinstance(below, RenderedSets)
@@ -85,7 +85,7 @@ def test_sets_are_found_below_the_data_folder_or_by_their_whole_path(recipe, roo
     assert same(below(3, 2, 32), absolute(3, 2, 32))
 
 
-def test_live_samples_of_builtin_worlds_need_no_data_folder(recipe, builtin):
+def test_online_samples_of_builtin_environments_need_no_data_folder(recipe, builtin):
     endless = with_value(recipe, "data.rendered.count", None)
     plain = OnlineRendered(read_scene_recipe("tiny"), BUILTIN_CATALOG, builtin, seed=recipe.seed)
     assert same(open_stream(endless)(1, 2, 32), plain(1, 2, 32))
@@ -102,51 +102,51 @@ def test_orders_and_seed_of_a_recipe_reach_the_scenes(recipe, builtin):
     assert not torch.equal(whole.photo_encoded, other.photo_encoded)
 
 
-def test_each_batch_is_divided_as_the_shares_say(recipe, root):
+def test_each_batch_is_divided_by_the_shares(recipe, root):
     make(root / "set", count=2)
     data = {"photos": ["photos"], "pairs": ["real"], "rendered": {"sets": ["set"], "share": 0.25}}
-    blend = open_stream(learning_from(recipe, **data, pairs_share=0.5))
+    blend = open_stream(with_data(recipe, **data, pairs_share=0.5))
     batch = blend(0, 8, 32)
     assert batch.photo_encoded.shape == (8, 3, 32, 32)
     assert (batch.reflection_weight < 1).tolist() == 4 * [True] + 4 * [False]
-    rendered = open_stream(learning_from(recipe, rendered={"sets": ["set"]}))(0, 1, 32)
+    rendered = open_stream(with_data(recipe, rendered={"sets": ["set"]}))(0, 1, 32)
     assert torch.equal(batch.photo_encoded[4:5], rendered.photo_encoded)
-    mixtures = open_stream(learning_from(recipe, photos=["photos"]))(0, 3, 32)
+    mixtures = open_stream(with_data(recipe, photos=["photos"]))(0, 3, 32)
     assert torch.equal(batch.photo_encoded[5:], mixtures.photo_encoded)
 
 
 def test_pairs_alone_may_fill_a_batch(recipe, root):
-    batch = open_stream(learning_from(recipe, pairs=["real"], pairs_share=1.0))(0, 4, 32)
+    batch = open_stream(with_data(recipe, pairs=["real"], pairs_share=1.0))(0, 4, 32)
     assert (batch.reflection_weight < 1).all()
 
 
-def test_what_has_no_share_is_not_read(recipe, root):
+def test_data_without_a_share_is_not_read(recipe, root):
     gone = {"pairs": ["gone"], "pairs_share": 0.0, "rendered": {"sets": ["gone"], "share": 0.0}}
-    only = open_stream(learning_from(recipe, photos=["photos"]))
+    only = open_stream(with_data(recipe, photos=["photos"]))
     assert same(
-        open_stream(learning_from(recipe, photos=["photos"], **gone))(0, 2, 32),
+        open_stream(with_data(recipe, photos=["photos"], **gone))(0, 2, 32),
         only(0, 2, 32),
     )
 
 
-def test_a_stream_of_nothing_says_what_to_raise(recipe):
+def test_a_stream_without_data_names_the_values_to_raise(recipe):
     stream = open_stream(with_value(recipe, "data.rendered.count", 0))
-    with pytest.raises(RecipeError, match=r"nothing to learn from; .*raise data\.rendered\.count"):
+    with pytest.raises(RecipeError, match=r"no training data.*; .*raise data\.rendered\.count"):
         stream(0, 1, 32)
 
 
-def test_a_map_that_cannot_light_a_scene_is_named_unless_it_is_excluded(recipe, root):
+def test_a_map_that_cannot_light_a_scene_is_refused_unless_it_is_excluded(recipe, root):
     good, clipped = torch.rand(16, 32, 3).numpy(), torch.ones(16, 32, 3).numpy()
     (root / "hdri").mkdir()
     for name, texels in (("good.exr", good), ("clipped.exr", clipped)):
         Photo.from_array(texels, encoding="linear").save(root / "hdri" / name)
     wanted = {"rendered": {"recipe": "tiny", "maps": ["hdri"]}}
     with pytest.raises(UnsupportedPhoto, match=r"clipped\.exr"):
-        open_stream(learning_from(recipe, **wanted))
-    open_stream(learning_from(recipe, **wanted, exclude=["clip*"]))
+        open_stream(with_data(recipe, **wanted))
+    open_stream(with_data(recipe, **wanted, exclude=["clip*"]))
 
 
-def test_the_photos_of_a_source_weigh_together_as_the_root_of_their_number(recipe, root):
+def test_the_total_weight_of_a_source_is_the_square_root_of_its_number_of_photos(recipe, root):
     for name in ("many_1", "many_2", "many_3", "many_4", "few-1"):
         Photo.from_array(np.zeros((8, 8, 3), np.uint8), encoding="srgb").save(
             root / "sources" / f"{name}.png"

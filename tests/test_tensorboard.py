@@ -1,4 +1,4 @@
-"""What TensorBoard itself reads back of a run."""
+"""TensorBoard events of a run, read back with TensorBoard."""
 
 import sys
 import time
@@ -7,7 +7,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from brewster.training.tensorboard import PICTURE, TensorBoardLog
+from brewster.training.tensorboard import IMAGE_TAG, TensorBoardLog
 
 
 def read(folder):
@@ -25,16 +25,16 @@ def test_numbers_and_the_picture_are_read_back_at_their_steps(tmp_path):
         (6, pytest.approx(1 / 6)),
     ]
     assert events.Scalars("gain_db_real/dev")[0].value == -2.5
-    shown = events.Images(PICTURE)
+    shown = events.Images(IMAGE_TAG)
     assert [(event.step, event.width, event.height) for event in shown] == [(3, 6, 4), (6, 6, 4)]
 
 
-def test_a_run_that_goes_on_forgets_what_was_told_of_later_steps(tmp_path):
+def test_a_resumed_run_discards_events_of_later_steps(tmp_path):
     picture = torch.zeros(4, 6, 3)
     killed = TensorBoardLog(tmp_path, 0)
     for step in (1, 2, 3):
         killed.log(step, {"loss": 10.0}, picture)
-    time.sleep(1.1)  # files are told apart, and ordered, by the second in which they begin
+    time.sleep(1.1)  # event files are named and sorted by the second of their creation
     resumed = TensorBoardLog(tmp_path, 1)
     for step in (2, 3, 4):
         resumed.log(step, {"loss": 5.0}, picture)
@@ -42,15 +42,15 @@ def test_a_run_that_goes_on_forgets_what_was_told_of_later_steps(tmp_path):
     assert [(event.step, event.value) for event in events.Scalars("loss")] == [
         (1, 10.0), (2, 5.0), (3, 5.0), (4, 5.0),
     ]  # fmt: skip
-    assert [event.step for event in events.Images(PICTURE)] == [1, 2, 3, 4]
+    assert [event.step for event in events.Images(IMAGE_TAG)] == [1, 2, 3, 4]
 
 
-def test_a_run_with_nothing_to_tell_leaves_no_file(tmp_path):
+def test_a_run_without_events_writes_no_file(tmp_path):
     TensorBoardLog(tmp_path, 7)
     assert not list(tmp_path.iterdir())
 
 
-def test_without_tensorboard_nothing_is_told_and_nothing_breaks(tmp_path, monkeypatch):
+def test_without_tensorboard_nothing_is_written(tmp_path, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     TensorBoardLog(tmp_path, 0).log(1, {"loss": 1.0}, torch.zeros(4, 6, 3))

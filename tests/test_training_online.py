@@ -47,7 +47,7 @@ def test_iterating_gives_the_samples_in_order_at_the_recipes_size(assets):
 
 
 @pytest.mark.parametrize("mixing", ["light", "8-bit"])
-def test_the_photo_has_been_through_its_jpeg_and_no_truth_has(assets, mixing):
+def test_the_photo_has_jpeg_artefacts_and_the_ground_truth_has_none(assets, mixing):
     """A second JPEG of the same quality changes next to nothing."""
     sample = stream(assets, mixing=mixing).sample(0)
 
@@ -65,7 +65,7 @@ def test_the_target_is_the_background_or_the_transmission(assets):
     assert transmission.mean() < background.mean()
 
 
-def test_both_kinds_of_data_show_the_same_background(assets):
+def test_both_kinds_of_mixing_have_the_same_background(assets):
     light, mixed = (stream(assets, mixing=mixing).sample(3) for mixing in ("light", "8-bit"))
     assert (light.background_encoded - mixed.transmission_encoded).abs().max() <= 0.5 / 255 + 1e-6
     assert not torch.equal(light.photo_encoded, mixed.photo_encoded)
@@ -78,7 +78,7 @@ def test_layers_are_photo_target_and_reflection_of_the_batch(assets):
     assert torch.equal(layers, torch.cat(pictures))
 
 
-def test_threads_that_share_a_stream_get_what_one_would_get(assets):
+def test_threads_that_share_a_stream_get_the_same_batches(assets):
     alone = [stream(assets)(step, 1, 32) for step in range(4)]
     shared = stream(Assets())
     with ThreadPoolExecutor(4) as pool:

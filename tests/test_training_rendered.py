@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 import torch
 
-import brewster.training.data.rendered as kept
+import brewster.training.data.rendered as module
 from brewster.errors import PhotoError, RecipeError
 from brewster.photo import Photo
 from brewster.render.camera_response import encode_jpeg
@@ -28,14 +28,14 @@ def pixels(data):
     return torch.from_numpy(Photo.open(data).pixels.copy())
 
 
-class Live:
-    """Stands in for a live stream, and counts what it is asked for."""
+class FakeOnline:
+    """Replaces OnlineRendered and records the rendered samples."""
 
     def __init__(self):
-        self.asked = []
+        self.rendered = []
 
     def layers(self, index, size):
-        self.asked.append((index, size))
+        self.rendered.append((index, size))
         return torch.rand(9, size, size, generator=torch.Generator().manual_seed(index))
 
 
@@ -61,7 +61,7 @@ def test_an_8_bit_sample_is_the_blend_of_its_own_background_and_mirror(folder):
         torch.testing.assert_close(found[:3], seen)
 
 
-def test_windows_of_photo_and_truths_show_the_same_place(folder):
+def test_crops_of_photo_and_ground_truth_are_aligned(folder):
     for sample in folder.glob("0*"):
         for name in ("background", "reflection"):
             shutil.copy(sample / "photo.jpg", sample / f"{name}.jpg")
@@ -103,15 +103,15 @@ def test_sets_follow_one_another(folder, tmp_path):
     assert torch.equal(both.sample(3), RenderedSets([tmp_path / "more"], seed=1).sample(0))
 
 
-def test_more_samples_than_there_are_cannot_be_asked_for(folder):
-    with pytest.raises(RecipeError, match=r"set: 3 rendered samples; .* learns from 4; .* lower"):
+def test_a_count_above_the_number_of_samples_is_refused(folder):
+    with pytest.raises(RecipeError, match=r"set: 3 rendered samples; at least 4, .*; .* lower"):
         RenderedSets([folder], seed=1, count=4)
 
 
 def test_a_folder_that_is_missing_empty_or_no_set_is_named(tmp_path):
     with pytest.raises(RecipeError, match=r"gone cannot be read \(No such"):
         RenderedSets([tmp_path / "gone"], seed=1)
-    with pytest.raises(RecipeError, match=r"0 rendered samples; .* at least one"):
+    with pytest.raises(RecipeError, match=r"0 rendered samples; at least 1"):
         RenderedSets([tmp_path], seed=1)
     (tmp_path / "shard-000000.tar").write_bytes(b"no tar" * 200)
     with pytest.raises(RecipeError, match="cannot be read"):
@@ -119,7 +119,7 @@ def test_a_folder_that_is_missing_empty_or_no_set_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["mirror.jpg", "scene.toml"])
-def test_a_file_that_is_gone_is_named_with_its_sample(folder, name):
+def test_a_missing_file_is_named_with_its_sample(folder, name):
     (folder / "000001" / name).unlink()
     with pytest.raises(RecipeError, match=f"{name} of sample 000001 .*; .*; .* again"):
         RenderedSets([folder], seed=1, mixing="8-bit").sample(1)
@@ -132,38 +132,38 @@ def test_a_damaged_picture_is_named_with_its_sample(folder):
         RenderedSets([folder], seed=1).sample(1)
 
 
-def test_what_was_read_is_kept_while_there_is_room(folder, monkeypatch):
-    roomy = RenderedSets([folder], seed=1)
-    monkeypatch.setattr(kept, "KEPT_BYTES", 16 * 24 * 9)
-    narrow = RenderedSets([folder], seed=1)
-    first = [stream(0, 20, 32) for stream in (roomy, narrow)]
+def test_samples_that_were_read_are_cached_within_the_memory_limit(folder, monkeypatch):
+    large = RenderedSets([folder], seed=1)
+    monkeypatch.setattr(module, "CACHE_BYTES", 16 * 24 * 9)
+    small = RenderedSets([folder], seed=1)
+    first = [stream(0, 20, 32) for stream in (large, small)]
     assert same(*first)
     shutil.rmtree(folder)
-    assert same(roomy(0, 20, 32), first[0])
+    assert same(large(0, 20, 32), first[0])
     with pytest.raises(RecipeError):
-        narrow(0, 20, 32)
+        small(0, 20, 32)
 
 
-def test_a_live_sample_is_rendered_once_for_each_size():
-    live = Live()
-    stream = CachedRendered(live, 3, seed=1)
+def test_a_cached_sample_is_rendered_once_per_size():
+    source = FakeOnline()
+    stream = CachedRendered(source, 3, seed=1)
     for step in range(10):
         stream(step, 4, 8)
         stream(step, 4, 16)
-    assert sorted(live.asked) == [(index, size) for index in range(3) for size in (8, 16)]
+    assert sorted(source.rendered) == [(index, size) for index in range(3) for size in (8, 16)]
 
 
 def test_a_batch_from_memory_depends_on_seed_and_step_alone():
-    one, other = (CachedRendered(Live(), 3, seed=1) for _ in range(2))
+    one, other = (CachedRendered(FakeOnline(), 3, seed=1) for _ in range(2))
     late = one(7, 4, 16)
     other(0, 9, 16)
     assert same(late, other(7, 4, 16))
     assert same(late, one(7, 4, 16))
 
 
-def test_a_kept_sample_is_shown_as_it_is_or_mirrored():
-    batch = CachedRendered(Live(), 1, seed=1)(0, 16, 8)
-    whole = Live().layers(0, 8)
+def test_a_cached_sample_is_mirrored_at_random():
+    batch = CachedRendered(FakeOnline(), 1, seed=1)(0, 16, 8)
+    whole = FakeOnline().layers(0, 8)
     for photo, target in zip(batch.photo_encoded, batch.transmission_encoded, strict=True):
         straight = (photo - whole[:3]).abs().max() < 0.003
         expected = whole if straight else whole.flip(2)
@@ -171,14 +171,14 @@ def test_a_kept_sample_is_shown_as_it_is_or_mirrored():
     assert len({photo.numpy().tobytes() for photo in batch.photo_encoded}) == 2
 
 
-def test_memory_that_is_full_changes_nothing_but_the_time():
-    live = Live()
-    narrow = CachedRendered(live, 4, seed=1, most_bytes=2 * 9 * 8 * 8)
-    roomy = CachedRendered(Live(), 4, seed=1)
-    assert all(same(narrow(step, 4, 8), roomy(step, 4, 8)) for step in range(10))
-    assert len(live.asked) > 4
+def test_a_full_cache_does_not_change_the_samples():
+    source = FakeOnline()
+    small = CachedRendered(source, 4, seed=1, max_bytes=2 * 9 * 8 * 8)
+    large = CachedRendered(FakeOnline(), 4, seed=1)
+    assert all(same(small(step, 4, 8), large(step, 4, 8)) for step in range(10))
+    assert len(source.rendered) > 4
 
 
-def test_a_set_may_be_named_by_a_relative_path(folder, monkeypatch):
+def test_a_set_can_have_a_relative_path(folder, monkeypatch):
     monkeypatch.chdir(folder.parent)
     assert len(RenderedSets([Path(folder.name)], seed=1)) == 3

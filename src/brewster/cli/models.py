@@ -131,7 +131,7 @@ def _put_scores(folder: Path, scores: Path) -> None:
     """Replaces what the card in this folder says was measured."""
     require_extra("train", "writing a card")
     from brewster.evaluate.report.tables import overview  # noqa: PLC0415  (wakes torch)
-    from brewster.training.lora.model_card import with_measured  # noqa: PLC0415
+    from brewster.training.lora.model_card import with_benchmark_tables  # noqa: PLC0415
 
     try:
         results = json.loads(scores.read_text("utf-8"))
@@ -142,5 +142,5 @@ def _put_scores(folder: Path, scores: Path) -> None:
             "the results.json that brewster evaluate wrote",
             "name that file",
         ) from error
-    text = with_measured(_read_card(folder), "\n".join(told))
+    text = with_benchmark_tables(_read_card(folder), "\n".join(told))
     write_atomically(folder / _CARD, text.encode(), overwrite=True)

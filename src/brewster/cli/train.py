@@ -74,7 +74,7 @@ def train(*, recipe: Path, out: Path | None, plan: bool, card: str | None, quiet
 
 
 def _print_plan(recipe: CompactRecipe | LoraRecipe, card: str | None) -> None:
-    from brewster.training.lora.resource_estimate import find_card, is_here, plan_for  # noqa: PLC0415
+    from brewster.training.lora.resource_estimate import estimate_resources, find_card, is_local_gpu  # noqa: PLC0415
     from brewster.training.recipe import LoraRecipe  # noqa: PLC0415
 
     if not isinstance(recipe, LoraRecipe):
@@ -82,11 +82,11 @@ def _print_plan(recipe: CompactRecipe | LoraRecipe, card: str | None) -> None:
             "the recipe trains the compact network", "a large backbone's recipe", "train it without --plan"
         )
     found = find_card(card)
-    if card is None and not is_here(found):
+    if card is None and not is_local_gpu(found):
         say(f"there is no graphics card here: planned for {found.name}, the paper's; --card names another")
-    estimate = plan_for(recipe, found)
+    estimate = estimate_resources(recipe, found)
     print_out(estimate.table())
-    estimate.refuse_misfit()
+    estimate.check_fits()
 
 
 def _make(folder: Path) -> None:

@@ -126,7 +126,7 @@ def ablate(
     return results
 
 
-def _train(recipe: CompactRecipe | LoraRecipe, folder: Path, on_step: loop.Report) -> Path:
+def _train(recipe: CompactRecipe | LoraRecipe, folder: Path, on_step: loop.StepCallback) -> Path:
     """Trains a recipe and returns the path of its model. The trainer is freed on return, so that memory does not grow."""
     trainer = open_trainer(recipe)
     loop.run(trainer, folder, on_step)

@@ -1,1 +1,1 @@
-"""How does it learn? A recipe, losses, one loop, and what it leaves behind."""
+"""Training: recipes, data streams, losses, one loop, checkpoints, and the trainers of both kinds of model."""

@@ -1,4 +1,4 @@
-"""The state of a run on disk: written atomically, read back bit for bit."""
+"""Checkpoints of training runs: written atomically, restored bit for bit."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ import torch
 from brewster.errors import ModelError
 from brewster.files import write_atomically
 
-AFRESH = "delete it to start afresh, or name another folder with -o"
+START_FRESH = "delete it to start again, or choose another folder with -o"
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Everything that a step depends on; the data and the schedule follow from step and recipe.
+    """The state of a trainer after `step` steps, and its recipe as JSON.
 
-    In the file the parts of the state stand beside `step` and `recipe`.
+    Batches and learning rates need no state, because they are functions of step and recipe. In the file, the keys of
+    `state` are at the same level as `step` and `recipe`.
     """
 
     step: int
@@ -30,21 +31,21 @@ class Checkpoint:
     state: Mapping[str, Any]
 
     def write(self, path: Path) -> None:
-        """Replaces the file in one move: a kill leaves the old checkpoint or the new one.
+        """Replaces the file atomically: a killed process leaves either the old or the new checkpoint.
 
         Raises:
-            TargetError: it cannot be written.
+            TargetError: the file cannot be written.
         """
         stream = io.BytesIO()
         torch.save({"step": self.step, "recipe": self.recipe, **self.state}, stream)
         write_atomically(path, stream.getvalue(), overwrite=True)
 
     @classmethod
-    def read(cls, path: Path, cure: str = AFRESH) -> Checkpoint:
-        """Reads a checkpoint; no code in it is run. `cure` is what an error advises.
+    def read(cls, path: Path, cure: str = START_FRESH) -> Checkpoint:
+        """Reads a checkpoint without running code from it (`weights_only`). `cure` is the advice in the error message.
 
         Raises:
-            ModelError: missing, damaged, or not a checkpoint of ours.
+            ModelError: the file is missing, damaged, or not a checkpoint of brewster.
         """
         try:
             state = dict(torch.load(path, map_location="cpu", weights_only=True))
@@ -66,15 +67,15 @@ class Checkpoint:
 
 
 @contextmanager
-def fitting(path: Path, cure: str) -> Iterator[None]:
-    """Tells plainly that the state in a checkpoint does not fit what it is put into.
+def mismatch_as_model_error(path: Path, cure: str) -> Iterator[None]:
+    """Turns the errors of `load_state_dict` into one that names the checkpoint.
 
     Raises:
-        ModelError: it does not.
+        ModelError: the state does not match the network.
     """
     try:
         yield
     except (RuntimeError, ValueError, KeyError) as error:
         raise ModelError(
-            f"{path} holds another network", "a checkpoint of the network that the recipe trains", cure
+            f"{path} contains another network", "a checkpoint of the network that the recipe trains", cure
         ) from error

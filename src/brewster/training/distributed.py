@@ -1,10 +1,11 @@
-"""Several processes that learn as one, each on a GPU of its own; alone, nothing of this is noticed.
+"""Data-parallel training, one GPU per process; a no-op for a single process.
 
 torchrun --standalone --nproc_per_node 2 -m brewster train recipes/train/klein.toml
 accelerate launch --multi_gpu --num_processes 2 -m brewster train recipes/train/klein.toml
 
-They divide each batch, and all end with the same weights as one process with the whole batch: a run may be resumed by
-another number of processes. The first of them writes and speaks. accelerate is beneath, where there is more than one.
+Each process computes the gradients of its part of the batch; the sum equals the gradient of one process with the whole
+batch. A run can therefore be resumed with another number of processes. Only rank 0 writes files and logs. Several processes
+need accelerate.
 """
 
 from __future__ import annotations
@@ -20,60 +21,65 @@ from torch import Tensor
 from brewster.errors import DeviceError
 from brewster.models.diffusion.lazy_imports import import_library
 
-_LAUNCHER: Final = ("RANK", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
-"""What a launcher tells each process, beside WORLD_SIZE."""
+_LAUNCHER_VARIABLES: Final = ("RANK", "LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
+"""The environment variables that a launcher sets for each process, in addition to WORLD_SIZE."""
 _CURE: Final = "start them with torchrun --nproc_per_node"
 
 
 def initialize() -> None:
-    """Meets the others, if the launcher (torchrun, accelerate launch) says that there are some.
+    """Joins the process group if a launcher (torchrun, accelerate launch) started several processes.
 
     Raises:
-        DeviceError: not as many came as were announced.
-        MissingExtra: there are some, and accelerate is not installed.
+        DeviceError: the environment is incomplete, or fewer processes joined than WORLD_SIZE.
+        MissingExtra: there are several processes, and accelerate is not installed.
     """
-    _refuse_half_a_launch()
+    _check_launch_variables()
     try:
-        together = _together()
-    except (NotImplementedError, RuntimeError, ValueError) as error:  # the first: cards that need NCCL told
+        state = _partial_state()
+    except (NotImplementedError, RuntimeError, ValueError) as error:
+        # NotImplementedError: accelerate refuses RTX 40 GPUs until NCCL_P2P_DISABLE and NCCL_IB_DISABLE are set.
         raise DeviceError(
-            f"the processes could not meet: {error}", f"{_announced()} that reach each other", _CURE
+            f"the process group could not be created: {error}",
+            f"{_expected_world_size()} processes that can connect to each other",
+            _CURE,
         ) from error
-    if world_size() != _announced():
+    if world_size() != _expected_world_size():
         raise DeviceError(
-            f"{world_size()} processes have met", f"the {_announced()} that WORLD_SIZE names", _CURE
+            f"{world_size()} processes have joined",
+            f"{_expected_world_size()} processes, as WORLD_SIZE states",
+            _CURE,
         )
-    if together:
-        atexit.register(together.destroy_process_group)
+    if state:
+        atexit.register(state.destroy_process_group)
 
 
 def world_size() -> int:
-    """How many processes learn together."""
-    together = _together()
-    return int(together.num_processes) if together else 1
+    """Number of processes."""
+    state = _partial_state()
+    return int(state.num_processes) if state else 1
 
 
 def rank() -> int:
-    """Which of them this one is, from 0."""
-    together = _together()
-    return int(together.process_index) if together else 0
+    """Number of this process, from 0."""
+    state = _partial_state()
+    return int(state.process_index) if state else 0
 
 
 def is_main_process() -> bool:
-    """Whether this is the one that writes and speaks."""
+    """Whether this process has rank 0, which writes files and logs."""
     return rank() == 0
 
 
 def best_device() -> torch.device:
-    """This process's GPU where torch sees one, else the CPU."""
+    """The GPU of this process, or the CPU if torch finds no GPU."""
     if not torch.cuda.is_available():
         return torch.device("cpu")
-    together = _together()
-    return torch.device(together.device) if together else torch.device("cuda")
+    state = _partial_state()
+    return torch.device(state.device) if state else torch.device("cuda")
 
 
 def all_reduce_sum(tensors: Sequence[Tensor]) -> None:
-    """Replaces these tensors, of one device, by their sums over all processes."""
+    """Replaces each tensor in place by its sum over all processes. All tensors are on one device."""
     if world_size() > 1 and tensors:
         flat = torch.cat([tensor.flatten() for tensor in tensors])
         total = import_library("accelerate.utils").reduce(flat, "sum")
@@ -82,31 +88,31 @@ def all_reduce_sum(tensors: Sequence[Tensor]) -> None:
             tensor.copy_(part.view_as(tensor))
 
 
-def _together() -> Any | None:  # noqa: ANN401 - accelerate's state
-    """accelerate's state of all processes, the same at each call; nothing where this one is alone."""
-    if _announced() == 1:
+def _partial_state() -> Any | None:  # noqa: ANN401 - accelerate's state
+    """accelerate's state, a singleton; None for a single process."""
+    if _expected_world_size() == 1:
         return None
-    # Without a GPU, accelerate has to be told so: else each process quietly believes that it is the only one.
+    # Without cpu=True and without a GPU, accelerate creates no process group, and each process trains alone.
     return import_library("accelerate").PartialState(cpu=not torch.cuda.is_available())
 
 
-def _announced() -> int:
+def _expected_world_size() -> int:
     return int(os.environ.get("WORLD_SIZE", "1"))
 
 
-def _refuse_half_a_launch() -> None:
-    """Several processes were wanted, and the launcher started one, or did not tell it who the others are."""
-    lacking = [name for name in _LAUNCHER if name not in os.environ]
-    if _announced() > 1 and lacking:
+def _check_launch_variables() -> None:
+    """Refuses an environment in which a launcher started only one process, or did not set its variables."""
+    missing = [name for name in _LAUNCHER_VARIABLES if name not in os.environ]
+    if _expected_world_size() > 1 and missing:
         raise DeviceError(
-            f"WORLD_SIZE is {_announced()}, and {', '.join(lacking)} not set",
-            "all that a launcher sets",
+            f"WORLD_SIZE is {_expected_world_size()}, and {', '.join(missing)} not set",
+            "all variables that a launcher sets",
             _CURE,
         )
-    # What `accelerate launch --cpu --num_processes 2` sets: it starts a single process, and says nothing.
+    # `accelerate launch --cpu --num_processes 2` sets these variables, but starts only one process, without a warning.
     if "WORLD_SIZE" not in os.environ and {"ACCELERATE_MIXED_PRECISION", "MASTER_ADDR"} <= os.environ.keys():
         raise DeviceError(
-            "accelerate launch was asked for several processes and has started one",
-            "several",
+            "accelerate launch started one process instead of several",
+            "several processes",
             f"{_CURE}, or accelerate launch --multi_gpu",
         )

@@ -1,7 +1,7 @@
-"""The training loop, the only one: `run(trainer, out, report)` runs or resumes, bit for bit, whatever learns.
+"""The training loop: `run(trainer, out, on_step)` starts or resumes a run of any `Trainer`.
 
-Every step depends on the trainer's state and on (seed, step) alone: no hidden state, so on the CPU a killed run that
-resumes ends with the same weights, to the last bit, as one that never stopped (same machine, same number of threads).
+A step depends on the trainer's state and on (seed, step) only. On a CPU, a run that was killed and resumed therefore ends
+with bit-identical weights to an uninterrupted run (same machine, same number of threads).
 """
 
 from __future__ import annotations
@@ -20,137 +20,139 @@ from brewster.errors import RecipeError
 from brewster.files import write_atomically
 from brewster.photo import Photo
 from brewster.srgb import to_linear
-from brewster.training.checkpoint import AFRESH, Checkpoint, fitting
+from brewster.training.checkpoint import START_FRESH, Checkpoint, mismatch_as_model_error
 from brewster.training.distributed import is_main_process
 from brewster.training.recipe import TrainingRecipe
 from brewster.training.tensorboard import TensorBoardLog
 
-Report = Callable[[int, int, Mapping[str, float], bool], None]
-"""Called with (step, steps, numbers, logged) after every step; `logged` says that the numbers went into the log."""
+StepCallback = Callable[[int, int, Mapping[str, float], bool], None]
+"""Called after every step with (step, steps, metrics, logged); `logged` is true if the metrics were written to the log."""
 
 CHECKPOINT: Final = "checkpoint.pt"
 LOG: Final = "log.jsonl"
 SAMPLES: Final = "samples.png"
-_MAY_CHANGE: Final = {"start_from", "steps", "report_every", "checkpoint_every"}
+_NOT_COMPARED: Final = {"start_from", "steps", "report_every", "checkpoint_every"}
+"""Recipe values that may change when a run is resumed."""
 
 
 class Trainer(Protocol):
-    """What can be trained: a network with its optimiser and its data, and no memory but its state."""
+    """A network with its optimiser and its data. `state_dict` holds all of its mutable state."""
 
     @property
     def recipe(self) -> TrainingRecipe:
-        """What it learns, and for how long."""
+        """The recipe of the run."""
         ...
 
     def initialize(self) -> None:
-        """Takes up what the recipe starts from; called where there is no run to go on with."""
+        """Loads what the recipe starts from. Called once, when a new run starts, not when a run is resumed."""
         ...
 
     def training_step(self, step: int) -> dict[str, float]:
-        """Learns from this step's batch; its loss, and the parts of it, by name."""
+        """Trains on the batch of `step` (from 0). Returns the loss and its parts by name."""
         ...
 
     def state_dict(self) -> dict[str, Any]:
-        """All that the next step depends on: tensors, numbers and words by name."""
+        """Returns everything that the next step depends on, as tensors, numbers and strings by name."""
         ...
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on from what `state` gave."""
+        """Restores a state that `state_dict` returned."""
         ...
 
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """How good it is, by name, and what it makes of a few photos: (H, W, 3), sRGB-encoded, in 0..1."""
+        """Returns the validation metrics by name, and a picture of sample predictions: (H, W, 3), sRGB-encoded, in 0..1."""
         ...
 
     def export(self, folder: Path) -> Path:
-        """Writes what users need of it into this folder; where that is."""
+        """Writes the model for inference into `folder`. Returns the path of the model."""
         ...
 
 
-def run(trainer: Trainer, out: Path, report: Report) -> None:
-    """Trains to the end of the recipe in folder `out`, from its checkpoint if there is one.
+def run(trainer: Trainer, out: Path, on_step: StepCallback) -> None:
+    """Trains until the last step of the recipe; resumes from the checkpoint in `out` if there is one.
 
-    Where several processes learn together, the first alone writes.
-
-    A recipe whose data are none (a count of 0) takes no step: the trainer stays as it starts.
-
-    `out` receives `checkpoint.pt` and, at every report, a line in `log.jsonl`, `samples.png`, and both in a file for
-    TensorBoard, where that is installed.
+    Every `checkpoint_every` steps it writes `checkpoint.pt` into `out`. Every `report_every` steps it validates, appends a
+    line to `log.jsonl`, replaces `samples.png`, and writes both as TensorBoard events if tensorboard is installed. With
+    several processes, only rank 0 writes files. A recipe without data (a count of 0) takes no step: the trainer keeps its
+    initial weights.
 
     Raises:
-        RecipeError: `out` holds a run of another recipe.
-        ModelError: a checkpoint is missing, damaged or of another network, or the loss is not a number.
+        RecipeError: `out` contains a run of another recipe.
+        ModelError: a checkpoint is missing, damaged or of another network, or the loss is NaN or infinite.
         TargetError: `out` cannot be written to.
     """
     out.mkdir(parents=True, exist_ok=True)
     recipe = trainer.recipe
-    begun = _take_up(trainer, out / CHECKPOINT)
+    completed_steps = _resume_or_initialize(trainer, out / CHECKPOINT)
     if is_main_process():
-        _forget_after(begun, out / LOG)
+        _truncate_log(completed_steps, out / LOG)
     started, steps = time.monotonic(), 0 if recipe.data.is_none else recipe.steps
-    with closing(TensorBoardLog(out, begun)) as board:
-        for step in range(begun + 1, 1 + steps):
-            numbers, last = trainer.training_step(step - 1), step == recipe.steps
-            logged = is_main_process() and (last or step % recipe.report_every == 0)
+    with closing(TensorBoardLog(out, completed_steps)) as event_log:
+        for step in range(completed_steps + 1, 1 + steps):
+            metrics, is_last = trainer.training_step(step - 1), step == recipe.steps
+            logged = is_main_process() and (is_last or step % recipe.report_every == 0)
             if logged:
                 scores, picture = trainer.validate()
-                numbers |= scores | {"seconds": time.monotonic() - started}
-                _log(out / LOG, {"step": step, **numbers})
+                metrics |= scores | {"seconds": time.monotonic() - started}
+                _append_log(out / LOG, {"step": step, **metrics})
                 _write_picture(out / SAMPLES, picture)
-                board.log(step, numbers, picture)
-            if is_main_process() and (last or step % recipe.checkpoint_every == 0):
+                event_log.log(step, metrics, picture)
+            if is_main_process() and (is_last or step % recipe.checkpoint_every == 0):
                 Checkpoint(step, recipe.model_dump_json(), trainer.state_dict()).write(out / CHECKPOINT)
-            report(step, recipe.steps, numbers, logged)
+            on_step(step, recipe.steps, metrics, logged)
 
 
-def last_numbers(folder: Path) -> dict[str, float]:
-    """What a run in this folder logged last; nothing if it has not."""
+def read_last_metrics(folder: Path) -> dict[str, float]:
+    """Returns the last line of the log in `folder`, or an empty dict if there is no log."""
     log = folder / LOG
     lines = log.read_text().splitlines() if log.exists() else []
     return dict(json.loads(lines[-1])) if lines else {}
 
 
-def _take_up(trainer: Trainer, saved: Path) -> int:
-    """Goes on with the run if it has begun, else begins it where its recipe says; how many steps are taken."""
-    if not saved.exists():
+def _resume_or_initialize(trainer: Trainer, path: Path) -> int:
+    """Restores the checkpoint at `path`, or initializes the trainer if there is none. Returns the number of completed steps."""
+    if not path.exists():
         trainer.initialize()
         return 0
-    checkpoint = _of_this_recipe(Checkpoint.read(saved), trainer.recipe, saved)
-    with fitting(saved, AFRESH):
+    checkpoint = _check_recipe(Checkpoint.read(path), trainer.recipe, path)
+    with mismatch_as_model_error(path, START_FRESH):
         trainer.load_state_dict(checkpoint.state)
     return checkpoint.step
 
 
-def _of_this_recipe(checkpoint: Checkpoint, recipe: TrainingRecipe, path: Path) -> Checkpoint:
-    before, now = _identity(checkpoint.recipe, recipe), _identity(recipe.model_dump_json(), recipe)
+def _check_recipe(checkpoint: Checkpoint, recipe: TrainingRecipe, path: Path) -> Checkpoint:
+    before, now = (
+        _compared_values(checkpoint.recipe, recipe),
+        _compared_values(recipe.model_dump_json(), recipe),
+    )
     if before == now:
         return checkpoint
     changed = ", ".join(name for name in now if before and before.get(name) != now[name])
     raise RecipeError(
-        f"{path} belongs to another recipe{f' (other values: {changed})' if changed else ''}",
-        "a run resumes only with the recipe that it began with",
+        f"{path} belongs to a run of another recipe{f' (different values: {changed})' if changed else ''}",
+        "a run is resumed with the recipe that it started with",
         "choose another folder with -o",
     )
 
 
-def _identity(text: str, recipe: TrainingRecipe) -> dict[str, object]:
-    """What a run must keep to be resumed: all but how long it is, how often it reports, and where it started from.
+def _compared_values(text: str, recipe: TrainingRecipe) -> dict[str, object]:
+    """Returns the values that must be equal for a run to resume: all but `_NOT_COMPARED`.
 
-    What a recipe does not name, such as a value that is newer than the run, counts as its default.
+    A value that the stored recipe lacks, because it was added to the schema later, counts as its default.
     """
     try:
-        return type(recipe).model_validate_json(text).model_dump(exclude=_MAY_CHANGE)
+        return type(recipe).model_validate_json(text).model_dump(exclude=_NOT_COMPARED)
     except ValidationError:
         return {}
 
 
-def _log(path: Path, numbers: Mapping[str, float]) -> None:
+def _append_log(path: Path, metrics: Mapping[str, float]) -> None:
     with path.open("a") as stream:
-        stream.write(json.dumps({name: round(value, 5) for name, value in numbers.items()}) + "\n")
+        stream.write(json.dumps({name: round(value, 5) for name, value in metrics.items()}) + "\n")
 
 
-def _forget_after(step: int, log: Path) -> None:
-    """Drops the lines that a killed run wrote after its last checkpoint, the last of them perhaps half."""
+def _truncate_log(step: int, log: Path) -> None:
+    """Removes the lines that a killed run wrote after its last checkpoint. The last line may be incomplete."""
     lines = log.read_text().splitlines() if log.exists() else []
     kept = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= step]
     if kept != lines:

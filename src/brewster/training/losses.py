@@ -1,4 +1,4 @@
-"""What a good separation is, as a number to minimise."""
+"""The loss of the compact network, and the validation metrics of both trainers."""
 
 from __future__ import annotations
 
@@ -15,20 +15,27 @@ from brewster.training.data.mixtures import TrainingBatch
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-_ROUNDING: Final = 1 / (12 * 255**2)
-"""The mean squared error of rounding to 8 bits; pictures that differ by less are the same, at 58.9 dB."""
+_QUANTIZATION_MSE: Final = 1 / (12 * 255**2)
+"""The mean squared error of rounding to 8 bits, 58.9 dB: smaller errors count as this one, so that no score is infinite."""
 _SCALES = (1, 4, 16)
-_LITTLE = 0.05
-_GOOD_ENOUGH = 1e-3
-"""Mean squared error, 30 dB, past which a picture no longer pulls."""
+"""Side of the averaging windows of the loss, in pixels."""
+_MAX_ADDED_SHARE = 0.05
+"""Pixels where the glass added less light than this share of the photo's light count as unchanged."""
+_MSE_FLOOR = 1e-3
+"""Added to the mean squared error in the logarithm: below it, 30 dB, the gradient of a picture fades out."""
 
 
 def separation_loss(layers: Float[Tensor, "n 6 h w"], batch: TrainingBatch) -> dict[str, Tensor]:
-    """The parts of the loss, scalars to be summed, on sRGB-encoded values as benchmarks measure them.
+    """The loss of transmission and reflection, the channels of `layers`, on sRGB-encoded values as benchmarks measure them.
 
-    Mean absolute error at three scales, so that a wrong overall tone weighs as much as wrong detail, and of
-    the transmission's gradients, so that edges of the reflection do not stay behind (Zhang et al. 2018); and
-    each picture's logarithmic error, which is its PSNR, so that easy pictures count as much as hard ones.
+    - transmission, reflection: mean absolute error at three scales, so that a wrong overall tone weighs as much as wrong
+      detail.
+    - edges: mean absolute error of the transmission's gradients, so that edges of the reflection are removed
+      (Zhang et al. 2018).
+    - psnr: logarithm of each picture's squared error, so that easy pictures count as much as hard ones.
+
+    Returns:
+        The parts by name, scalars; the loss is their sum.
     """
     transmission, reflection = layers[:, :3], layers[:, 3:]
     edges = sum(
@@ -37,43 +44,48 @@ def separation_loss(layers: Float[Tensor, "n 6 h w"], batch: TrainingBatch) -> d
     )
     squared = (transmission - batch.transmission_encoded).square().mean(dim=(1, 2, 3))
     return {
-        "transmission": _at_all_scales(transmission - batch.transmission_encoded).mean(),
+        "transmission": _multiscale_error(transmission - batch.transmission_encoded).mean(),
         "reflection": 0.3
-        * (_at_all_scales(reflection - batch.reflection_encoded) * batch.reflection_weight).mean(),
+        * (_multiscale_error(reflection - batch.reflection_encoded) * batch.reflection_weight).mean(),
         "edges": edges,  # type: ignore[dict-item]
-        "psnr": 0.02 * (squared + _GOOD_ENOUGH).log().mean(),
+        "psnr": 0.02 * (squared + _MSE_FLOOR).log().mean(),
     }
 
 
-def _at_all_scales(error: Tensor) -> Float[Tensor, " n"]:
+def _multiscale_error(error: Tensor) -> Float[Tensor, " n"]:
     return sum(  # type: ignore[return-value]
         functional.avg_pool2d(error, scale).abs().mean(dim=(1, 2, 3)) for scale in _SCALES
     )
 
 
-def gain_db(answer: Tensor, photo: Tensor, truth: Tensor) -> float:
-    """How much nearer to the truth the answer is than the photo, in dB of PSNR; encoded pictures in 0..1."""
-    errors = [functional.mse_loss(picture, truth).item() for picture in (photo, answer)]
-    before, after = (max(error, _ROUNDING) for error in errors)
+def psnr_gain_db(prediction: Tensor, photo: Tensor, ground_truth: Tensor) -> float:
+    """PSNR of the prediction minus PSNR of the photo, in dB; pictures of one shape, encoded in 0..1."""
+    errors = [functional.mse_loss(picture, ground_truth).item() for picture in (photo, prediction)]
+    before, after = (max(error, _QUANTIZATION_MSE) for error in errors)
     return 10 * math.log10(before / after)
 
 
-def tone(answer: Tensor, photo: Tensor, truth: Tensor) -> float:
-    """Light of the answer over that of the photo where the truth says that little was added; 1 if that is nowhere.
+def tone_ratio(prediction: Tensor, photo: Tensor, ground_truth: Tensor) -> float:
+    """Linear light of the prediction divided by that of the photo, over the pixels where the glass added almost no light.
 
-    Encoded pictures in 0..1; little is less than a twentieth of the photo's own light in every channel.
+    It is 1 for a network that keeps the exposure, and 1 if there is no such pixel. Pictures are (..., 3, h, w), encoded in
+    0..1; the added light is photo - ground truth, and less than a twentieth of the photo's light in every channel.
     """
-    before, after, wanted = (to_linear(picture) for picture in (photo, answer, truth))
-    untouched = (before - wanted < _LITTLE * before + _LITTLE**2).all(dim=-3, keepdim=True).expand_as(before)
+    before, after, wanted = (to_linear(picture) for picture in (photo, prediction, ground_truth))
+    untouched = (
+        (before - wanted < _MAX_ADDED_SHARE * before + _MAX_ADDED_SHARE**2)
+        .all(dim=-3, keepdim=True)
+        .expand_as(before)
+    )
     light = before[untouched].sum()
     return (after[untouched].sum() / light).item() if light > 0 else 1.0
 
 
-def finite(value: Tensor, step: int, name: str = "loss") -> Tensor:
-    """The loss, or what is named, if it is a number.
+def check_finite(value: Tensor, step: int, name: str = "loss") -> Tensor:
+    """Returns `value`, a scalar, if it is finite.
 
     Raises:
-        ModelError: it is not; the last checkpoint is still good.
+        ModelError: the value is NaN or infinite. The last checkpoint is still valid.
     """
     if value.isfinite():
         return value

@@ -1,4 +1,4 @@
-"""Opens what a recipe learns from: photos, maps and pairs are read into memory, rendered samples are not.
+"""Opens the training data of a recipe. Photos, maps and pairs are read into memory; rendered samples are not.
 
 stream = open_stream(read_recipe(Path("recipes/train/tiny.toml")))
 batch = stream(step=0, count=2, size=64)
@@ -25,48 +25,55 @@ from brewster.training.recipe import CompactRecipe, DataRecipe, RenderedRecipe, 
 
 
 def open_stream(recipe: CompactRecipe, device: torch.device | str = "cpu") -> Stream:
-    """The recipe's training data: photos, maps and pairs in memory; what is rendered live is so on the device.
+    """Opens the training data of a recipe as one stream. Samples that are rendered online are rendered on `device`.
 
     Raises:
-        RecipeError: a folder is missing or empty, pairs do not fit together, or too few samples are rendered.
+        RecipeError: a folder is missing or empty, pairs do not match, or there are too few rendered samples.
         PhotoError: a picture cannot be read, or a map cannot light a scene.
     """
-    return _shared(
-        recipe.data.pairs_share, partial(_open_pairs, recipe), partial(_open_others, recipe, device)
+    return _interleave(
+        recipe.data.pairs_share, partial(_open_pairs, recipe), partial(_open_unpaired, recipe, device)
     )
 
 
 def validation_pairs(data: DataRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]:
-    """Aligned (photo, transmission) pairs, uint8 sRGB (H, W, 3), by names that tell their folders apart.
+    """Reads the aligned (photo, transmission) pairs of `validate_on`, uint8 sRGB (H, W, 3).
+
+    Returns:
+        The pairs of each folder, by a short unique name of the folder.
 
     Raises:
-        RecipeError: a folder is missing or empty, or pairs do not fit together.
+        RecipeError: a folder is missing or empty, or pairs do not match.
         PhotoError: a picture cannot be read.
     """
     folders = tuple(dict.fromkeys(data.validate_on))
     root = data_folder() if folders else Path()
     return {
         name: read_pairs([root / folder], data.validate_at_most)
-        for name, folder in zip(_short(folders), folders, strict=True)
+        for name, folder in zip(_unique_names(folders), folders, strict=True)
     }
 
 
 def held_out_mixtures(recipe: CompactRecipe) -> Stream | None:
-    """Mixtures of the recipe's held-out photos and maps, distributed as in training; None if none are held out.
+    """Opens mixtures of the recipe's held-out photos and maps, distributed as in training.
+
+    Returns:
+        The stream, or None if the recipe holds out nothing.
 
     Raises:
-        RecipeError, PhotoError: no photo is held out, or one cannot be read.
+        RecipeError: no photo matches `held_out`.
+        PhotoError: a photo cannot be read.
     """
     data = recipe.data
     if not (data.held_out and data.photos):
         return None
-    photos = read_photos(found(data.photos), data.exclude, only=data.held_out)
-    maps = read_maps(found(data.maps), data.exclude, only=data.held_out)
+    photos = read_photos(resolve_folders(data.photos), data.exclude, only=data.held_out)
+    maps = read_maps(resolve_folders(data.maps), data.exclude, only=data.held_out)
     return Mixtures(photos, maps, recipe.mix, seed=recipe.seed + 3)
 
 
-def _short(folders: Sequence[Path]) -> list[str]:
-    """Names for different folders: as much of the end of their paths as tells them apart."""
+def _unique_names(folders: Sequence[Path]) -> list[str]:
+    """The shortest ends of the paths that are unique, with an equal number of parts."""
     for length in range(1, max((len(folder.parts) for folder in folders), default=0)):
         names = ["/".join(folder.parts[-length:]) for folder in folders]
         if len(set(names)) == len(names):
@@ -74,14 +81,14 @@ def _short(folders: Sequence[Path]) -> list[str]:
     return list(map(str, folders))
 
 
-def _open_others(recipe: CompactRecipe, device: torch.device | str) -> Stream:
-    return _shared(
+def _open_unpaired(recipe: CompactRecipe, device: torch.device | str) -> Stream:
+    return _interleave(
         recipe.data.rendered_share, partial(_open_rendered, recipe, device), partial(_open_mixtures, recipe)
     )
 
 
-def _shared(share: float, first: Callable[[], Stream], second: Callable[[], Stream]) -> Stream:
-    """Opens only what has a share."""
+def _interleave(share: float, first: Callable[[], Stream], second: Callable[[], Stream]) -> Stream:
+    """Opens only the streams with a share above 0."""
     if share in (0, 1):
         return first() if share else second()
     return InterleavedStream(first(), second(), share)
@@ -90,11 +97,11 @@ def _shared(share: float, first: Callable[[], Stream], second: Callable[[], Stre
 def _open_mixtures(recipe: CompactRecipe) -> Stream:
     data = recipe.data
     if data.is_none:
-        return _refuse
-    folders = found(data.photos)
+        return _empty_stream
+    folders = resolve_folders(data.photos)
     return Mixtures(
         read_photos(folders, data.never_trained_on),
-        read_maps(found(data.maps), data.never_trained_on),
+        read_maps(resolve_folders(data.maps), data.never_trained_on),
         recipe.mix,
         seed=recipe.seed,
         weights=source_weights(folders, data.never_trained_on),
@@ -102,58 +109,62 @@ def _open_mixtures(recipe: CompactRecipe) -> Stream:
 
 
 def _open_pairs(recipe: CompactRecipe) -> Stream:
-    return Pairs(read_pairs(found(recipe.data.pairs)), recipe.mix.crop, seed=recipe.seed + 1)
+    return Pairs(read_pairs(resolve_folders(recipe.data.pairs)), recipe.mix.crop, seed=recipe.seed + 1)
 
 
 def _open_rendered(recipe: CompactRecipe, device: torch.device | str) -> Stream:
-    wanted, choices = recipe.data.rendered, recipe.seed + 2
-    assert wanted
-    if wanted.sets:
+    rendered, seed = recipe.data.rendered, recipe.seed + 2
+    assert rendered
+    if rendered.sets:
         return RenderedSets(
-            found(wanted.sets),
-            seed=choices,
-            count=wanted.count,
+            resolve_folders(rendered.sets),
+            seed=seed,
+            count=rendered.count,
             crop=recipe.mix.crop,
-            target=wanted.target,
-            mixing=wanted.mixing,
+            target=rendered.target,
+            mixing=rendered.mixing,
         )
-    live = _open_live(recipe, wanted, device)
-    return live if wanted.count is None else CachedRendered(live, wanted.count, seed=choices)
+    online = _open_online(recipe, rendered, device)
+    return online if rendered.count is None else CachedRendered(online, rendered.count, seed=seed)
 
 
-def _open_live(recipe: CompactRecipe, wanted: RenderedRecipe, device: torch.device | str) -> OnlineRendered:
-    maps, photos = found(wanted.maps), found(wanted.photos)
+def _open_online(
+    recipe: CompactRecipe, rendered: RenderedRecipe, device: torch.device | str
+) -> OnlineRendered:
+    maps, photos = resolve_folders(rendered.maps), resolve_folders(rendered.photos)
     catalog, refused = read_catalog(maps, photos, recipe.data.never_trained_on)
-    if refused:  # a run of hours has nobody to tell that it learns from less than was asked
+    if (
+        refused
+    ):  # a warning in a log of hours would be overlooked, and the run would train on less data than listed
         raise refused[0]
     return OnlineRendered(
-        _scenes(wanted),
+        _scene_recipe(rendered),
         catalog,
         Assets([*maps, *photos]),
-        seed=recipe.seed if wanted.seed is None else wanted.seed,
+        seed=recipe.seed if rendered.seed is None else rendered.seed,
         device=device,
-        target=wanted.target,
-        mixing=wanted.mixing,
+        target=rendered.target,
+        mixing=rendered.mixing,
     )
 
 
-def _scenes(wanted: RenderedRecipe) -> SceneRecipe:
-    scenes = read_scene_recipe(wanted.recipe or "")
-    return scenes.model_copy(update={"orders": wanted.orders}) if wanted.orders else scenes
+def _scene_recipe(rendered: RenderedRecipe) -> SceneRecipe:
+    scenes = read_scene_recipe(rendered.recipe or "")
+    return scenes.model_copy(update={"orders": rendered.orders}) if rendered.orders else scenes
 
 
-def _refuse(step: int, count: int, size: int) -> TrainingBatch:  # noqa: ARG001  (a Stream)
+def _empty_stream(step: int, count: int, size: int) -> TrainingBatch:  # noqa: ARG001  (a Stream)
     raise RecipeError(
-        "the recipe has nothing to learn from",
+        "the recipe has no training data: every share or count is 0",
         "a share above 0, and a count of rendered samples above 0",
         "raise data.rendered.count, data.rendered.share or data.pairs_share",
     )
 
 
-def found(named: Sequence[Path]) -> list[Path]:
-    """Where a recipe's folders lie; BREWSTER_DATA is not asked for where no path starts from it.
+def resolve_folders(folders: Sequence[Path]) -> list[Path]:
+    """Resolves the folders of a recipe: relative paths start from BREWSTER_DATA.
 
     Raises:
-        RecipeError: it is asked for and names no folder.
+        RecipeError: a path is relative, and BREWSTER_DATA is unset or not a folder.
     """
-    return [folder if folder.is_absolute() else data_folder() / folder for folder in named]
+    return [folder if folder.is_absolute() else data_folder() / folder for folder in folders]

@@ -1,4 +1,4 @@
-"""What a run tells TensorBoard beside its log: `tensorboard --logdir OUT`; nothing where tensorboard is not installed."""
+"""TensorBoard events of a run, in addition to its log: `tensorboard --logdir OUT`. A no-op without tensorboard."""
 
 from __future__ import annotations
 
@@ -14,34 +14,34 @@ if TYPE_CHECKING:
     from jaxtyping import Float
     from torch.utils.tensorboard import SummaryWriter
 
-PICTURE = "samples"
+IMAGE_TAG = "samples"
 
 
 @final
 class TensorBoardLog:
-    """Event files in a folder, from the step on that a run goes on from: what was told of later steps is forgotten."""
+    """Event files in a folder. Events after `completed_steps`, from an earlier interrupted run, are discarded."""
 
-    def __init__(self, folder: Path, begun: int) -> None:
-        self._folder, self._begun = folder, begun
+    def __init__(self, folder: Path, completed_steps: int) -> None:
+        self._folder, self._completed_steps = folder, completed_steps
 
-    def log(self, step: int, numbers: Mapping[str, float], encoded: Float[Tensor, "h w 3"]) -> None:
-        """Writes each number as a scalar, and the picture, sRGB-encoded in 0..1."""
+    def log(self, step: int, metrics: Mapping[str, float], picture_encoded: Float[Tensor, "h w 3"]) -> None:
+        """Writes each metric as a scalar, and the picture, sRGB-encoded in 0..1, as an image."""
         if self._writer:
-            for name, value in numbers.items():
+            for name, value in metrics.items():
                 self._writer.add_scalar(name, value, step)
-            self._writer.add_image(PICTURE, encoded.clamp(0, 1), step, dataformats="HWC")
+            self._writer.add_image(IMAGE_TAG, picture_encoded.clamp(0, 1), step, dataformats="HWC")
             self._writer.flush()
 
     def close(self) -> None:
-        """Nothing more is told."""
+        """Closes the event file, if one was opened."""
         if "_writer" in vars(self) and self._writer:
             self._writer.close()
 
     @cached_property
     def _writer(self) -> SummaryWriter | None:
-        """Opened when there is something to tell, so that a run that has ended leaves no empty file."""
+        """Opened at the first event, so that resuming a completed run creates no empty file."""
         if not importlib.util.find_spec("tensorboard"):
             return None
-        from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  (wakes tensorboard)
+        from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  (imports tensorboard)
 
-        return SummaryWriter(self._folder, purge_step=self._begun + 1)
+        return SummaryWriter(self._folder, purge_step=self._completed_steps + 1)

@@ -1,4 +1,4 @@
-"""From a recipe to what learns it."""
+"""Selects and creates the trainer for a recipe."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from brewster.training.recipe import CompactRecipe, LoraRecipe
 
 
 def open_trainer(recipe: CompactRecipe | LoraRecipe) -> Trainer:
-    """The recipe's network and data, ready for `loop.run`; meets the other processes, where there are some.
+    """Creates the trainer of a recipe, for `loop.run`. Joins the process group if there are several processes.
 
     Raises:
-        RecipeError, PhotoError: data are missing or damaged, or cannot be divided among the processes.
+        RecipeError, PhotoError: data is missing or damaged, or the batch cannot be divided among the processes.
         DownloadError, ModelError, DeviceError, MissingExtra: a backbone cannot be loaded.
     """
     distributed.initialize()
     if isinstance(recipe, LoraRecipe):
-        from brewster.training.lora.trainer import LoraTrainer  # noqa: PLC0415  (one network is enough to wake)
+        from brewster.training.lora.trainer import LoraTrainer  # noqa: PLC0415  (imports diffusers)
 
         return LoraTrainer(recipe)
     if distributed.world_size() > 1:
         raise RecipeError(
-            f"{distributed.world_size()} processes are to train the compact network",
-            "one",
+            f"the compact network was started with {distributed.world_size()} processes",
+            "one process",
             "start it without torchrun",
         )
     from brewster.training.compact.trainer import CompactTrainer  # noqa: PLC0415

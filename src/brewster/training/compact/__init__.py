@@ -1,1 +1,1 @@
-"""How does the compact network learn, and what does its training leave?"""
+"""Training and ONNX export of the compact network."""

@@ -1,4 +1,4 @@
-"""From a trained network to a file that needs no torch."""
+"""Exports a trained network to ONNX, which runs without torch."""
 
 from __future__ import annotations
 
@@ -21,16 +21,17 @@ _SMALLEST_WEIGHT = 16
 
 
 def export_onnx(network: nn.Module, path: Path, stride: int) -> None:
-    """Writes `photo` -> `transmission`, `reflection`, linear light (1, 3, H, W), H and W multiples of `stride`.
+    """Writes the network as an ONNX file: input `photo`, outputs `transmission` and `reflection`.
 
-    The weights are stored in half precision, which halves the file; the network still computes in float32.
+    All are linear light, (1, 3, H, W), H and W multiples of `stride`. The weights are stored in half precision, which halves
+    the file; the network still computes in float32.
 
     Raises:
         TargetError: the file cannot be written.
     """
     height, width = (torch.export.Dim(name, min=1, max=256) for name in ("rows", "columns"))
     example = torch.rand(1, 3, 4 * stride, 5 * stride)
-    with _quietly():
+    with _without_warnings():
         program = torch.onnx.export(
             LinearSeparator(network).eval(),
             (example,),
@@ -46,10 +47,10 @@ def export_onnx(network: nn.Module, path: Path, stride: int) -> None:
 
 
 def with_half_weights(model: ModelProto) -> ModelProto:
-    """The same graph, its weights stored as float16 and cast to float32 before use.
+    """Changes the graph in place: weights are stored as float16 and cast to float32 before use. Returns `model`.
 
-    The runtime folds the casts when it loads the file, so that they cost no time afterwards. Small tensors stay as they
-    are: they are constants of the graph, such as the numbers of the sRGB curve.
+    ONNX Runtime folds the casts when it loads the file, so inference takes no extra time. Small tensors are not changed:
+    they are constants of the graph, such as the coefficients of the sRGB curve.
     """
     graph = model.graph
     casts = []
@@ -66,8 +67,8 @@ def with_half_weights(model: ModelProto) -> ModelProto:
 
 
 @contextmanager
-def _quietly() -> Iterator[None]:
-    """The exporter warns of a torchvision that nobody needs, and of its own old calls."""
+def _without_warnings() -> Iterator[None]:
+    """Hides the exporter's warnings about a missing torchvision, which is not needed, and about its own deprecated calls."""
     logger = logging.getLogger("torch.onnx")
     before = logger.level
     logger.setLevel(logging.ERROR)

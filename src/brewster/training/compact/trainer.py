@@ -1,6 +1,6 @@
-"""The compact network as a trainer: its losses, optimiser and running average, on the GPU where there is one.
+"""The trainer of the compact network: AdamW, an exponential moving average (EMA) of the weights, on a GPU if there is one.
 
-network = train(read_recipe(Path("recipes/train/compact.toml")), Path("out/compact"), report)
+network = train(read_recipe(Path("recipes/train/compact.toml")), Path("out/compact"), on_step)
 """
 
 from __future__ import annotations
@@ -20,67 +20,72 @@ from torch.nn import functional
 
 from brewster.errors import ModelError
 from brewster.models.networks import DEFAULT_NETWORK, NETWORKS
-from brewster.training.checkpoint import Checkpoint, fitting
+from brewster.training.checkpoint import Checkpoint, mismatch_as_model_error
 from brewster.training.compact.export import export_onnx
 from brewster.training.data.mixtures import Stream, TrainingBatch
 from brewster.training.distributed import best_device
-from brewster.training.loop import Report, run
-from brewster.training.losses import finite, gain_db, separation_loss, tone
+from brewster.training.loop import StepCallback, run
+from brewster.training.losses import check_finite, psnr_gain_db, separation_loss, tone_ratio
 from brewster.training.recipe import CompactRecipe
 from brewster.training.streams import held_out_mixtures, open_stream, validation_pairs
 from brewster.worker_setup import one_thread
 
-Pairs = Mapping[str, list[tuple[Tensor, Tensor]]]
-"""Encoded (photo, truth), float (1, 3, h, w) each, by the name of their folder."""
+ValidationPairs = Mapping[str, list[tuple[Tensor, Tensor]]]
+"""folder -> pairs of photo and ground truth, each float (1, 3, h, w), sRGB-encoded."""
 
 MODEL: Final = "model.onnx"
 _VALIDATION_SIDE_PX: Final = 384
 _HELD_OUT_MIXTURES: Final = 128
 _HELD_OUT_SIDE_PX: Final = 192
 _VISIBLE: Final = 1e-4
-"""Mean squared difference, encoded: a photo at more than 40 dB from its transmission has no visible reflection."""
+"""Mean squared difference of encoded values: at more than 40 dB, photo and transmission show no visible reflection."""
 _MAX_GRADIENT_NORM: Final = 1.0
-_TRAIN_IT_FIRST: Final = "train the recipe that makes it first, or mend start_from in this one"
+_START_FROM_CURE: Final = "train the recipe that writes it first, or correct start_from in this recipe"
 
 
-def train(recipe: CompactRecipe, out: Path, report: Report) -> nn.Module:
-    """Runs or resumes the recipe in folder `out`, as `loop.run` does; the network that users get.
+def train(recipe: CompactRecipe, out: Path, on_step: StepCallback) -> nn.Module:
+    """Trains or resumes the recipe in folder `out`, as `loop.run` does.
+
+    Returns:
+        The network with the averaged weights, which `export` would write.
 
     Raises:
-        RecipeError: data missing, or `out` holds a run of another recipe.
+        RecipeError: data is missing, or `out` contains a run of another recipe.
         PhotoError: a picture cannot be read.
         ModelError, TargetError: as `loop.run`.
     """
     trainer = CompactTrainer(recipe)
-    with one_thread():  # of the caller; the trainer's own threads have one each
-        run(trainer, out, report)
+    with one_thread():  # for this thread; the threads of the trainer's pools are limited by their initializer
+        run(trainer, out, on_step)
     return trainer.averaged_network()
 
 
 class CompactTrainer:
-    """A `Learner`: the network, the running average of its weights, and AdamW.
+    """The `Trainer` of a compact network: the network, the EMA of its weights, and AdamW.
 
-    `stream` stands in for the recipe's data.
+    `stream` replaces the recipe's data.
 
     Raises:
-        RecipeError, PhotoError: the data are missing or damaged.
+        RecipeError, PhotoError: the data is missing or damaged.
     """
 
     def __init__(self, recipe: CompactRecipe, stream: Stream | None = None) -> None:
         self.recipe, self.device = recipe, best_device()
         self._entry = NETWORKS[recipe.network]
         self.stream = stream or open_stream(recipe, self.device)
-        self._reduced = recipe.precision == "auto" and _has_bfloat16(self.device)
-        self._pairs: Pairs = _fitted(validation_pairs(recipe.data), self._entry.stride) | _held_out(recipe)
-        self._workers = 1 if self.device.type == "cpu" else os.cpu_count() or 1
-        self._cores = torch.get_num_threads() if self.device.type == "cpu" else 1
-        self._core_pool = _one_thread_each(self._cores)
-        self._pool = _one_thread_each(self._workers)
-        self._ahead: dict[int, Future[TrainingBatch]] = {}
+        self._uses_bfloat16 = recipe.precision == "auto" and _has_bfloat16(self.device)
+        self._validation_pairs: ValidationPairs = _resize_pairs(
+            validation_pairs(recipe.data), self._entry.stride
+        ) | _held_out_pairs(recipe)
+        self._data_workers = 1 if self.device.type == "cpu" else os.cpu_count() or 1
+        self._shard_count = torch.get_num_threads() if self.device.type == "cpu" else 1
+        self._shard_pool = _single_thread_pool(self._shard_count)
+        self._data_pool = _single_thread_pool(self._data_workers)
+        self._prefetched: dict[int, Future[TrainingBatch]] = {}
         torch.manual_seed(recipe.seed)
         network = self._entry.pretrained()
         self.network = network.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._begin_average()
+        self._reset_average()
         encoder = list(self.network.get_submodule("encoder").parameters())
         known = set(map(id, encoder))
         rest = [parameter for parameter in self.network.parameters() if id(parameter) not in known]
@@ -95,24 +100,24 @@ class CompactTrainer:
 
     @torch.no_grad()
     def initialize(self) -> None:
-        """Begins with the averaged weights of other runs, if the recipe names any; of several, with their mean.
+        """Loads the EMA weights of the checkpoints in `start_from`; the mean, if there are several.
 
-        The mean of runs that began alike is often better than each (Wortsman et al. 2022, model soups).
+        The mean of runs with one starting point is often better than each of them (Wortsman et al. 2022, model soups).
 
         Raises:
             ModelError: a checkpoint is missing, damaged or of another network.
         """
         for count, path in enumerate(self.recipe.start_from, start=1):
-            other, checkpoint = self._entry.build(), Checkpoint.read(path, _TRAIN_IT_FIRST)
-            with fitting(path, _TRAIN_IT_FIRST):
-                _refuse_another_network(path, checkpoint, self.recipe.network)
+            other, checkpoint = self._entry.build(), Checkpoint.read(path, _START_FROM_CURE)
+            with mismatch_as_model_error(path, _START_FROM_CURE):
+                _check_network(path, checkpoint, self.recipe.network)
                 other.load_state_dict(checkpoint.state.get("average", {}))
-            for mine, theirs in zip(self.network.parameters(), other.parameters(), strict=True):
-                mine.lerp_(theirs.to(self.device), 1 / count)
-        self._begin_average()
+            for parameter, start in zip(self.network.parameters(), other.parameters(), strict=True):
+                parameter.lerp_(start.to(self.device), 1 / count)
+        self._reset_average()
 
     def state_dict(self) -> dict[str, Any]:
-        """Weights, their average, and the optimiser's moments."""
+        """Returns the weights, their EMA, and the state of the optimiser."""
         return {
             "network": self.network.state_dict(),
             "average": self.average,
@@ -120,47 +125,50 @@ class CompactTrainer:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on from such a state."""
+        """Restores a state that `state_dict` returned."""
         self.network.load_state_dict(state["network"])
         self.average = {name: value.to(self.device) for name, value in state["average"].items()}
         self.optimizer.load_state_dict(state["optimizer"])
 
     def training_step(self, step: int) -> dict[str, float]:
-        """One step of AdamW on one batch; returns the parts of the loss.
+        """Runs one step of AdamW on one batch. Returns the loss and its parts.
 
         Raises:
-            ModelError: the loss is not a number; the last checkpoint is still good.
+            ModelError: the loss is NaN or infinite. The last checkpoint is still valid.
         """
-        parts = self._set_gradients(self._batch(step).to(self.device))
-        loss = finite(torch.stack(list(parts.values())).sum(), step)
+        parts = self._compute_gradients(self._batch(step).to(self.device))
+        loss = check_finite(torch.stack(list(parts.values())).sum(), step)
         self._set_learning_rates(step)
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
-        if norm.isfinite():  # else this batch is skipped: one infinite gradient would end a run of hours
+        if norm.isfinite():  # otherwise skip the batch: one infinite gradient would destroy the weights
             self.optimizer.step()
             self._update_average(step + 1)
         return {"loss": loss.item(), **{name: part.item() for name, part in parts.items()}}
 
-    def _set_gradients(self, batch: TrainingBatch) -> dict[str, Tensor]:
-        """Sets each parameter's gradient of the loss, a mean over the batch; returns the parts of the loss.
+    def _compute_gradients(self, batch: TrainingBatch) -> dict[str, Tensor]:
+        """Sets the gradient of the mean loss of the batch on each parameter. Returns the parts of the loss.
 
-        On a CPU each core computes a share of the batch by itself: measured 1.2-1.3 times faster than all cores on
-        one operation after the other (16 x 128 px, two cores).
+        On a CPU the batch is split into one shard per core, each computed by a single thread: measured 1.2-1.3 times faster
+        than splitting each operation over all cores (16 x 128 px, two cores).
         """
         count = len(batch.photo_encoded)
-        shares = list(self._core_pool.map(self._share_of_gradients, batch.split(-(-count // self._cores))))
+        shards = list(
+            self._shard_pool.map(self._shard_gradients, batch.split(-(-count // self._shard_count)))
+        )
         for parameter in self.network.parameters():
-            parameter.grad = torch.zeros_like(
-                parameter
-            )  # the fused optimiser needs the parameter's memory layout
-        for n, _, gradients in shares:
+            # The fused optimiser ignores strides: a gradient needs its parameter's memory layout (docs/training.md).
+            parameter.grad = torch.zeros_like(parameter)
+        for n, _, gradients in shards:
             for parameter, gradient in zip(self.network.parameters(), gradients, strict=True):
                 assert parameter.grad is not None
                 parameter.grad.add_(gradient, alpha=n / count)
-        names = shares[0][1]
-        return {name: torch.stack([part[name] * n / count for n, part, _ in shares]).sum() for name in names}
+        names = shards[0][1]
+        return {name: torch.stack([part[name] * n / count for n, part, _ in shards]).sum() for name in names}
 
-    def _share_of_gradients(self, batch: TrainingBatch) -> tuple[int, dict[str, Tensor], tuple[Tensor, ...]]:
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._reduced, cache_enabled=False):
+    def _shard_gradients(self, batch: TrainingBatch) -> tuple[int, dict[str, Tensor], tuple[Tensor, ...]]:
+        with torch.autocast(
+            self.device.type, torch.bfloat16, enabled=self._uses_bfloat16, cache_enabled=False
+        ):
             layers = self.network(_channels_last(batch.photo_encoded))
         parts = separation_loss(layers, batch)
         total = torch.stack(list(parts.values())).sum()
@@ -168,36 +176,36 @@ class CompactTrainer:
         return len(batch.photo_encoded), {name: part.detach() for name, part in parts.items()}, gradients
 
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """What the averaged network gains on the recipe's pairs, and what it makes of four of each folder."""
+        """Returns the metrics of the averaged network on the recipe's pairs, and a picture of four predictions per folder."""
         network = self.averaged_network()
-        numbers = validate(network, self._pairs, self._core_pool.map)
-        return numbers, _sheet(network, self._pairs or self._some())
+        metrics = validate(network, self._validation_pairs, self._shard_pool.map)
+        return metrics, _contact_sheet(network, self._validation_pairs or self._training_pairs())
 
     def export(self, folder: Path) -> Path:
-        """Writes model.onnx, which needs no torch.
+        """Writes the averaged network to model.onnx in `folder`. Returns the path of the file.
 
         Raises:
-            TargetError: it cannot be written.
+            TargetError: the file cannot be written.
         """
         export_onnx(self.averaged_network(), folder / MODEL, self._entry.stride)
         return folder / MODEL
 
     def averaged_network(self) -> nn.Module:
-        """The network with the running average of its weights, ready to be used."""
+        """Returns a copy of the network with the EMA of the weights, in evaluation mode."""
         network = self._entry.build().eval()
         network.load_state_dict(self.average)
         return network
 
-    def _begin_average(self) -> None:
+    def _reset_average(self) -> None:
         self.average = {name: value.clone() for name, value in self.network.state_dict().items()}
 
-    def _batch(self, wanted: int) -> TrainingBatch:
-        """The batch of this step; those of the next steps are made in the background meanwhile."""
-        for step in range(wanted, wanted + 1 + self._workers):
-            if step not in self._ahead:
-                size = self.recipe.size_at(step)
-                self._ahead[step] = self._pool.submit(self.stream, step, self.recipe.batch, size)
-        return self._ahead.pop(wanted).result()
+    def _batch(self, step: int) -> TrainingBatch:
+        """Returns the batch of this step, and starts making the next batches in background threads."""
+        for ahead in range(step, step + 1 + self._data_workers):
+            if ahead not in self._prefetched:
+                size = self.recipe.size_at(ahead)
+                self._prefetched[ahead] = self._data_pool.submit(self.stream, ahead, self.recipe.batch, size)
+        return self._prefetched.pop(step).result()
 
     def _set_learning_rates(self, step: int) -> None:
         warm = min(1.0, (step + 1) / self.recipe.warmup_steps)
@@ -212,77 +220,79 @@ class CompactTrainer:
         for name, value in self.network.state_dict().items():
             self.average[name].lerp_(value, 1 - decay)
 
-    def _some(self) -> Pairs:
+    def _training_pairs(self) -> ValidationPairs:
         batch = self.stream(0, self.recipe.batch, self.recipe.size_at(0)).to(torch.device("cpu"))
         pairs = zip(batch.photo_encoded[:, None], batch.transmission_encoded[:, None], strict=True)
         return {"training": list(pairs)}
 
 
 def validate(
-    network: Callable[[Tensor], Tensor], pairs: Pairs, map_: Callable[..., Iterable[Any]] = map
+    network: Callable[[Tensor], Tensor], pairs: ValidationPairs, map_: Callable[..., Iterable[Any]] = map
 ) -> dict[str, float]:
-    """By folder, at the (small) size of the given pairs: the mean gain in PSNR over the input, in dB; the share of pairs
-    that are worse than the input; and the tone, the light of the answer over that of the input where nothing was added,
-    which is 1 for a network that leaves the exposure alone. `map_` may be that of a pool of threads.
+    """Validates a network on pairs, at the size of the given pairs. `map_` may be the `map` of a thread pool.
+
+    Returns:
+        For each folder: gain_db_NAME, the mean PSNR gain over the input in dB; worse_NAME, the share of pairs whose
+        prediction is worse than the input; tone_NAME, the mean `tone_ratio`, which is 1 if the exposure is kept.
     """
 
     @torch.no_grad()
     def measure(pair: tuple[Tensor, Tensor]) -> tuple[float, float]:
-        answer = network(pair[0])[:, :3].clamp(0, 1)
-        return gain_db(answer, *pair), tone(answer, *pair)
+        prediction = network(pair[0])[:, :3].clamp(0, 1)
+        return psnr_gain_db(prediction, *pair), tone_ratio(prediction, *pair)
 
-    numbers = {}
+    metrics = {}
     for name, folder in filter(itemgetter(1), pairs.items()):
         gains, tones = zip(*map_(measure, folder), strict=True)
-        numbers[f"gain_db_{name}"] = sum(gains) / len(gains)
-        numbers[f"worse_{name}"] = sum(gain < 0 for gain in gains) / len(gains)
-        numbers[f"tone_{name}"] = sum(tones) / len(tones)
-    return numbers
+        metrics[f"gain_db_{name}"] = sum(gains) / len(gains)
+        metrics[f"worse_{name}"] = sum(gain < 0 for gain in gains) / len(gains)
+        metrics[f"tone_{name}"] = sum(tones) / len(tones)
+    return metrics
 
 
 @torch.no_grad()
-def _sheet(network: nn.Module, pairs: Pairs) -> Tensor:
-    """Rows of photo, truth, transmission and reflection, four of each folder: (H, 960, 3)."""
+def _contact_sheet(network: nn.Module, pairs: ValidationPairs) -> Tensor:
+    """Rows of photo, ground truth, transmission and reflection, four rows per folder: (H, 960, 3), sRGB-encoded."""
     rows = []
-    for photo, truth in (pair for folder in pairs.values() for pair in folder[:4]):
+    for photo, ground_truth in (pair for folder in pairs.values() for pair in folder[:4]):
         layers = network(photo)
-        row = torch.cat([photo, truth, layers[:, :3], layers[:, 3:]], dim=3)
+        row = torch.cat([photo, ground_truth, layers[:, :3], layers[:, 3:]], dim=3)
         rows.append(functional.interpolate(row, (160, 960), mode="bilinear", antialias=True)[0])
     return torch.cat(rows, dim=1).permute(1, 2, 0)
 
 
-def _fitted(folders: Pairs, stride: int) -> dict[str, list[tuple[Tensor, Tensor]]]:
+def _resize_pairs(folders: ValidationPairs, stride: int) -> dict[str, list[tuple[Tensor, Tensor]]]:
     return {
-        name: [(_fit(photo, stride), _fit(truth, stride)) for photo, truth in pairs]
+        name: [(_resize(photo, stride), _resize(ground_truth, stride)) for photo, ground_truth in pairs]
         for name, pairs in folders.items()
     }
 
 
-def _refuse_another_network(path: Path, checkpoint: Checkpoint, wanted: str) -> None:
-    """Checkpoints of runs older than the recipe's `network` hold the default one."""
+def _check_network(path: Path, checkpoint: Checkpoint, expected: str) -> None:
+    """Checkpoints older than the recipe key `network` contain the default network."""
     found = json.loads(checkpoint.recipe).get("network", DEFAULT_NETWORK)
-    if found != wanted:
+    if found != expected:
         raise ModelError(
-            f"{path} holds the network {found}",
-            f"a checkpoint of {wanted}, the network that the recipe trains",
-            _TRAIN_IT_FIRST,
+            f"{path} contains the network {found}",
+            f"a checkpoint of {expected}, the network that the recipe trains",
+            _START_FROM_CURE,
         )
 
 
-def _one_thread_each(count: int) -> ThreadPoolExecutor:
-    """Threads that compute side by side, each operation in one of them: they never wait for each other."""
+def _single_thread_pool(count: int) -> ThreadPoolExecutor:
+    """A pool whose threads run each torch operation on one core, so that they never wait at a barrier."""
     return ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(1,))
 
 
 def _has_bfloat16(device: torch.device) -> bool:
-    """Whether the processor computes bfloat16 natively; elsewhere it is emulated, 20 to 50 times slower than float32."""
+    """Whether the device computes bfloat16 natively. Emulation is 20 to 50 times slower than float32."""
     if device.type != "cpu":
         return bool(torch.cuda.is_bf16_supported(including_emulation=False))
     return bool(torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported())
 
 
-def _held_out(recipe: CompactRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]:
-    """Always the same mixtures of what the recipe holds out: those with a visible reflection, and those without."""
+def _held_out_pairs(recipe: CompactRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]:
+    """Fixed mixtures of the held-out photos: "mixtures" with a visible reflection, "plain" without."""
     stream = held_out_mixtures(recipe)
     if stream is None:
         return {}
@@ -290,13 +300,15 @@ def _held_out(recipe: CompactRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]:
     pairs = list(zip(batch.photo_encoded[:, None], batch.transmission_encoded[:, None], strict=True))
     visible = [functional.mse_loss(*pair).item() > _VISIBLE for pair in pairs]
     return {
-        name: [pair for pair, shown in zip(pairs, visible, strict=True) if shown is wanted]
-        for name, wanted in (("mixtures", True), ("plain", False))
+        name: [
+            pair for pair, has_reflection in zip(pairs, visible, strict=True) if has_reflection is expected
+        ]
+        for name, expected in (("mixtures", True), ("plain", False))
     }
 
 
-def _fit(picture: Tensor, stride: int) -> Tensor:
-    """uint8 (H, W, 3) to float (1, 3, h, w) that the network takes, longest side 384 px."""
+def _resize(picture: Tensor, stride: int) -> Tensor:
+    """Resizes uint8 (H, W, 3) to float (1, 3, h, w) in 0..1, multiples of `stride`, longest side about 384 px."""
     height, width, _ = picture.shape
     scale = _VALIDATION_SIDE_PX / max(height, width)
     size = [max(1, round(side * scale / stride)) * stride for side in (height, width)]

@@ -1,1 +1,1 @@
-"""Training data: mixtures made online, rendered samples, real pairs, and the streams that interleave them."""
+"""Training data: mixtures of photos, rendered samples, real pairs, and streams that interleave them."""

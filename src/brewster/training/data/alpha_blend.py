@@ -1,7 +1,7 @@
-"""8-bit mixtures of a rendered sample's own content: the baseline of the paper's ablation (Table 4, Figure 7).
+"""8-bit mixtures of a rendered sample's layers: the baseline of the paper's ablation (Table 4, Figure 7).
 
-RDNet blends two tone-mapped pictures, I = alpha T + beta R - T o R. Here T is the background and R the mirrored
-scene of a sample, developed as they are, so that both kinds of data show the same two scenes.
+RDNet blends two tone-mapped pictures, I = alpha T + beta R - T o R. Here T is the background and R the mirror image of a
+rendered sample, so that both kinds of data show the same two scenes.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ BETA: Final = (0.4, 1.0)
 
 
 def blend(transmission_encoded: Tensor, reflection_encoded: Tensor, alpha: float, beta: float) -> Tensor:
-    """I = alpha T + beta R - T o R of encoded pictures of one shape, rounded to 8 bits, in 0..1 (RDNet)."""
+    """Returns I = alpha T + beta R - T o R (RDNet) of encoded pictures of one shape, rounded to 8 bits, in 0..1."""
     t, r = (_eight_bits(layer) for layer in (transmission_encoded, reflection_encoded))
     return _eight_bits(alpha * t + beta * r - t * r)
 
 
 def blended(developed: DevelopedSample) -> DevelopedSample:
-    """The same content mixed in 8 bits: background for T, beta times the mirrored scene for R, and their blend."""
+    """Returns the sample as an 8-bit mixture: T is the background, R is beta times the mirror image, I is their blend."""
     photo, transmission, reflection = blended_layers(
         developed.background_encoded, developed.mirror_encoded, developed.scene
     )
@@ -38,9 +38,9 @@ def blended(developed: DevelopedSample) -> DevelopedSample:
 def blended_layers(
     background_encoded: Tensor, mirror_encoded: Tensor, scene: Scene
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """I, T and R of a scene's mixture in 8 bits, (3, H, W) each in 0..1, from its encoded B and MR.
+    """Returns I, T and R of an 8-bit mixture, each (3, H, W) in 0..1, from encoded background and mirror image.
 
-    alpha and beta are drawn by the scene's seed and index, uniform in 0.8..1 and 0.4..1.
+    alpha is uniform in 0.8..1, beta in 0.4..1; both are functions of the scene's seed and index.
     """
     rng = Random(f"blend/{scene.seed}/{scene.index}")  # noqa: S311  (data, not secrets)
     alpha, beta = rng.uniform(*ALPHA), rng.uniform(*BETA)

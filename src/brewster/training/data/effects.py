@@ -1,6 +1,6 @@
-"""Optical effects of a mixture, on pictures (3, H, W) in linear light: defocus, ghosts, lamps, signs, shadows, windows.
+"""Optical effects of mixtures: defocus, ghost images, lamps, signs, shadows, windows, and JPEG.
 
-Masks are (1, size, size) in 0..1. All randomness comes from the `SampleRng` that is passed in.
+Pictures are (3, H, W) in linear light, masks (1, size, size) in 0..1. All random numbers come from the `SampleRng` argument.
 """
 
 from __future__ import annotations
@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 
 
 def blur(picture: Picture, radius_px: float, *, disc: bool) -> Picture:
-    """Defocus: a gaussian of this standard deviation, or a lens's disc of the same spread."""
+    """Defocus: a Gaussian with this standard deviation, or the disc of a lens aperture with the same spread.
+
+    The variance of a disc along an axis is a quarter of its squared radius; radii above 6 px are cut to 6 px.
+    """
     if disc:
         return _filter(picture, _disc(min(2 * radius_px, 6.0)))
     reach = max(1, round(3 * radius_px))
@@ -32,7 +35,7 @@ def blur(picture: Picture, radius_px: float, *, disc: bool) -> Picture:
 
 
 def ghost(rng: SampleRng, picture: Picture, weight: float, reach_px: float) -> Picture:
-    """Adds the second surface's copy, displaced by whole pixels; the mean stays."""
+    """Adds the ghost image of the pane's second surface, displaced by whole pixels; the mean is kept."""
     reach = max(1, round(reach_px))
     down, right = rng.randint(2 * reach + 1), rng.randint(2 * reach + 1)
     padded = functional.pad(picture[None], (reach,) * 4, mode="replicate")[0]
@@ -41,7 +44,7 @@ def ghost(rng: SampleRng, picture: Picture, weight: float, reach_px: float) -> P
 
 
 def lamps(rng: SampleRng, size: int) -> Picture:
-    """One to six small lamps, each a disc with the glow that the lens scatters around it; black elsewhere."""
+    """One to six small lamps on black, (3, size, size): each is a disc with the glow that the lens scatters around it."""
     count = 1 + rng.randint(6)
     x, y = rng.uniform_tensor(2, count, 1, 1) * size
     rows, columns = _pixels(size)
@@ -55,7 +58,7 @@ def lamps(rng: SampleRng, size: int) -> Picture:
 
 
 def sign(rng: SampleRng, picture: Picture) -> Picture:
-    """Adds rows of random glyphs, as letters of light on the picture, or dark on a lit panel; edges are sharp."""
+    """Adds rows of random glyphs with sharp edges: luminous letters, or dark letters on a luminous panel."""
     size = picture.shape[-1]
     rows, columns = 1 + rng.randint(3), 3 + rng.randint(9)
     glyphs = (rng.uniform_tensor(rows, 5, columns, 3) < 0.55).float()
@@ -75,25 +78,25 @@ def sign(rng: SampleRng, picture: Picture) -> Picture:
 
 
 def falloff(rng: SampleRng, size: int) -> Mask:
-    """A smooth field: where the mirrored side is lit, and where it is dark."""
+    """A smooth mask of the reflection: parts of the mirrored scene are unlit."""
     return torch.sigmoid(
         rng.uniform((1, 6)) * (_noise(rng, size, 2 + rng.randint(4)) + rng.uniform((-0.5, 0.5)))
     )
 
 
 def edge(rng: SampleRng, size: int) -> Mask:
-    """A half-plane: the reflection ends at a line, such as a frame or a dark body in front of the glass."""
+    """A half-plane: the reflection ends at a line, such as a frame or a dark person in front of the glass."""
     return torch.sigmoid(rng.log_uniform((4, 100)) * _line(rng, size))
 
 
 def window(rng: SampleRng, size: int) -> Mask:
-    """Where there is glass: the intersection of one to four half-planes with edges of about a pixel."""
+    """The area of the glass: the intersection of one to four half-planes, with edges of about a pixel."""
     inside = torch.stack([_line(rng, size) + 0.3 for _ in range(1 + rng.randint(4))]).amin(dim=0)
     return torch.sigmoid(size * inside)
 
 
 def shadow(rng: SampleRng, size: int) -> Mask:
-    """A factor on light: hard shadows with straight edges, or those of leaves."""
+    """A factor on light: hard shadows with straight edges, or shadows of leaves."""
     if rng.bernoulli(0.5):
         lit = torch.stack([_line(rng, size) for _ in range(1 + rng.randint(3))]).amin(dim=0)
     else:
@@ -104,10 +107,10 @@ def shadow(rng: SampleRng, size: int) -> Mask:
 
 
 def jpeg(encoded: Picture, quality: int) -> Picture:
-    """An encoded picture after JPEG's loss at this quality, 1..100: 8x8 cosine transform, quantisation, 8 bits.
+    """Returns an encoded picture with the loss of JPEG at a quality of 1..100: 8x8 cosine transform, quantisation, 8 bits.
 
-    Wallace, The JPEG still picture compression standard, CACM 34 (1991), tables K.1 and K.2, colour at full resolution;
-    without the lossless coding, so that it takes a tenth of a codec's time.
+    Wallace, The JPEG still picture compression standard, CACM 34 (1991), tables K.1 and K.2, colour at full resolution. It
+    skips the lossless coding and takes a tenth of a codec's time. Sides are multiples of 8.
     """
     scale = 50 / quality if quality < 50 else 2 - quality / 50
     luma, chroma = (_JPEG_TABLES * scale + 0.5).floor().clamp(1, 255)
@@ -136,24 +139,24 @@ _JPEG_TABLES: Final = torch.tensor([
 _COSINES: Final = torch.cat([torch.full((1, 8), math.sqrt(1 / 8)), 0.5 * torch.cos(
     torch.arange(1, 8)[:, None] * (2 * torch.arange(8)[None] + 1) * math.pi / 16
 )])  # fmt: skip
-"""The orthonormal discrete cosine transform of eight values."""
+"""Matrix of the orthonormal discrete cosine transform of eight values."""
 
 
 def _pixels(size: int) -> tuple[Tensor, Tensor]:
-    """Row and column numbers of pixel centres."""
+    """Row and column coordinates of pixel centres, (size, 1) and (1, size)."""
     centres = torch.arange(size) + 0.5
     return centres[:, None], centres[None]
 
 
 def _line(rng: SampleRng, size: int) -> Mask:
-    """Signed distance to a random line, in half pictures."""
+    """Signed distance to a random line, in units of half the picture's side."""
     angle, offset = rng.uniform((0, 2 * math.pi)), rng.uniform((-0.5, 0.5))
     rows, columns = (2 * centres / size - 1 for centres in _pixels(size))
     return (columns * math.cos(angle) + rows * math.sin(angle) + offset)[None]
 
 
 def _noise(rng: SampleRng, size: int, cells: int) -> Mask:
-    """Smooth noise of unit variance at its `cells` x `cells` nodes."""
+    """Normal noise on a grid of `cells` x `cells` nodes, bicubically interpolated."""
     return functional.interpolate(rng.normal(1, 1, cells, cells), (size, size), mode="bicubic")[0]
 
 

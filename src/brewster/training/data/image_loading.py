@@ -1,4 +1,4 @@
-"""Reads folders of photos, HDR maps and aligned pairs into memory, small, for the streams in `mix`."""
+"""Reads folders of photos, HDR maps and aligned pairs into memory, at reduced size, for the streams in `mixtures`."""
 
 from __future__ import annotations
 
@@ -24,31 +24,34 @@ _PICTURES = SUFFIXES.keys() - _MAPS
 _PHOTO_SIDE_PX = 640
 _MAP_HEIGHT_PX = 512
 _LARGEST_HALF = 65504.0
-_WORD = re.compile(r"[^0-9A-Za-z]")
+_WORD_END = re.compile(r"[^0-9A-Za-z]")
+_FOLDER_CURE = "name another folder in the recipe, or set BREWSTER_DATA to the folder of the data"
 
 
 def read_photos(
     folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
 ) -> list[Tensor]:
-    """Every photo of the folders, uint8 sRGB (H, W, 3), longest side at most 640 px, in order of name.
+    """Reads every photo of the folders: uint8 sRGB (H, W, 3), longest side at most 640 px, sorted by path.
+
+    `exclude` and `only` are patterns of file names, as in `fnmatch`.
 
     Raises:
-        RecipeError: a folder cannot be read, or there is no photo in any of them.
-        PhotoError: a photo cannot be read.
+        RecipeError: a folder cannot be read, or none of the folders contains a photo.
+        PhotoError: a photo cannot be decoded.
     """
-    return [_read_photo(path, _PHOTO_SIDE_PX) for path in _list(folders, _PICTURES, exclude, only)]
+    return [_read_photo(path, _PHOTO_SIDE_PX) for path in _list_pictures(folders, _PICTURES, exclude, only)]
 
 
 def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list[float]:
-    """Relative frequencies of the photos that `read_photos` returns, so that no single source dominates.
+    """Returns sampling weights for the photos of `read_photos`, so that no single source dominates.
 
-    Photos whose names begin with the same word (letters and digits) are of one source; n of them together weigh
-    sqrt(n).
+    Photos whose file names start with the same word (letters and digits) belong to one source. The n photos of a source have
+    the total weight sqrt(n).
 
     Raises:
-        RecipeError: as `read_photos`.
+        RecipeError: a folder cannot be read, or none of the folders contains a photo.
     """
-    sources = [_WORD.split(path.name)[0] for path in _list(folders, _PICTURES, exclude)]
+    sources = [_WORD_END.split(path.name)[0] for path in _list_pictures(folders, _PICTURES, exclude)]
     counts = Counter(sources)
     return [counts[source] ** -0.5 for source in sources]
 
@@ -56,93 +59,99 @@ def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list
 def read_maps(
     folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
 ) -> list[Tensor]:
-    """Every lat-long map of the folders, half precision (3, H, 2 H), at most 512 px high, linear light.
+    """Reads every lat-long map of the folders: half precision (3, H, 2 H), at most 512 px high, linear light.
+
+    `exclude` and `only` are patterns of file names, as in `fnmatch`.
 
     Raises:
-        RecipeError: a folder cannot be read, or there is no map in any of them.
-        PhotoError: a map cannot be read.
+        RecipeError: a folder cannot be read, or none of the folders contains a map.
+        PhotoError: a map cannot be decoded.
     """
-    return [_read_map(path) for path in _list(folders, _MAPS, exclude, only)]
+    return [_read_map(path) for path in _list_pictures(folders, _MAPS, exclude, only)]
 
 
-def read_pairs(folders: Sequence[Path], at_most: int | None = None) -> list[tuple[Tensor, Tensor]]:
-    """Aligned (photo, transmission) pairs of folders as `layouts.read_folders` joins them, in order of path.
+def read_pairs(folders: Sequence[Path], max_pairs: int | None = None) -> list[tuple[Tensor, Tensor]]:
+    """Reads aligned pairs (photo, transmission), uint8 sRGB (H, W, 3), sorted by path.
 
-    Of each folder `at_most` so many are read, evenly spaced.
+    `pairing.read_folders` matches the files. At most `max_pairs` are read from each folder, evenly spaced.
 
     Raises:
-        RecipeError: a folder cannot be read or is empty; a picture has no partner, or one of another size.
-        PhotoError: a picture cannot be read.
+        RecipeError: a folder cannot be read or is empty, or a photo has no transmission of its name and size.
+        PhotoError: a picture cannot be decoded.
     """
-    return [_read_pair(trio) for folder in folders for trio in _evenly(_trios(folder), at_most)]
+    return [
+        _read_pair(group)
+        for folder in folders
+        for group in _evenly_spaced(_picture_groups(folder), max_pairs)
+    ]
 
 
-def _evenly(trios: list[PictureGroup], at_most: int | None) -> list[PictureGroup]:
-    count = min(len(trios), at_most or len(trios))
-    return [trios[number * len(trios) // count] for number in range(count)]
+def _evenly_spaced(groups: list[PictureGroup], max_pairs: int | None) -> list[PictureGroup]:
+    count = min(len(groups), max_pairs or len(groups))
+    return [groups[number * len(groups) // count] for number in range(count)]
 
 
-def _trios(folder: Path) -> list[PictureGroup]:
+def _picture_groups(folder: Path) -> list[PictureGroup]:
     try:
         found = read_folders(folder)
     except PhotoError as error:
         raise RecipeError(
             error.happened,
-            "blended/ and transmission_layer/ beside each other",
-            "name another folder in the recipe, or set BREWSTER_DATA to where the data lies",
+            "a folder that contains blended/ and transmission_layer/",
+            _FOLDER_CURE,
         ) from error
     if found.refused:
         raise RecipeError(
-            f"{folder}: {found.refused[0]} ({len(found.refused)} such)",
-            "each photo needs one transmission of its name, and no transmission is left over",
+            f"{folder}: {found.refused[0]} (pictures without a partner: {len(found.refused)})",
+            "one transmission with the name of each photo, and no other files",
             "add or remove files until the names match",
         )
-    return sorted(found.groups, key=lambda trio: trio.photo)
+    return sorted(found.groups, key=lambda group: group.photo)
 
 
-def _read_pair(trio: PictureGroup) -> tuple[Tensor, Tensor]:
+def _read_pair(group: PictureGroup) -> tuple[Tensor, Tensor]:
     photo, transmission = (
-        torch.from_numpy(Photo.open(path).srgb_8bit().copy()) for path in (trio.photo, trio.transmission)
+        torch.from_numpy(Photo.open(path).srgb_8bit().copy()) for path in (group.photo, group.transmission)
     )
     if photo.shape != transmission.shape:
         raise RecipeError(
-            f"{trio.photo} and {trio.transmission} differ in size",
-            "pairs must be aligned pixel by pixel",
-            "crop one to the other",
+            f"{group.photo} and {group.transmission} differ in size",
+            "pairs that are aligned pixel by pixel",
+            "crop one to the size of the other",
         )
     return photo, transmission
 
 
 def _read_map(path: Path) -> Tensor:
-    linear = np.clip(_at_most(Photo.open(path), 2 * _MAP_HEIGHT_PX), 0, _LARGEST_HALF)
+    linear = np.clip(_downscaled(Photo.open(path), 2 * _MAP_HEIGHT_PX), 0, _LARGEST_HALF)
     return torch.from_numpy(linear.astype(np.float16)).permute(2, 0, 1).contiguous()
 
 
-def _read_photo(path: Path, longest_px: int) -> Tensor:
-    encoded = to_encoded(np.clip(_at_most(Photo.open(path), longest_px), 0, 1))
+def _read_photo(path: Path, max_side_px: int) -> Tensor:
+    encoded = to_encoded(np.clip(_downscaled(Photo.open(path), max_side_px), 0, 1))
     return torch.from_numpy(np.rint(encoded * 255).astype(np.uint8))
 
 
-def _at_most(photo: Photo, longest_px: int) -> NDArray[np.float32]:
-    scale = min(1.0, longest_px / max(photo.size))
+def _downscaled(photo: Photo, max_side_px: int) -> NDArray[np.float32]:
+    scale = min(1.0, max_side_px / max(photo.size))
     width, height = (max(1, round(side * scale)) for side in photo.size)
     return photo.small(width, height)
 
 
-def _list(
+def _list_pictures(
     folders: Iterable[Path], suffixes: set[str], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
 ) -> list[Path]:
     found = sorted(
         path
         for folder in folders
-        for path in _entries(folder)
+        for path in _list_folder(folder)
         if path.suffix.lower() in suffixes and _matches(path, only) and not _matches(path, exclude)
     )
     if folders and not found:
         raise RecipeError(
             f"no pictures in {', '.join(map(str, folders))}",
             f"files ending in {', '.join(sorted(suffixes))}",
-            "name another folder in the recipe, or set BREWSTER_DATA to where the data lies",
+            _FOLDER_CURE,
         )
     return found
 
@@ -151,12 +160,12 @@ def _matches(path: Path, patterns: Sequence[str]) -> bool:
     return any(fnmatch(path.name, pattern) for pattern in patterns)
 
 
-def _entries(folder: Path) -> list[Path]:
+def _list_folder(folder: Path) -> list[Path]:
     try:
         return list(folder.iterdir())
     except OSError as error:
         raise RecipeError(
             f"{folder} cannot be read ({error.strerror})",
             "a folder with pictures",
-            "name another folder in the recipe, or set BREWSTER_DATA to where the data lies",
+            _FOLDER_CURE,
         ) from error

@@ -1,9 +1,9 @@
-"""Linear-light mixtures of photographs: training data without a renderer, live and without end.
+"""Linear-light mixtures of photographs: an endless stream of training data without a renderer.
 
     stream = Mixtures(read_photos([Path("photos")]), read_maps([Path("hdri")]), MixRecipe(), seed=7)
     batch = stream(step=0, count=8, size=192)
 
-Each sample is a function of (seed, step, slot) alone. In linear light photo = T + R + veil with T = t B: the
+Each sample is a function of (seed, step, slot) only. In linear light, photo = T + R + veil with T = t B: the
 transmission T is the background B behind a pane of transmittance t.
 """
 
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
     Picture = Float[Tensor, "3 h w"]
 
 _REFERENCE_SIZE: Final = 256
-"""Lengths in a recipe are pixels of a picture of this size, and scale with the size asked for."""
+"""Lengths in a recipe are in pixels of a picture with this side, and are scaled to the side of the batch."""
 
 
 @dataclass(frozen=True)
 class TrainingBatch:
-    """Encoded pictures, each (N, 3, S, S) in 0..1, and how far each reflection truth is to be trusted, (N,)."""
+    """Encoded pictures, each (N, 3, S, S) in 0..1, and the weights of the reflections in the loss, (N,)."""
 
     photo_encoded: Tensor
     transmission_encoded: Tensor
@@ -43,68 +43,68 @@ class TrainingBatch:
     reflection_weight: Tensor
 
     @classmethod
-    def of(cls, layers: Tensor) -> TrainingBatch:
-        """Samples whose truths are certain, from (N, 9, S, S): photo, transmission and reflection as channels."""
+    def from_layers(cls, layers: Tensor) -> TrainingBatch:
+        """Creates a batch with reflection weights of 1 from (N, 9, S, S): photo, transmission and reflection as channels."""
         photo, transmission, reflection = layers.chunk(3, dim=1)
         return cls(photo, transmission, reflection, torch.ones(len(layers), device=layers.device))
 
     def to(self, device: torch.device) -> TrainingBatch:
-        """The same batch on another device."""
+        """Returns the batch on another device."""
         return TrainingBatch(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
 
-    def split(self, most: int) -> list[TrainingBatch]:
-        """The same samples in batches of at most so many."""
-        parts = zip(*(getattr(self, name).split(most) for name in self.__dataclass_fields__), strict=True)
+    def split(self, max_size: int) -> list[TrainingBatch]:
+        """Splits the batch into batches of at most `max_size` samples."""
+        parts = zip(*(getattr(self, name).split(max_size) for name in self.__dataclass_fields__), strict=True)
         return [TrainingBatch(*tensors) for tensors in parts]
 
 
 class Stream(Protocol):
-    """Where training data comes from: a function of the step, so that a resumed run sees the same data."""
+    """A source of training data. A batch is a function of the step, so that a resumed run sees the same data."""
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """The batch of this step: `count` samples of `size` px a side."""
+        """Returns the batch of this step: `count` samples with sides of `size` px."""
         ...
 
 
 Target = Literal["background", "transmission"]
-"""What a network learns to find behind the glass: the background B, photographed with the glass taken away, or the
-transmission T, which is what the pane lets through of it: photo = T + R in linear light."""
+"""What a network learns to predict: the background B, photographed without the glass, or the transmission T, the light of B
+that the pane lets through: photo = T + R in linear light."""
 
 
 class MixRecipe(FrozenModel):
-    """The distributions of a mixture; ranges are uniform, `_log` ranges uniform in the logarithm.
+    """The distributions of a mixture. Ranges are uniform; `_log` ranges are uniform in the logarithm.
 
-    The defaults are those that the shipped model learns from; a recipe names what it changes. Luminances are linear,
-    lengths in pixels are those of a picture of 256 px.
+    The defaults are the values of the shipped model; a recipe states only what it changes. Luminances are linear; lengths are
+    in pixels of a picture with a side of 256 px.
     """
 
     target: Target = "transmission"
     crop: Range = (0.35, 1.0)
-    """Side of the crop over the photo's shorter side."""
+    """Side of the crop, relative to the photo's shorter side."""
     temperature: Range = (-0.35, 0.35)
     background_map_probability: Share = 0.2
     """Share of backgrounds that are views of an HDR map instead of a photo."""
     background_level_log: LogRange = (0.03, 0.5)
     """Mean luminance of the background before the camera's exposure."""
     highlight_boost: Range = (0.0, 6.0)
-    """How many times brighter the white parts of a photo become: their true luminance was clipped."""
+    """Added brightness of the white parts of a photo, whose true luminance was clipped: a factor of 1 + this value."""
     shadow_probability: Share = 0.15
     """Share of backgrounds with a hard shadow."""
 
     absent_probability: Share = 0.12
-    """Share of samples without glass, from which a network learns to leave plain photos alone."""
+    """Share of samples without glass, from which a network learns not to change plain photos."""
     partial_probability: Share = 0.12
-    """Share of samples whose glass covers a part of the picture only."""
+    """Share of samples whose glass covers only a part of the picture."""
     transmittance: Range = (0.85, 1.0)
     veil_probability: Share = 0.1
     veil: Range = (0.0, 0.1)
-    """Scattered light of the pane, uniform, over the mean of the photo."""
+    """Uniform scattered light of the pane, relative to the mean of the photo."""
 
     reflection_map_probability: Share = 0.4
     reflection_ratio_log: LogRange = (0.04, 2.0)
-    """Mean of the reflection, its lamps left out, over the mean of the background."""
+    """Mean of the reflection without its lamps, relative to the mean of the background."""
     reflection_contrast_log: LogRange = (0.8, 1.8)
-    """Exponent on the reflected scene's luminance: the unlit side of the glass mirrors little but its lights."""
+    """Exponent on the luminance of the reflected scene: above 1, only bright objects remain visible in the reflection."""
     lamp_probability: Share = 0.15
     sign_probability: Share = 0.08
     sharp_probability: Share = 0.45
@@ -116,9 +116,9 @@ class MixRecipe(FrozenModel):
     edge_probability: Share = 0.3
 
     exposure: Range = (0.2, 0.55)
-    """The largest mean luminance of the exposed photo."""
+    """Largest mean luminance of the exposed photo."""
     overexposed_probability: Share = 0.2
-    """Share of photos that are exposed so long that a part of the background is white."""
+    """Share of photos whose exposure makes a part of the background white."""
     overexposed_share: Range = (0.005, 0.15)
     gamma_log: LogRange = (0.8, 1.25)
     contrast: Range = (-0.3, 0.5)
@@ -128,9 +128,9 @@ class MixRecipe(FrozenModel):
 
 
 class Mixtures:
-    """A `Stream` of mixtures of photos (uint8, (H, W, 3), sRGB) and HDR maps (half, (3, H, 2 H), linear).
+    """A `Stream` of mixtures of photos, uint8 (H, W, 3) sRGB, and HDR maps, half (3, H, 2 H) linear.
 
-    `weights` are the relative frequencies of the photos; by default all are equal.
+    `weights` are the relative sampling frequencies of the photos; by default all are equal.
     """
 
     def __init__(
@@ -146,7 +146,7 @@ class Mixtures:
         self._cumulative = torch.tensor(weights or [1.0] * len(photos), dtype=torch.float64).cumsum(0)
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """The batch of this step: `count` samples of `size` px a side."""
+        """Returns the batch of this step: `count` samples with sides of `size` px."""
         samples = [self._sample(SampleRng(self._seed, step, slot), size) for slot in range(count)]
         photo, transmission, reflection = (torch.stack(layer) for layer in zip(*samples, strict=True))
         return TrainingBatch(photo, transmission, reflection, torch.ones(count))
@@ -156,7 +156,7 @@ class Mixtures:
         background = self._background(rng, size)
         reflection = self._reflection(rng, size) * background.mean()
         if rng.bernoulli(recipe.absent_probability):
-            return _photograph(rng, recipe, background, background, torch.zeros_like(background))
+            return _expose_and_develop(rng, recipe, background, background, torch.zeros_like(background))
         glass = effects.window(rng, size) if rng.bernoulli(recipe.partial_probability) else torch.ones(1)
         transmittance = rng.uniform(recipe.transmittance) * (1 + 0.02 * rng.normal(3, 1, 1))
         transmission, reflection = background * (1 + glass * (transmittance - 1)), reflection * glass
@@ -164,7 +164,7 @@ class Mixtures:
         if rng.bernoulli(recipe.veil_probability):
             photo = photo + glass * rng.uniform(recipe.veil) * photo.mean(dim=(1, 2), keepdim=True)
         target = transmission if recipe.target == "transmission" else background
-        return _photograph(rng, recipe, photo, target, reflection)
+        return _expose_and_develop(rng, recipe, photo, target, reflection)
 
     def _background(self, rng: SampleRng, size: int) -> Picture:
         recipe = self._recipe
@@ -172,15 +172,15 @@ class Mixtures:
         if rng.bernoulli(recipe.shadow_probability):
             view = view * effects.shadow(rng, size)
         level = rng.log_uniform(recipe.background_level_log)
-        return view * _temperature(rng, recipe.temperature) * (level / _mean_without_lamps(view))
+        return view * _temperature(rng, recipe.temperature) * (level / _mean_without_highlights(view))
 
     def _reflection(self, rng: SampleRng, size: int) -> Picture:
-        """A reflection for a background of mean 1: blurred, doubled, fading and cut off, in linear light."""
+        """A reflection in linear light for a background with mean 1: blurred, with ghost image, falloff and edge."""
         recipe, scale = self._recipe, size / _REFERENCE_SIZE
         view = self._view(rng, size, recipe.reflection_map_probability)
-        view = view / _mean_without_lamps(view)
+        view = view / _mean_without_highlights(view)
         view = view * (view.mean(dim=0) + 1e-4) ** (rng.log_uniform(recipe.reflection_contrast_log) - 1)
-        view = view / _mean_without_lamps(view) * _temperature(rng, recipe.temperature)
+        view = view / _mean_without_highlights(view) * _temperature(rng, recipe.temperature)
         if rng.bernoulli(recipe.sign_probability):
             view = effects.sign(rng, view)
         if not rng.bernoulli(recipe.sharp_probability):
@@ -197,7 +197,7 @@ class Mixtures:
 
     def _view(self, rng: SampleRng, size: int, map_probability: float) -> Picture:
         if self._maps and rng.bernoulli(map_probability):
-            return _look_into(rng, self._maps[rng.randint(len(self._maps))], size)
+            return _perspective_view(rng, self._maps[rng.randint(len(self._maps))], size)
         crop = random_crop(rng, self._photos[self._choose_photo(rng)], self._recipe.crop, size)
         bright = ((crop.amax(dim=0, keepdim=True) - 0.8) / 0.2).clamp(0, 1)
         return crop * (1 + rng.uniform(self._recipe.highlight_boost) * bright**2)
@@ -208,15 +208,15 @@ class Mixtures:
 
 
 class Pairs:
-    """A `Stream` of aligned real pairs (uint8, (H, W, 3), sRGB): photo and the same view without glass."""
+    """A `Stream` of aligned real pairs, uint8 (H, W, 3) sRGB: the photo, and the same view without glass."""
 
-    reflection_weight = 0.3  # its truth is only what photo - transmission leaves
+    reflection_weight = 0.3  # below 1, because photo - transmission only approximates the reflection
 
     def __init__(self, pairs: Sequence[tuple[Tensor, Tensor]], crop: Range, *, seed: int) -> None:
         self._pairs, self._crop, self._seed = pairs, crop, seed
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """The batch of this step: `count` samples of `size` px a side."""
+        """Returns the batch of this step: `count` samples with sides of `size` px."""
         samples = [self._sample(SampleRng(self._seed, step, slot), size) for slot in range(count)]
         photo, transmission = (torch.stack(layer) for layer in zip(*samples, strict=True))
         reflection = (photo - transmission).clamp(min=0)
@@ -230,16 +230,16 @@ class Pairs:
 
 
 class InterleavedStream:
-    """A `Stream` that takes a share of each batch from one stream and the rest from another; blends may nest.
+    """A `Stream` that takes a share of each batch from one stream and the rest from another. Instances can be nested.
 
-    A batch comes on the accelerator if any part does, as what was rendered there should not travel twice.
+    A batch is on the accelerator if any part of it is, so that rendered samples are not copied back and forth.
     """
 
     def __init__(self, first: Stream, second: Stream, first_share: float) -> None:
         self._first, self._second, self._share = first, second, first_share
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """The batch of this step: `count` samples of `size` px a side."""
+        """Returns the batch of this step: `count` samples with sides of `size` px."""
         first_count = round(count * self._share)
         counts = (self._first, first_count), (self._second, count - first_count)
         parts = [stream(step, some, size) for stream, some in counts if some]
@@ -250,8 +250,10 @@ class InterleavedStream:
         )
 
 
-def _photograph(rng: SampleRng, recipe: MixRecipe, *layers: Picture) -> tuple[Picture, Picture, Picture]:
-    """One exposure and one tone curve for photo, target and reflection; noise, JPEG and 8 bits for the photo."""
+def _expose_and_develop(
+    rng: SampleRng, recipe: MixRecipe, *layers: Picture
+) -> tuple[Picture, Picture, Picture]:
+    """Applies one exposure and one tone curve to photo, target and reflection; and noise, JPEG and 8 bits to the photo."""
     exposure = min(1.0, rng.uniform(recipe.exposure) / layers[0].clamp(max=1).mean().item())
     if rng.bernoulli(recipe.overexposed_probability):
         white = _quantile(layers[1].amax(dim=0), 1 - rng.uniform(recipe.overexposed_share))
@@ -272,9 +274,9 @@ def _photograph(rng: SampleRng, recipe: MixRecipe, *layers: Picture) -> tuple[Pi
 
 
 def random_crop(rng: SampleRng, picture: Tensor, fraction: Range, size: int) -> Tensor:
-    """A random window, maybe mirrored, in linear light: (H, W, C) sRGB uint8 to (C, size, size).
+    """Returns a random crop, mirrored with probability 0.5, in linear light: (H, W, C) sRGB uint8 to (C, size, size).
 
-    `fraction` is the range of the window's side over the picture's shorter one.
+    `fraction` is the range of the crop's side relative to the picture's shorter side.
     """
     height, width, _ = picture.shape
     side = min(height, width) * rng.uniform(fraction)
@@ -282,7 +284,7 @@ def random_crop(rng: SampleRng, picture: Tensor, fraction: Range, size: int) -> 
     rows, columns = (max(8, min(limit, round(length))) for limit, length in (
         (height, side * stretch), (width, side / stretch)))  # fmt: skip
     top, left = rng.randint(height - rows + 1), rng.randint(width - columns + 1)
-    window = _light_of(picture[top : top + rows, left : left + columns]).permute(2, 0, 1)
+    window = _linear_from_bytes(picture[top : top + rows, left : left + columns]).permute(2, 0, 1)
     if rng.bernoulli(0.5):
         window = window.flip(2)
     return functional.interpolate(window[None], (size, size), mode="bilinear", antialias=True)[0].clamp(min=0)
@@ -291,13 +293,13 @@ def random_crop(rng: SampleRng, picture: Tensor, fraction: Range, size: int) -> 
 _LINEAR_OF_BYTE: Final = to_linear(torch.arange(256) / 255)
 
 
-def _light_of(encoded: Tensor) -> Tensor:
-    """Linear light of sRGB bytes, by a table; in one row, as torch looks up a row much faster than a picture."""
+def _linear_from_bytes(encoded: Tensor) -> Tensor:
+    """Linear light of sRGB bytes by a lookup table. Flattened, because torch indexes a vector much faster than a picture."""
     return _LINEAR_OF_BYTE.index_select(0, encoded.reshape(-1).int()).view(encoded.shape)
 
 
-def _look_into(rng: SampleRng, lat_long: Tensor, size: int) -> Picture:
-    """A perspective view into a lat-long map (3, H, 2 H): any heading, level within 20 degrees."""
+def _perspective_view(rng: SampleRng, lat_long: Tensor, size: int) -> Picture:
+    """A perspective view of a lat-long map (3, H, 2 H): field of view 50..100 degrees, any heading, pitch within 20 degrees."""
     half = math.tan(math.radians(rng.uniform((50, 100))) / 2)
     heading, pitch = rng.uniform((-math.pi, math.pi)), math.radians(rng.uniform((-20, 20)))
     down, right = torch.meshgrid(*[torch.linspace(-half, half, size)] * 2, indexing="ij")
@@ -310,19 +312,19 @@ def _look_into(rng: SampleRng, lat_long: Tensor, size: int) -> Picture:
     return view[0].clamp(min=0)
 
 
-def _mean_without_lamps(picture: Picture) -> Tensor:
-    """The mean of what is not brighter than the 95th percentile, so that a lamp does not set the exposure."""
+def _mean_without_highlights(picture: Picture) -> Tensor:
+    """The mean after clipping at the 95th percentile, so that a lamp does not determine the exposure."""
     return picture.clamp(max=_quantile(picture, 0.95)).mean() + 1e-4
 
 
 def _quantile(picture: Tensor, share: float) -> float:
-    """Estimated from every 29th value: a full sort would take as long as all the rest of a sample."""
+    """A quantile, estimated from every 29th value: a full sort would take as long as the rest of the sample."""
     values = picture.flatten()[::29]
     return values.kthvalue(max(1, round(share * len(values)))).values.item()
 
 
 def _temperature(rng: SampleRng, bounds: Range) -> Tensor:
-    """Gains of a warmer or colder light, (3, 1, 1)."""
+    """Random gains of warmer or colder light, (3, 1, 1)."""
     warmth = rng.uniform(bounds)
     gains = torch.tensor([warmth, 0, -warmth]) + 0.05 * rng.normal(3)
     return gains.exp()[:, None, None]

@@ -1,6 +1,6 @@
-"""Rendered samples as a stream without end or disk, on any device: a function of (seed, index) alone.
+"""An endless stream of samples that are rendered during training, on any device. A sample is a function of (seed, index).
 
-stream = Rendered(read_scene_recipe("window"), catalog, Assets(folders), seed=7, device="cuda")
+stream = OnlineRendered(read_scene_recipe("window"), catalog, Assets(folders), seed=7, device="cuda")
 batch = stream(step=0, count=16, size=256)
 for developed in stream: ...
 """
@@ -24,13 +24,13 @@ from brewster.training.data.alpha_blend import blended
 from brewster.training.data.mixtures import Target, TrainingBatch
 
 Mixing = Literal["light", "8-bit"]
-"""How a photo came about: light that met at the glass, or a blend of the same content in 8 bits, as RDNet's."""
+"""How the layers of a photo are added: as light at the glass, or as an 8-bit blend like RDNet's."""
 
 
 class OnlineRendered:
-    """A `Stream` of the analytic renderer's samples, also an iterable of them; threads may share it.
+    """A `Stream` of samples of the analytic renderer; also an iterable of single samples. It is thread-safe.
 
-    They render one at a time, as `Assets` serves one at a time; the rest of their work runs side by side.
+    Threads render one sample at a time, because `Assets` is not thread-safe; all other work runs in parallel.
     """
 
     def __init__(
@@ -46,32 +46,32 @@ class OnlineRendered:
     ) -> None:
         self._recipe, self._catalog, self._assets = recipe, catalog, assets
         self._seed, self._device, self._target, self._mixing = seed, device, target, mixing
-        self._renders = Lock()
+        self._render_lock = Lock()
 
     def __iter__(self) -> Iterator[DevelopedSample]:
         return (self.sample(index) for index in numbers())
 
     def sample(self, index: int) -> DevelopedSample:
-        """The sample of this number, at the recipe's size; I has been through JPEG.
+        """Renders the sample of this index at the recipe's size; the photo has JPEG artefacts.
 
         Raises:
-            RecipeError: the recipe gives no possible scene, or a file is missing.
-            PhotoError: a file cannot be read.
+            RecipeError: no valid scene can be drawn from the recipe, or a file is missing.
+            PhotoError: a file cannot be decoded.
         """
         return self._developed(self._recipe, index)
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """The batch of this step: `count` samples of `size` px a side, none of them ever seen before."""
-        return TrainingBatch.of(
+        """Returns the batch of this step: `count` new samples with sides of `size` px."""
+        return TrainingBatch.from_layers(
             torch.stack([self.layers(step * count + slot, size) for slot in range(count)])
         )
 
     def layers(self, index: int, size: int) -> Tensor:
-        """Photo, target and reflection of this number, square and as channels: (9, size, size), encoded, in 0..1.
+        """Renders photo, target and reflection of this index as channels, square: (9, size, size), encoded, in 0..1.
 
         Raises:
-            RecipeError: the recipe gives no possible scene, or a file is missing.
-            PhotoError: a file cannot be read.
+            RecipeError: no valid scene can be drawn from the recipe, or a file is missing.
+            PhotoError: a file cannot be decoded.
         """
         camera = self._recipe.camera.model_copy(update={"width": size, "height": size})
         developed = self._developed(self._recipe.model_copy(update={"camera": camera}), index).layers()
@@ -79,7 +79,7 @@ class OnlineRendered:
 
     def _developed(self, recipe: SceneRecipe, index: int) -> DevelopedSample:
         scene = draw(recipe, self._catalog, self._seed, index)
-        with self._renders:
+        with self._render_lock:
             sample = render(scene, self._assets, self._device)
         developed = develop(sample)
         return with_jpeg(developed if self._mixing == "light" else blended(developed))

@@ -1,9 +1,9 @@
-"""A finite number of rendered samples to learn from again and again: windows of sets on disk, or live ones kept.
+"""Streams of a finite number of rendered samples: crops of sets on disk, or a cache of samples rendered online.
 
-    stream = OnDisk([Path("out/window")], seed=7, count=300)
-    stream = InMemory(Rendered(...), 300, seed=7)
+    stream = RenderedSets([Path("out/window")], seed=7, count=300)
+    stream = CachedRendered(OnlineRendered(...), 300, seed=7)
 
-Which sample fills a slot, and how it is cropped and mirrored, is a function of (seed, step, slot) alone.
+The sample in a slot, its crop and its mirroring are functions of (seed, step, slot) only.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from brewster.training.data.mixtures import Target, TrainingBatch, random_crop
 from brewster.training.data.online import Mixing, OnlineRendered
 from brewster.training.data.sample_rng import SampleRng
 
-KEPT_BYTES: Final = 1 << 30
-"""What samples may take in memory, 9 bytes a pixel: 600 of 512x384, 1,800 of 256x256, 7,200 of 128x128. Beyond, the
-oldest are forgotten, and read or rendered again when their turn comes: slower, but the same."""
+CACHE_BYTES: Final = 1 << 30
+"""Memory for cached samples, 9 bytes per pixel: 600 of 512x384, 1,800 of 256x256, 7,200 of 128x128. When it is full, the
+oldest are dropped, and read or rendered again when they are drawn: slower, with the same result."""
 
 
 class RenderedSets:
-    """A `Stream` of random windows, maybe mirrored, of the first `count` samples of rendered sets.
+    """A `Stream` of random crops, mirrored at random, of the first `count` samples of rendered sets. It is thread-safe.
 
-    With `mixing` "8-bit", background and mirror of a sample are blended, and the blend has been through JPEG at the
-    sample's own quality, as its photo has. Threads may share it.
+    With `mixing` "8-bit", the photo is a blend of the sample's background and mirror image. Like the sample's photo, the blend
+    is compressed as JPEG at the sample's quality.
 
     Raises:
-        RecipeError: a set cannot be read, or all of them together hold fewer samples.
+        RecipeError: a set cannot be read, or all sets together have fewer than `count` samples.
     """
 
     def __init__(
@@ -55,95 +55,97 @@ class RenderedSets:
         target: Target = "background",
         mixing: Mixing = "light",
     ) -> None:
-        self._entries = _first(folders, count)
+        self._entries = _first_entries(folders, count)
         self._seed, self._crop, self._target, self._mixing = seed, crop, target, mixing
-        self._kept = _TensorCache(KEPT_BYTES)
+        self._cache = _TensorCache(CACHE_BYTES)
 
     def __len__(self) -> int:
         return len(self._entries)
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """The batch of this step: `count` samples of `size` px a side.
+        """Returns the batch of this step: `count` samples with sides of `size` px.
 
         Raises:
             RecipeError, PhotoError: a file of a sample is missing or damaged.
         """
         rng = (SampleRng(self._seed, step, slot) for slot in range(count))
         windows = [random_crop(each, self.sample(each.randint(len(self))), self._crop, size) for each in rng]
-        return TrainingBatch.of(to_encoded(torch.stack(windows)))
+        return TrainingBatch.from_layers(to_encoded(torch.stack(windows)))
 
     def sample(self, number: int) -> Tensor:
-        """Photo, target and reflection of a sample whole, as channels: (H, W, 9) sRGB uint8.
+        """Returns photo, target and reflection of a whole sample as channels: (H, W, 9) sRGB uint8.
 
         Raises:
             RecipeError, PhotoError: a file of the sample is missing or damaged.
         """
-        return self._kept.once(number, lambda: self._read(self._entries[number]))
+        return self._cache.get_or_create(number, lambda: self._read(self._entries[number]))
 
     def _read(self, entry: StoredSample) -> Tensor:
         if self._mixing == "8-bit":
-            return _blend(entry)
+            return _blended_sample(entry)
         return torch.cat([_picture(entry, name) for name in ("photo", self._target, "reflection")], dim=2)
 
 
 class CachedRendered:
-    """A `Stream` of the first `count` samples of a live one, maybe mirrored; threads may share it.
+    """A `Stream` of the first `count` samples of `source`, mirrored at random. It is thread-safe.
 
-    Each is rendered once for each size and kept in 8 bits, in `most_bytes` of memory.
+    Each sample is rendered once per size and cached in 8 bits, in at most `max_bytes` of memory.
     """
 
-    def __init__(self, live: OnlineRendered, count: int, *, seed: int, most_bytes: int = KEPT_BYTES) -> None:
-        self._live, self._count, self._seed, self._kept = live, count, seed, _TensorCache(most_bytes)
+    def __init__(
+        self, source: OnlineRendered, count: int, *, seed: int, max_bytes: int = CACHE_BYTES
+    ) -> None:
+        self._source, self._count, self._seed, self._cache = source, count, seed, _TensorCache(max_bytes)
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
-        """The batch of this step: `count` samples of `size` px a side.
+        """Returns the batch of this step: `count` samples with sides of `size` px.
 
         Raises:
-            RecipeError: the recipe gives no possible scene, or a file is missing.
-            PhotoError: a file cannot be read.
+            RecipeError: no valid scene can be drawn from the recipe, or a file is missing.
+            PhotoError: a file cannot be decoded.
         """
         rng = (SampleRng(self._seed, step, slot) for slot in range(count))
-        return TrainingBatch.of(torch.stack([self._use(each, size) for each in rng]) / 255)
+        return TrainingBatch.from_layers(torch.stack([self._sample(each, size) for each in rng]) / 255)
 
-    def _use(self, rng: SampleRng, size: int) -> Tensor:
+    def _sample(self, rng: SampleRng, size: int) -> Tensor:
         index = rng.randint(self._count)
-        layers = self._kept.once((index, size), lambda: self._render(index, size))
+        layers = self._cache.get_or_create((index, size), lambda: self._render(index, size))
         return layers.flip(2) if rng.bernoulli(0.5) else layers
 
     def _render(self, index: int, size: int) -> Tensor:
-        """(9, size, size) uint8, the first time too, so that a sample never changes."""
-        return (self._live.layers(index, size).clamp(0, 1) * 255).round().to(torch.uint8)
+        """Renders (9, size, size) uint8. The first use is quantised too, so that a sample is the same each time."""
+        return (self._source.layers(index, size).clamp(0, 1) * 255).round().to(torch.uint8)
 
 
 class _TensorCache:
-    """Tensors that are made once, as long as there is room for them."""
+    """A thread-safe cache of tensors, limited by their size in bytes; the oldest are dropped first."""
 
-    def __init__(self, most_bytes: int) -> None:
+    def __init__(self, max_bytes: int) -> None:
         self._tensors: dict[Hashable, Tensor] = {}
-        self._bytes, self._most, self._changes = 0, most_bytes, Lock()
+        self._bytes, self._max_bytes, self._lock = 0, max_bytes, Lock()
 
-    def once(self, name: Hashable, make: Callable[[], Tensor]) -> Tensor:
+    def get_or_create(self, name: Hashable, create: Callable[[], Tensor]) -> Tensor:
         found = self._tensors.get(name)
         if found is None:
-            found = make()
-            self._keep(name, found)
+            found = create()
+            self._insert(name, found)
         return found
 
-    def _keep(self, name: Hashable, made: Tensor) -> None:
-        with self._changes:
-            if name not in self._tensors:  # or another thread was faster
-                self._tensors[name] = made
-                self._bytes += made.nbytes
-            while self._bytes > self._most:
+    def _insert(self, name: Hashable, tensor: Tensor) -> None:
+        with self._lock:
+            if name not in self._tensors:  # another thread may have inserted it
+                self._tensors[name] = tensor
+                self._bytes += tensor.nbytes
+            while self._bytes > self._max_bytes:
                 self._bytes -= self._tensors.pop(next(iter(self._tensors))).nbytes
 
 
-def _first(folders: Sequence[Path], count: int | None) -> list[StoredSample]:
+def _first_entries(folders: Sequence[Path], count: int | None) -> list[StoredSample]:
     entries = [entry for folder in folders for entry in _entries(folder)]
     if len(entries) < (count or 1):
         raise RecipeError(
             f"{', '.join(map(str, folders))}: {len(entries)} rendered samples",
-            f"the recipe learns from {count or 'at least one'}",
+            f"at least {count or 1}, as the recipe states",
             "render more with a larger --count, or lower data.rendered.count",
         )
     return entries[:count]
@@ -155,13 +157,13 @@ def _entries(folder: Path) -> list[StoredSample]:
     except (OSError, ValueError, tarfile.TarError) as error:
         raise RecipeError(
             f"{folder} cannot be read ({getattr(error, 'strerror', None) or error})",
-            "a folder that brewster render made",
-            "name another in data.rendered.sets, or set BREWSTER_DATA to where the data lies",
+            "a folder that brewster render wrote",
+            "name another folder in data.rendered.sets, or set BREWSTER_DATA to the folder of the data",
         ) from error
 
 
-def _blend(entry: StoredSample) -> Tensor:
-    with _whole(entry, SCENE):
+def _blended_sample(entry: StoredSample) -> Tensor:
+    with _file_errors(entry, SCENE):
         scene = read_cause(entry)
     background, mirror = (_picture(entry, name).permute(2, 0, 1) / 255 for name in ("background", "mirror"))
     photo, *layers = blended_layers(background, mirror, scene)
@@ -170,19 +172,19 @@ def _blend(entry: StoredSample) -> Tensor:
 
 
 def _picture(entry: StoredSample, layer: str) -> Tensor:
-    """One of a sample's photographs, (H, W, 3) sRGB uint8."""
+    """Reads a layer of a sample, (H, W, 3) sRGB uint8."""
     name = f"{layer}.jpg"
-    with _whole(entry, name), naming(f"{name} of sample {key(entry.index)} in {entry.place}"):
+    with _file_errors(entry, name), naming(f"{name} of sample {key(entry.index)} in {entry.place}"):
         return torch.from_numpy(Photo.open(entry.read(name)).pixels.copy())
 
 
 @contextmanager
-def _whole(entry: StoredSample, name: str) -> Iterator[None]:
+def _file_errors(entry: StoredSample, name: str) -> Iterator[None]:
     try:
         yield
     except (OSError, KeyError) as error:
         raise RecipeError(
             f"{name} of sample {key(entry.index)} in {entry.place} cannot be read",
-            "a sample has five pictures and a scene",
-            "delete that sample and render the set again",
+            "a sample with five pictures and a scene",
+            "delete the sample and render the set again",
         ) from error

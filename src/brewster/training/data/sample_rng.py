@@ -1,4 +1,4 @@
-"""Random numbers of a training sample: a function of (seed, step, slot), so that a resumed run sees the same data."""
+"""Seeded random numbers of a training sample, so that a resumed run sees the same data."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from brewster.scene.values import Range
 
 
 class SampleRng:
-    """Random numbers that depend on (seed, step, slot) and on nothing else."""
+    """A random number generator that is a function of (seed, step, slot); `slot` is the index in the batch."""
 
     def __init__(self, seed: int, step: int, slot: int) -> None:
         self.generator = Generator().manual_seed((seed * 1_000_003 + step) * 1_009 + slot)
 
     def uniform(self, bounds: Range) -> float:
-        """A number between the bounds."""
+        """A uniform number between the bounds."""
         low, high = bounds
         return low + (high - low) * torch.rand((), generator=self.generator).item()
 
@@ -26,15 +26,15 @@ class SampleRng:
         return math.exp(self.uniform((math.log(bounds[0]), math.log(bounds[1]))))
 
     def bernoulli(self, probability: float) -> bool:
-        """True as often as `probability` says."""
+        """True with this probability."""
         return self.uniform((0, 1)) < probability
 
     def randint(self, count: int) -> int:
-        """A number from 0 up to, not including, `count`."""
+        """A uniform integer in 0..count - 1."""
         return int(torch.randint(count, (), generator=self.generator).item())
 
     def uniform_tensor(self, *shape: int) -> Tensor:
-        """A tensor of numbers between 0 and 1."""
+        """A tensor of uniform numbers in 0..1."""
         return torch.rand(shape, generator=self.generator)
 
     def normal(self, *shape: int) -> Tensor:

@@ -1,1 +1,1 @@
-"""How does a LoRA on a large backbone learn, what will that cost, and what does its card say?"""
+"""Training of a LoRA on a large backbone, its resource estimate and its model card."""

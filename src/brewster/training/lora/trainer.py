@@ -1,10 +1,11 @@
-"""A LoRA on a large backbone as a trainer: flow matching on the latents of panels (paper, Text-to-image Model Fine-tuning).
+"""The trainer of a LoRA on a large backbone: flow matching on the latents of panels (paper, Text-to-image Model Fine-tuning).
 
-trainer = LoraLearner(read_recipe(Path("recipes/train/kontext.toml")))
-run(trainer, Path("out/kontext"), report)
+trainer = LoraTrainer(read_recipe(Path("recipes/train/kontext.toml")))
+run(trainer, Path("out/kontext"), on_step)
 
-A batch is learnt one sample after another, so that each keeps its aspect ratio and a batch needs no more memory than
-a sample. Sample, noise and time are functions of (seed, step, slot) alone; several processes divide the slots.
+The gradients of a batch are accumulated one sample at a time, so that each sample keeps its aspect ratio and a batch needs no
+more memory than one sample. Sample, noise and time are functions of (seed, step, slot) only; several processes divide the
+slots.
 """
 
 from __future__ import annotations
@@ -32,94 +33,94 @@ from brewster.models.diffusion.prompt import PROMPTS, PromptEmbedding, load_prom
 from brewster.models.diffusion.sampling import STEPS
 from brewster.training import distributed
 from brewster.training.data.sample_rng import SampleRng
-from brewster.training.loop import last_numbers
+from brewster.training.loop import read_last_metrics
 from brewster.training.lora.latents import (
     EncodedSample,
     LatentEncoder,
     SampleSequence,
+    layers_from_pair,
+    make_panels,
     open_samples,
-    panels_in,
-    with_difference,
 )
 from brewster.training.lora.model_card import write_card
-from brewster.training.losses import finite, gain_db
+from brewster.training.losses import check_finite, psnr_gain_db
 from brewster.training.recipe import ENCODED, LoraRecipe
 from brewster.training.streams import validation_pairs
 
-FOLDER: Final = "lora"
-RECIPE: Final = "recipe.json"
+LORA_FOLDER: Final = "lora"
+RECIPE_FILE: Final = "recipe.json"
 _MAX_GRADIENT_NORM: Final = 1.0
-_SHOWN: Final = 4
-"""How many pictures of each folder are generated to see how good it is: each takes as long as some steps."""
+_VALIDATION_SAMPLES: Final = 4
+"""Validation pictures per folder: generating one takes as long as several training steps."""
 _ROW_PX: Final = (160, 240)
-_LOWER: Final = "lower budget_px or rank, quantise the base, or take a smaller backbone (klein)"
+_MEMORY_CURE: Final = "lower budget_px or rank, quantise the base, or take a smaller backbone (klein)"
 
 
 class LoraTrainer:
-    """A `Learner`: the backbone, frozen, a float32 LoRA on it, and AdamW.
+    """The `Trainer` of a LoRA: a frozen backbone, a float32 LoRA on it, and AdamW.
 
     Raises:
-        RecipeError, PhotoError: the data are missing, damaged or without reflections.
+        RecipeError, PhotoError: the data is missing, damaged or without reflections.
         DownloadError, ModelError, DeviceError, MissingExtra: the backbone cannot be loaded.
     """
 
     def __init__(self, recipe: LoraRecipe) -> None:
-        _refuse_idle(recipe)
+        _check_batch(recipe)
         self.recipe = recipe
         samples = open_samples(recipe)
-        self._shown = _shown(recipe, samples)
+        self._validation_samples = _validation_samples(recipe, samples)
         device = str(distributed.best_device())
         self.backbone = load_backbone(recipe.backbone, device=device, quantise=recipe.quantise)
-        self._data = LatentEncoder(samples, self.backbone, recipe)
+        self._latents = LatentEncoder(samples, self.backbone, recipe)
         self._parameters = add_lora(self.backbone, rank=recipe.rank, alpha=recipe.alpha, seed=recipe.seed)
         self.backbone.transformer.enable_gradient_checkpointing()
-        self._optimizer = _adamw(self._parameters, recipe)
+        self._optimizer = _create_optimizer(self._parameters, recipe)
         self._prompt: PromptEmbedding | None = None
 
     @property
     def prompt(self) -> PromptEmbedding:
-        """What the backbone is told; known once the run has begun."""
-        assert self._prompt, "begin or restore comes first"
+        """The encoded prompt; available after `initialize` or `load_state_dict`."""
+        assert self._prompt, "call initialize or load_state_dict first"
         return self._prompt
 
     def initialize(self) -> None:
-        """Takes up the recipe's prompt; a real backbone's text encoder is loaded for it, and forgotten.
+        """Loads or encodes the recipe's prompt. The text encoder of a real backbone is loaded for this and released.
 
         Raises:
-            DownloadError, ModelError, DeviceError, MissingExtra: it cannot be had.
+            DownloadError, ModelError, DeviceError, MissingExtra: the text encoder or the prompt cannot be loaded.
         """
-        self._prompt = _find_prompt(self.recipe, self.backbone)
+        self._prompt = _load_prompt(self.recipe, self.backbone)
 
     def state_dict(self) -> dict[str, Any]:
-        """The LoRA, the optimiser's moments, and the prompt: nothing of the base."""
+        """Returns the LoRA, the state of the optimiser, and the prompt; no weights of the base."""
         prompt = {"text": self.prompt.text, **self.prompt.tensors}
         return {
             "lora": lora_state(self.backbone), "optimizer": self._optimizer.state_dict(), "prompt": prompt,
         }  # fmt: skip
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Goes on from such a state."""
+        """Restores a state that `state_dict` returned."""
         load_lora_state(self.backbone, state["lora"])
         self._optimizer.load_state_dict(state["optimizer"])
         self._prompt = PromptEmbedding(self.backbone.name, **state["prompt"])
 
     def training_step(self, step: int) -> dict[str, float]:
-        """One step of AdamW on one batch; the loss, and each panel's part of it.
+        """Runs one step of AdamW on one batch. Returns the loss and the part of each panel.
 
         Raises:
-            ModelError: the loss is not a number; the last checkpoint is still good.
-            DeviceError: out of memory (says what to lower).
+            ModelError: the loss is NaN or infinite. The last checkpoint is still valid.
+            DeviceError: out of memory. The message says which values to lower.
             RecipeError, PhotoError: a sample is missing, damaged, or smaller than a panel.
         """
         self._optimizer.zero_grad()
-        with explain_out_of_memory(_LOWER):
-            parts = self._learn(step)
+        with explain_out_of_memory(_MEMORY_CURE):
+            parts = self._compute_gradients(step)
         distributed.all_reduce_sum(
             [parameter.grad for parameter in self._parameters if parameter.grad is not None]
         )
         distributed.all_reduce_sum(list(parts.values()))
-        loss = finite(torch.stack(list(parts.values())).sum(), step)
-        finite(nn.utils.clip_grad_norm_(self._parameters, _MAX_GRADIENT_NORM), step, "gradient")
+        loss = check_finite(torch.stack(list(parts.values())).sum(), step)
+        check_finite(nn.utils.clip_grad_norm_(self._parameters, _MAX_GRADIENT_NORM), step, "gradient")
         for group in self._optimizer.param_groups:
             group["lr"] = self.recipe.learning_rate * min(1.0, (step + 1) / self.recipe.warmup_steps)
         self._optimizer.step()
@@ -127,42 +128,44 @@ class LoraTrainer:
 
     @torch.no_grad()
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """Mean PSNR gain in dB of the generated T over the photo, per folder; and rows of truths and panels."""
+        """Returns the mean PSNR gain of the generated T over the photo in dB, by folder, and a picture of the panels."""
         gains, rows = {}, []
-        for name, samples in self._shown.items():
-            answers = [self._answer(layers) for layers in samples]
-            gains[f"gain_db_{name}"] = sum(gain for gain, _ in answers) / len(answers)
-            rows += [row for _, row in answers]
+        for name, samples in self._validation_samples.items():
+            results = [self._validate_sample(layers) for layers in samples]
+            gains[f"gain_db_{name}"] = sum(gain for gain, _ in results) / len(results)
+            rows += [row for _, row in results]
         return gains, torch.cat(rows, dim=1).clamp(0, 1).permute(1, 2, 0)
 
     def export(self, folder: Path) -> Path:
-        """Writes a folder that stock diffusers loads: the LoRA, the prompt, the recipe, and the model card, README.md.
+        """Writes the folder `lora`: LoRA, prompt, recipe and model card. diffusers can load it. Returns its path.
 
         Raises:
-            TargetError: it cannot be written.
+            TargetError: the folder cannot be written.
         """
-        place = folder / FOLDER
+        place = folder / LORA_FOLDER
         base, quantise = self.recipe.backbone, self.recipe.quantise
         if Path(base).is_dir():
             base = str(Path(base).resolve())
         save_lora(place, self.backbone, self.prompt, self.recipe.task, base=base, quantise=quantise)
         text = json.dumps(self.recipe.model_dump(mode="json"), indent=2)
-        write_atomically(place / RECIPE, f"{text}\n".encode(), overwrite=True)
-        write_card(place, self.recipe, last_numbers(folder), type(self.backbone))
+        write_atomically(place / RECIPE_FILE, f"{text}\n".encode(), overwrite=True)
+        write_card(place, self.recipe, read_last_metrics(folder), type(self.backbone))
         return place
 
     def separate(self, photo: Tensor, *, steps: int = STEPS, seed: int = 0) -> Mapping[str, Tensor]:
-        """The panels that it makes of a photo in a panel, (1, 3, h, w) in [-1, 1]; one_step takes one step.
+        """Generates the panels of a photo of the size of a panel, (1, 3, h, w) in [-1, 1].
+
+        `steps` is ignored for the objective one_step.
 
         Raises:
-            DeviceError: out of memory (says what to lower).
+            DeviceError: out of memory. The message says which values to lower.
         """
         return DecompositionPipeline(self.backbone, self.prompt, self.recipe.task)(
             photo, steps=steps, seeds=[seed]
         )
 
-    def _learn(self, step: int) -> dict[str, Tensor]:
-        """The gradients, and the parts of the loss, of this process's slots of the batch."""
+    def _compute_gradients(self, step: int) -> dict[str, Tensor]:
+        """Accumulates the gradients of this process's slots of the batch. Returns the parts of the loss."""
         totals: dict[str, Tensor] = {}
         for slot in range(distributed.rank(), self.recipe.batch, distributed.world_size()):
             parts = self._losses(SampleRng(self.recipe.seed, step, slot))
@@ -172,27 +175,30 @@ class LoraTrainer:
         return totals
 
     def _losses(self, rng: SampleRng) -> dict[str, Tensor]:
-        """The mean squared error of the velocity, start - picture, in each panel, weighted; they add up to the loss."""
-        encoded, device = self._data(rng), self.backbone.device
-        start, sigma = self._begun(rng, encoded)
-        moved = (1 - sigma) * encoded.composite + sigma * start
+        """Returns the weighted mean squared error of the velocity, start - composite, of each panel; the loss is their sum."""
+        encoded, device = self._latents(rng), self.backbone.device
+        start, sigma = self._start_and_sigma(rng, encoded)
+        noisy = (1 - sigma) * encoded.composite + sigma * start
         velocity = self.backbone.predict(
-            moved.to(device),
+            noisy.to(device),
             encoded.condition.to(device),
             sigma.to(device),
             self.prompt,
             self.recipe.guidance,
         )
         errors = (velocity - (start - encoded.composite).to(device)).square()
-        weights = self._weights()
-        trust = {"R": encoded.trust}
+        weights = self._panel_weights()
+        reliability = {"R": encoded.reflection_weight}
         return {
-            f"panel_{name}": weights[name] * trust.get(name, 1.0) * panel.mean()
+            f"panel_{name}": weights[name] * reliability.get(name, 1.0) * panel.mean()
             for name, panel in split(errors, self.recipe.layout).items()
         }
 
-    def _begun(self, rng: SampleRng, encoded: EncodedSample) -> tuple[Tensor, Tensor]:
-        """Where this sample starts, and at which time from 0 to 1 it is looked at."""
+    def _start_and_sigma(self, rng: SampleRng, encoded: EncodedSample) -> tuple[Tensor, Tensor]:
+        """Returns the start of the sample's path, noise or the photo, and its time sigma in 0..1.
+
+        Times are logit-normal (Esser et al. 2024), then shifted for the resolution.
+        """
         if encoded.start is not None:
             return encoded.start, torch.ones(1)
         recipe, grid = self.recipe, encoded.composite
@@ -200,45 +206,48 @@ class LoraTrainer:
         sigma = self.backbone.shifted(normal.sigmoid(), grid.shape[2] * grid.shape[3])
         return rng.normal(*grid.shape), sigma
 
-    def _weights(self) -> dict[str, float]:
-        """How much each panel counts; 1 in all."""
+    def _panel_weights(self) -> dict[str, float]:
+        """Weights of the panels in the loss; their sum is 1."""
         named = {panel: self.recipe.panel_weights.get(panel, 1.0) for panel in self.recipe.panels}
         return {panel: weight / sum(named.values()) for panel, weight in named.items()}
 
-    def _panels(self, layers: Tensor) -> tuple[dict[str, Tensor], PanelFit]:
-        """Of a picture that is only looked at: one that is smaller than a panel gets smaller panels."""
+    def _validation_panels(self, layers: Tensor) -> tuple[dict[str, Tensor], PanelFit]:
+        """Panels of a validation picture. Unlike in training, a picture smaller than a panel gets smaller panels."""
         height, width, _ = layers.shape
         fit = self.recipe.task.fit((width, height), self.backbone.multiple)
-        return panels_in(layers, fit), fit
+        return make_panels(layers, fit), fit
 
-    def _answer(self, layers: Tensor) -> tuple[float, Tensor]:
-        """The gain on a sample, and its row: photo and truths, then the panels."""
-        truths, fit = self._panels(layers)
-        made = self.separate(truths["I"])
-        photo, truth, answer = ((fit.crop(panel) + 1) / 2 for panel in (truths["I"], truths["T"], made["T"]))
+    def _validate_sample(self, layers: Tensor) -> tuple[float, Tensor]:
+        """Returns the PSNR gain on a sample in dB, and a row of photo, ground truth and generated panels."""
+        ground_truth, fit = self._validation_panels(layers)
+        predicted = self.separate(ground_truth["I"])
+        photo, transmission, prediction = (
+            (fit.crop(panel) + 1) / 2 for panel in (ground_truth["I"], ground_truth["T"], predicted["T"])
+        )
         panels = [
-            functional.interpolate((panel + 1) / 2, _ROW_PX) for panel in (*truths.values(), *made.values())
+            functional.interpolate((panel + 1) / 2, _ROW_PX)
+            for panel in (*ground_truth.values(), *predicted.values())
         ]
-        return gain_db(answer, photo, truth), torch.cat(panels, dim=3)[0]
+        return psnr_gain_db(prediction, photo, transmission), torch.cat(panels, dim=3)[0]
 
 
-def _refuse_idle(recipe: LoraRecipe) -> None:
+def _check_batch(recipe: LoraRecipe) -> None:
     if recipe.batch % distributed.world_size():
         raise RecipeError(
-            f"batch = {recipe.batch} is to be divided among {distributed.world_size()} processes",
-            "an equal part for each",
+            f"batch = {recipe.batch} cannot be divided equally among {distributed.world_size()} processes",
+            "a batch that is a multiple of the number of processes",
             "raise batch to a multiple, or start fewer processes",
         )
 
 
-def _find_prompt(recipe: LoraRecipe, backbone: Backbone) -> PromptEmbedding:
+def _load_prompt(recipe: LoraRecipe, backbone: Backbone) -> PromptEmbedding:
     if recipe.prompt.endswith(ENCODED):
         return load_prompt(Path(recipe.prompt), backbone.name)
     return encode_prompt(recipe.backbone, PROMPTS[recipe.prompt])
 
 
-def _adamw(parameters: Sequence[nn.Parameter], recipe: LoraRecipe) -> torch.optim.Optimizer:
-    """AdamW, its moments in 8 bits where there is CUDA and bitsandbytes."""
+def _create_optimizer(parameters: Sequence[nn.Parameter], recipe: LoraRecipe) -> torch.optim.Optimizer:
+    """AdamW; with 8-bit moments on CUDA, if bitsandbytes is installed."""
     options: dict[str, Any] = {"lr": recipe.learning_rate, "weight_decay": recipe.weight_decay}
     if parameters[0].is_cuda and importlib.util.find_spec("bitsandbytes"):
         small = importlib.import_module("bitsandbytes.optim").AdamW8bit(parameters, **options)
@@ -247,9 +256,12 @@ def _adamw(parameters: Sequence[nn.Parameter], recipe: LoraRecipe) -> torch.opti
     return torch.optim.AdamW(parameters, **options)
 
 
-def _shown(recipe: LoraRecipe, samples: SampleSequence) -> dict[str, list[Tensor]]:
-    """A few validation pairs of each folder, (H, W, 9), or of the samples that it learns from."""
+def _validation_samples(recipe: LoraRecipe, samples: SampleSequence) -> dict[str, list[Tensor]]:
+    """The first validation pairs of each folder, (H, W, 9), or the first training samples if the recipe names no folder."""
     folders = validation_pairs(recipe.data)
     if folders:
-        return {name: [with_difference(*pair) for pair in pairs[:_SHOWN]] for name, pairs in folders.items()}
-    return {"training": [samples[number].layers for number in range(min(_SHOWN, len(samples)))]}
+        return {
+            name: [layers_from_pair(*pair) for pair in pairs[:_VALIDATION_SAMPLES]]
+            for name, pairs in folders.items()
+        }
+    return {"training": [samples[number].layers for number in range(min(_VALIDATION_SAMPLES, len(samples)))]}

@@ -36,7 +36,7 @@ class Klein(ClassifierFreeBackbone):
     licence = APACHE_2
     diffusers_usage = DiffusersUsage(
         "text_encoder=None, tokenizer=None",
-        'negative_prompt_embeds=words["negative"],',
+        'negative_prompt_embeds=prompt["negative"],',
         "The pipeline silently rescales a condition of more than 1024 x 1024 pixels.",
     )
     classes: ClassVar = {

@@ -45,7 +45,7 @@ class Kontext(Backbone):
     )
     diffusers_usage = DiffusersUsage(
         "text_encoder=None, text_encoder_2=None, tokenizer=None, tokenizer_2=None",
-        'pooled_prompt_embeds=words["pooled"], max_area={area}, _auto_resize=False,',
+        'pooled_prompt_embeds=prompt["pooled"], max_area={area}, _auto_resize=False,',
         "Without `max_area` and `_auto_resize=False` the pipeline silently rescales both pictures.",
     )
     classes: ClassVar = {
