@@ -276,16 +276,16 @@ def test_half_a_download_is_taken_up_and_none_is_taken_for_whole(server, state, 
     promise, digest = promised(server, body), digest_of(state)
     server.faults = ["cut"]
     with pytest.raises(DownloadError, match="ended after"):
-        load_backbone(promise, digest, line=Downloader(pauses_s=()))
+        load_backbone(promise, digest, line=Downloader(retry_delays_s=()))
     assert [path.name for path in cache.iterdir()] == ["whole.pth.part"]
-    load_backbone(promise, digest, line=Downloader(pauses_s=()))
+    load_backbone(promise, digest, line=Downloader(retry_delays_s=()))
     assert server.asked[-1] == ("/whole.pth", f"bytes={len(body) // 2}-")
 
 
 def test_a_server_that_is_not_there_is_explained():
     promise = RemoteFile(f"{unheard()}/whole.pth", 9, "sha256", "0")
     with pytest.raises(DownloadError, match="check the connection"):
-        load_backbone(promise, line=Downloader(pauses_s=()))
+        load_backbone(promise, line=Downloader(retry_delays_s=()))
 
 
 def test_another_file_from_the_server_is_dropped(server, state, cache):

@@ -105,7 +105,7 @@ def test_a_panorama_of_20000_by_300_works() -> None:
     photo = Photo.from_array(np.zeros((300, 20000, 1), np.uint8), encoding="srgb")
     again = Photo.open(photo.encode("jpeg"))
     assert again.size == (20000, 300)
-    assert again.small(500, 8).shape == (8, 500, 3)
+    assert again.resized(500, 8).shape == (8, 500, 3)
 
 
 # --- floats
@@ -282,7 +282,7 @@ def test_a_small_picture_holds_the_mean_light_of_each_area(
     photo = Photo.from_array(pixels, encoding="srgb")
     repeated = photo.linear().repeat(height, axis=0).repeat(width, axis=1)
     means = repeated.reshape(height, down, width, across, 3).mean(axis=(1, 3))
-    np.testing.assert_allclose(photo.small(width, height), means, atol=1e-5)
+    np.testing.assert_allclose(photo.resized(width, height), means, atol=1e-5)
 
 
 def test_strips_cover_every_row_once() -> None:

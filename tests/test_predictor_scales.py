@@ -62,7 +62,7 @@ def test_a_copy_is_never_larger_than_the_photo_and_each_size_is_shown_once():
 def test_a_long_thin_photo_is_shown_larger_so_that_its_short_side_is_160_px_at_least(size):
     """Yet no side of a copy is more than three times as long as that of a photo of ordinary shape."""
     (pixels,) = QUALITIES["draft"]
-    ((width, height),) = MultiScalePredictor(lambda tile: (tile, tile)).sizes(size, "draft")
+    ((width, height),) = MultiScalePredictor(lambda tile: (tile, tile)).input_sizes(size, "draft")
     assert width / height == pytest.approx(size[0] / size[1], rel=0.05)
     largest = 9 * pixels
     assert min(width, height) == 160 or width * height == pytest.approx(largest, rel=0.05)
@@ -72,7 +72,8 @@ def test_the_answer_is_the_mean_over_all_copies():
     """The transmission's change is proportional to the copy's height: the mean is that of the heights."""
     photo = np.full((900, 1200, 3), 0.5, np.float32)
     heights = [
-        height for _, height in MultiScalePredictor(lambda tile: (tile, tile)).sizes((1200, 900), "best")
+        height
+        for _, height in MultiScalePredictor(lambda tile: (tile, tile)).input_sizes((1200, 900), "best")
     ]
 
     def backend(tile):

@@ -120,7 +120,7 @@ def test_what_is_seen_are_the_pictures_of_the_trial_on_their_sides_and_all_has_a
         seen = Photo.open(page.locator(f".{side} .frame").screenshot()).linear()
         truth = Photo.open(store.study.file(getattr(person.trials[0], side)))
         assert (
-            np.median(np.abs(seen - truth.small(*seen.shape[1::-1]))) < 0.002
+            np.median(np.abs(seen - truth.resized(*seen.shape[1::-1]))) < 0.002
         )  # not the mean: edges are smoothed
     places = [page.locator(f".{side} .frame").bounding_box()["x"] for side in ("left", "photo", "right")]
     assert places == sorted(places)

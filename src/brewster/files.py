@@ -42,11 +42,11 @@ SUFFIXES = {
 DEFAULT_MAX_PIXELS = 200_000_000
 """Larger pictures are refused before they are decoded: a small file can hold an enormous one."""
 
-HIDDEN = ".brewster-"
+TEMPORARY_PREFIX = ".brewster-"
 """What the names of files begin with that are not whole yet."""
 
 LAYERS = ("transmission", "reflection", "confidence")
-_ALWAYS_PNG = ("confidence",)  # a grey map, not a photograph: no container of the source would suit it better
+_PNG_LAYERS = ("confidence",)  # a grey map, not a photograph: no container of the source would suit it better
 
 
 @dataclass(frozen=True)
@@ -59,12 +59,12 @@ class SeparationPaths:
 
     def target(self, layer: str, suffix: str | None = None) -> Path:
         """The file for a layer: the source's suffix unless one is given; PNG where that cannot be written."""
-        own = self.source.suffix
-        writable = SUFFIXES.get(own.lower(), "gif") != "gif" and layer not in _ALWAYS_PNG
-        return self.folder / f"{self.name}.{layer}{suffix or (own if writable else '.png')}"
+        source_suffix = self.source.suffix
+        writable = SUFFIXES.get(source_suffix.lower(), "gif") != "gif" and layer not in _PNG_LAYERS
+        return self.folder / f"{self.name}.{layer}{suffix or (source_suffix if writable else '.png')}"
 
 
-def find(sources: Iterable[Path], into: Path | None = None) -> list[SeparationPaths]:
+def find(sources: Iterable[Path], output_folder: Path | None = None) -> list[SeparationPaths]:
     """Every picture in the files and folders given, each once, in a stable order.
 
     Layers go beside their picture, or under `into`, where the tree below a folder is mirrored. They are
@@ -79,17 +79,17 @@ def find(sources: Iterable[Path], into: Path | None = None) -> list[SeparationPa
     Raises TargetError when two pictures would be written under one name.
     """
     jobs: dict[str, SeparationPaths] = {}
-    wanted: dict[Path, Counter[str]] = {}
+    counts: dict[Path, Counter[str]] = {}
     for source in sources:
-        for picture in _pictures(source):
-            beside = picture.parent
-            if beside not in wanted:
-                wanted[beside] = _wanted_names(beside)
-            inside = Path() if picture == source else beside.relative_to(source)
-            folder = beside if into is None else into / inside
-            job = SeparationPaths(picture, folder, _layer_name(picture, wanted[beside]))
-            jobs.setdefault(_place(picture), job)
-    _refuse_shared_names(jobs.values())
+        for picture in _image_files(source):
+            parent = picture.parent
+            if parent not in counts:
+                counts[parent] = _name_counts(parent)
+            subfolder = Path() if picture == source else parent.relative_to(source)
+            folder = parent if output_folder is None else output_folder / subfolder
+            job = SeparationPaths(picture, folder, _layer_name(picture, counts[parent]))
+            jobs.setdefault(_absolute(picture), job)
+    _check_unique_targets(jobs.values())
     return list(jobs.values())
 
 
@@ -100,19 +100,19 @@ def write_atomically(path: Path, data: bytes, *, overwrite: bool = False, source
     neither a full disk nor Ctrl-C leaves half a picture. Raises TargetError if the target exists and
     `overwrite` is off, is the `source`, or cannot be written.
     """
-    _refuse_source(path, source)
+    _check_not_source(path, source)
     try:
-        with _part_of(path) as part:
+        with _temporary(path) as part:
             path.parent.mkdir(parents=True, exist_ok=True)
-            _refuse_taken(path, overwrite)
-            _write_through(part, data)
-            _take_name(part, path, overwrite)
+            _check_writable(path, overwrite)
+            _write_synced(part, data)
+            _publish(part, path, overwrite)
     except OSError as error:
         raise _target_error(path, error) from error
 
 
 @contextlib.contextmanager
-def arriving(place: Path) -> Iterator[Path]:
+def atomic_path(path: Path) -> Iterator[Path]:
     """A hidden path beside a file or folder that takes its name once it is whole and on the disk.
 
     It replaces a file; a folder that another process has put there meanwhile stays.
@@ -121,24 +121,24 @@ def arriving(place: Path) -> Iterator[Path]:
         TargetError: it cannot be written; the disk may be full.
     """
     try:
-        with _part_of(place) as part:
-            place.parent.mkdir(parents=True, exist_ok=True)
+        with _temporary(path) as part:
+            path.parent.mkdir(parents=True, exist_ok=True)
             yield part
             _sync(part)
-            _replace(place, part)
-            _sync(place.parent)
+            _replace(path, part)
+            _sync(path.parent)
     except OSError as error:
         raise TargetError(
-            f"{place} was not written ({error.strerror or error})",
+            f"{path} was not written ({error.strerror or error})",
             "it needs its place on the disk",
             "mend that (free some space, or name another folder) and run again: what is finished is kept",
         ) from error
 
 
 @contextlib.contextmanager
-def _part_of(place: Path) -> Iterator[Path]:
+def _temporary(path: Path) -> Iterator[Path]:
     """A hidden path beside a place, where nothing is left afterwards."""
-    part = hidden_beside(place)
+    part = temporary_path(path)
     try:
         try:
             yield part
@@ -149,9 +149,9 @@ def _part_of(place: Path) -> Iterator[Path]:
         raise
 
 
-def hidden_beside(place: Path) -> Path:
+def temporary_path(path: Path) -> Path:
     """A new hidden name in the folder of a place, for what is not whole yet or not wanted any more."""
-    return place.parent / f"{HIDDEN}{secrets.token_hex(8)}.part"
+    return path.parent / f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}.part"
 
 
 def discard(path: Path) -> None:
@@ -163,9 +163,9 @@ def discard(path: Path) -> None:
             path.unlink()
 
 
-def _replace(place: Path, part: Path) -> None:
+def _replace(path: Path, part: Path) -> None:
     try:
-        part.replace(place)
+        part.replace(path)
     except OSError as error:
         if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
             raise
@@ -182,23 +182,23 @@ def _sync(path: Path) -> None:
         os.close(file)
 
 
-def _pictures(source: Path) -> Iterator[Path]:
+def _image_files(source: Path) -> Iterator[Path]:
     if _is_folder(source):
-        yield from walk(source, _is_wanted)
+        yield from walk(source, _is_input)
     else:
         yield source
 
 
-def walk(folder: Path, is_wanted: Callable[[Path], bool]) -> Iterator[Path]:
+def walk(folder: Path, is_included: Callable[[Path], bool]) -> Iterator[Path]:
     """The files in a folder and below that are wanted, in a stable order, hidden folders passed over.
 
     Links are followed, and a real folder is visited once, so that loops end. A folder that cannot be looked into is
     given itself.
     """
-    return _walk(folder, is_wanted, set())
+    return _walk(folder, is_included, set())
 
 
-def _walk(folder: Path, is_wanted: Callable[[Path], bool], seen: set[tuple[int, int]]) -> Iterator[Path]:
+def _walk(folder: Path, is_included: Callable[[Path], bool], seen: set[tuple[int, int]]) -> Iterator[Path]:
     try:
         entries = sorted(folder.iterdir())
         status = folder.stat()
@@ -211,12 +211,12 @@ def _walk(folder: Path, is_wanted: Callable[[Path], bool], seen: set[tuple[int, 
     for entry in entries:
         if _is_folder(entry):
             if not entry.name.startswith("."):
-                yield from _walk(entry, is_wanted, seen)
-        elif is_wanted(entry):
+                yield from _walk(entry, is_included, seen)
+        elif is_included(entry):
             yield entry
 
 
-def _place(path: Path) -> str:
+def _absolute(path: Path) -> str:
     """A path in one spelling, links as they are: two links to one file are two pictures."""
     return os.path.abspath(path)  # noqa: PTH100
 
@@ -225,31 +225,31 @@ def _is_folder(path: Path) -> bool:
     return os.path.isdir(path)  # noqa: PTH112  (Path.is_dir raises where we may not look)
 
 
-def _wanted_names(folder: Path) -> Counter[str]:
+def _name_counts(folder: Path) -> Counter[str]:
     """How often the pictures of a folder claim a name: each once by its stem and once in full."""
     try:
-        pictures = [path for path in folder.iterdir() if _is_wanted(path)]
+        pictures = [path for path in folder.iterdir() if _is_input(path)]
     except OSError:
         return Counter()
     return Counter(name for path in pictures for name in (path.stem, path.name))
 
 
-def _layer_name(picture: Path, wanted: Counter[str]) -> str:
-    others = wanted[picture.stem] - _is_wanted(picture)
+def _layer_name(picture: Path, counts: Counter[str]) -> str:
+    others = counts[picture.stem] - _is_input(picture)
     return picture.name if others > 0 else picture.stem
 
 
-def _is_wanted(path: Path) -> bool:
+def _is_input(path: Path) -> bool:
     """Whether a file found in a folder is a picture by name, not hidden, and not one of our own results."""
-    ours = Path(path.stem).suffix.lstrip(".") in LAYERS
-    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and not ours
+    is_result = Path(path.stem).suffix.lstrip(".") in LAYERS
+    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and not is_result
 
 
-def _refuse_shared_names(jobs: Iterable[SeparationPaths]) -> None:
+def _check_unique_targets(jobs: Iterable[SeparationPaths]) -> None:
     owners: dict[str, SeparationPaths] = {}
     for job in jobs:
         name = job.folder / job.name
-        other = owners.setdefault(_place(name), job)
+        other = owners.setdefault(_absolute(name), job)
         if other is not job:
             raise TargetError(
                 f"{other.source} and {job.source} would both be written as {name}.*",
@@ -258,7 +258,7 @@ def _refuse_shared_names(jobs: Iterable[SeparationPaths]) -> None:
             )
 
 
-def _refuse_source(path: Path, source: Path | None) -> None:
+def _check_not_source(path: Path, source: Path | None) -> None:
     with contextlib.suppress(OSError):  # a source or target that is not there is not the same file
         if source is not None and path.samefile(source):
             raise TargetError(
@@ -266,7 +266,7 @@ def _refuse_source(path: Path, source: Path | None) -> None:
             )
 
 
-def _refuse_taken(path: Path, overwrite: bool) -> None:
+def _check_writable(path: Path, overwrite: bool) -> None:
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     if path.exists() and not overwrite:
@@ -275,14 +275,14 @@ def _refuse_taken(path: Path, overwrite: bool) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
 
-def _write_through(path: Path, data: bytes) -> None:
+def _write_synced(path: Path, data: bytes) -> None:
     with path.open("xb") as file:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
 
 
-def _take_name(part: Path, path: Path, overwrite: bool) -> None:
+def _publish(part: Path, path: Path, overwrite: bool) -> None:
     if overwrite:
         part.replace(path)
         return
@@ -294,7 +294,7 @@ def _take_name(part: Path, path: Path, overwrite: bool) -> None:
         part.replace(path)  # a file system without links (FAT): _refuse_taken has looked just before
 
 
-_CURES = {
+_REMEDIES = {
     errno.EEXIST: (
         "nothing is overwritten unasked",
         "pass --overwrite (in Python overwrite=True) or choose another place",
@@ -307,11 +307,11 @@ _CURES = {
     errno.EROFS: ("the place must be writable", "choose another place with -o"),
     errno.ENAMETOOLONG: ("the name must be shorter", "rename the picture"),
 }
-_OTHERWISE = ("the file must be writable", "choose another place with -o")
+_DEFAULT_REMEDY = ("the file must be writable", "choose another place with -o")
 
 
 def _target_error(path: Path, error: OSError) -> TargetError:
-    expected, cure = _CURES.get(error.errno or 0, _OTHERWISE)
+    expected, cure = _REMEDIES.get(error.errno or 0, _DEFAULT_REMEDY)
     return TargetError(f"{path} was not written ({error.strerror or error})", expected, cure)
 
 

@@ -119,13 +119,13 @@ class Options:
                 "choose format tiff or exr, or leave additive out",
             )
 
-    def load(self) -> dict[str, Any]:
+    def load_options(self) -> dict[str, Any]:
         """The keywords for loading a `Separator`."""
         large = {name: getattr(self, name) for name in DiffusionOptions.__annotations__}
         asked = {name: value for name, value in large.items() if value != getattr(Options, name)}
         return {"model": self.model, "device": self.device, **asked}
 
-    def call(self) -> dict[str, Any]:
+    def call_options(self) -> dict[str, Any]:
         """The keywords for calling a `Separator`."""
         return {name: getattr(self, name) for name in ("strength", "quality", "additive", "max_pixels")}
 

@@ -10,7 +10,7 @@ from multiprocessing import parent_process
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
+def single_torch_thread() -> Iterator[None]:
     """Torch with one thread: it sums in another order with more, so that results would depend on the machine."""
     import torch  # noqa: PLC0415  (only where it is used anyway)
 
@@ -22,7 +22,7 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def end_with_parent() -> None:
+def exit_with_parent() -> None:
     """From now on this process ends when its parent does, however that ends: nobody works on for a run that is gone."""
     threading.Thread(target=_wait_for_parent, daemon=True).start()
 

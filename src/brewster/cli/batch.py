@@ -179,7 +179,7 @@ class SeparationBatch:
     def _separator(self) -> Separator:
         from brewster.inference import Separator  # noqa: PLC0415  (wakes ONNX Runtime and pyvips)
 
-        return Separator.load(**self.options.load())
+        return Separator.load(**self.options.load_options())
 
     def _do(self, task: BatchItem, bugs: list[Exception]) -> BatchResult:
         entry = BatchResult(task.name)
@@ -234,7 +234,7 @@ class SeparationBatch:
 
     def _separate(self, source: Path | None, targets: dict[str, Path | None], entry: BatchResult) -> None:
         photo = source or sys.stdin.buffer.read()
-        separation = self._separator(photo, on_progress=self._show_progress, **self.options.call())
+        separation = self._separator(photo, on_progress=self._show_progress, **self.options.call_options())
         entry.seconds, entry.residual = dict(separation.seconds), separation.residual
         entry.reconstruction_error, entry.doubtful = separation.reconstruction_error, separation.doubtful
         started = time.perf_counter()

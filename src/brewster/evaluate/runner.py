@@ -24,7 +24,7 @@ from brewster.errors import BrewsterError, TargetError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import Method, MethodOutput, refuse_names
 from brewster.evaluate.scoring import GroundTruth, Scorer
-from brewster.worker_setup import end_with_parent, one_thread
+from brewster.worker_setup import exit_with_parent, single_torch_thread
 
 SCORES: Final = "scores.jsonl"
 SCORE_FORMAT: Final = 2
@@ -216,7 +216,7 @@ def _run(
     """
     named = {method.name: method for method in methods}
     if workers == 1:
-        with one_thread():
+        with single_torch_thread():
             for task in tasks:
                 take(_do(task, named, protocol))
         return
@@ -250,12 +250,12 @@ _process: dict[str, Any] = {}
 
 def _begin(methods: dict[str, Method], protocol: EvaluationConfig) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which lets a case be finished
-    end_with_parent()
+    exit_with_parent()
     _process.update(methods=methods, protocol=protocol)
 
 
 def _do_here(task: _ScoringTask) -> list[ScoreRow]:
-    with one_thread():
+    with single_torch_thread():
         return _do(task, _process["methods"], _process["protocol"])
 
 

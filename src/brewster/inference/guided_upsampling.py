@@ -22,7 +22,7 @@ Floats = NDArray[np.float32]
 
 _RADIUS: Final = 2
 _VARIANCE_FLOOR: Final = 4e-3
-_FAINT_DETAIL: Final = 1e-6
+_MIN_DETAIL_ENERGY: Final = 1e-6
 """Energy of detail, linear light squared, below which it is nobody's."""
 
 
@@ -34,7 +34,7 @@ class _LocalLinearMap:
     slope: Float32[Floats, "h w 3"]
     offset: Float32[Floats, "h w 3"]
 
-    def read(self, photo: Floats, top: int, height: int) -> Floats:
+    def apply(self, photo: Floats, top: int, height: int) -> Floats:
         """The picture over rows top..top+n of the full photo, (n, W, 3)."""
         rows, width, _ = photo.shape
         picture = enlarge_rows(self.slope, top, rows, (height, width))
@@ -53,20 +53,20 @@ class GeneratedOverride:
     """
 
     transmission: Float32[Floats, "h w 3"]
-    share: Float32[Floats, "h w 1"]
+    weight: Float32[Floats, "h w 1"]
     """0: the photo's own detail; 1: the drawn picture."""
     strength: float = 1.0
     """How much of the way from the photo to the drawn picture is gone."""
 
     @classmethod
-    def where_mirrored(cls, transmission: Floats, reflection: Floats) -> GeneratedOverride:
+    def weighted_by_detail(cls, transmission: Floats, reflection: Floats) -> GeneratedOverride:
         """Taken as far as the fine detail is the reflection's: its share of the energy above the windows' means."""
-        mirrored, behind = (
-            _box(np.square(layer - _box(layer)).mean(axis=2, keepdims=True))
+        reflected, transmitted = (
+            _box_mean(np.square(layer - _box_mean(layer)).mean(axis=2, keepdims=True))
             for layer in (reflection, transmission)
         )
-        share: Floats = mirrored / (mirrored + behind + np.float32(_FAINT_DETAIL))
-        return cls(transmission, share)
+        weight: Floats = reflected / (reflected + transmitted + np.float32(_MIN_DETAIL_ENERGY))
+        return cls(transmission, weight)
 
 
 @final
@@ -76,22 +76,22 @@ class GuidedUpsampler:
 
     change: _LocalLinearMap
     reflection: _LocalLinearMap
-    redrawn: GeneratedOverride | None = None
+    override: GeneratedOverride | None = None
 
     @classmethod
-    def learn(
-        cls, photo: Floats, change: Floats, reflection: Floats, redrawn: GeneratedOverride | None = None
+    def fit(
+        cls, photo: Floats, change: Floats, reflection: Floats, override: GeneratedOverride | None = None
     ) -> GuidedUpsampler:
         """From a photo, transmission - photo, and the reflection at work resolution, (h, w, 3), linear light."""
-        mean = _box(photo)
-        spread = _box(photo * photo) - mean**2 + _VARIANCE_FLOOR
+        mean = _box_mean(photo)
+        variance = _box_mean(photo * photo) - mean**2 + _VARIANCE_FLOOR
 
         def fit(picture: Floats) -> _LocalLinearMap:
             """Slopes from windows, smoothed; offsets that make the lines meet the picture exactly."""
-            slope = _box((_box(photo * picture) - mean * _box(picture)) / spread)
+            slope = _box_mean((_box_mean(photo * picture) - mean * _box_mean(picture)) / variance)
             return _LocalLinearMap(slope, picture - slope * photo)
 
-        return cls(fit(change), fit(reflection), redrawn)
+        return cls(fit(change), fit(reflection), override)
 
     def apply(self, photo: Floats, top: int, height: int) -> tuple[Floats, Floats]:
         """Transmission and reflection of rows top..top+n of a photo `height` rows high, each (n, W, 3).
@@ -99,51 +99,51 @@ class GuidedUpsampler:
         Light is not negative, except where a wide-gamut photo's own values are, and no reflection is brighter
         than the photo it is part of.
         """
-        transmission = self.change.read(photo, top, height)
-        if self.redrawn:
+        transmission = self.change.apply(photo, top, height)
+        if self.override:
             size = height, photo.shape[1]
-            drawn, share = (
+            generated, weight = (
                 enlarge_rows(map_, top, len(photo), size)
-                for map_ in (self.redrawn.transmission, self.redrawn.share)
+                for map_ in (self.override.transmission, self.override.weight)
             )
-            transmission += share * (np.float32(self.redrawn.strength) * (drawn - photo) - transmission)
+            transmission += weight * (np.float32(self.override.strength) * (generated - photo) - transmission)
         transmission += photo
         np.maximum(transmission, np.minimum(photo, 0), out=transmission)
-        reflection = self.reflection.read(photo, top, height)
+        reflection = self.reflection.apply(photo, top, height)
         return transmission, np.clip(reflection, 0, np.maximum(photo, 0), out=reflection)
 
 
 def enlarge_rows(map_: Floats, top: int, rows: int, size: tuple[int, int]) -> Floats:
     """Rows top..top+rows of `map_` (h, w, C) enlarged to `size` (H, W), linearly between pixel centres."""
-    vertical = _between(map_, *_positions(map_.shape[0], top, rows, size[0]), axis=0)
-    return _between(vertical, *_positions(map_.shape[1], 0, size[1], size[1]), axis=1)
+    vertical = _interpolate(map_, *_positions(map_.shape[0], top, rows, size[0]), axis=0)
+    return _interpolate(vertical, *_positions(map_.shape[1], 0, size[1], size[1]), axis=1)
 
 
 def _positions(small: int, first: int, count: int, large: int) -> tuple[NDArray[np.intp], Floats]:
     """For large pixels first..first+count: the small pixel before each centre, and how far past it."""
     centres = (np.arange(first, first + count) + 0.5) * (small / large) - 0.5
     centres = np.clip(centres, 0, small - 1)
-    before = np.minimum(centres.astype(np.intp), max(small - 2, 0))
-    return before, (centres - before).astype(np.float32)
+    lower = np.minimum(centres.astype(np.intp), max(small - 2, 0))
+    return lower, (centres - lower).astype(np.float32)
 
 
-def _between(map_: Floats, before: NDArray[np.intp], past: Floats, *, axis: int) -> Floats:
+def _interpolate(map_: Floats, lower: NDArray[np.intp], fraction: Floats, *, axis: int) -> Floats:
     shape = [1] * map_.ndim
     shape[axis] = -1
-    low = np.take(map_, before, axis=axis)
-    high: Floats = np.take(map_, np.minimum(before + 1, map_.shape[axis] - 1), axis=axis)
+    low = np.take(map_, lower, axis=axis)
+    high: Floats = np.take(map_, np.minimum(lower + 1, map_.shape[axis] - 1), axis=axis)
     high -= low
-    high *= past.reshape(shape)
+    high *= fraction.reshape(shape)
     high += low
     return high
 
 
-def _box(map_: Floats) -> Floats:
+def _box_mean(map_: Floats) -> Floats:
     """Means over windows of 2 r + 1 pixels a side, edges repeated, (h, w, C)."""
     for axis in (0, 1):
-        reach = [(0, 0)] * 3
-        reach[axis] = (_RADIUS, _RADIUS)
-        padded = np.pad(map_, reach, mode="edge")
-        parts = [np.take(padded, range(i, i + map_.shape[axis]), axis=axis) for i in range(2 * _RADIUS + 1)]
-        map_ = np.mean(parts, axis=0, dtype=np.float32)
+        padding = [(0, 0)] * 3
+        padding[axis] = (_RADIUS, _RADIUS)
+        padded = np.pad(map_, padding, mode="edge")
+        shifted = [np.take(padded, range(i, i + map_.shape[axis]), axis=axis) for i in range(2 * _RADIUS + 1)]
+        map_ = np.mean(shifted, axis=0, dtype=np.float32)
     return map_

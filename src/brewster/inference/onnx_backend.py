@@ -11,7 +11,7 @@ import onnxruntime as ort
 from brewster.errors import DeviceError, ModelError
 from brewster.inference.tiles import Picture
 
-_STRIDE: Final = 32
+_STRIDE_PX: Final = 32
 """Networks take sides that are multiples of this; pictures are mirrored outwards to reach it."""
 
 # device name: (ONNX Runtime's provider, the line that installs it), the preferred ones first
@@ -39,9 +39,9 @@ class OnnxBackend:
     """
 
     def __init__(self, model: Path, device: str = "auto") -> None:
-        data = _read(model)
+        data = _read_model(model)
         for candidate in _candidates(device):
-            session = _start(model, data, candidate)
+            session = _create_session(model, data, candidate)
             if session.get_providers()[0] == _PROVIDERS[candidate][0]:
                 self.device, self._session = candidate, session
                 self._check_names(model)
@@ -55,18 +55,18 @@ class OnnxBackend:
     def __call__(self, tile: Picture) -> tuple[Picture, Picture]:
         """Separates one tile (H, W, 3), linear light in 0..1, of any size."""
         height, width, _ = tile.shape
-        margins = [(0, -side % _STRIDE) for side in (height, width)]
+        margins = [(0, -side % _STRIDE_PX) for side in (height, width)]
         padded = np.pad(tile, [*margins, (0, 0)], mode="symmetric")
         feed = {"photo": np.ascontiguousarray(padded.transpose(2, 0, 1)[None], dtype=np.float32)}
         try:
-            answers = self._session.run(["transmission", "reflection"], feed)
+            outputs = self._session.run(["transmission", "reflection"], feed)
         except Exception as error:
             raise ModelError(
                 f"the model failed on a tile of {width}x{height} pixels ({_first_line(error)})",
                 "a model that takes any size that is a multiple of 32",
                 "check it with brewster models verify, or try --device cpu",
             ) from error
-        transmission, reflection = (layer[0, :, :height, :width].transpose(1, 2, 0) for layer in answers)
+        transmission, reflection = (layer[0, :, :height, :width].transpose(1, 2, 0) for layer in outputs)
         return transmission, reflection
 
     def _check_names(self, model: Path) -> None:
@@ -84,7 +84,7 @@ def _first_line(error: Exception) -> str:
     return str(error).splitlines()[0][:120] if str(error) else type(error).__name__
 
 
-def _read(model: Path) -> bytes:
+def _read_model(model: Path) -> bytes:
     try:
         return model.read_bytes()
     except OSError as error:
@@ -95,7 +95,7 @@ def _read(model: Path) -> bytes:
         ) from error
 
 
-def _start(model: Path, data: bytes, device: str) -> ort.InferenceSession:
+def _create_session(model: Path, data: bytes, device: str) -> ort.InferenceSession:
     """A session on the device, or on the CPU where the device's own libraries do not load."""
     options = ort.SessionOptions()
     options.log_severity_level = 3

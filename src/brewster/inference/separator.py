@@ -41,7 +41,7 @@ RECONSTRUCTION_ERROR_LIMIT: Final = 0.06
 _WORKERS: Final = 2
 _WHITE_PERCENTILE: Final = 99.0
 """Of a photo brighter than white, such as an EXR, this percentile is shown to the network as white."""
-_LOOKING: Final = 0.6
+_NETWORK_SHARE: Final = 0.6
 """The share of the work that is told as done when the network has answered: an estimate for those who wait."""
 
 
@@ -75,7 +75,7 @@ class Separation:
     @cached_property
     def confidence(self) -> Photo:
         """Grey, 8 bit: 255 where the separation is sure of the transmission. Enlarged when it is first asked for."""
-        return _enlarged(self.confidence_map, self.photo)
+        return _upsampled_confidence(self.confidence_map, self.photo)
 
 
 @final
@@ -90,12 +90,12 @@ class Separator:
         sha256: str | None = None,
         device: str = "cpu",
     ) -> None:
-        self._look = model if isinstance(model, Predictor) else MultiScalePredictor(model)
+        self._predictor = model if isinstance(model, Predictor) else MultiScalePredictor(model)
         self.name, self.sha256, self.device = name, sha256, device
 
     @classmethod
     def load(
-        cls, model: str = "compact", *, device: str = "auto", **large: Unpack[DiffusionOptions]
+        cls, model: str = "compact", *, device: str = "auto", **diffusion_options: Unpack[DiffusionOptions]
     ) -> Separator:
         """A separator by the name of a model in the zoo, the path of an .onnx file, or a large image model.
 
@@ -114,20 +114,20 @@ class Separator:
             MissingExtra: a large model needs the extra `large`.
         """
         if is_large(model):
-            return cls._load_large(model, device, large)
-        if large:
+            return cls._load_diffusion(model, device, diffusion_options)
+        if diffusion_options:
             raise ModelError(
-                f"{', '.join(large)} was asked of {model}",
+                f"{', '.join(diffusion_options)} was asked of {model}",
                 "a large image model or a LoRA",
                 "leave it out, or name such a model",
             )
-        found = find_model(model)
-        digest = found.verify()
-        backend = OnnxBackend(found.path, device)
-        return cls(backend, name=found.name, sha256=digest, device=backend.device)
+        model_file = find_model(model)
+        digest = model_file.verify()
+        backend = OnnxBackend(model_file.path, device)
+        return cls(backend, name=model_file.name, sha256=digest, device=backend.device)
 
     @classmethod
-    def _load_large(cls, model: str, device: str, asked: DiffusionOptions) -> Separator:
+    def _load_diffusion(cls, model: str, device: str, diffusion_options: DiffusionOptions) -> Separator:
         try:
             from brewster.inference.diffusion_predictor import DiffusionPredictor  # noqa: PLC0415
             from brewster.models.diffusion.pipeline import open_decomposer  # noqa: PLC0415  (wakes torch)
@@ -135,17 +135,20 @@ class Separator:
             raise MissingExtra(
                 f"{error.name} is not installed", f"{model} needs it", "pip install 'brewster[large]'"
             ) from error
-        decomposer = open_decomposer(
-            model, device=device, base=asked.get("base"), quantise=asked.get("quantise")
+        pipeline = open_decomposer(
+            model,
+            device=device,
+            base=diffusion_options.get("base"),
+            quantise=diffusion_options.get("quantise"),
         )
-        look = DiffusionPredictor(
-            decomposer,
-            steps=asked.get("steps"),
-            average=asked.get("average", 1),
-            plain=asked.get("plain", False),
+        predictor = DiffusionPredictor(
+            pipeline,
+            steps=diffusion_options.get("steps"),
+            average=diffusion_options.get("average", 1),
+            plain=diffusion_options.get("plain", False),
         )
-        where = str(decomposer.backbone.device)
-        return cls(look, name=decomposer.name, sha256=decomposer.sha256, device=where)
+        where = str(pipeline.backbone.device)
+        return cls(predictor, name=pipeline.name, sha256=pipeline.sha256, device=where)
 
     def __call__(
         self,
@@ -173,30 +176,30 @@ class Separator:
             PhotoError: the source cannot be read, or is too large.
             BrewsterError: strength or quality out of range.
         """
-        _check(strength, quality)
+        _check_options(strength, quality)
         seconds: dict[str, float] = {}
-        with _clock(seconds, "decode"):
+        with _timed(seconds, "decode"):
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
-            copies = [photo.small(*size) for size in self._look.sizes(photo.size, quality)]
-            white = np.float32(max(1.0, float(np.percentile(copies[-1], _WHITE_PERCENTILE))))
-            copies = [np.clip(copy / white, 0, 1) for copy in copies]
+            inputs = [photo.resized(*size) for size in self._predictor.input_sizes(photo.size, quality)]
+            white = np.float32(max(1.0, float(np.percentile(inputs[-1], _WHITE_PERCENTILE))))
+            inputs = [np.clip(largest_input / white, 0, 1) for largest_input in inputs]
         on_progress(0.0)
-        with _clock(seconds, "network"):
-            seen = self._look(copies, quality, lambda done: on_progress(_LOOKING * done))
-        with _clock(seconds, "detail"):
-            transfer = _transfer(copies[-1], seen, strength, white)
-            whole, mirrored, residual = _at_full_size(
-                photo, transfer, additive=additive, on_progress=on_progress
+        with _timed(seconds, "network"):
+            prediction = self._predictor(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
+        with _timed(seconds, "detail"):
+            upsampler = _fit_upsampler(inputs[-1], prediction, strength, white)
+            transmission, reflection, residual = _upsample(
+                photo, upsampler, additive=additive, on_progress=on_progress
             )
-        made_by = self.name, self.sha256, self.device
+        model_info = self.name, self.sha256, self.device
         return Separation(
             photo,
-            whole,
-            mirrored,
-            seen.confidence_map,
+            transmission,
+            reflection,
+            prediction.confidence_map,
             residual,
-            seen.reconstruction_error,
-            *made_by,
+            prediction.reconstruction_error,
+            *model_info,
             seconds,
         )
 
@@ -211,10 +214,10 @@ def separate(
     additive: bool = False,
     encoding: Encoding | None = None,
     max_pixels: int = DEFAULT_MAX_PIXELS,
-    **large: Unpack[DiffusionOptions],
+    **diffusion_options: Unpack[DiffusionOptions],
 ) -> Separation:
     """Separates one photograph; for many, `Separator.load` once and call it. Options and errors are theirs."""
-    separator = Separator.load(model, device=device, **large)
+    separator = Separator.load(model, device=device, **diffusion_options)
     return separator(
         source,
         strength=strength,
@@ -225,48 +228,52 @@ def separate(
     )
 
 
-def _check(strength: float, quality: str) -> None:
+def _check_options(strength: float, quality: str) -> None:
     if not 0 <= strength <= 1:
         raise BrewsterError(f"strength is {strength}", "a number from 0 to 1", "choose one in that range")
     if quality not in QUALITIES:
         raise BrewsterError(f"quality is {quality!r}", f"one of {', '.join(QUALITIES)}", "choose one of them")
 
 
-def _transfer(copy: Floats, seen: Prediction, strength: float, white: np.float32) -> GuidedUpsampler:
+def _fit_upsampler(
+    largest_input: Floats, prediction: Prediction, strength: float, white: np.float32
+) -> GuidedUpsampler:
     """What was seen, as strong and as bright as it is asked for."""
-    share, redrawn = np.float32(strength) * white, seen.redrawn
-    if redrawn:
-        redrawn = replace(redrawn, transmission=white * redrawn.transmission, strength=strength)
-    return GuidedUpsampler.learn(white * copy, share * seen.change, share * seen.reflection, redrawn)
+    scale, override = np.float32(strength) * white, prediction.override
+    if override:
+        override = replace(override, transmission=white * override.transmission, strength=strength)
+    return GuidedUpsampler.fit(
+        white * largest_input, scale * prediction.change, scale * prediction.reflection, override
+    )
 
 
-def _at_full_size(
-    photo: Photo, transfer: GuidedUpsampler, *, additive: bool, on_progress: ProgressCallback
+def _upsample(
+    photo: Photo, upsampler: GuidedUpsampler, *, additive: bool, on_progress: ProgressCallback
 ) -> tuple[Photo, Photo, float]:
     """Both layers, stored as the photo is or as exact floats, and the mean unexplained residual."""
-    store = _as_floats(photo) if additive else photo
-    canvases = [np.empty(store.pixels.shape, store.pixels.dtype) for _ in range(2)]
+    template = _float_template(photo) if additive else photo
+    canvases = [np.empty(template.pixels.shape, template.pixels.dtype) for _ in range(2)]
 
     def fill(rows: slice) -> float:
         linear = photo.linear_rows(rows.start, rows.stop)
-        layers = transfer.apply(linear, rows.start, photo.size[1])
-        stored = [store.stored_rows(layer, rows.start) for layer in layers]
+        layers = upsampler.apply(linear, rows.start, photo.size[1])
+        stored = [template.stored_rows(layer, rows.start) for layer in layers]
         if additive:
-            stored = _summing_exactly(store.stored_rows(linear, rows.start), stored[0])
+            stored = _exact_sum_layers(template.stored_rows(linear, rows.start), stored[0])
         for canvas, layer in zip(canvases, stored, strict=True):
             canvas[rows] = layer
         return 0.0 if additive else float(np.abs(linear - layers[0] - layers[1]).sum(dtype=np.float64))
 
-    strips, unexplained = list(photo.strips()), 0.0
+    strips, residual_sum = list(photo.strips()), 0.0
     with ThreadPoolExecutor(_WORKERS) as pool:
-        for done, part in enumerate(pool.map(fill, strips), 1):
-            unexplained += part
-            on_progress(_LOOKING + (1 - _LOOKING) * done / len(strips))
-    transmission, reflection = (store.with_pixels(canvas) for canvas in canvases)
-    return transmission, reflection, unexplained / (math.prod(photo.size) * 3)
+        for done, strip_residual in enumerate(pool.map(fill, strips), 1):
+            residual_sum += strip_residual
+            on_progress(_NETWORK_SHARE + (1 - _NETWORK_SHARE) * done / len(strips))
+    transmission, reflection = (template.with_pixels(canvas) for canvas in canvases)
+    return transmission, reflection, residual_sum / (math.prod(photo.size) * 3)
 
 
-def _as_floats(photo: Photo) -> Photo:
+def _float_template(photo: Photo) -> Photo:
     """The photo's like, black, in 32-bit floats of linear light, to be filled; alpha and EXIF are kept."""
     file_info = replace(
         photo.file_info, container="tiff", bits=32, compression=None, icc=None, primaries=None, header=None
@@ -278,7 +285,7 @@ def _as_floats(photo: Photo) -> Photo:
     return Photo(black, alpha, file_info)
 
 
-def _summing_exactly(photo: Floats, transmission: Floats) -> list[Floats]:
+def _exact_sum_layers(photo: Floats, transmission: Floats) -> list[Floats]:
     """Two layers, none negative where the photo is not, whose float sum is the photo to the last bit.
 
     Of the two differences at least one is exact (Sterbenz 1974), which makes the sum exact.
@@ -287,7 +294,7 @@ def _summing_exactly(photo: Floats, transmission: Floats) -> list[Floats]:
     return [photo - reflection, reflection]
 
 
-def _enlarged(map_: Floats, photo: Photo) -> Photo:
+def _upsampled_confidence(map_: Floats, photo: Photo) -> Photo:
     """A map (h, w, 1) in 0..1 as a grey 8-bit picture of the photo's size."""
     width, height = photo.size
     canvas = np.empty((height, width, 1), np.uint8)
@@ -297,7 +304,7 @@ def _enlarged(map_: Floats, photo: Photo) -> Photo:
 
 
 @contextmanager
-def _clock(seconds: dict[str, float], name: str) -> Iterator[None]:
+def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
     started = time.perf_counter()
     yield
     seconds[name] = time.perf_counter() - started

@@ -21,7 +21,7 @@ Backend = Callable[[Picture], tuple[Picture, Picture]]
 reflection, both of the same shape and kind."""
 
 
-def in_tiles(
+def run_tiled(
     backend: Callable[[Picture], tuple[Picture, ...]], picture: Picture, *, tile_px: int, overlap_px: int
 ) -> tuple[Picture, ...]:
     """The backend's answers, (H, W, 3) each, for a picture of any size; one no larger than a tile goes in whole.
@@ -29,31 +29,31 @@ def in_tiles(
     Neighbouring tiles share at least `overlap_px` pixels, over which their answers are cross-faded.
     """
     height, width, _ = picture.shape
-    windows = tiles_of((height, width), tile_px=tile_px, overlap_px=overlap_px)
-    if len(windows) == 1:
+    tiles = tile_slices((height, width), tile_px=tile_px, overlap_px=overlap_px)
+    if len(tiles) == 1:
         return backend(picture)
     layers: list[Picture] = []
-    total = np.zeros((height, width, 1), np.float32)
-    for vertical, horizontal in windows:
-        window = np.s_[vertical, horizontal]
-        weight = np.outer(_fade(vertical, height, overlap_px), _fade(horizontal, width, overlap_px))[
-            ..., None
-        ]
-        total[window] += weight
-        answers = backend(picture[window])
-        layers = layers or [np.zeros((height, width, 3), np.float32) for _ in answers]
-        for layer, answer in zip(layers, answers, strict=True):
-            layer[window] += weight * answer
-    return tuple(layer / total for layer in layers)
+    weight_sum = np.zeros((height, width, 1), np.float32)
+    for vertical, horizontal in tiles:
+        tile = np.s_[vertical, horizontal]
+        weight = np.outer(
+            _blend_weights(vertical, height, overlap_px), _blend_weights(horizontal, width, overlap_px)
+        )[..., None]
+        weight_sum[tile] += weight
+        outputs = backend(picture[tile])
+        layers = layers or [np.zeros((height, width, 3), np.float32) for _ in outputs]
+        for layer, output in zip(layers, outputs, strict=True):
+            layer[tile] += weight * output
+    return tuple(layer / weight_sum for layer in layers)
 
 
-def tiles_of(size: tuple[int, int], *, tile_px: int, overlap_px: int) -> list[tuple[slice, slice]]:
+def tile_slices(size: tuple[int, int], *, tile_px: int, overlap_px: int) -> list[tuple[slice, slice]]:
     """The rows and columns of each tile of a picture of this (height, width)."""
-    rows, columns = (_spans(side, tile_px, overlap_px) for side in size)
+    rows, columns = (_tile_spans(side, tile_px, overlap_px) for side in size)
     return list(product(rows, columns))
 
 
-def _spans(side: int, tile: int, overlap: int) -> list[slice]:
+def _tile_spans(side: int, tile: int, overlap: int) -> list[slice]:
     """Equal spans of length `tile` that cover 0..side and overlap evenly."""
     if side <= tile:
         return [slice(0, side)]
@@ -62,7 +62,7 @@ def _spans(side: int, tile: int, overlap: int) -> list[slice]:
     return [slice(int(start), int(start) + tile) for start in starts]
 
 
-def _fade(span: slice, side: int, overlap: int) -> NDArray[np.float32]:
+def _blend_weights(span: slice, side: int, overlap: int) -> NDArray[np.float32]:
     """Weights along a span: 1 inside, falling linearly towards edges that are not the picture's own."""
     length = span.stop - span.start
     ramp = (np.arange(length, dtype=np.float32) + 1) / (overlap + 1)

@@ -80,27 +80,27 @@ class ColourSpace:
         channels = [_decoded(stored[..., i], curve) for i, curve in enumerate(self._curves(stored))]
         if len(channels) == 1:
             return np.repeat(channels[0][..., None], 3, axis=2)
-        return np.stack(_product(self.matrix, channels) if self.matrix else channels, axis=2)
+        return np.stack(_apply_matrix(self.matrix, channels) if self.matrix else channels, axis=2)
 
-    def to_stored(self, linear: Float32, before: Stored) -> Stored:
+    def to_stored(self, linear: Float32, original: Stored) -> Stored:
         """Linear Rec.709 (H, W, 3) back to the type and channels of `before`, the pixels that stood there.
 
         Pixels whose light is what `before` means come back as they were, to the bit. Not-a-number becomes
         black.
         """
-        stored = np.empty_like(before)
-        curves = self._curves(before)
+        stored = np.empty_like(original)
+        curves = self._curves(original)
         channels = [linear[..., i] for i in range(3)]
         if len(curves) == 1:
             channels = [_grey(linear)]
         elif self.matrix:
-            channels = _product(_inverse(self.matrix), channels)
+            channels = _apply_matrix(_inverse(self.matrix), channels)
         for i, curve in enumerate(curves):
-            stored[..., i] = _encoded(channels[i], curve, before.dtype)
-        is_exact = self == LINEAR_REC709 or (self == SRGB and before.dtype.kind == "u")
+            stored[..., i] = _encoded(channels[i], curve, original.dtype)
+        is_exact = self == LINEAR_REC709 or (self == SRGB and original.dtype.kind == "u")
         if not is_exact:  # those round-trip by themselves, as the tests prove
-            same = np.all(linear == self.to_linear(before), axis=2)
-            stored[same] = before[same]
+            same = np.all(linear == self.to_linear(original), axis=2)
+            stored[same] = original[same]
         return stored
 
     def _curves(self, stored: Stored) -> tuple[ToneCurve, ...]:
@@ -113,7 +113,7 @@ LINEAR_REC709 = ColourSpace((ToneCurve(),) * 3)
 
 
 @lru_cache(maxsize=16)
-def space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_float: bool) -> ColourSpace:
+def colour_space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_float: bool) -> ColourSpace:
     """The space of stored pixels: that of the ICC profile, of the chromaticities, or of nothing said.
 
     Nothing said means sRGB for whole numbers and linear Rec.709 for floats. Raises UnsupportedPhoto for
@@ -128,18 +128,18 @@ def space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_float: b
 
 def _decoded(stored: Stored, curve: ToneCurve) -> Float32:
     if stored.dtype.kind == "f":
-        is_straight = curve == ToneCurve()
-        return stored if is_straight else curve.decode(stored.astype(np.float64)).astype(np.float32)
+        is_identity = curve == ToneCurve()
+        return stored if is_identity else curve.decode(stored.astype(np.float64)).astype(np.float32)
     return _decode_table(curve, np.iinfo(stored.dtype).max).take(stored)
 
 
 def _encoded(linear: Float32, curve: ToneCurve, dtype: np.dtype[Any]) -> Stored:
     if dtype.kind == "f":
-        is_straight = curve == ToneCurve()
-        return linear if is_straight else curve.encode(linear.astype(np.float64)).astype(np.float32)
+        is_identity = curve == ToneCurve()
+        return linear if is_identity else curve.encode(linear.astype(np.float64)).astype(np.float32)
     table = _encode_table(curve, np.iinfo(dtype).max)
-    root = np.sqrt(np.fmin(np.fmax(linear, np.float32(0)), np.float32(1)))
-    return table.take((root * np.float32(len(table) - 1) + np.float32(0.5)).astype(np.intp))
+    sqrt_light = np.sqrt(np.fmin(np.fmax(linear, np.float32(0)), np.float32(1)))
+    return table.take((sqrt_light * np.float32(len(table) - 1) + np.float32(0.5)).astype(np.intp))
 
 
 @lru_cache(maxsize=16)
@@ -153,12 +153,12 @@ def _encode_table(curve: ToneCurve, white: int) -> NDArray[Any]:
 
     2**16 steps round 8 bits to within 0.01 of a level, 2**20 steps 16 bits to within 0.1.
     """
-    roots = np.linspace(0, 1, 2**16 if white < 256 else 2**20)
-    levels = np.rint(np.clip(curve.encode(roots**2), 0, 1) * white)
+    sqrt_light = np.linspace(0, 1, 2**16 if white < 256 else 2**20)
+    levels = np.rint(np.clip(curve.encode(sqrt_light**2), 0, 1) * white)
     return levels.astype(np.uint8 if white < 256 else np.uint16)
 
 
-def _product(matrix: Matrix, channels: list[Float32]) -> list[Float32]:
+def _apply_matrix(matrix: Matrix, channels: list[Float32]) -> list[Float32]:
     """A matrix times channels, by plain steps: BLAS would round a pixel by where in the strip it stands."""
     red, green, blue = channels
     rows = np.array(matrix, np.float32)
@@ -198,12 +198,12 @@ def _to_rec709(to_d50: Float64) -> Matrix:
 
 def _profile_space(icc: bytes) -> ColourSpace:
     try:
-        tags = tags_of(icc)
+        tags = icc_tags(icc)
         if icc[16:20] == b"GRAY":
-            return _snapped(ColourSpace((_curve(tags[b"kTRC"]),) * 3))
-        to_d50 = np.array([_xyz(tags[name]) for name in (b"rXYZ", b"gXYZ", b"bXYZ")]).T
-        red, green, blue = (_curve(tags[name]) for name in (b"rTRC", b"gTRC", b"bTRC"))
-        space = _snapped(ColourSpace((red, green, blue), _to_rec709(to_d50)))
+            return _snap_to_srgb(ColourSpace((_parse_curve(tags[b"kTRC"]),) * 3))
+        to_d50 = np.array([_parse_xyz(tags[name]) for name in (b"rXYZ", b"gXYZ", b"bXYZ")]).T
+        red, green, blue = (_parse_curve(tags[name]) for name in (b"rTRC", b"gTRC", b"bTRC"))
+        space = _snap_to_srgb(ColourSpace((red, green, blue), _to_rec709(to_d50)))
         _inverse(space.matrix or _as_matrix(np.eye(3)))
     except (KeyError, ValueError, struct.error, np.linalg.LinAlgError) as error:
         raise UnsupportedPhoto(
@@ -214,15 +214,15 @@ def _profile_space(icc: bytes) -> ColourSpace:
     return space
 
 
-def _snapped(space: ColourSpace) -> ColourSpace:
+def _snap_to_srgb(space: ColourSpace) -> ColourSpace:
     """Plain sRGB where a profile means that, to within its rounding and a small part of an 8-bit level."""
     levels = np.arange(256) / 255
-    off = [np.abs(curve.decode(levels) - srgb.to_linear(levels)).max() for curve in space.curves]
-    turned = np.abs(np.array(space.matrix) - np.eye(3)).max() if space.matrix else 0.0
-    return SRGB if max(off) < 2e-4 and turned < 1e-3 else space
+    curve_errors = [np.abs(curve.decode(levels) - srgb.to_linear(levels)).max() for curve in space.curves]
+    matrix_error = np.abs(np.array(space.matrix) - np.eye(3)).max() if space.matrix else 0.0
+    return SRGB if max(curve_errors) < 2e-4 and matrix_error < 1e-3 else space
 
 
-def tags_of(icc: bytes) -> dict[bytes, bytes]:
+def icc_tags(icc: bytes) -> dict[bytes, bytes]:
     """The tags of an ICC profile by signature.
 
     Raises:
@@ -233,19 +233,25 @@ def tags_of(icc: bytes) -> dict[bytes, bytes]:
     return {name: icc[start : start + size] for name, start, size in rows}
 
 
-def _xyz(tag: bytes) -> tuple[float, float, float]:
+def _parse_xyz(tag: bytes) -> tuple[float, float, float]:
     x, y, z = struct.unpack_from(">3i", tag, 8)
     return x / 65536, y / 65536, z / 65536
 
 
-_PLACES = ("g", "gab", "gabc", "gabcd", "gabcdef")  # the parameters that each of ICC's function types gives
+_PARAMETRIC_NAMES = (
+    "g",
+    "gab",
+    "gabc",
+    "gabcd",
+    "gabcdef",
+)  # the parameters that each of ICC's function types gives
 
 
-def _curve(tag: bytes) -> ToneCurve:
+def _parse_curve(tag: bytes) -> ToneCurve:
     """A curveType or parametricCurveType tag (ICC.1:2022 10.6 and 10.18)."""
     kind, count = struct.unpack_from(">4s4xI", tag)
     if kind == b"para":
-        return _parametric(count >> 16, tag)
+        return _parse_parametric(count >> 16, tag)
     if kind != b"curv":
         raise ValueError(kind)
     if count == 0:
@@ -256,8 +262,8 @@ def _curve(tag: bytes) -> ToneCurve:
     return ToneCurve(samples=tuple(number / 65535 for number in numbers))
 
 
-def _parametric(function: int, tag: bytes) -> ToneCurve:
-    names = _PLACES[function] if function < len(_PLACES) else ""
+def _parse_parametric(function: int, tag: bytes) -> ToneCurve:
+    names = _PARAMETRIC_NAMES[function] if function < len(_PARAMETRIC_NAMES) else ""
     given = dict(zip(names, struct.unpack_from(f">{len(names)}i", tag, 12), strict=True))
     g, a, b, c, d, e, f = (given.get(name, 65536 * (name == "a")) / 65536 for name in "gabcdef")
     if function in (1, 2):  # below -b/a these two are flat

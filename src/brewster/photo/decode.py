@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from brewster.errors import MissingExtra, PhotoError, UnreadablePhoto, UnsupportedPhoto
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.photo import metadata
-from brewster.photo.colour import space_of
+from brewster.photo.colour import colour_space_of
 from brewster.photo.file_info import FileInfo
 from brewster.photo.hdr_formats import read_exr, read_hdr, too_large
 from brewster.photo.lut_profiles import has_only_tables
@@ -76,15 +76,15 @@ def read_size(data: bytes) -> tuple[int, int]:
     icc = image.get("icc-profile-data") if image.get_typeof("icc-profile-data") else None
     _check_profile(icc or _profile_of(data, container), is_float=image.format == "float")
     sides = int(image.width), int(image.height)
-    return sides[::-1] if _orientation(image, container) in _SIDEWAYS else sides
+    return sides[::-1] if _orientation(image, container) in _TRANSPOSED else sides
 
 
 def _check_profile(icc: bytes | None, *, is_float: bool) -> None:
     if is_float or not has_only_tables(icc):
-        space_of(icc, None, is_float=is_float)
+        colour_space_of(icc, None, is_float=is_float)
 
 
-_STARTS = (
+_SIGNATURES = (
     (rb"\xff\xd8\xff", "jpeg"),
     (rb"\x89PNG\r\n\x1a\n", "png"),
     (rb"II[*+]\0|MM\0[*+]", "tiff"),
@@ -102,7 +102,7 @@ def _container(data: bytes) -> str:
         raise UnreadablePhoto("the file is empty", "a picture has at least a header", "copy it again")
     if re.match(rb"....ftypmi[fa]", data, re.DOTALL):  # either kind: the decoder's settings tell
         return "heic" if b"hvcC" in data[: 1 << 16] else "avif"
-    for start, container in _STARTS:
+    for start, container in _SIGNATURES:
         if re.match(start, data, re.DOTALL):
             return container
     raise UnreadablePhoto(
@@ -131,19 +131,19 @@ _TYPES = {"uchar": np.uint8, "ushort": np.uint16, "float": np.float32}
 def _decode_vips(data: bytes, container: str, max_pixels: int) -> Decoded:
     image = _open_vips(data, container, max_pixels)
     try:
-        file_info = _origin(image, data, container)
+        file_info = _file_info(image, data, container)
         array = np.frombuffer(image.write_to_memory(), _TYPES[image.format])
     except pyvips.Error as error:
         raise _unreadable(container, error) from error
     array = _full_scale(array.reshape(image.height, image.width, image.bands), file_info.bits)
-    return split(upright(array, _orientation(image, container)), file_info)
+    return split_alpha(apply_orientation(array, _orientation(image, container)), file_info)
 
 
 def _open_vips(data: bytes, container: str, max_pixels: int) -> pyvips.Image:
     """The header; pixels come when they are asked for."""
     try:
         image = _LOADERS[container](data, access="sequential", fail_on=_STRICT.get(container, "truncated"))
-        _refuse_odd(image, data, container, max_pixels)
+        _check_supported(image, data, container, max_pixels)
     except pyvips.Error as error:
         raise _unreadable(container, error) from error
     return image
@@ -151,21 +151,21 @@ def _open_vips(data: bytes, container: str, max_pixels: int) -> pyvips.Image:
 
 def _orientation(image: pyvips.Image, container: str) -> int:
     """How pixels are still to be turned: libvips has turned the others itself."""
-    turned = container in ("jpeg", "png", "tiff", "webp") and image.get_typeof("orientation")
-    return int(image.get("orientation")) if turned else 1
+    is_unapplied = container in ("jpeg", "png", "tiff", "webp") and image.get_typeof("orientation")
+    return int(image.get("orientation")) if is_unapplied else 1
 
 
 def _unreadable(container: str, error: Exception | str) -> PhotoError:
     lines = [line.strip() for line in str(error).splitlines()]
-    told = " ".join(line for line in lines if line and not line.startswith(("unable to", "source:")))
+    message = " ".join(line for line in lines if line and not line.startswith(("unable to", "source:")))
     return UnreadablePhoto(
-        f"the {container} cannot be read whole ({told[:200] or error})",
+        f"the {container} cannot be read whole ({message[:200] or error})",
         "a whole file of a common kind is needed",
         "copy it again from where it came, or convert it",
     )
 
 
-def _refuse_odd(image: pyvips.Image, data: bytes, container: str, max_pixels: int) -> None:
+def _check_supported(image: pyvips.Image, data: bytes, container: str, max_pixels: int) -> None:
     """Everything we do not take, told from the header alone."""
     if image.width * image.height > max_pixels:
         raise too_large(image.width, image.height, max_pixels)
@@ -189,11 +189,11 @@ def _refuse_odd(image: pyvips.Image, data: bytes, container: str, max_pixels: in
             "convert it to one of these",
         )
     if container == "tiff":
-        _refuse_odd_tiff(metadata.read_tags(data), len(data))
+        _check_tiff(metadata.read_tags(data), len(data))
 
 
-def _refuse_odd_tiff(tags: metadata.Tags, size: int) -> None:
-    if metadata.end_of_pixels(tags) > size:  # libvips reads missing tiles as black
+def _check_tiff(tags: metadata.Tags, size: int) -> None:
+    if metadata.pixel_data_end(tags) > size:  # libvips reads missing tiles as black
         raise _unreadable("tiff", "pixels are missing")
     if _is_raw(tags):
         raise UnsupportedPhoto(
@@ -214,7 +214,7 @@ def _is_raw(tags: metadata.Tags) -> bool:
     return 50706 in tags or metadata.number_of(tags, 254, 0) & 1 == 1
 
 
-def _origin(image: pyvips.Image, data: bytes, container: str) -> FileInfo:
+def _file_info(image: pyvips.Image, data: bytes, container: str) -> FileInfo:
     names = ("icc-profile-data", "exif-data", "xmp-data", "iptc-data")
     icc, exif, xmp, iptc = (image.get(name) if image.get_typeof(name) else None for name in names)
     bits = {"float": 32, "uchar": 8}.get(image.format, 16)
@@ -228,13 +228,13 @@ def _origin(image: pyvips.Image, data: bytes, container: str) -> FileInfo:
         iptc=iptc,
         resolution=(image.xres, image.yres) if has_resolution else None,
     )
-    return replace(file_info, **_MORE[container](data)) if container in _MORE else file_info
+    return replace(file_info, **_EXTRA_INFO[container](data)) if container in _EXTRA_INFO else file_info
 
 
 def _profile_of(data: bytes, container: str) -> bytes | None:
     """A profile for colours stated by number (ITU-T H.273) instead: sRGB needs none, Display P3 has one."""
-    points = metadata.coding_points(data) if container in ("avif", "heic", "png") else None
-    primaries, transfer = points[:2] if points else (1, 13)
+    codes = metadata.cicp(data) if container in ("avif", "heic", "png") else None
+    primaries, transfer = codes[:2] if codes else (1, 13)
     if transfer in (16, 18) or primaries not in (1, 2, 5, 6, 12):
         raise UnsupportedPhoto(
             f"the {container} has the colours of HDR video (primaries {primaries}, transfer {transfer})",
@@ -244,19 +244,19 @@ def _profile_of(data: bytes, container: str) -> bytes | None:
     return bytes(pyvips.Image.profile_load("p3")) if primaries == 12 else None
 
 
-def _more_jpeg(data: bytes) -> dict[str, Any]:
+def _jpeg_info(data: bytes) -> dict[str, Any]:
     subsampling = metadata.jpeg_subsampling(data)
     return {"subsampling": subsampling, "jpeg_quality": _jpeg_quality(data, bands=3 if subsampling else 1)}
 
 
 def _jpeg_quality(data: bytes, bands: int) -> int:
     """The least quality at which libvips quantises no coarser than the file, for luma and for chroma."""
-    file = metadata.jpeg_coarseness(data)
+    source = metadata.jpeg_quantisation_sums(data)
     square = pyvips.Image.black(8, 8, bands=bands)
 
     def is_fine(quality: int) -> bool:
-        ours = metadata.jpeg_coarseness(square.jpegsave_buffer(Q=quality))
-        return all(coarse <= file.get(number, file.get(0, 0)) for number, coarse in ours.items())
+        candidate = metadata.jpeg_quantisation_sums(square.jpegsave_buffer(Q=quality))
+        return all(sum_ <= source.get(number, source.get(0, 0)) for number, sum_ in candidate.items())
 
     return min(bisect.bisect_left(range(1, 101), True, key=is_fine) + 1, 100)
 
@@ -272,23 +272,23 @@ _COMPRESSIONS = {
 }
 
 
-def _more_tiff(data: bytes) -> dict[str, Any]:
+def _tiff_info(data: bytes) -> dict[str, Any]:
     tags = metadata.read_tags(data)
     compression = _COMPRESSIONS.get(metadata.number_of(tags, 259, 1), "deflate")
     return {"compression": compression, "exif": metadata.tiff_exif(tags)}
 
 
-def _more_webp(data: bytes) -> dict[str, Any]:
+def _webp_info(data: bytes) -> dict[str, Any]:
     return {"lossless": b"VP8L" in metadata.webp_chunks(data)}
 
 
-def _more_avif(data: bytes) -> dict[str, Any]:
+def _avif_info(data: bytes) -> dict[str, Any]:
     """Only a lossless AVIF stores RGB as it is: matrix 0, the identity."""
-    points = metadata.coding_points(data)
-    return {"lossless": points is not None and points[2] == 0}
+    codes = metadata.cicp(data)
+    return {"lossless": codes is not None and codes[2] == 0}
 
 
-_MORE = {"jpeg": _more_jpeg, "tiff": _more_tiff, "webp": _more_webp, "avif": _more_avif}
+_EXTRA_INFO = {"jpeg": _jpeg_info, "tiff": _tiff_info, "webp": _webp_info, "avif": _avif_info}
 
 
 # --- HEIC
@@ -333,12 +333,12 @@ def _decode_heic(data: bytes, max_pixels: int) -> Decoded:
         exif=metadata.upright_exif(exif) if exif else None,
         xmp=metadata.upright_xmp(xmp) if xmp else None,
     )
-    return split(_full_scale(array.reshape(*array.shape[:2], -1), file_info.bits), file_info)
+    return split_alpha(_full_scale(array.reshape(*array.shape[:2], -1), file_info.bits), file_info)
 
 
 # --- arrays
 
-_SIDEWAYS = (5, 6, 7, 8)
+_TRANSPOSED = (5, 6, 7, 8)
 
 
 def _full_scale(array: Stored, bits: int) -> Stored:
@@ -346,9 +346,9 @@ def _full_scale(array: Stored, bits: int) -> Stored:
     return array | array >> bits if bits in (10, 12) else array
 
 
-def upright(array: Stored, orientation: int) -> Stored:
+def apply_orientation(array: Stored, orientation: int) -> Stored:
     """The array (H, W, C) turned as EXIF orientation 1..8 says (CIPA DC-008, tag 274)."""
-    if orientation in _SIDEWAYS:
+    if orientation in _TRANSPOSED:
         array = array.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
         array = array[::-1]
@@ -357,7 +357,7 @@ def upright(array: Stored, orientation: int) -> Stored:
     return array
 
 
-def split(array: Stored, file_info: FileInfo) -> Decoded:
+def split_alpha(array: Stored, file_info: FileInfo) -> Decoded:
     """Colour and alpha apart, each whole in memory."""
     has_alpha = array.shape[2] in (2, 4)
     colours = array.shape[2] - has_alpha

@@ -17,11 +17,11 @@ from brewster.photo.hdr_formats import HdrPixels, write_exr, write_hdr
 Stored = NDArray[Any]
 
 _OPAQUE = ("jpeg", "hdr")
-_KEPT = 2 | 4 | 8  # libvips' flags for XMP, IPTC and ICC: EXIF goes in byte for byte afterwards
-_KEPT_IN_AVIF = _KEPT | 1  # ... into the item that libvips has made for it
-_FINE = 95  # the quality of lossy files whose source does not tell its own
-_FINE_AVIF = 90  # AV1's scale differs
-_PLAIN_RESOLUTION = (72 / 25.4, 72 / 25.4)
+_KEEP = 2 | 4 | 8  # libvips' flags for XMP, IPTC and ICC: EXIF goes in byte for byte afterwards
+_KEEP_AVIF = _KEEP | 1  # ... into the item that libvips has made for it
+_DEFAULT_QUALITY = 95  # the quality of lossy files whose source does not tell its own
+_DEFAULT_AVIF_QUALITY = 90  # AV1's scale differs
+_DEFAULT_RESOLUTION = (72 / 25.4, 72 / 25.4)
 
 
 def encode(pixels: Stored, alpha: Stored | None, file_info: FileInfo) -> bytes:
@@ -47,7 +47,7 @@ def encode(pixels: Stored, alpha: Stored | None, file_info: FileInfo) -> bytes:
 
 def _encode_vips(array: Stored, file_info: FileInfo) -> bytes:
     height, width, bands = array.shape
-    across, down = file_info.resolution or _PLAIN_RESOLUTION
+    across, down = file_info.resolution or _DEFAULT_RESOLUTION
     contiguous = np.ascontiguousarray(array)
     kind = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}[array.dtype.name]
     image = pyvips.Image.new_from_memory(contiguous.data, width, height, bands, kind)
@@ -59,10 +59,10 @@ def _encode_vips(array: Stored, file_info: FileInfo) -> bytes:
     for name, blob in blobs.items():
         if blob is not None:
             image.set_type(pyvips.GValue.blob_type, name, blob)
-    kept = _KEPT_IN_AVIF if file_info.container == "avif" else _KEPT
+    keep = _KEEP_AVIF if file_info.container == "avif" else _KEEP
     saver, options = _saver(file_info, array.dtype)
     try:
-        return bytes(getattr(image, saver)(keep=kept, **options))
+        return bytes(getattr(image, saver)(keep=keep, **options))
     except pyvips.Error as error:
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         raise UnsupportedPhoto(
@@ -86,14 +86,14 @@ def _saver(file_info: FileInfo, dtype: np.dtype[Any]) -> tuple[str, dict[str, An
     match file_info.container:
         case "jpeg":
             mode = "on" if file_info.subsampling == "4:2:0" else "off"
-            quality = file_info.jpeg_quality or _FINE
+            quality = file_info.jpeg_quality or _DEFAULT_QUALITY
             return "jpegsave_buffer", {"Q": quality, "subsample_mode": mode, "optimize_coding": True}
         case "png":
             return "pngsave_buffer", {}
         case "webp":
-            return "webpsave_buffer", {"Q": _FINE, "lossless": file_info.lossless, "exact": True}
+            return "webpsave_buffer", {"Q": _DEFAULT_QUALITY, "lossless": file_info.lossless, "exact": True}
         case "avif":
-            fidelity = {"Q": _FINE_AVIF, "lossless": file_info.lossless, "subsample_mode": "off"}
+            fidelity = {"Q": _DEFAULT_AVIF_QUALITY, "lossless": file_info.lossless, "subsample_mode": "off"}
             # effort 1 takes a seventh of the default's time for an eighth more bytes
             return "heifsave_buffer", {
                 "compression": "av1",
@@ -105,7 +105,7 @@ def _saver(file_info: FileInfo, dtype: np.dtype[Any]) -> tuple[str, dict[str, An
     if compression == "jpeg" and dtype != np.uint8:
         compression = "deflate"
     predictor = "float" if dtype.kind == "f" else "horizontal"
-    options = {"compression": compression, "predictor": predictor, "Q": _FINE, "resunit": "inch"}
+    options = {"compression": compression, "predictor": predictor, "Q": _DEFAULT_QUALITY, "resunit": "inch"}
     return "tiffsave_buffer", options
 
 
@@ -136,11 +136,16 @@ def _encode_heic(array: Stored, file_info: FileInfo) -> bytes:
     height, width, bands = array.shape
     mode = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}[bands] + (";16" if file_info.bits > 8 else "")
     heif = pillow_heif.from_bytes(mode, (width, height), np.ascontiguousarray(array).tobytes())
-    said = {
+    metadata_items = {
         "icc_profile": file_info.icc,
         "exif": file_info.exif and b"Exif\0\0" + file_info.exif,
         "xmp": file_info.xmp,
     }
     file = io.BytesIO()
-    heif.save(file, quality=_FINE_AVIF, chroma=444, **{key: value for key, value in said.items() if value})
+    heif.save(
+        file,
+        quality=_DEFAULT_AVIF_QUALITY,
+        chroma=444,
+        **{key: value for key, value in metadata_items.items() if value},
+    )
     return file.getvalue()

@@ -65,16 +65,16 @@ def container_of(path: Path) -> str:
     return container
 
 
-def depth_for(file_info: FileInfo, container: str, asked: int | None) -> int:
+def depth_for(file_info: FileInfo, container: str, bit_depth: int | None) -> int:
     """Bits per channel to write: those asked for, else those of the file_info or the nearest below.
 
     Raises UnsupportedPhoto for a container or a depth that cannot be written.
     """
-    if container not in DEPTHS or (asked is not None and asked not in DEPTHS[container]):
+    if container not in DEPTHS or (bit_depth is not None and bit_depth not in DEPTHS[container]):
         raise UnsupportedPhoto(
-            f"{container} with {asked or 'any'} bits per channel was asked for",
+            f"{container} with {bit_depth or 'any'} bits per channel was asked for",
             f"brewster writes {', '.join(f'{name} {depths}' for name, depths in DEPTHS.items())}",
             "choose one of these",
         )
     fitting = [bits for bits in DEPTHS[container] if bits <= file_info.bits]
-    return asked or max(fitting, default=DEPTHS[container][0])
+    return bit_depth or max(fitting, default=DEPTHS[container][0])

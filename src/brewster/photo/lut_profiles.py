@@ -15,7 +15,7 @@ import pyvips
 from numpy.typing import NDArray
 
 from brewster.errors import UnsupportedPhoto
-from brewster.photo.colour import tags_of
+from brewster.photo.colour import icc_tags
 from brewster.photo.file_info import FileInfo
 
 _MATRIX = {b"rXYZ", b"gXYZ", b"bXYZ", b"rTRC", b"gTRC", b"bTRC"}
@@ -28,13 +28,13 @@ def has_only_tables(icc: bytes | None) -> bool:
     if icc is None or icc[16:20] != b"RGB ":
         return False
     try:
-        tags = tags_of(icc).keys()
+        tags = icc_tags(icc).keys()
     except struct.error:
         return False
     return bool(tags & _TABLES) and not tags >= _MATRIX
 
 
-def in_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[NDArray[Any], FileInfo]:
+def convert_to_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[NDArray[Any], FileInfo]:
     """Pixels (H, W, 3) of 8 or 16 bits, converted from a profile of tables (relative colorimetric), and their new file_info.
 
     Raises:
@@ -50,13 +50,13 @@ def in_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[NDArray[An
     icc = file_info.icc or b""
     try:
         is_ignored = np.array_equal(
-            _converted(_PROBE, icc), _converted(_PROBE, pyvips.Image.profile_load("srgb"))
+            _convert(_PROBE, icc), _convert(_PROBE, pyvips.Image.profile_load("srgb"))
         )
-        array = _converted(pixels, icc)
+        array = _convert(pixels, icc)
     except pyvips.Error as error:
-        raise _damaged(icc, str(error).strip()) from error
+        raise _damaged_profile(icc, str(error).strip()) from error
     if is_ignored:
-        raise _damaged(icc, "libvips takes sRGB instead")
+        raise _damaged_profile(icc, "libvips takes sRGB instead")
     return array, replace(file_info, icc=bytes(pyvips.Image.profile_load("p3")))
 
 
@@ -65,7 +65,7 @@ _PROBE = np.stack(np.meshgrid(_LEVELS, _LEVELS, _LEVELS), axis=-1).reshape(-1, 6
 """Colours by which an ignored profile is noticed: libvips takes sRGB in silence for one that it cannot use."""
 
 
-def _converted(pixels: NDArray[Any], icc: bytes) -> NDArray[Any]:
+def _convert(pixels: NDArray[Any], icc: bytes) -> NDArray[Any]:
     height, width, bands = pixels.shape
     kind, meaning, depth = _DEPTHS[pixels.dtype.name]
     contiguous = np.ascontiguousarray(pixels)
@@ -76,7 +76,7 @@ def _converted(pixels: NDArray[Any], icc: bytes) -> NDArray[Any]:
     return np.frombuffer(converted.write_to_memory(), pixels.dtype).reshape(pixels.shape)
 
 
-def _damaged(icc: bytes, reason: str) -> UnsupportedPhoto:
+def _damaged_profile(icc: bytes, reason: str) -> UnsupportedPhoto:
     return UnsupportedPhoto(
         f"the colour profile of tables ({len(icc)} bytes) cannot be used ({reason})",
         "a whole ICC profile is needed",

@@ -19,7 +19,7 @@ from brewster.errors import UnsupportedPhoto
 _EXIF_NAME = b"Exif\0\0"
 _APP0, _APP1, _DQT, _SOS = 0xE0, 0xE1, 0xDB, 0xDA
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_LONGEST = 65533  # bytes of a segment's payload
+_MAX_SEGMENT_PAYLOAD = 65533  # bytes of a segment's payload
 
 
 def jpeg_segments(data: bytes) -> Iterator[tuple[int, int, bytes]]:
@@ -36,7 +36,7 @@ def jpeg_segments(data: bytes) -> Iterator[tuple[int, int, bytes]]:
         at += 2 + size
 
 
-def jpeg_coarseness(data: bytes) -> dict[int, int]:
+def jpeg_quantisation_sums(data: bytes) -> dict[int, int]:
     """Sum of each quantisation table by its number (0: luma, 1: chroma): more is coarser."""
     sums = {}
     for marker, _, payload in jpeg_segments(data):
@@ -54,8 +54,8 @@ def jpeg_subsampling(data: bytes) -> str | None:
         if marker in _FRAMES and len(payload) >= 15:
             across, down = payload[7] >> 4, payload[7] & 15
             chroma_across, chroma_down = payload[10] >> 4, payload[10] & 15
-            kept = 4 * chroma_across // across
-            return f"4:{kept}:{0 if down > chroma_down else kept}"
+            chroma = 4 * chroma_across // across
+            return f"4:{chroma}:{0 if down > chroma_down else chroma}"
     return None
 
 
@@ -74,10 +74,10 @@ def with_jpeg_head(data: bytes, exif: bytes | None, dots_per_inch: tuple[float, 
 
 
 def _segment(marker: int, payload: bytes) -> bytes:
-    if len(payload) > _LONGEST:
+    if len(payload) > _MAX_SEGMENT_PAYLOAD:
         raise UnsupportedPhoto(
             f"the EXIF block holds {len(payload)} bytes",
-            f"a JPEG holds at most {_LONGEST}",
+            f"a JPEG holds at most {_MAX_SEGMENT_PAYLOAD}",
             "write PNG, TIFF or WebP instead",
         )
     return struct.pack(">BBH", 0xFF, marker, len(payload) + 2) + payload
@@ -130,7 +130,7 @@ def with_webp_exif(data: bytes, exif: bytes, size: tuple[int, int], has_alpha: b
     return b"RIFF" + struct.pack("<I", len(body) + 4) + b"WEBP" + body
 
 
-def coding_points(data: bytes) -> tuple[int, int, int] | None:
+def cicp(data: bytes) -> tuple[int, int, int] | None:
     """Colour primaries, transfer and matrix as in ITU-T H.273, where an AVIF, HEIC or PNG states them."""
     if data.startswith(b"\x89PNG"):
         chunk = png_chunks(data).get(b"cICP", b"")
@@ -145,7 +145,7 @@ def coding_points(data: bytes) -> tuple[int, int, int] | None:
 def with_avif_exif(data: bytes, exif: bytes) -> bytes:
     """An AVIF whose Exif item, written by libvips in its own words, now is this block at the file's end."""
     item = re.search(rb"infe\x02...(..)..Exif", data, re.DOTALL)
-    row = _location(data, item[1]) if item else None
+    row = _item_location(data, item[1]) if item else None
     if row is None:
         return data
     payload = bytes(4) + exif
@@ -154,7 +154,7 @@ def with_avif_exif(data: bytes, exif: bytes) -> bytes:
     return b"".join((data[:row], place, data[row + len(place) :], box))
 
 
-def _location(data: bytes, item: bytes) -> int | None:
+def _item_location(data: bytes, item: bytes) -> int | None:
     """Where an item's base, count, offset and length stand in an iloc box of the kind libheif writes."""
     table = data.find(b"iloc")
     version, sizes, more = data[table + 4], data[table + 8], data[table + 9]
@@ -175,8 +175,8 @@ def _location(data: bytes, item: bytes) -> int | None:
 Tags = dict[int, "tuple[int, int, bytes] | Tags"]
 """Tag -> (type, count, value in little-endian) or, for a pointer, the directory it points to."""
 
-_POINTERS = (34665, 34853, 40965)  # Exif, GPS, interoperability
-_CAMERA = (
+_POINTER_TAGS = (34665, 34853, 40965)  # Exif, GPS, interoperability
+_CAMERA_TAGS = (
     270,
     271,
     272,
@@ -188,8 +188,8 @@ _CAMERA = (
     34853,
 )  # what a camera says of a picture in its directory
 _ORIENTATION = 274
-_WIDTHS = {1: 1, 2: 1, 3: 2, 4: 4, 5: 4, 6: 1, 7: 1, 8: 2, 9: 4, 10: 4, 11: 4, 12: 8, 13: 4}
-_FRACTIONS = (5, 10)  # two numbers each
+_TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 4, 6: 1, 7: 1, 8: 2, 9: 4, 10: 4, 11: 4, 12: 8, 13: 4}
+_RATIONAL_TYPES = (5, 10)  # two numbers each
 
 
 def read_tags(data: bytes) -> Tags:
@@ -197,7 +197,7 @@ def read_tags(data: bytes) -> Tags:
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
     if order is None:
         return {}
-    return _directory(data, order, struct.unpack_from(order + "I", data, 4)[0], _POINTERS)
+    return _directory(data, order, struct.unpack_from(order + "I", data, 4)[0], _POINTER_TAGS)
 
 
 def _directory(data: bytes, order: str, at: int, pointers: tuple[int, ...]) -> Tags:
@@ -207,18 +207,18 @@ def _directory(data: bytes, order: str, at: int, pointers: tuple[int, ...]) -> T
     tags: Tags = {}
     for row in range(at + 2, min(at + 2 + 12 * count, len(data) - 11), 12):
         tag, kind, number = struct.unpack_from(order + "HHI", data, row)
-        width = _WIDTHS.get(kind, 0)
-        size = width * number * (2 if kind in _FRACTIONS else 1)
+        width = _TYPE_BYTES.get(kind, 0)
+        size = width * number * (2 if kind in _RATIONAL_TYPES else 1)
         (offset,) = struct.unpack_from(order + "I", data, row + 8)
         start = row + 8 if size <= 4 else offset
         if tag in pointers:
             tags[tag] = _directory(data, order, offset, tuple(p for p in pointers if p != tag))
         elif width and start + size <= len(data):
-            tags[tag] = (kind, number, _swapped(data[start : start + size], width, order))
+            tags[tag] = (kind, number, _to_little_endian(data[start : start + size], width, order))
     return tags
 
 
-def _swapped(value: bytes, width: int, order: str) -> bytes:
+def _to_little_endian(value: bytes, width: int, order: str) -> bytes:
     if order == "<" or width == 1:
         return value
     return b"".join(value[i : i + width][::-1] for i in range(0, len(value), width))
@@ -229,7 +229,7 @@ def number_of(tags: Tags, tag: int, default: int) -> int:
     return next(iter(numbers(tags, tag)), default)
 
 
-def end_of_pixels(tags: Tags) -> int:
+def pixel_data_end(tags: Tags) -> int:
     """Where in a TIFF its last strip or tile ends; 0 where its tags do not say."""
     ends = [0]
     for starts, sizes in ((273, 279), (324, 325)):
@@ -244,7 +244,7 @@ def numbers(tags: Tags, tag: int) -> list[int]:
     entry = tags.get(tag)
     if not isinstance(entry, tuple) or entry[0] not in (1, 3, 4):
         return []
-    width = _WIDTHS[entry[0]]
+    width = _TYPE_BYTES[entry[0]]
     return [int.from_bytes(entry[2][i : i + width], "little") for i in range(0, len(entry[2]), width)]
 
 
@@ -254,12 +254,12 @@ def orientation_of(exif: bytes) -> int:
     return stated if 1 <= stated <= 8 else 1
 
 
-def lay_out(tags: Tags, at: int) -> tuple[bytes, int]:
+def _serialize_directory(tags: Tags, at: int) -> tuple[bytes, int]:
     """A directory as bytes to stand at offset `at` of a little-endian file, and the offset of its rows."""
     values, rows = b"", b""
     for tag, entry in sorted(tags.items(), key=lambda item: item[0]):
         if isinstance(entry, dict):
-            below, offset = lay_out(entry, at + len(values))
+            below, offset = _serialize_directory(entry, at + len(values))
             values, entry = values + below, (4, 1, struct.pack("<I", offset))  # noqa: PLW2901
         kind, count, value = entry
         if len(value) > 4:
@@ -273,20 +273,20 @@ def lay_out(tags: Tags, at: int) -> tuple[bytes, int]:
 
 def tiff_exif(tags: Tags) -> bytes | None:
     """An EXIF block of what a TIFF says of its camera; None if it says nothing."""
-    camera: Tags = {tag: entry for tag, entry in tags.items() if tag in _CAMERA}
+    camera: Tags = {tag: entry for tag, entry in tags.items() if tag in _CAMERA_TAGS}
     if not camera:
         return None
     camera[_ORIENTATION] = (3, 1, b"\x01\0")
-    body, first = lay_out(camera, 8)
+    body, first = _serialize_directory(camera, 8)
     return b"II*\0" + struct.pack("<I", first) + body
 
 
 def with_tiff_exif(data: bytes, exif: bytes) -> bytes:
     """A little-endian TIFF of one page with the camera's tags, in a new directory at its end."""
     tags = read_tags(data)
-    tags.update((tag, entry) for tag, entry in read_tags(exif).items() if tag in _CAMERA)
+    tags.update((tag, entry) for tag, entry in read_tags(exif).items() if tag in _CAMERA_TAGS)
     start = len(data) + len(data) % 2
-    body, first = lay_out(tags, start)
+    body, first = _serialize_directory(tags, start)
     return b"".join((data[:4], struct.pack("<I", first), data[8:], bytes(len(data) % 2), body))
 
 

@@ -16,12 +16,12 @@ from brewster import srgb
 from brewster.errors import PhotoError, UnreadablePhoto, UnsupportedPhoto
 from brewster.files import DEFAULT_MAX_PIXELS, write_atomically
 from brewster.photo import metadata
-from brewster.photo.colour import SRGB, ColourSpace, space_of
-from brewster.photo.decode import Decoded, decode, split, upright
+from brewster.photo.colour import SRGB, ColourSpace, colour_space_of
+from brewster.photo.decode import Decoded, apply_orientation, decode, split_alpha
 from brewster.photo.encode import encode
 from brewster.photo.file_info import DEPTHS, LINEAR, FileInfo, container_of, depth_for
 from brewster.photo.hdr_formats import too_large
-from brewster.photo.lut_profiles import has_only_tables, in_display_p3
+from brewster.photo.lut_profiles import convert_to_display_p3, has_only_tables
 
 Float32 = NDArray[np.float32]
 Stored = NDArray[Any]
@@ -29,7 +29,9 @@ Encoding = Literal["srgb", "linear"]
 Source = Any
 """A path, the bytes of a file, a numpy array (with its encoding stated), a PIL image, or a Photo."""
 
-_STRIP = 1 << 18  # pixels worked on at once: a few megabytes, so that whole float copies are never needed
+_STRIP_PIXELS = (
+    1 << 18
+)  # pixels worked on at once: a few megabytes, so that whole float copies are never needed
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +48,7 @@ class Photo:
 
     def __post_init__(self) -> None:
         """Fix the arrays, so that photos can share them."""
-        _refuse_shapes(self.pixels, self.alpha)
+        _check_arrays(self.pixels, self.alpha)
         self.pixels.flags.writeable = False
         if self.alpha is not None:
             self.alpha.flags.writeable = False
@@ -64,8 +66,8 @@ class Photo:
         """
         if isinstance(source, np.ndarray):
             height, width = (*source.shape, 1, 1)[:2]
-            _refuse_large(width, height, max_pixels)
-            return cls.from_array(source, encoding=_stated(encoding))
+            _check_pixel_count(width, height, max_pixels)
+            return cls.from_array(source, encoding=_check_encoding(encoding))
         if encoding is not None:
             raise PhotoError(
                 f"encoding={encoding!r} came with a {type(source).__name__}",
@@ -75,18 +77,20 @@ class Photo:
         if isinstance(source, Photo):
             return source
         if hasattr(source, "getbands"):
-            _refuse_large(source.width, source.height, max_pixels)
+            _check_pixel_count(source.width, source.height, max_pixels)
             return cls.from_pil(source)
-        data = bytes(source) if isinstance(source, bytes | bytearray | memoryview) else _read(Path(source))
-        return cls._of(decode(data, max_pixels))
+        data = (
+            bytes(source) if isinstance(source, bytes | bytearray | memoryview) else _read_file(Path(source))
+        )
+        return cls._from_decoded(decode(data, max_pixels))
 
     @classmethod
-    def _of(cls, decoded: Decoded) -> Photo:
+    def _from_decoded(cls, decoded: Decoded) -> Photo:
         pixels, file_info = decoded.pixels, decoded.file_info
         if has_only_tables(file_info.icc):
-            pixels, file_info = in_display_p3(pixels, file_info)
+            pixels, file_info = convert_to_display_p3(pixels, file_info)
         photo = cls(pixels, decoded.alpha, file_info)
-        photo.space()  # a profile we cannot use is an error now, not in the middle of the work
+        photo.colour_space()  # a profile we cannot use is an error now, not in the middle of the work
         return photo
 
     @classmethod
@@ -96,7 +100,7 @@ class Photo:
         sRGB whole numbers are stored as they are, all others as linear float32. Raises UnsupportedPhoto for
         other shapes and types and for values that are not finite, PhotoError for other encodings.
         """
-        encoding = _stated(encoding)
+        encoding = _check_encoding(encoding)
         array = np.array(array)[..., None] if np.ndim(array) == 2 else np.array(array)
         if array.ndim != 3 or array.shape[2] not in (1, 3, 4) or array.dtype.name not in _LEVELS:
             raise UnsupportedPhoto(
@@ -113,11 +117,11 @@ class Photo:
             pixels = srgb.to_linear(pixels) if encoding == "srgb" else pixels
             alpha = None if alpha is None else alpha / np.float32(_LEVELS[array.dtype.name])
         floats = pixels.dtype.kind == "f"
-        kind = np.dtype(np.float32) if floats else array.dtype
+        dtype = np.dtype(np.float32) if floats else array.dtype
         return cls(
-            np.ascontiguousarray(pixels, kind),
-            None if alpha is None else np.ascontiguousarray(alpha, kind),
-            FileInfo(bits=8 * kind.itemsize),
+            np.ascontiguousarray(pixels, dtype),
+            None if alpha is None else np.ascontiguousarray(alpha, dtype),
+            FileInfo(bits=8 * dtype.itemsize),
         )
 
     @classmethod
@@ -150,16 +154,18 @@ class Photo:
             icc=icc or None,
             exif=metadata.upright_exif(exif) if exif else None,
         )
-        return cls._of(split(upright(array, metadata.orientation_of(exif or b"")), file_info))
+        return cls._from_decoded(
+            split_alpha(apply_orientation(array, metadata.orientation_of(exif or b"")), file_info)
+        )
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
         return self.pixels.shape[1], self.pixels.shape[0]
 
-    def space(self) -> ColourSpace:
+    def colour_space(self) -> ColourSpace:
         """What light the stored numbers mean."""
-        return space_of(self.file_info.icc, self.file_info.primaries, self.pixels.dtype.kind == "f")
+        return colour_space_of(self.file_info.icc, self.file_info.primaries, self.pixels.dtype.kind == "f")
 
     def linear(self) -> Float32:
         """Linear Rec.709 light, (H, W, 3) float32; below 0 and above 1 where the gamut or range is wider."""
@@ -170,7 +176,7 @@ class Photo:
 
     def linear_rows(self, top: int, bottom: int) -> Float32:
         """Linear light of the rows from `top` up to `bottom`: a strip of `linear`."""
-        return self.space().to_linear(self.pixels[top:bottom])
+        return self.colour_space().to_linear(self.pixels[top:bottom])
 
     def stored_rows(self, linear: Float32, top: int) -> Stored:
         """Light (rows, W, 3) that takes the place of the rows from `top` on, as this photo would store it.
@@ -179,18 +185,20 @@ class Photo:
         to what can be stored. For results made in strips; gather them in an array like `pixels` and call
         `with_pixels`.
         """
-        return self.space().to_stored(np.asarray(linear, np.float32), self.pixels[top : top + len(linear)])
+        return self.colour_space().to_stored(
+            np.asarray(linear, np.float32), self.pixels[top : top + len(linear)]
+        )
 
     def srgb_8bit(self) -> NDArray[np.uint8]:
         """8-bit sRGB numbers (H, W, 3), clipped to what sRGB can show, without alpha: what benchmarks compare.
 
         Of an 8-bit photo in sRGB these are the stored numbers; grey is repeated in all three channels.
         """
-        kind = np.dtype(np.uint8)
-        if self.space() == SRGB and self.pixels.dtype.kind == "u":
-            pixels = _rescaled(self.pixels, kind) if self.pixels.dtype != kind else self.pixels
+        dtype = np.dtype(np.uint8)
+        if self.colour_space() == SRGB and self.pixels.dtype.kind == "u":
+            pixels = _rescaled(self.pixels, dtype) if self.pixels.dtype != dtype else self.pixels
             return np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels
-        shown = np.empty((*self.pixels.shape[:2], 3), kind)
+        shown = np.empty((*self.pixels.shape[:2], 3), dtype)
         for rows in self.strips():
             shown[rows] = SRGB.to_stored(self.linear_rows(rows.start, rows.stop), shown[rows])
         return shown
@@ -215,10 +223,10 @@ class Photo:
     def strips(self) -> Iterator[slice]:
         """Slices of rows from top to bottom, each small enough to be worked on in floats."""
         height, width = self.pixels.shape[:2]
-        step = max(1, _STRIP // width)
+        step = max(1, _STRIP_PIXELS // width)
         return (slice(top, min(top + step, height)) for top in range(0, height, step))
 
-    def small(self, width: int, height: int) -> Float32:
+    def resized(self, width: int, height: int) -> Float32:
         """The photo at another size, (height, width, 3) linear light: the mean over each new pixel's area."""
         out = np.empty((height, width, 3), np.float32)
         full_height = self.size[1]
@@ -256,15 +264,15 @@ class Photo:
     def _stored_as(self, container: str, bits: int) -> Photo:
         """The pixels in the type that a container and its depth need, meaning the same light."""
         was_linear, is_linear = self.file_info.container in LINEAR, container in LINEAR
-        kind = np.dtype(np.float32 if is_linear or bits == 32 else np.uint8 if bits == 8 else np.uint16)
-        moves = container != self.file_info.container and (was_linear or is_linear)
-        if kind == self.pixels.dtype and not moves:
+        dtype = np.dtype(np.float32 if is_linear or bits == 32 else np.uint8 if bits == 8 else np.uint16)
+        changes_light = container != self.file_info.container and (was_linear or is_linear)
+        if dtype == self.pixels.dtype and not changes_light:
             return self
-        alpha = None if self.alpha is None else _rescaled(self.alpha, kind)
+        alpha = None if self.alpha is None else _rescaled(self.alpha, dtype)
         has_profile = self.file_info.icc is not None and not is_linear
-        if has_profile or (kind.kind == "u" and self.pixels.dtype.kind == "u"):
-            return Photo(_rescaled(self.pixels, kind), alpha, self.file_info)
-        pixels, space = np.empty(self.pixels.shape, kind), space_of(None, None, kind.kind == "f")
+        if has_profile or (dtype.kind == "u" and self.pixels.dtype.kind == "u"):
+            return Photo(_rescaled(self.pixels, dtype), alpha, self.file_info)
+        pixels, space = np.empty(self.pixels.shape, dtype), colour_space_of(None, None, dtype.kind == "f")
         for rows in self.strips():
             pixels[rows] = space.to_stored(self.linear_rows(rows.start, rows.stop), pixels[rows])
         return Photo(pixels, alpha, replace(self.file_info, icc=None, primaries=None, header=None))
@@ -273,14 +281,14 @@ class Photo:
 _LEVELS = {"uint8": 255, "uint16": 65535, "float16": 1, "float32": 1, "float64": 1}
 
 
-def _rescaled(values: Stored, kind: np.dtype[Any]) -> Stored:
+def _rescaled(values: Stored, dtype: np.dtype[Any]) -> Stored:
     """Numbers of one type as another's, white staying white, encoded as they were."""
-    white, new_white = _LEVELS[values.dtype.name], _LEVELS[kind.name]
-    if kind.kind == "f":
-        return values.astype(kind) / np.float32(white)
+    white, new_white = _LEVELS[values.dtype.name], _LEVELS[dtype.name]
+    if dtype.kind == "f":
+        return values.astype(dtype) / np.float32(white)
     if values.dtype.kind == "f":
-        return np.rint(values.clip(0, 1) * np.float32(new_white)).astype(kind)
-    return ((values.astype(np.uint32) * new_white + white // 2) // white).astype(kind)
+        return np.rint(values.clip(0, 1) * np.float32(new_white)).astype(dtype)
+    return ((values.astype(np.uint32) * new_white + white // 2) // white).astype(dtype)
 
 
 def _area_means(line: Float32, width: int) -> Float32:
@@ -291,7 +299,7 @@ def _area_means(line: Float32, width: int) -> Float32:
     return (np.diff(at, axis=0) * (width / len(line))).astype(np.float32)
 
 
-def _stated(encoding: Encoding | None) -> Encoding:
+def _check_encoding(encoding: Encoding | None) -> Encoding:
     if encoding not in ("srgb", "linear"):
         raise PhotoError(
             f"the array's encoding is {encoding!r}",
@@ -301,12 +309,12 @@ def _stated(encoding: Encoding | None) -> Encoding:
     return encoding
 
 
-def _refuse_large(width: int, height: int, most: int) -> None:
-    if width * height > most:
-        raise too_large(width, height, most)
+def _check_pixel_count(width: int, height: int, max_pixels: int) -> None:
+    if width * height > max_pixels:
+        raise too_large(width, height, max_pixels)
 
 
-def _refuse_shapes(pixels: Stored, alpha: Stored | None) -> None:
+def _check_arrays(pixels: Stored, alpha: Stored | None) -> None:
     is_picture = pixels.ndim == 3 and pixels.shape[2] in (1, 3) and pixels.size > 0
     fits = alpha is None or (alpha.shape == pixels.shape[:2] and alpha.dtype == pixels.dtype)
     if not (is_picture and fits and pixels.dtype.name in ("uint8", "uint16", "float32")):
@@ -317,7 +325,7 @@ def _refuse_shapes(pixels: Stored, alpha: Stored | None) -> None:
         )
 
 
-def _read(path: Path) -> bytes:
+def _read_file(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:

@@ -19,7 +19,7 @@ from typing import Final, final
 
 import brewster
 from brewster.errors import BrewsterError, PhotoError, TargetError
-from brewster.files import arriving, write_atomically
+from brewster.files import atomic_path, write_atomically
 from brewster.photo import Photo
 from brewster.user_study.degrade import spoil
 from brewster.user_study.folders import Key, find_pictures, listed
@@ -91,7 +91,7 @@ def create(
     seed = secrets.randbelow(1 << 32) if choices.seed is None else choices.seed
     shown = _fitting(choices.pairs, PAIRS, len(pairs) * len(found.inputs), "pairs")
     catches = _fitting(choices.catches, CATCHES, min(CATCH_POOL, len(found.inputs)), "catch trials")
-    with arriving(out) as part:
+    with atomic_path(out) as part:
         copier = _Copier(part / PICTURES, Random(f"{seed}/names"), on_progress)  # noqa: S311  (a published seed)
         comparisons = tuple(_comparisons(found, pairs, copier))
         pool = tuple(_catch_pool(found, copier, Random(f"{seed}/catches")))  # noqa: S311

@@ -44,8 +44,8 @@ def preview(
         BrewsterError: as `Separator` does.
     """
     width, height = _fitting(photo.size)
-    small = photo.small(width, height)
-    asked = options.call() | {"strength": _FAINT, "additive": False}
+    small = photo.resized(width, height)
+    asked = options.call_options() | {"strength": _FAINT, "additive": False}
     shown = Photo.from_array(small[..., : photo.pixels.shape[2]], encoding="linear")  # grey stays grey
     layers = separator(shown, on_progress=on_progress, **asked)
     transmission = small + (layers.transmission.linear() - small) / np.float32(_FAINT)

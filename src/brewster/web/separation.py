@@ -122,7 +122,9 @@ def _separate(shelf: ModelCache, asked: SeparationRequest, on_progress: Progress
     """The layers as files."""
     started = time.perf_counter()
     options = asked.options
-    separation = shelf.separator(options.model)(asked.photo, on_progress=on_progress, **options.call())
+    separation = shelf.separator(options.model)(
+        asked.photo, on_progress=on_progress, **options.call_options()
+    )
     files = {}
     for layer in options.layers:
         on_progress(1)  # encoding takes a while, too, and may not be wanted any more

@@ -26,7 +26,7 @@ from brewster.evaluate.report.images import (
     photo_tiles,
 )
 from brewster.evaluate.report.tables import is_complete, ranking, remarks
-from brewster.files import arriving
+from brewster.files import atomic_path
 
 __all__ = ["CaseImages", "write_report"]
 
@@ -47,7 +47,7 @@ def write_report(results: Results, shown: Iterable[CaseImages], path: Path) -> N
         TargetError: it cannot be written.
     """
     with (
-        arriving(path) as part,
+        atomic_path(path) as part,
         part.open("x", encoding="utf-8", errors="replace", newline="\n") as file,
     ):
         file.writelines(_page(results, shown))

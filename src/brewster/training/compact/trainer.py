@@ -28,7 +28,7 @@ from brewster.training.loop import Report, run
 from brewster.training.losses import finite, gain_db, separation_loss, tone
 from brewster.training.recipe import CompactRecipe
 from brewster.training.streams import held_out_mixtures, open_stream, validation_pairs
-from brewster.worker_setup import one_thread
+from brewster.worker_setup import single_torch_thread
 
 Pairs = Mapping[str, list[tuple[Tensor, Tensor]]]
 """Encoded (photo, truth), float (1, 3, h, w) each, by the name of their folder."""
@@ -52,7 +52,7 @@ def train(recipe: CompactRecipe, out: Path, report: Report) -> nn.Module:
         ModelError, TargetError: as `loop.run`.
     """
     trainer = CompactTrainer(recipe)
-    with one_thread():  # of the caller; the trainer's own threads have one each
+    with single_torch_thread():  # of the caller; the trainer's own threads have one each
         run(trainer, out, report)
     return trainer.averaged_network()
 

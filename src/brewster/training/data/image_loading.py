@@ -126,7 +126,7 @@ def _read_photo(path: Path, longest_px: int) -> Tensor:
 def _at_most(photo: Photo, longest_px: int) -> NDArray[np.float32]:
     scale = min(1.0, longest_px / max(photo.size))
     width, height = (max(1, round(side * scale)) for side in photo.size)
-    return photo.small(width, height)
+    return photo.resized(width, height)
 
 
 def _list(

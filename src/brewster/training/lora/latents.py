@@ -230,5 +230,5 @@ def with_difference(photo: Tensor, transmission: Tensor) -> Tensor:
 
 def _read(path: Path) -> Tensor:
     photo = Photo.open(path)
-    encoded = to_encoded(np.clip(photo.small(*photo.size), 0, 1))
+    encoded = to_encoded(np.clip(photo.resized(*photo.size), 0, 1))
     return torch.from_numpy(np.rint(encoded * 255).astype(np.uint8))
