@@ -21,7 +21,7 @@ def main(source: Path) -> int:
     separator = Separator.load("compact")
     OUT.mkdir(parents=True, exist_ok=True)
     rows, failures = [], 0
-    for job in find([source], into=OUT):
+    for job in find([source], output_folder=OUT):
         try:
             rows.append(separate(separator, job))
         except BrewsterError as error:

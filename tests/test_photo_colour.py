@@ -304,7 +304,7 @@ def light_by_table(pixels: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("container", "kind", "tolerance"), [("png", np.uint8, 0.01), ("tiff", np.uint16, 0.006)]
 )
-def test_a_profile_of_tables_gives_its_colours_and_they_survive(container, kind, tolerance) -> None:
+def test_a_lut_profile_gives_its_colours_and_they_survive(container, kind, tolerance) -> None:
     random = np.random.default_rng(8).integers(0, np.iinfo(kind).max + 1, (24, 24, 3)).astype(kind)
     data = stored(random, table_profile()).encode(container)
     photo = Photo.open(data)
@@ -317,13 +317,13 @@ def test_a_profile_of_tables_gives_its_colours_and_they_survive(container, kind,
     assert read_size(data) == (24, 24)
 
 
-def test_a_pil_image_with_a_profile_of_tables_is_read_as_its_file_is() -> None:
+def test_a_pil_image_with_a_lut_profile_is_read_as_its_file_is() -> None:
     random = np.random.default_rng(9).integers(0, 256, (16, 16, 3), np.uint8)
     data = stored(random, table_profile()).encode("png")
     assert np.array_equal(Photo.open(Image.open(io.BytesIO(data))).pixels, Photo.open(data).pixels)
 
 
-def test_white_by_a_profile_of_tables_stays_white() -> None:
+def test_white_in_a_lut_profile_stays_white() -> None:
     white = Photo.open(stored(np.full((4, 4, 3), 255, np.uint8), table_profile()).encode("png"))
     assert white.srgb_8bit().min() >= 254
 
@@ -333,14 +333,14 @@ def test_white_by_a_profile_of_tables_stays_white() -> None:
     [table_profile()[:100_000], table_profile().replace(b"mft2", b"mftX")],
     ids=["cut short", "unknown"],
 )
-def test_a_damaged_profile_of_tables_is_refused(icc: bytes) -> None:
+def test_a_damaged_lut_profile_is_refused(icc: bytes) -> None:
     """libvips would take sRGB instead, and say nothing."""
-    with pytest.raises(UnsupportedPhoto, match="profile of tables"):
+    with pytest.raises(UnsupportedPhoto, match="LUT-based colour profile"):
         Photo.open(stored(NOISE_8BIT, icc).encode("tiff"))
 
 
 @pytest.mark.parametrize(("kind", "channels"), [(np.uint8, 1), (np.float32, 3)])
-def test_a_profile_of_tables_is_for_whole_numbers_in_colour(kind: type, channels: int) -> None:
+def test_a_lut_profile_is_for_whole_numbers_in_colour(kind: type, channels: int) -> None:
     with pytest.raises(UnsupportedPhoto, match="RGB of 8 or 16 bits"):
         convert_to_display_p3(np.ones((4, 4, channels), kind), FileInfo(icc=table_profile()))
 

@@ -134,7 +134,7 @@ def test_a_hostile_name_gives_a_harmless_one(app, name):
     [
         (b"", 422, "empty"),
         (b"hello", 422, "no picture"),
-        (SMALL[:60], 422, "cannot be read whole"),
+        (SMALL[:60], 422, "cannot be read completely"),
         (file_of(np.zeros((40, 50, 4), np.uint8), "tiff"), 200, ""),
         (file_of(smooth(200, 300), "png"), 413, "pixels"),
     ],

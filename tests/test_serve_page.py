@@ -252,7 +252,7 @@ def test_what_is_no_photo_is_told_in_place_and_can_be_tried_again_or_removed(vis
     page = visit()
     upload(page, ("holiday.jpg", b"not a picture"), ("window.png", picture(90, 60, "png")))
     assert page.get_by_role("heading", name="holiday.jpg could not be separated").is_visible()
-    assert "no picture brewster knows" in page.get_by_role("alert").inner_text()
+    assert "no known image format" in page.get_by_role("alert").inner_text()
     assert page.get_by_role("button", name="Download transmission").is_disabled()
     assert page.get_by_role("button", name="Download all").is_enabled()
     page.get_by_role("button", name="Try again").click()

@@ -12,14 +12,14 @@ def halves(tile):
 
 
 @given(st.integers(1, 90), st.integers(1, 90), st.integers(9, 40), st.integers(1, 8))
-def test_a_backend_that_looks_at_single_pixels_cannot_tell_tiles(height, width, tile, overlap):
+def test_tiling_does_not_change_the_output_of_a_pointwise_backend(height, width, tile, overlap):
     picture = np.random.default_rng(height * width).random((height, width, 3), np.float32)
     layers = run_tiled(halves, picture, tile_px=tile, overlap_px=overlap)
     for layer, whole in zip(layers, halves(picture), strict=True):
         np.testing.assert_allclose(layer, whole, rtol=1e-5)
 
 
-def test_no_tile_is_larger_than_asked():
+def test_no_tile_is_larger_than_requested():
     sizes = set()
 
     def spy(tile):
@@ -31,14 +31,14 @@ def test_no_tile_is_larger_than_asked():
 
 
 @given(st.integers(1, 400), st.integers(9, 60), st.integers(1, 8))
-def test_tiles_cover_the_picture_and_neighbours_share_the_overlap(side, tile, overlap):
+def test_tiles_cover_the_image_and_neighbours_overlap(side, tile, overlap):
     rows = [vertical for vertical, _ in tile_slices((side, 1), tile_px=tile, overlap_px=overlap)]
     assert (rows[0].start, rows[-1].stop) == (0, side)
     assert all(row.stop - row.start == min(side, tile) for row in rows)
     assert all(first.stop - second.start >= overlap for first, second in itertools.pairwise(rows))
 
 
-def test_neighbouring_tiles_fade_into_each_other_without_a_seam():
+def test_neighbouring_tiles_are_blended_without_a_seam():
     seen = iter(range(100))
 
     def each_its_own_grey(tile):
@@ -50,7 +50,7 @@ def test_neighbouring_tiles_fade_into_each_other_without_a_seam():
     assert np.abs(np.diff(transmission[0, :, 0])).max() < 0.1
 
 
-def test_a_picture_that_fits_goes_in_whole():
+def test_an_image_no_larger_than_a_tile_is_not_tiled():
     calls = []
     run_tiled(
         lambda tile: calls.append(tile) or (tile, tile),

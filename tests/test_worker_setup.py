@@ -1,4 +1,4 @@
-"""What processes owe to each other; that workers end with their parent is tested with those who have workers."""
+"""Thread limits of workers; that workers exit with their parent is tested with the packages that start them."""
 
 import contextlib
 

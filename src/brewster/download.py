@@ -1,8 +1,8 @@
-"""Fetches files over a line that may break: patiently, from http and https only, and checked against a sum.
+"""Downloads files from http and https, with retries, resume, and a checksum.
 
-    Line().fetch(Promise(url, size=244408911, algorithm="sha256", digest="7be5..."), Path("alexnet.pth"))
+    Downloader().fetch(RemoteFile(url, size=244408911, algorithm="sha256", digest="7be5..."), Path("alexnet.pth"))
 
-What was begun lies beside its target as `.part`, and the next call goes on from there.
+A partial download is kept next to the target as `.part`. The next call resumes it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _T = TypeVar("_T")
 
 
 class RemoteFile(NamedTuple):
-    """A file as its server, or we, promise it; the digest is in lower-case hexadecimal digits."""
+    """A file to download: its address, size in bytes, and expected digest in lower-case hexadecimal."""
 
     url: str
     size: int
@@ -42,7 +42,7 @@ class RemoteFile(NamedTuple):
 
 @final
 class _RetryableError(Exception):
-    """The line broke, or the server asks for patience: worth another attempt, after so many seconds."""
+    """A failure that another attempt may fix: a lost connection or a busy server. `wait_s`: seconds to wait first."""
 
     def __init__(self, reason: object, wait_s: float = 0.0) -> None:
         super().__init__(str(reason) or type(reason).__name__)
@@ -52,17 +52,23 @@ class _RetryableError(Exception):
 @final
 @dataclass(frozen=True)
 class Downloader:
-    """How to ask: the pauses between attempts, how long silence is borne, and how to wait."""
+    """Downloads over http and https with retries.
+
+    Attributes:
+        retry_delays_s: the seconds before each further attempt; one attempt more than delays is made.
+        timeout_s: the longest time without data, in seconds.
+        sleep: called with the seconds to wait; tests replace it.
+    """
 
     retry_delays_s: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0)
     timeout_s: float = 30.0
     sleep: Callable[[float], object] = time.sleep
 
     def read(self, url: str) -> bytes:
-        """All that an address answers.
+        """Returns the body of a response.
 
         Raises:
-            DownloadError: the address is none, the server refuses, or cannot be reached in all attempts.
+            DownloadError: the URL is invalid, the server refuses it, or all attempts fail.
         """
 
         def attempt() -> bytes:
@@ -72,10 +78,10 @@ class Downloader:
         return self._with_retries(url, attempt)
 
     def fetch(self, remote: RemoteFile, target: Path) -> None:
-        """Downloads a file, making its folder; the target has its name only when it is whole and right.
+        """Downloads a file and creates its folder. The target appears only after its checksum is verified.
 
         Raises:
-            DownloadError: the file cannot be had, or is not what was promised.
+            DownloadError: all attempts fail, or the digest differs from the expected one.
             TargetError: the folder cannot be written.
         """
         part = target.with_name(f"{target.name}.part")
@@ -84,11 +90,9 @@ class Downloader:
             self._with_retries(remote.url, lambda: self._fetch_rest(remote, part))
             if (digest := file_digest(part, remote.algorithm)) != remote.digest:
                 part.unlink()
-                happened = (
-                    f"{remote.url} came with the {remote.algorithm.upper()} sum {digest}, and was dropped"
-                )
-                cure = "run again, to fetch all of it anew"
-                raise DownloadError(happened, f"{remote.digest} was promised", cure)
+                happened = f"{remote.url} was downloaded with the {remote.algorithm.upper()} digest {digest}, and was deleted"
+                cure = "run again to download the whole file"
+                raise DownloadError(happened, f"the digest {remote.digest} was expected", cure)
             part.replace(target)
 
     def _with_retries(self, url: str, attempt: Callable[[], _T]) -> _T:
@@ -98,18 +102,20 @@ class Downloader:
                 return attempt()
             except _RetryableError as error:
                 if (delay := next(delays, None)) is None:
-                    happened = f"{url} did not come in {len(self.retry_delays_s) + 1} attempts ({error})"
-                    cure = "check the connection, or run again later: what came is kept"
+                    happened = (
+                        f"{url} could not be downloaded in {len(self.retry_delays_s) + 1} attempts ({error})"
+                    )
+                    cure = "check the connection, or run again later: the partial download is kept"
                     raise DownloadError(
-                        happened, "a server that answers, and a line that holds", cure
+                        happened, "a server that responds and a stable connection", cure
                     ) from error
                 self.sleep(max(delay, error.wait_s))
 
     def _open(self, url: str, start: int = 0) -> HTTPResponse:
-        """The answer, from this byte on if the server can do that."""
+        """Returns the open response, from byte `start` on where the server supports ranges."""
         headers = {"User-Agent": _user_agent()} | ({"Range": f"bytes={start}-"} if start else {})
         try:
-            query = request.Request(url, headers=headers)  # noqa: S310  (the opener knows http and https only)
+            query = request.Request(url, headers=headers)  # noqa: S310  (the opener supports http and https only)
             response = _opener().open(query, timeout=self.timeout_s)
         except HTTPError as error:
             error.close()
@@ -118,13 +124,17 @@ class Downloader:
                 raise _RetryableError(
                     error, min(float(retry_after), _MAX_RETRY_AFTER_S) if retry_after.isdecimal() else 0
                 ) from error
-            raise DownloadError(f"{url} was refused ({error})", "a file", "run again later") from error
+            raise DownloadError(f"the server refused {url} ({error})", "a file", "run again later") from error
         except (ValueError, InvalidURL) as error:
-            raise DownloadError(f"{url!r} is no address ({error})", _HTTP_URL, "check the address") from error
+            raise DownloadError(
+                f"{url!r} is not a valid URL ({error})", _HTTP_URL, "check the address"
+            ) from error
         except (OSError, HTTPException) as error:
             raise _RetryableError(error) from error
         if response is None:
-            raise DownloadError(f"{url!r} leads elsewhere", _HTTP_URL, "check the address")
+            raise DownloadError(
+                f"{url!r} is not, or redirects to a URL that is not, http(s)", _HTTP_URL, "check the address"
+            )
         return cast("HTTPResponse", response)
 
     def _fetch_rest(self, remote: RemoteFile, part: Path) -> None:
@@ -133,35 +143,38 @@ class Downloader:
             return
         start = partial_bytes if partial_bytes < remote.size else 0
         with self._open(remote.url, start) as response:
-            received = start if response.status == 206 else 0  # a server may ignore from where we asked
+            received = start if response.status == 206 else 0  # 206: the server honours the range
             with part.open("ab" if received else "wb") as file:
                 while block := _read(response, min(_BLOCK_BYTES, remote.size - received)):
                     received += file.write(block)
                 file.flush()
                 os.fsync(file.fileno())
         if received < remote.size:
-            raise _RetryableError(f"it ended after {received} of {remote.size} bytes")
+            raise _RetryableError(f"the response ended after {received} of {remote.size} bytes")
 
 
 def file_digest(path: Path, algorithm: str) -> str:
-    """The sum of a file's bytes, in lower-case hexadecimal digits."""
+    """Returns the digest of a file's bytes in lower-case hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, lambda: hashlib.new(algorithm, usedforsecurity=False)).hexdigest()
 
 
 @contextmanager
 def target_errors(path: Path) -> Iterator[None]:
-    """Turns what a disk says about a file that is fetched into a TargetError."""
+    """Turns an OSError about a downloaded file into a TargetError."""
     try:
         yield
     except OSError as error:
         happened = f"{path} cannot be read or written ({error.strerror or error})"
-        cure = "free some space or name another folder, and run again: it goes on from there"
-        raise TargetError(happened, "a folder of yours on a disk with room", cure) from error
+        cure = "free some space or name another folder, and run again: the download is resumed"
+        raise TargetError(happened, "a writable folder on a disk with free space", cure) from error
 
 
 def _read(response: HTTPResponse, max_bytes: int | None = None) -> bytes:
-    """All of it, or what has come of the next so many bytes: none of them is lost with the line."""
+    """Returns the whole body, or up to `max_bytes` of what has arrived.
+
+    `read1` returns what is there already, so that a lost connection loses none of the received bytes.
+    """
     try:
         return response.read() if max_bytes is None else response.read1(max_bytes)
     except (OSError, HTTPException) as error:
@@ -170,7 +183,7 @@ def _read(response: HTTPResponse, max_bytes: int | None = None) -> bytes:
 
 @functools.cache
 def _opener() -> request.OpenerDirector:
-    """Opens http and https only, also where a server redirects to; for all else it has no answer."""
+    """An opener for http and https only, redirects included; for other schemes `open` returns None."""
     opener = request.OpenerDirector()
     for handler in (
         request.ProxyHandler,
@@ -186,7 +199,7 @@ def _opener() -> request.OpenerDirector:
 
 @functools.cache
 def _user_agent() -> str:
-    """Poly Haven asks that programs name themselves, and others may like it."""
+    """The User-Agent header; Poly Haven requires that programs identify themselves."""
     try:
         version = metadata.version("brewster")
     except metadata.PackageNotFoundError:

@@ -1,8 +1,8 @@
-"""How a large image model looks at a photo: it draws the panels anew, and only what it changes is believed.
+"""Predicts layers with a diffusion model, which generates them as panels of one image.
 
-A generated picture drifts from the photo in its colours and in its detail. Where the model draws the photo, too (the
-panel I), it drifts there alike, so that the change is taken between its own panels, T - I, and detail.py lays it over
-the real photo. How far its photo is from the real one is the reconstruction_error, of which nobody should be unaware.
+Generated panels differ from the photo in colour and detail. If the model also generates the photo (panel I), that
+panel has the same errors. So the change is computed between generated panels, T - I, and guided_upsampling.py applies
+it to the real photo. The difference between the generated and the real photo is the reconstruction error.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from brewster.srgb import to_encoded, to_linear
 
 _DRAFT_STEPS: Final = 4
 _FINE_SCALE: Final = 2
-"""How much larger a side of the second copy of a close look is; it is seen in tiles of a panel each."""
+"""The scale of the second input of quality "best" relative to the first, per side; its tiles have the size of a panel."""
 _MIN_FINE_SCALE: Final = 1.25
-"""A copy that is less than so much larger shows nothing new."""
+"""A second input with a smaller scale than this adds no detail and is left out."""
 
 
 @final
 class DiffusionPredictor(Predictor):
-    """Looks through a `DecompositionPipeline`: at the whole photo in one panel, and for "best" also closer, panel by panel.
+    """Runs a `DecompositionPipeline` on the whole photo in one panel, and for "best" also on larger tiles.
 
     Args:
-        decomposer: the model.
-        steps: how many steps each look takes; by default the paper's 20, and 4 for "draft".
-        average: how many answers, from as many seeds, are averaged: what the model merely made up averages out.
-        plain: gives the transmission as the model draws it, enlarged, without the photo's own detail.
+        pipeline: the model.
+        steps: sampling steps for each prediction; by default 20 as in the paper, and 4 for "draft".
+        average: the number of predictions, each from its own seed, that are averaged to reduce generated detail.
+        plain: returns the transmission as it is generated, enlarged, without the detail of the photo.
 
     Raises:
-        ModelError: no step, or nothing to average.
+        ModelError: `steps` or `average` is below 1, or set for a one-step model.
     """
 
     def __init__(
@@ -57,11 +57,13 @@ class DiffusionPredictor(Predictor):
         plain: bool = False,
     ) -> None:
         if (steps is not None and steps < 1) or average < 1:
-            raise ModelError(f"steps = {steps}, average = {average}", "at least 1 of each", "raise them")
+            raise ModelError(
+                f"steps = {steps}, average = {average}", "both must be at least 1", "set them to 1 or more"
+            )
         if pipeline.task.objective == "one_step" and (steps not in (None, 1) or average > 1):
             raise ModelError(
-                f"steps = {steps}, average = {average} were asked of a model that answers in one step",
-                "there is one step and one answer",
+                f"steps = {steps}, average = {average} were set for a one-step model",
+                "its prediction takes one step and is deterministic",
                 "leave them out",
             )
         self._pipeline, self._plain = pipeline, plain
@@ -69,7 +71,7 @@ class DiffusionPredictor(Predictor):
         self._lock = Lock()
 
     def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
-        """As large as a panel, and for "best" twice that, as far as the photo is.
+        """Returns the size of a panel, and for "best" also up to twice that size, but not more than the photo.
 
         Raises:
             PhotoError: the photo has fewer than 16 pixels a side, or is too long and thin.
@@ -84,7 +86,7 @@ class DiffusionPredictor(Predictor):
     def __call__(
         self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
     ) -> Prediction:
-        """The mean of the looks; the reconstruction_error is that of the look at the whole."""
+        """Returns the mean over the inputs; the reconstruction error is that of the first input, the whole photo."""
         size = inputs[-1].shape[:2]
         sides = [max(inputs[0].shape), *(self._tile_px for _ in inputs[1:])]
         tiles = [
@@ -94,7 +96,7 @@ class DiffusionPredictor(Predictor):
         steps = self._steps or (_DRAFT_STEPS if quality == "draft" else STEPS)
         progress = _ProgressCounter(on_progress, sum(tiles))
         predictions = []
-        with self._lock:  # two at once would need twice the memory of the card
+        with self._lock:  # two at once would need twice the memory of the GPU
             for scaled_input, side in zip(inputs, sides, strict=True):
                 predictions.append(
                     run_tiled(
@@ -127,17 +129,17 @@ class DiffusionPredictor(Predictor):
 
     @property
     def _has_confidence(self) -> bool:
-        """Whether anything shows how sure the model is: a photo that it draws, or other answers."""
+        """Whether a confidence can be computed: from a reconstruction of the photo, or from several samples."""
         return self._reconstructs_input or (len(self._seeds) > 1 and self._pipeline.task.objective == "flow")
 
     @property
     def _tile_px(self) -> int:
-        """The side of a square panel."""
+        """The side of a square panel in pixels."""
         task, multiple = self._pipeline.task, self._pipeline.backbone.multiple
         return max(1, math.isqrt(task.budget_px // len(task.layout.panels)) // multiple) * multiple
 
     def _predict_tile(self, tile: Floats, steps: int, progress: _ProgressCounter) -> tuple[Floats, ...]:
-        """Change, reflection and transmission, linear; how far the answers are apart and their photo strays, encoded."""
+        """Returns change, reflection and transmission (linear light), spread of the samples and reconstruction error (encoded)."""
         height, width, _ = tile.shape
         fit = PanelFit((width, height), _round_up((width, height), self._pipeline.backbone.multiple))
         panel_input = torch.from_numpy(2 * to_encoded(tile) - 1).permute(2, 0, 1)[None]
@@ -162,7 +164,7 @@ class DiffusionPredictor(Predictor):
 
 @dataclass
 class _ProgressCounter:
-    """Tells how far a look is, tile by tile and step by step."""
+    """Reports progress over tiles and sampling steps."""
 
     on_progress: ProgressCallback
     tiles: int
@@ -176,7 +178,7 @@ class _ProgressCounter:
 
 
 def _reconstruction(light: Mapping[str, Floats], tile: Floats) -> Floats:
-    """The photo as the model draws it: its own panel, or T and R together, or not at all."""
+    """Returns the photo as the model generates it: panel I, or T + R; without either, the photo itself."""
     if "I" in light:
         return light["I"]
     return np.minimum(light["T"] + light["R"], 1) if "R" in light else tile[None]
@@ -186,14 +188,14 @@ def _check_finite(panels: Mapping[str, torch.Tensor]) -> None:
     for name, panel in panels.items():
         if not panel.isfinite().all():
             raise ModelError(
-                f"the model drew a panel {name} with numbers that are none",
-                "finite ones",
-                "store the base otherwise (quantise), or train the LoRA again: its weights may be broken",
+                f"panel {name} of the model contains NaN or infinity",
+                "finite values",
+                "use another quantise, or train the LoRA again: its weights may be damaged",
             )
 
 
 def _to_light(panels: torch.Tensor) -> NDArray[np.float32]:
-    """Panels (n, 3, h, w) in [-1, 1] as linear light (n, h, w, 3)."""
+    """Converts panels (n, 3, h, w) in [-1, 1] to linear light (n, h, w, 3)."""
     light: NDArray[np.float32] = to_linear(((panels + 1) / 2).clamp(0, 1).permute(0, 2, 3, 1).numpy())
     return light
 

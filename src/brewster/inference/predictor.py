@@ -1,7 +1,8 @@
-"""How a model looks at a photo: at which small copies, how often, and what it makes of them together.
+"""Predicts the layers of a photo from downscaled copies of it.
 
-A network that answers at once (`MultiScalePredictor`) sees copies of several sizes, each as it is and in a mirror: the mean is the
-answer, the disagreement tells how sure it is. A model that generates pictures looks in a way of its own (generate.py).
+`MultiScalePredictor` runs a feed-forward network at several input scales with flip augmentation. The mean of the
+outputs is the prediction; their spread gives the confidence. Diffusion models have their own predictor
+(diffusion_predictor.py).
 """
 
 from __future__ import annotations
@@ -24,63 +25,63 @@ if TYPE_CHECKING:
     from jaxtyping import Float32
 
 ProgressCallback = Callable[[float], None]
-"""Called with the share that is done, 0 to 1, between pieces of work; what it raises stops the work."""
+"""Called with the completed share, 0 to 1; an exception raised in it stops the work."""
 
 QUALITIES: Final[dict[Quality, tuple[int, ...]]] = {
     "draft": (100_000,),
     "standard": (100_000, 200_000),
     "best": (30_000, 100_000, 200_000, 350_000),
 }
-"""Pixels of the small copies that `MultiScalePredictor` shows the network, the largest last."""
+"""The input scales of `MultiScalePredictor` in pixels, the largest last."""
 
 _MIN_SHORT_SIDE_PX: Final = 160
 _MAX_ELONGATED_SCALE: Final = 3.0
-"""How much larger than the dial says the small copy of a long thin photo may be, a side."""
+"""The largest factor by which the sides of an input may exceed its input scale, for long thin photos."""
 _TILE_PX: Final = 1024
 _OVERLAP_PX: Final = 192
 _SPREAD_AT_1_E: Final = 0.05
-"""Disagreement, in sRGB-encoded units, at which confidence has fallen to 1/e."""
+"""The spread of outputs, in sRGB-encoded units, at which the confidence is 1/e."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What a look has found, in maps of the size of the largest copy, linear light."""
+    """The output of a predictor: maps (h, w) of the size of the largest input, linear light."""
 
     change: Float32[NDArray[np.float32], "h w 3"]
-    """Transmission - photo."""
+    """Transmission minus photo."""
     reflection: Float32[NDArray[np.float32], "h w 3"]
     confidence_map: Float32[NDArray[np.float32], "h w 1"]
-    """1 where it is sure, towards 0 where it is not."""
+    """Confidence in the transmission: 1 is certain, 0 unknown."""
     override: GeneratedOverride | None = None
-    """Where the transmission is to be taken as the model drew it."""
+    """Where the generated transmission replaces the detail of the photo."""
     reconstruction_error: float | None = None
-    """Mean of |the photo as the model redraws it - the photo|, sRGB-encoded; None where it redraws nothing."""
+    """Mean of |the photo as the model redraws it - photo|, sRGB-encoded; None if the model does not redraw it."""
 
 
 class Predictor(ABC):
-    """A way of looking. It is called from many threads at once."""
+    """Predicts layers from inputs of the sizes it chooses. May be called from several threads at once."""
 
     @abstractmethod
     def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
-        """Width and height of the copies that it wants of a photo of this size, smallest first, each once."""
+        """Returns width and height of its inputs for a photo of this (width, height): smallest first, no duplicates."""
 
     @abstractmethod
     def __call__(
         self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
     ) -> Prediction:
-        """Looks at these copies, (h, w, 3) each, linear light in 0..1."""
+        """Predicts from inputs of the sizes of `input_sizes`, (h, w, 3) each, linear light in 0..1."""
 
 
 @final
 class MultiScalePredictor(Predictor):
-    """Looks through a `Backend` at copies of several sizes, each as it is and in a mirror."""
+    """Runs a `Backend` at several input scales, with and without a horizontal flip, and averages the outputs."""
 
     def __init__(self, backend: Backend) -> None:
         self._backend = backend
 
     def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
-        """As `QUALITIES` says; more pixels for long thin photos."""
+        """The input scales of `QUALITIES`, never larger than the photo, and larger for long thin photos."""
         width, height = size
         sizes = []
         for pixels in QUALITIES[quality]:
@@ -95,7 +96,7 @@ class MultiScalePredictor(Predictor):
         quality: Quality,  # noqa: ARG002
         on_progress: ProgressCallback,
     ) -> Prediction:
-        """The mean of all views; it is sure where they agree."""
+        """Returns the mean over input scales and flips; the confidence is high where they agree."""
         size = inputs[-1].shape[:2]
         changes, reflections = [], []
         for scaled_input in inputs:
@@ -111,7 +112,7 @@ class MultiScalePredictor(Predictor):
         )
 
     def _predict_with_flip(self, scaled_input: Floats) -> Iterator[tuple[Floats, Floats]]:
-        """Both layers of a copy as it is, and as seen in a mirror."""
+        """Yields both layers of an input: as it is, and flipped and flipped back."""
         yield self._predict(scaled_input)
         transmission, reflection = self._predict(np.ascontiguousarray(scaled_input[:, ::-1]))
         yield transmission[:, ::-1], reflection[:, ::-1]
@@ -124,6 +125,6 @@ class MultiScalePredictor(Predictor):
 
 
 def confidence_from_spread(spread: Float32[Floats, "h w 3"]) -> Float32[Floats, "h w 1"]:
-    """How sure one can be where answers differ by so much, sRGB-encoded: 1 where they do not."""
+    """Returns exp(-spread / 0.05) of the channel with the largest spread (maximum - minimum), sRGB-encoded."""
     confidence: Floats = np.exp(-spread.max(axis=2, keepdims=True) / np.float32(_SPREAD_AT_1_E))
     return confidence

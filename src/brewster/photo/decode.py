@@ -1,7 +1,7 @@
-"""Bytes of a file to stored pixels: what kind it is, whether we take it, its pixels, and what else it says.
+"""Decodes the bytes of an image file to stored pixels and file facts.
 
-Each kind is recognised by its first bytes, never by its name. Everything that can be refused is refused from
-the header, before a pixel is decoded.
+The format is recognised by the first bytes, never by the file name. Unsupported files are refused by their header,
+before any pixel is decoded.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import bisect
 import logging
 import re
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,21 +18,22 @@ from numpy.typing import NDArray
 
 from brewster.errors import MissingExtra, PhotoError, UnreadablePhoto, UnsupportedPhoto
 from brewster.files import DEFAULT_MAX_PIXELS
+from brewster.image_formats import FORMATS
 from brewster.photo import metadata
 from brewster.photo.colour import colour_space_of
 from brewster.photo.file_info import FileInfo
 from brewster.photo.hdr_formats import read_exr, read_hdr, too_large
 from brewster.photo.lut_profiles import has_only_tables
 
-pyvips.cache_set_max(0)  # each picture is read once: libvips' cache of operations would only hold memory
-logging.getLogger("pyvips").addHandler(logging.NullHandler())  # its warnings come as errors of ours
+pyvips.cache_set_max(0)  # each image is read once: libvips' operation cache would only hold memory
+logging.getLogger("pyvips").addHandler(logging.NullHandler())  # its warnings are raised as brewster errors
 
 Stored = NDArray[Any]
 
 
 @dataclass(frozen=True)
 class Decoded:
-    """Upright pixels (H, W, 1|3) and alpha (H, W) or None: uint8, uint16 or float32, as stored."""
+    """Pixels (H, W, 1|3) and alpha (H, W) or None, as stored (uint8, uint16 or float32), EXIF orientation applied."""
 
     pixels: Stored
     alpha: Stored | None
@@ -41,10 +41,15 @@ class Decoded:
 
 
 def decode(data: bytes, max_pixels: int) -> Decoded:
-    """The picture in these bytes. Raises PhotoError's kinds, as Photo.open says."""
+    """Decodes the image in these bytes.
+
+    Raises:
+        PhotoError: the image cannot be read, is unsupported or too large; see `Photo.open`.
+        MissingExtra: the reader of EXR or HEIC is not installed.
+    """
     container = _container(data)
-    if container in ("exr", "hdr"):
-        floats = (read_exr if container == "exr" else read_hdr)(data, max_pixels)
+    if container in _FLOAT_READERS:
+        floats = _FLOAT_READERS[container](data, max_pixels)
         decoded = Decoded(floats.pixels, floats.alpha, floats.file_info)
     elif container == "heic":
         decoded = _decode_heic(data, max_pixels)
@@ -53,19 +58,22 @@ def decode(data: bytes, max_pixels: int) -> Decoded:
     if decoded.pixels.dtype.kind == "f" and not np.isfinite(decoded.pixels).all():
         count = int((~np.isfinite(decoded.pixels)).any(axis=2).sum())
         raise UnsupportedPhoto(
-            f"{count} pixels are infinite or not a number", "light is finite", "repair them in the renderer"
+            f"{count} pixels are infinite or NaN", "all values must be finite", "repair them in the renderer"
         )
     return decoded
 
 
 def read_size(data: bytes) -> tuple[int, int]:
-    """Width and height of the upright picture in these bytes, as Photo.open(data).size, by the header alone.
+    """Returns width and height as `Photo.open(data).size` does, but reads only the header.
 
-    What Photo.open refuses by the header is refused here too; damage further on is not seen. Pictures of
-    floats are read whole.
+    Refuses what `Photo.open` refuses by the header; does not notice damaged pixel data. EXR and HDR files are read
+    completely.
+
+    Raises:
+        PhotoError: as `Photo.open`.
     """
     container = _container(data)
-    if container in ("exr", "hdr"):
+    if container in _FLOAT_READERS:
         height, width = decode(data, DEFAULT_MAX_PIXELS).pixels.shape[:2]
         return width, height
     if container == "heic":
@@ -84,45 +92,29 @@ def _check_profile(icc: bytes | None, *, is_float: bool) -> None:
         colour_space_of(icc, None, is_float=is_float)
 
 
-_SIGNATURES = (
-    (rb"\xff\xd8\xff", "jpeg"),
-    (rb"\x89PNG\r\n\x1a\n", "png"),
-    (rb"II[*+]\0|MM\0[*+]", "tiff"),
-    (rb"RIFF....WEBP", "webp"),
-    (rb"....ftyp(avif|avis)", "avif"),
-    (rb"....ftyp(hei[cxms]|hev[cxms])", "heic"),
-    (rb"GIF8[79]a", "gif"),
-    (rb"v/1\x01", "exr"),
-    (rb"#\?(RADIANCE|RGBE)", "hdr"),
-)
+_FLOAT_READERS = {"exr": read_exr, "hdr": read_hdr}
 
 
 def _container(data: bytes) -> str:
     if not data:
-        raise UnreadablePhoto("the file is empty", "a picture has at least a header", "copy it again")
-    if re.match(rb"....ftypmi[fa]", data, re.DOTALL):  # either kind: the decoder's settings tell
+        raise UnreadablePhoto("the file is empty", "an image file has at least a header", "copy it again")
+    if re.match(
+        rb"....ftypmi[fa]", data, re.DOTALL
+    ):  # a brand of both: only HEVC files have a decoder configuration hvcC
         return "heic" if b"hvcC" in data[: 1 << 16] else "avif"
-    for start, container in _SIGNATURES:
-        if re.match(start, data, re.DOTALL):
-            return container
+    for image_format in FORMATS.values():
+        if re.match(image_format.signature, data, re.DOTALL):
+            return image_format.name
     raise UnreadablePhoto(
-        f"the file starts with {data[:12]!r}, which is no picture brewster knows",
-        "JPEG, PNG, TIFF, WebP, AVIF, HEIC, EXR, HDR and single GIF pictures are read",
-        "convert it, or check that the file is what its name says",
+        f"the file starts with {data[:12]!r}, which is no known image format",
+        f"brewster reads {', '.join(FORMATS)}",
+        "convert it, or check that its content fits its name",
     )
 
 
 # --- libvips
 
-_LOADERS: dict[str, Callable[..., Any]] = {
-    "jpeg": pyvips.Image.jpegload_buffer,
-    "png": pyvips.Image.pngload_buffer,
-    "tiff": pyvips.Image.tiffload_buffer,
-    "webp": pyvips.Image.webpload_buffer,
-    "avif": pyvips.Image.heifload_buffer,
-    "gif": pyvips.Image.gifload_buffer,
-}
-_STRICT = {"tiff": "error"}  # missing strips are no more than errors to libvips
+_STRICT = {"tiff": "error"}  # libvips reports missing strips as errors, not as truncation
 _GREY = ("b-w", "grey16")
 _RGB = ("srgb", "rgb", "rgb16", "scrgb")
 _TYPES = {"uchar": np.uint8, "ushort": np.uint16, "float": np.float32}
@@ -140,9 +132,10 @@ def _decode_vips(data: bytes, container: str, max_pixels: int) -> Decoded:
 
 
 def _open_vips(data: bytes, container: str, max_pixels: int) -> pyvips.Image:
-    """The header; pixels come when they are asked for."""
+    """Opens an image and checks its header; pixels are decoded on demand."""
+    load = getattr(pyvips.Image, FORMATS[container].vips_loader or "")
     try:
-        image = _LOADERS[container](data, access="sequential", fail_on=_STRICT.get(container, "truncated"))
+        image = load(data, access="sequential", fail_on=_STRICT.get(container, "truncated"))
         _check_supported(image, data, container, max_pixels)
     except pyvips.Error as error:
         raise _unreadable(container, error) from error
@@ -150,8 +143,8 @@ def _open_vips(data: bytes, container: str, max_pixels: int) -> pyvips.Image:
 
 
 def _orientation(image: pyvips.Image, container: str) -> int:
-    """How pixels are still to be turned: libvips has turned the others itself."""
-    is_unapplied = container in ("jpeg", "png", "tiff", "webp") and image.get_typeof("orientation")
+    """The EXIF orientation that is still to be applied; 1 where libvips has applied it."""
+    is_unapplied = FORMATS[container].is_stored_rotated and image.get_typeof("orientation")
     return int(image.get("orientation")) if is_unapplied else 1
 
 
@@ -159,33 +152,38 @@ def _unreadable(container: str, error: Exception | str) -> PhotoError:
     lines = [line.strip() for line in str(error).splitlines()]
     message = " ".join(line for line in lines if line and not line.startswith(("unable to", "source:")))
     return UnreadablePhoto(
-        f"the {container} cannot be read whole ({message[:200] or error})",
-        "a whole file of a common kind is needed",
-        "copy it again from where it came, or convert it",
+        f"the {container} cannot be read completely ({message[:200] or error})",
+        "a complete file in a common variant of the format is needed",
+        "copy it again from its source, or convert it",
     )
 
 
 def _check_supported(image: pyvips.Image, data: bytes, container: str, max_pixels: int) -> None:
-    """Everything we do not take, told from the header alone."""
+    """Refuses unsupported images by their header.
+
+    Raises:
+        PhotoTooLarge: more pixels than `max_pixels`.
+        UnsupportedPhoto: an animation, several pages, CMYK, or an unsupported number or type of channels.
+    """
     if image.width * image.height > max_pixels:
         raise too_large(image.width, image.height, max_pixels)
     if _has_frames(image, data, container):
         raise UnsupportedPhoto(
             f"the {container} is an animation or has several pages",
-            "brewster takes one picture at a time",
+            "brewster reads single images",
             "extract the frames first, for example with ffmpeg or vips",
         )
     if image.interpretation == "cmyk":
         raise UnsupportedPhoto(
-            f"the {container} is CMYK, colours for print",
-            "brewster needs RGB or grey",
+            f"the {container} has CMYK colours",
+            "brewster reads RGB and grey images",
             "convert it to sRGB first",
         )
     meanings = {1: _GREY, 2: _GREY, 3: _RGB, 4: _RGB}.get(image.bands, ())
     if image.interpretation not in meanings or image.format not in _TYPES:
         raise UnsupportedPhoto(
             f"the {container} has {image.bands} channels of {image.format} ({image.interpretation})",
-            "brewster takes grey or RGB, with or without alpha, of 8 or 16 bits or 32-bit floats",
+            "brewster reads grey or RGB, with or without alpha, of 8 or 16 bits or 32-bit floats",
             "convert it to one of these",
         )
     if container == "tiff":
@@ -197,20 +195,20 @@ def _check_tiff(tags: metadata.Tags, size: int) -> None:
         raise _unreadable("tiff", "pixels are missing")
     if _is_raw(tags):
         raise UnsupportedPhoto(
-            "the file is a camera's raw picture", "a developed picture is needed", "develop it first"
+            "the file is a camera's raw image", "a developed image is needed", "develop it first"
         )
 
 
 def _has_frames(image: pyvips.Image, data: bytes, container: str) -> bool:
     if container == "png":
-        return b"acTL" in metadata.png_chunks(data)  # libvips would take the first frame in silence
+        return b"acTL" in metadata.png_chunks(data)  # libvips would read the first frame without an error
     if container == "avif":
-        return data[8:12] == b"avis"  # an avif may hold thumbnails, which count as pages
+        return data[8:12] == b"avis"  # libvips counts thumbnails as pages
     return bool(image.get_typeof("n-pages")) and image.get("n-pages") > 1
 
 
 def _is_raw(tags: metadata.Tags) -> bool:
-    """A DNG by its version tag; others because their first picture is a reduced one (NewSubfileType)."""
+    """Whether a TIFF is a raw file: a DNG has a version tag (50706); others store a reduced image first (NewSubfileType)."""
     return 50706 in tags or metadata.number_of(tags, 254, 0) & 1 == 1
 
 
@@ -232,14 +230,18 @@ def _file_info(image: pyvips.Image, data: bytes, container: str) -> FileInfo:
 
 
 def _profile_of(data: bytes, container: str) -> bytes | None:
-    """A profile for colours stated by number (ITU-T H.273) instead: sRGB needs none, Display P3 has one."""
-    codes = metadata.cicp(data) if container in ("avif", "heic", "png") else None
+    """Returns an ICC profile for colours stated by code points (ITU-T H.273): None for sRGB, else Display P3.
+
+    Raises:
+        UnsupportedPhoto: other primaries, or the transfer functions PQ (16) or HLG (18) of HDR video.
+    """
+    codes = metadata.cicp(data) if FORMATS[container].has_cicp else None
     primaries, transfer = codes[:2] if codes else (1, 13)
     if transfer in (16, 18) or primaries not in (1, 2, 5, 6, 12):
         raise UnsupportedPhoto(
             f"the {container} has the colours of HDR video (primaries {primaries}, transfer {transfer})",
-            "brewster takes sRGB, Display P3, or colours with an ICC profile",
-            "export it in one of these",
+            "brewster reads sRGB, Display P3, or colours with an ICC profile",
+            "export it with one of these",
         )
     return bytes(pyvips.Image.profile_load("p3")) if primaries == 12 else None
 
@@ -250,7 +252,7 @@ def _jpeg_info(data: bytes) -> dict[str, Any]:
 
 
 def _jpeg_quality(data: bytes, bands: int) -> int:
-    """The least quality at which libvips quantises no coarser than the file, for luma and for chroma."""
+    """Returns the lowest quality at which libvips quantises luma and chroma at least as finely as the file."""
     source = metadata.jpeg_quantisation_sums(data)
     square = pyvips.Image.black(8, 8, bands=bands)
 
@@ -283,7 +285,7 @@ def _webp_info(data: bytes) -> dict[str, Any]:
 
 
 def _avif_info(data: bytes) -> dict[str, Any]:
-    """Only a lossless AVIF stores RGB as it is: matrix 0, the identity."""
+    """Only a lossless AVIF stores RGB directly: matrix code 0, the identity."""
     codes = metadata.cicp(data)
     return {"lossless": codes is not None and codes[2] == 0}
 
@@ -297,9 +299,9 @@ _HEIC_ERRORS = (ValueError, RuntimeError, OSError, SyntaxError, EOFError)
 
 
 def _open_heic(data: bytes, max_pixels: int) -> Any:  # noqa: ANN401  (pillow-heif has no types)
-    """The header; pixels come when they are asked for."""
+    """Opens a HEIC file and checks its header; pixels are decoded on demand."""
     try:
-        import pillow_heif  # noqa: PLC0415  (an extra, for the patents on HEVC)
+        import pillow_heif  # noqa: PLC0415  (an extra, because of the patents on HEVC)
     except ImportError as error:
         raise MissingExtra(
             "HEIC needs the pillow-heif package", "it is not installed", "run: pip install 'brewster[heic]'"
@@ -307,7 +309,7 @@ def _open_heic(data: bytes, max_pixels: int) -> Any:  # noqa: ANN401  (pillow-he
     try:
         heif = pillow_heif.open_heif(data, convert_hdr_to_8bit=False)
         if not len(heif):
-            raise ValueError("no image in it can be decoded")
+            raise ValueError("no image in the file can be decoded")
         if heif.size[0] * heif.size[1] > max_pixels:
             raise too_large(heif.size[0], heif.size[1], max_pixels)
     except _HEIC_ERRORS as error:
@@ -342,12 +344,12 @@ _TRANSPOSED = (5, 6, 7, 8)
 
 
 def _full_scale(array: Stored, bits: int) -> Stored:
-    """10 and 12 bits, which arrive in the upper part of 16, repeated below, so that white is 65535."""
+    """Fills 10- and 12-bit values, which arrive in the upper bits of 16, with their own upper bits: white is 65535."""
     return array | array >> bits if bits in (10, 12) else array
 
 
 def apply_orientation(array: Stored, orientation: int) -> Stored:
-    """The array (H, W, C) turned as EXIF orientation 1..8 says (CIPA DC-008, tag 274)."""
+    """Rotates and flips an array (H, W, C) by an EXIF orientation 1..8 (CIPA DC-008, tag 274)."""
     if orientation in _TRANSPOSED:
         array = array.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
@@ -358,7 +360,7 @@ def apply_orientation(array: Stored, orientation: int) -> Stored:
 
 
 def split_alpha(array: Stored, file_info: FileInfo) -> Decoded:
-    """Colour and alpha apart, each whole in memory."""
+    """Splits an array (H, W, 1..4) into contiguous colour (H, W, 1|3) and alpha (H, W) or None."""
     has_alpha = array.shape[2] in (2, 4)
     colours = array.shape[2] - has_alpha
     alpha = np.ascontiguousarray(array[..., colours]) if has_alpha else None

@@ -1,6 +1,6 @@
-"""Pictures of floats: OpenEXR through its own package, Radiance HDR through a small reader and writer.
+"""Reads and writes floating-point images: OpenEXR with its own package, Radiance HDR with built-in code.
 
-Both hold linear light. What else their headers say is kept and written back.
+Both store linear light. Other header attributes are kept and written back.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Float32 = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class HdrPixels:
-    """Pixels (H, W, 1|3) float32 of linear light, alpha (H, W) or None, and where they come from."""
+    """Pixels (H, W, 1|3) in float32 linear light, alpha (H, W) or None, and the facts of their file."""
 
     pixels: Float32
     alpha: Float32 | None
@@ -31,16 +31,16 @@ class HdrPixels:
 
 
 def too_large(width: int, height: int, max_pixels: int) -> PhotoTooLarge:
-    """The error for a picture of more pixels than the limit."""
+    """Returns the error for an image with more pixels than the limit."""
     return PhotoTooLarge(
-        f"the picture has {width} x {height} pixels ({width * height / 1e6:.3g} million)",
+        f"the image has {width} x {height} pixels ({width * height / 1e6:.3g} million)",
         f"the limit is {max_pixels / 1e6:g} million",
-        "raise --max-pixels (in Python max_pixels) if you trust it",
+        "raise --max-pixels (in Python max_pixels) if you trust the file",
     )
 
 
 def _valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float, ...] | None:
-    """Chromaticities if they span colours; None if they are missing or, as some writers put it, all zero."""
+    """Returns chromaticities if they span a gamut; None if they are missing or all zero, as some programs write."""
     try:
         points = np.array(chromaticities, np.float64).reshape(4, 2)
     except ValueError:
@@ -56,7 +56,7 @@ def _valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float,
 
 def _openexr() -> types.ModuleType:
     try:
-        import OpenEXR  # noqa: PLC0415  (an extra: only who has EXR files needs it)
+        import OpenEXR  # noqa: PLC0415  (an extra: only EXR files need it)
     except ImportError as error:
         raise MissingExtra(
             "EXR needs the OpenEXR package", "it is not installed", "run: pip install 'brewster[exr]'"
@@ -65,9 +65,13 @@ def _openexr() -> types.ModuleType:
 
 
 def read_exr(data: bytes, max_pixels: int) -> HdrPixels:
-    """An EXR's first part: R, G, B or Y, and A. Further channels, such as depth, are not carried.
+    """Reads the first part of an EXR: R, G, B or Y, and A. Other channels, such as depth, are ignored.
 
-    Raises MissingExtra, PhotoTooLarge, UnreadablePhoto, or UnsupportedPhoto for channels that are no picture.
+    Raises:
+        MissingExtra: OpenEXR is not installed.
+        PhotoTooLarge: more pixels than `max_pixels`.
+        UnreadablePhoto: the file is damaged or truncated.
+        UnsupportedPhoto: it has neither R, G and B nor Y.
     """
     header = _exr_part(data, header_only=True).header
     low, high = header["dataWindow"]
@@ -84,7 +88,7 @@ def _exr_part(data: bytes, *, header_only: bool) -> Any:  # noqa: ANN401  (OpenE
         return exr.File(io.BytesIO(data), separate_channels=True, header_only=header_only).parts[0]
     except (RuntimeError, ValueError, TypeError, IndexError) as error:
         raise UnreadablePhoto(
-            f"the exr cannot be read whole ({error})", "a whole file is needed", "export it again"
+            f"the exr cannot be read completely ({error})", "a complete file is needed", "export it again"
         ) from error
 
 
@@ -93,7 +97,7 @@ def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> Hd
     if not set(names) <= channels.keys() or "RY" in channels:
         raise UnsupportedPhoto(
             f"the EXR has the channels {', '.join(sorted(channels))}",
-            "a picture has R, G, B or Y, and perhaps A",
+            "the channels R, G, B or Y, and optionally A",
             "export it with these names",
         )
     is_half = all(channels[name].dtype == np.float16 for name in names)
@@ -111,7 +115,7 @@ def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> Hd
 
 
 def write_exr(image: HdrPixels) -> bytes:
-    """An EXR of halfs or floats, as the file_info's bits say, with the attributes it came with."""
+    """Encodes an EXR in half or single precision, by `file_info.bits`, with the attributes of the source."""
     exr = _openexr()
     names = "RGB" if image.pixels.shape[2] == 3 else "Y"
     planes = {name: image.pixels[..., i] for i, name in enumerate(names)}
@@ -130,24 +134,29 @@ def write_exr(image: HdrPixels) -> bytes:
     return file.getvalue()
 
 
-# --- OpenEXR of several pictures
+# --- OpenEXR with several layers
 
 _LAYER_CHANNELS = ("R", "G", "B")
 _RESERVED = {"channels", "chunkCount", "compression", "dataWindow", "lineOrder", "tiles", "type", "version"}
-"""Attributes that OpenEXR keeps for itself: text under some of these names is dropped without a word."""
+"""Attributes that OpenEXR defines itself: it silently drops text under some of these names."""
 
 
 def write_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -> bytes:
-    """One EXR of several pictures (H, W, 3) of equal size, as halfs, with text attributes beside them.
+    """Encodes images (H, W, 3) of equal size as the layers of one EXR, in half precision, with text attributes.
 
-    Channels are called "photo.R" for the layer "photo", as programs for compositing expect ("Technical
-    Introduction to OpenEXR", layers). Light beyond a half's range, 65504, is clipped. Raises MissingExtra,
-    or UnsupportedPhoto for attributes named as EXR's own.
+    The red channel of the layer "photo" is named "photo.R", as compositing programs expect ("Technical Introduction
+    to OpenEXR", layers). Values are clipped to the range of half precision, 65504.
+
+    Raises:
+        MissingExtra: OpenEXR is not installed.
+        UnsupportedPhoto: an attribute has a name that OpenEXR reserves.
     """
     exr = _openexr()
     if reserved := _RESERVED & header.keys():
         raise UnsupportedPhoto(
-            f"attributes are called {', '.join(sorted(reserved))}", "EXR keeps these names", "choose others"
+            f"attributes are named {', '.join(sorted(reserved))}",
+            "OpenEXR reserves these names",
+            "choose others",
         )
     max_value = float(np.finfo(np.float16).max)
     half_layers = {
@@ -165,9 +174,11 @@ def write_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -> by
 
 
 def read_layers(data: bytes) -> dict[str, Float32]:
-    """The pictures (H, W, 3) of an EXR by layer, in the order of their names; other channels are passed over.
+    """Returns the layers of an EXR by name, (H, W, 3) float32 each, sorted by name; other channels are ignored.
 
-    Raises MissingExtra, or UnreadablePhoto if it is no whole EXR or has no layer of R, G and B.
+    Raises:
+        MissingExtra: OpenEXR is not installed.
+        UnreadablePhoto: the file is damaged, or has no layer with R, G and B.
     """
     channels = _exr_part(data, header_only=False).channels
     stems = sorted(name.removesuffix(".R") for name in channels if name.endswith(".R"))
@@ -181,7 +192,7 @@ def read_layers(data: bytes) -> dict[str, Float32]:
         raise UnreadablePhoto(
             f"the EXR has the channels {', '.join(sorted(channels))}",
             'layers have the channels "name.R", "name.G" and "name.B"',
-            "open it as a photo, or write it again",
+            "open it with Photo.open, or write it again",
         )
     return layers
 
@@ -190,10 +201,12 @@ def read_layers(data: bytes) -> dict[str, Float32]:
 
 
 def read_hdr(data: bytes, max_pixels: int) -> HdrPixels:
-    """A Radiance picture: red, green and blue with a common exponent.
+    """Reads a Radiance HDR image: red, green and blue with a shared exponent (RGBE).
 
-    Raises PhotoTooLarge, UnreadablePhoto if it is empty or ends early, UnsupportedPhoto for XYZ or turned
-    scan lines.
+    Raises:
+        PhotoTooLarge: more pixels than `max_pixels`.
+        UnreadablePhoto: the image is empty or truncated.
+        UnsupportedPhoto: XYZ colours, or scan lines that do not run from top to bottom.
     """
     head, blank, rest = data.partition(b"\n\n")
     size, _, body = rest.partition(b"\n")
@@ -201,14 +214,14 @@ def read_hdr(data: bytes, max_pixels: int) -> HdrPixels:
     lines = head.decode("latin-1").splitlines()[1:]
     if not blank or size_match is None or any("xyze" in line for line in lines):
         raise UnsupportedPhoto(
-            f"the HDR picture's header ends in {size[:40]!r}",
-            "brewster reads RGBE pictures with lines from top to bottom, '-Y height +X width'",
-            "export it so",
+            f"the header of the HDR image ends in {size[:40]!r}",
+            "brewster reads RGBE images with lines from top to bottom, '-Y height +X width'",
+            "export it in this form",
         )
     height, width = int(size_match[1]), int(size_match[2])
     if width * height == 0:
         raise UnreadablePhoto(
-            f"the HDR picture has {width} x {height} pixels", "a picture has at least one", "export it again"
+            f"the HDR image has {width} x {height} pixels", "at least one pixel is needed", "export it again"
         )
     if width * height > max_pixels:
         raise too_large(width, height, max_pixels)
@@ -226,7 +239,7 @@ def _hdr_file_info(lines: list[str]) -> FileInfo:
 
 
 def _scan_lines(body: bytes, width: int, height: int) -> NDArray[np.uint8]:
-    """Bytes (H, W, 4) of run-length coded or flat lines; lines of 2**15 pixels and more are always flat."""
+    """Reads bytes (H, W, 4) from run-length encoded or flat scan lines; lines of 2**15 pixels or more are flat."""
     is_coded = width < 1 << 15 and body.startswith(b"\2\2" + width.to_bytes(2, "big"))
     try:
         if is_coded:
@@ -235,14 +248,14 @@ def _scan_lines(body: bytes, width: int, height: int) -> NDArray[np.uint8]:
         return np.frombuffer(body, np.uint8, height * width * 4).reshape(height, width, 4)
     except (IndexError, ValueError) as error:
         raise UnreadablePhoto(
-            "the hdr cannot be read whole (it ends early)",
-            f"{height} lines were promised",
-            "copy it again from where it came",
+            "the hdr cannot be read completely (it is truncated)",
+            f"its header states {height} lines",
+            "copy it again from its source",
         ) from error
 
 
 def _decode_runs(body: bytes, width: int, height: int) -> bytes:
-    """Run-length coded lines: a lead of four bytes; runs of (128 + length, value), (length, values...)."""
+    """Decodes run-length encoded lines: a header of 4 bytes, then runs (128 + length, value) or (length, values...)."""
     planes, position = bytearray(), 0
     for line in range(height):
         position += 4
@@ -266,7 +279,7 @@ def _from_rgbe(rgbe: NDArray[np.uint8]) -> Float32:
 
 
 def _to_rgbe(pixels: Float32) -> NDArray[np.uint8]:
-    """The inverse of `_from_rgbe`, exact for what it made; negative light becomes black."""
+    """The inverse of `_from_rgbe`, exact for its outputs; negative light becomes black."""
     light = np.fmax(pixels, 0)
     _, exponent = np.frexp(light.max(axis=2))
     exponent = np.clip(exponent, -127, 127)
@@ -277,7 +290,7 @@ def _to_rgbe(pixels: Float32) -> NDArray[np.uint8]:
 
 
 def write_hdr(image: HdrPixels) -> bytes:
-    """A Radiance picture with flat lines, which every reader takes; grey becomes three equal channels."""
+    """Encodes a Radiance HDR image with flat lines, which all readers support; grey becomes three equal channels."""
     height, width = image.pixels.shape[:2]
     attributes = [f"{key}={value}" for key, value in (image.file_info.header or {}).items()]
     lines = ["#?RADIANCE", "FORMAT=32-bit_rle_rgbe", *attributes]

@@ -1,7 +1,8 @@
-"""Photos whose ICC profile holds tables instead of curves and a matrix, as scanners and some cameras write them.
+"""Converts photos with LUT-based ICC profiles, which scanners and some cameras write, to Display P3.
 
-`colour` understands curves and a matrix, both ways and for any strip of a photo. Other RGB profiles are converted once, by
-littleCMS inside libvips, to Display P3, the widest space whose profile libvips brings. Colours beyond it are clipped.
+colour.py supports profiles of curves and a matrix, in both directions. Photos with other RGB profiles are converted
+once, by littleCMS in libvips, to Display P3, the largest colour space whose profile libvips includes. Colours outside
+it are clipped.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ _DEPTHS = {"uint8": ("uchar", "rgb", 8), "uint16": ("ushort", "rgb16", 16)}
 
 
 def has_only_tables(icc: bytes | None) -> bool:
-    """Whether it is an RGB profile that has tables, and no curves and matrix beside them."""
+    """Whether an ICC profile is an RGB profile with lookup tables and without curves and a matrix."""
     if icc is None or icc[16:20] != b"RGB ":
         return False
     try:
@@ -35,17 +36,17 @@ def has_only_tables(icc: bytes | None) -> bool:
 
 
 def convert_to_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[NDArray[Any], FileInfo]:
-    """Pixels (H, W, 3) of 8 or 16 bits, converted from a profile of tables (relative colorimetric), and their new file_info.
+    """Converts pixels (H, W, 3) of 8 or 16 bits to Display P3 (relative colorimetric); returns them and their file facts.
 
     Raises:
-        UnsupportedPhoto: the tables are damaged, or the pixels are grey or floats.
+        UnsupportedPhoto: the profile is damaged, or the pixels are grey or floats.
     """
     bands = pixels.shape[2]
     if bands != 3 or pixels.dtype.name not in _DEPTHS:
         raise UnsupportedPhoto(
-            f"{bands} channels of {pixels.dtype} have a colour profile of tables",
-            "tables are read for RGB of 8 or 16 bits",
-            "convert the picture to sRGB or Display P3 first",
+            f"{bands} channels of {pixels.dtype} have a LUT-based colour profile",
+            "such profiles are supported for RGB of 8 or 16 bits",
+            "convert the photo to sRGB or Display P3 first",
         )
     icc = file_info.icc or b""
     try:
@@ -56,13 +57,13 @@ def convert_to_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[ND
     except pyvips.Error as error:
         raise _damaged_profile(icc, str(error).strip()) from error
     if is_ignored:
-        raise _damaged_profile(icc, "libvips takes sRGB instead")
+        raise _damaged_profile(icc, "libvips uses sRGB instead")
     return array, replace(file_info, icc=bytes(pyvips.Image.profile_load("p3")))
 
 
 _LEVELS = np.arange(0, 256, 51).astype(np.uint8)
 _PROBE = np.stack(np.meshgrid(_LEVELS, _LEVELS, _LEVELS), axis=-1).reshape(-1, 6, 3)
-"""Colours by which an ignored profile is noticed: libvips takes sRGB in silence for one that it cannot use."""
+"""Colours that reveal an ignored profile: libvips silently uses sRGB instead of a profile that it cannot use."""
 
 
 def _convert(pixels: NDArray[Any], icc: bytes) -> NDArray[Any]:
@@ -78,7 +79,7 @@ def _convert(pixels: NDArray[Any], icc: bytes) -> NDArray[Any]:
 
 def _damaged_profile(icc: bytes, reason: str) -> UnsupportedPhoto:
     return UnsupportedPhoto(
-        f"the colour profile of tables ({len(icc)} bytes) cannot be used ({reason})",
-        "a whole ICC profile is needed",
-        "convert the picture to sRGB or Display P3 first",
+        f"the LUT-based colour profile ({len(icc)} bytes) cannot be used ({reason})",
+        "a complete ICC profile is needed",
+        "convert the photo to sRGB or Display P3 first",
     )

@@ -23,7 +23,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 import brewster
-from brewster.files import SUFFIXES
+from brewster.image_formats import SUFFIXES
 from brewster.inference.predictor import ProgressCallback
 from brewster.photo import Photo
 from brewster.web.job_queue import JobProgress, JobQueue
@@ -31,10 +31,6 @@ from brewster.web.model_cache import ModelCache, ModelRow
 from brewster.web.preview import preview
 from brewster.web.request_schema import SeparationRequest, form_schema, read_form
 
-_MEDIA: Final = {
-    "exr": "image/x-exr",
-    "hdr": "image/vnd.radiance",
-}  # the others are image/ and their own name
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # zip has no earlier; the same layers make the same bytes
 
 
@@ -129,7 +125,7 @@ def _separate(shelf: ModelCache, asked: SeparationRequest, on_progress: Progress
     for layer in options.layers:
         on_progress(1)  # encoding takes a while, too, and may not be wanted any more
         name = asked.target(layer, separation.photo.file_info.container)
-        files[name] = getattr(separation, layer).encode(SUFFIXES[Path(name).suffix.lower()])
+        files[name] = getattr(separation, layer).encode(SUFFIXES[Path(name).suffix.lower()].name)
     name, data = (
         next(iter(files.items())) if len(files) == 1 else (f"{Path(asked.name).stem}.zip", _zip(files))
     )
@@ -158,8 +154,7 @@ def _preview(shelf: ModelCache, asked: SeparationRequest, on_progress: ProgressC
 def _media(name: str) -> str:
     if name.endswith(".zip"):
         return "application/zip"
-    container = SUFFIXES[Path(name).suffix.lower()]
-    return _MEDIA.get(container, f"image/{container}")
+    return SUFFIXES[Path(name).suffix.lower()].mime_type
 
 
 def _zip(files: Mapping[str, bytes]) -> bytes:

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from brewster.benchmarks.pairing import PictureGroup, read_folders
 from brewster.errors import PhotoError, RecipeError
-from brewster.files import SUFFIXES
+from brewster.image_formats import SUFFIXES
 from brewster.photo import Photo
 from brewster.srgb import to_encoded
 
-_MAPS = {suffix for suffix, container in SUFFIXES.items() if container in ("exr", "hdr")}
+_MAPS = {suffix for suffix, image_format in SUFFIXES.items() if image_format.is_linear}
 _PICTURES = SUFFIXES.keys() - _MAPS
 _PHOTO_SIDE_PX = 640
 _MAP_HEIGHT_PX = 512
