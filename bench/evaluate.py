@@ -49,7 +49,7 @@ def make_pairs(data: Path, count: int) -> None:
     for i in range(count):
         if (OUT / "theirs" / f"{i}.png").exists():
             continue
-        behind, mirrored = (Photo.open(photos[(i + step) % len(photos)]).small(*SIZE) for step in (0, 17))
+        behind, mirrored = (Photo.open(photos[(i + step) % len(photos)]).resized(*SIZE) for step in (0, 17))
         reflection = 0.3 * rng.uniform() * mirrored
         layers = {
             "blended": 0.9 * behind + reflection,

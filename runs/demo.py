@@ -21,7 +21,7 @@ def main(source: Path) -> int:
     separator = Separator.load("compact")
     OUT.mkdir(parents=True, exist_ok=True)
     rows, failures = [], 0
-    for job in find([source], into=OUT):
+    for job in find([source], output_folder=OUT):
         try:
             rows.append(separate(separator, job))
         except BrewsterError as error:
@@ -52,7 +52,7 @@ def side_by_side(result: Separation) -> np.ndarray:
     width, height = result.photo.size
     size = max(1, round(width * ROW_PX / height)), ROW_PX
     pictures = (result.photo, result.transmission, result.reflection)
-    return np.concatenate([np.clip(picture.small(*size), 0, 1) for picture in pictures], axis=1)
+    return np.concatenate([np.clip(picture.resized(*size), 0, 1) for picture in pictures], axis=1)
 
 
 if __name__ == "__main__":

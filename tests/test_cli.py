@@ -14,10 +14,11 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 import brewster
-from brewster import Photo, files, photo
+from brewster import Photo, files
 from brewster.cli import cli
 from brewster.cli.reference import reference
 from brewster.errors import BrewsterError
+from brewster.image_formats import WRITABLE
 from brewster.inference import QUALITIES
 from brewster.inference.onnx_backend import DEVICES
 from brewster.options import Options
@@ -69,7 +70,7 @@ def test_the_options_offer_what_the_rooms_below_take():
     assert get_args(hints["quality"]) == tuple(QUALITIES)
     assert set(get_args(hints["device"])) == set(DEVICES)
     assert get_args(get_args(hints["layers"])[0]) == files.LAYERS
-    assert set(get_args(get_args(hints["format"])[0])) == set(photo.DEPTHS)
+    assert set(get_args(get_args(hints["format"])[0])) == set(WRITABLE)
 
 
 def test_every_option_of_a_separation_is_an_option_of_the_command():

@@ -1,4 +1,4 @@
-"""A large model behind the Separator: twins where the machinery matters, and a model that is known where the answer does."""
+"""Diffusion models in the Separator: tiny random models for the mechanics, an oracle with known layers for values."""
 
 import json
 import shutil
@@ -25,7 +25,7 @@ SMALL = 3 * 48 * 32
 
 
 class Oracle:
-    """A model that splits every photo alike, T = 0.7 I and R = 0.3 I, and draws all its panels in a tint of its own."""
+    """A pipeline with T = 0.7 I and R = 0.3 I that adds a constant, `tint`, to all panels."""
 
     backbone = SimpleNamespace(multiple=16)
 
@@ -39,14 +39,14 @@ class Oracle:
         shares = {"I": 1.0, "T": 0.7, "R": 0.3}
         for step in range(steps):
             on_progress(step + 1, steps)
-        return {name: self.draw(shares[name] * light, len(seeds)) for name in self.task.layout.panels}
+        return {name: self.generate(shares[name] * light, len(seeds)) for name in self.task.layout.panels}
 
-    def draw(self, light, count):
+    def generate(self, light, count):
         return (2 * (to_encoded(light) + self.tint) - 1).clamp(-1, 1).expand(count, -1, -1, -1)
 
 
 def smooth(width, height, seed=1):
-    """A photo of soft colours, never near black or white."""
+    """A photo of smooth colours, never near black or white."""
     coarse = np.random.default_rng(seed).uniform(0.15, 0.6, (4, 5, 3)).astype(np.float32)
     rows, columns = np.linspace(0, 2.99, height), np.linspace(0, 3.99, width)
     picture = coarse[rows.astype(int)][:, columns.astype(int)]
@@ -61,7 +61,7 @@ def smooth(width, height, seed=1):
 
 @pytest.fixture(scope="module")
 def lora(tmp_path_factory):
-    """A LoRA that changes something, on a toy twin of the paper's backbone."""
+    """A LoRA with random weights on a tiny version of the paper's backbone."""
     folder = tmp_path_factory.mktemp("kontext") / "lora"
     backbone, prompt = tiny("kontext")
     add_lora(backbone, rank=2, alpha=2)
@@ -73,17 +73,17 @@ def lora(tmp_path_factory):
 
 
 @pytest.mark.parametrize("tint", [-0.1, 0.0, 0.08])
-def test_the_colours_that_a_model_draws_amiss_do_not_reach_the_layers(tint):
+def test_a_colour_shift_of_the_model_does_not_reach_the_layers(tint):
     photo = smooth(300, 200)
     result = Separator(DiffusionPredictor(Oracle(tint)))(photo)
     off = np.abs(result.transmission.linear() - 0.7 * photo.linear()).mean()
-    believed = np.abs(to_linear(to_encoded(0.7 * photo.linear()) + tint) - 0.7 * photo.linear()).mean()
-    assert off < max(0.004, believed / 2)
+    shifted = np.abs(to_linear(to_encoded(0.7 * photo.linear()) + tint) - 0.7 * photo.linear()).mean()
+    assert off < max(0.004, shifted / 2)
     assert result.reconstruction_error == pytest.approx(abs(tint), abs=0.004)
     assert result.doubtful == (abs(tint) > RECONSTRUCTION_ERROR_LIMIT)
 
 
-def test_confidence_falls_with_the_drift():
+def test_confidence_falls_with_the_reconstruction_error():
     photo = smooth(120, 90)
     sure, doubtful = (
         Separator(DiffusionPredictor(Oracle(tint)))(photo).confidence.pixels.mean() for tint in (0, 0.1)
@@ -92,7 +92,7 @@ def test_confidence_falls_with_the_drift():
     assert doubtful < 100
 
 
-def test_strength_nought_is_the_photo_and_half_is_half_the_way():
+def test_strength_zero_is_the_photo_and_half_is_halfway():
     photo = Photo.from_array(
         np.random.default_rng(2).integers(0, 256, (160, 240, 3), np.uint8), encoding="srgb"
     )
@@ -102,23 +102,23 @@ def test_strength_nought_is_the_photo_and_half_is_half_the_way():
     np.testing.assert_allclose(half, (none + whole) / 2, atol=0.01)
 
 
-def test_the_photos_own_detail_is_kept_unless_the_plain_drawing_is_asked_for():
+def test_the_detail_of_the_photo_is_kept_unless_plain_is_set():
     rows = np.linspace(0.2, 0.5, 400, dtype=np.float32)[:, None, None]
     photo = Photo.from_array(np.broadcast_to(rows, (400, 400, 3)).copy(), encoding="linear")
     fine = photo.linear()
     fine[::2] *= 1.1  # lines of one pixel, which no panel of 96 px can show
     photo = Photo.from_array(fine, encoding="linear")
-    kept, plain = (
+    guided, plain = (
         Separator(DiffusionPredictor(Oracle(), plain=plain))(photo).transmission.linear()
         for plain in (False, True)
     )
     contrast = [np.abs(np.diff(layer[100:-100], axis=0)).mean() / np.abs(np.diff(fine[100:-100], axis=0)).mean()
-                for layer in (kept, plain)]  # fmt: skip
+                for layer in (guided, plain)]  # fmt: skip
     assert contrast[0] > 0.6
     assert contrast[1] < 0.1
 
 
-def test_drafts_take_few_steps_and_close_looks_see_tiles():
+def test_drafts_take_few_steps_and_best_uses_tiles():
     calls = {}
     for quality in ("draft", "standard", "best"):
         oracle = Oracle()
@@ -132,7 +132,7 @@ def test_drafts_take_few_steps_and_close_looks_see_tiles():
 
 
 @pytest.mark.parametrize(("width", "height"), [(16, 16), (17, 40), (30, 20), (90, 21), (171, 16), (1000, 60)])
-def test_photos_of_any_shape_come_back_in_their_size(width, height):
+def test_photos_of_any_shape_keep_their_size(width, height):
     result = Separator(DiffusionPredictor(Oracle(budget_px=3 * 128 * 128)))(smooth(width, height))
     assert result.transmission.size == result.reflection.size == (width, height)
     np.testing.assert_allclose(result.transmission.linear(), 0.7 * result.photo.linear(), atol=0.02)
@@ -145,49 +145,49 @@ def test_a_photo_that_is_smaller_than_a_token_is_refused_with_the_size_it_takes(
         Separator(DiffusionPredictor(Oracle()))(smooth(15, 40))
 
 
-def test_a_model_that_draws_no_reflection_leaves_what_it_took_away():
+def test_without_a_reflection_panel_the_reflection_is_what_was_removed():
     photo = smooth(100, 80)
     result = Separator(DiffusionPredictor(Oracle(panels=("T",), budget_px=96 * 96)))(photo)
     np.testing.assert_allclose(result.reflection.linear(), 0.3 * photo.linear(), atol=0.02)
     assert result.reconstruction_error is None
     assert not result.doubtful
-    assert not result.confidence.pixels.any()  # nothing tells how sure it is
+    assert not result.confidence.pixels.any()  # no confidence without a reconstruction or several samples
 
 
-def test_a_model_that_draws_numbers_that_are_none_is_refused():
+def test_a_model_that_generates_nan_is_refused():
     class Broken(Oracle):
-        def draw(self, light, count):
-            return super().draw(light * float("nan"), count)
+        def generate(self, light, count):
+            return super().generate(light * float("nan"), count)
 
-    with pytest.raises(ModelError, match="numbers that are none; finite ones"):
+    with pytest.raises(ModelError, match="contains NaN or infinity; finite values"):
         Separator(DiffusionPredictor(Broken()))(smooth(60, 40))
 
 
-def test_light_that_the_photo_could_not_hold_is_no_drift():
+def test_light_beyond_the_range_of_the_photo_is_no_reconstruction_error():
     photo = Photo.from_array(np.full((64, 64, 3), 1.0, np.float32), encoding="linear")
 
     class Bright(Oracle):
-        def draw(self, light, count):
-            return super().draw(light + 0.4, count)
+        def generate(self, light, count):
+            return super().generate(light + 0.4, count)
 
     assert Separator(DiffusionPredictor(Bright(panels=("T", "R"))))(photo).reconstruction_error < 0.004
 
 
-def test_the_share_that_is_done_rises_tile_by_tile_and_step_by_step():
-    told = []
-    Separator(DiffusionPredictor(Oracle()))(smooth(400, 300), quality="best", on_progress=told.append)
-    assert told == sorted(told)
-    assert told[-1] == 1
-    assert len(told) > 7 * 20
+def test_progress_rises_with_tiles_and_steps():
+    progress = []
+    Separator(DiffusionPredictor(Oracle()))(smooth(400, 300), quality="best", on_progress=progress.append)
+    assert progress == sorted(progress)
+    assert progress[-1] == 1
+    assert len(progress) > 7 * 20
 
 
-@pytest.mark.parametrize("effort", [{"steps": 0}, {"average": 0}])
-def test_no_step_and_no_answer_are_refused(effort):
-    with pytest.raises(ModelError, match="at least 1 of each"):
-        DiffusionPredictor(Oracle(), **effort)
+@pytest.mark.parametrize("options", [{"steps": 0}, {"average": 0}])
+def test_zero_steps_and_zero_averages_are_refused(options):
+    with pytest.raises(ModelError, match="both must be at least 1"):
+        DiffusionPredictor(Oracle(), **options)
 
 
-def test_a_lora_goes_through_the_separator_by_its_folder(lora):
+def test_a_lora_is_loaded_by_its_folder(lora):
     separator = Separator.load(str(lora), steps=2)
     first, again = separator(smooth(90, 60)), Separator.load(str(lora), steps=2)(smooth(90, 60))
     assert (separator.name, separator.device, len(separator.sha256)) == ("lora", "cpu", 64)
@@ -198,7 +198,7 @@ def test_a_lora_goes_through_the_separator_by_its_folder(lora):
     assert (first.transmission.pixels != other.transmission.pixels).any()
 
 
-def test_a_backbone_without_a_lora_is_asked_for_the_transmission_alone():
+def test_a_backbone_without_a_lora_generates_the_transmission_only():
     decomposer = load_pipeline("tiny:klein")
     assert decomposer.task.layout.panels == ("T",)
     generic = load_pipeline("tiny:klein", prompt="generic")
@@ -237,7 +237,7 @@ def test_what_a_lora_is_opened_with_is_checked(lora, tmp_path):
         ({"task": {"layout": {"panels": ["T", "T"], "direction": "stacked"}}}, "each once"),
     ],
 )
-def test_a_damaged_card_ends_in_a_sentence(lora, tmp_path, change, words):
+def test_a_damaged_card_is_a_model_error(lora, tmp_path, change, words):
     tensors, about = read_tensors(lora / LORA_FILE)
     card = json.loads(about["brewster"])
     card |= change | {"task": card["task"] | change.get("task", {})}
@@ -256,7 +256,7 @@ def test_another_base_has_another_digest(lora, tmp_path):
 
 
 @pytest.mark.parametrize("folder", ["compact", "kontext", "models"])
-def test_folders_here_do_not_stand_in_for_models(folder, tmp_path, monkeypatch):
+def test_local_folders_do_not_hide_models(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / folder).mkdir()
     assert Separator.load("compact").name == "compact"
@@ -276,14 +276,14 @@ def test_a_base_that_has_moved_can_be_named(tmp_path):
 def test_one_step_takes_neither_steps_nor_averages():
     one_step = Oracle()
     one_step.task = DecompositionTask(PanelLayout(), SMALL, "one_step", 1.0)
-    with pytest.raises(ModelError, match="answers in one step"):
+    with pytest.raises(ModelError, match="one-step model"):
         DiffusionPredictor(one_step, steps=4)
-    with pytest.raises(ModelError, match="answers in one step"):
+    with pytest.raises(ModelError, match="one-step model"):
         DiffusionPredictor(one_step, average=2)
 
 
-def test_options_of_large_models_are_not_forgotten_by_small_ones():
-    with pytest.raises(ModelError, match="steps, plain was asked of compact"):
+def test_options_of_diffusion_models_are_refused_for_other_models():
+    with pytest.raises(ModelError, match="steps, plain was set for the model compact"):
         Separator.load("compact", steps=3, plain=True)
 
 

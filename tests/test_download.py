@@ -1,4 +1,4 @@
-"""Files from a server on this machine, and all that can go wrong on the way; more of it stands in test_polyhaven."""
+"""Downloads from a server on this machine, and how they fail; test_polyhaven.py has more."""
 
 import hashlib
 import subprocess
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from brewster.download import Downloader, RemoteFile, digest_of
+from brewster.download import Downloader, RemoteFile, file_digest
 from brewster.errors import DownloadError, TargetError
 from file_server import loopback_only, served, unused_address
 
@@ -27,18 +27,18 @@ def server():
 
 
 @pytest.fixture
-def promise(server):
+def remote(server):
     return RemoteFile(f"{server.url}/map", len(BODY), "sha256", hashlib.sha256(BODY).hexdigest())
 
 
 @pytest.fixture
-def waited():
+def delays():
     return []
 
 
 @pytest.fixture
-def line(waited):
-    return Downloader(sleep=waited.append)
+def downloader(delays):
+    return Downloader(sleep=delays.append)
 
 
 @pytest.fixture
@@ -46,24 +46,24 @@ def target(tmp_path):
     return tmp_path / "new" / "map"
 
 
-def test_a_file_comes_whole_and_alone(line, promise, target):
-    line.fetch(promise, target)
+def test_a_file_is_downloaded_and_nothing_else_is_left(downloader, remote, target):
+    downloader.fetch(remote, target)
     assert target.read_bytes() == BODY
     assert [path.name for path in target.parent.iterdir()] == ["map"]
 
 
 @pytest.mark.parametrize("algorithm", ["md5", "sha256"])
-def test_either_sum_can_be_promised(line, promise, target, algorithm):
+def test_md5_and_sha256_digests_are_supported(downloader, remote, target, algorithm):
     digest = hashlib.new(algorithm, BODY).hexdigest()
-    line.fetch(promise._replace(algorithm=algorithm, digest=digest), target)
-    assert digest_of(target, algorithm) == digest
+    downloader.fetch(remote._replace(algorithm=algorithm, digest=digest), target)
+    assert file_digest(target, algorithm) == digest
 
 
-def test_a_line_that_breaks_is_taken_up_where_it_was(server, line, promise, target, waited):
+def test_a_lost_connection_is_resumed(server, downloader, remote, target, delays):
     server.faults = ["cut", 503, "cut"]
-    line.fetch(promise, target)
+    downloader.fetch(remote, target)
     assert target.read_bytes() == BODY
-    assert waited == [1, 2, 4]
+    assert delays == [1, 2, 4]
     assert [start for _, start in server.requests] == [
         None,
         "bytes=160000-",
@@ -72,55 +72,55 @@ def test_a_line_that_breaks_is_taken_up_where_it_was(server, line, promise, targ
     ]
 
 
-def test_what_came_of_half_a_file_is_kept_for_the_next_call(server, promise, target):
+def test_a_partial_download_is_kept_for_the_next_call(server, remote, target):
     server.faults = ["cut"]
     with pytest.raises(DownloadError, match="ended after 160000 of 320000 bytes"):
-        Downloader(pauses_s=()).fetch(promise, target)
+        Downloader(retry_delays_s=()).fetch(remote, target)
     assert [path.name for path in target.parent.iterdir()] == ["map.part"]
-    Downloader(pauses_s=()).fetch(promise, target)
+    Downloader(retry_delays_s=()).fetch(remote, target)
     assert server.requests[-1] == ("/map", "bytes=160000-")
 
 
-def test_a_file_that_is_another_is_dropped(server, line, promise, target):
+def test_a_file_with_a_wrong_digest_is_deleted(server, downloader, remote, target):
     server.bodies["/map"] = BODY[::-1]
-    with pytest.raises(DownloadError, match=r"SHA256 sum .* was promised; run again"):
-        line.fetch(promise, target)
+    with pytest.raises(DownloadError, match=r"SHA256 digest .* was expected; run again"):
+        downloader.fetch(remote, target)
     assert list(target.parent.iterdir()) == []
 
 
-def test_a_server_that_is_not_there_is_asked_five_times(line, waited):
+def test_an_unreachable_server_is_tried_five_times(downloader, delays):
     with pytest.raises(DownloadError, match=r"in 5 attempts .*refused.*check the connection"):
-        line.read(unused_address())
-    assert waited == [1, 2, 4, 8]
+        downloader.read(unused_address())
+    assert delays == [1, 2, 4, 8]
 
 
-def test_what_is_not_found_is_asked_for_once(server, line, waited):
+def test_a_missing_file_is_requested_once(server, downloader, delays):
     with pytest.raises(DownloadError, match="404"):
-        line.read(f"{server.url}/none")
-    assert waited == []
-    assert line.read(f"{server.url}/map") == BODY
+        downloader.read(f"{server.url}/none")
+    assert delays == []
+    assert downloader.read(f"{server.url}/map") == BODY
 
 
 @pytest.mark.parametrize("url", ["file:///etc/hosts", "ftp://127.0.0.1/map", "map", "", "http://a b/"])
-def test_only_the_web_is_opened(line, url, waited):
+def test_only_http_urls_are_opened(downloader, url, delays):
     with pytest.raises(DownloadError, match="https://; check the address"):
-        line.read(url)
-    assert waited == []
+        downloader.read(url)
+    assert delays == []
 
 
-def test_a_folder_that_cannot_be_made_is_explained(line, promise, tmp_path):
+def test_a_folder_that_cannot_be_created_is_an_error(downloader, remote, tmp_path):
     (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(TargetError, match="a folder of yours"):
-        line.fetch(promise, tmp_path / "file" / "map")
+    with pytest.raises(TargetError, match="a writable folder"):
+        downloader.fetch(remote, tmp_path / "file" / "map")
 
 
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a disk that is always full")
-def test_a_full_disk_is_explained(line, promise, tmp_path):
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has /dev/full")
+def test_a_full_disk_is_an_error(downloader, remote, tmp_path):
     (tmp_path / "map.part").symlink_to("/dev/full")
     with pytest.raises(TargetError, match=r"No space left .* free some space"):
-        line.fetch(promise, tmp_path / "map")
+        downloader.fetch(remote, tmp_path / "map")
 
 
-def test_downloading_wakes_no_torch():
+def test_downloading_imports_no_torch():
     code = "import brewster.download, sys; assert not {'torch', 'numpy', 'click'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,4 +1,4 @@
-"""Finding pictures and writing results: names, trees, link loops, and nothing lost whatever happens."""
+"""Finding input images and writing results: names, trees, link loops, atomic writes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from platformdirs import macos, unix
 
 from brewster import files
 from brewster.errors import TargetError
-from brewster.files import SUFFIXES, SeparationPaths, cache_folder, find, write_atomically
+from brewster.files import SeparationPaths, cache_folder, find, write_atomically
+from brewster.image_formats import SUFFIXES
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -29,7 +30,7 @@ def names(jobs: list[SeparationPaths]) -> dict[str, str]:
     return {job.source.name: job.name for job in jobs}
 
 
-def test_layers_lie_beside_their_picture_and_keep_its_suffix(tmp_path: Path) -> None:
+def test_layers_are_next_to_their_image_and_keep_its_suffix(tmp_path: Path) -> None:
     (job,) = find([touch(tmp_path, "view.jpg") / "view.jpg"])
     assert job.target("transmission") == tmp_path / "view.transmission.jpg"
     assert job.target("reflection") == tmp_path / "view.reflection.jpg"
@@ -45,18 +46,18 @@ def test_pictures_whose_format_is_not_written_get_png_layers(tmp_path: Path, nam
 
 def test_a_folder_is_searched_in_order_and_its_tree_is_mirrored(tmp_path: Path) -> None:
     touch(tmp_path / "in", "b.jpg", "a.PNG", "deep/er/c.webp", "notes.txt")
-    jobs = find([tmp_path / "in"], into=tmp_path / "out")
+    jobs = find([tmp_path / "in"], output_folder=tmp_path / "out")
     assert [job.source.name for job in jobs] == ["a.PNG", "b.jpg", "c.webp"]
     assert jobs[2].target("transmission") == tmp_path / "out/deep/er/c.transmission.webp"
 
 
-def test_hidden_files_and_our_own_results_are_passed_over(tmp_path: Path) -> None:
+def test_hidden_files_and_results_are_skipped(tmp_path: Path) -> None:
     ours = [f"a.{layer}.png" for layer in ("transmission", "reflection", "confidence")]
     touch(tmp_path, "a.jpg", ".hidden.jpg", ".thumbnails/b.jpg", *ours)
     assert names(find([tmp_path])) == {"a.jpg": "a"}
 
 
-def test_a_file_asked_for_by_name_is_always_taken(tmp_path: Path) -> None:
+def test_a_file_given_by_name_is_always_listed(tmp_path: Path) -> None:
     wanted = ["a.transmission.jpg", ".hidden.jpg", "missing.jpg"]
     touch(tmp_path, *wanted[:2])
     assert list(names(find([tmp_path / name for name in wanted]))) == wanted
@@ -67,7 +68,7 @@ def test_two_pictures_of_one_stem_keep_their_suffix(tmp_path: Path) -> None:
     assert names(find([tmp_path])) == {"a.jpg": "a.jpg", "a.png": "a.png", "b.jpg": "b"}
 
 
-def test_names_do_not_depend_on_what_is_asked_for_or_already_done(tmp_path: Path) -> None:
+def test_names_do_not_depend_on_the_selection_or_on_existing_results(tmp_path: Path) -> None:
     touch(tmp_path, "a.jpg", "a.png")
     before = names(find([tmp_path / "a.jpg"]))
     touch(tmp_path, "a.jpg.transmission.jpg", "a.jpg.confidence.png")
@@ -101,7 +102,7 @@ def test_link_loops_end_and_linked_folders_are_searched_once(tmp_path: Path) -> 
     assert [job.source.name for job in jobs] == ["a.jpg", "self.jpg"]
 
 
-def test_a_picture_named_twice_is_done_once(tmp_path: Path) -> None:
+def test_an_image_given_twice_is_listed_once(tmp_path: Path) -> None:
     touch(tmp_path, "a.jpg")
     assert len(find([tmp_path, tmp_path / "a.jpg", tmp_path / "." / "a.jpg"])) == 1
 
@@ -109,10 +110,10 @@ def test_a_picture_named_twice_is_done_once(tmp_path: Path) -> None:
 def test_pictures_of_two_folders_with_one_target_are_refused_before_any_work(tmp_path: Path) -> None:
     touch(tmp_path, "x/a.jpg", "y/a.jpg")
     with pytest.raises(TargetError, match="would both be written"):
-        find([tmp_path / "x/a.jpg", tmp_path / "y/a.jpg"], into=tmp_path / "out")
+        find([tmp_path / "x/a.jpg", tmp_path / "y/a.jpg"], output_folder=tmp_path / "out")
 
 
-def test_a_folder_that_cannot_be_read_is_left_for_opening_to_explain(
+def test_an_unreadable_folder_is_listed_so_that_opening_it_reports_the_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     touch(tmp_path, "locked/a.jpg", "z.jpg")
@@ -135,13 +136,13 @@ def test_names_with_spaces_accents_and_newlines_work(tmp_path: Path, name: str) 
     assert job.target("transmission").name == name.replace(".jpg", ".transmission.jpg")
 
 
-def test_writing_makes_the_folder_and_leaves_only_the_file(tmp_path: Path) -> None:
+def test_writing_creates_the_folder_and_leaves_only_the_file(tmp_path: Path) -> None:
     write_atomically(tmp_path / "new" / "deep" / "a.png", b"whole")
     assert [path.name for path in (tmp_path / "new" / "deep").iterdir()] == ["a.png"]
     assert (tmp_path / "new" / "deep" / "a.png").read_bytes() == b"whole"
 
 
-def test_nothing_is_overwritten_unasked(tmp_path: Path) -> None:
+def test_nothing_is_overwritten_by_default(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     path.write_bytes(b"old")
     with pytest.raises(TargetError, match="overwrite"):
@@ -169,7 +170,7 @@ def test_the_source_is_never_the_target(tmp_path: Path) -> None:
     source.write_bytes(b"picture")
     link.symlink_to(source)
     for target in (source, link):
-        with pytest.raises(TargetError, match="the picture itself"):
+        with pytest.raises(TargetError, match="the input image itself"):
             write_atomically(target, b"layer", overwrite=True, source=source)
     assert source.read_bytes() == b"picture"
 
@@ -178,7 +179,7 @@ def test_the_source_is_never_the_target(tmp_path: Path) -> None:
     ("code", "word"),
     [(errno.ENOSPC, "free some space"), (errno.EROFS, "writable"), (errno.EIO, "was not written")],
 )
-def test_a_full_or_failing_disk_is_explained_and_leaves_nothing(
+def test_a_full_or_failing_disk_is_an_error_and_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, word: str
 ) -> None:
     def fail(descriptor: int) -> None:
@@ -190,7 +191,7 @@ def test_a_full_or_failing_disk_is_explained_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_control_c_leaves_the_old_file_and_no_half_one(
+def test_ctrl_c_leaves_the_old_file_and_no_partial_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupt(descriptor: int) -> None:
@@ -204,7 +205,7 @@ def test_control_c_leaves_the_old_file_and_no_half_one(
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-def test_a_read_only_folder_is_explained(tmp_path: Path) -> None:
+def test_a_read_only_folder_is_an_error(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     with pytest.raises(TargetError, match="writable"):
         write_atomically(tmp_path / "a.png", b"layer")
@@ -238,7 +239,7 @@ def test_file_systems_without_links_are_written_to_as_well(
 @pytest.mark.parametrize(
     ("target", "word"), [("folder", "a file"), ("file/a.png", "not written"), ("n" * 300, "shorter")]
 )
-def test_impossible_targets_are_explained(tmp_path: Path, target: str, word: str) -> None:
+def test_impossible_targets_are_errors(tmp_path: Path, target: str, word: str) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").write_bytes(b"")
     with pytest.raises(TargetError, match=word):
@@ -264,8 +265,8 @@ def test_downloads_are_kept_where_the_system_has_its_caches(
     assert cache_folder() == Path(folder)
 
 
-def test_ctrl_c_just_after_a_file_took_its_name_leaves_nothing_else(tmp_path, monkeypatch):
-    """Where the interrupt comes before the hidden file is removed; it happened on a busy machine."""
+def test_ctrl_c_just_after_the_rename_leaves_nothing_else(tmp_path, monkeypatch):
+    """The interrupt comes before the hidden file is deleted; this happened on a busy machine."""
     discard, calls = files.discard, []
 
     def interrupted(path):

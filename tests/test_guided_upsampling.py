@@ -20,44 +20,44 @@ def sharp_scene_and_soft_reflection(random):
     return scene, np.broadcast_to(soft, scene.shape)
 
 
-def learn(photo, transmission, reflection):
-    return GuidedUpsampler.learn(photo, transmission - photo, reflection)
+def fit(photo, transmission, reflection):
+    return GuidedUpsampler.fit(photo, transmission - photo, reflection)
 
 
 def as_bytes(layer):
     return np.rint(np.clip(layer, 0, 1) * 255).astype(np.uint8)
 
 
-def test_a_soft_reflection_leaves_and_sharp_detail_stays(sharp_scene_and_soft_reflection):
+def test_a_soft_reflection_is_removed_and_sharp_detail_is_kept(sharp_scene_and_soft_reflection):
     scene, reflection = sharp_scene_and_soft_reflection
     photo = scene + reflection
-    transfer = learn(*(shrink(layer, 8) for layer in (photo, scene, reflection)))
-    transmission, mirrored = transfer.apply(photo, 0, 160)
+    upsampler = fit(*(shrink(layer, 8) for layer in (photo, scene, reflection)))
+    transmission, reflected = upsampler.apply(photo, 0, 160)
     enlarged = enlarge_rows(shrink(scene, 8), 0, 160, (160, 240))
     assert psnr(as_bytes(transmission), as_bytes(scene)) > psnr(as_bytes(enlarged), as_bytes(scene)) + 15
-    assert psnr(as_bytes(mirrored), as_bytes(reflection)) > 35
+    assert psnr(as_bytes(reflected), as_bytes(reflection)) > 35
 
 
 @pytest.mark.parametrize("gain", [0.7, 1.25])
 def test_glass_that_only_dims_leaves_no_trace_of_the_scene_in_the_reflection(random, gain):
     photo = np.kron(random.random((20, 30, 3)), np.ones((8, 8, 1))).astype(np.float32) * 0.7
     small = shrink(photo, 4)
-    transmission, mirrored = learn(small, gain * small, np.zeros_like(small)).apply(photo, 0, 160)
-    assert not mirrored.any()
+    transmission, reflected = fit(small, gain * small, np.zeros_like(small)).apply(photo, 0, 160)
+    assert not reflected.any()
     assert psnr(as_bytes(transmission), as_bytes(gain * photo)) > 38
 
 
-def test_where_nothing_is_enlarged_the_answer_is_kept_as_it_is(random):
+def test_without_upsampling_the_prediction_is_unchanged(random):
     photo, transmission, share = (random.random((33, 47, 3), np.float32) for _ in range(3))
     reflection = share * photo
-    layers = learn(photo, transmission, reflection).apply(photo, 0, 33)
+    layers = fit(photo, transmission, reflection).apply(photo, 0, 33)
     np.testing.assert_allclose(layers, (transmission, reflection), atol=1e-5)
 
 
-def test_a_picture_that_the_backend_left_alone_is_not_touched_even_where_its_light_is_negative(random):
+def test_an_unchanged_photo_is_kept_bit_equal_even_where_its_light_is_negative(random):
     photo = random.random((64, 48, 3), np.float32) * 3 - 0.5
     small = np.clip(shrink(photo, 4), 0, 1)
-    transmission, reflection = learn(small, small, np.zeros_like(small)).apply(photo, 0, 64)
+    transmission, reflection = fit(small, small, np.zeros_like(small)).apply(photo, 0, 64)
     assert (transmission == photo).all()
     assert (reflection == 0).all()
 
@@ -65,12 +65,12 @@ def test_a_picture_that_the_backend_left_alone_is_not_touched_even_where_its_lig
 def test_no_reflection_is_brighter_than_the_photo(random):
     photo = random.random((20, 20, 3), np.float32)
     photo[:5] = 0
-    _, reflection = learn(photo, photo, np.full_like(photo, 0.2)).apply(photo, 0, 20)
+    _, reflection = fit(photo, photo, np.full_like(photo, 0.2)).apply(photo, 0, 20)
     assert (reflection <= photo).all()
 
 
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 40), st.integers(1, 40))
-def test_rows_made_one_at_a_time_equal_all_rows_at_once(small_height, small_width, height, width):
+def test_rows_computed_one_at_a_time_equal_all_rows_at_once(small_height, small_width, height, width):
     map_ = np.random.default_rng(1).random((small_height, small_width, 2), np.float32)
     whole = enlarge_rows(map_, 0, height, (height, width))
     rows = [enlarge_rows(map_, top, 1, (height, width)) for top in range(height)]
@@ -84,26 +84,26 @@ def test_a_ramp_stays_a_ramp_when_enlarged():
     assert enlarged.mean() == pytest.approx(ramp.mean())
 
 
-def test_fine_detail_that_is_mirrored_is_taken_from_the_drawn_picture():
-    """Fine lines mirrored in front of a smooth wall: at work resolution they are grey, in the photo they are not."""
+def test_fine_detail_of_the_reflection_is_replaced_by_the_generated_transmission():
+    """A reflection of fine lines in front of a smooth wall: at low resolution the lines are grey."""
     large = 240
     wall = np.broadcast_to(np.linspace(0.2, 0.4, large, dtype=np.float32)[:, None, None], (large, large, 3))
     lines = np.zeros((large, large, 3), np.float32)
     lines[:, ::6] = lines[:, 1::6] = 0.3  # a period of two small pixels
     photo = wall + lines
-    drawn, mirrored = shrink(wall, 3), shrink(lines, 3)
-    redrawn = GeneratedOverride.where_mirrored(drawn, mirrored)
+    generated, reflected = shrink(wall, 3), shrink(lines, 3)
+    override = GeneratedOverride.weighted_by_detail(generated, reflected)
     errors = [
         np.abs(
-            GuidedUpsampler.learn(shrink(photo, 3), -mirrored, mirrored, how).apply(photo, 0, large)[0] - wall
+            GuidedUpsampler.fit(shrink(photo, 3), -reflected, reflected, how).apply(photo, 0, large)[0] - wall
         ).mean()
-        for how in (None, redrawn)
+        for how in (None, override)
     ]
     assert errors[1] < errors[0] / 5
-    assert redrawn.share[8:-8, 8:-8].min() > 0.9
+    assert override.weight[8:-8, 8:-8].min() > 0.9
 
 
-def test_where_nothing_fine_is_mirrored_the_photo_keeps_its_detail(random):
+def test_without_fine_reflections_the_photo_keeps_its_detail(random):
     detail = random.random((40, 60, 3), np.float32)
     soft = np.full_like(detail, 0.2)
-    assert GeneratedOverride.where_mirrored(detail, soft).share.max() < 1e-3
+    assert GeneratedOverride.weighted_by_detail(detail, soft).weight.max() < 1e-3

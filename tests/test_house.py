@@ -18,7 +18,7 @@ import brewster
 import brewster.errors
 import brewster.inference
 import brewster.photo
-from brewster.inference.tiles import in_tiles
+from brewster.inference.tiles import run_tiled
 from brewster.options import Options
 
 ROOT = Path(__file__).parents[1]
@@ -58,10 +58,10 @@ def test_a_light_start_wakes_no_heavy_library(command):
 def test_shapes_that_annotations_state_are_checked_while_tests_run():
     """Without the hook of shape_checks.py, these annotations are never looked at."""
     flat = np.zeros((8, 8), np.float32)
-    with pytest.raises(jaxtyping.TypeCheckError, match="picture"):
-        in_tiles(lambda tile: (tile, tile), flat, tile_px=16, overlap_px=2)
+    with pytest.raises(jaxtyping.TypeCheckError, match="image"):
+        run_tiled(lambda tile: (tile, tile), flat, tile_px=16, overlap_px=2)
     with pytest.raises(jaxtyping.TypeCheckError, match="return value"):
-        in_tiles(lambda tile: (tile[..., 0],), flat[..., None].repeat(3, 2), tile_px=16, overlap_px=2)
+        run_tiled(lambda tile: (tile[..., 0],), flat[..., None].repeat(3, 2), tile_px=16, overlap_px=2)
 
 
 def test_large_image_models_have_one_door():
@@ -84,7 +84,7 @@ def test_the_signature_of_separate_shows_the_source_and_every_option():
     shown = inspect.signature(brewster.separate)
     assert shown == inspect.signature(brewster.inference.separate)
     assert list(shown.parameters)[:3] == ["source", "model", "device"]
-    assert set(Options.__dataclass_fields__) & {"strength", "quality", "additive"} <= set(shown.parameters)
+    assert set(Options.__dataclass_fields__) - {"layers", "format"} <= set(shown.parameters)
 
 
 def test_type_checkers_know_every_public_name_and_no_other(tmp_path):

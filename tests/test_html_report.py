@@ -333,7 +333,7 @@ def test_pictures_stay_upright_and_keep_their_values(page):
 
 def test_pictures_are_reduced_as_a_photo_reduces_itself(page, random):
     photo = random.integers(0, 255, (501, 733, 3)).astype(np.uint8)
-    expected = Photo.from_array(Photo.from_array(photo, encoding="srgb").small(480, 328), encoding="linear")
+    expected = Photo.from_array(Photo.from_array(photo, encoding="srgb").resized(480, 328), encoding="linear")
     made = pictures(page(cases=[shown("a", size=(501, 733), photo=photo)]))["photo, a"]
     apart = abs(made.pixels.astype(int) - Photo.open(expected.encode("webp")).pixels)
     assert apart.mean() < 1  # roundings apart, then WebP; averages of encoded values would be some 10 apart

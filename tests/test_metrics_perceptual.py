@@ -292,16 +292,16 @@ def test_an_interrupted_download_is_resumed_and_not_used_before(server, state, c
     remote, digest = remote_file(server, body), digest_of(state)
     server.faults = ["cut"]
     with pytest.raises(DownloadError, match="ended after"):
-        load_alexnet(remote, digest, downloader=Downloader(pauses_s=()))
+        load_alexnet(remote, digest, downloader=Downloader(retry_delays_s=()))
     assert [path.name for path in cache.iterdir()] == ["whole.pth.part"]
-    load_alexnet(remote, digest, downloader=Downloader(pauses_s=()))
+    load_alexnet(remote, digest, downloader=Downloader(retry_delays_s=()))
     assert server.requests[-1] == ("/whole.pth", f"bytes={len(body) // 2}-")
 
 
 def test_an_unreachable_server_is_explained():
     remote = RemoteFile(f"{unused_address()}/whole.pth", 9, "sha256", "0")
     with pytest.raises(DownloadError, match="check the connection"):
-        load_alexnet(remote, downloader=Downloader(pauses_s=()))
+        load_alexnet(remote, downloader=Downloader(retry_delays_s=()))
 
 
 def test_a_wrong_file_from_the_server_is_deleted(server, state, cache):

@@ -44,29 +44,29 @@ def test_the_file_holds_two_bytes_a_weight(network, exported):
 
 
 @pytest.mark.parametrize("size", [(1, 1), (33, 31), (5, 200)])
-def test_sides_that_are_no_multiple_of_the_stride_come_back_as_they_were(exported, size):
+def test_sides_that_are_no_multiple_of_the_stride_are_kept(exported, size):
     for layer in OnnxBackend(exported, "cpu")(np.full((*size, 3), 0.5, np.float32)):
         assert layer.shape == (*size, 3)
         assert np.isfinite(layer).all()
 
 
-def test_threads_that_share_a_backend_get_the_same_answers(exported):
+def test_threads_that_share_a_backend_get_the_same_outputs(exported):
     backend = OnnxBackend(exported, "cpu")
     tiles = [np.random.default_rng(seed).random((64, 64, 3), np.float32) for seed in range(4)]
     expected = [backend(tile)[0] for tile in tiles]
-    answers = [None] * 4
+    outputs = [None] * 4
     threads = [
-        threading.Thread(target=lambda i=i: answers.__setitem__(i, backend(tiles[i])[0])) for i in range(4)
+        threading.Thread(target=lambda i=i: outputs.__setitem__(i, backend(tiles[i])[0])) for i in range(4)
     ]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    for answer, truth in zip(answers, expected, strict=True):
-        assert (answer == truth).all()
+    for output, truth in zip(outputs, expected, strict=True):
+        assert (output == truth).all()
 
 
-def test_a_device_that_is_not_there_is_an_error_with_the_line_that_installs_it(exported):
+def test_an_unavailable_device_is_an_error_with_the_command_that_installs_it(exported):
     missing = "cuda" if "cuda" not in available_devices() else "coreml"
     with pytest.raises(DeviceError, match="pip install onnxruntime"):
         OnnxBackend(exported, missing)
@@ -78,7 +78,7 @@ def test_auto_finds_a_device(exported):
     assert OnnxBackend(exported).device == available_devices()[0]
 
 
-def test_a_device_that_is_installed_but_does_not_start_is_an_error_and_auto_goes_on(exported, monkeypatch):
+def test_a_device_that_does_not_start_is_an_error_and_auto_skips_it(exported, monkeypatch):
     """As with onnxruntime-gpu where there is no driver: the provider is listed, and its session is the CPU's."""
     monkeypatch.setitem(
         onnx_backend._PROVIDERS, "cuda", ("AzureExecutionProvider", "pip install onnxruntime-gpu")
@@ -96,7 +96,7 @@ def test_a_device_that_is_installed_but_does_not_start_is_an_error_and_auto_goes
     assert OnnxBackend(exported, "auto").device == "cpu"
 
 
-def test_a_file_that_is_no_model_is_named(tmp_path):
+def test_a_file_that_is_no_model_is_an_error(tmp_path):
     (tmp_path / "text.onnx").write_text("hello")
     with pytest.raises(ModelError, match=r"text\.onnx"):
         OnnxBackend(tmp_path / "text.onnx")
@@ -104,6 +104,6 @@ def test_a_file_that_is_no_model_is_named(tmp_path):
         OnnxBackend(tmp_path / "missing.onnx")
 
 
-def test_a_model_that_fails_while_it_runs_is_an_error_of_the_model(exported):
+def test_a_model_that_fails_at_run_time_is_a_model_error(exported):
     with pytest.raises(ModelError, match="tile of 0x0"):
         OnnxBackend(exported, "cpu")(np.zeros((0, 0, 3), np.float32))

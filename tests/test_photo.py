@@ -1,4 +1,4 @@
-"""Photos in and out: what was stored comes back, and so does what the file said beside it."""
+"""Reading and writing photos: pixels and metadata are kept."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from hypothesis.extra import numpy as arrays
 from PIL import Image, ImageOps
 
 from brewster.errors import MissingExtra, PhotoError, TargetError, UnsupportedPhoto
-from brewster.photo import DEPTHS, FileInfo, Photo
+from brewster.image_formats import FORMATS
+from brewster.photo import FileInfo, Photo
 from picture_files import exif_block, file_of, pil, smooth
 
 quick = settings(max_examples=25, deadline=None, database=None)
@@ -105,7 +106,7 @@ def test_a_panorama_of_20000_by_300_works() -> None:
     photo = Photo.from_array(np.zeros((300, 20000, 1), np.uint8), encoding="srgb")
     again = Photo.open(photo.encode("jpeg"))
     assert again.size == (20000, 300)
-    assert again.small(500, 8).shape == (8, 500, 3)
+    assert again.resized(500, 8).shape == (8, 500, 3)
 
 
 # --- floats
@@ -156,7 +157,7 @@ def test_a_radiance_picture_too_wide_for_run_lengths_is_flat(width: int) -> None
 
 
 @pytest.mark.parametrize("stated", ["0 0 0 0 0 0 0 0", "none", "0.3 0.3"])
-def test_primaries_that_span_no_colours_are_passed_over(stated: str) -> None:
+def test_primaries_that_span_no_gamut_are_ignored(stated: str) -> None:
     data = f"#?RADIANCE\nPRIMARIES={stated}\n\n-Y 1 +X 1\n".encode() + bytes((128, 64, 32, 129))
     np.testing.assert_allclose(Photo.open(data).linear()[0, 0], (1, 0.5, 0.25))
 
@@ -169,7 +170,7 @@ def test_light_is_the_same_in_every_container(container: str) -> None:
 
 
 @pytest.mark.parametrize(("asked", "dtype"), [(8, np.uint8), (16, np.uint16), (32, np.float32)])
-def test_depth_is_changed_only_when_asked(asked: int, dtype: type) -> None:
+def test_bit_depth_is_changed_only_on_request(asked: int, dtype: type) -> None:
     for photo in (Photo(smooth(), None, FileInfo(icc=P3)), Photo.from_array(smooth() / 255, encoding="srgb")):
         again = Photo.open(photo.encode("tiff", depth=asked))
         assert again.pixels.dtype == dtype
@@ -183,7 +184,7 @@ def test_depth_is_changed_only_when_asked(asked: int, dtype: type) -> None:
 def test_heic_keeps_profile_exif_and_pixels() -> None:
     pytest.importorskip("pillow_heif")
     photo = Photo(smooth(), None, FileInfo(icc=P3, exif=exif_block(1).removeprefix(b"Exif\0\0")))
-    for depth in DEPTHS["heic"]:
+    for depth in FORMATS["heic"].bit_depths:
         again = Photo.open(photo.encode("heic", depth=depth))
         assert (again.file_info.container, again.file_info.bits) == ("heic", depth)
         assert (again.file_info.icc, again.file_info.exif) == (P3, photo.file_info.exif)
@@ -191,7 +192,7 @@ def test_heic_keeps_profile_exif_and_pixels() -> None:
 
 
 @pytest.mark.parametrize(("container", "module"), [("heic", "pillow_heif"), ("exr", "OpenEXR")])
-def test_a_missing_extra_names_the_line_that_installs_it(
+def test_a_missing_extra_names_the_command_that_installs_it(
     container: str, module: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, module, None)
@@ -209,13 +210,13 @@ def test_an_array_needs_its_encoding() -> None:
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.float32])
-def test_an_encoding_we_do_not_know_is_refused(kind: type) -> None:
+def test_an_unknown_encoding_is_refused(kind: type) -> None:
     for make in (Photo.open, Photo.from_array):
-        with pytest.raises(PhotoError, match=r"'sRGB'; .*; say encoding"):
+        with pytest.raises(PhotoError, match=r"'sRGB'; .*; pass encoding"):
             make(smooth().astype(kind), encoding="sRGB")
 
 
-def test_an_encoding_is_refused_for_what_tells_its_own() -> None:
+def test_an_encoding_is_refused_for_sources_that_state_their_own() -> None:
     data = file_of(smooth(), "PNG")
     for source in (data, "a.png", pil(data), Photo.open(data)):
         with pytest.raises(PhotoError, match="only arrays need one"):
@@ -223,7 +224,7 @@ def test_an_encoding_is_refused_for_what_tells_its_own() -> None:
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float64])
-def test_arrays_mean_what_their_encoding_says(kind: type) -> None:
+def test_arrays_are_read_by_their_encoding(kind: type) -> None:
     white = np.iinfo(kind).max if kind != np.float64 else 1
     half = np.full((2, 2), white * 0.5).astype(kind)
     encoded = Photo.from_array(half, encoding="srgb").linear()
@@ -242,7 +243,7 @@ def test_a_photo_does_not_change_with_the_array_it_came_from() -> None:
 
 
 @pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "I;16"])
-def test_pil_images_are_taken_as_they_are(mode: str) -> None:
+def test_pil_images_are_read_unchanged(mode: str) -> None:
     wide = Image.fromarray(noise(channels=1, kind=np.uint16)[..., 0])
     image = wide if mode == "I;16" else Image.fromarray(smooth()).convert(mode)
     again = pil(Photo.open(image).encode())
@@ -252,7 +253,7 @@ def test_pil_images_are_taken_as_they_are(mode: str) -> None:
         assert np.array_equal(np.asarray(again.convert("RGBA")), np.asarray(image.convert("RGBA")))
 
 
-def test_a_pil_image_brings_its_profile_exif_and_orientation() -> None:
+def test_profile_exif_and_orientation_of_a_pil_image_are_read() -> None:
     image = pil(file_of(smooth(), "JPEG", exif=exif_block(), icc_profile=P3))
     photo = Photo.open(image)
     assert photo.file_info.icc == P3
@@ -260,13 +261,13 @@ def test_a_pil_image_brings_its_profile_exif_and_orientation() -> None:
     assert np.array_equal(photo.pixels, np.asarray(ImageOps.exif_transpose(image)))
 
 
-def test_a_pil_jpeg_with_previews_behind_it_is_one_picture() -> None:
+def test_a_pil_jpeg_followed_by_previews_is_one_image() -> None:
     image = Image.fromarray(smooth())
     data = file_of(smooth(), "MPO", save_all=True, append_images=[image.resize((8, 8))])
     assert Photo.open(pil(data)).size == Photo.open(data).size == image.size
 
 
-def test_a_pil_image_of_ink_or_lab_is_refused() -> None:
+def test_a_cmyk_or_lab_pil_image_is_refused() -> None:
     for mode in ("CMYK", "LAB"):
         image = Image.new(mode, (4, 4))
         with pytest.raises(UnsupportedPhoto, match=mode):
@@ -275,14 +276,14 @@ def test_a_pil_image_of_ink_or_lab_is_refused() -> None:
 
 @quick
 @given(st.integers(1, 12), st.integers(1, 12), st.integers(1, 30), st.integers(1, 30))
-def test_a_small_picture_holds_the_mean_light_of_each_area(
+def test_a_reduced_photo_has_the_mean_light_of_each_area(
     width: int, height: int, across: int, down: int
 ) -> None:
     pixels = noise(down, across)
     photo = Photo.from_array(pixels, encoding="srgb")
     repeated = photo.linear().repeat(height, axis=0).repeat(width, axis=1)
     means = repeated.reshape(height, down, width, across, 3).mean(axis=(1, 3))
-    np.testing.assert_allclose(photo.small(width, height), means, atol=1e-5)
+    np.testing.assert_allclose(photo.resized(width, height), means, atol=1e-5)
 
 
 def test_strips_cover_every_row_once() -> None:
@@ -315,12 +316,12 @@ def test_saving_takes_the_container_from_the_suffix_and_overwrites_nothing(tmp_p
 
 
 @pytest.mark.parametrize("name", ["a.gif", "a", "a.bmp"])
-def test_saving_to_a_format_we_do_not_write_is_refused(tmp_path: Path, name: str) -> None:
+def test_saving_to_a_format_that_is_not_written_is_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(UnsupportedPhoto, match="brewster writes"):
         Photo.from_array(smooth(), encoding="srgb").save(tmp_path / name)
 
 
-def test_alpha_is_not_dropped_unasked_and_impossible_depths_are_refused() -> None:
+def test_alpha_is_not_dropped_silently_and_impossible_depths_are_refused() -> None:
     photo = Photo.from_array(noise(channels=4), encoding="srgb")
     for container in ("jpeg", "hdr"):
         with pytest.raises(UnsupportedPhoto, match="alpha"):
@@ -329,7 +330,7 @@ def test_alpha_is_not_dropped_unasked_and_impossible_depths_are_refused() -> Non
         photo.encode("webp", depth=16)
 
 
-def test_a_container_too_small_for_the_picture_says_so() -> None:
+def test_a_photo_too_large_for_the_format_is_refused() -> None:
     with pytest.raises(UnsupportedPhoto, match="write PNG"):
         Photo.from_array(np.zeros((1, 17000, 3), np.uint8), encoding="srgb").encode("webp")
 
@@ -340,18 +341,18 @@ def test_the_same_photo_gives_the_same_bytes() -> None:
         assert photo.encode(container) == photo.encode(container)
 
 
-def test_what_only_some_files_need_is_imported_only_then() -> None:
+def test_optional_libraries_are_imported_on_demand() -> None:
     code = "import brewster.photo, sys; assert not {'PIL', 'OpenEXR', 'pillow_heif'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_sixteen_bits_become_the_nearest_of_eight():
+def test_sixteen_bits_are_rounded_to_eight():
     values = np.arange(0, 65536, 37, np.uint16)
     photo = Photo.from_array(np.repeat(values[None, :, None], 3, axis=2), encoding="srgb")
     stored = Photo.open(photo.encode("png", depth=8)).pixels[0, :, 0]
     assert (stored == np.rint(values / 257)).all()
 
 
-def test_a_jpeg_of_what_had_no_quality_has_95():
+def test_a_jpeg_has_quality_95_if_the_source_states_none():
     photo = Photo.from_array(np.full((16, 16, 3), 99, np.uint8), encoding="srgb")
     assert Photo.open(photo.encode("jpeg")).file_info.jpeg_quality == 95

@@ -16,9 +16,9 @@ from PIL import Image, ImageCms
 from brewster import srgb
 from brewster.errors import UnsupportedPhoto
 from brewster.photo import FileInfo, Photo
-from brewster.photo.colour import SRGB, ToneCurve, space_of
+from brewster.photo.colour import SRGB, ToneCurve, colour_space_of
 from brewster.photo.decode import read_size
-from brewster.photo.lut_profiles import in_display_p3
+from brewster.photo.lut_profiles import convert_to_display_p3
 
 quick = settings(max_examples=25, deadline=None, database=None)
 
@@ -177,7 +177,7 @@ def test_wide_gamut_is_not_clipped_and_white_stays_white() -> None:
 @given(arrays.arrays(np.float32, (4, 5, 3), elements=st.floats(0, 1, width=32)))
 def test_storing_and_reading_light_is_an_inverse_within_a_sixteen_bit_step(linear: np.ndarray) -> None:
     for icc in (None, *PROFILES.values()):
-        space = space_of(icc, None, is_float=False)
+        space = colour_space_of(icc, None, is_float=False)
         inside = space.to_linear(space.to_stored(linear, np.zeros(linear.shape, np.uint16)))
         again = space.to_linear(space.to_stored(inside, np.zeros(linear.shape, np.uint16)))
         np.testing.assert_allclose(again, inside, atol=1e-4)
@@ -213,12 +213,12 @@ def test_only_changed_pixels_change() -> None:
     ],
 )
 def test_a_profile_that_is_srgb_takes_the_fast_path(icc: bytes) -> None:
-    assert space_of(icc, None, is_float=False) == SRGB
+    assert colour_space_of(icc, None, is_float=False) == SRGB
 
 
 @pytest.mark.parametrize("icc", [PROFILES["Display P3"], PROFILES["linear"]])
 def test_a_profile_that_is_not_srgb_does_not(icc: bytes) -> None:
-    assert space_of(icc, None, is_float=False) != SRGB
+    assert colour_space_of(icc, None, is_float=False) != SRGB
 
 
 def test_grey_profiles_set_the_tone_of_grey_pictures() -> None:
@@ -254,13 +254,13 @@ def test_floats_with_a_profile_go_through_it_and_back() -> None:
 def test_unchanged_floats_with_the_srgb_profile_come_back_bit_equal(channels: int) -> None:
     pixels = np.random.default_rng(7).uniform(-0.5, 2, (64, 64, channels)).astype(np.float32)
     photo = stored(pixels, bytes(pyvips.Image.profile_load("srgb")))
-    assert photo.space() == SRGB
+    assert photo.colour_space() == SRGB
     assert np.array_equal(photo.with_linear(photo.linear()).pixels, pixels)
 
 
 def test_chromaticities_turn_into_rec709_with_white_on_white() -> None:
     aces = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
-    light_of = space_of(None, aces, is_float=True).to_linear
+    light_of = colour_space_of(None, aces, is_float=True).to_linear
     np.testing.assert_allclose(light_of(np.ones((1, 1, 3), np.float32)), 1, atol=1e-4)
     red = light_of(np.array([[[1, 0, 0]]], np.float32))[0, 0]
     np.testing.assert_allclose(
@@ -304,7 +304,7 @@ def light_by_table(pixels: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(
     ("container", "kind", "tolerance"), [("png", np.uint8, 0.01), ("tiff", np.uint16, 0.006)]
 )
-def test_a_profile_of_tables_gives_its_colours_and_they_survive(container, kind, tolerance) -> None:
+def test_a_lut_profile_gives_its_colours_and_they_survive(container, kind, tolerance) -> None:
     random = np.random.default_rng(8).integers(0, np.iinfo(kind).max + 1, (24, 24, 3)).astype(kind)
     data = stored(random, table_profile()).encode(container)
     photo = Photo.open(data)
@@ -317,13 +317,13 @@ def test_a_profile_of_tables_gives_its_colours_and_they_survive(container, kind,
     assert read_size(data) == (24, 24)
 
 
-def test_a_pil_image_with_a_profile_of_tables_is_read_as_its_file_is() -> None:
+def test_a_pil_image_with_a_lut_profile_is_read_as_its_file_is() -> None:
     random = np.random.default_rng(9).integers(0, 256, (16, 16, 3), np.uint8)
     data = stored(random, table_profile()).encode("png")
     assert np.array_equal(Photo.open(Image.open(io.BytesIO(data))).pixels, Photo.open(data).pixels)
 
 
-def test_white_by_a_profile_of_tables_stays_white() -> None:
+def test_white_in_a_lut_profile_stays_white() -> None:
     white = Photo.open(stored(np.full((4, 4, 3), 255, np.uint8), table_profile()).encode("png"))
     assert white.srgb_8bit().min() >= 254
 
@@ -333,16 +333,16 @@ def test_white_by_a_profile_of_tables_stays_white() -> None:
     [table_profile()[:100_000], table_profile().replace(b"mft2", b"mftX")],
     ids=["cut short", "unknown"],
 )
-def test_a_damaged_profile_of_tables_is_refused(icc: bytes) -> None:
+def test_a_damaged_lut_profile_is_refused(icc: bytes) -> None:
     """libvips would take sRGB instead, and say nothing."""
-    with pytest.raises(UnsupportedPhoto, match="profile of tables"):
+    with pytest.raises(UnsupportedPhoto, match="LUT-based colour profile"):
         Photo.open(stored(NOISE_8BIT, icc).encode("tiff"))
 
 
 @pytest.mark.parametrize(("kind", "channels"), [(np.uint8, 1), (np.float32, 3)])
-def test_a_profile_of_tables_is_for_whole_numbers_in_colour(kind: type, channels: int) -> None:
+def test_a_lut_profile_is_for_whole_numbers_in_colour(kind: type, channels: int) -> None:
     with pytest.raises(UnsupportedPhoto, match="RGB of 8 or 16 bits"):
-        in_display_p3(np.ones((4, 4, channels), kind), FileInfo(icc=table_profile()))
+        convert_to_display_p3(np.ones((4, 4, channels), kind), FileInfo(icc=table_profile()))
 
 
 @pytest.mark.parametrize(
@@ -352,4 +352,4 @@ def test_a_profile_of_tables_is_for_whole_numbers_in_colour(kind: type, channels
 )
 def test_profiles_without_curves_and_matrix_are_refused(icc: bytes) -> None:
     with pytest.raises(UnsupportedPhoto, match="curves and a matrix"):
-        space_of(icc, None, is_float=False)
+        colour_space_of(icc, None, is_float=False)

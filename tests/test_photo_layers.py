@@ -33,7 +33,7 @@ def part_of(data, **options):
         elements=st.floats(-60000, 60000, width=32),
     )
 )
-def test_light_comes_back_to_half_precision(picture):
+def test_layers_are_kept_in_half_precision(picture):
     again = read_layers(write_layers({"photo": picture, "mirror": picture * 2**-7}, {}))
     assert sorted(again) == ["mirror", "photo"]
     for name, light in (("photo", picture), ("mirror", picture * 2**-7)):
@@ -43,13 +43,13 @@ def test_light_comes_back_to_half_precision(picture):
     assert all(np.array_equal(halfs[name], again[name]) for name in again)
 
 
-def test_light_beyond_a_half_is_clipped_not_lost():
+def test_values_beyond_half_precision_are_clipped():
     picture = np.full((2, 2, 3), 1e9, np.float32)
     picture[0] = np.inf
     assert (read_layers(write_layers({"photo": picture}, {}))["photo"] == 65504).all()
 
 
-def test_layers_keep_apart_whatever_their_order(random):
+def test_layers_are_separate_in_any_order(random):
     given_ = pictures(random)
     again = read_layers(write_layers(given_, HEADER))
     assert list(again) == sorted(NAMES)
@@ -63,7 +63,7 @@ def test_the_same_pictures_are_the_same_bytes_in_any_order(random):
     assert write_layers(given_, HEADER) == write_layers(turned, dict(reversed(HEADER.items())))
 
 
-def test_other_programs_see_named_layers_of_compressed_halfs_and_the_text(random):
+def test_other_programs_read_named_compressed_half_layers_and_the_text(random):
     data = write_layers(pictures(random), HEADER)
     exr = pytest.importorskip("OpenEXR")
     part = part_of(data, separate_channels=True)
@@ -75,7 +75,7 @@ def test_other_programs_see_named_layers_of_compressed_halfs_and_the_text(random
     assert b"mirror.B\0\1\0\0\0" in data  # as the file's channel list spells a half
 
 
-def test_a_layer_may_have_dots_and_other_channels_are_passed_over(random):
+def test_a_layer_name_may_have_dots_and_other_channels_are_ignored(random):
     exr = pytest.importorskip("OpenEXR")
     half = np.ones((4, 5), np.float16)
     channels = {f"left.photo.{channel}": half for channel in "RGB"} | {"photo.Z": half, "depth.R": half}
@@ -85,9 +85,9 @@ def test_a_layer_may_have_dots_and_other_channels_are_passed_over(random):
 
 
 @pytest.mark.parametrize("damage", [b"", b"no picture", None])
-def test_what_is_no_whole_file_is_refused(damage, random):
+def test_a_damaged_file_is_refused(damage, random):
     data = write_layers(pictures(random), HEADER)
-    with pytest.raises(UnreadablePhoto, match="whole"):
+    with pytest.raises(UnreadablePhoto, match="complete"):
         read_layers(data[: len(data) // 2] if damage is None else damage)
 
 
@@ -98,11 +98,11 @@ def test_an_exr_without_layers_is_refused(random):
 
 
 def test_attributes_that_exr_would_drop_are_refused(random):
-    with pytest.raises(UnsupportedPhoto, match="called version"):
+    with pytest.raises(UnsupportedPhoto, match="named version"):
         write_layers(pictures(random), {**HEADER, "version": "0.1.0"})
 
 
-def test_without_openexr_the_cure_is_named(monkeypatch, random):
+def test_without_openexr_the_error_names_the_extra(monkeypatch, random):
     data = write_layers(pictures(random), {})
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     for attempt in (lambda: read_layers(data), lambda: write_layers(pictures(random), {})):

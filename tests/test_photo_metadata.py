@@ -148,12 +148,12 @@ def test_resolution_is_kept(container: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["raw", "tiff_lzw", "tiff_adobe_deflate", "packbits", "jpeg"])
-def test_a_tiff_keeps_its_kind_of_compression(kind: str) -> None:
+def test_a_tiff_keeps_its_compression(kind: str) -> None:
     data = file_of(smooth(), "TIFF", compression=kind)
     assert pil(Photo.open(data).encode()).info["compression"] == kind
 
 
-def test_xmp_orientation_is_reset_with_the_other() -> None:
+def test_xmp_orientation_is_reset_with_that_of_exif() -> None:
     photo = Photo.open(file_of(smooth(), "JPEG", xmp=XMP, exif=exif_block()))
     assert photo.file_info.xmp == UPRIGHT_XMP
 
@@ -167,7 +167,7 @@ def test_broken_exif_never_breaks_a_picture(rubbish: bytes, order: bytes, at: in
         assert Photo.open(photo.encode(container)).size == photo.size
 
 
-def test_display_p3_stated_by_number_gets_its_profile() -> None:
+def test_display_p3_stated_by_code_points_gets_its_profile() -> None:
     chunk = b"cICP" + bytes((12, 13, 0, 1))
     data = file_of(smooth(), "PNG")
     sized = struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
@@ -177,7 +177,7 @@ def test_display_p3_stated_by_number_gets_its_profile() -> None:
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_the_thumbnail_of_the_unseparated_picture_is_unlinked_and_nothing_else_moves(order):
+def test_the_thumbnail_of_the_input_is_unlinked_and_nothing_else_changes(order):
     mark = b"II*\0" if order == "<" else b"MM\0*"
     entry = struct.pack(f"{order}HHIHH", 274, 3, 1, 8, 0)
     block = (

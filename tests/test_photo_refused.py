@@ -55,9 +55,9 @@ def refused(source: object, kind: type[PhotoError], word: str, **options: object
         ("GIF", {}),
     ],
 )
-def test_a_truncated_picture_is_no_grey_picture(kind: str, options: dict[str, object], part: float) -> None:
+def test_a_truncated_image_is_refused(kind: str, options: dict[str, object], part: float) -> None:
     data = file_of(kind, **options)
-    refused(data[: int(len(data) * part)], UnreadablePhoto, "read whole")
+    refused(data[: int(len(data) * part)], UnreadablePhoto, "read completely")
 
 
 def test_a_tiff_with_missing_tiles_is_truncated_too() -> None:
@@ -77,7 +77,7 @@ def test_truncated_floats_are_refused(container: str, part: float) -> None:
 
 def test_a_heic_without_an_image_is_refused() -> None:
     data = Photo.from_array(NOISE, encoding="srgb").encode("heic")
-    refused(data.replace(b"hvcC", b"hvcX"), UnreadablePhoto, "no image in it can be decoded")
+    refused(data.replace(b"hvcC", b"hvcX"), UnreadablePhoto, "no image in the file can be decoded")
 
 
 def test_a_heic_whose_picture_is_longer_than_the_file_is_refused() -> None:
@@ -101,7 +101,7 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
     refused(tmp_path, UnreadablePhoto, "folder")
 
 
-def test_a_file_we_may_not_read_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_without_read_permission_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def deny(path: Path) -> bytes:
         raise PermissionError(13, "Permission denied")
 
@@ -110,8 +110,8 @@ def test_a_file_we_may_not_read_is_refused(tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("kind", ["BMP", "JPEG2000", "PPM", "ICO"])
-def test_formats_we_do_not_read_are_named(kind: str) -> None:
-    refused(file_of(kind), UnreadablePhoto, "no picture brewster knows")
+def test_unknown_formats_are_refused(kind: str) -> None:
+    refused(file_of(kind), UnreadablePhoto, "no known image format")
 
 
 @pytest.mark.parametrize("kind", ["GIF", "WEBP", "PNG", "AVIF", "TIFF"])
@@ -141,8 +141,8 @@ def test_five_channels_and_more_are_refused(bands: int) -> None:
 
 
 @pytest.mark.parametrize("kind", [np.uint32, np.float64])
-def test_odd_number_types_are_refused(kind: type) -> None:
-    refused(tiff_of(np.zeros((4, 4, 3), kind)), PhotoError, "3 channels of|common kind")
+def test_unsupported_dtypes_are_refused(kind: type) -> None:
+    refused(tiff_of(np.zeros((4, 4, 3), kind)), PhotoError, "3 channels of|common variant")
 
 
 def test_raw_files_are_refused_instead_of_their_preview() -> None:
@@ -165,7 +165,7 @@ def test_hdr_video_colours_are_refused(transfer: int) -> None:
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("container", ["exr", "tiff"])
-def test_floats_that_are_no_light_are_refused(container: str, value: float) -> None:
+def test_floats_that_are_not_finite_are_refused(container: str, value: float) -> None:
     pixels = np.zeros((4, 4, 3), np.float32)
     whole = Photo.from_array(pixels, encoding="linear")
     broken = pixels.copy()
@@ -177,7 +177,7 @@ def test_floats_that_are_no_light_are_refused(container: str, value: float) -> N
         Photo.from_array(broken, encoding="linear")
 
 
-def test_an_exr_without_a_picture_is_refused() -> None:
+def test_an_exr_without_colour_channels_is_refused() -> None:
     exr = pytest.importorskip("OpenEXR")
     file = io.BytesIO()
     header = {"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
@@ -185,7 +185,7 @@ def test_an_exr_without_a_picture_is_refused() -> None:
     refused(file.getvalue(), UnsupportedPhoto, "channels Z")
 
 
-def test_a_radiance_picture_of_xyz_or_turned_lines_is_refused() -> None:
+def test_a_radiance_image_with_xyz_or_rotated_lines_is_refused() -> None:
     for head in (b"FORMAT=32-bit_rle_xyze\n\n-Y 1 +X 1\n", b"FORMAT=32-bit_rle_rgbe\n\n+Y 1 +X 1\n"):
         refused(b"#?RADIANCE\n" + head + bytes(4), UnsupportedPhoto, "RGBE")
 
@@ -193,13 +193,13 @@ def test_a_radiance_picture_of_xyz_or_turned_lines_is_refused() -> None:
 @pytest.mark.parametrize(("height", "width"), [(0, 8), (8, 0), (0, 0)])
 def test_a_radiance_picture_without_pixels_is_refused(height: int, width: int) -> None:
     head = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode()
-    refused(head, UnreadablePhoto, f"{width} x {height} pixels; a picture has at least one; ")
+    refused(head, UnreadablePhoto, f"{width} x {height} pixels; at least one pixel is needed; ")
 
 
 @pytest.mark.parametrize(
-    ("width", "word"), [("70000", "ends early"), ("999999999", "limit"), ("9" * 5000, "RGBE")]
+    ("width", "word"), [("70000", "is truncated"), ("999999999", "limit"), ("9" * 5000, "RGBE")]
 )
-def test_a_radiance_picture_that_promises_too_much_is_refused(width: str, word: str) -> None:
+def test_a_radiance_image_with_a_wrong_size_is_refused(width: str, word: str) -> None:
     refused(f"#?RADIANCE\n\n-Y 1 +X {width}\n".encode(), PhotoError, word)
 
 
@@ -208,7 +208,7 @@ def test_a_radiance_picture_that_promises_too_much_is_refused(width: str, word: 
     st.sampled_from(["JPEG", "PNG", "TIFF", "WEBP", "AVIF", "GIF"]),
     st.lists(st.tuples(st.integers(0, 400), st.integers(0, 255)), min_size=1, max_size=5),
 )
-def test_damaged_files_give_a_photo_or_an_error_of_ours(kind: str, damage: list[tuple[int, int]]) -> None:
+def test_damaged_files_give_a_photo_or_a_photo_error(kind: str, damage: list[tuple[int, int]]) -> None:
     data = bytearray(file_of(kind, NOISE[:16, :16]))
     for place, value in damage:
         data[place % len(data)] = value
@@ -243,7 +243,7 @@ def test_a_decompression_bomb_is_refused_from_its_header() -> None:
 
 
 @pytest.mark.parametrize("shape", [(4,), (4, 4, 2), (4, 4, 5), (0, 4, 3), (1, 4, 4, 3)])
-def test_arrays_that_are_no_pictures_are_refused(shape: tuple[int, ...]) -> None:
+def test_arrays_of_other_shapes_are_refused(shape: tuple[int, ...]) -> None:
     with pytest.raises(UnsupportedPhoto):
         Photo.from_array(np.zeros(shape, np.uint8), encoding="srgb")
 

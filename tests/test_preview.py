@@ -89,7 +89,7 @@ def test_a_large_photo_is_made_smaller_and_looks_like_its_large_separation(shipp
     assert maps.head["full"] == list(photo.size)
     assert maps.head["width"] * maps.head["height"] == pytest.approx(PREVIEW_PIXELS, rel=0.01)
     whole = shipped(photo, quality="draft").transmission
-    small = 255 * to_encoded(whole.small(maps.head["width"], maps.head["height"]).clip(0, 1))
+    small = 255 * to_encoded(whole.resized(maps.head["width"], maps.head["height"]).clip(0, 1))
     difference = np.abs(small - maps.at(1)[0])
     assert difference.mean() < 0.5
     assert np.quantile(difference, 0.99) < 3

@@ -269,7 +269,7 @@ def test_sizes_are_those_of_upright_pictures(tmp_path):
     ("role", "label"),
     [("blended", "photo"), ("transmission_layer", "truth"), ("reflection_layer", "reflection")],
 )
-@pytest.mark.parametrize(("bad", "why"), [(b"", "is empty"), (b"no picture", "no picture brewster knows")])
+@pytest.mark.parametrize(("bad", "why"), [(b"", "is empty"), (b"no picture", "no known image format")])
 def test_an_unreadable_picture_is_refused_by_name(tmp_path, role, label, bad, why):
     repacked(tmp_path, ["a", "b"], ("blended", "transmission_layer", "reflection_layer"))
     (tmp_path / role / "a.png").write_bytes(bad)

@@ -133,8 +133,8 @@ def test_a_hostile_name_gives_a_harmless_one(app, name):
     ("photo", "status", "sentence"),
     [
         (b"", 422, "empty"),
-        (b"hello", 422, "no picture"),
-        (SMALL[:60], 422, "cannot be read whole"),
+        (b"hello", 422, "no known image format"),
+        (SMALL[:60], 422, "cannot be read completely"),
         (file_of(np.zeros((40, 50, 4), np.uint8), "tiff"), 200, ""),
         (file_of(smooth(200, 300), "png"), 413, "pixels"),
     ],

@@ -18,7 +18,7 @@ PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
 
 
 def glass(tile):
-    """A pane that lets three quarters through."""
+    """Glass that transmits three quarters and reflects one quarter."""
     return tile * 0.75, tile * 0.25
 
 
@@ -40,7 +40,7 @@ def picture(height, width, channels=3, dtype=np.uint8, seed=1):
 @given(
     st.integers(1, 60), st.integers(1, 60), st.sampled_from([1, 3, 4]), st.sampled_from([np.uint8, np.uint16])
 )
-def test_what_the_backend_leaves_alone_comes_back_bit_equal(height, width, channels, dtype):
+def test_an_unchanged_photo_is_returned_bit_equal(height, width, channels, dtype):
     array = picture(height, width, channels, dtype)
     result = Separator(nothing)(Photo.from_array(array, encoding="srgb"))
     assert (result.transmission.pixels == result.photo.pixels).all()
@@ -49,7 +49,7 @@ def test_what_the_backend_leaves_alone_comes_back_bit_equal(height, width, chann
 
 
 @pytest.mark.parametrize("profile", ["srgb", "p3"])
-def test_strength_nought_returns_the_photo_and_no_reflection_whatever_the_profile(profile):
+def test_strength_zero_returns_the_photo_and_no_reflection_with_any_profile(profile):
     icc = bytes(pyvips.Image.profile_load(profile))
     photo = Photo(picture(300, 500), file_info=FileInfo(icc=icc))
     result = Separator(glass)(photo, strength=0)
@@ -58,7 +58,7 @@ def test_strength_nought_returns_the_photo_and_no_reflection_whatever_the_profil
     assert result.transmission.file_info.icc == icc
 
 
-def test_light_above_white_and_below_black_is_left_alone_too():
+def test_unchanged_light_above_white_and_below_black_is_kept():
     light = np.random.default_rng(3).normal(1, 4, (50, 80, 3)).astype(np.float32)
     result = Separator(nothing)(light, encoding="linear")
     assert (result.transmission.linear() == light).all()
@@ -76,7 +76,7 @@ def test_a_brighter_picture_is_separated_like_the_same_picture_darker():
     )
 
 
-def test_strength_goes_evenly_from_the_photo_to_the_whole_separation():
+def test_strength_is_linear_between_the_photo_and_the_full_separation():
     photo = Photo.from_array(np.full((40, 40, 3), 0.5, np.float32), encoding="linear")
     light = [Separator(glass)(photo, strength=share).transmission.linear().mean() for share in (0, 0.5, 1)]
     np.testing.assert_allclose(light, [0.5, 0.4375, 0.375], atol=0.003)
@@ -107,13 +107,13 @@ def test_additive_layers_sum_to_the_photo_to_the_last_bit(channels):
         np.testing.assert_allclose(result.transmission.alpha, photo.alpha / 255, atol=1e-6)
 
 
-def test_the_unexplained_remainder_is_reported():
+def test_the_residual_is_reported():
     photo = Photo.from_array(np.full((64, 64, 3), 0.4, np.float32), encoding="linear")
     result = Separator(lambda tile: (tile * 0.5, tile * 0.25))(photo)
     assert result.residual == pytest.approx(0.1, abs=0.005)
 
 
-def test_light_that_is_too_much_and_light_that_is_missing_do_not_cancel_in_the_remainder():
+def test_positive_and_negative_differences_do_not_cancel_in_the_residual():
     """Dark: 0.2 - 0.1 - 0.05 = 0.05 is missing. Bright: 0.6 - 0.3 - 0.45 = -0.15 is too much."""
     light = np.full((64, 64, 3), 0.2, np.float32)
     light[32:] = 0.6
@@ -133,19 +133,19 @@ def test_a_separation_is_doubtful_where_the_model_redraws_the_photo(reconstructi
     assert replace(separation, reconstruction_error=reconstruction_error).doubtful == doubtful
 
 
-def test_confidence_falls_where_the_two_views_disagree():
+def test_confidence_falls_where_the_flipped_prediction_disagrees():
     def sees_left_from_right(tile):
         half = tile.shape[1] // 2
-        answer = tile.copy()
-        answer[:, :half] *= 0.5
-        return answer, np.zeros_like(tile)
+        transmission = tile.copy()
+        transmission[:, :half] *= 0.5
+        return transmission, np.zeros_like(tile)
 
     grey = Photo.from_array(np.full((64, 64, 3), 128, np.uint8), encoding="srgb")
     assert Separator(nothing)(grey).confidence.pixels.min() == 255
     assert Separator(sees_left_from_right)(grey).confidence.pixels.max() < 50
 
 
-def test_a_mixture_comes_closer_to_what_is_behind_the_glass(separator):
+def test_the_transmission_of_a_mixture_is_closer_to_the_background(separator):
     """The mixture is 0.92 of the coffee picture plus a rocket: see tests/pictures/make.py."""
     data = pytest.importorskip("skimage.data")
     photo = Photo.open(next(path for path in PICTURES if "coffee" in path.name))
@@ -161,15 +161,15 @@ def test_tiled_and_untiled_agree(separator, monkeypatch):
 
 
 @pytest.mark.parametrize("path", PICTURES, ids=lambda path: path.stem)
-def test_every_kind_of_source_gives_the_same_answer(separator, path):
+def test_every_kind_of_source_gives_the_same_transmission(separator, path):
     image = pytest.importorskip("PIL.Image")
     sources = [path, str(path), path.read_bytes(), image.open(path), Photo.open(path)]
-    answers = [separator(source, quality="draft").transmission.pixels for source in sources]
-    for answer in answers:
-        assert (answer == answers[0]).all()
+    transmissions = [separator(source, quality="draft").transmission.pixels for source in sources]
+    for transmission in transmissions:
+        assert (transmission == transmissions[0]).all()
 
 
-def test_the_same_photo_gives_the_same_bytes_whatever_came_before(separator):
+def test_the_same_photo_gives_the_same_bytes_after_other_photos(separator):
     first = separator(PICTURES[0]).transmission.encode()
     separator(PICTURES[1])
     assert separator(PICTURES[0]).transmission.encode() == first
@@ -186,31 +186,31 @@ def test_options_out_of_range_are_refused(wrong):
         Separator(nothing)(Photo.from_array(picture(4, 4), encoding="srgb"), **wrong)
 
 
-def test_every_quality_works_and_more_quality_sees_more_pixels():
+def test_every_quality_works_and_higher_quality_uses_larger_inputs():
     assert list(QUALITIES) == ["draft", "standard", "best"]
-    seen = {}
+    largest = {}
     photo = Photo.from_array(picture(900, 1200), encoding="srgb")
     for quality in QUALITIES:
         sizes = []
         Separator(lambda tile, sizes=sizes: sizes.append(tile.size) or nothing(tile))(photo, quality=quality)
-        seen[quality] = max(sizes)
-    assert seen["draft"] < seen["standard"] < seen["best"]
+        largest[quality] = max(sizes)
+    assert largest["draft"] < largest["standard"] < largest["best"]
 
 
-def test_a_source_that_is_no_picture_is_refused():
+def test_a_source_that_is_no_image_is_refused():
     with pytest.raises(PhotoError):
         Separator(nothing)(b"hello")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("folder", ["nature", "real"])
-def test_the_shipped_model_beats_doing_nothing_on_the_development_pairs(separator, data, folder):
+def test_the_shipped_model_beats_the_unprocessed_input_on_the_development_pairs(separator, data, folder):
     gains = []
     for path in sorted((data / "real/dev" / folder / "blended").iterdir()):
         (partner,) = (data / "real/dev" / folder).glob(f"transmission*/{path.stem}.*")
         photo, truth = Photo.open(path), Photo.open(partner).pixels
-        answer = separator(photo).transmission.pixels
-        gains.append([metric(answer, truth) - metric(photo.pixels, truth) for metric in (psnr, ssim)])
+        transmission = separator(photo).transmission.pixels
+        gains.append([metric(transmission, truth) - metric(photo.pixels, truth) for metric in (psnr, ssim)])
     assert len(gains) == 10
     assert (np.mean(gains, axis=0) > [0.4, 0]).all()
 
@@ -223,23 +223,23 @@ def test_the_shipped_model_hardly_changes_photographs_without_glass(separator, d
 
 
 @pytest.mark.parametrize("quality", QUALITIES)
-def test_the_share_that_is_done_rises_to_one(quality):
-    told = []
+def test_progress_rises_to_one(quality):
+    progress = []
     Separator(glass)(
-        Photo.from_array(picture(600, 900), encoding="srgb"), quality=quality, on_progress=told.append
+        Photo.from_array(picture(600, 900), encoding="srgb"), quality=quality, on_progress=progress.append
     )
-    assert told == sorted(told)
-    assert (told[0], told[-1]) == (0, 1)
-    assert len(told) > 4
+    assert progress == sorted(progress)
+    assert (progress[0], progress[-1]) == (0, 1)
+    assert len(progress) > 4
 
 
-@pytest.mark.parametrize("patience", [1, 3, 6])
-def test_what_tell_raises_stops_the_work(patience):
-    told, tiles = [], []
+@pytest.mark.parametrize("calls_until_error", [1, 3, 6])
+def test_an_exception_in_on_progress_stops_the_work(calls_until_error):
+    progress, tiles = [], []
 
-    def give_up(share):
-        told.append(share)
-        if len(told) == patience:
+    def stop(share):
+        progress.append(share)
+        if len(progress) == calls_until_error:
             raise TimeoutError
 
     def counting(tile):
@@ -247,6 +247,6 @@ def test_what_tell_raises_stops_the_work(patience):
         return glass(tile)
 
     with pytest.raises(TimeoutError):
-        Separator(counting)(Photo.from_array(picture(600, 900), encoding="srgb"), on_progress=give_up)
-    assert len(told) == patience
-    assert len(tiles) <= patience
+        Separator(counting)(Photo.from_array(picture(600, 900), encoding="srgb"), on_progress=stop)
+    assert len(progress) == calls_until_error
+    assert len(tiles) <= calls_until_error

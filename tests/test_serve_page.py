@@ -252,7 +252,7 @@ def test_a_file_that_is_not_a_photo_shows_an_error_and_can_be_retried_or_removed
     page = open_page()
     upload(page, ("holiday.jpg", b"not a picture"), ("window.png", picture(90, 60, "png")))
     assert page.get_by_role("heading", name="holiday.jpg could not be separated").is_visible()
-    assert "no picture brewster knows" in page.get_by_role("alert").inner_text()
+    assert "no known image format" in page.get_by_role("alert").inner_text()
     assert page.get_by_role("button", name="Download transmission").is_disabled()
     assert page.get_by_role("button", name="Download all").is_enabled()
     page.get_by_role("button", name="Try again").click()

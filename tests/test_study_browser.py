@@ -119,7 +119,7 @@ def test_the_pictures_of_the_trial_are_shown_on_their_sides_and_have_names(open_
     for side in ("left", "photo", "right"):
         seen = Photo.open(page.locator(f".{side} .frame").screenshot()).linear()
         truth = Photo.open(store.study.picture_file(getattr(participant.trials[0], side)))
-        difference = np.abs(seen - truth.small(*seen.shape[1::-1]))
+        difference = np.abs(seen - truth.resized(*seen.shape[1::-1]))
         assert np.median(difference) < 0.002  # not the mean, because the browser smooths edges
     places = [page.locator(f".{side} .frame").bounding_box()["x"] for side in ("left", "photo", "right")]
     assert places == sorted(places)

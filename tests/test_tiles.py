@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brewster.inference.tiles import in_tiles, tiles_of
+from brewster.inference.tiles import run_tiled, tile_slices
 
 
 def halves(tile):
@@ -12,47 +12,47 @@ def halves(tile):
 
 
 @given(st.integers(1, 90), st.integers(1, 90), st.integers(9, 40), st.integers(1, 8))
-def test_a_backend_that_looks_at_single_pixels_cannot_tell_tiles(height, width, tile, overlap):
+def test_tiling_does_not_change_the_output_of_a_pointwise_backend(height, width, tile, overlap):
     picture = np.random.default_rng(height * width).random((height, width, 3), np.float32)
-    layers = in_tiles(halves, picture, tile_px=tile, overlap_px=overlap)
+    layers = run_tiled(halves, picture, tile_px=tile, overlap_px=overlap)
     for layer, whole in zip(layers, halves(picture), strict=True):
         np.testing.assert_allclose(layer, whole, rtol=1e-5)
 
 
-def test_no_tile_is_larger_than_asked():
+def test_no_tile_is_larger_than_requested():
     sizes = set()
 
     def spy(tile):
         sizes.add(tile.shape)
         return tile, tile
 
-    in_tiles(spy, np.zeros((70, 130, 3), np.float32), tile_px=50, overlap_px=10)
+    run_tiled(spy, np.zeros((70, 130, 3), np.float32), tile_px=50, overlap_px=10)
     assert sizes == {(50, 50, 3)}
 
 
 @given(st.integers(1, 400), st.integers(9, 60), st.integers(1, 8))
-def test_tiles_cover_the_picture_and_neighbours_share_the_overlap(side, tile, overlap):
-    rows = [vertical for vertical, _ in tiles_of((side, 1), tile_px=tile, overlap_px=overlap)]
+def test_tiles_cover_the_image_and_neighbours_overlap(side, tile, overlap):
+    rows = [vertical for vertical, _ in tile_slices((side, 1), tile_px=tile, overlap_px=overlap)]
     assert (rows[0].start, rows[-1].stop) == (0, side)
     assert all(row.stop - row.start == min(side, tile) for row in rows)
     assert all(first.stop - second.start >= overlap for first, second in itertools.pairwise(rows))
 
 
-def test_neighbouring_tiles_fade_into_each_other_without_a_seam():
+def test_neighbouring_tiles_are_blended_without_a_seam():
     seen = iter(range(100))
 
     def each_its_own_grey(tile):
         return np.full_like(tile, next(seen)), np.zeros_like(tile)
 
-    transmission, _ = in_tiles(
+    transmission, _ = run_tiled(
         each_its_own_grey, np.zeros((20, 100, 3), np.float32), tile_px=40, overlap_px=20
     )
     assert np.abs(np.diff(transmission[0, :, 0])).max() < 0.1
 
 
-def test_a_picture_that_fits_goes_in_whole():
+def test_an_image_no_larger_than_a_tile_is_not_tiled():
     calls = []
-    in_tiles(
+    run_tiled(
         lambda tile: calls.append(tile) or (tile, tile),
         np.zeros((40, 40, 3), np.float32),
         tile_px=40,

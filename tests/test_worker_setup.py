@@ -1,15 +1,15 @@
-"""What processes owe to each other; that workers end with their parent is tested with those who have workers."""
+"""Thread limits of workers; that workers exit with their parent is tested with the packages that start them."""
 
 import contextlib
 
 import torch
 
-from brewster.worker_setup import one_thread
+from brewster.worker_setup import single_torch_thread
 
 
 def test_torch_has_one_thread_inside_and_as_many_as_before_afterwards():
     torch.set_num_threads(2)
-    with contextlib.suppress(ZeroDivisionError), one_thread():
+    with contextlib.suppress(ZeroDivisionError), single_torch_thread():
         inside = torch.get_num_threads()
         raise ZeroDivisionError
     after = torch.get_num_threads()

@@ -1,10 +1,10 @@
-"""Separates a photograph taken through glass into what is behind the glass and what is mirrored in it.
+"""Separates a photo taken through glass into transmission (behind the glass) and reflection (in the glass).
 
     import brewster
 
     brewster.separate("window.jpg").transmission.save("clear.jpg")
 
-Names are looked up when they are first used, so `import brewster` wakes neither pyvips nor ONNX Runtime.
+Public names are imported on first use, so `import brewster` loads neither pyvips nor ONNX Runtime.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from brewster.photo import Photo
 
     __version__: str
-else:  # a type checker would take any name, even a misspelt one, for what __getattr__ returns
+else:  # hidden from type checkers: with a module-level __getattr__ they accept misspelt names
 
     def __getattr__(name: str) -> object:
-        """Names are looked up when they are first used."""
-        if name in _HOMES:
-            return getattr(importlib.import_module(_HOMES[name]), name)
+        """Imports a public name on first use."""
+        if name in _MODULES:
+            return getattr(importlib.import_module(_MODULES[name]), name)
         if name == "__version__":
             return _version()
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
@@ -32,7 +32,7 @@ else:  # a type checker would take any name, even a misspelt one, for what __get
 
 __all__ = ["Photo", "Separation", "Separator", "__version__", "errors", "separate"]
 
-_HOMES = {
+_MODULES = {
     "Photo": "brewster.photo",
     "Separation": "brewster.inference",
     "Separator": "brewster.inference",
@@ -45,7 +45,7 @@ def __dir__() -> list[str]:
 
 
 def _version() -> str:
-    from importlib import metadata  # noqa: PLC0415  (slow to import, seldom asked for)
+    from importlib import metadata  # noqa: PLC0415  (slow to import, rarely needed)
 
     try:
         return metadata.version("brewster")

@@ -1,4 +1,4 @@
-"""`python -m brewster` is `brewster`."""
+"""Makes `python -m brewster` run the command line."""
 
 import sys
 

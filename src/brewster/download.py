@@ -1,8 +1,8 @@
-"""Fetches files over a line that may break: patiently, from http and https only, and checked against a sum.
+"""Downloads files from http and https, with retries, resume, and a checksum.
 
-    Line().fetch(Promise(url, size=244408911, algorithm="sha256", digest="7be5..."), Path("alexnet.pth"))
+    Downloader().fetch(RemoteFile(url, size=244408911, algorithm="sha256", digest="7be5..."), Path("alexnet.pth"))
 
-What was begun lies beside its target as `.part`, and the next call goes on from there.
+A partial download is kept next to the target as `.part`. The next call resumes it.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from urllib.error import HTTPError
 
 from brewster.errors import DownloadError, TargetError
 
-_BUSY = (408, 425, 429, 500, 502, 503, 504)
-_LONGEST_WAIT_S = 120.0
-_BLOCK = 1 << 18
-_WEB = "http:// or https://"
+_RETRYABLE_STATUS = (408, 425, 429, 500, 502, 503, 504)
+_MAX_RETRY_AFTER_S = 120.0
+_BLOCK_BYTES = 1 << 18
+_HTTP_URL = "http:// or https://"
 
 _T = TypeVar("_T")
 
 
 class RemoteFile(NamedTuple):
-    """A file as its server, or we, promise it; the digest is in lower-case hexadecimal digits."""
+    """A file to download: its address, size in bytes, and expected digest in lower-case hexadecimal."""
 
     url: str
     size: int
@@ -42,135 +42,148 @@ class RemoteFile(NamedTuple):
 
 @final
 class _RetryableError(Exception):
-    """The line broke, or the server asks for patience: worth another attempt, after so many seconds."""
+    """A failure that another attempt may fix: a lost connection or a busy server. `wait_s`: seconds to wait first."""
 
-    def __init__(self, why: object, wait_s: float = 0.0) -> None:
-        super().__init__(str(why) or type(why).__name__)
+    def __init__(self, reason: object, wait_s: float = 0.0) -> None:
+        super().__init__(str(reason) or type(reason).__name__)
         self.wait_s = wait_s
 
 
 @final
 @dataclass(frozen=True)
 class Downloader:
-    """How to ask: the pauses between attempts, how long silence is borne, and how to wait."""
+    """Downloads over http and https with retries.
 
-    pauses_s: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0)
+    Attributes:
+        retry_delays_s: the seconds before each further attempt; one attempt more than delays is made.
+        timeout_s: the longest time without data, in seconds.
+        sleep: called with the seconds to wait; tests replace it.
+    """
+
+    retry_delays_s: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0)
     timeout_s: float = 30.0
     sleep: Callable[[float], object] = time.sleep
 
     def read(self, url: str) -> bytes:
-        """All that an address answers.
+        """Returns the body of a response.
 
         Raises:
-            DownloadError: the address is none, the server refuses, or cannot be reached in all attempts.
+            DownloadError: the URL is invalid, the server refuses it, or all attempts fail.
         """
 
         def attempt() -> bytes:
             with self._open(url) as response:
                 return _read(response)
 
-        return self._patiently(url, attempt)
+        return self._with_retries(url, attempt)
 
-    def fetch(self, promise: RemoteFile, target: Path) -> None:
-        """Downloads a file, making its folder; the target has its name only when it is whole and right.
+    def fetch(self, remote: RemoteFile, target: Path) -> None:
+        """Downloads a file and creates its folder. The target appears only after its checksum is verified.
 
         Raises:
-            DownloadError: the file cannot be had, or is not what was promised.
+            DownloadError: all attempts fail, or the digest differs from the expected one.
             TargetError: the folder cannot be written.
         """
         part = target.with_name(f"{target.name}.part")
-        with explained(target):
+        with target_errors(target):
             target.parent.mkdir(parents=True, exist_ok=True)
-            self._patiently(promise.url, lambda: self._fetch_rest(promise, part))
-            if (came := digest_of(part, promise.algorithm)) != promise.digest:
+            self._with_retries(remote.url, lambda: self._fetch_rest(remote, part))
+            if (digest := file_digest(part, remote.algorithm)) != remote.digest:
                 part.unlink()
-                happened = (
-                    f"{promise.url} came with the {promise.algorithm.upper()} sum {came}, and was dropped"
-                )
-                cure = "run again, to fetch all of it anew"
-                raise DownloadError(happened, f"{promise.digest} was promised", cure)
+                happened = f"{remote.url} was downloaded with the {remote.algorithm.upper()} digest {digest}, and was deleted"
+                cure = "run again to download the whole file"
+                raise DownloadError(happened, f"the digest {remote.digest} was expected", cure)
             part.replace(target)
 
-    def _patiently(self, url: str, attempt: Callable[[], _T]) -> _T:
-        pauses = iter(self.pauses_s)
+    def _with_retries(self, url: str, attempt: Callable[[], _T]) -> _T:
+        delays = iter(self.retry_delays_s)
         while True:
             try:
                 return attempt()
-            except _RetryableError as lost:
-                if (pause := next(pauses, None)) is None:
-                    happened = f"{url} did not come in {len(self.pauses_s) + 1} attempts ({lost})"
-                    cure = "check the connection, or run again later: what came is kept"
+            except _RetryableError as error:
+                if (delay := next(delays, None)) is None:
+                    happened = (
+                        f"{url} could not be downloaded in {len(self.retry_delays_s) + 1} attempts ({error})"
+                    )
+                    cure = "check the connection, or run again later: the partial download is kept"
                     raise DownloadError(
-                        happened, "a server that answers, and a line that holds", cure
-                    ) from lost
-                self.sleep(max(pause, lost.wait_s))
+                        happened, "a server that responds and a stable connection", cure
+                    ) from error
+                self.sleep(max(delay, error.wait_s))
 
     def _open(self, url: str, start: int = 0) -> HTTPResponse:
-        """The answer, from this byte on if the server can do that."""
-        headers = {"User-Agent": _agent()} | ({"Range": f"bytes={start}-"} if start else {})
+        """Returns the open response, from byte `start` on where the server supports ranges."""
+        headers = {"User-Agent": _user_agent()} | ({"Range": f"bytes={start}-"} if start else {})
         try:
-            asked = request.Request(url, headers=headers)  # noqa: S310  (the opener knows http and https only)
-            answer = _opener().open(asked, timeout=self.timeout_s)
+            query = request.Request(url, headers=headers)  # noqa: S310  (the opener supports http and https only)
+            response = _opener().open(query, timeout=self.timeout_s)
         except HTTPError as error:
             error.close()
-            if error.code in _BUSY:
-                wait = error.headers.get("Retry-After", "")
+            if error.code in _RETRYABLE_STATUS:
+                retry_after = error.headers.get("Retry-After", "")
                 raise _RetryableError(
-                    error, min(float(wait), _LONGEST_WAIT_S) if wait.isdecimal() else 0
+                    error, min(float(retry_after), _MAX_RETRY_AFTER_S) if retry_after.isdecimal() else 0
                 ) from error
-            raise DownloadError(f"{url} was refused ({error})", "a file", "run again later") from error
+            raise DownloadError(f"the server refused {url} ({error})", "a file", "run again later") from error
         except (ValueError, InvalidURL) as error:
-            raise DownloadError(f"{url!r} is no address ({error})", _WEB, "check the address") from error
+            raise DownloadError(
+                f"{url!r} is not a valid URL ({error})", _HTTP_URL, "check the address"
+            ) from error
         except (OSError, HTTPException) as error:
             raise _RetryableError(error) from error
-        if answer is None:
-            raise DownloadError(f"{url!r} leads elsewhere", _WEB, "check the address")
-        return cast("HTTPResponse", answer)
+        if response is None:
+            raise DownloadError(
+                f"{url!r} is not, or redirects to a URL that is not, http(s)", _HTTP_URL, "check the address"
+            )
+        return cast("HTTPResponse", response)
 
-    def _fetch_rest(self, promise: RemoteFile, part: Path) -> None:
-        came = part.stat().st_size if part.exists() else 0
-        if came == promise.size:
+    def _fetch_rest(self, remote: RemoteFile, part: Path) -> None:
+        partial_bytes = part.stat().st_size if part.exists() else 0
+        if partial_bytes == remote.size:
             return
-        start = came if came < promise.size else 0
-        with self._open(promise.url, start) as response:
-            there = start if response.status == 206 else 0  # a server may ignore from where we asked
-            with part.open("ab" if there else "wb") as file:
-                while block := _read(response, min(_BLOCK, promise.size - there)):
-                    there += file.write(block)
+        start = partial_bytes if partial_bytes < remote.size else 0
+        with self._open(remote.url, start) as response:
+            received = start if response.status == 206 else 0  # 206: the server honours the range
+            with part.open("ab" if received else "wb") as file:
+                while block := _read(response, min(_BLOCK_BYTES, remote.size - received)):
+                    received += file.write(block)
                 file.flush()
                 os.fsync(file.fileno())
-        if there < promise.size:
-            raise _RetryableError(f"it ended after {there} of {promise.size} bytes")
+        if received < remote.size:
+            raise _RetryableError(f"the response ended after {received} of {remote.size} bytes")
 
 
-def digest_of(path: Path, algorithm: str) -> str:
-    """The sum of a file's bytes, in lower-case hexadecimal digits."""
+def file_digest(path: Path, algorithm: str) -> str:
+    """Returns the digest of a file's bytes in lower-case hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, lambda: hashlib.new(algorithm, usedforsecurity=False)).hexdigest()
 
 
 @contextmanager
-def explained(path: Path) -> Iterator[None]:
-    """Turns what a disk says about a file that is fetched into a TargetError."""
+def target_errors(path: Path) -> Iterator[None]:
+    """Turns an OSError about a downloaded file into a TargetError."""
     try:
         yield
     except OSError as error:
         happened = f"{path} cannot be read or written ({error.strerror or error})"
-        cure = "free some space or name another folder, and run again: it goes on from there"
-        raise TargetError(happened, "a folder of yours on a disk with room", cure) from error
+        cure = "free some space or name another folder, and run again: the download is resumed"
+        raise TargetError(happened, "a writable folder on a disk with free space", cure) from error
 
 
-def _read(response: HTTPResponse, most: int | None = None) -> bytes:
-    """All of it, or what has come of the next so many bytes: none of them is lost with the line."""
+def _read(response: HTTPResponse, max_bytes: int | None = None) -> bytes:
+    """Returns the whole body, or up to `max_bytes` of what has arrived.
+
+    `read1` returns what is there already, so that a lost connection loses none of the received bytes.
+    """
     try:
-        return response.read() if most is None else response.read1(most)
+        return response.read() if max_bytes is None else response.read1(max_bytes)
     except (OSError, HTTPException) as error:
         raise _RetryableError(error) from error
 
 
 @functools.cache
 def _opener() -> request.OpenerDirector:
-    """Opens http and https only, also where a server redirects to; for all else it has no answer."""
+    """An opener for http and https only, redirects included; for other schemes `open` returns None."""
     opener = request.OpenerDirector()
     for handler in (
         request.ProxyHandler,
@@ -185,8 +198,8 @@ def _opener() -> request.OpenerDirector:
 
 
 @functools.cache
-def _agent() -> str:
-    """Poly Haven asks that programs name themselves, and others may like it."""
+def _user_agent() -> str:
+    """The User-Agent header; Poly Haven requires that programs identify themselves."""
     try:
         version = metadata.version("brewster")
     except metadata.PackageNotFoundError:

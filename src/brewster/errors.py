@@ -1,16 +1,16 @@
-"""Every error brewster raises on purpose, in one tree.
+"""All exceptions that brewster raises for expected failures.
 
-    BrewsterError              exit code 1 on the command line, one sentence, no traceback
-    |-- PhotoError             a picture cannot be read, understood or written
-    |   |-- UnreadablePhoto    not a picture, empty, truncated
-    |   |-- UnsupportedPhoto   a picture, but of a kind we refuse (five channels, animation, NaN)
-    |   `-- PhotoTooLarge      beyond the stated pixel limit
-    |-- TargetError            the place to write to: exists, read-only, full, equal to the source
+    BrewsterError              exit code 1 on the command line, one sentence without a traceback
+    |-- PhotoError             an image cannot be read, interpreted or written
+    |   |-- UnreadablePhoto    not an image, empty, truncated
+    |   |-- UnsupportedPhoto   an image of an unsupported kind (five channels, animation, NaN)
+    |   `-- PhotoTooLarge      more pixels than the limit
+    |-- TargetError            the target exists, is read-only or the source, or the disk is full
     |-- ModelError             unknown model, damaged file, wrong inputs
-    |-- DeviceError            the asked device is not there
-    |-- RecipeError            a TOML recipe that does not say what it must
-    |-- DownloadError          a server cannot be reached, or did not send what it promised
-    `-- MissingExtra           an optional part is not installed
+    |-- DeviceError            the requested device is not available
+    |-- RecipeError            a recipe is not TOML, or its values are invalid
+    |-- DownloadError          a server cannot be reached, or its file has the wrong digest
+    `-- MissingExtra           an optional dependency is not installed
 
 Messages have three parts: what happened (with the value), what was expected, what to do.
 """
@@ -19,7 +19,7 @@ from __future__ import annotations
 
 
 class BrewsterError(Exception):
-    """Anything brewster can explain; the message is one sentence in three parts.
+    """Base class of all brewster errors; the message is one sentence in three parts.
 
     Attributes:
         happened: what happened, with the value.
@@ -35,24 +35,24 @@ class BrewsterError(Exception):
         return f"{self.happened}; {self.expected}; {self.cure}{'' if self.cure.endswith('?') else '.'}"
 
     def __reduce__(self) -> tuple[type[BrewsterError], tuple[str, str, str]]:
-        """Errors are sent between processes; the attributes count, as a caller may have changed them."""
+        """Pickles the attributes, not `args`: callers may have changed them before the error crosses processes."""
         return type(self), (self.happened, self.expected, self.cure)
 
 
 class PhotoError(BrewsterError):
-    """A picture cannot be read, understood or written."""
+    """An image cannot be read, interpreted or written."""
 
 
 class UnreadablePhoto(PhotoError):
-    """The bytes are not a whole picture: empty, truncated, or something else entirely."""
+    """The bytes are not a complete image: empty, truncated, or another kind of file."""
 
 
 class UnsupportedPhoto(PhotoError):
-    """A picture of a kind that brewster refuses: five channels, an animation, NaN."""
+    """An image of an unsupported kind, such as five channels, an animation, or NaN values."""
 
 
 class PhotoTooLarge(PhotoError):
-    """The picture has more pixels than the stated limit."""
+    """The image has more pixels than the limit."""
 
 
 class TargetError(BrewsterError):
@@ -60,20 +60,20 @@ class TargetError(BrewsterError):
 
 
 class ModelError(BrewsterError):
-    """A model is unknown, damaged or not one of ours."""
+    """A model is unknown, damaged, or has the wrong inputs and outputs."""
 
 
 class DeviceError(BrewsterError):
-    """The asked device is not available to the installed runtime."""
+    """The requested device is not available to the installed runtime."""
 
 
 class RecipeError(BrewsterError):
-    """A recipe is not TOML, or its values are missing, unknown or impossible."""
+    """A recipe is not TOML, or its values are missing, unknown or out of range."""
 
 
 class DownloadError(BrewsterError):
-    """A server cannot be reached, refuses, or did not send what it promised."""
+    """A server cannot be reached, refuses a request, or sends a file with the wrong digest."""
 
 
 class MissingExtra(BrewsterError):
-    """An optional part of brewster is needed and not installed."""
+    """An optional dependency is needed and not installed."""

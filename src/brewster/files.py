@@ -1,6 +1,6 @@
-"""Find pictures and write results safely: which files, under which names, never half, never over another.
+"""Finds input images and writes results atomically, without overwriting other files.
 
-for job in find([Path("holiday")], into=Path("clear")):
+for job in find([Path("holiday")], output_folder=Path("clear")):
     write_atomically(job.target("transmission"), data, source=job.source)
 """
 
@@ -20,142 +20,128 @@ from pathlib import Path
 import platformdirs
 
 from brewster.errors import TargetError
-
-SUFFIXES = {
-    ".jpg": "jpeg",
-    ".jpeg": "jpeg",
-    ".jpe": "jpeg",
-    ".jfif": "jpeg",
-    ".png": "png",
-    ".tif": "tiff",
-    ".tiff": "tiff",
-    ".webp": "webp",
-    ".avif": "avif",
-    ".heic": "heic",
-    ".heif": "heic",
-    ".exr": "exr",
-    ".hdr": "hdr",
-    ".gif": "gif",
-}
-"""What a file name promises to be: lower-case suffix -> container."""
+from brewster.image_formats import format_of
 
 DEFAULT_MAX_PIXELS = 200_000_000
-"""Larger pictures are refused before they are decoded: a small file can hold an enormous one."""
+"""Larger images are refused before they are decoded: a small compressed file can expand to a very large image."""
 
-HIDDEN = ".brewster-"
-"""What the names of files begin with that are not whole yet."""
+TEMPORARY_PREFIX = ".brewster-"
+"""File name prefix of files that are still being written."""
 
 LAYERS = ("transmission", "reflection", "confidence")
-_ALWAYS_PNG = ("confidence",)  # a grey map, not a photograph: no container of the source would suit it better
+_PNG_LAYERS = ("confidence",)  # a grey map, not a photo: the format of the source does not matter
 
 
 @dataclass(frozen=True)
 class SeparationPaths:
-    """One picture to separate, and where its layers go: `folder/name.layer.suffix`."""
+    """An image to separate and the paths of its layers: `folder/name.layer.suffix`."""
 
     source: Path
     folder: Path
     name: str
 
     def target(self, layer: str, suffix: str | None = None) -> Path:
-        """The file for a layer: the source's suffix unless one is given; PNG where that cannot be written."""
-        own = self.source.suffix
-        writable = SUFFIXES.get(own.lower(), "gif") != "gif" and layer not in _ALWAYS_PNG
-        return self.folder / f"{self.name}.{layer}{suffix or (own if writable else '.png')}"
+        """Returns the path of a layer: with `suffix`, else that of the source, or .png if brewster does not write it."""
+        image_format = format_of(self.source)
+        is_kept = image_format is not None and image_format.is_writable and layer not in _PNG_LAYERS
+        return self.folder / f"{self.name}.{layer}{suffix or (self.source.suffix if is_kept else '.png')}"
 
 
-def find(sources: Iterable[Path], into: Path | None = None) -> list[SeparationPaths]:
-    """Every picture in the files and folders given, each once, in a stable order.
+def find(sources: Iterable[Path], output_folder: Path | None = None) -> list[SeparationPaths]:
+    """Lists the images in files and folders, each once, in a stable order.
 
-    Layers go beside their picture, or under `into`, where the tree below a folder is mirrored. They are
-    called by the picture's stem, or by its full name where a neighbour could want the same: `a.jpg` gives
-    `a`; with `a.png` beside it, `a.jpg` and `a.png`. That depends on the pictures in the folder only, not on
-    what was asked for or done.
+    Layers are written next to their image, or below `output_folder`, which mirrors the tree of each input folder.
+    Their name begins with the stem of the image, or with its full name if another image in the folder has the same
+    stem: `a.jpg` gives `a`; `a.jpg` and `a.png` in one folder give `a.jpg` and `a.png`. The name depends only on the
+    images in the folder, not on which of them are selected or already separated.
 
-    In folders, hidden files, files that are no pictures by name, and brewster's own results are passed over;
-    a real folder is visited once, so link loops end. A file given by name is always taken: opening it will
-    say what is wrong.
+    In folders, hidden files, files without an image suffix, and brewster's own results are skipped. A folder that
+    is reached through several links is visited once, so that link loops end. A file given by name is always listed:
+    opening it reports what is wrong.
 
-    Raises TargetError when two pictures would be written under one name.
+    Raises:
+        TargetError: two images would be written under one name.
     """
     jobs: dict[str, SeparationPaths] = {}
-    wanted: dict[Path, Counter[str]] = {}
+    counts: dict[Path, Counter[str]] = {}
     for source in sources:
-        for picture in _pictures(source):
-            beside = picture.parent
-            if beside not in wanted:
-                wanted[beside] = _wanted_names(beside)
-            inside = Path() if picture == source else beside.relative_to(source)
-            folder = beside if into is None else into / inside
-            job = SeparationPaths(picture, folder, _layer_name(picture, wanted[beside]))
-            jobs.setdefault(_place(picture), job)
-    _refuse_shared_names(jobs.values())
+        for image in _image_files(source):
+            parent = image.parent
+            if parent not in counts:
+                counts[parent] = _name_counts(parent)
+            subfolder = Path() if image == source else parent.relative_to(source)
+            folder = parent if output_folder is None else output_folder / subfolder
+            job = SeparationPaths(image, folder, _layer_name(image, counts[parent]))
+            jobs.setdefault(_absolute(image), job)
+    _check_unique_targets(jobs.values())
     return list(jobs.values())
 
 
 def write_atomically(path: Path, data: bytes, *, overwrite: bool = False, source: Path | None = None) -> None:
-    """Write a file whole or not at all, making its folder where needed.
+    """Writes a file atomically and creates its folder where needed.
 
-    The bytes go to a hidden file in the same folder, reach the disk, and only then take the name, so that
-    neither a full disk nor Ctrl-C leaves half a picture. Raises TargetError if the target exists and
-    `overwrite` is off, is the `source`, or cannot be written.
+    The bytes are written to a hidden file in the same folder and flushed to the disk; then the file is renamed. So
+    neither a full disk nor Ctrl-C leaves a partial file.
+
+    Raises:
+        TargetError: the file exists and `overwrite` is off, is the `source`, or cannot be written.
     """
-    _refuse_source(path, source)
+    _check_not_source(path, source)
     try:
-        with _part_of(path) as part:
+        with _temporary(path) as part:
             path.parent.mkdir(parents=True, exist_ok=True)
-            _refuse_taken(path, overwrite)
-            _write_through(part, data)
-            _take_name(part, path, overwrite)
+            _check_writable(path, overwrite)
+            _write_synced(part, data)
+            _publish(part, path, overwrite)
     except OSError as error:
         raise _target_error(path, error) from error
 
 
 @contextlib.contextmanager
-def arriving(place: Path) -> Iterator[Path]:
-    """A hidden path beside a file or folder that takes its name once it is whole and on the disk.
+def atomic_path(path: Path) -> Iterator[Path]:
+    """Yields a hidden path for a new file or folder; it is renamed to `path` at the end of the block.
 
-    It replaces a file; a folder that another process has put there meanwhile stays.
+    It replaces an existing file. A folder that another process has created meanwhile is kept.
 
     Raises:
-        TargetError: it cannot be written; the disk may be full.
+        TargetError: it cannot be written, for example because the disk is full.
     """
     try:
-        with _part_of(place) as part:
-            place.parent.mkdir(parents=True, exist_ok=True)
+        with _temporary(path) as part:
+            path.parent.mkdir(parents=True, exist_ok=True)
             yield part
             _sync(part)
-            _replace(place, part)
-            _sync(place.parent)
+            _replace(path, part)
+            _sync(path.parent)
     except OSError as error:
         raise TargetError(
-            f"{place} was not written ({error.strerror or error})",
-            "it needs its place on the disk",
-            "mend that (free some space, or name another folder) and run again: what is finished is kept",
+            f"{path} was not written ({error.strerror or error})",
+            "a writable folder on a disk with free space",
+            "free some space or name another folder, and run again: finished files are kept",
         ) from error
 
 
 @contextlib.contextmanager
-def _part_of(place: Path) -> Iterator[Path]:
-    """A hidden path beside a place, where nothing is left afterwards."""
-    part = hidden_beside(place)
+def _temporary(path: Path) -> Iterator[Path]:
+    """Yields a hidden path in the folder of `path` and deletes it afterwards."""
+    part = temporary_path(path)
     try:
         try:
             yield part
         finally:
             discard(part)
-    except KeyboardInterrupt:  # it may have come between the name's taking and the part's removal
+    except KeyboardInterrupt:  # it may have come after the rename and before the file was discarded
         discard(part)
         raise
 
 
-def hidden_beside(place: Path) -> Path:
-    """A new hidden name in the folder of a place, for what is not whole yet or not wanted any more."""
-    return place.parent / f"{HIDDEN}{secrets.token_hex(8)}.part"
+def temporary_path(path: Path) -> Path:
+    """Returns a new hidden path in the folder of `path`, for files being written or deleted."""
+    return path.parent / f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}.part"
 
 
 def discard(path: Path) -> None:
-    """Removes a file, or a folder with all in it, as far as that can be done."""
+    """Deletes a file, or a folder with its content; ignores errors."""
     with contextlib.suppress(OSError):
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
@@ -163,9 +149,9 @@ def discard(path: Path) -> None:
             path.unlink()
 
 
-def _replace(place: Path, part: Path) -> None:
+def _replace(path: Path, part: Path) -> None:
     try:
-        part.replace(place)
+        part.replace(path)
     except OSError as error:
         if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
             raise
@@ -173,37 +159,39 @@ def _replace(place: Path, part: Path) -> None:
 
 def _sync(path: Path) -> None:
     is_folder = path.is_dir()
-    if is_folder and sys.platform == "win32":  # a folder cannot be opened there
+    if is_folder and sys.platform == "win32":  # Windows cannot open a folder
         return
-    file = os.open(path, os.O_RDONLY if is_folder else os.O_RDWR)  # Windows syncs what it may write
+    file = os.open(
+        path, os.O_RDONLY if is_folder else os.O_RDWR
+    )  # Windows syncs only files opened for writing
     try:
         os.fsync(file)
     finally:
         os.close(file)
 
 
-def _pictures(source: Path) -> Iterator[Path]:
+def _image_files(source: Path) -> Iterator[Path]:
     if _is_folder(source):
-        yield from walk(source, _is_wanted)
+        yield from walk(source, _is_input)
     else:
         yield source
 
 
-def walk(folder: Path, is_wanted: Callable[[Path], bool]) -> Iterator[Path]:
-    """The files in a folder and below that are wanted, in a stable order, hidden folders passed over.
+def walk(folder: Path, is_included: Callable[[Path], bool]) -> Iterator[Path]:
+    """Lists the files below a folder that `is_included` accepts, in a stable order, without hidden folders.
 
-    Links are followed, and a real folder is visited once, so that loops end. A folder that cannot be looked into is
-    given itself.
+    Links are followed. Each folder is visited once, so that link loops end. A folder that cannot be read is yielded
+    itself.
     """
-    return _walk(folder, is_wanted, set())
+    return _walk(folder, is_included, set())
 
 
-def _walk(folder: Path, is_wanted: Callable[[Path], bool], seen: set[tuple[int, int]]) -> Iterator[Path]:
+def _walk(folder: Path, is_included: Callable[[Path], bool], seen: set[tuple[int, int]]) -> Iterator[Path]:
     try:
         entries = sorted(folder.iterdir())
         status = folder.stat()
     except OSError:
-        yield folder  # opening it will say why, and the rest of the batch goes on
+        yield folder  # opening it reports the reason, and the rest of the batch continues
         return
     if (status.st_dev, status.st_ino) in seen:
         return
@@ -211,62 +199,62 @@ def _walk(folder: Path, is_wanted: Callable[[Path], bool], seen: set[tuple[int, 
     for entry in entries:
         if _is_folder(entry):
             if not entry.name.startswith("."):
-                yield from _walk(entry, is_wanted, seen)
-        elif is_wanted(entry):
+                yield from _walk(entry, is_included, seen)
+        elif is_included(entry):
             yield entry
 
 
-def _place(path: Path) -> str:
-    """A path in one spelling, links as they are: two links to one file are two pictures."""
+def _absolute(path: Path) -> str:
+    """Returns the absolute path with links unresolved: two links to one file are two images."""
     return os.path.abspath(path)  # noqa: PTH100
 
 
 def _is_folder(path: Path) -> bool:
-    return os.path.isdir(path)  # noqa: PTH112  (Path.is_dir raises where we may not look)
+    return os.path.isdir(path)  # noqa: PTH112  (Path.is_dir raises without permission)
 
 
-def _wanted_names(folder: Path) -> Counter[str]:
-    """How often the pictures of a folder claim a name: each once by its stem and once in full."""
+def _name_counts(folder: Path) -> Counter[str]:
+    """Counts the stems and the full names of the images in a folder."""
     try:
-        pictures = [path for path in folder.iterdir() if _is_wanted(path)]
+        images = [path for path in folder.iterdir() if _is_input(path)]
     except OSError:
         return Counter()
-    return Counter(name for path in pictures for name in (path.stem, path.name))
+    return Counter(name for path in images for name in (path.stem, path.name))
 
 
-def _layer_name(picture: Path, wanted: Counter[str]) -> str:
-    others = wanted[picture.stem] - _is_wanted(picture)
-    return picture.name if others > 0 else picture.stem
+def _layer_name(image: Path, counts: Counter[str]) -> str:
+    others = counts[image.stem] - _is_input(image)
+    return image.name if others > 0 else image.stem
 
 
-def _is_wanted(path: Path) -> bool:
-    """Whether a file found in a folder is a picture by name, not hidden, and not one of our own results."""
-    ours = Path(path.stem).suffix.lstrip(".") in LAYERS
-    return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and not ours
+def _is_input(path: Path) -> bool:
+    """Whether a file in a folder has an image suffix, is not hidden, and is not a result of brewster."""
+    is_result = Path(path.stem).suffix.lstrip(".") in LAYERS
+    return format_of(path) is not None and not path.name.startswith(".") and not is_result
 
 
-def _refuse_shared_names(jobs: Iterable[SeparationPaths]) -> None:
+def _check_unique_targets(jobs: Iterable[SeparationPaths]) -> None:
     owners: dict[str, SeparationPaths] = {}
     for job in jobs:
         name = job.folder / job.name
-        other = owners.setdefault(_place(name), job)
+        other = owners.setdefault(_absolute(name), job)
         if other is not job:
             raise TargetError(
                 f"{other.source} and {job.source} would both be written as {name}.*",
-                "every picture needs a name of its own",
-                "give the folder above them, whose tree is mirrored, or run them into different folders",
+                "each image needs its own output name",
+                "name their parent folder, whose tree is mirrored, or use different output folders",
             )
 
 
-def _refuse_source(path: Path, source: Path | None) -> None:
-    with contextlib.suppress(OSError):  # a source or target that is not there is not the same file
+def _check_not_source(path: Path, source: Path | None) -> None:
+    with contextlib.suppress(OSError):  # a file that does not exist is not the same file
         if source is not None and path.samefile(source):
             raise TargetError(
-                f"{path} is the picture itself", "sources are never touched", "choose another name"
+                f"{path} is the input image itself", "input files are never changed", "choose another name"
             )
 
 
-def _refuse_taken(path: Path, overwrite: bool) -> None:
+def _check_writable(path: Path, overwrite: bool) -> None:
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     if path.exists() and not overwrite:
@@ -275,46 +263,48 @@ def _refuse_taken(path: Path, overwrite: bool) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
 
-def _write_through(path: Path, data: bytes) -> None:
+def _write_synced(path: Path, data: bytes) -> None:
     with path.open("xb") as file:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
 
 
-def _take_name(part: Path, path: Path, overwrite: bool) -> None:
+def _publish(part: Path, path: Path, overwrite: bool) -> None:
     if overwrite:
         part.replace(path)
         return
     try:
-        os.link(part, path)  # unlike a rename, a link never replaces what somebody else wrote meanwhile
+        os.link(
+            part, path
+        )  # unlike a rename, a link never replaces a file that another process wrote meanwhile
     except OSError as error:
         if error.errno not in (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK):
             raise
-        part.replace(path)  # a file system without links (FAT): _refuse_taken has looked just before
+        part.replace(path)  # a file system without links (FAT); _check_writable has just checked
 
 
-_CURES = {
+_REMEDIES = {
     errno.EEXIST: (
-        "nothing is overwritten unasked",
-        "pass --overwrite (in Python overwrite=True) or choose another place",
+        "existing files are not overwritten",
+        "pass --overwrite (in Python overwrite=True) or choose another name or folder",
     ),
     errno.EISDIR: ("the target must be a file", "name a file in it, or use -o for a folder"),
-    errno.ENOSPC: ("the whole file must fit on the disk", "free some space and run again"),
-    errno.EDQUOT: ("the whole file must fit in the quota", "free some space and run again"),
-    errno.EACCES: ("the place must be writable", "choose another place with -o, or change its permissions"),
-    errno.EPERM: ("the place must be writable", "choose another place with -o, or change its permissions"),
-    errno.EROFS: ("the place must be writable", "choose another place with -o"),
-    errno.ENAMETOOLONG: ("the name must be shorter", "rename the picture"),
+    errno.ENOSPC: ("the file must fit on the disk", "free some space and run again"),
+    errno.EDQUOT: ("the file must fit in the quota", "free some space and run again"),
+    errno.EACCES: ("the folder must be writable", "choose another folder with -o, or change its permissions"),
+    errno.EPERM: ("the folder must be writable", "choose another folder with -o, or change its permissions"),
+    errno.EROFS: ("the folder must be writable", "choose another folder with -o"),
+    errno.ENAMETOOLONG: ("the name must be shorter", "rename the image"),
 }
-_OTHERWISE = ("the file must be writable", "choose another place with -o")
+_DEFAULT_REMEDY = ("the file must be writable", "choose another folder with -o")
 
 
 def _target_error(path: Path, error: OSError) -> TargetError:
-    expected, cure = _CURES.get(error.errno or 0, _OTHERWISE)
+    expected, cure = _REMEDIES.get(error.errno or 0, _DEFAULT_REMEDY)
     return TargetError(f"{path} was not written ({error.strerror or error})", expected, cure)
 
 
 def cache_folder() -> Path:
-    """Where downloads are kept: brewster's part of the user's cache folder, as each operating system has it."""
+    """Returns the folder for downloads, in the cache folder of the user and operating system."""
     return platformdirs.user_cache_path("brewster", appauthor=False)

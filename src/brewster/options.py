@@ -1,39 +1,35 @@
-"""What can be asked of a separation, written once: the command line, its help and a web form are made from it.
+"""The options of a separation: type, default, limits and meaning of each, written once.
 
-The metadata of each field are keywords of `pydantic.Field`, so that `pydantic.TypeAdapter(Options)` gives an
-HTTP API its checks and its JSON schema, while `brewster --help` needs no pydantic.
+The command line, its help and the web form are made from `Options`; the Python API takes its defaults and its
+documentation from it. The metadata of each field are keywords of `pydantic.Field`, so that
+`pydantic.TypeAdapter(Options)` gives an HTTP API its validation and JSON schema, while `brewster --help` needs no
+pydantic.
 """
 
 from __future__ import annotations
 
+import inspect
+import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, TypedDict, final
+from typing import Any, Final, Literal, TypeVar, final
 
 from brewster.errors import BrewsterError
-from brewster.files import DEFAULT_MAX_PIXELS, SUFFIXES
+from brewster.files import DEFAULT_MAX_PIXELS
+from brewster.image_formats import FORMATS, FormatName, format_of
 
 Layer = Literal["transmission", "reflection", "confidence"]
 Quality = Literal["draft", "standard", "best"]
-Container = Literal["jpeg", "png", "tiff", "webp", "avif", "heic", "exr", "hdr"]
 Device = Literal["auto", "cuda", "rocm", "directml", "coreml", "cpu"]
 
 Quantisation = Literal["int8", "float8", "nf4"]
-"""How a large base is stored that would not fit as it is: 8 bits by torchao, 4 by bitsandbytes."""
+"""How the weights of a large base model are stored to save memory: 8 bits by torchao, 4 bits by bitsandbytes."""
 
+DIFFUSION_OPTIONS: Final = ("base", "quantise", "steps", "average", "plain")
+"""The options of diffusion models only."""
 
-class DiffusionOptions(TypedDict, total=False):
-    """What can be asked of large image models alone; see `Options` for what each is."""
-
-    base: str | None
-    quantise: Quantisation | None
-    steps: int | None
-    average: int
-    plain: bool
-
-
-_FLOAT_CONTAINERS = ("tiff", "exr")
-_SUFFIXES = {"jpeg": ".jpg"}  # the others are the container's name
+_Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def _about(description: str, **limits: int) -> dict[str, Any]:
@@ -43,21 +39,27 @@ def _about(description: str, **limits: int) -> dict[str, Any]:
 @final
 @dataclass(frozen=True)
 class Options:
-    """What can be asked of a separation."""
+    """The options of a separation.
+
+    Raises:
+        BrewsterError: `additive` with a format that stores no 32-bit floats.
+    """
 
     layers: tuple[Layer, ...] = field(
         default=("transmission", "reflection"),
-        metadata=_about("The layers to write, with commas between: transmission, reflection, confidence."),
+        metadata=_about("The layers to write, separated by commas: transmission, reflection, confidence."),
     )
     strength: float = field(
         default=1.0,
         metadata=_about(
-            "How much to separate, from 0 (the photo as it is) to 1 (the whole separation).", ge=0, le=1
+            "How much of the separation to apply, from 0 (the unchanged photo) to 1 (the full separation).",
+            ge=0,
+            le=1,
         ),
     )
     quality: Quality = field(
         default="standard",
-        metadata=_about("How closely the network looks: draft is fastest, best is slowest."),
+        metadata=_about("Number and size of the input scales: draft is fastest, best is slowest."),
     )
     additive: bool = field(
         default=False,
@@ -65,9 +67,9 @@ class Options:
             "Write layers that sum to the photo exactly: 32-bit floats in linear light, TIFF or EXR."
         ),
     )
-    format: Container | None = field(
+    format: FormatName | None = field(
         default=None,
-        metadata=_about("Write transmission and reflection in this container instead of the photo's own."),
+        metadata=_about("The file format of transmission and reflection, if not that of the photo."),
     )
     model: str = field(
         default="compact",
@@ -77,68 +79,84 @@ class Options:
     )
     device: Device = field(
         default="auto",
-        metadata=_about("Where the network runs; auto takes the fastest device that is there."),
+        metadata=_about("The device that runs the model; auto selects the fastest one available."),
     )
     base: str | None = field(
         default=None,
         metadata=_about(
-            "Of a LoRA: the folder or hub id of its base, if that lies not where it was trained."
+            "For a LoRA: the folder or hub id of its base model, if it has moved since training."
         ),
     )
     quantise: Quantisation | None = field(
         default=None,
-        metadata=_about("Of large models: store the weights in 8 or 4 bits, as small cards need it."),
+        metadata=_about(
+            "For diffusion models: store the weights in 8 or 4 bits, for GPUs with little memory."
+        ),
     )
     steps: int | None = field(
         default=None,
         metadata=_about(
-            "Of large models: steps for each look, 20 if not said otherwise, and 4 for a draft.", ge=1
+            "For diffusion models: sampling steps for each prediction, by default 20, and 4 for a draft.",
+            ge=1,
         ),
     )
     average: int = field(
         default=1,
-        metadata=_about("Of large models: how many answers are averaged.", ge=1),
+        metadata=_about("For diffusion models: the number of predictions that are averaged.", ge=1),
     )
     plain: bool = field(
         default=False,
         metadata=_about(
-            "Of large models: the transmission as it is drawn, enlarged, without the photo's own detail."
+            "For diffusion models: the transmission as it is generated, enlarged, without the photo's detail."
         ),
     )
     max_pixels: int = field(
         default=DEFAULT_MAX_PIXELS,
-        metadata=_about("Refuse photos of more pixels than this, before decoding them.", ge=1),
+        metadata=_about("Refuse photos with more pixels than this, before they are decoded.", ge=1),
     )
 
     def __post_init__(self) -> None:
-        """Refuses values that do not go together."""
-        if self.additive and self.format not in (None, *_FLOAT_CONTAINERS):
+        """Refuses combinations of values that are not possible."""
+        if self.additive and self.format and not FORMATS[self.format].has_float32:
             raise BrewsterError(
-                f"additive layers were asked for as {self.format}",
+                f"additive layers were requested as {self.format}",
                 "their 32-bit floats fit only into TIFF and EXR",
                 "choose format tiff or exr, or leave additive out",
             )
 
-    def load(self) -> dict[str, Any]:
-        """The keywords for loading a `Separator`."""
-        large = {name: getattr(self, name) for name in DiffusionOptions.__annotations__}
-        asked = {name: value for name, value in large.items() if value != getattr(Options, name)}
-        return {"model": self.model, "device": self.device, **asked}
+    def load_options(self) -> dict[str, Any]:
+        """Returns the keywords for `Separator.load`."""
+        names = ("model", "device", *DIFFUSION_OPTIONS)
+        return {name: getattr(self, name) for name in names}
 
-    def call(self) -> dict[str, Any]:
-        """The keywords for calling a `Separator`."""
+    def call_options(self) -> dict[str, Any]:
+        """Returns the keywords for calling a `Separator`."""
         return {name: getattr(self, name) for name in ("strength", "quality", "additive", "max_pixels")}
 
     def container(self, layer: str, own: str) -> str:
-        """The container of a layer of a photo whose own container is `own`; confidence is always PNG."""
+        """Returns the format of a layer of a photo whose own format is `own`; confidence is always PNG."""
         if layer == "confidence":
             return "png"
-        if self.additive and own not in _FLOAT_CONTAINERS:
+        if self.additive and not (own in FORMATS and FORMATS[own].has_float32):
             own = "tiff"
         return self.format or own
 
     def suffix(self, layer: str, source: Path) -> str | None:
-        """The suffix of a layer's file; None where it is the source's."""
-        own = SUFFIXES.get(source.suffix.lower(), "")
+        """Returns the suffix of a layer's file; None if it is that of the source."""
+        image_format = format_of(source)
+        own = image_format.name if image_format else ""
         container = self.container(layer, own)
-        return None if container == own else _SUFFIXES.get(container, f".{container}")
+        return None if container == own else FORMATS[container].suffixes[0]
+
+
+def document_options(function: _Function) -> _Function:
+    """Appends the parameters that are fields of `Options` to the `Args:` section of a docstring."""
+    fields, docstring = Options.__dataclass_fields__, inspect.getdoc(function) or ""
+    rows = [
+        f"    {name}: {fields[name].metadata['description']}"
+        for name in inspect.signature(function).parameters
+        if name in fields
+    ]
+    section = re.compile(r"^Args:\n(?: +.*\n)*", re.MULTILINE)
+    function.__doc__ = section.sub(lambda found: found[0] + "\n".join([*rows, ""]), docstring, count=1)
+    return function

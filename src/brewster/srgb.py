@@ -1,7 +1,7 @@
-"""The sRGB transfer curve, for numpy arrays and torch tensors alike.
+"""The sRGB transfer function (IEC 61966-2-1) for numpy arrays and torch tensors.
 
-Everything in brewster is linear light unless its name ends in `_encoded`. The curve is IEC 61966-2-1,
-extended past 1 by its own formula and below 0 by its straight part, so that it stays invertible.
+All arrays in brewster are linear light unless their name ends in `_encoded`. Values above 1 follow the power
+segment and values below 0 the linear segment, so that the function stays invertible.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ REC709_LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
 def to_linear(encoded: Array) -> Array:
-    """sRGB-encoded values to linear light, any shape; 1.0 stays 1.0 (IEC 61966-2-1)."""
+    """Converts sRGB-encoded values of any shape to linear light; 1.0 maps to 1.0."""
     dark = encoded <= 0.04045
-    safe = encoded * ~dark + dark  # 1 where the straight part rules: no NaN, no infinite gradient
+    safe = encoded * ~dark + dark  # 1 on the linear segment: the power gives no NaN and no infinite gradient
     linear: Array = encoded / 12.92 * dark + ((safe + 0.055) / 1.055) ** 2.4 * ~dark
     return linear
 
 
 def to_encoded(linear: Array) -> Array:
-    """Linear light to sRGB-encoded values, any shape; 1.0 stays 1.0 (IEC 61966-2-1)."""
+    """Converts linear light of any shape to sRGB-encoded values; 1.0 maps to 1.0."""
     dark = linear <= 0.0031308
     safe = linear * ~dark + dark
     encoded: Array = linear * 12.92 * dark + (1.055 * safe ** (1 / 2.4) - 0.055) * ~dark

@@ -1,4 +1,4 @@
-"""What processes that share work owe to each other: sums in one order, and an end when their parent ends."""
+"""Set-up of worker processes: reproducible sums, and no orphans when the parent process ends."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from multiprocessing import parent_process
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """Torch with one thread: it sums in another order with more, so that results would depend on the machine."""
-    import torch  # noqa: PLC0415  (only where it is used anyway)
+def single_torch_thread() -> Iterator[None]:
+    """Limits torch to one thread: the order of sums, and so the result, depends on the number of threads."""
+    import torch  # noqa: PLC0415  (only where torch is loaded anyway)
 
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -22,8 +22,8 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def end_with_parent() -> None:
-    """From now on this process ends when its parent does, however that ends: nobody works on for a run that is gone."""
+def exit_with_parent() -> None:
+    """Makes this process exit when its parent process ends, also when the parent is killed."""
     threading.Thread(target=_wait_for_parent, daemon=True).start()
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final, final
 
 from brewster.errors import PhotoError
-from brewster.files import SUFFIXES
+from brewster.image_formats import SUFFIXES
 
 ROLES: Final[dict[str, tuple[str, ...]]] = {
     "photo": ("blended", "blend", "input", "mixture", "mixed", "photo", "with_reflection", "i"),

@@ -28,7 +28,8 @@ from brewster.cli.terminal import (
     write_out,
 )
 from brewster.errors import BrewsterError, PhotoError, TargetError
-from brewster.files import SUFFIXES, find, write_atomically
+from brewster.files import find, write_atomically
+from brewster.image_formats import SUFFIXES, ImageFormat, format_of
 from brewster.options import Options
 
 if TYPE_CHECKING:
@@ -111,19 +112,20 @@ def _plan_one(photos: Sequence[str], output: str | None, options: Options) -> Ba
     target = None
     if output not in (None, "-"):
         target = Path(output)
-        _refuse_container(SUFFIXES.get(target.suffix.lower()), options)
+        _refuse_format(format_of(target), options)
     source = None if photos[0] == "-" else Path(photos[0])
     return BatchItem(source, {options.layers[0]: target})
 
 
-def _refuse_container(container: str | None, options: Options) -> None:
-    """A picture named with -o has its container; --format and --additive may not ask for another."""
-    if container is None:
+def _refuse_format(image_format: ImageFormat | None, options: Options) -> None:
+    """The suffix of a picture named with -o sets its format; --format and --additive must agree with it."""
+    if image_format is None:
         raise click.UsageError("With standard input, -o names a picture (such as clear.jpg), or is left out.")
-    if container == "gif":
-        raise click.UsageError("brewster writes no GIF.")
-    if options.layers != ("confidence",) and options.container(options.layers[0], container) != container:
-        raise click.UsageError(f"-o names a {container} picture, but --format or --additive ask for another.")
+    name = image_format.name
+    if not image_format.is_writable:
+        raise click.UsageError(f"brewster writes no {name.upper()}.")
+    if options.layers != ("confidence",) and options.container(options.layers[0], name) != name:
+        raise click.UsageError(f"-o names a {name} picture, but --format or --additive ask for another.")
 
 
 def _names_a_picture(output: str | None) -> bool:
@@ -179,7 +181,7 @@ class SeparationBatch:
     def _separator(self) -> Separator:
         from brewster.inference import Separator  # noqa: PLC0415  (wakes ONNX Runtime and pyvips)
 
-        return Separator.load(**self.options.load())
+        return Separator.load(**self.options.load_options())
 
     def _do(self, task: BatchItem, bugs: list[Exception]) -> BatchResult:
         entry = BatchResult(task.name)
@@ -234,13 +236,14 @@ class SeparationBatch:
 
     def _separate(self, source: Path | None, targets: dict[str, Path | None], entry: BatchResult) -> None:
         photo = source or sys.stdin.buffer.read()
-        separation = self._separator(photo, on_progress=self._show_progress, **self.options.call())
+        separation = self._separator(photo, on_progress=self._show_progress, **self.options.call_options())
         entry.seconds, entry.residual = dict(separation.seconds), separation.residual
         entry.reconstruction_error, entry.doubtful = separation.reconstruction_error, separation.doubtful
         started = time.perf_counter()
         for layer, target in targets.items():
             own = separation.photo.file_info.container
-            container = SUFFIXES[target.suffix.lower()] if target else self.options.container(layer, own)
+            stated = format_of(target) if target else None
+            container = stated.name if stated else self.options.container(layer, own)
             data = getattr(separation, layer).encode(container)
             interrupts.heed()
             if target is None:

@@ -18,10 +18,10 @@ from brewster.cli.extras import CORE, EXTRAS
 from brewster.cli.models import describe
 from brewster.cli.terminal import print_out
 from brewster.errors import BrewsterError, MissingExtra
+from brewster.image_formats import FORMATS, WRITABLE
 from brewster.models import zoo
 
 _OLDEST: Final = (3, 11)
-_OPTIONAL_FORMATS: Final = {"exr": "exr", "heic": "heic"}
 _GIF: Final = bytes.fromhex(
     "47494638396101000100800000ffffff00000021f90401000000002c00000000010001000002024401003b"
 )
@@ -127,11 +127,11 @@ def _devices() -> Iterator[Check]:
 def _formats() -> Iterator[Check]:
     """Writes and reads a small picture in each container."""
     try:
-        from brewster.photo import DEPTHS  # noqa: PLC0415  (wakes pyvips)
+        importlib.import_module("brewster.photo")  # wakes pyvips
     except (ImportError, OSError) as error:
         yield Check("formats", "formats", "broken", str(error), "mend the packages above")
         return
-    for container in DEPTHS:
+    for container in WRITABLE:
         yield _try_format(container, "reads and writes", lambda name=container: _sample(name))  # type: ignore[misc]
     yield _try_format("gif", "reads", lambda: _GIF)
 
@@ -148,7 +148,7 @@ def _sample(container: str) -> bytes:
 def _try_format(container: str, verbs: str, sample: Callable[[], bytes]) -> Check:
     from brewster.photo import Photo  # noqa: PLC0415  (wakes pyvips)
 
-    extra = _OPTIONAL_FORMATS.get(container)
+    extra = FORMATS[container].extra
     try:
         Photo.open(sample())
     except MissingExtra as error:

@@ -10,12 +10,11 @@ from pathlib import Path
 
 from brewster.environments.assets import BUILTIN_HEIGHT, check_map, naming, read_bytes
 from brewster.errors import BrewsterError, RecipeError
-from brewster.files import SUFFIXES
+from brewster.image_formats import format_of
 from brewster.photo import Photo, read_size
 from brewster.scene.sampler import Asset, Catalog
 from brewster.scene.world import BUILTIN, AssetSource
 
-_MAP_KINDS = ("exr", "hdr")
 _WORLD_COUNT = 8
 _PAINTING_COUNT = 64
 _CATEGORIES = {"street": "outdoor", "room": "indoor", "night": "night"}
@@ -102,8 +101,8 @@ def _files(folder: Path, are_maps: bool) -> Iterator[Path]:
             f"{folder} cannot be read ({error.strerror})", "a folder of files", "name another folder"
         ) from error
     for path in entries:
-        kind = SUFFIXES.get(path.suffix.lower())
-        if kind and not path.name.startswith(".") and (kind in _MAP_KINDS) == are_maps:
+        image_format = format_of(path)
+        if image_format and not path.name.startswith(".") and image_format.is_linear == are_maps:
             yield path
 
 

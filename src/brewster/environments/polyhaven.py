@@ -18,7 +18,7 @@ from pathlib import Path
 from time import sleep
 from typing import Literal, NamedTuple, final
 
-from brewster.download import Downloader, RemoteFile, digest_of, explained
+from brewster.download import Downloader, RemoteFile, file_digest, target_errors
 from brewster.errors import DownloadError, TargetError
 from brewster.files import cache_folder, write_atomically
 
@@ -185,9 +185,9 @@ def _line() -> Downloader:
 
 
 def _is_there(target: Path, promise: RemoteFile) -> bool:
-    with explained(target):
+    with target_errors(target):
         there = target.exists()
-        if there and digest_of(target, promise.algorithm) != promise.digest:
+        if there and file_digest(target, promise.algorithm) != promise.digest:
             expected, cure = f"one with the MD5 sum {promise.digest}", "move it away, and run again"
             raise DownloadError(f"{target} is there, and is not the server's file", expected, cure)
     return there
@@ -196,7 +196,7 @@ def _is_there(target: Path, promise: RemoteFile) -> bool:
 def _read_manifest(out: Path) -> list[dict[str, str]]:
     """The rows for the maps that are still there."""
     path = out / "manifest.csv"
-    with explained(path):
+    with target_errors(path):
         text = path.read_text("utf-8", errors="replace") if path.exists() else ",".join(_COLUMNS)
         rows = csv.DictReader(io.StringIO(text, newline=""))
         if tuple(rows.fieldnames or ()) != _COLUMNS:

@@ -21,7 +21,8 @@ import numpy as np
 
 from brewster.benchmarks.registry import Case
 from brewster.errors import BrewsterError, PhotoError
-from brewster.files import SUFFIXES, walk, write_atomically
+from brewster.files import walk, write_atomically
+from brewster.image_formats import SUFFIXES
 from brewster.inference import Separator
 from brewster.models.zoo import find_model, is_large
 from brewster.options import Device, Quality

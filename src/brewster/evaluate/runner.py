@@ -24,7 +24,7 @@ from brewster.errors import BrewsterError, TargetError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import Method, MethodOutput, check_names
 from brewster.evaluate.scoring import CaseFiles, GroundTruth, Scorer
-from brewster.worker_setup import end_with_parent, one_thread
+from brewster.worker_setup import exit_with_parent, single_torch_thread
 
 SCORES: Final = "scores.jsonl"
 SCORE_FORMAT: Final = 2
@@ -281,7 +281,7 @@ def _run_tasks(
     Each process computes metrics with one thread, so that the scores do not depend on the number of workers.
     """
     if workers == 1:
-        with one_thread():
+        with single_torch_thread():
             for task in tasks:
                 on_rows(_score_case(task, state))
         return
@@ -317,12 +317,12 @@ def _initialize_worker(state: _WorkerState) -> None:
     signal.signal(
         signal.SIGINT, signal.SIG_IGN
     )  # only the parent handles Ctrl-C: it lets running cases finish
-    end_with_parent()
+    exit_with_parent()
     _worker_state.append(state)
 
 
 def _score_case_in_worker(task: _ScoringTask) -> list[ScoreRow]:
-    with one_thread():
+    with single_torch_thread():
         return _score_case(task, _worker_state[0])
 
 

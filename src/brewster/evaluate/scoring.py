@@ -168,7 +168,7 @@ def downscale(photo: Photo, shorter: int | None) -> Photo:
     if shorter is None or min(photo.size) <= shorter:
         return photo
     width, height = (round(side * shorter / min(photo.size)) for side in photo.size)
-    small = Photo.from_array(photo.small(width, height), encoding="linear")
+    small = Photo.from_array(photo.resized(width, height), encoding="linear")
     return Photo.from_array(small.srgb_8bit(), encoding="srgb")
 
 

@@ -1,4 +1,4 @@
-"""Inference: a photo in, transmission and reflection out. Loads neither the renderer nor the trainer."""
+"""Inference: separates a photo into transmission and reflection. Imports neither the renderer nor the trainer."""
 
 from brewster.inference.predictor import QUALITIES
 from brewster.inference.separator import Separation, Separator, separate

@@ -1,8 +1,8 @@
-"""How a large image model looks at a photo: it draws the panels anew, and only what it changes is believed.
+"""Predicts layers with a diffusion model, which generates them as panels of one image.
 
-A generated picture drifts from the photo in its colours and in its detail. Where the model draws the photo, too (the
-panel I), it drifts there alike, so that the change is taken between its own panels, T - I, and detail.py lays it over
-the real photo. How far its photo is from the real one is the reconstruction_error, of which nobody should be unaware.
+Generated panels differ from the photo in colour and detail. If the model also generates the photo (panel I), that
+panel has the same errors. So the change is computed between generated panels, T - I, and guided_upsampling.py applies
+it to the real photo. The difference between the generated and the real photo is the reconstruction error.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from brewster.errors import ModelError
 from brewster.inference.guided_upsampling import Floats, GeneratedOverride, enlarge_rows
 from brewster.inference.predictor import Prediction, Predictor, ProgressCallback, confidence_from_spread
-from brewster.inference.tiles import in_tiles, tiles_of
+from brewster.inference.tiles import run_tiled, tile_slices
 from brewster.models.diffusion.panels import PanelFit
 from brewster.models.diffusion.pipeline import DecompositionPipeline
 from brewster.models.diffusion.sampling import STEPS
@@ -28,132 +28,143 @@ from brewster.options import Quality
 from brewster.srgb import to_encoded, to_linear
 
 _DRAFT_STEPS: Final = 4
-_CLOSER: Final = 2
-"""How much larger a side of the second copy of a close look is; it is seen in tiles of a panel each."""
-_WORTH_IT: Final = 1.25
-"""A copy that is less than so much larger shows nothing new."""
+_FINE_SCALE: Final = 2
+"""The scale of the second input of quality "best" relative to the first, per side; its tiles have the size of a panel."""
+_MIN_FINE_SCALE: Final = 1.25
+"""A second input with a smaller scale than this adds no detail and is left out."""
 
 
 @final
 class DiffusionPredictor(Predictor):
-    """Looks through a `DecompositionPipeline`: at the whole photo in one panel, and for "best" also closer, panel by panel.
+    """Runs a `DecompositionPipeline` on the whole photo in one panel, and for "best" also on larger tiles.
 
     Args:
-        decomposer: the model.
-        steps: how many steps each look takes; by default the paper's 20, and 4 for "draft".
-        average: how many answers, from as many seeds, are averaged: what the model merely made up averages out.
-        plain: gives the transmission as the model draws it, enlarged, without the photo's own detail.
+        pipeline: the model.
+        steps: sampling steps for each prediction; by default 20 as in the paper, and 4 for "draft".
+        average: the number of predictions, each from its own seed, that are averaged to reduce generated detail.
+        plain: returns the transmission as it is generated, enlarged, without the detail of the photo.
 
     Raises:
-        ModelError: no step, or nothing to average.
+        ModelError: `steps` or `average` is below 1, or set for a one-step model.
     """
 
     def __init__(
         self,
-        decomposer: DecompositionPipeline,
+        pipeline: DecompositionPipeline,
         *,
         steps: int | None = None,
         average: int = 1,
         plain: bool = False,
     ) -> None:
         if (steps is not None and steps < 1) or average < 1:
-            raise ModelError(f"steps = {steps}, average = {average}", "at least 1 of each", "raise them")
-        if decomposer.task.objective == "one_step" and (steps not in (None, 1) or average > 1):
             raise ModelError(
-                f"steps = {steps}, average = {average} were asked of a model that answers in one step",
-                "there is one step and one answer",
+                f"steps = {steps}, average = {average}", "both must be at least 1", "set them to 1 or more"
+            )
+        if pipeline.task.objective == "one_step" and (steps not in (None, 1) or average > 1):
+            raise ModelError(
+                f"steps = {steps}, average = {average} were set for a one-step model",
+                "its prediction takes one step and is deterministic",
                 "leave them out",
             )
-        self._decomposer, self._plain = decomposer, plain
+        self._pipeline, self._plain = pipeline, plain
         self._steps, self._seeds = steps, range(average)
-        self._one_at_a_time = Lock()
+        self._lock = Lock()
 
-    def sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
-        """As large as a panel, and for "best" twice that, as far as the photo is.
+    def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
+        """Returns the size of a panel, and for "best" also up to twice that size, but not more than the photo.
 
         Raises:
             PhotoError: the photo has fewer than 16 pixels a side, or is too long and thin.
         """
-        task, multiple = self._decomposer.task, self._decomposer.backbone.multiple
-        whole = task.fit(size, multiple).content
-        scale = min(_CLOSER, size[0] / whole[0])
-        if quality != "best" or scale < _WORTH_IT:
-            return [whole]
-        return [whole, (round(scale * whole[0]), round(scale * whole[1]))]
+        task, multiple = self._pipeline.task, self._pipeline.backbone.multiple
+        coarse = task.fit(size, multiple).content
+        scale = min(_FINE_SCALE, size[0] / coarse[0])
+        if quality != "best" or scale < _MIN_FINE_SCALE:
+            return [coarse]
+        return [coarse, (round(scale * coarse[0]), round(scale * coarse[1]))]
 
     def __call__(
-        self, copies: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
+        self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
     ) -> Prediction:
-        """The mean of the looks; the reconstruction_error is that of the look at the whole."""
-        size = copies[-1].shape[:2]
-        sides = [max(copies[0].shape), *(self._tile_px for _ in copies[1:])]
+        """Returns the mean over the inputs; the reconstruction error is that of the first input, the whole photo."""
+        size = inputs[-1].shape[:2]
+        sides = [max(inputs[0].shape), *(self._tile_px for _ in inputs[1:])]
         tiles = [
-            len(tiles_of(copy.shape[:2], **_cut(side))) for copy, side in zip(copies, sides, strict=True)
+            len(tile_slices(scaled_input.shape[:2], **_tiling(side)))
+            for scaled_input, side in zip(inputs, sides, strict=True)
         ]
         steps = self._steps or (_DRAFT_STEPS if quality == "draft" else STEPS)
-        count = _ProgressCounter(on_progress, sum(tiles))
-        looks = []
-        with self._one_at_a_time:  # two at once would need twice the memory of the card
-            for copy, side in zip(copies, sides, strict=True):
-                looks.append(in_tiles(lambda tile: self._answer(tile, steps, count), copy, **_cut(side)))
-        change, reflection, drawn, apart, reconstruction_error = (
+        progress = _ProgressCounter(on_progress, sum(tiles))
+        predictions = []
+        with self._lock:  # two at once would need twice the memory of the GPU
+            for scaled_input, side in zip(inputs, sides, strict=True):
+                predictions.append(
+                    run_tiled(
+                        lambda tile: self._predict_tile(tile, steps, progress), scaled_input, **_tiling(side)
+                    )
+                )
+        change, reflection, generated, spread, reconstruction_error = (
             np.mean([enlarge_rows(map_, 0, size[0], size) for map_ in maps], axis=0)
-            for maps in zip(*looks, strict=True)
+            for maps in zip(*predictions, strict=True)
         )
-        redrawn, strayed = None, None
+        override, mean_error = None, None
         if self._plain:
-            redrawn = GeneratedOverride(drawn, np.ones_like(drawn[..., :1]))
-        elif self._redraws:
-            redrawn = GeneratedOverride.where_mirrored(drawn, reflection)
-        if self._redraws:
-            strayed = float(looks[0][-1].mean())
-        sure = confidence_from_spread(apart + reconstruction_error)
+            override = GeneratedOverride(generated, np.ones_like(generated[..., :1]))
+        elif self._reconstructs_input:
+            override = GeneratedOverride.weighted_by_detail(generated, reflection)
+        if self._reconstructs_input:
+            mean_error = float(predictions[0][-1].mean())
+        confidence = confidence_from_spread(spread + reconstruction_error)
         return Prediction(
-            change, reflection, sure if self._can_tell else np.zeros_like(sure), redrawn, strayed
+            change,
+            reflection,
+            confidence if self._has_confidence else np.zeros_like(confidence),
+            override,
+            mean_error,
         )
 
     @property
-    def _redraws(self) -> bool:
-        return bool({"I", "R"} & set(self._decomposer.task.layout.panels))
+    def _reconstructs_input(self) -> bool:
+        return bool({"I", "R"} & set(self._pipeline.task.layout.panels))
 
     @property
-    def _can_tell(self) -> bool:
-        """Whether anything shows how sure the model is: a photo that it draws, or other answers."""
-        return self._redraws or (len(self._seeds) > 1 and self._decomposer.task.objective == "flow")
+    def _has_confidence(self) -> bool:
+        """Whether a confidence can be computed: from a reconstruction of the photo, or from several samples."""
+        return self._reconstructs_input or (len(self._seeds) > 1 and self._pipeline.task.objective == "flow")
 
     @property
     def _tile_px(self) -> int:
-        """The side of a square panel."""
-        task, multiple = self._decomposer.task, self._decomposer.backbone.multiple
+        """The side of a square panel in pixels."""
+        task, multiple = self._pipeline.task, self._pipeline.backbone.multiple
         return max(1, math.isqrt(task.budget_px // len(task.layout.panels)) // multiple) * multiple
 
-    def _answer(self, tile: Floats, steps: int, count: _ProgressCounter) -> tuple[Floats, ...]:
-        """Change, reflection and transmission, linear; how far the answers are apart and their photo strays, encoded."""
+    def _predict_tile(self, tile: Floats, steps: int, progress: _ProgressCounter) -> tuple[Floats, ...]:
+        """Returns change, reflection and transmission (linear light), spread of the samples and reconstruction error (encoded)."""
         height, width, _ = tile.shape
-        fit = PanelFit((width, height), _up((width, height), self._decomposer.backbone.multiple))
-        shown = torch.from_numpy(2 * to_encoded(tile) - 1).permute(2, 0, 1)[None]
-        panels = self._decomposer(
-            fit.pad(shown), steps=steps, seeds=self._seeds, on_progress=count.within_tile
+        fit = PanelFit((width, height), _round_up((width, height), self._pipeline.backbone.multiple))
+        panel_input = torch.from_numpy(2 * to_encoded(tile) - 1).permute(2, 0, 1)[None]
+        panels = self._pipeline(
+            fit.pad(panel_input), steps=steps, seeds=self._seeds, on_progress=progress.within_tile
         )
-        count.tile_done()
-        _refuse_broken(panels)
-        light = {name: _light(fit.crop(panel)) for name, panel in panels.items()}
+        progress.tile_done()
+        _check_finite(panels)
+        light = {name: _to_light(fit.crop(panel)) for name, panel in panels.items()}
         photo = light.get("I", tile)
         change = light["T"] - photo
         reflection = light.get("R", np.maximum(-change, 0))
-        drawn = to_encoded(_drawn(light, tile))
+        generated = to_encoded(_reconstruction(light, tile))
         return (
             change.mean(axis=0),
             reflection.mean(axis=0),
             light["T"].mean(axis=0),
             np.ptp(to_encoded(light["T"]), axis=0),
-            np.abs(drawn - to_encoded(tile)).mean(axis=0),
+            np.abs(generated - to_encoded(tile)).mean(axis=0),
         )
 
 
 @dataclass
 class _ProgressCounter:
-    """Tells how far a look is, tile by tile and step by step."""
+    """Reports progress over tiles and sampling steps."""
 
     on_progress: ProgressCallback
     tiles: int
@@ -166,33 +177,33 @@ class _ProgressCounter:
         self.done += 1
 
 
-def _drawn(light: Mapping[str, Floats], tile: Floats) -> Floats:
-    """The photo as the model draws it: its own panel, or T and R together, or not at all."""
+def _reconstruction(light: Mapping[str, Floats], tile: Floats) -> Floats:
+    """Returns the photo as the model generates it: panel I, or T + R; without either, the photo itself."""
     if "I" in light:
         return light["I"]
     return np.minimum(light["T"] + light["R"], 1) if "R" in light else tile[None]
 
 
-def _refuse_broken(panels: Mapping[str, torch.Tensor]) -> None:
+def _check_finite(panels: Mapping[str, torch.Tensor]) -> None:
     for name, panel in panels.items():
         if not panel.isfinite().all():
             raise ModelError(
-                f"the model drew a panel {name} with numbers that are none",
-                "finite ones",
-                "store the base otherwise (quantise), or train the LoRA again: its weights may be broken",
+                f"panel {name} of the model contains NaN or infinity",
+                "finite values",
+                "use another quantise, or train the LoRA again: its weights may be damaged",
             )
 
 
-def _light(panels: torch.Tensor) -> NDArray[np.float32]:
-    """Panels (n, 3, h, w) in [-1, 1] as linear light (n, h, w, 3)."""
+def _to_light(panels: torch.Tensor) -> NDArray[np.float32]:
+    """Converts panels (n, 3, h, w) in [-1, 1] to linear light (n, h, w, 3)."""
     light: NDArray[np.float32] = to_linear(((panels + 1) / 2).clamp(0, 1).permute(0, 2, 3, 1).numpy())
     return light
 
 
-def _cut(side: int) -> dict[str, int]:
+def _tiling(side: int) -> dict[str, int]:
     return {"tile_px": side, "overlap_px": side // 4}
 
 
-def _up(size: tuple[int, int], multiple: int) -> tuple[int, int]:
+def _round_up(size: tuple[int, int], multiple: int) -> tuple[int, int]:
     width, height = (-(-side // multiple) * multiple for side in size)
     return width, height

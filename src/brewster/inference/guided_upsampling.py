@@ -1,10 +1,10 @@
-"""Carries a separation made at work resolution to the photo's full resolution, without blurring the photo.
+"""Upsamples a separation from the resolution of the network to that of the photo, and keeps the photo's detail.
 
 Reflection adds to light, so in linear light the change from photo to transmission is about as smooth as the
-reflection itself, whatever detail lies behind the glass. The change is described at work resolution by local
-lines, change = slope * photo + offset (slopes as in the guided filter: He et al. 2013, eq. 5; enlarged as in the
-fast guided filter: He & Sun 2015), and applied to the full photo: its own detail stays. At the same size the
-lines give back exactly what they were learned from.
+reflection itself, whatever detail is behind the glass. At low resolution the change is modelled as a local linear
+function of the photo, change = slope * photo + offset (slopes: guided filter, He et al. 2013, eq. 5; upsampling:
+fast guided filter, He & Sun 2015). The upsampled slope and offset are applied to the full photo. Without
+upsampling, the result is exactly the input.
 """
 
 from __future__ import annotations
@@ -22,128 +22,128 @@ Floats = NDArray[np.float32]
 
 _RADIUS: Final = 2
 _VARIANCE_FLOOR: Final = 4e-3
-_FAINT_DETAIL: Final = 1e-6
-"""Energy of detail, linear light squared, below which it is nobody's."""
+_MIN_DETAIL_ENERGY: Final = 1e-6
+"""Detail energy, in linear light squared, below which the photo's detail is kept."""
 
 
 @final
 @dataclass(frozen=True)
 class _LocalLinearMap:
-    """A picture as local lines over the photo, picture = slope * photo + offset, maps of work resolution."""
+    """A layer as a local linear function of the photo: layer = slope * photo + offset, at low resolution."""
 
     slope: Float32[Floats, "h w 3"]
     offset: Float32[Floats, "h w 3"]
 
-    def read(self, photo: Floats, top: int, height: int) -> Floats:
-        """The picture over rows top..top+n of the full photo, (n, W, 3)."""
+    def apply(self, photo: Floats, top: int, height: int) -> Floats:
+        """Returns the layer for the rows top..top+n of the full photo: `photo` and the result are (n, W, 3)."""
         rows, width, _ = photo.shape
-        picture = enlarge_rows(self.slope, top, rows, (height, width))
-        picture *= photo
-        picture += enlarge_rows(self.offset, top, rows, (height, width))
-        return picture
+        layer = enlarge_rows(self.slope, top, rows, (height, width))
+        layer *= photo
+        layer += enlarge_rows(self.offset, top, rows, (height, width))
+        return layer
 
 
 @final
 @dataclass(frozen=True)
 class GeneratedOverride:
-    """A transmission that a model drew at work resolution, and where it is to be taken as it is, merely enlarged.
+    """A generated transmission at low resolution, and where it replaces the result of the guided filter.
 
-    Where sharp detail is mirrored and little lies behind it, the photo's detail is the mirror's: the drawn picture,
-    though softer, is nearer to the truth there.
+    Where the reflection has sharp detail and the background has little, the detail of the photo belongs to the
+    reflection. The generated transmission is softer, but closer to the ground truth there.
     """
 
     transmission: Float32[Floats, "h w 3"]
-    share: Float32[Floats, "h w 1"]
-    """0: the photo's own detail; 1: the drawn picture."""
+    weight: Float32[Floats, "h w 1"]
+    """0: guided upsampling with the photo's detail; 1: the enlarged generated transmission."""
     strength: float = 1.0
-    """How much of the way from the photo to the drawn picture is gone."""
+    """The strength of the separation: 0 is the photo, 1 the generated transmission."""
 
     @classmethod
-    def where_mirrored(cls, transmission: Floats, reflection: Floats) -> GeneratedOverride:
-        """Taken as far as the fine detail is the reflection's: its share of the energy above the windows' means."""
-        mirrored, behind = (
-            _box(np.square(layer - _box(layer)).mean(axis=2, keepdims=True))
+    def weighted_by_detail(cls, transmission: Floats, reflection: Floats) -> GeneratedOverride:
+        """Weighs by the share of the reflection in the detail energy: the local variance of both layers."""
+        reflected, transmitted = (
+            _box_mean(np.square(layer - _box_mean(layer)).mean(axis=2, keepdims=True))
             for layer in (reflection, transmission)
         )
-        share: Floats = mirrored / (mirrored + behind + np.float32(_FAINT_DETAIL))
-        return cls(transmission, share)
+        weight: Floats = reflected / (reflected + transmitted + np.float32(_MIN_DETAIL_ENERGY))
+        return cls(transmission, weight)
 
 
 @final
 @dataclass(frozen=True)
 class GuidedUpsampler:
-    """A separation at work resolution, ready to be read at the photo's, row by row."""
+    """A separation at low resolution that can be applied to the rows of the full photo."""
 
     change: _LocalLinearMap
     reflection: _LocalLinearMap
-    redrawn: GeneratedOverride | None = None
+    override: GeneratedOverride | None = None
 
     @classmethod
-    def learn(
-        cls, photo: Floats, change: Floats, reflection: Floats, redrawn: GeneratedOverride | None = None
+    def fit(
+        cls, photo: Floats, change: Floats, reflection: Floats, override: GeneratedOverride | None = None
     ) -> GuidedUpsampler:
-        """From a photo, transmission - photo, and the reflection at work resolution, (h, w, 3), linear light."""
-        mean = _box(photo)
-        spread = _box(photo * photo) - mean**2 + _VARIANCE_FLOOR
+        """Fits to the photo, transmission - photo, and reflection at low resolution, (h, w, 3) each, linear light."""
+        mean = _box_mean(photo)
+        variance = _box_mean(photo * photo) - mean**2 + _VARIANCE_FLOOR
 
-        def fit(picture: Floats) -> _LocalLinearMap:
-            """Slopes from windows, smoothed; offsets that make the lines meet the picture exactly."""
-            slope = _box((_box(photo * picture) - mean * _box(picture)) / spread)
-            return _LocalLinearMap(slope, picture - slope * photo)
+        def fit(layer: Floats) -> _LocalLinearMap:
+            """Smoothed window slopes; the offset makes the model exact at low resolution."""
+            slope = _box_mean((_box_mean(photo * layer) - mean * _box_mean(layer)) / variance)
+            return _LocalLinearMap(slope, layer - slope * photo)
 
-        return cls(fit(change), fit(reflection), redrawn)
+        return cls(fit(change), fit(reflection), override)
 
     def apply(self, photo: Floats, top: int, height: int) -> tuple[Floats, Floats]:
-        """Transmission and reflection of rows top..top+n of a photo `height` rows high, each (n, W, 3).
+        """Returns transmission and reflection of the rows top..top+n of a photo `height` rows high, each (n, W, 3).
 
-        Light is not negative, except where a wide-gamut photo's own values are, and no reflection is brighter
-        than the photo it is part of.
+        The transmission is not negative where the photo is not (wide-gamut photos have negative values). The
+        reflection is never brighter than the photo.
         """
-        transmission = self.change.read(photo, top, height)
-        if self.redrawn:
+        transmission = self.change.apply(photo, top, height)
+        if self.override:
             size = height, photo.shape[1]
-            drawn, share = (
+            generated, weight = (
                 enlarge_rows(map_, top, len(photo), size)
-                for map_ in (self.redrawn.transmission, self.redrawn.share)
+                for map_ in (self.override.transmission, self.override.weight)
             )
-            transmission += share * (np.float32(self.redrawn.strength) * (drawn - photo) - transmission)
+            transmission += weight * (np.float32(self.override.strength) * (generated - photo) - transmission)
         transmission += photo
         np.maximum(transmission, np.minimum(photo, 0), out=transmission)
-        reflection = self.reflection.read(photo, top, height)
+        reflection = self.reflection.apply(photo, top, height)
         return transmission, np.clip(reflection, 0, np.maximum(photo, 0), out=reflection)
 
 
 def enlarge_rows(map_: Floats, top: int, rows: int, size: tuple[int, int]) -> Floats:
-    """Rows top..top+rows of `map_` (h, w, C) enlarged to `size` (H, W), linearly between pixel centres."""
-    vertical = _between(map_, *_positions(map_.shape[0], top, rows, size[0]), axis=0)
-    return _between(vertical, *_positions(map_.shape[1], 0, size[1], size[1]), axis=1)
+    """Returns the rows top..top+rows of `map_` (h, w, C) enlarged to `size` (H, W) by bilinear interpolation."""
+    vertical = _interpolate(map_, *_positions(map_.shape[0], top, rows, size[0]), axis=0)
+    return _interpolate(vertical, *_positions(map_.shape[1], 0, size[1], size[1]), axis=1)
 
 
 def _positions(small: int, first: int, count: int, large: int) -> tuple[NDArray[np.intp], Floats]:
-    """For large pixels first..first+count: the small pixel before each centre, and how far past it."""
+    """Returns, for the large pixels first..first+count, the index of the small pixel before it and the fraction past it."""
     centres = (np.arange(first, first + count) + 0.5) * (small / large) - 0.5
     centres = np.clip(centres, 0, small - 1)
-    before = np.minimum(centres.astype(np.intp), max(small - 2, 0))
-    return before, (centres - before).astype(np.float32)
+    lower = np.minimum(centres.astype(np.intp), max(small - 2, 0))
+    return lower, (centres - lower).astype(np.float32)
 
 
-def _between(map_: Floats, before: NDArray[np.intp], past: Floats, *, axis: int) -> Floats:
+def _interpolate(map_: Floats, lower: NDArray[np.intp], fraction: Floats, *, axis: int) -> Floats:
     shape = [1] * map_.ndim
     shape[axis] = -1
-    low = np.take(map_, before, axis=axis)
-    high: Floats = np.take(map_, np.minimum(before + 1, map_.shape[axis] - 1), axis=axis)
+    low = np.take(map_, lower, axis=axis)
+    high: Floats = np.take(map_, np.minimum(lower + 1, map_.shape[axis] - 1), axis=axis)
     high -= low
-    high *= past.reshape(shape)
+    high *= fraction.reshape(shape)
     high += low
     return high
 
 
-def _box(map_: Floats) -> Floats:
-    """Means over windows of 2 r + 1 pixels a side, edges repeated, (h, w, C)."""
+def _box_mean(map_: Floats) -> Floats:
+    """Returns means over windows of 2 r + 1 pixels a side of a map (h, w, C), with repeated edges."""
     for axis in (0, 1):
-        reach = [(0, 0)] * 3
-        reach[axis] = (_RADIUS, _RADIUS)
-        padded = np.pad(map_, reach, mode="edge")
-        parts = [np.take(padded, range(i, i + map_.shape[axis]), axis=axis) for i in range(2 * _RADIUS + 1)]
-        map_ = np.mean(parts, axis=0, dtype=np.float32)
+        padding = [(0, 0)] * 3
+        padding[axis] = (_RADIUS, _RADIUS)
+        padded = np.pad(map_, padding, mode="edge")
+        shifted = [np.take(padded, range(i, i + map_.shape[axis]), axis=axis) for i in range(2 * _RADIUS + 1)]
+        map_ = np.mean(shifted, axis=0, dtype=np.float32)
     return map_

@@ -1,4 +1,4 @@
-"""Turns a model file and a device name into a `Backend`: the only file that imports ONNX Runtime."""
+"""Runs an ONNX model as a `Backend`. Only this module imports ONNX Runtime."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 import onnxruntime as ort
 
 from brewster.errors import DeviceError, ModelError
-from brewster.inference.tiles import Picture
+from brewster.inference.tiles import Image
 
-_STRIDE: Final = 32
-"""Networks take sides that are multiples of this; pictures are mirrored outwards to reach it."""
+_STRIDE_PX: Final = 32
+"""Networks take sides that are multiples of this; tiles are padded by reflection."""
 
-# device name: (ONNX Runtime's provider, the line that installs it), the preferred ones first
+# device name: (execution provider of ONNX Runtime, command that installs it), preferred devices first
 _PROVIDERS: Final = {
     "cuda": ("CUDAExecutionProvider", "pip install onnxruntime-gpu"),
     "rocm": ("ROCMExecutionProvider", "pip install onnxruntime-rocm"),
@@ -26,47 +26,59 @@ DEVICES: Final = ("auto", *_PROVIDERS)
 
 
 def available_devices() -> list[str]:
-    """Names of the devices that the installed ONNX Runtime can use, the preferred one first."""
+    """Returns the names of the devices that the installed ONNX Runtime supports, the preferred one first."""
     installed = ort.get_available_providers()
     return [device for device, (provider, _) in _PROVIDERS.items() if provider in installed]
 
 
 @final
 class OnnxBackend:
-    """A `Backend` from an ONNX file: input `photo` (1, 3, H, W), outputs `transmission` and `reflection`.
+    """A `Backend` from an ONNX file with the input `photo` (1, 3, H, W) and the outputs `transmission` and `reflection`.
 
-    Safe to call from many threads at once.
+    May be called from several threads at once.
+
+    Args:
+        model: the path of the .onnx file.
+        device: a name from `DEVICES`; "auto" selects the preferred device that starts.
+
+    Raises:
+        ModelError: the file cannot be read, is not an ONNX model, or has other inputs and outputs.
+        DeviceError: the device is unknown, not available, or does not start.
     """
 
     def __init__(self, model: Path, device: str = "auto") -> None:
-        data = _read(model)
+        data = _read_model(model)
         for candidate in _candidates(device):
-            session = _start(model, data, candidate)
+            session = _create_session(model, data, candidate)
             if session.get_providers()[0] == _PROVIDERS[candidate][0]:
                 self.device, self._session = candidate, session
                 self._check_names(model)
                 return
         raise DeviceError(
             f"device {device} is installed but does not start",
-            "a driver and libraries that fit it",
-            "use --device auto, or see what ONNX Runtime says with --device cpu",
+            "its driver and libraries must match ONNX Runtime",
+            "install them, or use --device auto or cpu",
         )
 
-    def __call__(self, tile: Picture) -> tuple[Picture, Picture]:
-        """Separates one tile (H, W, 3), linear light in 0..1, of any size."""
+    def __call__(self, tile: Image) -> tuple[Image, Image]:
+        """Separates one tile (H, W, 3) of any size, linear light in 0..1.
+
+        Raises:
+            ModelError: the model fails on this tile.
+        """
         height, width, _ = tile.shape
-        margins = [(0, -side % _STRIDE) for side in (height, width)]
+        margins = [(0, -side % _STRIDE_PX) for side in (height, width)]
         padded = np.pad(tile, [*margins, (0, 0)], mode="symmetric")
         feed = {"photo": np.ascontiguousarray(padded.transpose(2, 0, 1)[None], dtype=np.float32)}
         try:
-            answers = self._session.run(["transmission", "reflection"], feed)
+            outputs = self._session.run(["transmission", "reflection"], feed)
         except Exception as error:
             raise ModelError(
                 f"the model failed on a tile of {width}x{height} pixels ({_first_line(error)})",
-                "a model that takes any size that is a multiple of 32",
+                "a model that accepts all sizes that are multiples of 32",
                 "check it with brewster models verify, or try --device cpu",
             ) from error
-        transmission, reflection = (layer[0, :, :height, :width].transpose(1, 2, 0) for layer in answers)
+        transmission, reflection = (layer[0, :, :height, :width].transpose(1, 2, 0) for layer in outputs)
         return transmission, reflection
 
     def _check_names(self, model: Path) -> None:
@@ -74,7 +86,7 @@ class OnnxBackend:
         outputs = {value.name for value in self._session.get_outputs()}
         if inputs != ["photo"] or not outputs >= {"transmission", "reflection"}:
             raise ModelError(
-                f"{model} maps {inputs} to {sorted(outputs)}",
+                f"{model} has the inputs {inputs} and the outputs {sorted(outputs)}",
                 "a model with input photo and outputs transmission and reflection",
                 "export it with brewster train",
             )
@@ -84,19 +96,19 @@ def _first_line(error: Exception) -> str:
     return str(error).splitlines()[0][:120] if str(error) else type(error).__name__
 
 
-def _read(model: Path) -> bytes:
+def _read_model(model: Path) -> bytes:
     try:
         return model.read_bytes()
     except OSError as error:
         raise ModelError(
             f"{model} cannot be read ({error.strerror})",
             "a model file",
-            "brewster models list names what is there",
+            "choose one from brewster models list",
         ) from error
 
 
-def _start(model: Path, data: bytes, device: str) -> ort.InferenceSession:
-    """A session on the device, or on the CPU where the device's own libraries do not load."""
+def _create_session(model: Path, data: bytes, device: str) -> ort.InferenceSession:
+    """Creates a session on the device; ONNX Runtime uses the CPU where the libraries of the device do not load."""
     options = ort.SessionOptions()
     options.log_severity_level = 3
     providers = dict.fromkeys([_PROVIDERS[device][0], "CPUExecutionProvider"])
@@ -111,13 +123,13 @@ def _start(model: Path, data: bytes, device: str) -> ort.InferenceSession:
 
 
 def _candidates(device: str) -> list[str]:
-    """The devices to try, the preferred one first; a device named by the user is the only one."""
+    """Returns the devices to try, the preferred one first; only `device` itself unless it is "auto"."""
     available = available_devices()
     if device == "auto":
         return available
     if device not in _PROVIDERS:
         raise DeviceError(
-            f"there is no device {device!r}", f"one of {', '.join(DEVICES)}", "use --device auto"
+            f"the device {device!r} is unknown", f"one of {', '.join(DEVICES)}", "use --device auto"
         )
     if device not in available:
         raise DeviceError(

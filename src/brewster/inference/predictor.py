@@ -1,7 +1,8 @@
-"""How a model looks at a photo: at which small copies, how often, and what it makes of them together.
+"""Predicts the layers of a photo from downscaled copies of it.
 
-A network that answers at once (`MultiScalePredictor`) sees copies of several sizes, each as it is and in a mirror: the mean is the
-answer, the disagreement tells how sure it is. A model that generates pictures looks in a way of its own (generate.py).
+`MultiScalePredictor` runs a feed-forward network at several input scales with flip augmentation. The mean of the
+outputs is the prediction; their spread gives the confidence. Diffusion models have their own predictor
+(diffusion_predictor.py).
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.inference.guided_upsampling import Floats, GeneratedOverride, enlarge_rows
-from brewster.inference.tiles import Backend, in_tiles
+from brewster.inference.tiles import Backend, run_tiled
 from brewster.options import Quality
 from brewster.srgb import to_encoded
 
@@ -24,104 +25,106 @@ if TYPE_CHECKING:
     from jaxtyping import Float32
 
 ProgressCallback = Callable[[float], None]
-"""Called with the share that is done, 0 to 1, between pieces of work; what it raises stops the work."""
+"""Called with the completed share, 0 to 1; an exception raised in it stops the work."""
 
 QUALITIES: Final[dict[Quality, tuple[int, ...]]] = {
     "draft": (100_000,),
     "standard": (100_000, 200_000),
     "best": (30_000, 100_000, 200_000, 350_000),
 }
-"""Pixels of the small copies that `MultiScalePredictor` shows the network, the largest last."""
+"""The input scales of `MultiScalePredictor` in pixels, the largest last."""
 
-_SHORTEST_SIDE_PX: Final = 160
-_LONG_PHOTO: Final = 3.0
-"""How much larger than the dial says the small copy of a long thin photo may be, a side."""
+_MIN_SHORT_SIDE_PX: Final = 160
+_MAX_ELONGATED_SCALE: Final = 3.0
+"""The largest factor by which the sides of an input may exceed its input scale, for long thin photos."""
 _TILE_PX: Final = 1024
 _OVERLAP_PX: Final = 192
-_UNSURE: Final = 0.05
-"""Disagreement, in sRGB-encoded units, at which confidence has fallen to 1/e."""
+_SPREAD_AT_1_E: Final = 0.05
+"""The spread of outputs, in sRGB-encoded units, at which the confidence is 1/e."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What a look has found, in maps of the size of the largest copy, linear light."""
+    """The output of a predictor: maps (h, w) of the size of the largest input, linear light."""
 
     change: Float32[NDArray[np.float32], "h w 3"]
-    """Transmission - photo."""
+    """Transmission minus photo."""
     reflection: Float32[NDArray[np.float32], "h w 3"]
     confidence_map: Float32[NDArray[np.float32], "h w 1"]
-    """1 where it is sure, towards 0 where it is not."""
-    redrawn: GeneratedOverride | None = None
-    """Where the transmission is to be taken as the model drew it."""
+    """Confidence in the transmission: 1 is certain, 0 unknown."""
+    override: GeneratedOverride | None = None
+    """Where the generated transmission replaces the detail of the photo."""
     reconstruction_error: float | None = None
-    """Mean of |the photo as the model redraws it - the photo|, sRGB-encoded; None where it redraws nothing."""
+    """Mean of |the photo as the model redraws it - photo|, sRGB-encoded; None if the model does not redraw it."""
 
 
 class Predictor(ABC):
-    """A way of looking. It is called from many threads at once."""
+    """Predicts layers from inputs of the sizes it chooses. May be called from several threads at once."""
 
     @abstractmethod
-    def sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
-        """Width and height of the copies that it wants of a photo of this size, smallest first, each once."""
+    def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
+        """Returns width and height of its inputs for a photo of this (width, height): smallest first, no duplicates."""
 
     @abstractmethod
     def __call__(
-        self, copies: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
+        self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
     ) -> Prediction:
-        """Looks at these copies, (h, w, 3) each, linear light in 0..1."""
+        """Predicts from inputs of the sizes of `input_sizes`, (h, w, 3) each, linear light in 0..1."""
 
 
 @final
 class MultiScalePredictor(Predictor):
-    """Looks through a `Backend` at copies of several sizes, each as it is and in a mirror."""
+    """Runs a `Backend` at several input scales, with and without a horizontal flip, and averages the outputs."""
 
     def __init__(self, backend: Backend) -> None:
         self._backend = backend
 
-    def sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
-        """As `QUALITIES` says; more pixels for long thin photos."""
+    def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
+        """The input scales of `QUALITIES`, never larger than the photo, and larger for long thin photos."""
         width, height = size
         sizes = []
         for pixels in QUALITIES[quality]:
             scale = math.sqrt(pixels / (width * height))
-            scale = min(1.0, max(scale, min(_LONG_PHOTO * scale, _SHORTEST_SIDE_PX / min(size))))
+            scale = min(1.0, max(scale, min(_MAX_ELONGATED_SCALE * scale, _MIN_SHORT_SIDE_PX / min(size))))
             sizes.append((max(1, round(width * scale)), max(1, round(height * scale))))
         return list(dict.fromkeys(sizes))
 
     def __call__(
         self,
-        copies: Sequence[Floats],
+        inputs: Sequence[Floats],
         quality: Quality,  # noqa: ARG002
         on_progress: ProgressCallback,
     ) -> Prediction:
-        """The mean of all views; it is sure where they agree."""
-        size = copies[-1].shape[:2]
+        """Returns the mean over input scales and flips; the confidence is high where they agree."""
+        size = inputs[-1].shape[:2]
         changes, reflections = [], []
-        for copy in copies:
-            for transmission, reflection in self._both_ways(copy):
-                changes.append(enlarge_rows(transmission - copy, 0, size[0], size))
+        for scaled_input in inputs:
+            for transmission, reflection in self._predict_with_flip(scaled_input):
+                changes.append(enlarge_rows(transmission - scaled_input, 0, size[0], size))
                 reflections.append(enlarge_rows(reflection, 0, size[0], size))
-                on_progress(len(changes) / (2 * len(copies)))
-        seen = to_encoded(np.maximum(copies[-1] + np.stack(changes), 0))
+                on_progress(len(changes) / (2 * len(inputs)))
+        transmissions_encoded = to_encoded(np.maximum(inputs[-1] + np.stack(changes), 0))
         return Prediction(
             np.mean(changes, axis=0),
             np.mean(reflections, axis=0),
-            confidence_from_spread(np.ptp(seen, axis=0)),
+            confidence_from_spread(np.ptp(transmissions_encoded, axis=0)),
         )
 
-    def _both_ways(self, copy: Floats) -> Iterator[tuple[Floats, Floats]]:
-        """Both layers of a copy as it is, and as seen in a mirror."""
-        yield self._separate(copy)
-        transmission, reflection = self._separate(np.ascontiguousarray(copy[:, ::-1]))
+    def _predict_with_flip(self, scaled_input: Floats) -> Iterator[tuple[Floats, Floats]]:
+        """Yields both layers of an input: as it is, and flipped and flipped back."""
+        yield self._predict(scaled_input)
+        transmission, reflection = self._predict(np.ascontiguousarray(scaled_input[:, ::-1]))
         yield transmission[:, ::-1], reflection[:, ::-1]
 
-    def _separate(self, small: Floats) -> tuple[Floats, Floats]:
-        transmission, reflection = in_tiles(self._backend, small, tile_px=_TILE_PX, overlap_px=_OVERLAP_PX)
+    def _predict(self, scaled_input: Floats) -> tuple[Floats, Floats]:
+        transmission, reflection = run_tiled(
+            self._backend, scaled_input, tile_px=_TILE_PX, overlap_px=_OVERLAP_PX
+        )
         return transmission, reflection
 
 
-def confidence_from_spread(apart: Float32[Floats, "h w 3"]) -> Float32[Floats, "h w 1"]:
-    """How sure one can be where answers differ by so much, sRGB-encoded: 1 where they do not."""
-    sure: Floats = np.exp(-apart.max(axis=2, keepdims=True) / np.float32(_UNSURE))
-    return sure
+def confidence_from_spread(spread: Float32[Floats, "h w 3"]) -> Float32[Floats, "h w 1"]:
+    """Returns exp(-spread / 0.05) of the channel with the largest spread (maximum - minimum), sRGB-encoded."""
+    confidence: Floats = np.exp(-spread.max(axis=2, keepdims=True) / np.float32(_SPREAD_AT_1_E))
+    return confidence

@@ -1,11 +1,12 @@
-"""A photograph in, two layers out, at the photo's own size.
+"""Separates a photo into transmission and reflection at the size of the photo.
 
     separator = Separator.load("compact")
     separation = separator("window.jpg")
     separation.transmission.save("clear.jpg")
 
-The model looks at small linear copies of the photo (look.py; generate.py for large image models; tiles.py cuts what
-is too large for it), and detail.py brings its answer to full size.
+The model predicts both layers for small linear copies of the photo (predictor.py, or diffusion_predictor.py for
+diffusion models; tiles.py splits inputs that are too large). guided_upsampling.py applies the prediction to the
+photo at full size.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Final, Unpack, final
+from typing import TYPE_CHECKING, Final, final
 
 import numpy as np
 
@@ -33,54 +34,64 @@ from brewster.inference.predictor import (
 )
 from brewster.inference.tiles import Backend
 from brewster.models.zoo import find_model, is_large
-from brewster.options import DiffusionOptions, Quality
-from brewster.photo import DEFAULT_MAX_PIXELS, Encoding, Photo, Source
+from brewster.options import Options, Quality, Quantisation, document_options
+from brewster.photo import Encoding, Photo, Source
+
+if TYPE_CHECKING:
+    from brewster.models.diffusion.pipeline import DecompositionPipeline
 
 RECONSTRUCTION_ERROR_LIMIT: Final = 0.06
-"""Beyond this reconstruction_error a separation is doubtful: three times what the VAEs of large models lose by themselves."""
+"""A separation with a larger reconstruction error is doubtful; three times the error of the VAE of such a model."""
 _WORKERS: Final = 2
 _WHITE_PERCENTILE: Final = 99.0
-"""Of a photo brighter than white, such as an EXR, this percentile is shown to the network as white."""
-_LOOKING: Final = 0.6
-"""The share of the work that is told as done when the network has answered: an estimate for those who wait."""
+"""In a photo with values above 1, such as an EXR, this percentile is scaled to 1 for the network."""
+_NETWORK_SHARE: Final = 0.6
+"""The progress at which the network has finished: an estimate of its share of the total time."""
 
 
 @final
 @dataclass(frozen=True)
 class Separation:
-    """The answer: all pictures have the photo's size; how it was made stands beside them."""
+    """The layers of a photo, each of the photo's size, and how they were computed."""
 
     photo: Photo
     transmission: Photo
     reflection: Photo
     confidence_map: Floats = field(repr=False, compare=False)
-    """How sure the looks were, (h, w, 1) in 0..1, as small as the network saw the photo."""
+    """Confidence in 0..1, (h, w, 1), at the size of the largest input of the network."""
     residual: float
-    """Mean of |photo - transmission - reflection| in linear light: what neither layer explains."""
+    """Mean of |photo - transmission - reflection| in linear light: what the layers do not explain."""
     reconstruction_error: float | None
-    """How far the model redraws the photo itself: mean difference, sRGB-encoded; None where it draws no photo."""
+    """Mean of |the photo as the model redraws it - photo|, sRGB-encoded; None if the model does not redraw it."""
     model: str
     sha256: str | None
     device: str
     seconds: dict[str, float] = field(compare=False)
-    """Wall time of decode, network and detail transfer."""
+    """Wall time of the steps `decode`, `network` and `detail`."""
 
     @property
     def doubtful(self) -> bool:
-        """Whether the model redrew the photo so freely that its layers may be of another scene: look at them."""
+        """Whether the model redraws the photo so freely that the layers may show another scene: check them."""
         return (
             self.reconstruction_error is not None and self.reconstruction_error > RECONSTRUCTION_ERROR_LIMIT
         )
 
     @cached_property
     def confidence(self) -> Photo:
-        """Grey, 8 bit: 255 where the separation is sure of the transmission. Enlarged when it is first asked for."""
-        return _enlarged(self.confidence_map, self.photo)
+        """The confidence as a grey 8-bit image of the photo's size: 255 is certain. Computed on first use."""
+        return _upsampled_confidence(self.confidence_map, self.photo)
 
 
 @final
 class Separator:
-    """A reusable, thread-safe callable around one `Backend`, or any other way to `Predictor`."""
+    """Separates photos with one model. Reusable and thread-safe.
+
+    Args:
+        model: a `Backend`, which runs at several input scales, or a `Predictor`.
+        name: the name of the model, for `Separation.model`.
+        sha256: the digest of its file, for `Separation.sha256`.
+        device: the device it runs on, for `Separation.device`.
+    """
 
     def __init__(
         self,
@@ -90,131 +101,138 @@ class Separator:
         sha256: str | None = None,
         device: str = "cpu",
     ) -> None:
-        self._look = model if isinstance(model, Predictor) else MultiScalePredictor(model)
+        self._predictor = model if isinstance(model, Predictor) else MultiScalePredictor(model)
         self.name, self.sha256, self.device = name, sha256, device
 
     @classmethod
+    @document_options
     def load(
-        cls, model: str = "compact", *, device: str = "auto", **large: Unpack[DiffusionOptions]
+        cls,
+        model: str = Options.model,
+        *,
+        device: str = Options.device,
+        base: str | None = Options.base,
+        quantise: Quantisation | None = Options.quantise,
+        steps: int | None = Options.steps,
+        average: int = Options.average,
+        plain: bool = Options.plain,
     ) -> Separator:
-        """A separator by the name of a model in the zoo, the path of an .onnx file, or a large image model.
+        """Loads a model and returns its separator.
 
         Args:
-            model: "compact", an .onnx file, a LoRA's folder or hub id, or a backbone's ("kontext", "klein", "qwen").
-            device: where it runs; "auto" takes the fastest device that is there.
-            large: of large models only: `base`, where a LoRA's base lies, if not where it was trained; `quantise`,
-                "int8", "float8" or "nf4", by default as for the LoRA's training; `steps` for each look, by default
-                the paper's 20, and 4 for quality "draft"; `average`, how many answers are averaged; `plain`, the
-                transmission as the model draws it, without the photo's own detail.
 
         Raises:
-            ModelError: no such model, a damaged one, or options of large models for a small one.
-            DeviceError: the asked device is not available, or a large model does not fit into its memory.
-            DownloadError: a large model cannot be downloaded; says how to ask for access.
-            MissingExtra: a large model needs the extra `large`.
+            ModelError: the model is unknown or damaged, or an option of diffusion models is set for another model.
+            DeviceError: the device is not available, or the model does not fit into its memory.
+            DownloadError: a diffusion model cannot be downloaded, for example because access was not granted.
+            MissingExtra: a diffusion model needs the extra `large`.
         """
         if is_large(model):
-            return cls._load_large(model, device, large)
-        if large:
+            pipeline = _open_pipeline(model, device, base, quantise)
+            return cls._from_pipeline(pipeline, steps=steps, average=average, plain=plain)
+        chosen = {"base": base, "quantise": quantise, "steps": steps, "average": average, "plain": plain}
+        if changed := [name for name, value in chosen.items() if value != getattr(Options, name)]:
             raise ModelError(
-                f"{', '.join(large)} was asked of {model}",
-                "a large image model or a LoRA",
-                "leave it out, or name such a model",
+                f"{', '.join(changed)} was set for the model {model}",
+                "only diffusion models and LoRAs have this option",
+                "leave it out, or choose such a model",
             )
-        found = find_model(model)
-        digest = found.verify()
-        backend = OnnxBackend(found.path, device)
-        return cls(backend, name=found.name, sha256=digest, device=backend.device)
+        model_file = find_model(model)
+        digest = model_file.verify()
+        backend = OnnxBackend(model_file.path, device)
+        return cls(backend, name=model_file.name, sha256=digest, device=backend.device)
 
     @classmethod
-    def _load_large(cls, model: str, device: str, asked: DiffusionOptions) -> Separator:
-        try:
-            from brewster.inference.diffusion_predictor import DiffusionPredictor  # noqa: PLC0415
-            from brewster.models.diffusion.pipeline import load_pipeline  # noqa: PLC0415  (wakes torch)
-        except ImportError as error:
-            raise MissingExtra(
-                f"{error.name} is not installed", f"{model} needs it", "pip install 'brewster[large]'"
-            ) from error
-        decomposer = load_pipeline(
-            model, device=device, base=asked.get("base"), quantise=asked.get("quantise")
-        )
-        look = DiffusionPredictor(
-            decomposer,
-            steps=asked.get("steps"),
-            average=asked.get("average", 1),
-            plain=asked.get("plain", False),
-        )
-        where = str(decomposer.backbone.device)
-        return cls(look, name=decomposer.name, sha256=decomposer.sha256, device=where)
+    def _from_pipeline(
+        cls, pipeline: DecompositionPipeline, *, steps: int | None, average: int, plain: bool
+    ) -> Separator:
+        from brewster.inference.diffusion_predictor import DiffusionPredictor  # noqa: PLC0415  (imports torch)
 
+        predictor = DiffusionPredictor(pipeline, steps=steps, average=average, plain=plain)
+        device = str(pipeline.backbone.device)
+        return cls(predictor, name=pipeline.name, sha256=pipeline.sha256, device=device)
+
+    @document_options
     def __call__(
         self,
         source: Source,
         *,
-        strength: float = 1.0,
-        quality: Quality = "standard",
-        additive: bool = False,
+        strength: float = Options.strength,
+        quality: Quality = Options.quality,
+        additive: bool = Options.additive,
         encoding: Encoding | None = None,
-        max_pixels: int = DEFAULT_MAX_PIXELS,
+        max_pixels: int = Options.max_pixels,
         on_progress: ProgressCallback = lambda _share: None,
     ) -> Separation:
-        """Separates a photograph; safe to call from many threads at once.
+        """Separates a photo. May be called from several threads at once.
 
         Args:
             source: a path, the bytes of a file, a PIL image, a `Photo`, or an array (see `Photo.from_array`).
-            strength: 0 returns the photo itself, 1 the whole separation; between, a share of it.
-            quality: how many copies of the photo the network sees, and how large.
-            additive: layers of 32-bit floats that sum to the photo exactly in linear light, for compositing.
-            encoding: what an array's numbers mean, "srgb" or "linear".
-            max_pixels: larger pictures are refused before they are decoded.
-            on_progress: called with the share that is done, 0 to 1; an exception that it raises stops the work.
+            encoding: what the numbers of an array mean, "srgb" or "linear"; for arrays only.
+            on_progress: called with the completed share, 0 to 1; an exception raised in it stops the work.
 
         Raises:
             PhotoError: the source cannot be read, or is too large.
-            BrewsterError: strength or quality out of range.
+            BrewsterError: strength or quality is out of range.
         """
-        _check(strength, quality)
+        _check_options(strength, quality)
         seconds: dict[str, float] = {}
-        with _clock(seconds, "decode"):
+        with _timed(seconds, "decode"):
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
-            copies = [photo.small(*size) for size in self._look.sizes(photo.size, quality)]
-            white = np.float32(max(1.0, float(np.percentile(copies[-1], _WHITE_PERCENTILE))))
-            copies = [np.clip(copy / white, 0, 1) for copy in copies]
+            inputs = [photo.resized(*size) for size in self._predictor.input_sizes(photo.size, quality)]
+            white = np.float32(max(1.0, float(np.percentile(inputs[-1], _WHITE_PERCENTILE))))
+            inputs = [np.clip(scaled_input / white, 0, 1) for scaled_input in inputs]
         on_progress(0.0)
-        with _clock(seconds, "network"):
-            seen = self._look(copies, quality, lambda done: on_progress(_LOOKING * done))
-        with _clock(seconds, "detail"):
-            transfer = _transfer(copies[-1], seen, strength, white)
-            whole, mirrored, residual = _at_full_size(
-                photo, transfer, additive=additive, on_progress=on_progress
+        with _timed(seconds, "network"):
+            prediction = self._predictor(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
+        with _timed(seconds, "detail"):
+            upsampler = _fit_upsampler(inputs[-1], prediction, strength, white)
+            transmission, reflection, residual = _upsample(
+                photo, upsampler, additive=additive, on_progress=on_progress
             )
-        made_by = self.name, self.sha256, self.device
         return Separation(
             photo,
-            whole,
-            mirrored,
-            seen.confidence_map,
+            transmission,
+            reflection,
+            prediction.confidence_map,
             residual,
-            seen.reconstruction_error,
-            *made_by,
+            prediction.reconstruction_error,
+            self.name,
+            self.sha256,
+            self.device,
             seconds,
         )
 
 
+@document_options
 def separate(
     source: Source,
     *,
-    model: str = "compact",
-    device: str = "auto",
-    strength: float = 1.0,
-    quality: Quality = "standard",
-    additive: bool = False,
+    model: str = Options.model,
+    device: str = Options.device,
+    strength: float = Options.strength,
+    quality: Quality = Options.quality,
+    additive: bool = Options.additive,
     encoding: Encoding | None = None,
-    max_pixels: int = DEFAULT_MAX_PIXELS,
-    **large: Unpack[DiffusionOptions],
+    max_pixels: int = Options.max_pixels,
+    base: str | None = Options.base,
+    quantise: Quantisation | None = Options.quantise,
+    steps: int | None = Options.steps,
+    average: int = Options.average,
+    plain: bool = Options.plain,
 ) -> Separation:
-    """Separates one photograph; for many, `Separator.load` once and call it. Options and errors are theirs."""
-    separator = Separator.load(model, device=device, **large)
+    """Separates one photo. For several photos, use `Separator.load` once and call the separator for each.
+
+    Args:
+        source: a path, the bytes of a file, a PIL image, a `Photo`, or an array (see `Photo.from_array`).
+        encoding: what the numbers of an array mean, "srgb" or "linear"; for arrays only.
+
+    Raises:
+        BrewsterError: as `Separator.load` and calling a `Separator`.
+    """
+    separator = Separator.load(
+        model, device=device, base=base, quantise=quantise, steps=steps, average=average, plain=plain
+    )
     return separator(
         source,
         strength=strength,
@@ -225,49 +243,67 @@ def separate(
     )
 
 
-def _check(strength: float, quality: str) -> None:
+def _open_pipeline(
+    model: str, device: str, base: str | None, quantise: Quantisation | None
+) -> DecompositionPipeline:
+    try:
+        from brewster.models.diffusion.pipeline import load_pipeline  # noqa: PLC0415  (imports torch)
+    except ImportError as error:
+        raise MissingExtra(
+            f"{error.name} is not installed", f"{model} needs it", "pip install 'brewster[large]'"
+        ) from error
+    return load_pipeline(model, device=device, base=base, quantise=quantise)
+
+
+def _check_options(strength: float, quality: str) -> None:
     if not 0 <= strength <= 1:
-        raise BrewsterError(f"strength is {strength}", "a number from 0 to 1", "choose one in that range")
+        raise BrewsterError(
+            f"strength is {strength}", "a number from 0 to 1", "choose a number in this range"
+        )
     if quality not in QUALITIES:
         raise BrewsterError(f"quality is {quality!r}", f"one of {', '.join(QUALITIES)}", "choose one of them")
 
 
-def _transfer(copy: Floats, seen: Prediction, strength: float, white: np.float32) -> GuidedUpsampler:
-    """What was seen, as strong and as bright as it is asked for."""
-    share, redrawn = np.float32(strength) * white, seen.redrawn
-    if redrawn:
-        redrawn = replace(redrawn, transmission=white * redrawn.transmission, strength=strength)
-    return GuidedUpsampler.learn(white * copy, share * seen.change, share * seen.reflection, redrawn)
+def _fit_upsampler(
+    largest_input: Floats, prediction: Prediction, strength: float, white: np.float32
+) -> GuidedUpsampler:
+    """Fits the upsampler to a prediction that is scaled by the strength and by the white of the photo."""
+    scale, override = np.float32(strength) * white, prediction.override
+    if override:
+        override = replace(override, transmission=white * override.transmission, strength=strength)
+    return GuidedUpsampler.fit(
+        white * largest_input, scale * prediction.change, scale * prediction.reflection, override
+    )
 
 
-def _at_full_size(
-    photo: Photo, transfer: GuidedUpsampler, *, additive: bool, on_progress: ProgressCallback
+def _upsample(
+    photo: Photo, upsampler: GuidedUpsampler, *, additive: bool, on_progress: ProgressCallback
 ) -> tuple[Photo, Photo, float]:
-    """Both layers, stored as the photo is or as exact floats, and the mean unexplained residual."""
-    store = _as_floats(photo) if additive else photo
-    canvases = [np.empty(store.pixels.shape, store.pixels.dtype) for _ in range(2)]
+    """Returns both layers, encoded like the photo or as exact floats, and the mean residual."""
+    template = _float_template(photo) if additive else photo
+    canvases = [np.empty(template.pixels.shape, template.pixels.dtype) for _ in range(2)]
 
     def fill(rows: slice) -> float:
         linear = photo.linear_rows(rows.start, rows.stop)
-        layers = transfer.apply(linear, rows.start, photo.size[1])
-        stored = [store.stored_rows(layer, rows.start) for layer in layers]
+        layers = upsampler.apply(linear, rows.start, photo.size[1])
+        stored = [template.stored_rows(layer, rows.start) for layer in layers]
         if additive:
-            stored = _summing_exactly(store.stored_rows(linear, rows.start), stored[0])
+            stored = _exact_sum_layers(template.stored_rows(linear, rows.start), stored[0])
         for canvas, layer in zip(canvases, stored, strict=True):
             canvas[rows] = layer
         return 0.0 if additive else float(np.abs(linear - layers[0] - layers[1]).sum(dtype=np.float64))
 
-    strips, unexplained = list(photo.strips()), 0.0
+    strips, residual_sum = list(photo.strips()), 0.0
     with ThreadPoolExecutor(_WORKERS) as pool:
-        for done, part in enumerate(pool.map(fill, strips), 1):
-            unexplained += part
-            on_progress(_LOOKING + (1 - _LOOKING) * done / len(strips))
-    transmission, reflection = (store.with_pixels(canvas) for canvas in canvases)
-    return transmission, reflection, unexplained / (math.prod(photo.size) * 3)
+        for done, strip_residual in enumerate(pool.map(fill, strips), 1):
+            residual_sum += strip_residual
+            on_progress(_NETWORK_SHARE + (1 - _NETWORK_SHARE) * done / len(strips))
+    transmission, reflection = (template.with_pixels(canvas) for canvas in canvases)
+    return transmission, reflection, residual_sum / (math.prod(photo.size) * 3)
 
 
-def _as_floats(photo: Photo) -> Photo:
-    """The photo's like, black, in 32-bit floats of linear light, to be filled; alpha and EXIF are kept."""
+def _float_template(photo: Photo) -> Photo:
+    """Returns a black photo of the same size in 32-bit floats of linear light, with the alpha and EXIF of the photo."""
     file_info = replace(
         photo.file_info, container="tiff", bits=32, compression=None, icc=None, primaries=None, header=None
     )
@@ -278,17 +314,17 @@ def _as_floats(photo: Photo) -> Photo:
     return Photo(black, alpha, file_info)
 
 
-def _summing_exactly(photo: Floats, transmission: Floats) -> list[Floats]:
-    """Two layers, none negative where the photo is not, whose float sum is the photo to the last bit.
+def _exact_sum_layers(photo: Floats, transmission: Floats) -> list[Floats]:
+    """Returns two layers whose float sum is bit-equal to the photo, and not negative where the photo is not.
 
-    Of the two differences at least one is exact (Sterbenz 1974), which makes the sum exact.
+    At least one of the two differences is exact (Sterbenz 1974), which makes the sum exact.
     """
     reflection = photo - np.minimum(transmission, photo)
     return [photo - reflection, reflection]
 
 
-def _enlarged(map_: Floats, photo: Photo) -> Photo:
-    """A map (h, w, 1) in 0..1 as a grey 8-bit picture of the photo's size."""
+def _upsampled_confidence(map_: Floats, photo: Photo) -> Photo:
+    """Enlarges a map (h, w, 1) in 0..1 to a grey 8-bit image of the photo's size."""
     width, height = photo.size
     canvas = np.empty((height, width, 1), np.uint8)
     for rows in photo.strips():
@@ -297,7 +333,7 @@ def _enlarged(map_: Floats, photo: Photo) -> Photo:
 
 
 @contextmanager
-def _clock(seconds: dict[str, float], name: str) -> Iterator[None]:
+def _timed(seconds: dict[str, float], name: str) -> Iterator[None]:
     started = time.perf_counter()
     yield
     seconds[name] = time.perf_counter() - started

@@ -1,4 +1,4 @@
-"""Runs a backend over a picture in overlapping tiles that fade into each other, where memory asks for it."""
+"""Runs a backend over an image in overlapping, blended tiles, to limit the memory that it needs."""
 
 from __future__ import annotations
 
@@ -12,49 +12,50 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from jaxtyping import Float32
 
-    Picture = Float32[NDArray[np.float32], "h w 3"]
+    Image = Float32[NDArray[np.float32], "h w 3"]
 else:
-    Picture = NDArray
+    Image = NDArray
 
-Backend = Callable[[Picture], tuple[Picture, Picture]]
-"""Anything that takes a tile (H, W, 3), float32 linear light in 0..1, and returns its transmission and its
-reflection, both of the same shape and kind."""
+Backend = Callable[[Image], tuple[Image, Image]]
+"""Any callable that takes a tile (H, W, 3), float32 linear light in 0..1, and returns its transmission and
+reflection, both of the same shape and dtype."""
 
 
-def in_tiles(
-    backend: Callable[[Picture], tuple[Picture, ...]], picture: Picture, *, tile_px: int, overlap_px: int
-) -> tuple[Picture, ...]:
-    """The backend's answers, (H, W, 3) each, for a picture of any size; one no larger than a tile goes in whole.
+def run_tiled(
+    backend: Callable[[Image], tuple[Image, ...]], image: Image, *, tile_px: int, overlap_px: int
+) -> tuple[Image, ...]:
+    """Returns the outputs of the backend, (H, W, 3) each, for an image of any size.
 
-    Neighbouring tiles share at least `overlap_px` pixels, over which their answers are cross-faded.
+    Neighbouring tiles overlap by at least `overlap_px` pixels, over which their outputs are blended linearly. An
+    image that is no larger than a tile is passed to the backend directly.
     """
-    height, width, _ = picture.shape
-    windows = tiles_of((height, width), tile_px=tile_px, overlap_px=overlap_px)
-    if len(windows) == 1:
-        return backend(picture)
-    layers: list[Picture] = []
-    total = np.zeros((height, width, 1), np.float32)
-    for vertical, horizontal in windows:
-        window = np.s_[vertical, horizontal]
-        weight = np.outer(_fade(vertical, height, overlap_px), _fade(horizontal, width, overlap_px))[
-            ..., None
-        ]
-        total[window] += weight
-        answers = backend(picture[window])
-        layers = layers or [np.zeros((height, width, 3), np.float32) for _ in answers]
-        for layer, answer in zip(layers, answers, strict=True):
-            layer[window] += weight * answer
-    return tuple(layer / total for layer in layers)
+    height, width, _ = image.shape
+    tiles = tile_slices((height, width), tile_px=tile_px, overlap_px=overlap_px)
+    if len(tiles) == 1:
+        return backend(image)
+    layers: list[Image] = []
+    weight_sum = np.zeros((height, width, 1), np.float32)
+    for vertical, horizontal in tiles:
+        tile = np.s_[vertical, horizontal]
+        weight = np.outer(
+            _blend_weights(vertical, height, overlap_px), _blend_weights(horizontal, width, overlap_px)
+        )[..., None]
+        weight_sum[tile] += weight
+        outputs = backend(image[tile])
+        layers = layers or [np.zeros((height, width, 3), np.float32) for _ in outputs]
+        for layer, output in zip(layers, outputs, strict=True):
+            layer[tile] += weight * output
+    return tuple(layer / weight_sum for layer in layers)
 
 
-def tiles_of(size: tuple[int, int], *, tile_px: int, overlap_px: int) -> list[tuple[slice, slice]]:
-    """The rows and columns of each tile of a picture of this (height, width)."""
-    rows, columns = (_spans(side, tile_px, overlap_px) for side in size)
+def tile_slices(size: tuple[int, int], *, tile_px: int, overlap_px: int) -> list[tuple[slice, slice]]:
+    """Returns the rows and columns of each tile of an image of this (height, width)."""
+    rows, columns = (_tile_spans(side, tile_px, overlap_px) for side in size)
     return list(product(rows, columns))
 
 
-def _spans(side: int, tile: int, overlap: int) -> list[slice]:
-    """Equal spans of length `tile` that cover 0..side and overlap evenly."""
+def _tile_spans(side: int, tile: int, overlap: int) -> list[slice]:
+    """Returns spans of length `tile` that cover 0..side with equal overlaps of at least `overlap`."""
     if side <= tile:
         return [slice(0, side)]
     count = -(-(side - overlap) // (tile - overlap))
@@ -62,8 +63,8 @@ def _spans(side: int, tile: int, overlap: int) -> list[slice]:
     return [slice(int(start), int(start) + tile) for start in starts]
 
 
-def _fade(span: slice, side: int, overlap: int) -> NDArray[np.float32]:
-    """Weights along a span: 1 inside, falling linearly towards edges that are not the picture's own."""
+def _blend_weights(span: slice, side: int, overlap: int) -> NDArray[np.float32]:
+    """Returns weights along a span: 1 inside, falling linearly towards edges inside the image."""
     length = span.stop - span.start
     ramp = (np.arange(length, dtype=np.float32) + 1) / (overlap + 1)
     ones = np.ones(length, np.float32)

@@ -1,20 +1,19 @@
-"""Photographs in and out: `Photo` keeps the stored pixels and knows their light and their file.
+"""Reads and writes photos. A `Photo` holds the stored pixels, their colour space and the facts of their file.
 
     photo = Photo.open("window.jpg")
     photo.with_linear(photo.linear() * 0.5).save("darker.jpg")
 
-pyvips is used in this room only (decode, encode), OpenEXR and pillow-heif only when such a file comes along.
+Only this package imports pyvips. OpenEXR and pillow-heif are imported when a file needs them.
 """
 
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.photo.decode import read_size
-from brewster.photo.file_info import DEPTHS, FileInfo
+from brewster.photo.file_info import FileInfo
 from brewster.photo.hdr_formats import read_layers, write_layers
 from brewster.photo.photo import Encoding, Photo, Source
 
 __all__ = [
     "DEFAULT_MAX_PIXELS",
-    "DEPTHS",
     "Encoding",
     "FileInfo",
     "Photo",

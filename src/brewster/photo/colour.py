@@ -1,8 +1,8 @@
-"""Colour: stored pixels to linear Rec.709 light and back, through tone curves, matrices and tables.
+"""Converts stored pixels to linear Rec.709 light and back.
 
-A `ColourSpace` is all that is needed: the tone curve of each channel and the matrix from the space's linear light
-to linear Rec.709. It comes from an ICC matrix profile (ICC.1:2022), from an EXR's chromaticities, or is plain
-sRGB. Light outside the Rec.709 gamut has values below 0 or above 1: nothing is clipped on the way in.
+A `ColourSpace` is the tone curve of each channel and the matrix from its linear light to linear Rec.709. It comes from
+an ICC matrix profile (ICC.1:2022) or from the chromaticities of an EXR, and is sRGB otherwise. Light outside the
+Rec.709 gamut has values below 0 or above 1; reading clips nothing.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0
 
 @dataclass(frozen=True)
 class ToneCurve:
-    """A tone curve: values 0..1 as stored to linear light (ICC.1:2022 10.6 and 10.18).
+    """A tone curve from stored values 0..1 to linear light (ICC.1:2022 10.6 and 10.18).
 
-    Either samples, or seven parameters: (a x + b)^g + e from x = d on, c x + f below.
+    Given by `samples`, or by the parameters g, a, b, c, d, e, f: (a x + b)^g + e for x >= d, else c x + f.
     """
 
     samples: tuple[float, ...] = ()
     parameters: tuple[float, ...] = (1, 1, 0, 0, 0, 0, 0)
 
     def decode(self, stored: Float64) -> Float64:
-        """Stored values to linear light, any shape."""
+        """Converts stored values of any shape to linear light."""
         if self.samples:
             return np.interp(stored, np.linspace(0, 1, len(self.samples)), self.samples)
         g, a, b, c, d, e, f = self.parameters
         return np.where(stored >= d, np.maximum(a * stored + b, 0) ** g + e, c * stored + f)
 
     def encode(self, linear: Float64) -> Float64:
-        """Linear light to stored values, any shape: the inverse of `decode`."""
+        """Converts linear light of any shape to stored values; the inverse of `decode`."""
         if self.samples:
             rising = np.maximum.accumulate(np.array(self.samples))
             return np.interp(linear, rising, np.linspace(0, 1, len(self.samples)))
@@ -57,54 +57,53 @@ class ToneCurve:
 
 @dataclass(frozen=True)
 class SrgbToneCurve(ToneCurve):
-    """The curve of sRGB, extended past 1 (brewster.srgb)."""
+    """The sRGB transfer function, extended above 1 and below 0 (brewster.srgb)."""
 
     def decode(self, stored: Float64) -> Float64:
-        """Stored values to linear light, any shape."""
+        """Converts stored values of any shape to linear light."""
         return srgb.to_linear(stored)
 
     def encode(self, linear: Float64) -> Float64:
-        """Linear light to stored values, any shape."""
+        """Converts linear light of any shape to stored values."""
         return srgb.to_encoded(linear)
 
 
 @dataclass(frozen=True)
 class ColourSpace:
-    """How stored pixels mean light: a tone curve per channel, then a matrix to linear Rec.709, if any."""
+    """A tone curve per channel, followed by an optional matrix to linear Rec.709."""
 
     curves: tuple[ToneCurve, ToneCurve, ToneCurve]
     matrix: Matrix | None = None
 
     def to_linear(self, stored: Stored) -> Float32:
-        """Stored pixels (H, W, 1|3), uint8, uint16 or float32, to linear Rec.709, (H, W, 3) float32."""
+        """Converts stored pixels (H, W, 1|3), uint8, uint16 or float32, to linear Rec.709, (H, W, 3) float32."""
         channels = [_decoded(stored[..., i], curve) for i, curve in enumerate(self._curves(stored))]
         if len(channels) == 1:
             return np.repeat(channels[0][..., None], 3, axis=2)
-        return np.stack(_product(self.matrix, channels) if self.matrix else channels, axis=2)
+        return np.stack(_apply_matrix(self.matrix, channels) if self.matrix else channels, axis=2)
 
-    def to_stored(self, linear: Float32, before: Stored) -> Stored:
-        """Linear Rec.709 (H, W, 3) back to the type and channels of `before`, the pixels that stood there.
+    def to_stored(self, linear: Float32, original: Stored) -> Stored:
+        """Converts linear Rec.709 (H, W, 3) to the dtype and channels of `original`, the pixels before a change.
 
-        Pixels whose light is what `before` means come back as they were, to the bit. Not-a-number becomes
-        black.
+        Pixels whose light equals that of `original` are returned bit-equal to it. NaN becomes black.
         """
-        stored = np.empty_like(before)
-        curves = self._curves(before)
+        stored = np.empty_like(original)
+        curves = self._curves(original)
         channels = [linear[..., i] for i in range(3)]
         if len(curves) == 1:
             channels = [_grey(linear)]
         elif self.matrix:
-            channels = _product(_inverse(self.matrix), channels)
+            channels = _apply_matrix(_inverse(self.matrix), channels)
         for i, curve in enumerate(curves):
-            stored[..., i] = _encoded(channels[i], curve, before.dtype)
-        is_exact = self == LINEAR_REC709 or (self == SRGB and before.dtype.kind == "u")
-        if not is_exact:  # those round-trip by themselves, as the tests prove
-            same = np.all(linear == self.to_linear(before), axis=2)
-            stored[same] = before[same]
+            stored[..., i] = _encoded(channels[i], curve, original.dtype)
+        is_exact = self == LINEAR_REC709 or (self == SRGB and original.dtype.kind == "u")
+        if not is_exact:  # exact spaces round-trip without this; the tests prove it
+            same = np.all(linear == self.to_linear(original), axis=2)
+            stored[same] = original[same]
         return stored
 
     def _curves(self, stored: Stored) -> tuple[ToneCurve, ...]:
-        """Grey takes the green curve: profiles for grey have but one, and neutral is neutral in any RGB."""
+        """Grey uses the green curve: grey profiles have one curve, and in RGB profiles neutral values are equal."""
         return self.curves if stored.shape[-1] == 3 else (self.curves[1],)
 
 
@@ -113,11 +112,13 @@ LINEAR_REC709 = ColourSpace((ToneCurve(),) * 3)
 
 
 @lru_cache(maxsize=16)
-def space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_float: bool) -> ColourSpace:
-    """The space of stored pixels: that of the ICC profile, of the chromaticities, or of nothing said.
+def colour_space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_float: bool) -> ColourSpace:
+    """Returns the colour space of stored pixels from their ICC profile or chromaticities.
 
-    Nothing said means sRGB for whole numbers and linear Rec.709 for floats. Raises UnsupportedPhoto for
-    profiles that are not matrix RGB or grey.
+    Without either, integers are sRGB and floats are linear Rec.709.
+
+    Raises:
+        UnsupportedPhoto: the profile is neither grey nor RGB with curves and a matrix.
     """
     if icc is not None:
         return _profile_space(icc)
@@ -128,18 +129,18 @@ def space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_float: b
 
 def _decoded(stored: Stored, curve: ToneCurve) -> Float32:
     if stored.dtype.kind == "f":
-        is_straight = curve == ToneCurve()
-        return stored if is_straight else curve.decode(stored.astype(np.float64)).astype(np.float32)
+        is_identity = curve == ToneCurve()
+        return stored if is_identity else curve.decode(stored.astype(np.float64)).astype(np.float32)
     return _decode_table(curve, np.iinfo(stored.dtype).max).take(stored)
 
 
 def _encoded(linear: Float32, curve: ToneCurve, dtype: np.dtype[Any]) -> Stored:
     if dtype.kind == "f":
-        is_straight = curve == ToneCurve()
-        return linear if is_straight else curve.encode(linear.astype(np.float64)).astype(np.float32)
+        is_identity = curve == ToneCurve()
+        return linear if is_identity else curve.encode(linear.astype(np.float64)).astype(np.float32)
     table = _encode_table(curve, np.iinfo(dtype).max)
-    root = np.sqrt(np.fmin(np.fmax(linear, np.float32(0)), np.float32(1)))
-    return table.take((root * np.float32(len(table) - 1) + np.float32(0.5)).astype(np.intp))
+    sqrt_light = np.sqrt(np.fmin(np.fmax(linear, np.float32(0)), np.float32(1)))
+    return table.take((sqrt_light * np.float32(len(table) - 1) + np.float32(0.5)).astype(np.intp))
 
 
 @lru_cache(maxsize=16)
@@ -149,24 +150,25 @@ def _decode_table(curve: ToneCurve, white: int) -> Float32:
 
 @lru_cache(maxsize=16)
 def _encode_table(curve: ToneCurve, white: int) -> NDArray[Any]:
-    """Stored whole numbers over the square root of linear light, which spreads the dark as encodings do.
+    """A lookup table from the square root of linear light to stored integers.
 
-    2**16 steps round 8 bits to within 0.01 of a level, 2**20 steps 16 bits to within 0.1.
+    Like tone curves, the square root gives dark values more of the table. With 2**16 entries the rounding error is
+    below 0.01 levels of 8 bits, with 2**20 entries below 0.1 levels of 16 bits.
     """
-    roots = np.linspace(0, 1, 2**16 if white < 256 else 2**20)
-    levels = np.rint(np.clip(curve.encode(roots**2), 0, 1) * white)
+    sqrt_light = np.linspace(0, 1, 2**16 if white < 256 else 2**20)
+    levels = np.rint(np.clip(curve.encode(sqrt_light**2), 0, 1) * white)
     return levels.astype(np.uint8 if white < 256 else np.uint16)
 
 
-def _product(matrix: Matrix, channels: list[Float32]) -> list[Float32]:
-    """A matrix times channels, by plain steps: BLAS would round a pixel by where in the strip it stands."""
+def _apply_matrix(matrix: Matrix, channels: list[Float32]) -> list[Float32]:
+    """Multiplies channels by a matrix. Without BLAS, whose rounding depends on the position of a pixel in the strip."""
     red, green, blue = channels
     rows = np.array(matrix, np.float32)
     return [row[0] * red + row[1] * green + row[2] * blue for row in rows]
 
 
 def _grey(linear: Float32) -> Float32:
-    """Luminance, and exactly the common value where the three agree."""
+    """Returns the luminance; exactly the common value where all channels are equal."""
     red, green, blue = (linear[..., i] for i in range(3))
     weights = np.array(srgb.REC709_LUMINANCE, np.float32)
     neutral = (red == green) & (green == blue)
@@ -182,7 +184,10 @@ def _as_matrix(array: Float64) -> Matrix:
 
 
 def _to_d50(primaries: tuple[float, ...]) -> Float64:
-    """Linear RGB of these chromaticities to XYZ under D50, white adapted by Bradford (ICC.1:2022 annex E)."""
+    """Returns the matrix from linear RGB with these chromaticities to XYZ under D50.
+
+    The white point is adapted by the Bradford transform (ICC.1:2022 annex E).
+    """
     xyz = np.array(
         [[x / y, 1, (1 - x - y) / y] for x, y in zip(primaries[::2], primaries[1::2], strict=True)]
     ).T
@@ -198,54 +203,60 @@ def _to_rec709(to_d50: Float64) -> Matrix:
 
 def _profile_space(icc: bytes) -> ColourSpace:
     try:
-        tags = tags_of(icc)
+        tags = icc_tags(icc)
         if icc[16:20] == b"GRAY":
-            return _snapped(ColourSpace((_curve(tags[b"kTRC"]),) * 3))
-        to_d50 = np.array([_xyz(tags[name]) for name in (b"rXYZ", b"gXYZ", b"bXYZ")]).T
-        red, green, blue = (_curve(tags[name]) for name in (b"rTRC", b"gTRC", b"bTRC"))
-        space = _snapped(ColourSpace((red, green, blue), _to_rec709(to_d50)))
+            return _snap_to_srgb(ColourSpace((_parse_curve(tags[b"kTRC"]),) * 3))
+        to_d50 = np.array([_parse_xyz(tags[name]) for name in (b"rXYZ", b"gXYZ", b"bXYZ")]).T
+        red, green, blue = (_parse_curve(tags[name]) for name in (b"rTRC", b"gTRC", b"bTRC"))
+        space = _snap_to_srgb(ColourSpace((red, green, blue), _to_rec709(to_d50)))
         _inverse(space.matrix or _as_matrix(np.eye(3)))
     except (KeyError, ValueError, struct.error, np.linalg.LinAlgError) as error:
         raise UnsupportedPhoto(
             f"the embedded colour profile ({len(icc)} bytes) does not consist of curves and a matrix",
-            "brewster reads those for RGB and grey: sRGB, Display P3, Adobe RGB, ProPhoto and their kind",
-            "convert the picture to one of these first",
+            "brewster reads RGB and grey profiles such as sRGB, Display P3, Adobe RGB and ProPhoto",
+            "convert the photo to one of these first",
         ) from error
     return space
 
 
-def _snapped(space: ColourSpace) -> ColourSpace:
-    """Plain sRGB where a profile means that, to within its rounding and a small part of an 8-bit level."""
+def _snap_to_srgb(space: ColourSpace) -> ColourSpace:
+    """Returns SRGB for a profile that equals sRGB within its rounding, a small fraction of an 8-bit level."""
     levels = np.arange(256) / 255
-    off = [np.abs(curve.decode(levels) - srgb.to_linear(levels)).max() for curve in space.curves]
-    turned = np.abs(np.array(space.matrix) - np.eye(3)).max() if space.matrix else 0.0
-    return SRGB if max(off) < 2e-4 and turned < 1e-3 else space
+    curve_errors = [np.abs(curve.decode(levels) - srgb.to_linear(levels)).max() for curve in space.curves]
+    matrix_error = np.abs(np.array(space.matrix) - np.eye(3)).max() if space.matrix else 0.0
+    return SRGB if max(curve_errors) < 2e-4 and matrix_error < 1e-3 else space
 
 
-def tags_of(icc: bytes) -> dict[bytes, bytes]:
-    """The tags of an ICC profile by signature.
+def icc_tags(icc: bytes) -> dict[bytes, bytes]:
+    """Returns the tags of an ICC profile by signature.
 
     Raises:
-        struct.error: the profile is cut short.
+        struct.error: the profile is truncated.
     """
     (count,) = struct.unpack_from(">I", icc, 128)
     rows = (struct.unpack_from(">4sII", icc, 132 + 12 * i) for i in range(min(count, 100)))
     return {name: icc[start : start + size] for name, start, size in rows}
 
 
-def _xyz(tag: bytes) -> tuple[float, float, float]:
+def _parse_xyz(tag: bytes) -> tuple[float, float, float]:
     x, y, z = struct.unpack_from(">3i", tag, 8)
     return x / 65536, y / 65536, z / 65536
 
 
-_PLACES = ("g", "gab", "gabc", "gabcd", "gabcdef")  # the parameters that each of ICC's function types gives
+_PARAMETRIC_NAMES = (
+    "g",
+    "gab",
+    "gabc",
+    "gabcd",
+    "gabcdef",
+)  # the parameters that each of ICC's function types gives
 
 
-def _curve(tag: bytes) -> ToneCurve:
-    """A curveType or parametricCurveType tag (ICC.1:2022 10.6 and 10.18)."""
+def _parse_curve(tag: bytes) -> ToneCurve:
+    """Parses a curveType or parametricCurveType tag (ICC.1:2022 10.6 and 10.18)."""
     kind, count = struct.unpack_from(">4s4xI", tag)
     if kind == b"para":
-        return _parametric(count >> 16, tag)
+        return _parse_parametric(count >> 16, tag)
     if kind != b"curv":
         raise ValueError(kind)
     if count == 0:
@@ -256,11 +267,11 @@ def _curve(tag: bytes) -> ToneCurve:
     return ToneCurve(samples=tuple(number / 65535 for number in numbers))
 
 
-def _parametric(function: int, tag: bytes) -> ToneCurve:
-    names = _PLACES[function] if function < len(_PLACES) else ""
+def _parse_parametric(function: int, tag: bytes) -> ToneCurve:
+    names = _PARAMETRIC_NAMES[function] if function < len(_PARAMETRIC_NAMES) else ""
     given = dict(zip(names, struct.unpack_from(f">{len(names)}i", tag, 12), strict=True))
     g, a, b, c, d, e, f = (given.get(name, 65536 * (name == "a")) / 65536 for name in "gabcdef")
-    if function in (1, 2):  # below -b/a these two are flat
+    if function in (1, 2):  # types 1 and 2 are constant below -b/a
         c, d, e, f = 0.0, -b / a, c, c
     if g <= 0 or a <= 0:
         raise ValueError(names)

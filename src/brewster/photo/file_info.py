@@ -1,4 +1,4 @@
-"""What a photograph remembers of its file, beside the pixels, and what each container can hold."""
+"""Facts of an image file that pixels do not hold, and the choice of a format and bit depth for writing."""
 
 from __future__ import annotations
 
@@ -8,29 +8,15 @@ from pathlib import Path
 from typing import Any
 
 from brewster.errors import UnsupportedPhoto
-from brewster.files import SUFFIXES
-
-DEPTHS = {
-    "jpeg": (8,),
-    "png": (8, 16),
-    "tiff": (8, 16, 32),
-    "webp": (8,),
-    "avif": (8, 10, 12),
-    "heic": (8, 10),
-    "exr": (16, 32),
-    "hdr": (32,),
-}
-"""Bits per channel that can be written; those of EXR and HDR, and the 32 of TIFF, are floats."""
-
-LINEAR = ("exr", "hdr")
-"""Containers whose pixels are linear light."""
+from brewster.image_formats import WRITABLE, format_of
 
 
 @dataclass(frozen=True)
 class FileInfo:
-    """The file behind a photo. `exif` starts at its TIFF header; its orientation is reset to 1 already."""
+    """Facts of the file of a photo. `exif` starts at its TIFF header; its orientation is already reset to 1."""
 
     container: str = "png"
+    """The name of the file format, a key of `brewster.image_formats.FORMATS`."""
     bits: int = 8
     """Bits per channel in the file."""
     icc: bytes | None = None
@@ -40,41 +26,47 @@ class FileInfo:
     resolution: tuple[float, float] | None = None
     """Pixels per millimetre, across and down."""
     jpeg_quality: int | None = None
-    """The least quality whose quantisation tables are nowhere coarser in sum than the file's, 1..100."""
+    """The lowest libvips quality, 1..100, at which no quantisation table has a larger sum than in the file."""
     subsampling: str | None = None
     """Chroma subsampling of a JPEG, such as "4:2:0"."""
     compression: str | None = None
-    """Compression of a TIFF, in the words of libvips."""
+    """Compression of a TIFF, as libvips names it."""
     lossless: bool = False
-    """Whether a WebP or AVIF says that it is stored without loss."""
+    """Whether a WebP or AVIF is compressed without loss."""
     primaries: tuple[float, ...] | None = None
-    """Chromaticities (xy of red, green, blue and white) where an EXR or HDR states them."""
+    """Chromaticities of an EXR or HDR: x and y of red, green, blue and white; None where the file has none."""
     header: Mapping[str, Any] | None = None
-    """The remaining attributes of an EXR or HDR."""
+    """The other attributes of an EXR or HDR."""
 
 
 def container_of(path: Path) -> str:
-    """The container that a file name asks for; UnsupportedPhoto for a suffix that cannot be written."""
-    container = SUFFIXES.get(path.suffix.lower())
-    if container not in DEPTHS:
-        raise UnsupportedPhoto(
-            f"{path.name!r} asks for the format {path.suffix or 'of no suffix'!r}",
-            f"brewster writes {', '.join(DEPTHS)}",
-            "choose one of their suffixes",
-        )
-    return container
+    """Returns the name of the format that a file name states by its suffix.
 
-
-def depth_for(file_info: FileInfo, container: str, asked: int | None) -> int:
-    """Bits per channel to write: those asked for, else those of the file_info or the nearest below.
-
-    Raises UnsupportedPhoto for a container or a depth that cannot be written.
+    Raises:
+        UnsupportedPhoto: brewster does not write files with this suffix.
     """
-    if container not in DEPTHS or (asked is not None and asked not in DEPTHS[container]):
+    image_format = format_of(path)
+    if image_format is None or not image_format.is_writable:
         raise UnsupportedPhoto(
-            f"{container} with {asked or 'any'} bits per channel was asked for",
-            f"brewster writes {', '.join(f'{name} {depths}' for name, depths in DEPTHS.items())}",
+            f"the file name {path.name!r} has the suffix {path.suffix!r}",
+            f"brewster writes {', '.join(WRITABLE)}",
+            "use the suffix of one of these formats",
+        )
+    return image_format.name
+
+
+def depth_for(file_info: FileInfo, container: str, bit_depth: int | None) -> int:
+    """Returns the bits per channel to write: `bit_depth` if given, else those of the file or the next fewer.
+
+    Raises:
+        UnsupportedPhoto: the format cannot be written, or not at this bit depth.
+    """
+    depths = WRITABLE[container].bit_depths if container in WRITABLE else ()
+    if not depths or (bit_depth is not None and bit_depth not in depths):
+        raise UnsupportedPhoto(
+            f"{container} with {bit_depth or 'any'} bits per channel was requested",
+            f"brewster writes {', '.join(f'{name} {row.bit_depths}' for name, row in WRITABLE.items())}",
             "choose one of these",
         )
-    fitting = [bits for bits in DEPTHS[container] if bits <= file_info.bits]
-    return asked or max(fitting, default=DEPTHS[container][0])
+    fitting = [bits for bits in depths if bits <= file_info.bits]
+    return bit_depth or max(fitting, default=depths[0])

@@ -1,6 +1,6 @@
-"""Pictures of floats: OpenEXR through its own package, Radiance HDR through a small reader and writer.
+"""Reads and writes floating-point images: OpenEXR with its own package, Radiance HDR with built-in code.
 
-Both hold linear light. What else their headers say is kept and written back.
+Both store linear light. Other header attributes are kept and written back.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ Float32 = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class HdrPixels:
-    """Pixels (H, W, 1|3) float32 of linear light, alpha (H, W) or None, and where they come from."""
+    """Pixels (H, W, 1|3) in float32 linear light, alpha (H, W) or None, and the facts of their file."""
 
     pixels: Float32
     alpha: Float32 | None
     file_info: FileInfo
 
 
-def too_large(width: int, height: int, most: int) -> PhotoTooLarge:
-    """The error for a picture of more pixels than the limit."""
+def too_large(width: int, height: int, max_pixels: int) -> PhotoTooLarge:
+    """Returns the error for an image with more pixels than the limit."""
     return PhotoTooLarge(
-        f"the picture has {width} x {height} pixels ({width * height / 1e6:.3g} million)",
-        f"the limit is {most / 1e6:g} million",
-        "raise --max-pixels (in Python max_pixels) if you trust it",
+        f"the image has {width} x {height} pixels ({width * height / 1e6:.3g} million)",
+        f"the limit is {max_pixels / 1e6:g} million",
+        "raise --max-pixels (in Python max_pixels) if you trust the file",
     )
 
 
-def _triangle(stated: Sequence[float | str]) -> tuple[float, ...] | None:
-    """Chromaticities if they span colours; None if they are missing or, as some writers put it, all zero."""
+def _valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float, ...] | None:
+    """Returns chromaticities if they span a gamut; None if they are missing or all zero, as some programs write."""
     try:
-        points = np.array(stated, np.float64).reshape(4, 2)
+        points = np.array(chromaticities, np.float64).reshape(4, 2)
     except ValueError:
         return None
     red, green, blue, _ = points
@@ -56,7 +56,7 @@ def _triangle(stated: Sequence[float | str]) -> tuple[float, ...] | None:
 
 def _openexr() -> types.ModuleType:
     try:
-        import OpenEXR  # noqa: PLC0415  (an extra: only who has EXR files needs it)
+        import OpenEXR  # noqa: PLC0415  (an extra: only EXR files need it)
     except ImportError as error:
         raise MissingExtra(
             "EXR needs the OpenEXR package", "it is not installed", "run: pip install 'brewster[exr]'"
@@ -64,18 +64,22 @@ def _openexr() -> types.ModuleType:
     return OpenEXR  # type: ignore[no-any-return]
 
 
-def read_exr(data: bytes, most: int) -> HdrPixels:
-    """An EXR's first part: R, G, B or Y, and A. Further channels, such as depth, are not carried.
+def read_exr(data: bytes, max_pixels: int) -> HdrPixels:
+    """Reads the first part of an EXR: R, G, B or Y, and A. Other channels, such as depth, are ignored.
 
-    Raises MissingExtra, PhotoTooLarge, UnreadablePhoto, or UnsupportedPhoto for channels that are no picture.
+    Raises:
+        MissingExtra: OpenEXR is not installed.
+        PhotoTooLarge: more pixels than `max_pixels`.
+        UnreadablePhoto: the file is damaged or truncated.
+        UnsupportedPhoto: it has neither R, G and B nor Y.
     """
     header = _exr_part(data, header_only=True).header
     low, high = header["dataWindow"]
     width, height = (int(side) for side in np.array(high) - np.array(low) + 1)
-    if width * height > most:
-        raise too_large(width, height, most)
+    if width * height > max_pixels:
+        raise too_large(width, height, max_pixels)
     part = _exr_part(data, header_only=False)
-    return _exr_floats({name: channel.pixels for name, channel in part.channels.items()}, dict(part.header))
+    return _exr_pixels({name: channel.pixels for name, channel in part.channels.items()}, dict(part.header))
 
 
 def _exr_part(data: bytes, *, header_only: bool) -> Any:  # noqa: ANN401  (OpenEXR has no types)
@@ -84,45 +88,45 @@ def _exr_part(data: bytes, *, header_only: bool) -> Any:  # noqa: ANN401  (OpenE
         return exr.File(io.BytesIO(data), separate_channels=True, header_only=header_only).parts[0]
     except (RuntimeError, ValueError, TypeError, IndexError) as error:
         raise UnreadablePhoto(
-            f"the exr cannot be read whole ({error})", "a whole file is needed", "export it again"
+            f"the exr cannot be read completely ({error})", "a complete file is needed", "export it again"
         ) from error
 
 
-def _exr_floats(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> HdrPixels:
+def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> HdrPixels:
     names = ["R", "G", "B"] if {"R", "G", "B"} <= channels.keys() else ["Y"]
     if not set(names) <= channels.keys() or "RY" in channels:
         raise UnsupportedPhoto(
             f"the EXR has the channels {', '.join(sorted(channels))}",
-            "a picture has R, G, B or Y, and perhaps A",
+            "the channels R, G, B or Y, and optionally A",
             "export it with these names",
         )
     is_half = all(channels[name].dtype == np.float16 for name in names)
-    kept = {key: value for key, value in header.items() if key not in ("channels", "tiles", "type")}
+    attributes = {key: value for key, value in header.items() if key not in ("channels", "tiles", "type")}
     return HdrPixels(
         np.stack([channels[name].astype(np.float32) for name in names], axis=2),
         channels["A"].astype(np.float32) if "A" in channels else None,
         FileInfo(
             container="exr",
             bits=16 if is_half else 32,
-            primaries=_triangle(header.get("chromaticities", ())),
-            header=kept,
+            primaries=_valid_chromaticities(header.get("chromaticities", ())),
+            header=attributes,
         ),
     )
 
 
-def write_exr(floats: HdrPixels) -> bytes:
-    """An EXR of halfs or floats, as the file_info's bits say, with the attributes it came with."""
+def write_exr(image: HdrPixels) -> bytes:
+    """Encodes an EXR in half or single precision, by `file_info.bits`, with the attributes of the source."""
     exr = _openexr()
-    names = "RGB" if floats.pixels.shape[2] == 3 else "Y"
-    planes = {name: floats.pixels[..., i] for i, name in enumerate(names)}
-    if floats.alpha is not None:
-        planes["A"] = floats.alpha
-    kind: type[np.floating[Any]] = np.float16 if floats.file_info.bits == 16 else np.float32
-    most = float(np.finfo(kind).max)
-    channels = {name: plane.clip(-most, most).astype(kind) for name, plane in planes.items()}
+    names = "RGB" if image.pixels.shape[2] == 3 else "Y"
+    planes = {name: image.pixels[..., i] for i, name in enumerate(names)}
+    if image.alpha is not None:
+        planes["A"] = image.alpha
+    kind: type[np.floating[Any]] = np.float16 if image.file_info.bits == 16 else np.float32
+    max_value = float(np.finfo(kind).max)
+    channels = {name: plane.clip(-max_value, max_value).astype(kind) for name, plane in planes.items()}
     header = {
         "compression": exr.ZIP_COMPRESSION,
-        **(floats.file_info.header or {}),
+        **(image.file_info.header or {}),
         "type": exr.scanlineimage,
     }
     file = io.BytesIO()
@@ -130,42 +134,51 @@ def write_exr(floats: HdrPixels) -> bytes:
     return file.getvalue()
 
 
-# --- OpenEXR of several pictures
+# --- OpenEXR with several layers
 
 _LAYER_CHANNELS = ("R", "G", "B")
 _RESERVED = {"channels", "chunkCount", "compression", "dataWindow", "lineOrder", "tiles", "type", "version"}
-"""Attributes that OpenEXR keeps for itself: text under some of these names is dropped without a word."""
+"""Attributes that OpenEXR defines itself: it silently drops text under some of these names."""
 
 
 def write_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -> bytes:
-    """One EXR of several pictures (H, W, 3) of equal size, as halfs, with text attributes beside them.
+    """Encodes images (H, W, 3) of equal size as the layers of one EXR, in half precision, with text attributes.
 
-    Channels are called "photo.R" for the layer "photo", as programs for compositing expect ("Technical
-    Introduction to OpenEXR", layers). Light beyond a half's range, 65504, is clipped. Raises MissingExtra,
-    or UnsupportedPhoto for attributes named as EXR's own.
+    The red channel of the layer "photo" is named "photo.R", as compositing programs expect ("Technical Introduction
+    to OpenEXR", layers). Values are clipped to the range of half precision, 65504.
+
+    Raises:
+        MissingExtra: OpenEXR is not installed.
+        UnsupportedPhoto: an attribute has a name that OpenEXR reserves.
     """
     exr = _openexr()
-    if taken := _RESERVED & header.keys():
+    if reserved := _RESERVED & header.keys():
         raise UnsupportedPhoto(
-            f"attributes are called {', '.join(sorted(taken))}", "EXR keeps these names", "choose others"
+            f"attributes are named {', '.join(sorted(reserved))}",
+            "OpenEXR reserves these names",
+            "choose others",
         )
-    most = float(np.finfo(np.float16).max)
-    halfs = {name: layer.clip(-most, most).astype(np.float16) for name, layer in layers.items()}
+    max_value = float(np.finfo(np.float16).max)
+    half_layers = {
+        name: layer.clip(-max_value, max_value).astype(np.float16) for name, layer in layers.items()
+    }
     channels = {
         f"{name}.{channel}": np.ascontiguousarray(half[..., i])
-        for name, half in halfs.items()
+        for name, half in half_layers.items()
         for i, channel in enumerate(_LAYER_CHANNELS)
     }
     file = io.BytesIO()
-    said = {**header, "compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
-    exr.File(said, channels).write(file)
+    attributes = {**header, "compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}
+    exr.File(attributes, channels).write(file)
     return file.getvalue()
 
 
 def read_layers(data: bytes) -> dict[str, Float32]:
-    """The pictures (H, W, 3) of an EXR by layer, in the order of their names; other channels are passed over.
+    """Returns the layers of an EXR by name, (H, W, 3) float32 each, sorted by name; other channels are ignored.
 
-    Raises MissingExtra, or UnreadablePhoto if it is no whole EXR or has no layer of R, G and B.
+    Raises:
+        MissingExtra: OpenEXR is not installed.
+        UnreadablePhoto: the file is damaged, or has no layer with R, G and B.
     """
     channels = _exr_part(data, header_only=False).channels
     stems = sorted(name.removesuffix(".R") for name in channels if name.endswith(".R"))
@@ -179,7 +192,7 @@ def read_layers(data: bytes) -> dict[str, Float32]:
         raise UnreadablePhoto(
             f"the EXR has the channels {', '.join(sorted(channels))}",
             'layers have the channels "name.R", "name.G" and "name.B"',
-            "open it as a photo, or write it again",
+            "open it with Photo.open, or write it again",
         )
     return layers
 
@@ -187,65 +200,74 @@ def read_layers(data: bytes) -> dict[str, Float32]:
 # --- Radiance HDR (G. Ward, "Real Pixels", Graphics Gems II; the RADIANCE reference manual)
 
 
-def read_hdr(data: bytes, most: int) -> HdrPixels:
-    """A Radiance picture: red, green and blue with a common exponent.
+def read_hdr(data: bytes, max_pixels: int) -> HdrPixels:
+    """Reads a Radiance HDR image: red, green and blue with a shared exponent (RGBE).
 
-    Raises PhotoTooLarge, UnreadablePhoto if it is empty or ends early, UnsupportedPhoto for XYZ or turned
-    scan lines.
+    Raises:
+        PhotoTooLarge: more pixels than `max_pixels`.
+        UnreadablePhoto: the image is empty or truncated.
+        UnsupportedPhoto: XYZ colours, or scan lines that do not run from top to bottom.
     """
     head, blank, rest = data.partition(b"\n\n")
     size, _, body = rest.partition(b"\n")
-    sides = re.fullmatch(rb"-Y (\d{1,9}) \+X (\d{1,9})\s*", size)
+    size_match = re.fullmatch(rb"-Y (\d{1,9}) \+X (\d{1,9})\s*", size)
     lines = head.decode("latin-1").splitlines()[1:]
-    if not blank or sides is None or any("xyze" in line for line in lines):
+    if not blank or size_match is None or any("xyze" in line for line in lines):
         raise UnsupportedPhoto(
-            f"the HDR picture's header ends in {size[:40]!r}",
-            "brewster reads RGBE pictures with lines from top to bottom, '-Y height +X width'",
-            "export it so",
+            f"the header of the HDR image ends in {size[:40]!r}",
+            "brewster reads RGBE images with lines from top to bottom, '-Y height +X width'",
+            "export it in this form",
         )
-    height, width = int(sides[1]), int(sides[2])
+    height, width = int(size_match[1]), int(size_match[2])
     if width * height == 0:
         raise UnreadablePhoto(
-            f"the HDR picture has {width} x {height} pixels", "a picture has at least one", "export it again"
+            f"the HDR image has {width} x {height} pixels", "at least one pixel is needed", "export it again"
         )
-    if width * height > most:
-        raise too_large(width, height, most)
-    return HdrPixels(_from_rgbe(_scan_lines(body, width, height)), None, _hdr_origin(lines))
+    if width * height > max_pixels:
+        raise too_large(width, height, max_pixels)
+    return HdrPixels(_from_rgbe(_scan_lines(body, width, height)), None, _hdr_file_info(lines))
 
 
-def _hdr_origin(lines: list[str]) -> FileInfo:
+def _hdr_file_info(lines: list[str]) -> FileInfo:
     header = dict(line.split("=", 1) for line in lines if "=" in line and not line.startswith("FORMAT"))
     return FileInfo(
-        container="hdr", bits=32, header=header, primaries=_triangle(header.get("PRIMARIES", "").split())
+        container="hdr",
+        bits=32,
+        header=header,
+        primaries=_valid_chromaticities(header.get("PRIMARIES", "").split()),
     )
 
 
 def _scan_lines(body: bytes, width: int, height: int) -> NDArray[np.uint8]:
-    """Bytes (H, W, 4) of run-length coded or flat lines; lines of 2**15 pixels and more are always flat."""
+    """Reads bytes (H, W, 4) from run-length encoded or flat scan lines; lines of 2**15 pixels or more are flat."""
     is_coded = width < 1 << 15 and body.startswith(b"\2\2" + width.to_bytes(2, "big"))
     try:
         if is_coded:
-            planes = np.frombuffer(_unpacked(body, width, height), np.uint8)
+            planes = np.frombuffer(_decode_runs(body, width, height), np.uint8)
             return planes.reshape(height, 4, width).swapaxes(1, 2)
         return np.frombuffer(body, np.uint8, height * width * 4).reshape(height, width, 4)
     except (IndexError, ValueError) as error:
         raise UnreadablePhoto(
-            "the hdr cannot be read whole (it ends early)",
-            f"{height} lines were promised",
-            "copy it again from where it came",
+            "the hdr cannot be read completely (it is truncated)",
+            f"its header states {height} lines",
+            "copy it again from its source",
         ) from error
 
 
-def _unpacked(body: bytes, width: int, height: int) -> bytes:
-    """Run-length coded lines: a lead of four bytes; runs of (128 + length, value), (length, values...)."""
-    planes, at = bytearray(), 0
+def _decode_runs(body: bytes, width: int, height: int) -> bytes:
+    """Decodes run-length encoded lines: a header of 4 bytes, then runs (128 + length, value) or (length, values...)."""
+    planes, position = bytearray(), 0
     for line in range(height):
-        at += 4
+        position += 4
         end = 4 * width * (line + 1)
         while len(planes) < end:
-            run = body[at]
-            planes += body[at + 1 : at + 2] * (run - 128) if run > 128 else body[at + 1 : at + 1 + run]
-            at += 2 if run > 128 else 1 + run
+            run = body[position]
+            planes += (
+                body[position + 1 : position + 2] * (run - 128)
+                if run > 128
+                else body[position + 1 : position + 1 + run]
+            )
+            position += 2 if run > 128 else 1 + run
     return bytes(planes)
 
 
@@ -257,7 +279,7 @@ def _from_rgbe(rgbe: NDArray[np.uint8]) -> Float32:
 
 
 def _to_rgbe(pixels: Float32) -> NDArray[np.uint8]:
-    """The inverse of `_from_rgbe`, exact for what it made; negative light becomes black."""
+    """The inverse of `_from_rgbe`, exact for its outputs; negative light becomes black."""
     light = np.fmax(pixels, 0)
     _, exponent = np.frexp(light.max(axis=2))
     exponent = np.clip(exponent, -127, 127)
@@ -267,11 +289,11 @@ def _to_rgbe(pixels: Float32) -> NDArray[np.uint8]:
     return rgbe
 
 
-def write_hdr(floats: HdrPixels) -> bytes:
-    """A Radiance picture with flat lines, which every reader takes; grey becomes three equal channels."""
-    height, width = floats.pixels.shape[:2]
-    kept = [f"{key}={value}" for key, value in (floats.file_info.header or {}).items()]
-    lines = ["#?RADIANCE", "FORMAT=32-bit_rle_rgbe", *kept]
+def write_hdr(image: HdrPixels) -> bytes:
+    """Encodes a Radiance HDR image with flat lines, which all readers support; grey becomes three equal channels."""
+    height, width = image.pixels.shape[:2]
+    attributes = [f"{key}={value}" for key, value in (image.file_info.header or {}).items()]
+    lines = ["#?RADIANCE", "FORMAT=32-bit_rle_rgbe", *attributes]
     head = "\n".join(lines) + f"\n\n-Y {height} +X {width}\n"
-    pixels = np.broadcast_to(floats.pixels, (height, width, 3))
+    pixels = np.broadcast_to(image.pixels, (height, width, 3))
     return head.encode("latin-1") + _to_rgbe(pixels).tobytes()

@@ -1,7 +1,8 @@
-"""Photos whose ICC profile holds tables instead of curves and a matrix, as scanners and some cameras write them.
+"""Converts photos with LUT-based ICC profiles, which scanners and some cameras write, to Display P3.
 
-`colour` understands curves and a matrix, both ways and for any strip of a photo. Other RGB profiles are converted once, by
-littleCMS inside libvips, to Display P3, the widest space whose profile libvips brings. Colours beyond it are clipped.
+colour.py supports profiles of curves and a matrix, in both directions. Photos with other RGB profiles are converted
+once, by littleCMS in libvips, to Display P3, the largest colour space whose profile libvips includes. Colours outside
+it are clipped.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import pyvips
 from numpy.typing import NDArray
 
 from brewster.errors import UnsupportedPhoto
-from brewster.photo.colour import tags_of
+from brewster.photo.colour import icc_tags
 from brewster.photo.file_info import FileInfo
 
 _MATRIX = {b"rXYZ", b"gXYZ", b"bXYZ", b"rTRC", b"gTRC", b"bTRC"}
@@ -24,48 +25,48 @@ _DEPTHS = {"uint8": ("uchar", "rgb", 8), "uint16": ("ushort", "rgb16", 16)}
 
 
 def has_only_tables(icc: bytes | None) -> bool:
-    """Whether it is an RGB profile that has tables, and no curves and matrix beside them."""
+    """Whether an ICC profile is an RGB profile with lookup tables and without curves and a matrix."""
     if icc is None or icc[16:20] != b"RGB ":
         return False
     try:
-        tags = tags_of(icc).keys()
+        tags = icc_tags(icc).keys()
     except struct.error:
         return False
     return bool(tags & _TABLES) and not tags >= _MATRIX
 
 
-def in_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[NDArray[Any], FileInfo]:
-    """Pixels (H, W, 3) of 8 or 16 bits, converted from a profile of tables (relative colorimetric), and their new file_info.
+def convert_to_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[NDArray[Any], FileInfo]:
+    """Converts pixels (H, W, 3) of 8 or 16 bits to Display P3 (relative colorimetric); returns them and their file facts.
 
     Raises:
-        UnsupportedPhoto: the tables are damaged, or the pixels are grey or floats.
+        UnsupportedPhoto: the profile is damaged, or the pixels are grey or floats.
     """
     bands = pixels.shape[2]
     if bands != 3 or pixels.dtype.name not in _DEPTHS:
         raise UnsupportedPhoto(
-            f"{bands} channels of {pixels.dtype} have a colour profile of tables",
-            "tables are read for RGB of 8 or 16 bits",
-            "convert the picture to sRGB or Display P3 first",
+            f"{bands} channels of {pixels.dtype} have a LUT-based colour profile",
+            "such profiles are supported for RGB of 8 or 16 bits",
+            "convert the photo to sRGB or Display P3 first",
         )
     icc = file_info.icc or b""
     try:
         is_ignored = np.array_equal(
-            _converted(_PROBE, icc), _converted(_PROBE, pyvips.Image.profile_load("srgb"))
+            _convert(_PROBE, icc), _convert(_PROBE, pyvips.Image.profile_load("srgb"))
         )
-        array = _converted(pixels, icc)
+        array = _convert(pixels, icc)
     except pyvips.Error as error:
-        raise _damaged(icc, str(error).strip()) from error
+        raise _damaged_profile(icc, str(error).strip()) from error
     if is_ignored:
-        raise _damaged(icc, "libvips takes sRGB instead")
+        raise _damaged_profile(icc, "libvips uses sRGB instead")
     return array, replace(file_info, icc=bytes(pyvips.Image.profile_load("p3")))
 
 
 _LEVELS = np.arange(0, 256, 51).astype(np.uint8)
 _PROBE = np.stack(np.meshgrid(_LEVELS, _LEVELS, _LEVELS), axis=-1).reshape(-1, 6, 3)
-"""Colours by which an ignored profile is noticed: libvips takes sRGB in silence for one that it cannot use."""
+"""Colours that reveal an ignored profile: libvips silently uses sRGB instead of a profile that it cannot use."""
 
 
-def _converted(pixels: NDArray[Any], icc: bytes) -> NDArray[Any]:
+def _convert(pixels: NDArray[Any], icc: bytes) -> NDArray[Any]:
     height, width, bands = pixels.shape
     kind, meaning, depth = _DEPTHS[pixels.dtype.name]
     contiguous = np.ascontiguousarray(pixels)
@@ -76,9 +77,9 @@ def _converted(pixels: NDArray[Any], icc: bytes) -> NDArray[Any]:
     return np.frombuffer(converted.write_to_memory(), pixels.dtype).reshape(pixels.shape)
 
 
-def _damaged(icc: bytes, reason: str) -> UnsupportedPhoto:
+def _damaged_profile(icc: bytes, reason: str) -> UnsupportedPhoto:
     return UnsupportedPhoto(
-        f"the colour profile of tables ({len(icc)} bytes) cannot be used ({reason})",
-        "a whole ICC profile is needed",
-        "convert the picture to sRGB or Display P3 first",
+        f"the LUT-based colour profile ({len(icc)} bytes) cannot be used ({reason})",
+        "a complete ICC profile is needed",
+        "convert the photo to sRGB or Display P3 first",
     )

@@ -1,8 +1,7 @@
-"""What a file says beside its pixels, read and written byte by byte: JPEG tables, EXIF, PNG and WebP chunks.
+"""Reads and writes metadata byte by byte: JPEG tables, EXIF, PNG and WebP chunks.
 
-libvips rewrites EXIF through libexif, which loses tags it does not know, and passes over EXIF in TIFF. Here
-the block of the source goes into the target as it is. It is kept from its TIFF header on, without the
-"Exif\\0\\0" of JPEG.
+libvips rewrites EXIF with libexif, which drops unknown tags, and ignores EXIF in TIFF. This module copies the EXIF
+block of the source unchanged. A block starts at its TIFF header, without the "Exif\\0\\0" of JPEG.
 """
 
 from __future__ import annotations
@@ -19,11 +18,11 @@ from brewster.errors import UnsupportedPhoto
 _EXIF_NAME = b"Exif\0\0"
 _APP0, _APP1, _DQT, _SOS = 0xE0, 0xE1, 0xDB, 0xDA
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_LONGEST = 65533  # bytes of a segment's payload
+_MAX_SEGMENT_PAYLOAD = 65533  # bytes of a segment's payload
 
 
 def jpeg_segments(data: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """The marker, start and payload of every segment before the pixels."""
+    """Yields the marker, start and payload of every segment before the pixel data."""
     at = 2
     while at + 4 <= len(data) and data[at] == 0xFF:
         marker, size = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
@@ -36,8 +35,8 @@ def jpeg_segments(data: bytes) -> Iterator[tuple[int, int, bytes]]:
         at += 2 + size
 
 
-def jpeg_coarseness(data: bytes) -> dict[int, int]:
-    """Sum of each quantisation table by its number (0: luma, 1: chroma): more is coarser."""
+def jpeg_quantisation_sums(data: bytes) -> dict[int, int]:
+    """Returns the sum of each quantisation table by its number (0: luma, 1: chroma); a larger sum is coarser."""
     sums = {}
     for marker, _, payload in jpeg_segments(data):
         while marker == _DQT and payload:
@@ -49,20 +48,21 @@ def jpeg_coarseness(data: bytes) -> dict[int, int]:
 
 
 def jpeg_subsampling(data: bytes) -> str | None:
-    """Chroma subsampling in the usual words, such as "4:4:4", "4:2:2" or "4:2:0"; None without chroma."""
+    """Returns the chroma subsampling, such as "4:4:4", "4:2:2" or "4:2:0"; None without chroma."""
     for marker, _, payload in jpeg_segments(data):
         if marker in _FRAMES and len(payload) >= 15:
             across, down = payload[7] >> 4, payload[7] & 15
             chroma_across, chroma_down = payload[10] >> 4, payload[10] & 15
-            kept = 4 * chroma_across // across
-            return f"4:{kept}:{0 if down > chroma_down else kept}"
+            chroma = 4 * chroma_across // across
+            return f"4:{chroma}:{0 if down > chroma_down else chroma}"
     return None
 
 
 def with_jpeg_head(data: bytes, exif: bytes | None, dots_per_inch: tuple[float, float] | None) -> bytes:
-    """A JPEG with its resolution (JFIF) and its EXIF in front, neither of which it has so far.
+    """Inserts the resolution (JFIF) and EXIF into a JPEG that has neither.
 
-    Raises UnsupportedPhoto for EXIF beyond the 64 KiB of a segment.
+    Raises:
+        UnsupportedPhoto: the EXIF block is larger than the 64 KiB of a segment.
     """
     head = b""
     if dots_per_inch is not None:
@@ -74,10 +74,10 @@ def with_jpeg_head(data: bytes, exif: bytes | None, dots_per_inch: tuple[float, 
 
 
 def _segment(marker: int, payload: bytes) -> bytes:
-    if len(payload) > _LONGEST:
+    if len(payload) > _MAX_SEGMENT_PAYLOAD:
         raise UnsupportedPhoto(
-            f"the EXIF block holds {len(payload)} bytes",
-            f"a JPEG holds at most {_LONGEST}",
+            f"the EXIF block has {len(payload)} bytes",
+            f"a JPEG stores at most {_MAX_SEGMENT_PAYLOAD}",
             "write PNG, TIFF or WebP instead",
         )
     return struct.pack(">BBH", 0xFF, marker, len(payload) + 2) + payload
@@ -87,7 +87,7 @@ def _segment(marker: int, payload: bytes) -> bytes:
 
 
 def png_chunks(data: bytes) -> dict[bytes, bytes]:
-    """The chunks before the pixels, by name."""
+    """Returns the chunks of a PNG before its pixel data, by name."""
     found, at = {}, 8
     while at + 8 <= len(data) and data[at + 4 : at + 8] != b"IDAT":
         size = int.from_bytes(data[at : at + 4], "big")
@@ -97,7 +97,7 @@ def png_chunks(data: bytes) -> dict[bytes, bytes]:
 
 
 def with_png_exif(data: bytes, exif: bytes) -> bytes:
-    """A PNG with an eXIf chunk right after its header."""
+    """Inserts an eXIf chunk into a PNG, directly after its header."""
     at = 8 + 12 + 13
     chunk = b"eXIf" + exif
     sized = struct.pack(">I", len(exif)) + chunk + struct.pack(">I", zlib.crc32(chunk))
@@ -105,7 +105,7 @@ def with_png_exif(data: bytes, exif: bytes) -> bytes:
 
 
 def webp_chunks(data: bytes) -> dict[bytes, bytes]:
-    """The chunks of a WebP by name."""
+    """Returns the chunks of a WebP by name."""
     found, at = {}, 12
     while at + 8 <= len(data):
         size = int.from_bytes(data[at + 4 : at + 8], "little")
@@ -115,7 +115,7 @@ def webp_chunks(data: bytes) -> dict[bytes, bytes]:
 
 
 def with_webp_exif(data: bytes, exif: bytes, size: tuple[int, int], has_alpha: bool) -> bytes:
-    """A WebP with an EXIF chunk, in the extended layout (RFC 9649 2.7). `size` is width and height."""
+    """Inserts an EXIF chunk into a WebP, in the extended layout (RFC 9649 2.7). `size` is (width, height)."""
     chunks = webp_chunks(data)
     flags = chunks.pop(b"VP8X", bytes(4))[0] | 0x08 | 0x10 * has_alpha
     canvas = b"".join((side - 1).to_bytes(3, "little") for side in size)
@@ -130,8 +130,8 @@ def with_webp_exif(data: bytes, exif: bytes, size: tuple[int, int], has_alpha: b
     return b"RIFF" + struct.pack("<I", len(body) + 4) + b"WEBP" + body
 
 
-def coding_points(data: bytes) -> tuple[int, int, int] | None:
-    """Colour primaries, transfer and matrix as in ITU-T H.273, where an AVIF, HEIC or PNG states them."""
+def cicp(data: bytes) -> tuple[int, int, int] | None:
+    """Returns the code points (CICP, ITU-T H.273) of primaries, transfer and matrix of an AVIF, HEIC or PNG; else None."""
     if data.startswith(b"\x89PNG"):
         chunk = png_chunks(data).get(b"cICP", b"")
         return (chunk[0], chunk[1], chunk[2]) if len(chunk) >= 3 else None
@@ -143,9 +143,9 @@ def coding_points(data: bytes) -> tuple[int, int, int] | None:
 
 
 def with_avif_exif(data: bytes, exif: bytes) -> bytes:
-    """An AVIF whose Exif item, written by libvips in its own words, now is this block at the file's end."""
+    """Replaces the Exif item of an AVIF written by libvips: appends the block and redirects the item to it."""
     item = re.search(rb"infe\x02...(..)..Exif", data, re.DOTALL)
-    row = _location(data, item[1]) if item else None
+    row = _item_location(data, item[1]) if item else None
     if row is None:
         return data
     payload = bytes(4) + exif
@@ -154,8 +154,8 @@ def with_avif_exif(data: bytes, exif: bytes) -> bytes:
     return b"".join((data[:row], place, data[row + len(place) :], box))
 
 
-def _location(data: bytes, item: bytes) -> int | None:
-    """Where an item's base, count, offset and length stand in an iloc box of the kind libheif writes."""
+def _item_location(data: bytes, item: bytes) -> int | None:
+    """Returns the position of an item's base, count, offset and length in an iloc box as libheif writes it."""
     table = data.find(b"iloc")
     version, sizes, more = data[table + 4], data[table + 8], data[table + 9]
     if table < 0 or version > 1 or (sizes, more) != (0x44, 0x40):
@@ -175,8 +175,8 @@ def _location(data: bytes, item: bytes) -> int | None:
 Tags = dict[int, "tuple[int, int, bytes] | Tags"]
 """Tag -> (type, count, value in little-endian) or, for a pointer, the directory it points to."""
 
-_POINTERS = (34665, 34853, 40965)  # Exif, GPS, interoperability
-_CAMERA = (
+_POINTER_TAGS = (34665, 34853, 40965)  # Exif, GPS, interoperability
+_CAMERA_TAGS = (
     270,
     271,
     272,
@@ -186,18 +186,18 @@ _CAMERA = (
     33432,
     34665,
     34853,
-)  # what a camera says of a picture in its directory
+)  # the tags of a TIFF directory that describe the camera and the photo
 _ORIENTATION = 274
-_WIDTHS = {1: 1, 2: 1, 3: 2, 4: 4, 5: 4, 6: 1, 7: 1, 8: 2, 9: 4, 10: 4, 11: 4, 12: 8, 13: 4}
-_FRACTIONS = (5, 10)  # two numbers each
+_TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 4, 6: 1, 7: 1, 8: 2, 9: 4, 10: 4, 11: 4, 12: 8, 13: 4}
+_RATIONAL_TYPES = (5, 10)  # numerator and denominator
 
 
 def read_tags(data: bytes) -> Tags:
-    """The first directory of a TIFF or EXIF block, with those below it; empty where there is none."""
+    """Returns the first directory of a TIFF or EXIF block with its subdirectories; empty if there is none."""
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
     if order is None:
         return {}
-    return _directory(data, order, struct.unpack_from(order + "I", data, 4)[0], _POINTERS)
+    return _directory(data, order, struct.unpack_from(order + "I", data, 4)[0], _POINTER_TAGS)
 
 
 def _directory(data: bytes, order: str, at: int, pointers: tuple[int, ...]) -> Tags:
@@ -207,30 +207,30 @@ def _directory(data: bytes, order: str, at: int, pointers: tuple[int, ...]) -> T
     tags: Tags = {}
     for row in range(at + 2, min(at + 2 + 12 * count, len(data) - 11), 12):
         tag, kind, number = struct.unpack_from(order + "HHI", data, row)
-        width = _WIDTHS.get(kind, 0)
-        size = width * number * (2 if kind in _FRACTIONS else 1)
+        width = _TYPE_BYTES.get(kind, 0)
+        size = width * number * (2 if kind in _RATIONAL_TYPES else 1)
         (offset,) = struct.unpack_from(order + "I", data, row + 8)
         start = row + 8 if size <= 4 else offset
         if tag in pointers:
             tags[tag] = _directory(data, order, offset, tuple(p for p in pointers if p != tag))
         elif width and start + size <= len(data):
-            tags[tag] = (kind, number, _swapped(data[start : start + size], width, order))
+            tags[tag] = (kind, number, _to_little_endian(data[start : start + size], width, order))
     return tags
 
 
-def _swapped(value: bytes, width: int, order: str) -> bytes:
+def _to_little_endian(value: bytes, width: int, order: str) -> bytes:
     if order == "<" or width == 1:
         return value
     return b"".join(value[i : i + width][::-1] for i in range(0, len(value), width))
 
 
 def number_of(tags: Tags, tag: int, default: int) -> int:
-    """The first whole number of a tag."""
+    """Returns the first integer of a tag, or the default."""
     return next(iter(numbers(tags, tag)), default)
 
 
-def end_of_pixels(tags: Tags) -> int:
-    """Where in a TIFF its last strip or tile ends; 0 where its tags do not say."""
+def pixel_data_end(tags: Tags) -> int:
+    """Returns the position at which the last strip or tile of a TIFF ends; 0 if its tags do not state it."""
     ends = [0]
     for starts, sizes in ((273, 279), (324, 325)):
         ends += [
@@ -240,26 +240,26 @@ def end_of_pixels(tags: Tags) -> int:
 
 
 def numbers(tags: Tags, tag: int) -> list[int]:
-    """The whole numbers of a tag; none if it is missing."""
+    """Returns the integers of a tag; none if it is missing."""
     entry = tags.get(tag)
     if not isinstance(entry, tuple) or entry[0] not in (1, 3, 4):
         return []
-    width = _WIDTHS[entry[0]]
+    width = _TYPE_BYTES[entry[0]]
     return [int.from_bytes(entry[2][i : i + width], "little") for i in range(0, len(entry[2]), width)]
 
 
 def orientation_of(exif: bytes) -> int:
-    """The orientation 1..8 that an EXIF block states; 1 if it states none."""
+    """Returns the orientation 1..8 of an EXIF block; 1 if it has none."""
     stated = number_of(read_tags(exif.removeprefix(_EXIF_NAME)), _ORIENTATION, 1)
     return stated if 1 <= stated <= 8 else 1
 
 
-def lay_out(tags: Tags, at: int) -> tuple[bytes, int]:
-    """A directory as bytes to stand at offset `at` of a little-endian file, and the offset of its rows."""
+def _serialize_directory(tags: Tags, at: int) -> tuple[bytes, int]:
+    """Returns a directory as bytes for offset `at` of a little-endian file, and the offset of its entries."""
     values, rows = b"", b""
     for tag, entry in sorted(tags.items(), key=lambda item: item[0]):
         if isinstance(entry, dict):
-            below, offset = lay_out(entry, at + len(values))
+            below, offset = _serialize_directory(entry, at + len(values))
             values, entry = values + below, (4, 1, struct.pack("<I", offset))  # noqa: PLW2901
         kind, count, value = entry
         if len(value) > 4:
@@ -272,28 +272,28 @@ def lay_out(tags: Tags, at: int) -> tuple[bytes, int]:
 
 
 def tiff_exif(tags: Tags) -> bytes | None:
-    """An EXIF block of what a TIFF says of its camera; None if it says nothing."""
-    camera: Tags = {tag: entry for tag, entry in tags.items() if tag in _CAMERA}
+    """Returns an EXIF block with the camera tags of a TIFF; None if it has none."""
+    camera: Tags = {tag: entry for tag, entry in tags.items() if tag in _CAMERA_TAGS}
     if not camera:
         return None
     camera[_ORIENTATION] = (3, 1, b"\x01\0")
-    body, first = lay_out(camera, 8)
+    body, first = _serialize_directory(camera, 8)
     return b"II*\0" + struct.pack("<I", first) + body
 
 
 def with_tiff_exif(data: bytes, exif: bytes) -> bytes:
-    """A little-endian TIFF of one page with the camera's tags, in a new directory at its end."""
+    """Adds camera tags to a little-endian TIFF of one page, in a new directory at its end."""
     tags = read_tags(data)
-    tags.update((tag, entry) for tag, entry in read_tags(exif).items() if tag in _CAMERA)
+    tags.update((tag, entry) for tag, entry in read_tags(exif).items() if tag in _CAMERA_TAGS)
     start = len(data) + len(data) % 2
-    body, first = lay_out(tags, start)
+    body, first = _serialize_directory(tags, start)
     return b"".join((data[:4], struct.pack("<I", first), data[8:], bytes(len(data) % 2), body))
 
 
 def upright_exif(exif: bytes) -> bytes:
-    """An EXIF block from its TIFF header on: orientation 1, no thumbnail, and all else as it was.
+    """Returns an EXIF block from its TIFF header on, with orientation 1 and without thumbnail, otherwise unchanged.
 
-    The thumbnail shows the picture as it was, unturned and unseparated; it is unlinked from the first directory.
+    The thumbnail shows the input before rotation and separation; its directory is unlinked from the first one.
     """
     exif = exif.removeprefix(_EXIF_NAME)
     order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
@@ -315,5 +315,5 @@ def upright_exif(exif: bytes) -> bytes:
 
 
 def upright_xmp(xmp: bytes) -> bytes:
-    """An XMP block with tiff:Orientation set to 1 and all else as it was."""
+    """Returns an XMP block with tiff:Orientation set to 1, otherwise unchanged."""
     return re.sub(rb"""(tiff:Orientation(?:=["']|>))[1-8]""", rb"\g<1>1", xmp)

@@ -1,4 +1,4 @@
-"""The photo: stored pixels that remember their file, and know what light they mean."""
+"""`Photo`: stored pixels with their colour space and the facts of their file."""
 
 from __future__ import annotations
 
@@ -15,29 +15,30 @@ from numpy.typing import NDArray
 from brewster import srgb
 from brewster.errors import PhotoError, UnreadablePhoto, UnsupportedPhoto
 from brewster.files import DEFAULT_MAX_PIXELS, write_atomically
+from brewster.image_formats import FORMATS, WRITABLE
 from brewster.photo import metadata
-from brewster.photo.colour import SRGB, ColourSpace, space_of
-from brewster.photo.decode import Decoded, decode, split, upright
+from brewster.photo.colour import SRGB, ColourSpace, colour_space_of
+from brewster.photo.decode import Decoded, apply_orientation, decode, split_alpha
 from brewster.photo.encode import encode
-from brewster.photo.file_info import DEPTHS, LINEAR, FileInfo, container_of, depth_for
+from brewster.photo.file_info import FileInfo, container_of, depth_for
 from brewster.photo.hdr_formats import too_large
-from brewster.photo.lut_profiles import has_only_tables, in_display_p3
+from brewster.photo.lut_profiles import convert_to_display_p3, has_only_tables
 
 Float32 = NDArray[np.float32]
 Stored = NDArray[Any]
 Encoding = Literal["srgb", "linear"]
 Source = Any
-"""A path, the bytes of a file, a numpy array (with its encoding stated), a PIL image, or a Photo."""
+"""A path, the bytes of a file, a numpy array (with its encoding), a PIL image, or a Photo."""
 
-_STRIP = 1 << 18  # pixels worked on at once: a few megabytes, so that whole float copies are never needed
+_STRIP_PIXELS = 1 << 18  # processed at once: a few MB as floats; a whole photo may not fit into memory
 
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """A photograph: pixels as stored, alpha apart, and their file. Upright, immutable, thread-safe.
+    """A photo: stored pixels, alpha and file facts, with the EXIF orientation applied. Immutable and thread-safe.
 
-    `pixels` is (H, W, 1|3) and `alpha` (H, W) or None; both are uint8, uint16 or float32. Whole numbers are
-    encoded by the file_info's profile (sRGB if it has none); floats without a profile are linear Rec.709 light.
+    `pixels` is (H, W, 1|3) and `alpha` (H, W) or None; both are uint8, uint16 or float32. Integers are encoded by
+    the ICC profile in `file_info` (sRGB if it has none); floats without a profile are linear Rec.709 light.
     """
 
     pixels: Stored = field(repr=False)
@@ -45,8 +46,8 @@ class Photo:
     file_info: FileInfo = field(default_factory=FileInfo, repr=False)
 
     def __post_init__(self) -> None:
-        """Fix the arrays, so that photos can share them."""
-        _refuse_shapes(self.pixels, self.alpha)
+        """Makes the arrays read-only, so that photos can share them."""
+        _check_arrays(self.pixels, self.alpha)
         self.pixels.flags.writeable = False
         if self.alpha is not None:
             self.alpha.flags.writeable = False
@@ -55,57 +56,73 @@ class Photo:
     def open(
         cls, source: Source, *, encoding: Encoding | None = None, max_pixels: int = DEFAULT_MAX_PIXELS
     ) -> Photo:
-        """A photo from whatever holds one: a path, the bytes of a file, an array, a PIL image, or a photo.
+        """Opens a photo from a path, the bytes of a file, an array, a PIL image, or a photo.
 
-        An array needs its `encoding` stated, the others tell theirs. Raises UnreadablePhoto (missing, empty,
-        truncated, no picture), UnsupportedPhoto (CMYK, animation, five channels, not-a-number, damaged
-        profile), PhotoTooLarge (beyond `max_pixels`, told from the header), MissingExtra (EXR, HEIC), or
-        PhotoError for an encoding that is missing, unknown or out of place.
+        Args:
+            source: what to open.
+            encoding: what the numbers of an array mean, "srgb" or "linear"; for arrays only.
+            max_pixels: larger photos are refused before they are decoded.
+
+        Raises:
+            UnreadablePhoto: the file is missing, empty, truncated, or not an image.
+            UnsupportedPhoto: CMYK, an animation, five channels, NaN values, or a damaged profile.
+            PhotoTooLarge: more pixels than `max_pixels`.
+            MissingExtra: the reader of EXR or HEIC is not installed.
+            PhotoError: the encoding is missing, unknown, or given for a source that is not an array.
         """
         if isinstance(source, np.ndarray):
             height, width = (*source.shape, 1, 1)[:2]
-            _refuse_large(width, height, max_pixels)
-            return cls.from_array(source, encoding=_stated(encoding))
+            _check_pixel_count(width, height, max_pixels)
+            return cls.from_array(source, encoding=_check_encoding(encoding))
         if encoding is not None:
             raise PhotoError(
                 f"encoding={encoding!r} came with a {type(source).__name__}",
-                "only arrays need one: files, PIL images and photos tell their own",
+                "only arrays need one: files, PIL images and photos state their own",
                 "leave it out",
             )
         if isinstance(source, Photo):
             return source
         if hasattr(source, "getbands"):
-            _refuse_large(source.width, source.height, max_pixels)
+            _check_pixel_count(source.width, source.height, max_pixels)
             return cls.from_pil(source)
-        data = bytes(source) if isinstance(source, bytes | bytearray | memoryview) else _read(Path(source))
-        return cls._of(decode(data, max_pixels))
+        data = (
+            bytes(source) if isinstance(source, bytes | bytearray | memoryview) else _read_file(Path(source))
+        )
+        return cls._from_decoded(decode(data, max_pixels))
 
     @classmethod
-    def _of(cls, decoded: Decoded) -> Photo:
+    def _from_decoded(cls, decoded: Decoded) -> Photo:
         pixels, file_info = decoded.pixels, decoded.file_info
         if has_only_tables(file_info.icc):
-            pixels, file_info = in_display_p3(pixels, file_info)
+            pixels, file_info = convert_to_display_p3(pixels, file_info)
         photo = cls(pixels, decoded.alpha, file_info)
-        photo.space()  # a profile we cannot use is an error now, not in the middle of the work
+        photo.colour_space()  # raises the error of an unusable profile now, not in the middle of a separation
         return photo
 
     @classmethod
     def from_array(cls, array: Stored, *, encoding: Encoding) -> Photo:
-        """A photo from (H, W) or (H, W, 1|3|4) numbers: uint8, uint16, or floats where 1.0 is white.
+        """Makes a photo from an array (H, W) or (H, W, 1|3|4) of uint8, uint16, or floats where 1.0 is white.
 
-        sRGB whole numbers are stored as they are, all others as linear float32. Raises UnsupportedPhoto for
-        other shapes and types and for values that are not finite, PhotoError for other encodings.
+        sRGB-encoded integers are stored unchanged, all others as linear float32.
+
+        Raises:
+            UnsupportedPhoto: another shape or dtype, or values that are not finite.
+            PhotoError: the encoding is neither "srgb" nor "linear".
         """
-        encoding = _stated(encoding)
+        encoding = _check_encoding(encoding)
         array = np.array(array)[..., None] if np.ndim(array) == 2 else np.array(array)
         if array.ndim != 3 or array.shape[2] not in (1, 3, 4) or array.dtype.name not in _LEVELS:
             raise UnsupportedPhoto(
                 f"the array is {array.shape} of {array.dtype}",
-                "a picture is (H, W) or (H, W, 1|3|4) of uint8, uint16 or float",
+                "an image is (H, W) or (H, W, 1|3|4) of uint8, uint16 or float",
                 "reshape or convert it",
             )
         if not np.isfinite(array).all():
-            raise UnsupportedPhoto("the array is not finite everywhere", "light is finite", "repair it first")
+            raise UnsupportedPhoto(
+                "the array has values that are infinite or NaN",
+                "all values must be finite",
+                "repair it first",
+            )
         colours = array.shape[2] - (array.shape[2] == 4)
         pixels, alpha = array[..., :colours], array[..., colours] if array.shape[2] == 4 else None
         if encoding == "linear" or array.dtype.kind == "f":
@@ -113,24 +130,25 @@ class Photo:
             pixels = srgb.to_linear(pixels) if encoding == "srgb" else pixels
             alpha = None if alpha is None else alpha / np.float32(_LEVELS[array.dtype.name])
         floats = pixels.dtype.kind == "f"
-        kind = np.dtype(np.float32) if floats else array.dtype
+        dtype = np.dtype(np.float32) if floats else array.dtype
         return cls(
-            np.ascontiguousarray(pixels, kind),
-            None if alpha is None else np.ascontiguousarray(alpha, kind),
-            FileInfo(bits=8 * kind.itemsize),
+            np.ascontiguousarray(pixels, dtype),
+            None if alpha is None else np.ascontiguousarray(alpha, dtype),
+            FileInfo(bits=8 * dtype.itemsize),
         )
 
     @classmethod
     def from_pil(cls, image: Source) -> Photo:
-        """A photo from a PIL image with its profile and EXIF; palettes become RGB.
+        """Makes a photo from a PIL image with its profile and EXIF; palettes become RGB.
 
-        Raises UnsupportedPhoto for animations, CMYK, LAB, floats and other modes whose meaning is not plain.
+        Raises:
+            UnsupportedPhoto: an animation, CMYK, LAB, floats, or another mode without a defined colour space.
         """
-        if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":  # a JPEG with previews behind it
+        if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":  # MPO: a JPEG followed by previews
             raise UnsupportedPhoto(
                 f"the PIL image has {image.n_frames} frames",
-                "brewster takes one picture at a time",
-                "seek the frame and give its image.copy()",
+                "brewster reads single images",
+                "seek the frame and pass its image.copy()",
             )
         if image.mode in ("P", "PA", "1"):
             has_alpha = image.mode == "PA" or "transparency" in image.info
@@ -138,72 +156,79 @@ class Photo:
         if image.mode not in ("L", "LA", "RGB", "RGBA", "I;16"):
             raise UnsupportedPhoto(
                 f"the PIL image has mode {image.mode}",
-                "RGB and grey are taken, with or without alpha",
+                "RGB and grey are supported, with or without alpha",
                 'use image.convert("RGB")',
             )
         exif, icc = image.info.get("exif"), image.info.get("icc_profile")
         container = (image.format or "png").lower()
         array = np.asarray(image).reshape(image.height, image.width, -1)
         file_info = FileInfo(
-            container=container if container in DEPTHS else "png",
+            container=container if container in WRITABLE else "png",
             bits=16 if image.mode == "I;16" else 8,
             icc=icc or None,
             exif=metadata.upright_exif(exif) if exif else None,
         )
-        return cls._of(split(upright(array, metadata.orientation_of(exif or b"")), file_info))
+        return cls._from_decoded(
+            split_alpha(apply_orientation(array, metadata.orientation_of(exif or b"")), file_info)
+        )
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
         return self.pixels.shape[1], self.pixels.shape[0]
 
-    def space(self) -> ColourSpace:
-        """What light the stored numbers mean."""
-        return space_of(self.file_info.icc, self.file_info.primaries, self.pixels.dtype.kind == "f")
+    def colour_space(self) -> ColourSpace:
+        """Returns the colour space of the stored pixels."""
+        return colour_space_of(self.file_info.icc, self.file_info.primaries, self.pixels.dtype.kind == "f")
 
     def linear(self) -> Float32:
-        """Linear Rec.709 light, (H, W, 3) float32; below 0 and above 1 where the gamut or range is wider."""
+        """Returns linear Rec.709 light, (H, W, 3) float32; below 0 or above 1 where the gamut or range is wider."""
         linear = np.empty((*self.pixels.shape[:2], 3), np.float32)
         for rows in self.strips():
             linear[rows] = self.linear_rows(rows.start, rows.stop)
         return linear
 
     def linear_rows(self, top: int, bottom: int) -> Float32:
-        """Linear light of the rows from `top` up to `bottom`: a strip of `linear`."""
-        return self.space().to_linear(self.pixels[top:bottom])
+        """Returns the rows `top` to `bottom` (exclusive) of `linear()`."""
+        return self.colour_space().to_linear(self.pixels[top:bottom])
 
     def stored_rows(self, linear: Float32, top: int) -> Stored:
-        """Light (rows, W, 3) that takes the place of the rows from `top` on, as this photo would store it.
+        """Encodes new linear light (rows, W, 3) for the rows from `top` on, in the colour space and dtype of this photo.
 
-        The inverse of `linear_rows`: pixels whose light is unchanged come back bit-equal; others are clipped
-        to what can be stored. For results made in strips; gather them in an array like `pixels` and call
-        `with_pixels`.
+        The inverse of `linear_rows`. Pixels with unchanged light are bit-equal; others are clipped to the range of
+        the dtype. To process a photo in strips, collect the strips in an array like `pixels` and call `with_pixels`.
         """
-        return self.space().to_stored(np.asarray(linear, np.float32), self.pixels[top : top + len(linear)])
+        return self.colour_space().to_stored(
+            np.asarray(linear, np.float32), self.pixels[top : top + len(linear)]
+        )
 
     def srgb_8bit(self) -> NDArray[np.uint8]:
-        """8-bit sRGB numbers (H, W, 3), clipped to what sRGB can show, without alpha: what benchmarks compare.
+        """Returns 8-bit sRGB values (H, W, 3), clipped to the sRGB gamut, without alpha; benchmarks compare these.
 
-        Of an 8-bit photo in sRGB these are the stored numbers; grey is repeated in all three channels.
+        For an 8-bit sRGB photo these are the stored values. Grey is repeated in all three channels.
         """
-        kind = np.dtype(np.uint8)
-        if self.space() == SRGB and self.pixels.dtype.kind == "u":
-            pixels = _rescaled(self.pixels, kind) if self.pixels.dtype != kind else self.pixels
+        dtype = np.dtype(np.uint8)
+        if self.colour_space() == SRGB and self.pixels.dtype.kind == "u":
+            pixels = _rescaled(self.pixels, dtype) if self.pixels.dtype != dtype else self.pixels
             return np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels
-        shown = np.empty((*self.pixels.shape[:2], 3), kind)
+        shown = np.empty((*self.pixels.shape[:2], 3), dtype)
         for rows in self.strips():
             shown[rows] = SRGB.to_stored(self.linear_rows(rows.start, rows.stop), shown[rows])
         return shown
 
     def with_linear(self, linear: Float32) -> Photo:
-        """The same photo with other light, (H, W, 3); pixels whose light is unchanged are bit-equal."""
+        """Returns the same photo with other light, (H, W, 3); pixels with unchanged light are bit-equal."""
         pixels = np.empty_like(self.pixels)
         for rows in self.strips():
             pixels[rows] = self.stored_rows(linear[rows], rows.start)
         return self.with_pixels(pixels)
 
     def with_pixels(self, pixels: Stored) -> Photo:
-        """The same photo with other stored pixels of the same shape and type, which become read-only."""
+        """Returns the same photo with other stored pixels of the same shape and dtype; the array becomes read-only.
+
+        Raises:
+            PhotoError: another shape or dtype.
+        """
         if pixels.shape != self.pixels.shape or pixels.dtype != self.pixels.dtype:
             raise PhotoError(
                 f"new pixels are {pixels.shape} of {pixels.dtype}",
@@ -213,13 +238,13 @@ class Photo:
         return replace(self, pixels=pixels)
 
     def strips(self) -> Iterator[slice]:
-        """Slices of rows from top to bottom, each small enough to be worked on in floats."""
+        """Returns slices of rows from top to bottom, each small enough to convert to floats."""
         height, width = self.pixels.shape[:2]
-        step = max(1, _STRIP // width)
+        step = max(1, _STRIP_PIXELS // width)
         return (slice(top, min(top + step, height)) for top in range(0, height, step))
 
-    def small(self, width: int, height: int) -> Float32:
-        """The photo at another size, (height, width, 3) linear light: the mean over each new pixel's area."""
+    def resized(self, width: int, height: int) -> Float32:
+        """Returns the photo at another size, (height, width, 3) linear light, by area averaging."""
         out = np.empty((height, width, 3), np.float32)
         full_height = self.size[1]
         for row in range(height):
@@ -232,10 +257,17 @@ class Photo:
         return out
 
     def encode(self, container: str | None = None, *, depth: int | None = None) -> bytes:
-        """The bytes of a file: the file_info's container and depth unless others are asked for (see `DEPTHS`).
+        """Returns the bytes of a file.
 
-        JPEG keeps the source's quality and chroma. Raises UnsupportedPhoto for what the container cannot
-        hold.
+        JPEG keeps the quality and chroma subsampling of the source.
+
+        Args:
+            container: the format, such as "png"; by default that of the photo's own file.
+            depth: bits per channel (see `image_formats.FORMATS`); by default those of the photo, or the next fewer.
+
+        Raises:
+            UnsupportedPhoto: the format cannot store this photo, or not at this bit depth.
+            MissingExtra: the writer of EXR or HEIC is not installed.
         """
         container = container or self.file_info.container
         bits = depth_for(self.file_info, container, depth)
@@ -245,26 +277,27 @@ class Photo:
     def save(
         self, path: str | os.PathLike[str], *, depth: int | None = None, overwrite: bool = False
     ) -> None:
-        """Write a file, whole or not at all, in the container that its suffix names.
+        """Writes a file atomically, in the format that its suffix states.
 
-        Raises TargetError if it exists (without `overwrite`) or cannot be written, UnsupportedPhoto as
-        `encode`.
+        Raises:
+            TargetError: the file exists (without `overwrite`) or cannot be written.
+            UnsupportedPhoto: as `encode`.
         """
         data = self.encode(container_of(Path(path)), depth=depth)
         write_atomically(Path(path), data, overwrite=overwrite)
 
     def _stored_as(self, container: str, bits: int) -> Photo:
-        """The pixels in the type that a container and its depth need, meaning the same light."""
-        was_linear, is_linear = self.file_info.container in LINEAR, container in LINEAR
-        kind = np.dtype(np.float32 if is_linear or bits == 32 else np.uint8 if bits == 8 else np.uint16)
-        moves = container != self.file_info.container and (was_linear or is_linear)
-        if kind == self.pixels.dtype and not moves:
+        """Converts the pixels to the dtype that a format and bit depth need; the light stays the same."""
+        was_linear, is_linear = (FORMATS[name].is_linear for name in (self.file_info.container, container))
+        dtype = np.dtype(np.float32 if is_linear or bits == 32 else np.uint8 if bits == 8 else np.uint16)
+        changes_light = container != self.file_info.container and (was_linear or is_linear)
+        if dtype == self.pixels.dtype and not changes_light:
             return self
-        alpha = None if self.alpha is None else _rescaled(self.alpha, kind)
+        alpha = None if self.alpha is None else _rescaled(self.alpha, dtype)
         has_profile = self.file_info.icc is not None and not is_linear
-        if has_profile or (kind.kind == "u" and self.pixels.dtype.kind == "u"):
-            return Photo(_rescaled(self.pixels, kind), alpha, self.file_info)
-        pixels, space = np.empty(self.pixels.shape, kind), space_of(None, None, kind.kind == "f")
+        if has_profile or (dtype.kind == "u" and self.pixels.dtype.kind == "u"):
+            return Photo(_rescaled(self.pixels, dtype), alpha, self.file_info)
+        pixels, space = np.empty(self.pixels.shape, dtype), colour_space_of(None, None, dtype.kind == "f")
         for rows in self.strips():
             pixels[rows] = space.to_stored(self.linear_rows(rows.start, rows.stop), pixels[rows])
         return Photo(pixels, alpha, replace(self.file_info, icc=None, primaries=None, header=None))
@@ -273,55 +306,55 @@ class Photo:
 _LEVELS = {"uint8": 255, "uint16": 65535, "float16": 1, "float32": 1, "float64": 1}
 
 
-def _rescaled(values: Stored, kind: np.dtype[Any]) -> Stored:
-    """Numbers of one type as another's, white staying white, encoded as they were."""
-    white, new_white = _LEVELS[values.dtype.name], _LEVELS[kind.name]
-    if kind.kind == "f":
-        return values.astype(kind) / np.float32(white)
+def _rescaled(values: Stored, dtype: np.dtype[Any]) -> Stored:
+    """Converts values between dtypes so that white stays white; the encoding is unchanged."""
+    white, new_white = _LEVELS[values.dtype.name], _LEVELS[dtype.name]
+    if dtype.kind == "f":
+        return values.astype(dtype) / np.float32(white)
     if values.dtype.kind == "f":
-        return np.rint(values.clip(0, 1) * np.float32(new_white)).astype(kind)
-    return ((values.astype(np.uint32) * new_white + white // 2) // white).astype(kind)
+        return np.rint(values.clip(0, 1) * np.float32(new_white)).astype(dtype)
+    return ((values.astype(np.uint32) * new_white + white // 2) // white).astype(dtype)
 
 
 def _area_means(line: Float32, width: int) -> Float32:
-    """Means of a row (W, 3) over `width` equal parts, by differences of its running sum."""
+    """Averages a row (W, 3) over `width` equal parts, by differences of its cumulative sum."""
     sums = np.vstack([np.zeros((1, 3)), np.cumsum(line, axis=0, dtype=np.float64)])
     edges = np.linspace(0, len(line), width + 1)
     at = np.column_stack([np.interp(edges, np.arange(len(sums)), sums[:, i]) for i in range(3)])
     return (np.diff(at, axis=0) * (width / len(line))).astype(np.float32)
 
 
-def _stated(encoding: Encoding | None) -> Encoding:
+def _check_encoding(encoding: Encoding | None) -> Encoding:
     if encoding not in ("srgb", "linear"):
         raise PhotoError(
             f"the array's encoding is {encoding!r}",
-            "numbers alone do not tell what light they mean",
-            'say encoding="srgb" or encoding="linear"',
+            "an array does not state its encoding",
+            'pass encoding="srgb" or encoding="linear"',
         )
     return encoding
 
 
-def _refuse_large(width: int, height: int, most: int) -> None:
-    if width * height > most:
-        raise too_large(width, height, most)
+def _check_pixel_count(width: int, height: int, max_pixels: int) -> None:
+    if width * height > max_pixels:
+        raise too_large(width, height, max_pixels)
 
 
-def _refuse_shapes(pixels: Stored, alpha: Stored | None) -> None:
+def _check_arrays(pixels: Stored, alpha: Stored | None) -> None:
     is_picture = pixels.ndim == 3 and pixels.shape[2] in (1, 3) and pixels.size > 0
     fits = alpha is None or (alpha.shape == pixels.shape[:2] and alpha.dtype == pixels.dtype)
     if not (is_picture and fits and pixels.dtype.name in ("uint8", "uint16", "float32")):
         raise UnsupportedPhoto(
             f"pixels are {pixels.shape} of {pixels.dtype}, alpha {None if alpha is None else alpha.shape}",
-            "a photo has (H, W, 1|3) pixels of uint8, uint16 or float32 and perhaps (H, W) alpha alike",
+            "a photo has (H, W, 1|3) pixels of uint8, uint16 or float32, and optionally (H, W) alpha of the same dtype",
             "use Photo.from_array",
         )
 
 
-def _read(path: Path) -> bytes:
+def _read_file(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
         reason = "it is a folder" if path.is_dir() else error.strerror or str(error)
         raise UnreadablePhoto(
-            f"{path} cannot be read ({reason})", "a picture file is needed", "check its name and permissions"
+            f"{path} cannot be read ({reason})", "an image file is needed", "check its name and permissions"
         ) from error

@@ -25,7 +25,7 @@ from pydantic import ValidationError
 
 import brewster
 from brewster.errors import RecipeError
-from brewster.files import HIDDEN, arriving, discard, hidden_beside, write_atomically
+from brewster.files import TEMPORARY_PREFIX, atomic_path, discard, temporary_path, write_atomically
 from brewster.photo import read_layers, write_layers
 from brewster.render.analytic import ghost_distance_px
 from brewster.render.camera_response import DevelopedSample, develop, encode_jpeg, luminance
@@ -103,7 +103,7 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
     Raises:
         TargetError: it cannot be written; the disk may be full.
     """
-    with arriving(folder) as part:
+    with atomic_path(folder) as part:
         part.mkdir(parents=True)
         for name, data in files.items():
             write_atomically(part / name, data)
@@ -111,7 +111,7 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
 
 def remove_leftovers(out: Path) -> None:
     """Removes what killed runs have left half; nobody else may be writing there."""
-    for part in out.glob(f"{HIDDEN}*"):
+    for part in out.glob(f"{TEMPORARY_PREFIX}*"):
         discard(part)
 
 
@@ -134,7 +134,7 @@ def pack(out: Path, block: int) -> None:
     entries = list(read_block(out, block))
     if any(not entry.spans for entry in entries):
         with (
-            arriving(out / shard_name(block)) as part,
+            atomic_path(out / shard_name(block)) as part,
             tarfile.open(part, "w", format=tarfile.USTAR_FORMAT) as tar,
         ):
             for entry in entries:
@@ -157,7 +157,7 @@ def _add(tar: tarfile.TarFile, entry: StoredSample) -> None:
 
 def _remove(folder: Path) -> None:
     """Removes a sample's folder, which must not be seen half: it loses its name first."""
-    doomed = hidden_beside(folder)
+    doomed = temporary_path(folder)
     with contextlib.suppress(OSError):  # another process was faster
         folder.replace(doomed)
         discard(doomed)

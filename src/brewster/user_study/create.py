@@ -19,7 +19,7 @@ from typing import Final, final
 
 import brewster
 from brewster.errors import BrewsterError, PhotoError, TargetError
-from brewster.files import arriving, write_atomically
+from brewster.files import write_atomically
 from brewster.photo import Photo
 from brewster.user_study.degrade import degrade
 from brewster.user_study.folders import Key, find_pictures, shorten_list
@@ -103,7 +103,7 @@ def create(
     catches = _limited(
         options.catches, DEFAULT_CATCHES, min(CATCH_POOL_SIZE, len(files.inputs)), "catch trials"
     )
-    with arriving(out) as folder:
+    with atomic_path(out) as folder:
         copier = _Copier(folder / PICTURES, Random(f"{seed}/names"), on_progress)  # noqa: S311  (the seed is published)
         comparisons = tuple(_comparisons(files, pairs, copier))
         pool = tuple(_catch_pool(files, copier, Random(f"{seed}/catches")))  # noqa: S311

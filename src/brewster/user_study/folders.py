@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from brewster.errors import BrewsterError
-from brewster.files import SUFFIXES
+from brewster.image_formats import SUFFIXES
 from brewster.user_study.study import UNNAMED_DATASET
 
 Key = tuple[str, str]

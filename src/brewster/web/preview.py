@@ -53,8 +53,8 @@ def preview(
         BrewsterError: as `Separator` does.
     """
     width, height = _preview_size(photo.size)
-    small = photo.small(width, height)
-    arguments = options.call() | {"strength": _SMALL_STRENGTH, "additive": False}
+    small = photo.resized(width, height)
+    arguments = options.call_options() | {"strength": _SMALL_STRENGTH, "additive": False}
     channels = photo.pixels.shape[2]  # one for a grey photo
     reduced = Photo.from_array(small[..., :channels], encoding="linear")
     layers = separator(reduced, on_progress=on_progress, **arguments)

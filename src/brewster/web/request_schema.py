@@ -15,7 +15,8 @@ from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import Request
 
-from brewster.files import LAYERS, SUFFIXES, SeparationPaths
+from brewster.files import LAYERS, SeparationPaths
+from brewster.image_formats import SUFFIXES
 from brewster.options import Options
 
 FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")

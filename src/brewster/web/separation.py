@@ -23,7 +23,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 import brewster
-from brewster.files import SUFFIXES
+from brewster.image_formats import SUFFIXES
 from brewster.inference.predictor import ProgressCallback
 from brewster.photo import Photo
 from brewster.web.job_queue import JobProgress, JobQueue
@@ -131,12 +131,14 @@ def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: Pro
     """The layers of a photo as files."""
     started = time.perf_counter()
     options = form.options
-    separation = model_cache.separator(options.model)(form.photo, on_progress=on_progress, **options.call())
+    separation = model_cache.separator(options.model)(
+        form.photo, on_progress=on_progress, **options.call_options()
+    )
     files = {}
     for layer in options.layers:
         on_progress(1)  # raises JobCancelled: encoding takes time too
         name = form.target(layer, separation.photo.file_info.container)
-        files[name] = getattr(separation, layer).encode(SUFFIXES[Path(name).suffix.lower()])
+        files[name] = getattr(separation, layer).encode(SUFFIXES[Path(name).suffix.lower()].name)
     name, data = (
         next(iter(files.items())) if len(files) == 1 else (f"{Path(form.name).stem}.zip", _zip(files))
     )
@@ -165,8 +167,7 @@ def _preview(model_cache: ModelCache, form: SeparationRequest, on_progress: Prog
 def _media_type(name: str) -> str:
     if name.endswith(".zip"):
         return "application/zip"
-    container = SUFFIXES[Path(name).suffix.lower()]
-    return _MEDIA_TYPES.get(container, f"image/{container}")
+    return SUFFIXES[Path(name).suffix.lower()].mime_type
 
 
 def _zip(files: Mapping[str, bytes]) -> bytes:

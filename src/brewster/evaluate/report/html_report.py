@@ -24,7 +24,7 @@ from brewster.evaluate.report.images import (
     CaseTiles,
 )
 from brewster.evaluate.report.tables import is_complete, ranking, remarks
-from brewster.files import arriving
+from brewster.files import atomic_path
 
 Results = Mapping[str, Any]
 
@@ -44,7 +44,7 @@ def write_report(results: Results, cases: Iterable[CaseTiles], path: Path) -> No
         TargetError: the file cannot be written.
     """
     with (
-        arriving(path) as part,
+        atomic_path(path) as part,
         part.open("x", encoding="utf-8", errors="replace", newline="\n") as file,
     ):
         file.writelines(_page(results, cases))

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn import functional
 
-from brewster.files import arriving, write_atomically
+from brewster.files import atomic_path, write_atomically
 from brewster.photo import Photo
 from brewster.render.sample import LAYERS
 from brewster.rendered.store import SCENE, STATISTICS, StoredSample, read_set
@@ -76,7 +76,7 @@ def write_index(out: Path) -> None:
     }
     schema = pa.schema([(name, pa.type_for_alias(kind)) for name, kind in kinds.items()])
     rows = map(_row, read_set(out))
-    with arriving(out / INDEX) as part, parquet.ParquetWriter(part, schema) as writer:
+    with atomic_path(out / INDEX) as part, parquet.ParquetWriter(part, schema) as writer:
         while some := list(islice(rows, _ROWS_AT_ONCE)):
             writer.write_batch(pa.RecordBatch.from_pylist(some, schema=schema))
 

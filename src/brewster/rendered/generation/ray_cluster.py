@@ -14,7 +14,7 @@ from typing import Any, Final, Self, final
 from brewster.errors import DeviceError, MissingExtra
 from brewster.rendered.generation.job import RenderJob, RenderResult, RenderTask
 from brewster.rendered.generation.workers import TRIES, TaskRunner
-from brewster.worker_setup import one_thread
+from brewster.worker_setup import single_torch_thread
 
 LOCAL: Final = "local"
 _PATIENCE_S: Final = 10.0
@@ -123,5 +123,5 @@ _hands: list[tuple[RenderJob, TaskRunner]] = []
 def _perform(job: RenderJob, task: RenderTask) -> list[RenderResult]:
     if not _hands or _hands[0][0] != job:
         _hands[:] = [(job, TaskRunner(job))]
-    with one_thread():
+    with single_torch_thread():
         return _hands[0][1](task)

@@ -27,7 +27,7 @@ from brewster.rendered import store
 from brewster.rendered.generation.job import FATAL, RenderJob, RenderResult, RenderTask
 from brewster.scene.sampler import draw
 from brewster.scene.scene import Scene, read_scene
-from brewster.worker_setup import end_with_parent, one_thread
+from brewster.worker_setup import exit_with_parent, single_torch_thread
 
 Renderer = Callable[[Scene, Assets], LightSample]
 
@@ -100,7 +100,7 @@ def render_again(path: Path, folder: Path, folders: Sequence[Path] = (), rendere
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise TargetError(f"{folder} is taken", "nothing is overwritten unasked", "name a new folder with -o")
     chosen = renderer or _renderer_of(path)
-    with one_thread():
+    with single_torch_thread():
         sample = find_renderer(chosen)(scene, Assets(folders))
         store.write_folder(folder, store.encode_sample(sample, chosen))
 
@@ -125,7 +125,7 @@ class SerialExecutor:
     chunk = 1
 
     def __init__(self, job: RenderJob) -> None:
-        self._hand, self._threads = TaskRunner(job), one_thread()
+        self._hand, self._threads = TaskRunner(job), single_torch_thread()
         self._task: RenderTask | None = None
 
     def has_room(self) -> bool:
@@ -256,8 +256,8 @@ def _deaf_to_interrupts() -> Iterator[None]:
 def _serve(pipe: Connection, job: RenderJob) -> None:
     """A worker's life: tasks until the pipe ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()  # the next run may be at the same sample
+    exit_with_parent()  # the next run may be at the same sample
     hand = TaskRunner(job)
-    with one_thread(), suppress(EOFError):
+    with single_torch_thread(), suppress(EOFError):
         while True:
             pipe.send(hand(pipe.recv()))

@@ -28,7 +28,6 @@ from brewster.training.loop import StepCallback, run
 from brewster.training.losses import check_finite, psnr_gain_db, separation_loss, tone_ratio
 from brewster.training.recipe import CompactRecipe
 from brewster.training.streams import held_out_mixtures, open_stream, validation_pairs
-from brewster.worker_setup import one_thread
 
 ValidationPairs = Mapping[str, list[tuple[Tensor, Tensor]]]
 """folder -> pairs of photo and ground truth, each float (1, 3, h, w), sRGB-encoded."""
@@ -55,7 +54,9 @@ def train(recipe: CompactRecipe, out: Path, on_step: StepCallback) -> nn.Module:
         ModelError, TargetError: as `loop.run`.
     """
     trainer = CompactTrainer(recipe)
-    with one_thread():  # for this thread; the threads of the trainer's pools are limited by their initializer
+    with (
+        single_torch_thread()
+    ):  # for this thread; the threads of the trainer's pools are limited by their initializer
         run(trainer, out, on_step)
     return trainer.averaged_network()
 

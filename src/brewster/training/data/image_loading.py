@@ -15,11 +15,11 @@ from torch import Tensor
 
 from brewster.benchmarks.pairing import PictureGroup, read_folders
 from brewster.errors import PhotoError, RecipeError
-from brewster.files import SUFFIXES
+from brewster.image_formats import SUFFIXES
 from brewster.photo import Photo
 from brewster.srgb import to_encoded
 
-_MAPS = {suffix for suffix, container in SUFFIXES.items() if container in ("exr", "hdr")}
+_MAPS = {suffix for suffix, image_format in SUFFIXES.items() if image_format.is_linear}
 _PICTURES = SUFFIXES.keys() - _MAPS
 _PHOTO_SIDE_PX = 640
 _MAP_HEIGHT_PX = 512
@@ -135,7 +135,7 @@ def _read_photo(path: Path, max_side_px: int) -> Tensor:
 def _downscaled(photo: Photo, max_side_px: int) -> NDArray[np.float32]:
     scale = min(1.0, max_side_px / max(photo.size))
     width, height = (max(1, round(side * scale)) for side in photo.size)
-    return photo.small(width, height)
+    return photo.resized(width, height)
 
 
 def _list_pictures(

@@ -228,5 +228,5 @@ def layers_from_pair(photo: Tensor, transmission: Tensor) -> Tensor:
 
 def _read_picture(path: Path) -> Tensor:
     photo = Photo.open(path)
-    encoded = to_encoded(np.clip(photo.small(*photo.size), 0, 1))
+    encoded = to_encoded(np.clip(photo.resized(*photo.size), 0, 1))
     return torch.from_numpy(np.rint(encoded * 255).astype(np.uint8))

@@ -1,0 +1,157 @@
+"""The table of image formats: one row holds everything that brewster knows about a file format.
+
+To add a format, add a row here. A format with a new `library` also needs a reader and a writer in `brewster.photo`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal, final
+
+FormatName = Literal["jpeg", "png", "tiff", "webp", "avif", "heic", "exr", "hdr"]
+"""The names of the formats that brewster writes."""
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class ImageFormat:
+    """A file format: how its files are recognised, what they can store, and which library reads and writes them."""
+
+    name: str
+    suffixes: tuple[str, ...]
+    """File name suffixes in lower case; new files get the first."""
+    mime_type: str
+    signature: bytes
+    """A regular expression for the first bytes of a file."""
+    library: Literal["libvips", "OpenEXR", "pillow-heif", "built-in"] = "libvips"
+    vips_loader: str | None = None
+    vips_saver: str | None = None
+    extra: str | None = None
+    """The extra of brewster that installs the library; None where the core has it."""
+    bit_depths: tuple[int, ...] = ()
+    """Bits per channel that can be written; empty for a format that is only read."""
+    has_float32: bool = False
+    """Whether 32-bit floats are stored without loss; HDR loses precision, as its channels share an exponent."""
+    is_linear: bool = False
+    """Whether the pixels are linear light by definition, without an ICC profile."""
+    has_alpha: bool = True
+    """Whether an alpha channel can be written."""
+    has_cicp: bool = False
+    """Whether a file may state its colour space by code points (ITU-T H.273) instead of an ICC profile."""
+    is_stored_rotated: bool = False
+    """Whether the library returns pixels as stored, so that the EXIF orientation must still be applied."""
+
+    @property
+    def is_writable(self) -> bool:
+        """Whether brewster writes this format."""
+        return bool(self.bit_depths)
+
+
+_ROWS: Final = (
+    ImageFormat(
+        name="jpeg",
+        suffixes=(".jpg", ".jpeg", ".jpe", ".jfif"),
+        mime_type="image/jpeg",
+        signature=rb"\xff\xd8\xff",
+        vips_loader="jpegload_buffer",
+        vips_saver="jpegsave_buffer",
+        bit_depths=(8,),
+        has_alpha=False,
+        is_stored_rotated=True,
+    ),
+    ImageFormat(
+        name="png",
+        suffixes=(".png",),
+        mime_type="image/png",
+        signature=rb"\x89PNG\r\n\x1a\n",
+        vips_loader="pngload_buffer",
+        vips_saver="pngsave_buffer",
+        bit_depths=(8, 16),
+        has_cicp=True,
+        is_stored_rotated=True,
+    ),
+    ImageFormat(
+        name="tiff",
+        suffixes=(".tiff", ".tif"),
+        mime_type="image/tiff",
+        signature=rb"II[*+]\0|MM\0[*+]",
+        vips_loader="tiffload_buffer",
+        vips_saver="tiffsave_buffer",
+        bit_depths=(8, 16, 32),
+        has_float32=True,
+        is_stored_rotated=True,
+    ),
+    ImageFormat(
+        name="webp",
+        suffixes=(".webp",),
+        mime_type="image/webp",
+        signature=rb"RIFF....WEBP",
+        vips_loader="webpload_buffer",
+        vips_saver="webpsave_buffer",
+        bit_depths=(8,),
+        is_stored_rotated=True,
+    ),
+    ImageFormat(
+        name="avif",
+        suffixes=(".avif",),
+        mime_type="image/avif",
+        signature=rb"....ftyp(avif|avis)",
+        vips_loader="heifload_buffer",
+        vips_saver="heifsave_buffer",
+        bit_depths=(8, 10, 12),
+        has_cicp=True,
+    ),
+    ImageFormat(
+        name="heic",
+        suffixes=(".heic", ".heif"),
+        mime_type="image/heic",
+        signature=rb"....ftyp(hei[cxms]|hev[cxms])",
+        library="pillow-heif",
+        extra="heic",
+        bit_depths=(8, 10),
+        has_cicp=True,
+    ),
+    ImageFormat(
+        name="exr",
+        suffixes=(".exr",),
+        mime_type="image/x-exr",
+        signature=rb"v/1\x01",
+        library="OpenEXR",
+        extra="exr",
+        bit_depths=(16, 32),
+        has_float32=True,
+        is_linear=True,
+    ),
+    ImageFormat(
+        name="hdr",
+        suffixes=(".hdr",),
+        mime_type="image/vnd.radiance",
+        signature=rb"#\?(RADIANCE|RGBE)",
+        library="built-in",
+        bit_depths=(32,),
+        is_linear=True,
+        has_alpha=False,
+    ),
+    ImageFormat(
+        name="gif",
+        suffixes=(".gif",),
+        mime_type="image/gif",
+        signature=rb"GIF8[79]a",
+        vips_loader="gifload_buffer",
+    ),
+)
+
+FORMATS: Final = {row.name: row for row in _ROWS}
+"""All formats by name, in the order in which their signatures are tried."""
+
+WRITABLE: Final = {name: row for name, row in FORMATS.items() if row.is_writable}
+"""The formats that brewster writes, by name."""
+
+SUFFIXES: Final = {suffix: row for row in _ROWS for suffix in row.suffixes}
+"""All formats by file name suffix, in lower case."""
+
+
+def format_of(path: Path) -> ImageFormat | None:
+    """Returns the format that a file name states by its suffix; None for a suffix of no known format."""
+    return SUFFIXES.get(path.suffix.lower())

@@ -1,0 +1,44 @@
+"""The table of image formats agrees with the type of format names and with the page."""
+
+import re
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from brewster import image_formats
+from brewster.image_formats import FORMATS, SUFFIXES, WRITABLE, FormatName, format_of
+
+PAGE = Path(image_formats.__file__).parent / "web" / "page" / "index.html"
+
+
+def test_format_names_of_type_checkers_are_those_of_the_table():
+    assert get_args(FormatName) == tuple(WRITABLE)
+
+
+def test_each_suffix_and_each_mime_type_belongs_to_one_format():
+    assert len(SUFFIXES) == sum(len(row.suffixes) for row in FORMATS.values())
+    assert len({row.mime_type for row in FORMATS.values()}) == len(FORMATS)
+
+
+@pytest.mark.parametrize(("name", "found"), [("a.JPG", "jpeg"), ("a.b.tif", "tiff"), ("a.gif", "gif")])
+def test_the_format_of_a_file_name_is_that_of_its_suffix(name, found):
+    assert format_of(Path(name)).name == found
+
+
+@pytest.mark.parametrize("name", ["a", "a.txt", ".png"])
+def test_other_suffixes_have_no_format(name):
+    assert format_of(Path(name)) is None
+
+
+def test_libvips_formats_have_a_loader_and_the_written_ones_a_saver():
+    for row in FORMATS.values():
+        uses_libvips = row.library == "libvips"
+        assert (row.vips_loader is not None) == uses_libvips
+        assert (row.vips_saver is not None) == (uses_libvips and row.is_writable)
+
+
+def test_the_page_offers_every_suffix_that_browsers_may_not_count_as_an_image():
+    (offered,) = re.findall(r'accept="image/\*,([^"]*)"', PAGE.read_text())
+    common = {suffix for name in ("jpeg", "png", "gif") for suffix in FORMATS[name].suffixes}
+    assert set(offered.split(",")) == set(SUFFIXES) - common
