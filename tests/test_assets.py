@@ -5,7 +5,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from brewster.environments import assets as worlds
+from brewster.environments import assets as assets_module
 from brewster.environments.assets import Assets
 from brewster.errors import PhotoError, RecipeError, UnreadablePhoto, UnsupportedPhoto
 from brewster.photo import Photo
@@ -104,11 +104,11 @@ def test_light_below_zero_is_none(folder, random):
 def test_builtin_maps_need_no_folder(monkeypatch, random):
     asked = []
     monkeypatch.setitem(
-        worlds.WORLDS, "street", lambda seed, height: asked.append((seed, height)) or sky(random)
+        assets_module.ENVIRONMENTS, "street", lambda seed, height: asked.append((seed, height)) or sky(random)
     )
     light = Assets().map_light(EnvironmentMap(source=AssetSource(file="builtin:street:7"), luminance=3))
     assert sphere_mean(luminance(light)) == pytest.approx(3, rel=1e-4)
-    assert asked == [(7, worlds.BUILTIN_HEIGHT)]
+    assert asked == [(7, assets_module.BUILTIN_HEIGHT)]
 
 
 @pytest.mark.parametrize(
@@ -289,7 +289,7 @@ def test_builtin_paintings_and_no_others():
 
 def test_what_was_used_last_is_kept_and_memory_is_bounded(folder, random, monkeypatch):
     one = sky(random).nbytes
-    monkeypatch.setattr(worlds, "_KEPT_BYTES", 2 * one)
+    monkeypatch.setattr(assets_module, "_CACHE_BYTES", 2 * one)
     opened = []
     monkeypatch.setattr(Photo, "open", classmethod(lambda _cls, data: opened.append(data) or _original(data)))
     for name in "abc":
@@ -305,7 +305,7 @@ def test_what_was_used_last_is_kept_and_memory_is_bounded(folder, random, monkey
 
 
 def test_a_map_larger_than_the_bound_is_kept_alone(folder, random, monkeypatch):
-    monkeypatch.setattr(worlds, "_KEPT_BYTES", 10)
+    monkeypatch.setattr(assets_module, "_CACHE_BYTES", 10)
     (folder / "a.hdr").write_bytes(hdr_of(sky(random)))
     assets = Assets([folder])
     first = assets.map_light(EnvironmentMap(source=AssetSource(file="a.hdr")))

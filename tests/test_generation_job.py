@@ -82,7 +82,7 @@ def test_shards_are_packed_as_they_become_complete_and_grow_with_the_set(tmp_pat
 
     class Watches(SerialExecutor):
         def submit(self, task):
-            seen[task.do, task.numbers[0]] = sorted(path.name for path in out.glob("0*"))
+            seen[task.kind, task.indices[0]] = sorted(path.name for path in out.glob("0*"))
             super().submit(task)
 
     out = tmp_path / "set"
@@ -170,8 +170,8 @@ def test_a_disk_that_is_full_when_a_shard_or_the_index_is_written_loses_nothing(
 @pytest.mark.parametrize(
     ("other", "says"),
     [
-        ({"seed": 8}, "its seed is 7, and 8 was asked for"),
-        ({"recipe": "window"}, "its recipe.name is tiny, and window was asked for"),
+        ({"seed": 8}, "its seed is 7, and 8 was requested"),
+        ({"recipe": "window"}, "its recipe.name is tiny, and window was requested"),
         ({"renderer": "slow"}, "its renderer is fake_renderer:render"),
     ],
 )
@@ -196,7 +196,7 @@ def test_a_set_grows_across_versions_until_its_samples_change(four, tmp_path, mo
     monkeypatch.setattr(brewster, "__version__", "99")
     assert statuses(make(tmp_path / "set", count=5))[4] == "rendered"
     monkeypatch.setattr(store, "SAMPLE_FORMAT", 99)
-    with pytest.raises(TargetError, match="its format is 1, and 99 was asked for"):
+    with pytest.raises(TargetError, match="its format is 1, and 99 was requested"):
         make(tmp_path / "set")
 
 
@@ -248,5 +248,5 @@ def test_a_schedule_looks_no_further_ahead_than_a_block(tmp_path):
     """A billion samples are as easily begun as ten."""
     schedule = building._Schedule(tmp_path, range(10**9), 4, shards=True, report=lambda _: None)
     tasks = [schedule.next() for _ in range(3)]
-    assert [task.numbers for task in tasks] == [(0, 1, 2, 3), (4, 5, 6, 7), (8, 9, 10, 11)]
+    assert [task.indices for task in tasks] == [(0, 1, 2, 3), (4, 5, 6, 7), (8, 9, 10, 11)]
     assert len(schedule._left) == 1

@@ -230,7 +230,7 @@ def test_a_broken_download_goes_on_where_it_was(haven, fetch, maps):
 
 
 def test_what_came_is_kept_for_the_next_call(haven, fetch, maps, monkeypatch):
-    monkeypatch.setattr(polyhaven, "_PAUSES_S", ())
+    monkeypatch.setattr(polyhaven, "_RETRY_DELAYS_S", ())
     haven.faults["/file/a_room"] = ["cut"]
     [result] = fetch()
     assert "ended after 25000 of 100000 bytes" in result.error

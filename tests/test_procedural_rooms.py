@@ -5,17 +5,17 @@ from brewster.environments.procedural import rooms
 from brewster.environments.procedural.canvas import (
     Canvas,
     Glow,
-    ProceduralWorld,
+    ProceduralEnvironment,
     Quad,
     directions,
     fractal,
     render,
     vector,
 )
-from brewster.environments.procedural.rooms import WORLDS, painting
+from brewster.environments.procedural.rooms import ENVIRONMENTS, painting
 from brewster.srgb import REC709_LUMINANCE
 
-NAMES = sorted(WORLDS)
+NAMES = sorted(ENVIRONMENTS)
 
 
 def luminance(picture):
@@ -36,7 +36,7 @@ def both_maps():
     heights = 64, 128
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rooms, "render", lambda world, _height: [render(world, each) for each in heights])
-        return {name: WORLDS[name](7, 0) for name in NAMES}
+        return {name: ENVIRONMENTS[name](7, 0) for name in NAMES}
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +65,8 @@ def test_a_world_is_a_lat_long_map_of_radiance(maps, name):
 
 @pytest.mark.parametrize("name", ["room", "night"])  # a street is a night street in other light
 def test_a_seed_gives_the_same_bytes_and_another_seed_another_world(maps, name):
-    assert WORLDS[name](7, 64).tobytes() == maps[name].tobytes()
-    first, second = (np.log(picture + 0.01) for picture in (maps[name], WORLDS[name](1, 64)))
+    assert ENVIRONMENTS[name](7, 64).tobytes() == maps[name].tobytes()
+    first, second = (np.log(picture + 0.01) for picture in (maps[name], ENVIRONMENTS[name](1, 64)))
     assert np.abs(first - second).mean() > 0.2
 
 
@@ -98,7 +98,7 @@ def test_lamps_of_a_room_outshine_its_walls(fine_maps):
 @pytest.mark.parametrize("aim", [(0, 0, -1), (0.6, 0.8, 0), (0.1, 1, 0.1), (0, -1, 0)])
 def test_a_glow_keeps_its_energy_whatever_the_map_resolves(height, aim):
     position = np.array(aim, np.float32) / np.linalg.norm(aim) * 10
-    picture = render(ProceduralWorld([], [Glow(position, 0.05, (1000, 0, 0))], dark, 0.5), height)
+    picture = render(ProceduralEnvironment([], [Glow(position, 0.05, (1000, 0, 0))], dark, 0.5), height)
     energy = (picture[..., 0] * solid_angles(height)).sum()
     assert energy == pytest.approx(1000 * np.pi * 0.005**2, rel=1e-3)
 
@@ -122,7 +122,7 @@ def test_a_quad_stands_where_it_was_put_and_covers_its_solid_angle():
         (vector(0, 0, 2), vector(0, -2, 0)),
         lambda points, _normal: np.ones_like(points),
     )
-    picture = render(ProceduralWorld([quad], [], dark, 0), 64)[..., 0]
+    picture = render(ProceduralEnvironment([quad], [], dark, 0), 64)[..., 0]
     assert ((picture > 0) * solid_angles(64)).sum() == pytest.approx(4 * np.pi / 6, rel=0.03)
     assert picture[32, 32 - 4] == 0.5
     assert picture[32, 32 + 4] == 1

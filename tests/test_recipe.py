@@ -66,11 +66,11 @@ def test_pictures_grow_at_the_shares_of_the_run_that_the_recipe_names():
 def test_what_has_no_share_may_be_listed(tmp_path):
     no_pairs = 'pairs = ["real"]\npairs_share = 0.0\n'
     rendered = '[data.rendered]\nrecipe = "tiny"\n'
-    assert not learning_from(tmp_path, f"{no_pairs}{rendered}").data.is_none
-    assert not learning_from(tmp_path, f'photos = ["a"]\n{no_pairs}').data.is_none
-    assert not learning_from(tmp_path, f'photos = ["a"]\n{rendered}share = 0.0\n').data.is_none
-    assert not learning_from(tmp_path, 'pairs = ["real"]\npairs_share = 1.0\n').data.is_none
-    assert learning_from(tmp_path, f"{no_pairs}{rendered}count = 0\n").data.is_none
+    assert not learning_from(tmp_path, f"{no_pairs}{rendered}").data.is_empty
+    assert not learning_from(tmp_path, f'photos = ["a"]\n{no_pairs}').data.is_empty
+    assert not learning_from(tmp_path, f'photos = ["a"]\n{rendered}share = 0.0\n').data.is_empty
+    assert not learning_from(tmp_path, 'pairs = ["real"]\npairs_share = 1.0\n').data.is_empty
+    assert learning_from(tmp_path, f"{no_pairs}{rendered}count = 0\n").data.is_empty
 
 
 def test_a_scene_recipe_of_ones_own_lies_beside_the_recipe(tmp_path):

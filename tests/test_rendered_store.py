@@ -162,7 +162,7 @@ def test_the_index_is_written_in_batches_and_the_same_each_time(four, tmp_path, 
     shutil.copytree(four, tmp_path / "set")
     preview.write_index(tmp_path / "set")
     assert hashes(tmp_path / "set") == hashes(four)
-    monkeypatch.setattr(preview, "_ROWS_AT_ONCE", 3)
+    monkeypatch.setattr(preview, "_BATCH_ROWS", 3)
     preview.write_index(tmp_path / "set")
     assert parquet.ParquetFile(tmp_path / "set" / preview.INDEX).num_row_groups == 2
     assert parquet.read_table(tmp_path / "set" / preview.INDEX) == parquet.read_table(four / preview.INDEX)

@@ -76,7 +76,7 @@ def test_ctrl_c_stops_all_at_once_and_leaves_nothing_half(tmp_path):
 
 
 def test_a_sample_that_kills_every_worker_is_named_and_the_rest_goes_on(tmp_path, monkeypatch):
-    monkeypatch.setattr(workers, "TRIES", 1)
+    monkeypatch.setattr(workers, "MAX_ATTEMPTS", 1)
     results = make(tmp_path / "set", renderer="deadly", executor=partial(ProcessExecutor, count=1))
     assert statuses(results) == {0: "rendered", 1: "rendered", 2: "failed", 3: "rendered"}
     assert "its worker died 1 times (exit code -9)" in next(
@@ -125,11 +125,11 @@ def test_every_renderer_is_there():
 
 
 def test_an_unfinished_task_is_done_only_where_it_is_not(tmp_path):
-    asked = job(tmp_path)
-    hand = workers.TaskRunner(asked)
+    requested = job(tmp_path)
+    runner = workers.TaskRunner(requested)
     task = RenderTask("render", (0, 1))
-    hand(task)
+    runner(task)
     before = (tmp_path / "000000").stat().st_ino
-    assert [result.status for result in hand(task)] == ["rendered", "rendered"]
+    assert [result.status for result in runner(task)] == ["rendered", "rendered"]
     assert (tmp_path / "000000").stat().st_ino == before
-    assert not SerialExecutor(asked).is_busy()
+    assert not SerialExecutor(requested).is_busy()

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.environments.procedural.rooms import WORLDS, painting
+from brewster.environments.procedural.rooms import ENVIRONMENTS, painting
 from brewster.errors import BrewsterError, RecipeError, UnsupportedPhoto
 from brewster.photo import Photo
 from brewster.scene.world import BUILTIN, AssetSource, EnvironmentMap, Plane
@@ -24,7 +24,7 @@ from brewster.srgb import REC709_LUMINANCE
 Float32 = NDArray[np.float32]
 
 BUILTIN_HEIGHT = 512
-_KEPT_BYTES = 300_000_000
+_CACHE_BYTES = 300_000_000
 _CLIPPED_SHARE = 0.002
 _LUMINANCE = np.array(REC709_LUMINANCE, np.float32)
 
@@ -34,9 +34,9 @@ class Assets:
 
     def __init__(self, folders: Sequence[Path] = ()) -> None:
         self._folders = tuple(folders)
-        self._kept: OrderedDict[tuple[str, str, str], Float32] = OrderedDict()
+        self._cache: OrderedDict[tuple[str, str, str], Float32] = OrderedDict()
 
-    def map_light(self, lit: EnvironmentMap) -> Float32:
+    def map_light(self, environment: EnvironmentMap) -> Float32:
         """A lat-long map's light, (H, 2 H, 3): its mean luminance, lamps left out, is the scene's.
 
         Raises:
@@ -44,7 +44,9 @@ class Assets:
             UnsupportedPhoto: it is not 2:1, holds values that are no light, or is clipped (no HDR map).
             PhotoError: it cannot be read.
         """
-        light: Float32 = self._once("map", lit.source, self._read_map) * np.float32(lit.luminance)
+        light: Float32 = self._cached("map", environment.source, self._read_map) * np.float32(
+            environment.luminance
+        )
         return light
 
     def plane_light(self, plane: Plane) -> Float32:
@@ -54,7 +56,7 @@ class Assets:
             RecipeError: the file is missing, or not the one that the scene was drawn with.
             PhotoError: it cannot be read.
         """
-        picture = self._once("picture", plane.source, self._read_picture)
+        picture = self._cached("picture", plane.source, self._read_picture)
         bright = ((picture.max(axis=2, keepdims=True) - 0.8) / 0.2).clip(0, 1)
         mean = (picture @ _LUMINANCE).mean() + np.float32(1e-4)
         light: Float32 = (
@@ -62,33 +64,33 @@ class Assets:
         )
         return light
 
-    def _once(self, kind: str, source: AssetSource, read: Callable[[AssetSource], Float32]) -> Float32:
+    def _cached(self, kind: str, source: AssetSource, read: Callable[[AssetSource], Float32]) -> Float32:
         key = (kind, source.file, source.sha256)
-        if key not in self._kept:
-            self._kept[key] = read(source)
-            while sum(array.nbytes for array in self._kept.values()) > _KEPT_BYTES and len(self._kept) > 1:
-                self._kept.popitem(last=False)
-        self._kept.move_to_end(key)
-        return self._kept[key]
+        if key not in self._cache:
+            self._cache[key] = read(source)
+            while sum(array.nbytes for array in self._cache.values()) > _CACHE_BYTES and len(self._cache) > 1:
+                self._cache.popitem(last=False)
+        self._cache.move_to_end(key)
+        return self._cache[key]
 
     def _read_map(self, source: AssetSource) -> Float32:
         if source.file.startswith(BUILTIN):
-            name, seed = _builtin(source, WORLDS)
-            texels = WORLDS[name](seed, BUILTIN_HEIGHT)
+            name, seed = _parse_builtin(source, ENVIRONMENTS)
+            texels = ENVIRONMENTS[name](seed, BUILTIN_HEIGHT)
         else:
             texels = check_map(self._open(source).linear(), source.file)
         light: Float32 = np.maximum(texels, np.float32(0))
-        light /= _level(texels)
+        light /= _mean_luminance(texels)
         return light
 
     def _read_picture(self, source: AssetSource) -> Float32:
         if source.file.startswith(BUILTIN):
-            _, seed = _builtin(source, ("painting",))
+            _, seed = _parse_builtin(source, ("painting",))
             return painting(seed, 768, 512)
         return self._open(source).linear().clip(0, 1)
 
     def _open(self, source: AssetSource) -> Photo:
-        with naming(source.file):
+        with naming_file(source.file):
             return Photo.open(self._bytes(source))
 
     def _bytes(self, source: AssetSource) -> bytes:
@@ -112,7 +114,7 @@ class Assets:
 
 
 @contextmanager
-def naming(name: str) -> Iterator[None]:
+def naming_file(name: str) -> Iterator[None]:
     """Errors that arise while a file is read say which file, unless they do already."""
     try:
         yield
@@ -163,17 +165,17 @@ def check_map(texels: Float32, name: str) -> Float32:
     return texels
 
 
-def _level(texels: Float32) -> np.float32:
+def _mean_luminance(texels: Float32) -> np.float32:
     """Mean luminance over the sphere of what is not brighter than ten times the mean: lamps left out."""
     height = texels.shape[0]
     share = np.sin((np.arange(height) + 0.5) / height * np.pi)[:, None]
     luminance = np.maximum(texels, 0) @ _LUMINANCE
     shares = np.broadcast_to(share / share.sum() / luminance.shape[1], luminance.shape)
-    most = 10 * (luminance * shares).sum()
-    return np.float32((np.minimum(luminance, most) * shares).sum())
+    limit = 10 * (luminance * shares).sum()
+    return np.float32((np.minimum(luminance, limit) * shares).sum())
 
 
-def _builtin(source: AssetSource, known: Iterable[str]) -> tuple[str, int]:
+def _parse_builtin(source: AssetSource, known: Iterable[str]) -> tuple[str, int]:
     _, name, seed = (*source.file.split(":"), "", "")[:3]
     if name not in known or not seed.isdigit():
         raise RecipeError(

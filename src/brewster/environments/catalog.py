@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 
-from brewster.environments.assets import BUILTIN_HEIGHT, check_map, naming, read_bytes
+from brewster.environments.assets import BUILTIN_HEIGHT, check_map, naming_file, read_bytes
 from brewster.errors import BrewsterError, RecipeError
 from brewster.files import SUFFIXES
 from brewster.photo import Photo, read_size
@@ -16,7 +16,7 @@ from brewster.scene.sampler import Asset, Catalog
 from brewster.scene.world import BUILTIN, AssetSource
 
 _MAP_KINDS = ("exr", "hdr")
-_WORLD_COUNT = 8
+_ENVIRONMENT_COUNT = 8
 _PAINTING_COUNT = 64
 _CATEGORIES = {"street": "outdoor", "room": "indoor", "night": "night"}
 
@@ -29,7 +29,7 @@ BUILTIN_CATALOG = Catalog(
             category=category,
         )
         for name, category in _CATEGORIES.items()
-        for seed in range(_WORLD_COUNT)
+        for seed in range(_ENVIRONMENT_COUNT)
     ),
     pictures=tuple(
         Asset(source=AssetSource(file=f"{BUILTIN}painting:{seed}"), width=768, height=512)
@@ -52,24 +52,24 @@ def read_catalog(
         RecipeError: a folder or its manifest cannot be read, or none of its files can be used.
     """
     refused: list[BrewsterError] = []
-    found_maps = _read(maps, exclude, refused, are_maps=True) if maps else BUILTIN_CATALOG.maps
+    found_maps = _read_folders(maps, exclude, refused, are_maps=True) if maps else BUILTIN_CATALOG.maps
     found_pictures = (
-        _read(pictures, exclude, refused, are_maps=False) if pictures else BUILTIN_CATALOG.pictures
+        _read_folders(pictures, exclude, refused, are_maps=False) if pictures else BUILTIN_CATALOG.pictures
     )
     return Catalog(maps=found_maps, pictures=found_pictures), refused
 
 
-def _read(
+def _read_folders(
     folders: Sequence[Path], exclude: Sequence[str], refused: list[BrewsterError], *, are_maps: bool
 ) -> tuple[Asset, ...]:
     found: dict[str, Asset] = {}
     for folder in folders:
-        categories = _categories(folder)
-        for path in _files(folder, are_maps):
+        categories = _read_categories(folder)
+        for path in _list_files(folder, are_maps):
             if path.name in found or any(fnmatch(path.name, pattern) for pattern in exclude):
                 continue
             try:
-                found[path.name] = _asset(path, categories.get(path.name, ""), are_maps)
+                found[path.name] = _read_asset(path, categories.get(path.name, ""), are_maps)
             except BrewsterError as error:
                 refused.append(error)
     if not found:
@@ -81,9 +81,9 @@ def _read(
     return tuple(found[name] for name in sorted(found))
 
 
-def _asset(path: Path, category: str, is_map: bool) -> Asset:
+def _read_asset(path: Path, category: str, is_map: bool) -> Asset:
     data = read_bytes(path)
-    with naming(str(path)):
+    with naming_file(str(path)):
         width, height = _map_size(data, str(path)) if is_map else read_size(data)
     source = AssetSource(file=path.name, sha256=hashlib.sha256(data).hexdigest())
     return Asset(source=source, width=width, height=height, category=category)
@@ -94,7 +94,7 @@ def _map_size(data: bytes, name: str) -> tuple[int, int]:
     return width, height
 
 
-def _files(folder: Path, are_maps: bool) -> Iterator[Path]:
+def _list_files(folder: Path, are_maps: bool) -> Iterator[Path]:
     try:
         entries = sorted(folder.iterdir())
     except OSError as error:
@@ -107,7 +107,7 @@ def _files(folder: Path, are_maps: bool) -> Iterator[Path]:
             yield path
 
 
-def _categories(folder: Path) -> dict[str, str]:
+def _read_categories(folder: Path) -> dict[str, str]:
     try:
         with (folder / "manifest.csv").open(newline="", encoding="utf-8-sig") as file:
             return {row["file"]: row.get("category") or "" for row in csv.DictReader(file) if row.get("file")}

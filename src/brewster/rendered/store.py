@@ -31,7 +31,7 @@ from brewster.render.analytic import ghost_distance_px
 from brewster.render.camera_response import DevelopedSample, develop, jpeg, luminance
 from brewster.render.sample import LAYERS, LightSample
 from brewster.scene.scene import Scene
-from brewster.scene.values import wrong_value
+from brewster.scene.values import validation_error
 
 Float32 = NDArray[np.float32]
 
@@ -40,8 +40,8 @@ LIGHT, SCENE = "layers.exr", "scene.toml"
 FILES: Final = (*(f"{layer}.jpg" for layer in LAYERS), LIGHT, SCENE)
 """The files of a sample: five photographs, their linear light, and their cause."""
 
-_TRUTH_QUALITY: Final = 95
-_AGAIN: Final = "delete that sample and render the set again"
+_GROUND_TRUTH_QUALITY: Final = 95
+_CURE: Final = "delete that sample and render the set again"
 
 
 # --- what is written of a sample
@@ -81,7 +81,9 @@ def encode_sample(sample: LightSample, renderer: str) -> dict[str, bytes]:
     developed = develop(sample)
     made = {"version": brewster.__version__, "renderer": renderer}
     outcome = {**made, **developed.decisions(), **statistics(sample, developed)}
-    qualities = dict.fromkeys(LAYERS, _TRUTH_QUALITY) | {"photo": sample.scene.development.jpeg_quality}
+    qualities = dict.fromkeys(LAYERS, _GROUND_TRUTH_QUALITY) | {
+        "photo": sample.scene.development.jpeg_quality
+    }
     files = {f"{name}.jpg": jpeg(layer, qualities[name]) for name, layer in developed.layers().items()}
     light = {name: layer.permute(1, 2, 0).float().cpu().numpy() for name, layer in sample.layers().items()}
     files[LIGHT] = write_layers(light, {"software": f"brewster {brewster.__version__}"})
@@ -109,7 +111,7 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
             write_atomically(part / name, data)
 
 
-def remove_leftovers(out: Path) -> None:
+def remove_partial_files(out: Path) -> None:
     """Removes what killed runs have left half; nobody else may be writing there."""
     for part in out.glob(f"{HIDDEN}*"):
         discard(part)
@@ -205,10 +207,10 @@ def open_sample(entry: StoredSample) -> tuple[dict[str, Float32], Scene]:
         PhotoError, RecipeError: its files are damaged.
     """
     light = read_layers(entry.read(LIGHT))
-    return {name: light[name] for name in LAYERS}, read_cause(entry)
+    return {name: light[name] for name in LAYERS}, read_scene_of(entry)
 
 
-def read_cause(entry: StoredSample) -> Scene:
+def read_scene_of(entry: StoredSample) -> Scene:
     """The scene of a sample.
 
     Raises:
@@ -218,9 +220,9 @@ def read_cause(entry: StoredSample) -> Scene:
         table = tomllib.loads(entry.read(SCENE).decode())
         return Scene.model_validate({name: table[name] for name in table if name != "outcome"})
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise RecipeError(f"the scene of {entry.place} is not TOML", "a sample's scene", _AGAIN) from error
+        raise RecipeError(f"the scene of {entry.place} is not TOML", "a sample's scene", _CURE) from error
     except ValidationError as error:
-        raise wrong_value(f"the scene of {entry.place}", error, "brewster render --help") from error
+        raise validation_error(f"the scene of {entry.place}", error, "brewster render --help") from error
 
 
 def _blocks(out: Path) -> list[int]:

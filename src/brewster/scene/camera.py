@@ -8,7 +8,7 @@ from typing import Annotated
 from pydantic import Field
 
 from brewster.scene.glass import Point
-from brewster.scene.values import Above0, From0, FrozenModel
+from brewster.scene.values import FrozenModel, NonNegativeFloat, PositiveFloat
 
 Axes = tuple[Point, Point, Point]
 """Unit vectors to the right, up and back."""
@@ -24,8 +24,8 @@ class Camera(FrozenModel):
     heading_deg: float = 0.0
     pitch_deg: Annotated[float, Field(ge=-80, le=80)] = 0.0
     fov_deg: Annotated[float, Field(gt=0.5, lt=150)] = 50.0
-    focus_mm: Above0 = 3000.0
-    aperture_mm: From0 = 0.0
+    focus_mm: PositiveFloat = 3000.0
+    aperture_mm: NonNegativeFloat = 0.0
     width: Annotated[int, Field(ge=16, le=16384)] = 512
     height: Annotated[int, Field(ge=16, le=16384)] = 384
 
@@ -44,7 +44,7 @@ class Camera(FrozenModel):
         right, up, back = axes(self.heading_deg, self.pitch_deg)
         across, down = self.half_width, self.half_width * self.height / self.width
         return [
-            _sum(_times(right, x), _times(up, y), _times(back, -1))
+            _add(_scale(right, x), _scale(up, y), _scale(back, -1))
             for x in (-across, across)
             for y in (-down, down)
         ]
@@ -60,7 +60,7 @@ def axes(heading_deg: float, pitch_deg: float) -> Axes:
         right[2] * ahead[0] - right[0] * ahead[2],
         right[0] * ahead[1] - right[1] * ahead[0],
     )
-    return right, up, _times(ahead, -1)
+    return right, up, _scale(ahead, -1)
 
 
 def dot(one: Point, other: Point) -> float:
@@ -68,10 +68,10 @@ def dot(one: Point, other: Point) -> float:
     return sum(a * b for a, b in zip(one, other, strict=True))
 
 
-def _times(point: Point, factor: float) -> Point:
+def _scale(point: Point, factor: float) -> Point:
     return point[0] * factor, point[1] * factor, point[2] * factor
 
 
-def _sum(*points: Point) -> Point:
+def _add(*points: Point) -> Point:
     x, y, z = (sum(values) for values in zip(*points, strict=True))
     return x, y, z

@@ -10,20 +10,20 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from brewster.scene.values import Above0, From0, FrozenModel
+from brewster.scene.values import FrozenModel, NonNegativeFloat, PositiveFloat
 
 Point = tuple[float, float, float]
 """Millimetres in the world: x to the right, y up, -z ahead."""
 
-ORDINARY_INDEX = 1.5
+DEFAULT_INDEX = 1.5
 
 
 class Pane(FrozenModel):
     """One sheet of glass. A wedge turns its far surface about the vertical axis."""
 
     thickness_mm: Annotated[float, Field(gt=0, le=200)] = 4.0
-    index: Annotated[float, Field(ge=1, le=3)] = ORDINARY_INDEX
-    absorption_per_m: tuple[From0, From0, From0] = (0.0, 0.0, 0.0)
+    index: Annotated[float, Field(ge=1, le=3)] = DEFAULT_INDEX
+    absorption_per_m: tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat] = (0.0, 0.0, 0.0)
     """Beer-Lambert coefficients for red, green and blue light."""
     roughness: Annotated[float, Field(ge=0, le=1)] = 0.0
     """The GGX width (alpha) of both surfaces: 0 is polished, 0.05 satin, 0.2 frosted."""
@@ -39,15 +39,15 @@ class Glazing(FrozenModel):
     """
 
     panes: Annotated[tuple[Pane, ...], Field(min_length=1, max_length=3)] = (Pane(),)
-    gap_mm: From0 = 0.0
+    gap_mm: NonNegativeFloat = 0.0
     position_mm: Point = (0.0, 0.0, 0.0)
     heading_deg: float = 0.0
     pitch_deg: Annotated[float, Field(ge=-80, le=80)] = 0.0
-    frame_mm: tuple[Above0, Above0] | None = None
+    frame_mm: tuple[PositiveFloat, PositiveFloat] | None = None
     radii_mm: tuple[float, float] | None = None
 
     @model_validator(mode="after")
-    def _stands(self) -> Glazing:
+    def _check_geometry(self) -> Glazing:
         if len(self.panes) > 1 and self.gap_mm == 0:
             raise ValueError("panes stand apart: gap_mm is above 0 when there is more than one")
         if self.radii_mm and (len(self.panes) > 1 or not all(self.radii_mm) or self.frame_mm is None):

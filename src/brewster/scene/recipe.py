@@ -13,7 +13,15 @@ from pydantic import Field, model_validator
 
 from brewster.errors import RecipeError
 from brewster.scene.scene import WhiteBalance
-from brewster.scene.values import From0, FrozenModel, LogRange, Positive, Range, Share, read_toml
+from brewster.scene.values import (
+    FrozenModel,
+    LogRange,
+    NonNegativeFloat,
+    PositiveInt,
+    Range,
+    Share,
+    read_toml,
+)
 
 _FOLDER: Final = Path(__file__).parent / "recipes"
 RECIPES: Final = tuple(sorted(path.stem for path in _FOLDER.glob("*.toml")))
@@ -29,7 +37,7 @@ class GlassRecipe(FrozenModel):
     structural_probability: Share = 0.0
     structural_mm: LogRange = (10.0, 40.0)
     index: Range = (1.45, 1.65)
-    tints: tuple[tuple[From0, From0, From0], ...] = ((4.0, 1.5, 2.5),)
+    tints: tuple[tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat], ...] = ((4.0, 1.5, 2.5),)
     """Absorption per metre for red, green and blue; clear float glass is a little green."""
     tint_strength_log: LogRange = (0.3, 2.0)
     rough_probability: Share = 0.0
@@ -39,7 +47,7 @@ class GlassRecipe(FrozenModel):
     pitch_deg: Range = (0.0, 0.0)
 
     @model_validator(mode="after")
-    def _is_glass(self) -> Self:
+    def _check_values(self) -> Self:
         if self.index[0] < 1:
             raise ValueError(f"glass has an index of 1 or more, and this begins at {self.index[0]:g}")
         if self.gap_mm[0] <= 0 and self.double_probability:
@@ -99,7 +107,7 @@ class DevelopmentRecipe(FrozenModel):
     jpeg_quality: tuple[Annotated[int, Field(ge=1, le=100)], Annotated[int, Field(ge=1, le=100)]] = (60, 97)
 
     @model_validator(mode="after")
-    def _rises(self) -> Self:
+    def _check_quality(self) -> Self:
         if self.jpeg_quality[0] > self.jpeg_quality[1]:
             raise ValueError(f"jpeg_quality goes up, and this goes from {self.jpeg_quality[0]}")
         return self
@@ -111,8 +119,8 @@ class SceneRecipe(FrozenModel):
     name: str
     about: str
     orders: Literal["all", "paper"] = "all"
-    samples: Positive = 8
-    rough_samples: Positive = 16
+    samples: PositiveInt = 8
+    rough_samples: PositiveInt = 16
     glass: GlassRecipe = GlassRecipe()
     camera: CameraRecipe = CameraRecipe()
     behind: SideRecipe = SideRecipe()

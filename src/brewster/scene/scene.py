@@ -14,10 +14,10 @@ from pydantic import Field, model_validator
 
 from brewster.scene.camera import Camera, axes, dot
 from brewster.scene.glass import Glazing
-from brewster.scene.values import From0, FrozenModel, Positive, Seed, Share, read_toml
+from brewster.scene.values import FrozenModel, NonNegativeFloat, PositiveInt, Seed, Share, read_toml
 from brewster.scene.world import Side
 
-STEEPEST_DEG = 85.0
+MAX_INCIDENCE_DEG = 85.0
 """Beyond this angle of incidence the view grazes the glass, and is refused."""
 
 WhiteBalance = Literal["none", "grey-world", "white-patch", "grey-edge"]
@@ -32,9 +32,9 @@ class Development(FrozenModel):
     white_balance_strength: Share = 1.0
     contrast: Annotated[float, Field(ge=-0.5, le=0.9)] = 0.0
     """How far encoded values move from a straight line towards an S: 0 is the plain sRGB curve."""
-    shot_noise: From0 = 0.0
+    shot_noise: NonNegativeFloat = 0.0
     """Standard deviation at white, of noise that grows with the root of the light, in I only."""
-    read_noise: From0 = 0.0
+    read_noise: NonNegativeFloat = 0.0
     """Standard deviation of noise that is everywhere the same, in I only."""
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 95
     """Of I; the truths are written at 95."""
@@ -53,7 +53,7 @@ class Scene(FrozenModel):
     version: str = ""
     """Of brewster, when the scene was drawn."""
     orders: Literal["all", "paper"] = "all"
-    samples: Positive = 16
+    samples: PositiveInt = 16
     """Rays a pixel: as many where chance is needed (lens, rough glass), at most as many elsewhere."""
     glass: Glazing = Glazing()
     camera: Camera = Camera()
@@ -62,15 +62,15 @@ class Scene(FrozenModel):
     development: Development = Development()
 
     @model_validator(mode="after")
-    def _is_possible(self) -> Scene:
+    def _check_geometry(self) -> Scene:
         _, _, normal = axes(self.glass.heading_deg, self.glass.pitch_deg)
         offset = self.camera_above_glass_mm
         if offset <= 0:
             raise ValueError(f"the camera stands {-offset:g} mm behind the glass; it belongs in front")
         if self.glass.is_flat:
-            self._refuse_grazing(normal)
-        self._refuse_focus_in_glass(normal, offset)
-        self._refuse_outside()
+            self._check_incidence(normal)
+        self._check_focus(normal, offset)
+        self._check_distances()
         return self
 
     @property
@@ -80,16 +80,16 @@ class Scene(FrozenModel):
         x, y, z = (a - b for a, b in zip(self.camera.position_mm, self.glass.position_mm, strict=True))
         return dot((x, y, z), normal)
 
-    def _refuse_grazing(self, normal: tuple[float, float, float]) -> None:
+    def _check_incidence(self, normal: tuple[float, float, float]) -> None:
         for corner in self.camera.corners():
             cosine = -dot(corner, normal) / math.sqrt(dot(corner, corner))
-            if cosine <= math.cos(math.radians(STEEPEST_DEG)):
+            if cosine <= math.cos(math.radians(MAX_INCIDENCE_DEG)):
                 raise ValueError(
-                    f"a corner of the view meets the glass at more than {STEEPEST_DEG:g} degrees;"
+                    f"a corner of the view meets the glass at more than {MAX_INCIDENCE_DEG:g} degrees;"
                     " turn the camera to the glass or narrow fov_deg"
                 )
 
-    def _refuse_focus_in_glass(self, normal: tuple[float, float, float], offset: float) -> None:
+    def _check_focus(self, normal: tuple[float, float, float], offset: float) -> None:
         _, _, back = axes(self.camera.heading_deg, self.camera.pitch_deg)
         depth = self.camera.focus_mm * dot(back, normal) - offset
         if self.camera.aperture_mm > 0 and 0 <= depth <= self.glass.depth_mm:
@@ -97,7 +97,7 @@ class Scene(FrozenModel):
                 f"the focus lies {depth:g} mm inside the glass; move focus_mm before or behind it"
             )
 
-    def _refuse_outside(self) -> None:
+    def _check_distances(self) -> None:
         """A dome holds the glass and the camera; a plane, turned or not, stands clear of the glass."""
         reach = math.dist(self.camera.position_mm, self.glass.position_mm)
         for side, surface_mm in ((self.behind, self.glass.depth_mm), (self.front, 0.0)):
@@ -106,11 +106,11 @@ class Scene(FrozenModel):
             if side.plane and side.plane.nearest_mm <= surface_mm:
                 raise ValueError(f"a plane at {side.plane.distance_mm:g} mm stands in the glass")
 
-    def to_toml(self, **more: dict[str, Any]) -> str:
+    def to_toml(self, **extra_tables: dict[str, Any]) -> str:
         """The scene as TOML, with more tables after it; reading it gives an equal scene."""
         import tomli_w  # noqa: PLC0415  (reading a scene does without it)
 
-        return tomli_w.dumps({**self.model_dump(mode="json", exclude_none=True), **more})
+        return tomli_w.dumps({**self.model_dump(mode="json", exclude_none=True), **extra_tables})
 
 
 def read_scene(path: Path) -> Scene:

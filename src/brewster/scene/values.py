@@ -17,40 +17,40 @@ class FrozenModel(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-def _rising(bounds: tuple[float, float]) -> tuple[float, float]:
+def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:
     if bounds[0] > bounds[1]:
         raise ValueError(f"a range goes up, and this one goes from {bounds[0]} to {bounds[1]}")
     return bounds
 
 
 Share = Annotated[float, Field(ge=0, le=1)]
-Above0 = Annotated[float, Field(gt=0)]
-From0 = Annotated[float, Field(ge=0)]
-Positive = Annotated[int, Field(gt=0)]
+PositiveFloat = Annotated[float, Field(gt=0)]
+NonNegativeFloat = Annotated[float, Field(ge=0)]
+PositiveInt = Annotated[int, Field(gt=0)]
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
-Range = Annotated[tuple[float, float], AfterValidator(_rising)]
-LogRange = Annotated[tuple[Above0, Above0], AfterValidator(_rising)]
+Range = Annotated[tuple[float, float], AfterValidator(_ascending)]
+LogRange = Annotated[tuple[PositiveFloat, PositiveFloat], AfterValidator(_ascending)]
 
-Read = TypeVar("Read", bound=FrozenModel)
+Model = TypeVar("Model", bound=FrozenModel)
 
 
-def read_toml(kind: type[Read], path: Path, *, compare: str) -> Read:
+def read_toml(model: type[Model], path: Path, *, compare: str) -> Model:
     """Reads and checks values; `compare` names what a user can compare a wrong file with.
 
     Raises:
         RecipeError: missing, not TOML, or with values that are missing, unknown or impossible.
     """
     try:
-        return kind.model_validate(tomllib.loads(path.read_text("utf-8")))
+        return model.model_validate(tomllib.loads(path.read_text("utf-8")))
     except OSError as error:
         raise RecipeError(f"{path} cannot be read", "a TOML file", f"see {compare}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise RecipeError(f"{path} is not TOML ({error})", "a TOML file", "mend that place") from error
     except ValidationError as error:
-        raise wrong_value(str(path), error, compare) from error
+        raise validation_error(str(path), error, compare) from error
 
 
-def wrong_value(owner: str, error: ValidationError, compare: str) -> RecipeError:
+def validation_error(owner: str, error: ValidationError, compare: str) -> RecipeError:
     """The first thing that pydantic found wrong, in our three beats."""
     first = error.errors()[0]
     name = ".".join(map(str, first["loc"]))

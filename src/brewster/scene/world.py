@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field, PlainSerializer, model_validator
 
-from brewster.scene.values import Above0, From0, FrozenModel
+from brewster.scene.values import FrozenModel, NonNegativeFloat, PositiveFloat
 
 BUILTIN = "builtin:"
 """A source that is computed, not read: `builtin:street:7` is the seventh street."""
@@ -28,7 +28,7 @@ class EnvironmentMap(FrozenModel):
     source: AssetSource
     heading_deg: float = 0.0
     """The map's left edge lies in this direction."""
-    luminance: From0 = 1.0
+    luminance: NonNegativeFloat = 1.0
     """Its mean luminance over the sphere, lamps left out, in the scene's own unit."""
     radius_mm: Radius = math.inf
 
@@ -41,16 +41,16 @@ class Plane(FrozenModel):
     """
 
     source: AssetSource
-    distance_mm: Above0
+    distance_mm: PositiveFloat
     """From the glazing's position, straight out to its side."""
     offset_mm: tuple[float, float] = (0.0, 0.0)
     """Of its centre, to the right and up, as a camera sees it that looks through the glass."""
-    width_mm: Above0
+    width_mm: PositiveFloat
     heading_deg: Annotated[float, Field(gt=-80, lt=80)] = 0.0
     pitch_deg: Annotated[float, Field(gt=-80, lt=80)] = 0.0
-    luminance: From0 = 1.0
+    luminance: NonNegativeFloat = 1.0
     """Its mean luminance, before highlights are raised."""
-    highlights: From0 = 0.0
+    highlights: NonNegativeFloat = 0.0
     """How much light the file's clipped whites get back: white shines (1 + highlights) times as bright."""
 
     @property
@@ -67,7 +67,7 @@ class Side(FrozenModel):
     plane: Plane | None = None
 
     @model_validator(mode="after")
-    def _fits(self) -> Side:
+    def _check_distance(self) -> Side:
         if self.map and self.plane and self.plane.distance_mm >= self.map.radius_mm:
             raise ValueError("the plane stands inside the map's dome: distance_mm is below radius_mm")
         return self

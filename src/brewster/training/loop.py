@@ -87,7 +87,7 @@ def run(trainer: Trainer, out: Path, report: Report) -> None:
     begun = _take_up(trainer, out / CHECKPOINT)
     if is_main_process():
         _forget_after(begun, out / LOG)
-    started, steps = time.monotonic(), 0 if recipe.data.is_none else recipe.steps
+    started, steps = time.monotonic(), 0 if recipe.data.is_empty else recipe.steps
     with closing(TensorBoardLog(out, begun)) as board:
         for step in range(begun + 1, 1 + steps):
             numbers, last = trainer.training_step(step - 1), step == recipe.steps

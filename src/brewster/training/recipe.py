@@ -23,17 +23,26 @@ from brewster.models.diffusion.task import PAPER_PX, DecompositionTask, Objectiv
 from brewster.models.networks import DEFAULT_NETWORK, LARGEST_STRIDE, NETWORKS
 from brewster.models.zoo import TINY
 from brewster.options import Quantisation
-from brewster.scene.values import Above0, From0, FrozenModel, Positive, Seed, Share, read_toml, wrong_value
+from brewster.scene.values import (
+    FrozenModel,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    Seed,
+    Share,
+    read_toml,
+    validation_error,
+)
 from brewster.training.data.mixtures import MixRecipe, Target
 from brewster.training.data.online import Mixing
 
 _COMPARE = "the recipes in recipes/train/"
 
-ENCODED: Final = ".safetensors"
+ENCODED_SUFFIX: Final = ".safetensors"
 """The ending of an encoded prompt's file."""
 
 
-def _rising_from_0(sizes: list[tuple[float, int]]) -> list[tuple[float, int]]:
+def _ascending_from_0(sizes: list[tuple[float, int]]) -> list[tuple[float, int]]:
     starts, sides = zip(*sizes, strict=True)
     if starts[0] != 0 or list(starts) != sorted(set(starts)) or list(sides) != sorted(sides):
         raise ValueError("the shares start at 0 and rise, and so do the sides")
@@ -49,7 +58,7 @@ def _known_network(name: str) -> str:
     return name
 
 
-Sizes = Annotated[list[tuple[Share, Side]], Field(min_length=1), AfterValidator(_rising_from_0)]
+Sizes = Annotated[list[tuple[Share, Side]], Field(min_length=1), AfterValidator(_ascending_from_0)]
 
 
 class RenderedRecipe(FrozenModel):
@@ -73,17 +82,17 @@ class RenderedRecipe(FrozenModel):
     """Worlds of live scenes; the builtin ones where there is no folder."""
 
     @model_validator(mode="after")
-    def _comes_from_one_place(self) -> Self:
+    def _check_source(self) -> Self:
         if bool(self.sets) == bool(self.recipe):
             raise ValueError(
                 "rendered samples come either from sets, on disk, or from a recipe, live: name one of the two"
             )
-        told = [
+        useless = [
             name for name in ("orders", "seed", "maps", "photos") if getattr(self, name) not in (None, ())
         ]
-        if self.sets and told:
+        if self.sets and useless:
             raise ValueError(
-                f"sets are rendered already, so that {', '.join(told)} can change nothing in them"
+                f"sets are rendered already, so that {', '.join(useless)} can change nothing in them"
             )
         return self
 
@@ -104,11 +113,11 @@ class DataRecipe(FrozenModel):
     held_out: tuple[str, ...] = ()
     """Photos and maps that are not learnt from either: the compact model is validated on mixtures of them."""
     validate_on: tuple[Path, ...] = ()
-    validate_at_most: Positive = 40
+    validate_at_most: PositiveInt = 40
     """Pairs of each folder in `validate_on`, evenly spaced in order of name."""
 
     @property
-    def never_trained_on(self) -> tuple[str, ...]:
+    def excluded_files(self) -> tuple[str, ...]:
         """File names that training leaves out."""
         return self.exclude + self.held_out
 
@@ -118,12 +127,12 @@ class DataRecipe(FrozenModel):
         return self.rendered.share if self.rendered and self.rendered.count != 0 else 0.0
 
     @property
-    def is_none(self) -> bool:
+    def is_empty(self) -> bool:
         """Whether everything that is listed has a share, or a count, of 0."""
         return not (self.photos or self.pairs_share or self.rendered_share)
 
     @model_validator(mode="after")
-    def _has_sources(self) -> Self:
+    def _check_shares(self) -> Self:
         if not (self.photos or self.pairs or self.rendered):
             raise ValueError("a network learns from photos, pairs or rendered, and here is none of them")
         if self.pairs_share and not self.pairs:
@@ -132,7 +141,7 @@ class DataRecipe(FrozenModel):
             raise ValueError("with pairs, pairs_share says how much of each batch they are; it may be 0")
         if self.photos and self.rendered and "share" not in self.rendered.model_fields_set:
             raise ValueError("with photos, rendered.share says how much is rendered; it may be 0 or 1")
-        if not (self.photos or self.is_none or self.pairs_share == 1 or self.rendered_share == 1):
+        if not (self.photos or self.is_empty or self.pairs_share == 1 or self.rendered_share == 1):
             raise ValueError(
                 "pairs and rendered samples leave a part of each batch, and there are no photos for it"
             )
@@ -143,13 +152,13 @@ class TrainingRecipe(FrozenModel):
     """One run, whatever learns in it."""
 
     seed: Seed
-    steps: Positive
-    batch: Positive
-    learning_rate: Above0
-    warmup_steps: Positive
-    weight_decay: From0
-    report_every: Positive
-    checkpoint_every: Positive
+    steps: PositiveInt
+    batch: PositiveInt
+    learning_rate: PositiveFloat
+    warmup_steps: PositiveInt
+    weight_decay: NonNegativeFloat
+    report_every: PositiveInt
+    checkpoint_every: PositiveInt
     data: DataRecipe
 
 
@@ -159,7 +168,7 @@ class CompactRecipe(TrainingRecipe):
     network: Annotated[str, AfterValidator(_known_network)] = DEFAULT_NETWORK
     """A name in the table of `brewster.models.networks`."""
     sizes: Sizes
-    encoder_learning_rate: Above0
+    encoder_learning_rate: PositiveFloat
     average_decay: Share
     decay_share: Share = 1.0
     """The last share of the run, over which the learning rate falls to zero along a cosine; constant before."""
@@ -170,9 +179,9 @@ class CompactRecipe(TrainingRecipe):
     mix: MixRecipe = MixRecipe()
 
     @model_validator(mode="after")
-    def _divides(self) -> Self:
-        real = _divide(self.batch, "pairs_share", self.data.pairs_share)
-        _divide(self.batch - real, "rendered.share", self.data.rendered_share)
+    def _check_shares(self) -> Self:
+        real = _share_of(self.batch, "pairs_share", self.data.pairs_share)
+        _share_of(self.batch - real, "rendered.share", self.data.rendered_share)
         return self
 
     def size_at(self, step: int) -> int:
@@ -189,21 +198,21 @@ class LoraRecipe(TrainingRecipe):
 
     backbone: str
     """A name in the table, a hub id, a folder, or "tiny:" and a name: that backbone's toy twin, random weights."""
-    rank: Positive = 16
-    alpha: Positive = 16
+    rank: PositiveInt = 16
+    alpha: PositiveInt = 16
     quantise: Quantisation | None = None
     panels: tuple[Panel, ...] = ("I", "T", "R")
     direction: Direction = "side by side"
-    budget_px: Positive = PAPER_PX
+    budget_px: PositiveInt = PAPER_PX
     """The most pixels that all panels have together."""
-    panel_weights: dict[Panel, From0] = Field(default_factory=dict)
+    panel_weights: dict[Panel, NonNegativeFloat] = Field(default_factory=dict)
     """How much each panel counts in the loss, 1 if not named."""
     objective: Objective = "flow"
     """From noise to panels in many steps, or from the photo, in every panel, to what it lacks in one."""
-    guidance: From0 = 1.0
+    guidance: NonNegativeFloat = 1.0
     """While learning; 1 is none where it takes a second prediction."""
     logit_mean: float = 0.0
-    logit_deviation: Above0 = 1.0
+    logit_deviation: PositiveFloat = 1.0
     """Of the times that it learns at, logit-normal (Esser et al. 2024), before the shift for the resolution."""
     flip: bool = True
     """Whether every sample is also seen mirrored."""
@@ -227,7 +236,7 @@ class LoraRecipe(TrainingRecipe):
         return DecompositionTask(self.layout, self.budget_px, self.objective, guidance)
 
     @model_validator(mode="after")
-    def _can_be_learnt(self) -> Self:
+    def _check_consistency(self) -> Self:
         rendered = self.data.rendered
         if self.data.photos or self.data.maps or (rendered and rendered.recipe):
             raise ValueError(
@@ -237,8 +246,10 @@ class LoraRecipe(TrainingRecipe):
             raise ValueError(f"the panels are {list(self.panels)}: each once, and T among them")
         if self.quantise and self.backbone.startswith(TINY):
             raise ValueError("a toy twin is never quantised")
-        if self.prompt not in PROMPTS and not self.prompt.endswith(ENCODED):
-            raise ValueError(f"prompt is {self.prompt!r}: one of {', '.join(PROMPTS)}, or a {ENCODED} file")
+        if self.prompt not in PROMPTS and not self.prompt.endswith(ENCODED_SUFFIX):
+            raise ValueError(
+                f"prompt is {self.prompt!r}: one of {', '.join(PROMPTS)}, or a {ENCODED_SUFFIX} file"
+            )
         if not any(self.panel_weights.get(panel, 1) for panel in self.panels):
             raise ValueError("panel_weights leaves nothing to learn: every panel counts 0")
         return self
@@ -247,7 +258,7 @@ class LoraRecipe(TrainingRecipe):
 AnyRecipe = TypeVar("AnyRecipe", bound=TrainingRecipe)
 
 
-def _divide(samples: int, name: str, share: float) -> int:
+def _share_of(samples: int, name: str, share: float) -> int:
     """The share's number of samples; a share between 0 and 1 must leave some on both sides."""
     part = round(samples * share)
     if samples and 0 < share < 1 and part in (0, samples):
@@ -261,11 +272,11 @@ def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
     Raises:
         RecipeError: missing, not TOML, or with values that are missing, unknown or impossible.
     """
-    recipe = read_toml(_kind(path), path, compare=_COMPARE)
+    recipe = read_toml(_recipe_class(path), path, compare=_COMPARE)
     changes: dict[str, Any] = {}
     if isinstance(recipe, CompactRecipe):
         changes["start_from"] = tuple(path.parent / start for start in recipe.start_from)
-    if isinstance(recipe, LoraRecipe) and recipe.prompt.endswith(ENCODED):
+    if isinstance(recipe, LoraRecipe) and recipe.prompt.endswith(ENCODED_SUFFIX):
         changes["prompt"] = str(path.parent / recipe.prompt)
     rendered = recipe.data.rendered
     if rendered and rendered.recipe and rendered.recipe.endswith(".toml"):
@@ -274,44 +285,44 @@ def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
     return recipe.model_copy(update=changes)
 
 
-def _kind(path: Path) -> type[CompactRecipe] | type[LoraRecipe]:
+def _recipe_class(path: Path) -> type[CompactRecipe] | type[LoraRecipe]:
     with suppress(OSError, ValueError):  # which read_toml tells
         if "backbone" in tomllib.loads(path.read_text("utf-8")):
             return LoraRecipe
     return CompactRecipe
 
 
-def with_value(recipe: AnyRecipe, dotted: str, value: object) -> AnyRecipe:
+def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
     """The recipe with one value changed, named as in `data.rendered.mixing`, and checked again as a whole.
 
     Raises:
         RecipeError: the recipe has no place of this name, or the value is impossible there.
     """
-    known = list(_names(recipe))
-    if dotted not in known:
-        close = get_close_matches(dotted, known, n=1)
+    known = list(_key_paths(recipe))
+    if key_path not in known:
+        close = get_close_matches(key_path, known, n=1)
         raise RecipeError(
-            f"the recipe has no {dotted}",
+            f"the recipe has no {key_path}",
             "the name of a value, with the names of its tables and dots before it, such as data.pairs_share",
             f"did you mean {close[0]}?" if close else "look for it in the recipe",
         )
-    table = place = recipe.model_dump(exclude_unset=True)
-    *way, last = dotted.split(".")
-    for name in way:
-        place = place.setdefault(name, {})
-    place[last] = value
+    table = target = recipe.model_dump(exclude_unset=True)
+    *tables, last = key_path.split(".")
+    for name in tables:
+        target = target.setdefault(name, {})
+    target[last] = value
     try:
         return type(recipe).model_validate(table)
     except ValidationError as error:
-        raise wrong_value(f"the recipe with {dotted} = {value!r}", error, _COMPARE) from error
+        raise validation_error(f"the recipe with {key_path} = {value!r}", error, _COMPARE) from error
 
 
-def _names(values: FrozenModel, before: str = "") -> Iterator[str]:
+def _key_paths(values: FrozenModel, before: str = "") -> Iterator[str]:
     for name in type(values).model_fields:
         yield before + name
         inside = getattr(values, name)
         if isinstance(inside, FrozenModel):
-            yield from _names(inside, f"{before}{name}.")
+            yield from _key_paths(inside, f"{before}{name}.")
 
 
 def data_folder() -> Path:

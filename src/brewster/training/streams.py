@@ -89,15 +89,15 @@ def _shared(share: float, first: Callable[[], Stream], second: Callable[[], Stre
 
 def _open_mixtures(recipe: CompactRecipe) -> Stream:
     data = recipe.data
-    if data.is_none:
+    if data.is_empty:
         return _refuse
     folders = found(data.photos)
     return Mixtures(
-        read_photos(folders, data.never_trained_on),
-        read_maps(found(data.maps), data.never_trained_on),
+        read_photos(folders, data.excluded_files),
+        read_maps(found(data.maps), data.excluded_files),
         recipe.mix,
         seed=recipe.seed,
-        weights=source_weights(folders, data.never_trained_on),
+        weights=source_weights(folders, data.excluded_files),
     )
 
 
@@ -123,7 +123,7 @@ def _open_rendered(recipe: CompactRecipe, device: torch.device | str) -> Stream:
 
 def _open_live(recipe: CompactRecipe, wanted: RenderedRecipe, device: torch.device | str) -> OnlineRendered:
     maps, photos = found(wanted.maps), found(wanted.photos)
-    catalog, refused = read_catalog(maps, photos, recipe.data.never_trained_on)
+    catalog, refused = read_catalog(maps, photos, recipe.data.excluded_files)
     if refused:  # a run of hours has nobody to tell that it learns from less than was asked
         raise refused[0]
     return OnlineRendered(

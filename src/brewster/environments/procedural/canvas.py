@@ -135,7 +135,7 @@ class Canvas:
             mask = lettering(random, count, *area.shape[:2])[..., None]
             area += (np.array((*colour, 1, glow), np.float32) - area) * mask
 
-    def roughen(self, random: Generator, amount: float, cells: float = 6, octaves: int = 6) -> None:
+    def add_noise(self, random: Generator, amount: float, cells: float = 6, octaves: int = 6) -> None:
         """Weathers the colours by fractal noise; `amount` is its relative deviation."""
         height, width = self.pixels.shape[:2]
         noise = fractal(random, height, width, cells, octaves)
@@ -223,7 +223,7 @@ class Glow:
 
 
 @dataclass(frozen=True)
-class ProceduralWorld:
+class ProceduralEnvironment:
     """What surrounds the viewer."""
 
     quads: Sequence[Quad]
@@ -234,17 +234,17 @@ class ProceduralWorld:
     """Azimuth of the world's -z axis in the map, in radians."""
 
 
-def render(world: ProceduralWorld, height: int) -> NDArray[np.float32]:
+def render(world: ProceduralEnvironment, height: int) -> NDArray[np.float32]:
     """The lat-long map (height, 2 height, 3) of a world, at four rays a texel, in strips that fit a cache."""
     strips = [_strip(world, height, top) for top in range(0, height, _STRIP_ROWS)]
     picture: NDArray[np.float32] = np.concatenate(strips).astype(np.float32)
     for glow in world.glows:
-        if not _hidden(world, glow.position):
+        if not _is_occluded(world, glow.position):
             _add_glow(picture, glow, world.turn)
     return picture
 
 
-def _strip(world: ProceduralWorld, height: int, top: int) -> Floats:
+def _strip(world: ProceduralEnvironment, height: int, top: int) -> Floats:
     rows = min(_STRIP_ROWS, height - top)
     polar = (np.arange(2 * top, 2 * (top + rows)) + 0.5) * (np.pi / (2 * height))
     closeness = np.zeros((2 * rows, 4 * height), np.float32)
@@ -255,7 +255,7 @@ def _strip(world: ProceduralWorld, height: int, top: int) -> Floats:
         if inside.size:
             chosen = slice(inside[0], inside[-1] + 1)
             for columns in _columns(quad, world.turn, 4 * height):
-                _cast(quad, world.turn, polar[chosen], (columns, closeness[chosen], colours[chosen]))
+                _rasterise(quad, world.turn, polar[chosen], (columns, closeness[chosen], colours[chosen]))
     blocks = colours.reshape(rows, 2, 2 * height, 2, 3)
     solid = blocks[:, 0, :, 0] + blocks[:, 0, :, 1] + blocks[:, 1, :, 0] + blocks[:, 1, :, 1]
     free = (closeness == 0).reshape(rows, 2, 2 * height, 2).mean((1, 3), dtype=np.float32)[..., None]
@@ -285,7 +285,7 @@ def _columns(quad: Quad, turn: float, width: int) -> list[slice]:
     ]
 
 
-def _cast(quad: Quad, turn: float, polar: Floats, target: tuple[slice, Floats, Floats]) -> None:
+def _rasterise(quad: Quad, turn: float, polar: Floats, target: tuple[slice, Floats, Floats]) -> None:
     """Draws a quad on the samples of some rows and columns wherever it is closer than what is there."""
     columns, closeness, colours = target[0], target[1][:, target[0]], target[2][:, target[0]]
     width = target[1].shape[1]
@@ -309,7 +309,7 @@ def _cast(quad: Quad, turn: float, polar: Floats, target: tuple[slice, Floats, F
     colours[hit] = texels[:, :3]
 
 
-def _hidden(world: ProceduralWorld, position: Floats) -> bool:
+def _is_occluded(world: ProceduralEnvironment, position: Floats) -> bool:
     for quad in world.quads:
         across, down, near = quad.forms @ position
         if near > 1.05 and 0 <= across < near and 0 <= down < near:

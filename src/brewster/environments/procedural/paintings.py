@@ -44,7 +44,7 @@ def _ellipse(grid: tuple[Floats, Floats], centre: tuple[float, float], radii: tu
     return result
 
 
-def _blob(
+def _paint_ellipse(
     picture: Floats,
     centre: tuple[float, float],
     radii: tuple[float, float],
@@ -60,12 +60,12 @@ def _blob(
         part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
         mask = _inside(_ellipse((x[:, part[1]], y[part[0]]), centre, radii), height)
         if shade is None:
-            _cover(picture[part], 0.5 * mask, colour)
+            _blend(picture[part], 0.5 * mask, colour)
         else:
-            _cover(picture[part], mask, colour * shade[part][..., None])
+            _blend(picture[part], mask, colour * shade[part][..., None])
 
 
-def _cover(picture: Floats, mask: Floats, colour: Floats) -> None:
+def _blend(picture: Floats, mask: Floats, colour: Floats) -> None:
     """Lays a colour (..., 3) over a picture where the mask (h, w, 1) says."""
     picture += (colour - picture) * mask
 
@@ -95,7 +95,7 @@ def _stroke(random: Generator, picture: Floats, size: float, paint: tuple[Floats
     streak = bristles[(aside * 400).astype(np.int32) % 256, (along * 30).astype(np.int32) % 256]
     ragged = thick * np.clip((0.42 + 0.06 * streak - np.abs(along)) * 20, 0, 1)
     mask = np.clip((ragged - np.abs(aside)) * reach + 0.5, 0, 1) * np.clip(streak, 0.2, 1)
-    _cover(part, mask[..., None], colour * streak[..., None])
+    _blend(part, mask[..., None], colour * streak[..., None])
 
 
 def _poster(random: Generator, height: int, width: int) -> Floats:
@@ -107,30 +107,30 @@ def _poster(random: Generator, height: int, width: int) -> Floats:
     slope = grid[0] * np.cos(angle) + grid[1] * np.sin(angle)
     for ink in inks:
         band = np.abs(slope - random.uniform(-0.6, 0.6)) - random.uniform(0.02, 0.15)
-        _cover(picture, _inside(band, height), ink)
+        _blend(picture, _inside(band, height), ink)
     for _ in range(random.integers(1, 6)):
         place = random.uniform(-0.45, 0.45) * width / height, random.uniform(-0.3, 0.4)
         radius = random.uniform(0.05, 0.3)
         disc = _ellipse(grid, place, (radius, radius))
         if random.uniform() < 0.5:
             disc = np.maximum(disc, np.abs(np.mod(slope * random.uniform(12, 30), 1) - 0.5) * 0.04 - 0.01)
-        _cover(picture, _inside(disc, height), inks[random.integers(4)])
+        _blend(picture, _inside(disc, height), inks[random.integers(4)])
     ink = vector(0.9, 0.88, 0.8) if ground.mean() < 0.25 else vector(0.02, 0.02, 0.03)
-    _print(random, picture, (0.05, random.uniform(0.1, 0.2), int(random.integers(4, 11))), ink)
+    _print_line(random, picture, (0.05, random.uniform(0.1, 0.2), int(random.integers(4, 11))), ink)
     top = random.uniform(0.6, 0.75)
     for line in range(random.integers(2, 7)):
-        _print(random, picture, (top + 0.05 * line, 0.03, int(random.integers(18, 36))), ink)
+        _print_line(random, picture, (top + 0.05 * line, 0.03, int(random.integers(18, 36))), ink)
     return picture
 
 
-def _print(random: Generator, picture: Floats, line: tuple[float, float, int], ink: Floats) -> None:
+def _print_line(random: Generator, picture: Floats, line: tuple[float, float, int], ink: Floats) -> None:
     """Prints a line at (top, size) in heights, of a number of glyphs, as wide as the margins allow."""
     height, width = picture.shape[:2]
     top, tall = round(line[0] * height), max(2, round(line[1] * height))
     wide = min(round(width * 0.9), max(4, round(tall * 0.75 * line[2])))
     part = picture[top : top + tall, width // 20 :][:, :wide]
     if part.size:
-        _cover(part, lettering(random, line[2], *part.shape[:2])[..., None], ink)
+        _blend(part, lettering(random, line[2], *part.shape[:2])[..., None], ink)
 
 
 def _landscape(random: Generator, height: int, width: int) -> Floats:
@@ -142,9 +142,9 @@ def _landscape(random: Generator, height: int, width: int) -> Floats:
     )
     picture: Floats = zenith + (haze - zenith) * np.clip(y * 1.6 + 0.7 + 0 * x, 0, 1)[..., None] ** 1.5
     clouds = np.clip(fractal(random, height, width, 4, 7) * 0.5 - 0.1, 0, 0.9) * np.clip(0.3 - y, 0, 1)
-    _cover(picture, clouds[..., None] * 1.5, vector(0.95, 0.92, 0.9))
+    _blend(picture, clouds[..., None] * 1.5, vector(0.95, 0.92, 0.9))
     sun = random.uniform(-0.5, 0.5), random.uniform(-0.4, 0)
-    _cover(picture, _inside(_ellipse((x, y), sun, (0.04, 0.04)), height), vector(1, 0.95, 0.8))
+    _blend(picture, _inside(_ellipse((x, y), sun, (0.04, 0.04)), height), vector(1, 0.95, 0.8))
     ground = tint(random, 0.12, 0.4) * vector(0.9, 1.2, 0.6)
     texture = 1 + 0.35 * fractal(random, height, width, 50, 4)
     layers = random.integers(4, 7)
@@ -155,7 +155,7 @@ def _landscape(random: Generator, height: int, width: int) -> Floats:
             ridge = ridge - np.abs(_ridge(random, width, 60)) * 0.02 * near
         colour = haze * (1 - near) * 0.6 + ground * (0.4 + 0.6 * near)
         shade = (texture * np.clip(1.2 - (y - ridge) * 1.5, 0.3, 1.2))[..., None]
-        _cover(picture, _inside(ridge - y, height), colour * (1 + (shade - 1) * near))
+        _blend(picture, _inside(ridge - y, height), colour * (1 + (shade - 1) * near))
     return picture
 
 
@@ -176,7 +176,7 @@ def _portrait(random: Generator, height: int, width: int) -> Floats:
         place = random.uniform(-0.5, 0.5) * width / height, random.uniform(-0.5, 0.5)
         radius = random.uniform(0.02, 0.09)
         colour = tint(random, 0.6, 0.6)
-        _blob(picture, place, (radius, radius), colour)
+        _paint_ellipse(picture, place, (radius, radius), colour)
     skin = vector(0.62, 0.36, 0.25) * random.uniform(0.2, 1.1)
     hair, cloth = (
         vector(0.4, 0.25, 0.14) * random.uniform(0.05, 1.4),
@@ -204,7 +204,7 @@ def _portrait(random: Generator, height: int, width: int) -> Floats:
         parts.append(((side, -0.02), (0.011, 0.011), vector(0.02, 0.02, 0.03), light))
         parts.append(((side, -0.055), (0.036, 0.007), hair * 0.7, strands))
     for (right, down), radii, colour, shade in parts:
-        _blob(picture, (middle + right, top + down), radii, colour, shade)
+        _paint_ellipse(picture, (middle + right, top + down), radii, colour, shade)
     return picture
 
 
@@ -288,8 +288,8 @@ def wallpaper(random: Generator, canvas: Canvas) -> None:
         for left in np.arange(0.1, canvas.width, 0.7):
             canvas.area((left, canvas.height - 1.0, 0.55, 0.8))[..., :3] *= 0.8
             canvas.area((left + 0.03, canvas.height - 0.97, 0.55, 0.8))[..., :3] *= 1.25
-    canvas.roughen(random, random.uniform(0.01, 0.05), 10)
-    canvas.roughen(random, random.uniform(0.01, 0.06), 100, 2)
+    canvas.add_noise(random, random.uniform(0.01, 0.05), 10)
+    canvas.add_noise(random, random.uniform(0.01, 0.06), 100, 2)
     canvas.rect((0, canvas.height - 0.1, canvas.width, 0.1), vector(0.7, 0.69, 0.66))
     canvas.rect((0, canvas.height - 0.11, canvas.width, 0.015), vector(0.2, 0.2, 0.2))
 
@@ -348,7 +348,7 @@ def flooring(random: Generator, canvas: Canvas) -> None:
             for column, left in enumerate(np.arange(0, canvas.width, size)):
                 shade = (colour, other)[(row + column) % 2] * random.uniform(0.9, 1.1)
                 canvas.rect((left, top, size - 0.015, size - 0.015), shade)
-    canvas.roughen(random, 0.1 if choice < 0.8 else 0.25, 30)
+    canvas.add_noise(random, 0.1 if choice < 0.8 else 0.25, 30)
 
 
 def rug(random: Generator, canvas: Canvas) -> None:

@@ -72,7 +72,7 @@ class SceneLighting:
         return left
 
 
-def upright(canvas: Canvas, foot: Floats, towards: Floats | None, light: Lighting) -> Quad:
+def vertical_quad(canvas: Canvas, foot: Floats, towards: Floats | None, light: Lighting) -> Quad:
     """A canvas that stands on the middle of its lower edge and faces a direction, or the viewer."""
     facing = unit(-foot * vector(1, 0, 1)) if towards is None else towards
     across = np.cross(-facing, UP) * canvas.width
@@ -80,7 +80,7 @@ def upright(canvas: Canvas, foot: Floats, towards: Floats | None, light: Lightin
     return Quad(canvas, foot - across / 2 + rise, (across, -rise), light)
 
 
-def flat(canvas: Canvas, centre: Floats, light: Lighting, turn: float = 0) -> Quad:
+def horizontal_quad(canvas: Canvas, centre: Floats, light: Lighting, turn: float = 0) -> Quad:
     """A canvas that lies level, its top towards -z before it turns about the vertical."""
     across = vector(np.cos(turn), 0, np.sin(turn)) * canvas.width
     down = vector(-np.sin(turn), 0, np.cos(turn)) * canvas.height
@@ -102,20 +102,20 @@ def box(
     ):
         middle = foot + normal * (reach / 2)
         if normal @ middle < -0.02:
-            faces.append(upright(paint(name, wide, height), middle, normal, light))
+            faces.append(vertical_quad(paint(name, wide, height), middle, normal, light))
     if foot[1] + height < -0.02:
-        faces.append(flat(paint("top", width, depth), foot + UP * height, light, turn))
+        faces.append(horizontal_quad(paint("top", width, depth), foot + UP * height, light, turn))
     elif foot[1] > 0.02:
-        faces.append(flat(paint("bottom", width, depth), foot, light, turn))
+        faces.append(horizontal_quad(paint("bottom", width, depth), foot, light, turn))
     return faces
 
 
-def plain(random: Generator, colour: Colour, density: float = 40, grain: float = 0.12) -> Painter:
+def plain_painter(random: Generator, colour: Colour, density: float = 40, grain: float = 0.12) -> Painter:
     """Paints every face in one weathered colour."""
 
     def paint(_face: str, width: float, height: float) -> Canvas:
         canvas = Canvas(width, height, density, colour)
-        canvas.roughen(random, grain, 6, 4)
+        canvas.add_noise(random, grain, 6, 4)
         return canvas
 
     return paint
@@ -155,14 +155,14 @@ def window(random: Generator, canvas: Canvas, place: Box, panes: WindowStyle) ->
         slant = np.linspace(0, random.uniform(-0.5, 0.5), glass.shape[1], dtype=np.float32)[:, None]
         glass[..., :3] = panes.sky * random.uniform(0.05, 0.45) * np.clip(fall + slant, 0.1, 1.2) + 0.01
         glass[..., 4] = 0 if panes.lit else 0.7
-    _drape(random, glass)
+    _add_curtains(random, glass)
     for index in range(1, panes.columns):
         canvas.rect((left + width * index / panes.columns - bar / 2, top, bar, height), panes.frame)
     for index in range(1, panes.rows):
         canvas.rect((left, top + height * index / panes.rows - bar / 2, width, bar), panes.frame)
 
 
-def _drape(random: Generator, glass: Floats) -> None:
+def _add_curtains(random: Generator, glass: Floats) -> None:
     """Hangs curtains at the sides of a window, or a blind from its top, or nothing."""
     height, width = glass.shape[:2]
     choice, cloth = random.uniform(), tint(random, 0.5, 0.15)
@@ -224,7 +224,7 @@ def _wheel(canvas: Canvas, middle: float) -> None:
 def bookshelf(random: Generator) -> Painter:
     """Paints a box as a shelf whose front is full of books."""
     wood = vector(0.35, 0.23, 0.13) * random.uniform(0.2, 1.9)
-    sides = plain(random, wood, 60)
+    sides = plain_painter(random, wood, 60)
 
     def paint(face: str, width: float, height: float) -> Canvas:
         if face != "front":
@@ -249,7 +249,7 @@ def bookshelf(random: Generator) -> Painter:
 def cabinet(random: Generator) -> Painter:
     """Paints a box as a cabinet with drawers or doors."""
     colour = tint(random, random.uniform(0.1, 0.6), 0.3)
-    sides = plain(random, colour, 60)
+    sides = plain_painter(random, colour, 60)
     columns, rows = int(random.integers(1, 4)), int(random.integers(1, 4))
 
     def paint(face: str, width: float, height: float) -> Canvas:
@@ -289,7 +289,7 @@ def facade(
     cornice.area((0, 0.4, wide, 0.15))[..., :3] *= 0.4
     canvas = Canvas(wide, 0.7 + storey * (floors + 1.15), density, wall)
     canvas.pixels = np.concatenate([cornice.pixels, body, base.pixels])
-    canvas.roughen(random, random.uniform(0.06, 0.16), 8)
+    canvas.add_noise(random, random.uniform(0.06, 0.16), 8)
     return canvas
 
 

@@ -65,15 +65,16 @@ class RenderJob:
 class RenderTask:
     """Samples to render, by index, or blocks of a hundred to pack into their shards."""
 
-    do: Literal["render", "pack"]
-    numbers: tuple[int, ...]
+    kind: Literal["render", "pack"]
+    indices: tuple[int, ...]
 
-    def lost(self, why: str) -> list[RenderResult]:
+    def failed_results(self, why: str) -> list[RenderResult]:
         """The results if nobody could finish it."""
-        told = f"{why}; a sample must fit into memory; use fewer --workers, or a smaller --size."
-        first = 1 if self.do == "render" else store.SHARD_SIZE
+        message = f"{why}; a sample must fit into memory; use fewer --workers, or a smaller --size."
+        first = 1 if self.kind == "render" else store.SHARD_SIZE
         return [
-            RenderResult(number * first, "failed", error=told, kind="WorkerLost") for number in self.numbers
+            RenderResult(number * first, "failed", error=message, kind="WorkerLost")
+            for number in self.indices
         ]
 
 
@@ -93,7 +94,7 @@ class RenderResult:
     fatal: BrewsterError | None = None
 
 
-Report = Callable[[RenderResult], None]
+ResultCallback = Callable[[RenderResult], None]
 
 
 class Executor(AbstractContextManager[Any], Protocol):
@@ -102,7 +103,7 @@ class Executor(AbstractContextManager[Any], Protocol):
     chunk: int
     """How many samples make a task."""
 
-    def has_room(self) -> bool:
+    def has_capacity(self) -> bool:
         """Whether it would begin one more now."""
 
     def is_busy(self) -> bool:
@@ -121,7 +122,7 @@ def build(
     executor: Executor,
     *,
     shards: bool = False,
-    report: Report = lambda _: None,
+    report: ResultCallback = lambda _: None,
 ) -> None:
     """Renders the samples that are not there yet, moves them into shards if asked, and writes the index.
 
@@ -131,27 +132,29 @@ def build(
         TargetError: the folder holds something else, another run is writing there, or it is full or read-only.
         MissingExtra, DeviceError: the renderer cannot run here.
     """
-    with _alone_in(job.out):
-        _agree(job)
-        store.remove_leftovers(job.out)
+    with _exclusive_lock(job.out):
+        _check_record(job)
+        store.remove_partial_files(job.out)
         try:
             with executor:
-                _work(_Schedule(job.out, indices, executor.chunk, shards=shards, report=report), executor)
+                _run_tasks(
+                    _Schedule(job.out, indices, executor.chunk, shards=shards, report=report), executor
+                )
         finally:
-            store.remove_leftovers(job.out)
+            store.remove_partial_files(job.out)
         write_index(job.out)
 
 
-def _work(schedule: _Schedule, executor: Executor) -> None:
+def _run_tasks(schedule: _Schedule, executor: Executor) -> None:
     while True:
-        task = schedule.next() if executor.has_room() else None
+        task = schedule.next() if executor.has_capacity() else None
         if task:
             executor.submit(task)
         elif executor.is_busy():
             for result in executor.wait():
                 if result.fatal:
                     raise result.fatal
-                schedule.note(result)
+                schedule.record_result(result)
         else:
             return
 
@@ -160,19 +163,21 @@ def _work(schedule: _Schedule, executor: Executor) -> None:
 class _Schedule:
     """What is still to do, block by block: the samples that are missing, and the shards that are complete."""
 
-    def __init__(self, out: Path, indices: range, chunk: int, *, shards: bool, report: Report) -> None:
+    def __init__(
+        self, out: Path, indices: range, chunk: int, *, shards: bool, report: ResultCallback
+    ) -> None:
         self._out, self._indices, self._chunk = out, indices, chunk
         self._shards, self._report = shards, report
         self._packs: deque[int] = deque()
         self._left: dict[int, int] = {}
         """Block -> how many of its samples are still to be rendered before it can be packed."""
-        self._renders = self._walk()
+        self._renders = self._plan_tasks()
 
     def next(self) -> RenderTask | None:
         """The next task; None if there is none, or none until a result is noted."""
         return RenderTask("pack", (self._packs.popleft(),)) if self._packs else next(self._renders, None)
 
-    def note(self, result: RenderResult) -> None:
+    def record_result(self, result: RenderResult) -> None:
         """Learns what became of a sample; with its last one, a block can be packed, unless one has failed."""
         block = result.index // store.SHARD_SIZE
         if result.status == "failed":
@@ -184,18 +189,18 @@ class _Schedule:
                 self._packs.append(block)
         self._report(result)
 
-    def _walk(self) -> Iterator[RenderTask]:
+    def _plan_tasks(self) -> Iterator[RenderTask]:
         size, wanted = store.SHARD_SIZE, self._indices
         for block in range(wanted.start // size, -(-wanted.stop // size)):
-            there = {entry.index for entry in store.read_block(self._out, block)}
+            present = {entry.index for entry in store.read_block(self._out, block)}
             here = range(max(wanted.start, block * size), min(wanted.stop, (block + 1) * size))
-            missing = [index for index in here if index not in there]
+            missing = [index for index in here if index not in present]
             if self._shards and missing:
                 self._left[block] = len(missing)
             elif self._shards and store.has_folders(self._out, block):
                 yield RenderTask("pack", (block,))
             for index in here:
-                if index in there:
+                if index in present:
                     self._report(RenderResult(index, "skipped"))
             for at in range(0, len(missing), self._chunk):
                 yield RenderTask("render", tuple(missing[at : at + self._chunk]))
@@ -205,7 +210,7 @@ class _Schedule:
 
 
 @contextmanager
-def _alone_in(out: Path) -> Iterator[None]:
+def _exclusive_lock(out: Path) -> Iterator[None]:
     """Holds the folder's lock, which is released by the operating system if the process is killed."""
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -237,19 +242,19 @@ def _acquire(lock: filelock.BaseFileLock, out: Path) -> None:
         ) from error
 
 
-def _agree(job: RenderJob) -> None:
+def _check_record(job: RenderJob) -> None:
     """Records the job in a new set; in one that is there, the job must be the same."""
     path, text = job.out / RECORD, tomli_w.dumps(job.record())
     if not path.exists():
-        _refuse_foreign(job.out)
+        _check_is_set(job.out)
         write_atomically(path, text.encode())
         return
-    there, asked = dict(_values(_read_record(path))), dict(_values(tomllib.loads(text)))
-    for name in {**there, **asked}:
-        old, new = there.get(name, "not set"), asked.get(name, "not set")
+    present, requested = dict(_flatten(_read_record(path))), dict(_flatten(tomllib.loads(text)))
+    for name in {**present, **requested}:
+        old, new = present.get(name, "not set"), requested.get(name, "not set")
         if old != new:
             raise TargetError(
-                f"{job.out} holds another set: its {name} is {old}, and {new} was asked for",
+                f"{job.out} holds another set: its {name} is {old}, and {new} was requested",
                 "a folder holds one set",
                 "name another folder, or ask for the same",
             )
@@ -264,7 +269,7 @@ def _read_record(path: Path) -> dict[str, Any]:
         ) from error
 
 
-def _refuse_foreign(out: Path) -> None:
+def _check_is_set(out: Path) -> None:
     foreign = next((path for path in out.iterdir() if not path.name.startswith(".")), None)
     if foreign:
         raise TargetError(
@@ -272,10 +277,10 @@ def _refuse_foreign(out: Path) -> None:
         )
 
 
-def _values(table: dict[str, Any], before: str = "") -> Iterator[tuple[str, object]]:
+def _flatten(table: dict[str, Any], before: str = "") -> Iterator[tuple[str, object]]:
     """Every value in nested tables with its dotted name."""
     for name, value in table.items():
         if isinstance(value, dict):
-            yield from _values(value, f"{before}{name}.")
+            yield from _flatten(value, f"{before}{name}.")
         else:
             yield f"{before}{name}", value

@@ -18,7 +18,7 @@ from brewster.render.sample import LAYERS
 from brewster.rendered.store import SCENE, STATISTICS, StoredSample, read_set
 
 INDEX, PREVIEW = "index.parquet", "preview.png"
-_ROWS_AT_ONCE: Final = 1000
+_BATCH_ROWS: Final = 1000
 
 
 # --- the index
@@ -77,17 +77,17 @@ def write_index(out: Path) -> None:
     schema = pa.schema([(name, pa.type_for_alias(kind)) for name, kind in kinds.items()])
     rows = map(_row, read_set(out))
     with arriving(out / INDEX) as part, parquet.ParquetWriter(part, schema) as writer:
-        while some := list(islice(rows, _ROWS_AT_ONCE)):
-            writer.write_batch(pa.RecordBatch.from_pylist(some, schema=schema))
+        while batch := list(islice(rows, _BATCH_ROWS)):
+            writer.write_batch(pa.RecordBatch.from_pylist(batch, schema=schema))
 
 
 def _row(entry: StoredSample) -> dict[str, Any]:
     scene = tomllib.loads(entry.read(SCENE).decode())
     own = {"index": entry.index, "place": entry.place.name, "panes": len(scene["glass"]["panes"])}
-    return own | {name: _at(scene, path.split(".")) for name, (_, path) in COLUMNS.items()}
+    return own | {name: _lookup(scene, path.split(".")) for name, (_, path) in COLUMNS.items()}
 
 
-def _at(table: Any, path: list[str]) -> Any:  # noqa: ANN401  (what TOML holds)
+def _lookup(table: Any, path: list[str]) -> Any:  # noqa: ANN401  (what TOML holds)
     """The value there, or None where the scene has no such part."""
     for step in path:
         if isinstance(table, dict) and step not in table:

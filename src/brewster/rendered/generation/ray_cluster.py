@@ -13,18 +13,18 @@ from typing import Any, Final, Self, final
 
 from brewster.errors import DeviceError, MissingExtra
 from brewster.rendered.generation.job import RenderJob, RenderResult, RenderTask
-from brewster.rendered.generation.workers import TRIES, TaskRunner
+from brewster.rendered.generation.workers import MAX_ATTEMPTS, TaskRunner
 from brewster.worker_setup import one_thread
 
 LOCAL: Final = "local"
-_PATIENCE_S: Final = 10.0
-_AHEAD: Final = 2
+_CONNECT_TIMEOUT_S: Final = 10.0
+_TASKS_PER_CPU: Final = 2
 """Tasks under way for each processor, so that none waits for the head."""
 
 
 @final
 class RayExecutor:
-    """The executor of a Ray cluster at an address, or of one on this machine alone ("local").
+    """The executor of a Ray cluster at an address, or of one on this machine local_options ("local").
 
     A task whose node is lost is tried on another.
     """
@@ -35,10 +35,10 @@ class RayExecutor:
         self._job, self._address, self._workers = job, address, workers
         self._tasks: dict[Any, RenderTask] = {}
 
-    def has_room(self) -> bool:
+    def has_capacity(self) -> bool:
         """Whether a processor may soon be idle; nodes come and go."""
         processors = int(self._ray.cluster_resources().get("CPU", 1))
-        return len(self._tasks) < _AHEAD * max(1, processors)
+        return len(self._tasks) < _TASKS_PER_CPU * max(1, processors)
 
     def is_busy(self) -> bool:
         """Whether any task is under way."""
@@ -46,7 +46,7 @@ class RayExecutor:
 
     def submit(self, task: RenderTask) -> None:
         """Sends a task to wherever there is place."""
-        self._tasks[self._perform.remote(self._sent_job, task)] = task
+        self._tasks[self._run_task.remote(self._job_ref, task)] = task
 
     def wait(self) -> list[RenderResult]:
         """The results of the next task that is done."""
@@ -55,15 +55,15 @@ class RayExecutor:
         try:
             results: list[RenderResult] = self._ray.get(done)
         except self._ray.exceptions.RayError as error:
-            return self._blame(task, type(error).__name__)
+            return self._handle_lost_task(task, type(error).__name__)
         return results
 
-    def _blame(self, task: RenderTask, why: str) -> list[RenderResult]:
-        """Of several numbers that were lost together, only one may be to blame: each is tried alone."""
-        if len(task.numbers) == 1:
-            return task.lost(f"its process or node was lost {TRIES} times ({why})")
-        for number in task.numbers:
-            self.submit(RenderTask(task.do, (number,)))
+    def _handle_lost_task(self, task: RenderTask, reason: str) -> list[RenderResult]:
+        """Of several numbers that were lost together, only one may be to blame: each is tried local_options."""
+        if len(task.indices) == 1:
+            return task.failed_results(f"its process or node was lost {MAX_ATTEMPTS} times ({reason})")
+        for number in task.indices:
+            self.submit(RenderTask(task.kind, (number,)))
         return []
 
     def __enter__(self) -> Self:
@@ -74,18 +74,20 @@ class RayExecutor:
             DeviceError: no cluster answers at the address.
         """
         self._ray = _ray()
-        alone = {"num_cpus": self._workers, "include_dashboard": False} if self._address == LOCAL else {}
+        local_options = (
+            {"num_cpus": self._workers, "include_dashboard": False} if self._address == LOCAL else {}
+        )
         try:
-            _knock(self._address)
-            self._ray.init(self._address, log_to_driver=False, logging_level="error", **alone)
+            _check_reachable(self._address)
+            self._ray.init(self._address, log_to_driver=False, logging_level="error", **local_options)
         except (OSError, RuntimeError, ValueError) as error:
             raise DeviceError(
                 f"there is no cluster at {self._address} ({error})",
                 "a Ray cluster that runs, HOST:PORT, or local",
                 "start one: ray start --head",
             ) from error
-        self._perform = self._ray.remote(max_retries=TRIES - 1, num_cpus=1)(_perform)
-        self._sent_job = self._ray.put(self._job)
+        self._run_task = self._ray.remote(max_retries=MAX_ATTEMPTS - 1, num_cpus=1)(_run_task)
+        self._job_ref = self._ray.put(self._job)
         return self
 
     def __exit__(
@@ -109,19 +111,19 @@ def _ray() -> ModuleType:
     return ray
 
 
-def _knock(address: str) -> None:
+def _check_reachable(address: str) -> None:
     """Raises OSError if nobody listens at HOST:PORT: Ray itself would ask there for many minutes."""
     host, _, port = address.rpartition(":")
     if host and port.isdigit() and "/" not in host:
-        socket.create_connection((host, int(port)), timeout=_PATIENCE_S).close()
+        socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT_S).close()
 
 
-_hands: list[tuple[RenderJob, TaskRunner]] = []
+_runners: list[tuple[RenderJob, TaskRunner]] = []
 """Of this process, which does many tasks of one job: the maps that it has read are read once."""
 
 
-def _perform(job: RenderJob, task: RenderTask) -> list[RenderResult]:
-    if not _hands or _hands[0][0] != job:
-        _hands[:] = [(job, TaskRunner(job))]
+def _run_task(job: RenderJob, task: RenderTask) -> list[RenderResult]:
+    if not _runners or _runners[0][0] != job:
+        _runners[:] = [(job, TaskRunner(job))]
     with one_thread():
-        return _hands[0][1](task)
+        return _runners[0][1](task)

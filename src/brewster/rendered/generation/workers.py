@@ -37,7 +37,7 @@ RENDERERS: Final = {
 }
 """What makes a sample of a scene -> the module and function that do it."""
 
-TRIES: Final = 3
+MAX_ATTEMPTS: Final = 3
 """How often a task may cost a worker its life before it is given up."""
 
 
@@ -50,11 +50,11 @@ class TaskRunner:
 
     def __call__(self, task: RenderTask) -> list[RenderResult]:
         """The results of rendering; packing has none unless it fails."""
-        if task.do == "render":
-            return [self._attempt(index, lambda index=index: self._render(index)) for index in task.numbers]  # type: ignore[misc]
+        if task.kind == "render":
+            return [self._attempt(index, lambda index=index: self._render(index)) for index in task.indices]  # type: ignore[misc]
         tried = [
             self._attempt(block * store.SHARD_SIZE, lambda block=block: store.pack(self._job.out, block))  # type: ignore[misc]
-            for block in task.numbers
+            for block in task.indices
         ]
         return [result for result in tried if result.error]
 
@@ -77,8 +77,8 @@ class TaskRunner:
                 index, "failed", error="it does not fit into memory; use fewer --workers", kind="MemoryError"
             )
         except Exception as bug:  # noqa: BLE001  (one sample must not cost the others)
-            told = f"brewster stumbled ({type(bug).__name__}: {bug}); please report it"
-            return RenderResult(index, "failed", error=told, kind=type(bug).__name__)
+            message = f"brewster stumbled ({type(bug).__name__}: {bug}); please report it"
+            return RenderResult(index, "failed", error=message, kind=type(bug).__name__)
         return RenderResult(index, "rendered", time.perf_counter() - started)
 
 
@@ -99,13 +99,13 @@ def render_again(path: Path, folder: Path, folders: Sequence[Path] = (), rendere
     scene = read_scene(path)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise TargetError(f"{folder} is taken", "nothing is overwritten unasked", "name a new folder with -o")
-    chosen = renderer or _renderer_of(path)
+    chosen = renderer or _recorded_renderer(path)
     with one_thread():
         sample = find_renderer(chosen)(scene, Assets(folders))
         store.write_folder(folder, store.encode_sample(sample, chosen))
 
 
-def _renderer_of(path: Path) -> str:
+def _recorded_renderer(path: Path) -> str:
     """The renderer that a scene file names; one of ours, as a file may not choose what code is run."""
     name = tomllib.loads(path.read_text("utf-8")).get("outcome", {}).get("renderer", "analytic")
     if name not in RENDERERS:
@@ -125,10 +125,10 @@ class SerialExecutor:
     chunk = 1
 
     def __init__(self, job: RenderJob) -> None:
-        self._hand, self._threads = TaskRunner(job), one_thread()
+        self._runner, self._threads = TaskRunner(job), one_thread()
         self._task: RenderTask | None = None
 
-    def has_room(self) -> bool:
+    def has_capacity(self) -> bool:
         """Whether nothing is to do."""
         return self._task is None
 
@@ -143,7 +143,7 @@ class SerialExecutor:
     def wait(self) -> list[RenderResult]:
         """Does the task."""
         task, self._task = self._task, None
-        return self._hand(task) if task else []
+        return self._runner(task) if task else []
 
     def __enter__(self) -> Self:
         self._threads.__enter__()
@@ -176,7 +176,7 @@ class ProcessExecutor:
         self._idle: list[_Worker] = []
         self._busy: dict[Connection, tuple[_Worker, RenderTask, int]] = {}
 
-    def has_room(self) -> bool:
+    def has_capacity(self) -> bool:
         """Whether a worker is idle, or could still be hired."""
         return len(self._busy) < self._count
 
@@ -186,42 +186,44 @@ class ProcessExecutor:
 
     def submit(self, task: RenderTask) -> None:
         """Gives the task to a worker."""
-        self._give(task, 1)
+        self._assign(task, 1)
 
     def wait(self) -> list[RenderResult]:
         """The results of the next worker that is done; none if it died and another one tries."""
         pipe = connection.wait(list(self._busy))[0]
         assert isinstance(pipe, Connection)
-        worker, task, tries = self._busy.pop(pipe)
+        worker, task, attempt = self._busy.pop(pipe)
         try:
             results: list[RenderResult] = pipe.recv()
         except (EOFError, OSError):
-            return self._handle_dead_worker(worker, task, tries)
+            return self._handle_dead_worker(worker, task, attempt)
         self._idle.append(worker)
         return results
 
-    def _give(self, task: RenderTask, tries: int) -> None:
+    def _assign(self, task: RenderTask, attempt: int) -> None:
         worker = self._idle.pop() if self._idle else self._spawn()
-        self._busy[worker.pipe] = (worker, task, tries)
+        self._busy[worker.pipe] = (worker, task, attempt)
         with suppress(OSError):  # it is dead: its pipe ends, which wait() will notice
             worker.pipe.send(task)
 
     def _spawn(self) -> _Worker:
         context = get_context("spawn")
         ours, theirs = context.Pipe()
-        process = context.Process(target=_serve, args=(theirs, self._job), daemon=True)
-        with _deaf_to_interrupts():
+        process = context.Process(target=_worker_main, args=(theirs, self._job), daemon=True)
+        with _interrupts_blocked():
             process.start()
         theirs.close()
         return _Worker(process, ours)
 
-    def _handle_dead_worker(self, worker: _Worker, task: RenderTask, tries: int) -> list[RenderResult]:
+    def _handle_dead_worker(self, worker: _Worker, task: RenderTask, attempt: int) -> list[RenderResult]:
         worker.pipe.close()
         worker.process.join()
-        if tries < TRIES:
-            self._give(task, tries + 1)
+        if attempt < MAX_ATTEMPTS:
+            self._assign(task, attempt + 1)
             return []
-        return task.lost(f"its worker died {TRIES} times (exit code {worker.process.exitcode})")
+        return task.failed_results(
+            f"its worker died {MAX_ATTEMPTS} times (exit code {worker.process.exitcode})"
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -240,9 +242,9 @@ class ProcessExecutor:
 
 
 @contextmanager
-def _deaf_to_interrupts() -> Iterator[None]:
+def _interrupts_blocked() -> Iterator[None]:
     """Processes started here never see Ctrl-C, which a terminal sends to all: who started them will stop them."""
-    if sys.platform == "win32":  # it has no signal masks; _serve ignores Ctrl-C as soon as it runs
+    if sys.platform == "win32":  # it has no signal masks; _worker_main ignores Ctrl-C as soon as it runs
         yield
         return
     resource_tracker.ensure_running()  # or it would start below, and lift the mask
@@ -253,11 +255,11 @@ def _deaf_to_interrupts() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _serve(pipe: Connection, job: RenderJob) -> None:
+def _worker_main(pipe: Connection, job: RenderJob) -> None:
     """A worker's life: tasks until the pipe ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()  # the next run may be at the same sample
-    hand = TaskRunner(job)
+    runner = TaskRunner(job)
     with one_thread(), suppress(EOFError):
         while True:
-            pipe.send(hand(pipe.recv()))
+            pipe.send(runner(pipe.recv()))

@@ -43,7 +43,7 @@ from brewster.training.lora.latents import (
 )
 from brewster.training.lora.model_card import write_card
 from brewster.training.losses import finite, gain_db
-from brewster.training.recipe import ENCODED, LoraRecipe
+from brewster.training.recipe import ENCODED_SUFFIX, LoraRecipe
 from brewster.training.streams import validation_pairs
 
 FOLDER: Final = "lora"
@@ -232,7 +232,7 @@ def _refuse_idle(recipe: LoraRecipe) -> None:
 
 
 def _find_prompt(recipe: LoraRecipe, backbone: Backbone) -> PromptEmbedding:
-    if recipe.prompt.endswith(ENCODED):
+    if recipe.prompt.endswith(ENCODED_SUFFIX):
         return load_prompt(Path(recipe.prompt), backbone.name)
     return encode_prompt(recipe.backbone, PROMPTS[recipe.prompt])
 
