@@ -1,4 +1,4 @@
-"""The camera: a thin lens before a sensor, and the axes of everything that has a heading and a pitch."""
+"""The camera, a thin lens and a sensor, and the coordinate axes of a heading and a pitch."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from brewster.scene.glass import Point
 from brewster.scene.values import FrozenModel, NonNegativeFloat, PositiveFloat
 
 Axes = tuple[Point, Point, Point]
-"""Unit vectors to the right, up and back."""
+"""Unit vectors (right, up, back)."""
 
 
 class Camera(FrozenModel):
-    """Where it stands, where it looks, and its thin lens; square pixels.
+    """Position, orientation and thin lens of a camera with square pixels.
 
-    `fov_deg` spans the picture's width. An aperture of 0 is a pinhole; `focus_mm` is measured along the axis.
+    `fov_deg` is the horizontal field of view. An aperture of 0 is a pinhole. `focus_mm` is measured along the axis.
     """
 
     position_mm: Point = (0.0, 0.0, 1000.0)
@@ -36,11 +36,11 @@ class Camera(FrozenModel):
 
     @property
     def pixel_rad(self) -> float:
-        """The angle of a pixel's side in the middle of the picture."""
+        """The angle that a pixel spans in the middle of the image, in radians."""
         return 2 * self.half_width / self.width
 
     def corners(self) -> list[Point]:
-        """Directions (not of unit length) through the picture's four corners."""
+        """Directions through the four corners of the image, not of unit length."""
         right, up, back = axes(self.heading_deg, self.pitch_deg)
         across, down = self.half_width, self.half_width * self.height / self.width
         return [
@@ -51,7 +51,10 @@ class Camera(FrozenModel):
 
 
 def axes(heading_deg: float, pitch_deg: float) -> Axes:
-    """The axes of what looks to `heading_deg` (0 is -z, 90 is +x), `pitch_deg` above the horizon."""
+    """The axes of an object that faces `heading_deg` (0 is -z, 90 is +x), `pitch_deg` above the horizon.
+
+    Returns: unit vectors (right, up, back) in world coordinates.
+    """
     heading, pitch = math.radians(heading_deg), math.radians(pitch_deg)
     ahead = (math.sin(heading) * math.cos(pitch), math.sin(pitch), -math.cos(heading) * math.cos(pitch))
     right = (math.cos(heading), 0.0, math.sin(heading))

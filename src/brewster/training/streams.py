@@ -17,11 +17,12 @@ from brewster.environments.assets import Assets
 from brewster.environments.catalog import read_catalog
 from brewster.errors import RecipeError
 from brewster.scene.recipe import SceneRecipe, read_scene_recipe
+from brewster.training.data.data_recipe import DataRecipe, RenderedRecipe
 from brewster.training.data.image_loading import read_maps, read_pairs, read_photos, source_weights
 from brewster.training.data.mixtures import InterleavedStream, Mixtures, Pairs, Stream, TrainingBatch
 from brewster.training.data.online import OnlineRendered
 from brewster.training.data.rendered import CachedRendered, RenderedSets
-from brewster.training.recipe import CompactRecipe, DataRecipe, RenderedRecipe, data_folder
+from brewster.training.recipe import CompactRecipe, data_folder
 
 
 def open_stream(recipe: CompactRecipe, device: torch.device | str = "cpu") -> Stream:
