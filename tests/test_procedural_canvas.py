@@ -1,4 +1,4 @@
-"""What the procedural worlds are made of: surfaces that hide each other, lamps that light them, and the sun."""
+"""Parts of the procedural environments: occlusion of surfaces, lamps, and the sun."""
 
 import math
 

@@ -49,12 +49,12 @@ def fine_maps(both_maps):
     return {name: fine for name, (_, fine) in both_maps.items()}
 
 
-def test_the_worlds_are_the_three_that_recipes_name():
+def test_the_environments_are_the_three_that_recipes_name():
     assert NAMES == ["night", "room", "street"]
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_world_is_a_lat_long_map_of_radiance(maps, name):
+def test_an_environment_is_a_lat_long_map_of_radiance(maps, name):
     picture = maps[name]
     assert picture.shape == (64, 128, 3)
     assert picture.dtype == np.float32
@@ -64,7 +64,7 @@ def test_a_world_is_a_lat_long_map_of_radiance(maps, name):
 
 
 @pytest.mark.parametrize("name", ["room", "night"])  # a street is a night street in other light
-def test_a_seed_gives_the_same_bytes_and_another_seed_another_world(maps, name):
+def test_a_seed_gives_the_same_bytes_and_another_seed_another_environment(maps, name):
     assert ENVIRONMENTS[name](7, 64).tobytes() == maps[name].tobytes()
     first, second = (np.log(picture + 0.01) for picture in (maps[name], ENVIRONMENTS[name](1, 64)))
     assert np.abs(first - second).mean() > 0.2
@@ -112,7 +112,7 @@ def test_directions_follow_the_convention_of_maps():
     np.testing.assert_allclose(v, np.broadcast_to((np.arange(64)[:, None] + 0.5) / 64, v.shape), atol=1e-4)
 
 
-def test_a_quad_stands_where_it_was_put_and_covers_its_solid_angle():
+def test_a_quad_is_at_its_position_and_covers_its_solid_angle():
     """A unit square, 1 m ahead of the viewer at +x, is 1/6 of a cube that surrounds it when it is 2 m wide."""
     canvas = Canvas(2, 2, 8, (0.5, 0.5, 0.5))
     canvas.rect((1, 0, 1, 2), (1.0, 1.0, 1.0))  # its right half: towards +z for who looks at +x

@@ -1,4 +1,4 @@
-"""Worlds of a single idea, which need no files: even light, one texel's sun, a half, a line; and scenes of them."""
+"""Synthetic environments and scenes without files: constant light, a single bright texel, a half, a line."""
 
 import math
 

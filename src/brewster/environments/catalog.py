@@ -1,4 +1,4 @@
-"""What is there to light scenes with: folders of maps and photos as a catalog, or the builtin worlds."""
+"""Catalogs of environment maps and pictures to draw scenes from: folders of files, or the builtin ones."""
 
 from __future__ import annotations
 
@@ -36,20 +36,22 @@ BUILTIN_CATALOG = Catalog(
         for seed in range(_PAINTING_COUNT)
     ),
 )
-"""Worlds that need no file: streets, rooms, nights, and paintings."""
+"""Maps and pictures that need no file: streets, rooms, streets at night, and paintings."""
 
 
 def read_catalog(
     maps: Sequence[Path], pictures: Sequence[Path], exclude: Sequence[str] = ()
 ) -> tuple[Catalog, list[BrewsterError]]:
-    """The maps and pictures of some folders, and what was wrong with those left out.
+    """Lists the maps and pictures of folders.
 
-    Maps are read whole; of a picture only the header, so one that is damaged further on is refused when drawn.
-    A `manifest.csv` with the columns file and category tells what a map is. Where no folder is given for maps
-    or for pictures, the builtin ones take their place. Files whose names match a pattern of `exclude` are passed over.
+    Maps are decoded and checked. Of pictures only the header is read, so that other damage is found when a picture is
+    used. A `manifest.csv` with the columns file and category gives the categories of maps. Without a folder for maps or
+    for pictures, the builtin ones are listed. File names that match a pattern of `exclude` are skipped.
+
+    Returns: the catalog, and an error for each file that cannot be used.
 
     Raises:
-        RecipeError: a folder or its manifest cannot be read, or none of its files can be used.
+        RecipeError: a folder or its manifest cannot be read, or none of the files can be used.
     """
     refused: list[BrewsterError] = []
     found_maps = _read_folders(maps, exclude, refused, are_maps=True) if maps else BUILTIN_CATALOG.maps
@@ -99,7 +101,7 @@ def _list_files(folder: Path, are_maps: bool) -> Iterator[Path]:
         entries = sorted(folder.iterdir())
     except OSError as error:
         raise RecipeError(
-            f"{folder} cannot be read ({error.strerror})", "a folder of files", "name another folder"
+            f"{folder} cannot be read ({error.strerror})", "expected a folder of files", "name another folder"
         ) from error
     for path in entries:
         kind = SUFFIXES.get(path.suffix.lower())
@@ -116,6 +118,6 @@ def _read_categories(folder: Path) -> dict[str, str]:
     except (UnicodeDecodeError, csv.Error) as error:
         raise RecipeError(
             f"{folder / 'manifest.csv'} cannot be read ({error})",
-            "a table with the columns file and category, as UTF-8",
-            "save it so, or remove it",
+            "expected a table with the columns file and category, in UTF-8",
+            "save it as UTF-8, or remove it",
         ) from error

@@ -1,4 +1,4 @@
-"""Draws scenes: (recipe, catalog, seed, index) to a Scene, the same on every machine.
+"""Draws random scenes: (recipe, catalog, seed, index) -> Scene, the same on every machine.
 
 scene = draw(read_scene_recipe("window"), catalog, seed=7, index=12)
 """
@@ -26,7 +26,7 @@ _MAX_FOCUS_MM: Final = 1e6
 
 
 class Asset(FrozenModel):
-    """A file that can light a scene: its size, and a category such as indoor, outdoor or night."""
+    """A map or a picture: its source, its size in px, and a category such as indoor, outdoor or night."""
 
     source: AssetSource
     width: int
@@ -35,17 +35,17 @@ class Asset(FrozenModel):
 
 
 class Catalog(FrozenModel):
-    """The maps and pictures to draw from."""
+    """The environment maps and pictures to draw from."""
 
     maps: tuple[Asset, ...] = ()
     pictures: tuple[Asset, ...] = ()
 
 
 def draw(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) -> Scene:
-    """The scene of this number. What turns out impossible (a view that grazes the glass, say) is drawn again.
+    """The scene of this index. An impossible one (such as a view that grazes the glass) is drawn again.
 
     Raises:
-        RecipeError: the recipe asks for maps or pictures that the catalog lacks, or for the impossible.
+        RecipeError: the catalog has no suitable maps or pictures, or no scene was possible in 100 attempts.
     """
     rng = _SceneRng(f"{recipe.name}/{seed}/{index}")
     reason = ""
@@ -55,19 +55,19 @@ def draw(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) -> Scene:
         except ValidationError as error:
             reason = error.errors()[0]["msg"].removeprefix("Value error, ")
     raise RecipeError(
-        f"the recipe {recipe.name!r} gave no possible scene in {_MAX_ATTEMPTS} tries",
+        f"the recipe {recipe.name!r} gave no possible scene in {_MAX_ATTEMPTS} attempts",
         reason,
         "change its ranges",
     )
 
 
 def _six_digits(number: float) -> float:
-    """Six digits, so that scenes read well."""
+    """The number rounded to six digits, so that scene files stay readable."""
     return float(f"{number:.6g}")
 
 
 class _SceneRng(Random):
-    """Random numbers by the words of a recipe."""
+    """Random numbers from the value types of a recipe."""
 
     def from_range(self, bounds: tuple[float, float]) -> float:
         return _six_digits(self.uniform(*bounds))
@@ -81,7 +81,7 @@ class _SceneRng(Random):
 
 @dataclass(frozen=True)
 class _PartialScene:
-    """What is settled when the sides are drawn."""
+    """The parts of a scene that are drawn before its two sides."""
 
     rng: _SceneRng
     catalog: Catalog
@@ -138,28 +138,28 @@ def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
 
 
 def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng: _SceneRng) -> Asset | None:
-    """A map that is sharp enough for the widest view that the recipe allows; None for a side of pictures."""
+    """A map with enough resolution for the widest view of the recipe; None for a side with a picture only."""
     wanted = [asset for asset in catalog.maps if not recipe.maps or asset.category in ("", *recipe.maps)]
     sharp = [asset for asset in wanted if _min_fov_deg(asset, recipe, camera) <= camera.fov_deg[1]]
     if not rng.bernoulli(recipe.map_probability) or (not sharp and recipe.picture_probability > 0):
         return None
     if not sharp:
         raise RecipeError(
-            f"of {len(catalog.maps)} maps none fits the recipe",
-            f"categories {', '.join(recipe.maps) or 'any'}, and texels finer than {recipe.most_px_per_texel:g} px"
+            f"none of {len(catalog.maps)} maps fits the recipe",
+            f"expected categories {', '.join(recipe.maps) or 'any'}, and texels finer than {recipe.most_px_per_texel:g} px"
             f" at {camera.fov_deg[1]:g} degrees",
-            "give other --maps, larger ones, or a smaller --size",
+            "give other --maps or larger ones, or a smaller --size",
         )
     return rng.choice(sharp)
 
 
 def _min_fov_deg(asset: Asset, recipe: SideRecipe, camera: CameraRecipe) -> float:
-    """The narrowest view in degrees in which a texel of the map is not too many pixels wide."""
+    """The smallest field of view in degrees in which a texel of the map does not cover too many pixels."""
     return camera.width * 360 / asset.width / recipe.most_px_per_texel
 
 
 def _draw_camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]], rng: _SceneRng) -> Camera:
-    """A camera whose axis meets the glass near its middle; where it focuses is settled later."""
+    """A camera whose axis meets the glass near its middle. Its focus is set later."""
     wanted = recipe.camera
     min_fov_deg = max(
         [wanted.fov_deg[0], *(_min_fov_deg(asset, side, wanted) for side, asset in maps if asset)]
@@ -197,10 +197,10 @@ def _draw_side(recipe: SideRecipe, asset: Asset | None, draft: _PartialScene, ne
 
 
 def _draw_plane(recipe: SideRecipe, draft: _PartialScene, luminance: float, distance_mm: float) -> Plane:
-    """A picture that covers as much of the view, straight or mirrored, as the recipe says."""
+    """A picture whose width is `fill` times what covers the view, seen directly or mirrored."""
     if not draft.catalog.pictures:
         raise RecipeError(
-            "there are no pictures to draw from", "the recipe asks for them", "name a folder with --photos"
+            "there are no pictures to draw from", "the recipe needs pictures", "name a folder with --photos"
         )
     rng, asset = draft.rng, draft.rng.choice(draft.catalog.pictures)
     (left, right), (bottom, top) = _visible_extent(draft.camera, draft.glass, distance_mm)
@@ -230,7 +230,10 @@ def _to_glass_frame(vector: Point, glass: Glazing) -> Point:
 def _visible_extent(
     camera: Camera, glass: Glazing, distance_mm: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """What the view spans on a plane this far beyond the glass, or as far before it in the mirror: x and y, in mm."""
+    """The ranges of x and y, in mm, that the view covers on a plane at this distance behind the glass.
+
+    A mirrored plane at the same distance in front of the glass covers the same ranges.
+    """
     x, y, z = _camera_in_glass_frame(camera, glass)
     places = []
     for corner in camera.corners():
@@ -242,7 +245,7 @@ def _visible_extent(
 
 
 def _focus_camera(recipe: CameraRecipe, draft: _PartialScene, behind: Side, front: Side) -> Camera:
-    """The camera with its lens set on something of the scene."""
+    """The camera with its lens focused on the content of one side."""
     rng, camera = draft.rng, draft.camera
     on = front if rng.bernoulli(recipe.focus_on_front_probability) else behind
     is_pinhole, aperture = (

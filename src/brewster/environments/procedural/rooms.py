@@ -1,9 +1,9 @@
-"""Worlds made from nothing but a seed, for a machine that has no HDR maps: a street, a night street, a room.
+"""Procedural environment maps from a seed, for machines without HDR maps: a street, a street at night, a room.
 
     picture = ENVIRONMENTS["street"](7, 512)  # (512, 1024, 3), linear radiance around the viewer
     poster = painting(seed=7, width=768, height=512)  # (512, 768, 3), linear, 0..1
 
-The same seed gives the same bytes. Radiance 1 is about what a white sheet shows in a world's shade.
+The same seed gives the same bytes. Radiance 1 is about that of a white sheet in the shade.
 """
 
 from __future__ import annotations
@@ -77,11 +77,11 @@ ENVIRONMENTS: Final[dict[str, Callable[[int, int], NDArray[np.float32]]]] = {
     "room": room,
     "night": night,
 }
-"""A world by its name: (seed, height) to a lat-long map (height, 2 height, 3), linear light."""
+"""Name -> function (seed, height) that returns a lat-long map (height, 2 height, 3) in linear light."""
 
 
 class _BoxRoom:
-    """A box room around the viewer: its walls, its light, and the furniture in it so far."""
+    """A box-shaped room around the viewer: its walls, its lighting, and the furniture placed so far."""
 
     def __init__(self, random: Generator) -> None:
         self.random = random
@@ -102,7 +102,7 @@ class _BoxRoom:
         self.glows: list[Glow] = []
 
     def light(self, points: Floats, normal: Floats) -> Floats:
-        """Lamps and windows, darker towards the corners, and sunlight that falls in."""
+        """Irradiance / pi of lamps and windows, darker in corners, and of sunlight through the windows."""
         total = self.lamps(points, normal)
         for end in (self.low, self.high):
             corner = 1 - 0.3 * np.exp(-np.abs(points - end) / 0.3)
@@ -119,7 +119,7 @@ class _BoxRoom:
         return total
 
     def world(self) -> ProceduralEnvironment:
-        """The finished room; what lights it comes first, textures are lit when they are shown."""
+        """Builds the room. Lights come first; lighting is baked into textures when they are rendered."""
         random = self.random
         paint = tint(random, random.uniform(0.3, 0.75), random.uniform(0, 0.2))
         ways = [vector(0, 0, 1), vector(-1, 0, 0), vector(0, 0, -1), vector(1, 0, 0)]
@@ -143,7 +143,7 @@ class _BoxRoom:
         )
 
     def _wall_base(self, inward: Floats) -> tuple[Floats, float]:
-        """The middle of a wall's lower edge, and its length."""
+        """The middle of the lower edge of a wall, and the length of the wall."""
         middle = (self.low + self.high) / 2
         foot = np.where(inward > 0, self.low, np.where(inward < 0, self.high, middle))
         foot[1] = self.floor
@@ -172,7 +172,7 @@ class _BoxRoom:
     def _opening(
         self, place: tuple[float, float, float], canvas: Canvas, foot: Floats, inward: Floats
     ) -> None:
-        """A window at (left, width, sill height) of a wall: the blurred view, its light, bars and curtains."""
+        """Adds a window at (left, width, sill height) of a wall: blurred view, light, bars and curtains."""
         random, (left, wide, sill) = self.random, place
         top = random.uniform(0.25, 0.45)
         tall = self.tall - sill - top
@@ -196,7 +196,7 @@ class _BoxRoom:
         self.openings.append((middle, inward, wide, tall))
 
     def _ceiling(self) -> None:
-        """A ceiling with lamps of one kind, or none by day, as bright as lighting the room takes."""
+        """Adds a ceiling with lamps of one kind, or none by day. Their radiance follows from the size of the room."""
         random, size = self.random, self.high - self.low
         canvas = Canvas(float(size[0]), float(size[2]), 60, vector(0.8, 0.79, 0.76) * random.uniform(0.7, 1))
         if random.uniform() < 0.3:
@@ -228,7 +228,7 @@ class _BoxRoom:
         self.quads.append(horizontal_quad(canvas, centre, self.light))
 
     def _pendant(self, colour: Floats) -> None:
-        """A lamp that hangs from the ceiling, its bulb below a shade."""
+        """Adds a pendant lamp: a bulb below a shade."""
         share = vector(*self.random.uniform(0.25, 0.75, 3))
         place = self.low + share * (self.high - self.low)
         place[1] = self.high[1] - self.random.uniform(0.5, 0.9)
@@ -248,7 +248,7 @@ class _BoxRoom:
         self.quads.append(horizontal_quad(canvas, vector(middle[0], self.floor, middle[2]), self.light))
 
     def _reserve_floor(self, foot: Floats, size: tuple[float, float, float], turn: float) -> bool:
-        """Reserves the floor for a piece of furniture, unless the viewer or another piece is there."""
+        """Reserves floor space for a piece of furniture. Returns False if the viewer or another piece is there."""
         reach = max(size[0], size[2]) / 2
         if np.hypot(foot[0], foot[2]) < reach + 0.7:
             return False
@@ -261,7 +261,7 @@ class _BoxRoom:
         return True
 
     def _furnish_wall(self, inward: Floats) -> None:
-        """Shelves, cabinets and sofas along a wall."""
+        """Adds shelves, cabinets and sofas along a wall."""
         random = self.random
         middle, long = self._wall_base(inward)
         turn = float(np.arctan2(-inward[0], inward[2]))
@@ -316,7 +316,7 @@ class _BoxRoom:
         self.quads.append(vertical_quad(tree(self.random, tall, 90), foot + UP * 0.25, None, self.light))
 
     def _place_free_standing(self) -> None:
-        """A table with chairs, a person or a floor lamp in the room."""
+        """Adds a table with chairs, a person or a floor lamp."""
         random = self.random
         margin = vector(0.8, 0, 0.8)
         share = vector(random.uniform(), 0, random.uniform())

@@ -1,4 +1,4 @@
-"""A street between two rows of houses, by day or by night, as a `ProceduralEnvironment` that `surfaces.render` shows."""
+"""A street between two rows of houses, by day or by night, as a `ProceduralEnvironment` for `canvas.render`."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ from brewster.environments.procedural.props import (
 )
 
 _END: Final = 90.0
-"""How far the houses reach, in metres either way."""
+"""Half the length of the street in m."""
 _SUN_RADIUS: Final = 0.00465
 
 
 @dataclass(frozen=True)
 class _Sky:
-    """The dome: a gradient, clouds and, by day, the light around the sun."""
+    """The sky: a gradient, clouds and, by day, the halo of the sun."""
 
     zenith: Floats
     horizon: Floats
@@ -68,7 +68,7 @@ class _Sky:
         return result
 
     def _thickness(self, ways: Floats, rise: Floats, texel: float) -> Floats:
-        """How much cloud (h, w, 1) lies in each direction: a flat layer that bends down at the horizon."""
+        """The thickness (h, w, 1) of clouds in each direction: a flat layer that curves down at the horizon."""
         height = rise + 0.1
         places = [(ways[..., axis] / height * 0.35 % 1).ravel() for axis in (0, 2)]
         spot = (texel * 0.35 * 512 / height**1.5).ravel()
@@ -111,7 +111,7 @@ def _night_sky(random: Generator) -> _Sky:
 
 
 class _Street:
-    """The layout of one street, the light in it, and everything that stands in it so far."""
+    """The layout of one street, its lighting, and the objects placed so far."""
 
     def __init__(self, random: Generator, *, night: bool) -> None:
         self.random, self.night = random, night
@@ -127,7 +127,7 @@ class _Street:
         self.glows: list[Glow] = []
 
     def light(self, points: Floats, normal: Floats) -> Floats:
-        """Lamps and sky, less of it deep in the street, and the sun where houses and trees let it through."""
+        """Irradiance / pi of lamps, sky (less of it near the ground), and the sun with shadows of houses and trees."""
         depth = np.clip((points[..., 1:2] - self.ground) / 12, 0, 1)
         total = self.lamps(points, normal) * (1 if self.night else 0.65 + 0.35 * depth)
         facing = float(normal @ self.sky.sun)
@@ -225,7 +225,7 @@ def _house(street: _Street, foot: Floats, wide: float, floors: int) -> None:
 
 
 def _roof(street: _Street, eave: Floats, wide: float, side: int) -> None:
-    """A slope of tiles with skylights, up from the eave."""
+    """Adds a tiled roof with skylights above the eave."""
     random = street.random
     slope = vector(-side * random.uniform(3, 5), -random.uniform(2, 4), 0)
     canvas = Canvas(wide, float(np.linalg.norm(slope)), 12, tint(random, 0.12, 0.3) + vector(0.06, 0.01, 0))
@@ -238,7 +238,7 @@ def _roof(street: _Street, eave: Floats, wide: float, side: int) -> None:
 
 
 def _paving(street: _Street) -> None:
-    """Road, kerbs, pavements and marks: fine close by, coarse far off and a little lower."""
+    """Adds road, kerbs, pavements and markings: a fine canvas nearby, and a coarse one, slightly lower, far away."""
     random = street.random
     asphalt, slabs = random.uniform(0.05, 0.12), tint(random, random.uniform(0.2, 0.4), 0.06)
     stripes = random.uniform() < 0.4
@@ -265,7 +265,7 @@ def _paving(street: _Street) -> None:
 
 
 def _ends(street: _Street) -> None:
-    """What closes the street: a house across it, or hills."""
+    """Adds a house or hills at both ends of the street."""
     random = street.random
     for end in (-1, 1):
         foot = vector(random.uniform(-10, 10), street.ground, end * (_END + random.uniform(5, 40)))
@@ -297,7 +297,7 @@ def _trees(street: _Street, side: int, *, park: bool) -> None:
 
 
 def _light_lamps(street: _Street) -> None:
-    """Street lamps of one kind along both kerbs, their light first so that all else receives it."""
+    """Adds street lamps along both kerbs. They come first, since lighting is baked into everything else."""
     random = street.random
     tall, gap = random.uniform(5, 8), random.uniform(16, 26)
     colour = vector(1, random.uniform(0.5, 0.9), random.uniform(0.15, 0.8)) * random.uniform(100, 250)
@@ -313,7 +313,7 @@ def _light_lamps(street: _Street) -> None:
 
 
 def _poles(street: _Street, side: int) -> None:
-    """Lamp posts, road signs on posts, and signs that hang out from the houses."""
+    """Adds posts, road signs on posts, and signs that hang from the houses."""
     random = street.random
     kerb = street.reach[side] - street.pavement + 0.3
     for z in np.arange(-55 + random.uniform(0, 15), 60, random.uniform(12, 20)):
