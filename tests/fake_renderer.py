@@ -1,4 +1,4 @@
-"""Renderers that take no time, for tests of what happens around them; processes find them by name."""
+"""Fast fake renderers for tests of executors; worker processes import them by name."""
 
 import os
 import signal
@@ -13,7 +13,7 @@ from brewster.render.sample import LAYERS, LightSample
 
 
 def render(scene, assets):
-    """Colours that depend on the scene alone."""
+    """Random colours that depend on the scene only."""
     generator = torch.Generator().manual_seed(1000 * scene.seed + scene.index)
     return LightSample(scene, **{layer: torch.rand(3, 16, 24, generator=generator) for layer in LAYERS})
 
@@ -24,14 +24,14 @@ def slow(scene, assets):
 
 
 def waits(scene, assets):
-    """Never finishes sample 2 where FAKE_WAIT is set."""
+    """Never finishes sample 2 if FAKE_WAIT is set."""
     if scene.index == 2 and "FAKE_WAIT" in os.environ:
         Event().wait()
     return render(scene, assets)
 
 
 def deadly_once(scene, assets):
-    """The worker that is first at sample 2 is killed, as by the kernel when memory runs out."""
+    """Kills the first worker at sample 2, as the kernel does when memory runs out."""
     mark = Path(os.environ["FAKE_MARK"])
     if scene.index == 2 and not mark.exists():
         mark.touch()

@@ -1,4 +1,4 @@
-"""What the tests of rendered sets share: jobs with a fake renderer, and what a folder holds."""
+"""Helpers for tests of rendered sets: jobs with a fake renderer, and the content of folders."""
 
 import hashlib
 
@@ -13,10 +13,10 @@ def job(out, renderer="render", seed=7, recipe="tiny"):
 
 
 def make(out, count=4, first=0, executor=SerialExecutor, shards=False, **of_job):
-    """Builds a set; what became of its samples."""
+    """Builds a set. Returns the result for each sample."""
     results = []
-    asked = job(out, **of_job)
-    build(asked, range(first, first + count), executor(asked), shards=shards, report=results.append)
+    requested = job(out, **of_job)
+    build(requested, range(first, first + count), executor(requested), shards=shards, report=results.append)
     return results
 
 

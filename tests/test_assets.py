@@ -5,7 +5,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from brewster.environments import assets as worlds
+from brewster.environments import assets as assets_module
 from brewster.environments.assets import Assets
 from brewster.errors import PhotoError, RecipeError, UnreadablePhoto, UnsupportedPhoto
 from brewster.photo import Photo
@@ -61,11 +61,11 @@ def plane_light(folder, name, data, **values):
 
 
 def refused(error, name, *words):
-    """The error of this call is a sentence of three beats that names the file."""
-    told = str(error.value)
-    assert name in told
-    assert told.count("; ") >= 2
-    assert all(word in told for word in words), told
+    """Checks that the message has three parts and names the file."""
+    message = str(error.value)
+    assert name in message
+    assert message.count("; ") >= 2
+    assert all(word in message for word in words), message
 
 
 # --- maps
@@ -93,7 +93,7 @@ def test_lamps_are_left_out_of_the_mean_but_not_of_the_light(folder, random):
     assert np.median(lit / plain) < 1.01
 
 
-def test_light_below_zero_is_none(folder, random):
+def test_negative_values_are_set_to_zero(folder, random):
     texels = sky(random)
     texels[3, 4] = -5
     light = map_light(folder, "gamut.exr", exr_of(texels))
@@ -104,11 +104,11 @@ def test_light_below_zero_is_none(folder, random):
 def test_builtin_maps_need_no_folder(monkeypatch, random):
     asked = []
     monkeypatch.setitem(
-        worlds.WORLDS, "street", lambda seed, height: asked.append((seed, height)) or sky(random)
+        assets_module.ENVIRONMENTS, "street", lambda seed, height: asked.append((seed, height)) or sky(random)
     )
     light = Assets().map_light(EnvironmentMap(source=AssetSource(file="builtin:street:7"), luminance=3))
     assert sphere_mean(luminance(light)) == pytest.approx(3, rel=1e-4)
-    assert asked == [(7, worlds.BUILTIN_HEIGHT)]
+    assert asked == [(7, assets_module.BUILTIN_HEIGHT)]
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ def test_a_map_that_is_not_twice_as_wide_as_high_is_refused(folder, random, kind
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_texels_that_are_no_numbers_are_refused(folder, random, value):
+def test_texels_that_are_not_finite_are_refused(folder, random, value):
     texels = sky(random)
     texels[5, 6, 1] = value
     with pytest.raises(UnsupportedPhoto, match="not a number") as error:
@@ -261,7 +261,7 @@ def test_a_black_picture_is_dark_and_finite(folder):
 
 
 @pytest.mark.parametrize(("data", "error"), [(b"", UnreadablePhoto), (b"<html>", UnreadablePhoto)])
-def test_a_picture_that_is_none_is_refused_by_name(folder, data, error):
+def test_a_file_that_is_no_picture_is_refused_by_name(folder, data, error):
     with pytest.raises(error) as caught:
         plane_light(folder, "photo.jpg", data)
     refused(caught, "photo.jpg")
@@ -287,9 +287,9 @@ def test_builtin_paintings_and_no_others():
 # --- memory
 
 
-def test_what_was_used_last_is_kept_and_memory_is_bounded(folder, random, monkeypatch):
+def test_the_cache_keeps_the_most_recently_used_and_is_bounded(folder, random, monkeypatch):
     one = sky(random).nbytes
-    monkeypatch.setattr(worlds, "_KEPT_BYTES", 2 * one)
+    monkeypatch.setattr(assets_module, "_CACHE_BYTES", 2 * one)
     opened = []
     monkeypatch.setattr(Photo, "open", classmethod(lambda _cls, data: opened.append(data) or _original(data)))
     for name in "abc":
@@ -304,8 +304,8 @@ def test_what_was_used_last_is_kept_and_memory_is_bounded(folder, random, monkey
     assert [read(name) for name in "ababacacb"] == [1, 1, 0, 0, 0, 1, 0, 0, 1]
 
 
-def test_a_map_larger_than_the_bound_is_kept_alone(folder, random, monkeypatch):
-    monkeypatch.setattr(worlds, "_KEPT_BYTES", 10)
+def test_a_map_larger_than_the_bound_is_cached_alone(folder, random, monkeypatch):
+    monkeypatch.setattr(assets_module, "_CACHE_BYTES", 10)
     (folder / "a.hdr").write_bytes(hdr_of(sky(random)))
     assets = Assets([folder])
     first = assets.map_light(EnvironmentMap(source=AssetSource(file="a.hdr")))
@@ -313,7 +313,7 @@ def test_a_map_larger_than_the_bound_is_kept_alone(folder, random, monkeypatch):
     assert np.array_equal(assets.map_light(EnvironmentMap(source=AssetSource(file="a.hdr"))), first)
 
 
-def test_the_scene_s_luminance_does_not_change_what_is_kept(folder, random):
+def test_the_luminance_of_the_scene_does_not_change_the_cached_map(folder, random):
     (folder / "a.hdr").write_bytes(hdr_of(sky(random)))
     assets = Assets([folder])
     bright, dim = (

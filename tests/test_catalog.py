@@ -54,7 +54,7 @@ def test_without_folders_everything_is_built_in():
     assert all(asset.width == 2 * asset.height for asset in catalog.maps)
 
 
-def test_a_folder_takes_the_place_of_what_is_built_in(maps, photos):
+def test_a_folder_replaces_the_builtin_assets(maps, photos):
     catalog, refused = read_catalog([maps], [])
     assert [asset.source.file for asset in catalog.maps] == ["a.hdr", "b.hdr", "c.HDR"]
     assert catalog.pictures == BUILTIN_CATALOG.pictures
@@ -75,14 +75,14 @@ def test_an_asset_has_the_size_upright_and_the_sha256_of_its_file(maps, photos):
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])  # spreadsheets write the second
-def test_a_manifest_tells_categories(maps, encoding):
+def test_a_manifest_gives_categories(maps, encoding):
     rows = "file,licence,category\na.hdr,CC0,indoor\nc.HDR,CC0,\nelsewhere.hdr,CC0,night\n"
     (maps / "manifest.csv").write_text(rows, encoding=encoding)
     catalog, _ = read_catalog([maps], [])
     assert [asset.category for asset in catalog.maps] == ["indoor", "", ""]
 
 
-def test_a_manifest_without_categories_tells_none(maps):
+def test_a_manifest_without_categories_gives_none(maps):
     (maps / "manifest.csv").write_text("name\na.hdr\n")
     assert {asset.category for asset in read_catalog([maps], [])[0].maps} == {""}
 
@@ -134,7 +134,7 @@ def test_what_cannot_be_used_is_left_out_and_named(maps, photos, random):
         assert str(error).count("; ") >= 2
 
 
-def test_a_folder_of_nothing_usable_tells_why(tmp_path):
+def test_a_folder_without_usable_files_names_the_reason(tmp_path):
     (tmp_path / "bad.hdr").write_bytes(b"")
     with pytest.raises(RecipeError, match=r"no maps in .*bad\.hdr: the file is empty"):
         read_catalog([tmp_path], [])
@@ -153,7 +153,7 @@ def test_the_order_of_the_file_system_does_not_matter(maps, photos, monkeypatch)
     assert found[0] == found[1]
 
 
-def test_of_two_files_of_one_name_the_first_folder_s_counts(maps, tmp_path, random):
+def test_of_two_files_of_one_name_the_one_in_the_first_folder_is_used(maps, tmp_path, random):
     other = tmp_path / "other"
     other.mkdir()
     (other / "a.hdr").write_bytes(sky(random, 32, 64))
@@ -210,7 +210,7 @@ def test_a_size_needs_the_header_only(kind):
         read_size(data[:9])
 
 
-def test_what_the_header_refuses_has_no_size(monkeypatch):
+def test_a_refused_header_has_no_size(monkeypatch):
     frames = [Image.fromarray(smooth()), Image.fromarray(smooth() // 2)]
     file = io.BytesIO()
     frames[0].save(file, "GIF", save_all=True, append_images=frames[1:])

@@ -93,7 +93,7 @@ def test_another_job_in_the_folder_is_one_line(bare, fake):
     code, _, err = bare("render", "set", "--recipe", "tiny", "--count", 1, "--workers", 0, "--seed", 3)
     assert code == 1
     assert len(errors(err)) == 1
-    assert "its seed is 0, and 3 was asked for" in err
+    assert "its seed is 0, and 3 was requested" in err
 
 
 def test_a_photo_that_cannot_light_a_scene_is_left_out_and_named(bare, fake, tmp_path):

@@ -1,4 +1,4 @@
-"""The builtin worlds look as they did, so that a set rendered from them can be rendered again."""
+"""The builtin environments do not change, so that a set rendered from them can be rendered again."""
 
 import importlib.util
 from pathlib import Path
@@ -8,24 +8,24 @@ import pytest
 
 from brewster.photo import Photo
 
-FOLDER = Path(__file__).parent / "worlds"
+FOLDER = Path(__file__).parent / "environments"
 
 
 @pytest.fixture(scope="module")
 def made():
-    spec = importlib.util.spec_from_file_location("make_worlds", FOLDER / "make.py")
+    spec = importlib.util.spec_from_file_location("make_environments", FOLDER / "make.py")
     make = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(make)
     return dict(make.pictures())
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.png")), ids=lambda path: path.stem)
-def test_a_world_is_what_it_was_but_for_rounding(made, path):
+def test_an_environment_equals_its_reference_image_up_to_rounding(made, path):
     """Processors round differently: a texel in a hundred may show another surface, all others the same level."""
-    kept, now = Photo.open(path).pixels.astype(int), made[path.stem].astype(int)
-    apart = np.abs(kept - now).max(axis=2)
+    reference, now = Photo.open(path).pixels.astype(int), made[path.stem].astype(int)
+    apart = np.abs(reference - now).max(axis=2)
     assert (apart > 1).mean() < 0.01
 
 
-def test_every_world_is_kept(made):
+def test_every_environment_has_a_reference_image(made):
     assert made.keys() == {path.stem for path in FOLDER.glob("*.png")}

@@ -1,4 +1,4 @@
-"""Building a set: resumed, grown, packed, refused, and the same bytes whatever happened in between."""
+"""Building a set: resuming, growing, packing, refusing, and always the same bytes."""
 
 import errno
 import fcntl
@@ -45,7 +45,7 @@ class Stops(SerialExecutor):
         return super().wait()
 
 
-def test_what_is_there_is_skipped_and_nothing_changes(four):
+def test_existing_samples_are_skipped_and_nothing_changes(four):
     before = {path: path.stat().st_mtime_ns for path in four.rglob("*.jpg")}
     assert statuses(make(four)) == dict.fromkeys(range(4), "skipped")
     assert before == {path: path.stat().st_mtime_ns for path in four.rglob("*.jpg")}
@@ -59,7 +59,7 @@ def test_a_set_can_grow_in_both_directions(four, tmp_path):
 
 
 @pytest.mark.parametrize("shards", [False, True])
-def test_an_interrupted_set_ends_as_an_undisturbed_one(tmp_path, small_shards, shards):
+def test_an_interrupted_set_equals_an_uninterrupted_one(tmp_path, small_shards, shards):
     make(tmp_path / "undisturbed", count=8, shards=shards)
     with pytest.raises(KeyboardInterrupt):
         make(tmp_path / "set", count=8, executor=Stops, shards=shards)
@@ -69,7 +69,7 @@ def test_an_interrupted_set_ends_as_an_undisturbed_one(tmp_path, small_shards, s
     assert hashes(tmp_path / "set") == hashes(tmp_path / "undisturbed")
 
 
-def test_what_a_killed_run_left_half_is_removed(four, tmp_path):
+def test_partial_files_of_a_killed_run_are_removed(four, tmp_path):
     shutil.copytree(four, tmp_path / "set")
     (tmp_path / "set" / "000001").rename(tmp_path / "set" / ".brewster-00.part")
     (tmp_path / "set" / ".brewster-01.part").write_bytes(b"half a shard")
@@ -82,7 +82,7 @@ def test_shards_are_packed_as_they_become_complete_and_grow_with_the_set(tmp_pat
 
     class Watches(SerialExecutor):
         def submit(self, task):
-            seen[task.do, task.numbers[0]] = sorted(path.name for path in out.glob("0*"))
+            seen[task.kind, task.indices[0]] = sorted(path.name for path in out.glob("0*"))
             super().submit(task)
 
     out = tmp_path / "set"
@@ -101,7 +101,7 @@ def test_shards_are_packed_as_they_become_complete_and_grow_with_the_set(tmp_pat
     assert parquet.read_table(out / "index.parquet")["place"].to_pylist()[-2:] == ["shard-000002.tar"] * 2
 
 
-def test_folders_of_an_earlier_run_are_packed_when_shards_are_asked_for(tmp_path, small_shards):
+def test_folders_of_an_earlier_run_are_packed_when_shards_are_requested(tmp_path, small_shards):
     make(tmp_path / "set", count=4)
     make(tmp_path / "set", count=4, shards=True)
     make(tmp_path / "undisturbed", count=4, shards=True)
@@ -124,7 +124,7 @@ def test_a_sample_that_fails_is_named_and_the_rest_goes_on(tmp_path, small_shard
     assert parquet.read_table(tmp_path / "set" / "index.parquet")["index"].to_pylist() == [0, 2, 3, 4]
 
 
-def test_what_every_sample_would_meet_ends_the_run_with_the_same_words(tmp_path):
+def test_an_error_of_every_sample_ends_the_run_with_its_message(tmp_path):
     with pytest.raises(DeviceError, match=r"^there is no light; a lamp; or two; buy one\.$"):
         make(tmp_path / "set", renderer="deviceless")
 
@@ -170,8 +170,8 @@ def test_a_disk_that_is_full_when_a_shard_or_the_index_is_written_loses_nothing(
 @pytest.mark.parametrize(
     ("other", "says"),
     [
-        ({"seed": 8}, "its seed is 7, and 8 was asked for"),
-        ({"recipe": "window"}, "its recipe.name is tiny, and window was asked for"),
+        ({"seed": 8}, "its seed is 7, and 8 was requested"),
+        ({"recipe": "window"}, "its recipe.name is tiny, and window was requested"),
         ({"renderer": "slow"}, "its renderer is fake_renderer:render"),
     ],
 )
@@ -183,11 +183,11 @@ def test_another_job_in_the_same_folder_is_refused_and_the_difference_named(four
 
 
 def test_other_maps_are_another_job(four):
-    asked = job(four)
-    poorer = asked.catalog.model_copy(update={"maps": asked.catalog.maps[1:]})
+    requested = job(four)
+    poorer = requested.catalog.model_copy(update={"maps": requested.catalog.maps[1:]})
     with pytest.raises(TargetError, match="its catalog is"):
         building.build(
-            building.RenderJob(**{**vars(asked), "catalog": poorer}), range(4), SerialExecutor(asked)
+            building.RenderJob(**{**vars(requested), "catalog": poorer}), range(4), SerialExecutor(requested)
         )
 
 
@@ -196,7 +196,7 @@ def test_a_set_grows_across_versions_until_its_samples_change(four, tmp_path, mo
     monkeypatch.setattr(brewster, "__version__", "99")
     assert statuses(make(tmp_path / "set", count=5))[4] == "rendered"
     monkeypatch.setattr(store, "SAMPLE_FORMAT", 99)
-    with pytest.raises(TargetError, match="its format is 1, and 99 was asked for"):
+    with pytest.raises(TargetError, match="its format is 1, and 99 was requested"):
         make(tmp_path / "set")
 
 
@@ -248,5 +248,5 @@ def test_a_schedule_looks_no_further_ahead_than_a_block(tmp_path):
     """A billion samples are as easily begun as ten."""
     schedule = building._Schedule(tmp_path, range(10**9), 4, shards=True, report=lambda _: None)
     tasks = [schedule.next() for _ in range(3)]
-    assert [task.numbers for task in tasks] == [(0, 1, 2, 3), (4, 5, 6, 7), (8, 9, 10, 11)]
+    assert [task.indices for task in tasks] == [(0, 1, 2, 3), (4, 5, 6, 7), (8, 9, 10, 11)]
     assert len(schedule._left) == 1

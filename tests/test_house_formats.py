@@ -16,7 +16,7 @@ from onnx import TensorProto, helper
 from brewster import Photo
 from brewster.benchmarks.registry import Case
 from brewster.environments.catalog import BUILTIN_CATALOG
-from brewster.environments.procedural.rooms import WORLDS as WORLDS_BY_NAME
+from brewster.environments.procedural.rooms import ENVIRONMENTS
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import PREDICTION_FORMAT, MethodOutput, ModelMethod
 from brewster.evaluate.runner import SCORE_FORMAT
@@ -274,6 +274,6 @@ def test_a_changed_rendering_raises_the_format_of_samples():
 
 
 def test_a_changed_world_raises_the_format_of_samples():
-    world = WORLDS_BY_NAME["room"](3, 32)
+    world = ENVIRONMENTS["room"](3, 32)
     made = {"room": [round(float(value), 3) for value in np.log(world[5::11, 7::17, 1] + 0.01).ravel()]}
     same("dataset.sets.SAMPLE_FORMAT", SAMPLE_FORMAT, MAPS, made, 0.05)

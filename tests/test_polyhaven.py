@@ -94,7 +94,7 @@ class _Haven:
     def picture(name):
         return (hashlib.sha256(name.encode()).digest() * SIZE)[:SIZE]
 
-    def promise(self, name):
+    def description(self, name):
         picture = self.picture(name)
         sums = {"size": SIZE, "md5": hashlib.md5(picture).hexdigest()}
         file = {"url": f"{self.url}/file/{name}"} | sums
@@ -107,7 +107,7 @@ class _Haven:
             return json.dumps({asset: named | record for asset, record in self.assets.items()}).encode()
         if name not in self.assets:
             return None
-        return self.picture(name) if kind == "file" else json.dumps(self.promise(name)).encode()
+        return self.picture(name) if kind == "file" else json.dumps(self.description(name)).encode()
 
     def ranges(self, name):
         return [asked for path, asked, _ in self.asked if path == f"/file/{name}"]
@@ -127,11 +127,11 @@ def haven():
 
 @pytest.fixture
 def fetch(haven, tmp_path):
-    """Pulls into a folder: what became of each asset."""
+    """Downloads into a folder. Returns the result for each asset."""
 
     def fetch(indoor=1, outdoor=0, **how):
-        order = DownloadRequest(indoor=indoor, outdoor=outdoor, **({"server": haven.url} | how))
-        return list(pull(order, tmp_path / "maps"))
+        request = DownloadRequest(indoor=indoor, outdoor=outdoor, **({"server": haven.url} | how))
+        return list(pull(request, tmp_path / "maps"))
 
     return fetch
 
@@ -172,8 +172,8 @@ def test_the_manifest_names_every_map_its_authors_and_its_licence(fetch, maps):
     rows = manifest(maps)
     assert [row["file"] for row in rows] == ["a_room_4k.hdr", "atrium_4k.hdr", "sky_4k.hdr"]
     md5 = hashlib.md5(_Haven.picture("sky")).hexdigest()
-    said = ("sky_4k.hdr", "sky", "outdoor", "4k", md5, 'Ann, "A."; Bo', "CC0")
-    assert tuple(rows[2].values()) == said
+    row = ("sky_4k.hdr", "sky", "outdoor", "4k", md5, 'Ann, "A."; Bo', "CC0")
+    assert tuple(rows[2].values()) == row
     (maps / "sky_4k.hdr").unlink()
     fetch(indoor=3)
     assert [row["asset"] for row in manifest(maps)] == ["a_room", "atrium", "b_hall"]
@@ -187,7 +187,7 @@ def test_an_asset_without_the_resolution_is_named_and_the_next_takes_its_place(h
     ]
 
 
-def test_finished_maps_are_skipped_and_nobody_elses_are_replaced(haven, fetch, maps):
+def test_finished_maps_are_skipped_and_other_files_are_not_replaced(haven, fetch, maps):
     fetch()
     assert states(fetch()) == [("a_room", "skipped")]
     assert len(haven.ranges("a_room")) == 1
@@ -200,13 +200,13 @@ def test_finished_maps_are_skipped_and_nobody_elses_are_replaced(haven, fetch, m
 
 
 @pytest.mark.parametrize("authors", [{"\ud800": "All"}, {"a" * 200_000: "All"}, ["Ann"], {}])
-def test_authors_may_be_called_anything(haven, fetch, authors):
+def test_authors_may_have_any_name(haven, fetch, authors):
     haven.assets = {"a": IN | {"authors": authors}, "b": IN}
     assert states(fetch(indoor=2)) == [("a", "downloaded"), ("b", "downloaded")]
     assert states(fetch(indoor=2)) == [("a", "skipped"), ("b", "skipped")]
 
 
-def test_an_id_cannot_lead_out_of_the_folder(haven, fetch, tmp_path):
+def test_an_id_cannot_write_outside_the_folder(haven, fetch, tmp_path):
     haven.assets = {"../../escaped": IN, "/etc/passwd": IN, "..": IN, "a\\b": IN, "a_room": IN}
     found = fetch(indoor=9)
     assert [result.status for result in found] == ["failed"] * 4 + ["downloaded"]
@@ -214,23 +214,23 @@ def test_an_id_cannot_lead_out_of_the_folder(haven, fetch, tmp_path):
     assert {path for path, *_ in haven.asked} == {"/assets", "/files/a_room", "/file/a_room"}
 
 
-# --- the line
+# --- the connection
 
 
-def test_every_request_says_who_asks(haven, fetch):
+def test_every_request_has_a_user_agent(haven, fetch):
     fetch()
     assert all(agent.startswith("brewster/") for *_, agent in haven.asked)
 
 
-def test_a_broken_download_goes_on_where_it_was(haven, fetch, maps):
+def test_a_broken_download_is_resumed(haven, fetch, maps):
     haven.faults["/file/a_room"] = ["cut", "cut"]
     assert states(fetch()) == [("a_room", "downloaded")]
     assert haven.ranges("a_room") == [None, "bytes=25000-", "bytes=50000-"]
     assert tree(maps) == ["a_room_4k.hdr", "manifest.csv"]
 
 
-def test_what_came_is_kept_for_the_next_call(haven, fetch, maps, monkeypatch):
-    monkeypatch.setattr(polyhaven, "_PAUSES_S", ())
+def test_a_partial_download_is_resumed_by_the_next_call(haven, fetch, maps, monkeypatch):
+    monkeypatch.setattr(polyhaven, "_RETRY_DELAYS_S", ())
     haven.faults["/file/a_room"] = ["cut"]
     [result] = fetch()
     assert "ended after 25000 of 100000 bytes" in result.error
@@ -256,13 +256,13 @@ def test_a_part_that_is_whole_is_not_fetched_and_one_that_is_too_long_is_fetched
     assert haven.ranges("a_room") == ranges
 
 
-def test_bytes_beyond_the_promised_size_are_not_taken(haven, fetch, maps):
+def test_bytes_beyond_the_stated_size_are_dropped(haven, fetch, maps):
     haven.faults["/file/a_room"] = [_Haven.picture("a_room") + b"and more"]
     assert states(fetch(server=f"{haven.url}/")) == [("a_room", "downloaded")]
     assert (maps / "a_room_4k.hdr").read_bytes() == _Haven.picture("a_room")
 
 
-def test_what_came_before_the_line_went_silent_is_kept(haven, fetch, monkeypatch):
+def test_bytes_received_before_a_timeout_are_kept(haven, fetch, monkeypatch):
     monkeypatch.setattr(polyhaven, "_TIMEOUT_S", 0.2)
     haven.faults["/file/a_room"] = ["stall"]
     assert states(fetch()) == [("a_room", "downloaded")]
@@ -278,13 +278,13 @@ def test_a_map_with_a_wrong_sum_is_dropped_and_named_and_the_others_are_fetched(
     assert tree(maps) == ["atrium_4k.hdr", "manifest.csv"]
 
 
-def test_a_busy_server_is_given_the_time_it_asks_for(haven, fetch, pauses):
+def test_a_retry_waits_as_long_as_a_busy_server_requests(haven, fetch, pauses):
     haven.faults = {"/assets": [429], "/file/a_room": [503, 500, 429]}
     assert states(fetch()) == [("a_room", "downloaded")]
     assert pauses == [7, 1, 2, 7]
 
 
-def test_patience_grows_and_ends(haven, fetch, pauses):
+def test_retry_delays_double_and_retries_end(haven, fetch, pauses):
     haven.faults["/file/a_room"] = [503] * 5
     [result] = fetch()
     assert "in 5 attempts (HTTP Error 503" in result.error
@@ -334,11 +334,11 @@ def test_json_that_was_cut_is_asked_for_again(haven, fetch, monkeypatch):
 
 
 @pytest.mark.parametrize("wrong", [{"md5": None}, {"size": "big"}, {"size": 0}, {"url": 3}])
-def test_a_promise_without_address_size_or_sum_is_not_taken(haven, fetch, wrong):
-    promise = haven.promise("a_room")
-    promise["hdri"]["4k"]["hdr"] |= wrong
-    haven.faults["/files/a_room"] = [json.dumps(promise).encode()]
-    assert "promises no file" in fetch()[0].error
+def test_a_description_without_url_size_or_sum_is_refused(haven, fetch, wrong):
+    description = haven.description("a_room")
+    description["hdri"]["4k"]["hdr"] |= wrong
+    haven.faults["/files/a_room"] = [json.dumps(description).encode()]
+    assert "describes no file" in fetch()[0].error
 
 
 @pytest.mark.parametrize("tree", [[], "map", {"hdri": []}, {"hdri": {"4k": "x"}}, {"hdri": None}])
@@ -350,10 +350,10 @@ def test_a_list_of_files_may_have_any_shape(haven, fetch, tree):
 @pytest.mark.parametrize(
     "url", ["file:///etc/hosts", "ftp://127.0.0.1/a", "data:,a", "a", "http://[", "http://a b/"]
 )
-def test_only_the_web_is_opened_not_even_when_a_server_leads_elsewhere(haven, fetch, url, maps, pauses):
-    promise = haven.promise("a_room")
-    promise["hdri"]["4k"]["hdr"]["url"] = url
-    haven.faults["/files/a_room"] = [json.dumps(promise).encode()]
+def test_only_http_urls_are_opened(haven, fetch, url, maps, pauses):
+    description = haven.description("a_room")
+    description["hdri"]["4k"]["hdr"]["url"] = url
+    haven.faults["/files/a_room"] = [json.dumps(description).encode()]
     assert "http:// or https://" in fetch()[0].error
     with pytest.raises(DownloadError):
         fetch(server=url)
@@ -361,7 +361,7 @@ def test_only_the_web_is_opened_not_even_when_a_server_leads_elsewhere(haven, fe
     assert tree(maps) == []
 
 
-def test_redirections_are_followed_on_the_web_only(haven, fetch):
+def test_redirections_are_followed_to_http_urls_only(haven, fetch):
     haven.faults["/file/a_room"] = [f"{haven.url}/file/a_room"]
     haven.faults["/file/atrium"] = ["ftp://127.0.0.1/file/atrium"]
     haven.faults["/file/b_hall"] = ["file:///etc/hosts"]
@@ -385,15 +385,15 @@ def test_a_place_that_is_no_folder_is_an_error(fetch, maps):
         fetch()
 
 
-def test_another_manifest_is_left_alone_and_nothing_is_fetched(haven, fetch, maps):
+def test_a_manifest_of_another_program_is_refused_before_any_download(haven, fetch, maps):
     maps.mkdir()
     (maps / "manifest.csv").write_bytes(b"name,price\n\xff,1\n")
-    with pytest.raises(TargetError, match="not one of brewster's"):
+    with pytest.raises(TargetError, match="was not written by brewster"):
         fetch()
     assert haven.asked == []
 
 
-def test_maps_lie_in_the_users_cache_folder(monkeypatch):
+def test_maps_are_stored_in_the_cache_folder(monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", "/cache")
     assert maps_folder() == Path("/cache/brewster/maps")
     monkeypatch.setenv("HOME", "/home/ann")
@@ -409,13 +409,13 @@ def command(bare, haven):
     return lambda *args: bare("assets", "pull", "polyhaven", "--server", haven.url, *args)
 
 
-def test_the_command_offers_what_an_order_takes():
+def test_the_command_has_an_option_for_every_field_of_a_request():
     command = cli.commands["assets"].commands["pull"]
     taken = command.make_context("pull", ["polyhaven"]).params
     assert {field.name: taken[field.name] for field in fields(DownloadRequest)} == vars(DownloadRequest())
 
 
-def test_the_command_tells_what_it_did_and_that_the_server_had_fewer(command, tmp_path):
+def test_the_command_prints_results_and_how_many_maps_are_missing(command, tmp_path):
     code, out, err = command("maps", "--indoor", 2, "--outdoor", 5)
     assert (code, out) == (0, b"")
     said = err.splitlines()
@@ -450,7 +450,7 @@ def test_a_dry_run_prints_what_would_be_downloaded_and_writes_nothing(command, h
     assert tree(tmp_path) == []
 
 
-def test_the_cache_folder_is_where_maps_go_unless_told_otherwise(command, tmp_path, monkeypatch):
+def test_maps_go_to_the_cache_folder_by_default(command, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     assert command("--indoor", 1, "--outdoor", 0)[0] == 0
     assert "a_room_4k.hdr" in tree(tmp_path / "cache" / "brewster" / "maps")
@@ -463,6 +463,6 @@ def test_a_server_that_fails_is_one_sentence(command, haven):
     assert errors(err)
 
 
-def test_fetching_wakes_no_torch():
+def test_downloading_imports_no_torch():
     code = "import brewster.environments.polyhaven, sys; assert not {'torch', 'numpy', 'click'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,4 +1,4 @@
-"""What the procedural worlds are made of: surfaces that hide each other, lamps that light them, and the sun."""
+"""Parts of the procedural environments: occlusion of surfaces, lamps, and the sun."""
 
 import math
 
@@ -6,9 +6,16 @@ import numpy as np
 import pytest
 from numpy.random import PCG64, Generator
 
-from brewster.environments.procedural.canvas import Canvas, ProceduralWorld, Quad, render, resize, vector
+from brewster.environments.procedural.canvas import (
+    Canvas,
+    ProceduralEnvironment,
+    Quad,
+    render,
+    resize,
+    vector,
+)
 from brewster.environments.procedural.props import UP, Lamp, SceneLighting
-from brewster.environments.procedural.streets import street_world
+from brewster.environments.procedural.streets import street_environment
 
 
 def even(points, _normal):
@@ -26,7 +33,7 @@ def wall(distance, grey):
 def test_a_near_surface_hides_a_far_one_whichever_is_drawn_first(order):
     walls = wall(1.0, 0.25), wall(5.0, 0.75)
     picture = render(
-        ProceduralWorld([walls[i] for i in order], [], lambda ways, _: np.zeros_like(ways), 0.0), 32
+        ProceduralEnvironment([walls[i] for i in order], [], lambda ways, _: np.zeros_like(ways), 0.0), 32
     )
     assert picture[16, 0].tolist() == [0.25] * 3
     assert set(np.unique(picture[10:22, :4])) == {0.25}
@@ -54,7 +61,7 @@ def test_what_is_turned_away_from_a_lamp_or_behind_it_is_dark():
 
 
 def test_the_sun_is_half_a_degree_wide():
-    sun = street_world(Generator(PCG64(7)), night=False).glows[-1]
+    sun = street_environment(Generator(PCG64(7)), night=False).glows[-1]
     width = 2 * sun.radius / np.linalg.norm(sun.position)
     assert math.degrees(width) == pytest.approx(0.533, abs=0.01)
 

@@ -5,17 +5,17 @@ from brewster.environments.procedural import rooms
 from brewster.environments.procedural.canvas import (
     Canvas,
     Glow,
-    ProceduralWorld,
+    ProceduralEnvironment,
     Quad,
     directions,
     fractal,
     render,
     vector,
 )
-from brewster.environments.procedural.rooms import WORLDS, painting
+from brewster.environments.procedural.rooms import ENVIRONMENTS, painting
 from brewster.srgb import REC709_LUMINANCE
 
-NAMES = sorted(WORLDS)
+NAMES = sorted(ENVIRONMENTS)
 
 
 def luminance(picture):
@@ -36,7 +36,7 @@ def both_maps():
     heights = 64, 128
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rooms, "render", lambda world, _height: [render(world, each) for each in heights])
-        return {name: WORLDS[name](7, 0) for name in NAMES}
+        return {name: ENVIRONMENTS[name](7, 0) for name in NAMES}
 
 
 @pytest.fixture(scope="module")
@@ -49,12 +49,12 @@ def fine_maps(both_maps):
     return {name: fine for name, (_, fine) in both_maps.items()}
 
 
-def test_the_worlds_are_the_three_that_recipes_name():
+def test_the_environments_are_the_three_that_recipes_name():
     assert NAMES == ["night", "room", "street"]
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_world_is_a_lat_long_map_of_radiance(maps, name):
+def test_an_environment_is_a_lat_long_map_of_radiance(maps, name):
     picture = maps[name]
     assert picture.shape == (64, 128, 3)
     assert picture.dtype == np.float32
@@ -64,9 +64,9 @@ def test_a_world_is_a_lat_long_map_of_radiance(maps, name):
 
 
 @pytest.mark.parametrize("name", ["room", "night"])  # a street is a night street in other light
-def test_a_seed_gives_the_same_bytes_and_another_seed_another_world(maps, name):
-    assert WORLDS[name](7, 64).tobytes() == maps[name].tobytes()
-    first, second = (np.log(picture + 0.01) for picture in (maps[name], WORLDS[name](1, 64)))
+def test_a_seed_gives_the_same_bytes_and_another_seed_another_environment(maps, name):
+    assert ENVIRONMENTS[name](7, 64).tobytes() == maps[name].tobytes()
+    first, second = (np.log(picture + 0.01) for picture in (maps[name], ENVIRONMENTS[name](1, 64)))
     assert np.abs(first - second).mean() > 0.2
 
 
@@ -98,7 +98,7 @@ def test_lamps_of_a_room_outshine_its_walls(fine_maps):
 @pytest.mark.parametrize("aim", [(0, 0, -1), (0.6, 0.8, 0), (0.1, 1, 0.1), (0, -1, 0)])
 def test_a_glow_keeps_its_energy_whatever_the_map_resolves(height, aim):
     position = np.array(aim, np.float32) / np.linalg.norm(aim) * 10
-    picture = render(ProceduralWorld([], [Glow(position, 0.05, (1000, 0, 0))], dark, 0.5), height)
+    picture = render(ProceduralEnvironment([], [Glow(position, 0.05, (1000, 0, 0))], dark, 0.5), height)
     energy = (picture[..., 0] * solid_angles(height)).sum()
     assert energy == pytest.approx(1000 * np.pi * 0.005**2, rel=1e-3)
 
@@ -112,7 +112,7 @@ def test_directions_follow_the_convention_of_maps():
     np.testing.assert_allclose(v, np.broadcast_to((np.arange(64)[:, None] + 0.5) / 64, v.shape), atol=1e-4)
 
 
-def test_a_quad_stands_where_it_was_put_and_covers_its_solid_angle():
+def test_a_quad_is_at_its_position_and_covers_its_solid_angle():
     """A unit square, 1 m ahead of the viewer at +x, is 1/6 of a cube that surrounds it when it is 2 m wide."""
     canvas = Canvas(2, 2, 8, (0.5, 0.5, 0.5))
     canvas.rect((1, 0, 1, 2), (1.0, 1.0, 1.0))  # its right half: towards +z for who looks at +x
@@ -122,7 +122,7 @@ def test_a_quad_stands_where_it_was_put_and_covers_its_solid_angle():
         (vector(0, 0, 2), vector(0, -2, 0)),
         lambda points, _normal: np.ones_like(points),
     )
-    picture = render(ProceduralWorld([quad], [], dark, 0), 64)[..., 0]
+    picture = render(ProceduralEnvironment([quad], [], dark, 0), 64)[..., 0]
     assert ((picture > 0) * solid_angles(64)).sum() == pytest.approx(4 * np.pi / 6, rel=0.03)
     assert picture[32, 32 - 4] == 0.5
     assert picture[32, 32 + 4] == 1

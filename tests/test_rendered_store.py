@@ -1,4 +1,4 @@
-"""A set on disk: what a sample's files say, folders and shards alike, the index, and the sheet."""
+"""A set on disk: the files of a sample, folders and shards, the index, and the contact sheet."""
 
 import io
 import shutil
@@ -99,7 +99,7 @@ def test_a_shard_is_a_plain_tar_that_webdataset_reads_and_that_depends_on_its_sa
         assert tar.extractfile("000002.photo.jpg").read() == (four / "000002" / "photo.jpg").read_bytes()
 
 
-def test_packing_goes_on_where_a_killed_run_left_folders_that_are_in_the_shard(four, tmp_path):
+def test_packing_removes_folders_that_are_in_the_shard_already(four, tmp_path):
     shutil.copytree(four, tmp_path / "set")
     store.pack(tmp_path / "set", 0)
     shard = (tmp_path / "set" / "shard-000000.tar").read_bytes()
@@ -112,7 +112,7 @@ def test_packing_goes_on_where_a_killed_run_left_folders_that_are_in_the_shard(f
     assert (tmp_path / "set" / "shard-000000.tar").read_bytes() == shard
 
 
-def test_a_sample_that_somebody_else_has_written_meanwhile_stays(tmp_path):
+def test_a_sample_that_another_process_has_written_stays(tmp_path):
     store.write_folder(tmp_path / "000000", {"a": b"first"})
     store.write_folder(tmp_path / "000000", {"a": b"second"})
     assert (tmp_path / "000000" / "a").read_bytes() == b"first"
@@ -162,7 +162,7 @@ def test_the_index_is_written_in_batches_and_the_same_each_time(four, tmp_path, 
     shutil.copytree(four, tmp_path / "set")
     preview.write_index(tmp_path / "set")
     assert hashes(tmp_path / "set") == hashes(four)
-    monkeypatch.setattr(preview, "_ROWS_AT_ONCE", 3)
+    monkeypatch.setattr(preview, "_BATCH_ROWS", 3)
     preview.write_index(tmp_path / "set")
     assert parquet.ParquetFile(tmp_path / "set" / preview.INDEX).num_row_groups == 2
     assert parquet.read_table(tmp_path / "set" / preview.INDEX) == parquet.read_table(four / preview.INDEX)

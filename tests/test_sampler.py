@@ -1,4 +1,4 @@
-"""Scenes are drawn alike everywhere, are possible, and keep to what their recipe asks."""
+"""Scenes are the same on every machine, possible, and within the ranges of their recipe."""
 
 import os
 import subprocess
@@ -44,7 +44,7 @@ def test_every_packaged_recipe_draws_possible_scenes(fifty, recipe):
     assert len({scene.to_toml() for scene in fifty[recipe]}) == 50
 
 
-def test_a_scene_belongs_to_its_number_and_not_to_what_was_drawn_before(fifty):
+def test_a_scene_depends_on_its_index_and_not_on_scenes_drawn_before(fifty):
     assert [drawn("tiny", index) for index in (9, 3, 40)] == [fifty["tiny"][index] for index in (9, 3, 40)]
 
 
@@ -108,7 +108,7 @@ def test_a_picture_behind_the_glass_fills_the_view():
         assert float(sample.transmission.min()) > 0.4 * scene.behind.plane.luminance
 
 
-def test_the_camera_stands_as_far_from_the_glass_as_the_recipe_says(fifty):
+def test_the_camera_distance_is_within_the_range_of_the_recipe(fifty):
     nearest, farthest = read_scene_recipe("window").camera.distance_mm_log
     for scene in fifty["window"]:
         assert 0.9 * nearest < scene.camera_above_glass_mm < 1.1 * farthest
@@ -120,7 +120,7 @@ def test_rough_glass_gets_more_rays():
     assert drawn(asked, 0).glass.is_rough
 
 
-def test_categories_are_kept_and_a_map_without_one_fits_everywhere():
+def test_categories_are_respected_and_a_map_without_one_fits_everywhere():
     asked = changed("window", behind={"map_probability": 1.0, "maps": ("indoor",)})
     rooms = {drawn(asked, index).behind.map.source.file for index in range(20)}
     assert rooms <= {f"builtin:room:{number}" for number in range(8)}
@@ -139,22 +139,22 @@ def test_a_recipe_of_maps_needs_maps_that_are_sharp_enough():
         Catalog(pictures=BUILTIN_CATALOG.pictures),
         Catalog(maps=(Asset(source=AssetSource(file="a.hdr"), width=64, height=32),)),
     ):
-        with pytest.raises(RecipeError, match=rf"of {len(catalog.maps)} maps none fits the recipe"):
+        with pytest.raises(RecipeError, match=rf"none of {len(catalog.maps)} maps fits the recipe"):
             drawn(asked, 0, catalog=catalog)
 
 
 @pytest.mark.parametrize(
     ("camera", "says"),
     [
-        ({"incidence_deg": (88.0, 89.0)}, "gave no possible scene in 100 tries; a corner of the view"),
+        ({"incidence_deg": (88.0, 89.0)}, "gave no possible scene in 100 attempts; a corner of the view"),
         (
             {"incidence_deg": (180.0, 180.0)},
-            "gave no possible scene in 100 tries; the camera stands .* behind",
+            "gave no possible scene in 100 attempts; the camera is .* behind",
         ),
-        ({"fov_deg": (155.0, 160.0)}, "gave no possible scene in 100 tries; .*less than 150"),
+        ({"fov_deg": (155.0, 160.0)}, "gave no possible scene in 100 attempts; .*less than 150"),
     ],
 )
-def test_an_impossible_recipe_says_why(camera, says):
+def test_an_impossible_recipe_names_the_reason(camera, says):
     with pytest.raises(RecipeError, match=says):
         drawn(changed("tiny", camera=camera), 0)
 

@@ -9,10 +9,11 @@ from brewster.environments.catalog import BUILTIN_CATALOG
 from brewster.errors import RecipeError, UnsupportedPhoto
 from brewster.photo import Photo
 from brewster.scene.recipe import read_scene_recipe
+from brewster.training.data.data_recipe import DataRecipe
 from brewster.training.data.image_loading import source_weights
 from brewster.training.data.online import OnlineRendered
 from brewster.training.data.rendered import RenderedSets
-from brewster.training.recipe import DataRecipe, read_recipe, with_value
+from brewster.training.recipe import read_recipe, with_value
 from brewster.training.streams import open_stream, validation_pairs
 from front_door import picture
 from set_folders import make

@@ -8,7 +8,7 @@ import brewster.training.data.rendered as module
 from brewster.errors import PhotoError, RecipeError
 from brewster.photo import Photo
 from brewster.render.camera_response import encode_jpeg
-from brewster.rendered.store import read_cause, read_set
+from brewster.rendered.store import read_scene_of, read_set
 from brewster.training.data.alpha_blend import blended_layers
 from brewster.training.data.rendered import CachedRendered, RenderedSets
 from set_folders import make
@@ -50,7 +50,7 @@ def test_a_sample_is_its_photo_its_target_and_its_reflection(folder):
 def test_an_8_bit_sample_is_the_blend_of_its_own_background_and_mirror(folder):
     stream = RenderedSets([folder], seed=1, mixing="8-bit")
     for number, entry in enumerate(read_set(folder)):
-        scene = read_cause(entry)
+        scene = read_scene_of(entry)
         behind, mirror = (
             pixels(entry.read(f"{name}.jpg")).permute(2, 0, 1) / 255 for name in ("background", "mirror")
         )

@@ -1,4 +1,4 @@
-"""Several processes: the same bytes as one, whoever dies."""
+"""Several processes give the same bytes as one, even if workers die."""
 
 import os
 import signal
@@ -46,7 +46,7 @@ def test_two_workers_make_what_one_process_makes_even_if_one_of_them_dies(tmp_pa
     assert hashes(tmp_path / "one") == hashes(tmp_path / "two")
 
 
-def test_a_run_killed_in_the_middle_takes_its_workers_along_and_is_resumed(tmp_path):
+def test_workers_of_a_killed_run_exit_and_the_run_is_resumed(tmp_path):
     out, count = tmp_path / "set", 4
     with in_a_process(out, count) as run:
         wait_for(lambda: len(list(out.glob("0*"))) == 2, run)
@@ -62,12 +62,12 @@ def test_a_run_killed_in_the_middle_takes_its_workers_along_and_is_resumed(tmp_p
     assert hashes(out) == hashes(tmp_path / "undisturbed")
 
 
-def test_ctrl_c_stops_all_at_once_and_leaves_nothing_half(tmp_path):
+def test_ctrl_c_stops_all_workers_and_leaves_no_partial_files(tmp_path):
     out = tmp_path / "set"
     with in_a_process(out, 4) as run:
         wait_for(lambda: len(list(out.glob("0*"))) == 2, run)
         workers = children(run)
-        for pid in [*map(int, workers), run.pid]:  # a terminal sends it to everybody
+        for pid in [*map(int, workers), run.pid]:  # a terminal sends it to all processes
             os.kill(pid, signal.SIGINT)
         _, err = run.communicate()
     assert err.count(b"KeyboardInterrupt") == 1
@@ -76,7 +76,7 @@ def test_ctrl_c_stops_all_at_once_and_leaves_nothing_half(tmp_path):
 
 
 def test_a_sample_that_kills_every_worker_is_named_and_the_rest_goes_on(tmp_path, monkeypatch):
-    monkeypatch.setattr(workers, "TRIES", 1)
+    monkeypatch.setattr(workers, "MAX_ATTEMPTS", 1)
     results = make(tmp_path / "set", renderer="deadly", executor=partial(ProcessExecutor, count=1))
     assert statuses(results) == {0: "rendered", 1: "rendered", 2: "failed", 3: "rendered"}
     assert "its worker died 1 times (exit code -9)" in next(
@@ -84,12 +84,12 @@ def test_a_sample_that_kills_every_worker_is_named_and_the_rest_goes_on(tmp_path
     )
 
 
-def test_what_ends_the_run_ends_it_from_another_process_too(tmp_path):
+def test_a_fatal_error_in_a_worker_ends_the_run(tmp_path):
     with pytest.raises(DeviceError, match=r"^there is no light; a lamp; or two; buy one\.$"):
         make(tmp_path / "set", renderer="deviceless", executor=partial(ProcessExecutor, count=1))
 
 
-def test_rendering_here_leaves_the_threads_of_torch_as_they_were(tmp_path):
+def test_serial_rendering_restores_the_number_of_torch_threads(tmp_path):
     threads = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
@@ -112,24 +112,24 @@ def test_a_scene_file_cannot_choose_what_code_is_run(tmp_path):
         render_again(tmp_path / "set" / "000000" / store.SCENE, tmp_path / "again")
 
 
-def test_a_scene_is_never_rendered_over_something(tmp_path):
+def test_a_scene_is_never_rendered_into_a_folder_with_files(tmp_path):
     make(tmp_path / "set", count=1)
     scene = tmp_path / "set" / "000000" / store.SCENE
     for taken in (scene, scene.parent):
-        with pytest.raises(TargetError, match="is taken"):
+        with pytest.raises(TargetError, match="exists; expected a new or empty folder"):
             render_again(scene, taken, renderer="fake_renderer:render")
 
 
-def test_every_renderer_is_there():
+def test_every_renderer_can_be_imported():
     assert all(callable(workers.find_renderer(name)) for name in workers.RENDERERS)
 
 
-def test_an_unfinished_task_is_done_only_where_it_is_not(tmp_path):
-    asked = job(tmp_path)
-    hand = workers.TaskRunner(asked)
+def test_a_task_that_is_tried_again_renders_missing_samples_only(tmp_path):
+    requested = job(tmp_path)
+    runner = workers.TaskRunner(requested)
     task = RenderTask("render", (0, 1))
-    hand(task)
+    runner(task)
     before = (tmp_path / "000000").stat().st_ino
-    assert [result.status for result in hand(task)] == ["rendered", "rendered"]
+    assert [result.status for result in runner(task)] == ["rendered", "rendered"]
     assert (tmp_path / "000000").stat().st_ino == before
-    assert not SerialExecutor(asked).is_busy()
+    assert not SerialExecutor(requested).is_busy()

@@ -1,4 +1,4 @@
-"""Simple environments without files (uniform light, a sun of one texel, a half, a line), and scenes that use them."""
+"""Synthetic environments and scenes without files: constant light, a single bright texel, a half, a line."""
 
 import math
 

@@ -34,7 +34,11 @@ class BrewsterError(Exception):
     def __str__(self) -> str:
         return f"{self.happened}; {self.expected}; {self.cure}{'' if self.cure.endswith('?') else '.'}"
 
-    def __reduce__(self) -> tuple[type[BrewsterError], tuple[str, str, str]]:
+    def sentences(self) -> list[str]:
+        """The message, a sentence for each problem; only a RecipeError has several."""
+        return [str(self)]
+
+    def __reduce__(self) -> tuple[type[BrewsterError], tuple[object, ...]]:
         """Pickles the attributes, not `args`: callers may have changed them before the error crosses processes."""
         return type(self), (self.happened, self.expected, self.cure)
 
@@ -68,7 +72,26 @@ class DeviceError(BrewsterError):
 
 
 class RecipeError(BrewsterError):
-    """A recipe is not TOML, or its values are missing, unknown or out of range."""
+    """A recipe is not TOML, or its values are missing, unknown or impossible.
+
+    Attributes:
+        others: further problems of the same recipe, each an error of its own. The message has a line for each.
+    """
+
+    def __init__(self, happened: str, expected: str, cure: str, others: tuple[RecipeError, ...] = ()) -> None:
+        super().__init__(happened, expected, cure)
+        self.others = others
+
+    def __str__(self) -> str:
+        return "\n".join(self.sentences())
+
+    def sentences(self) -> list[str]:
+        """The message, a sentence for each problem."""
+        return [super().__str__(), *(sentence for other in self.others for sentence in other.sentences())]
+
+    def __reduce__(self) -> tuple[type[BrewsterError], tuple[object, ...]]:
+        """Errors are sent between processes; the attributes count, as a caller may have changed them."""
+        return type(self), (self.happened, self.expected, self.cure, self.others)
 
 
 class DownloadError(BrewsterError):

@@ -100,5 +100,6 @@ def main(args: Sequence[str] | None = None) -> int:
         say("stopped: what was finished is kept, and the same command goes on from there")
         return _STOPPED
     except BrewsterError as error:
-        complain(error)
+        for sentence in error.sentences():
+            complain(sentence)
         return 1

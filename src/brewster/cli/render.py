@@ -13,7 +13,15 @@ import click
 from click.core import ParameterSource
 
 from brewster.cli.extras import require_extra
-from brewster.cli.terminal import complain, interrupts, progress, say, standard_output, write_out
+from brewster.cli.terminal import (
+    complain,
+    interrupts,
+    print_out,
+    progress,
+    say,
+    standard_output,
+    write_out,
+)
 
 if TYPE_CHECKING:
     from brewster.rendered.generation.job import Executor, RenderJob, RenderResult
@@ -60,6 +68,11 @@ class _Size(click.ParamType[tuple[int, int]]):
     show_default=True,
     metavar="NAME|FILE",
     help="What is drawn: window, shopfront, vitrine, office, tiny, or a TOML file.",
+)
+@click.option(
+    "--show-recipe",
+    metavar="NAME|FILE",
+    help="Print this recipe as TOML with all defaults and a comment for each key, and render nothing.",
 )
 @click.option("--count", type=click.IntRange(min=0), default=10, show_default=True, help="How many samples.")
 @click.option(
@@ -126,6 +139,7 @@ def render(
     out: Path | None,
     output: Path | None,
     scene: Path | None,
+    show_recipe: str | None,
     **asked: Any,  # noqa: ANN401  (the fields of _Order)
 ) -> None:
     """Render photographs through glass whose truth is known, into the folder OUT.
@@ -137,6 +151,9 @@ def render(
     What is there is kept: the same command goes on where a run was stopped, and a larger --count adds to it. A sample
     that fails does not stop the others: it is named, and the exit code is 1.
     """
+    if show_recipe:
+        _show_recipe(show_recipe)
+        return
     if (out is None) == (output is None):
         raise click.UsageError("Name one folder to render into: brewster render OUT.")
     require_extra("render", "rendering", without=_OF_THE_TRACER)
@@ -255,6 +272,13 @@ class _RenderProgress:
         """How many there were of each kind."""
         if not self._quiet:
             say(f"{out}: " + ", ".join(f"{count} {status}" for status, count in sorted(self.counts.items())))
+
+
+def _show_recipe(name: str) -> None:
+    from brewster.scene.recipe import read_scene_recipe  # noqa: PLC0415
+    from brewster.scene.recipe_file import commented_toml  # noqa: PLC0415
+
+    print_out(commented_toml(read_scene_recipe(name)).rstrip())
 
 
 def _refuse_out_of_place(context: click.Context) -> None:

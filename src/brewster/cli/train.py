@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @click.command
-@click.argument("recipe", type=click.Path(path_type=Path))
+@click.argument("recipe", required=False, type=click.Path(path_type=Path))
 @click.option(
     "-o",
     "--output",
@@ -34,14 +34,32 @@ if TYPE_CHECKING:
 @click.option(
     "--card", metavar="NAME", help="With --plan: for this graphics card, such as RTX 4090, not the one here."
 )
+@click.option(
+    "--show-recipe",
+    metavar="NAME|FILE",
+    help="Print a recipe as TOML with all defaults and a comment for each key, and train nothing: compact, lora, or a file.",
+)
 @click.option("--quiet", is_flag=True, help="Say nothing but errors.")
-def train(*, recipe: Path, out: Path | None, plan: bool, card: str | None, quiet: bool) -> None:
+def train(
+    *,
+    recipe: Path | None,
+    out: Path | None,
+    plan: bool,
+    card: str | None,
+    show_recipe: str | None,
+    quiet: bool,
+) -> None:
     """Train a model as RECIPE, a TOML file, says.
 
     The folder BREWSTER_DATA holds the data. A run that was stopped goes on from its last checkpoint when the same
     command is given again, and ends with the same weights. Under torchrun several GPUs learn a large backbone together.
     """
     require_extra("train", "training")
+    if show_recipe:
+        _show_recipe(show_recipe)
+        return
+    if recipe is None:
+        raise click.UsageError("Name a recipe: brewster train RECIPE.")
     from brewster.training.recipe import LoraRecipe, read_recipe  # noqa: PLC0415  (wakes torch, in two seconds)
 
     read, out = read_recipe(recipe), out or Path("out") / recipe.stem
@@ -71,6 +89,13 @@ def train(*, recipe: Path, out: Path | None, plan: bool, card: str | None, quiet
         model = trainer.export(out)
         if not quiet:
             say(f"the model is {model}")
+
+
+def _show_recipe(name: str) -> None:
+    from brewster.scene.recipe_file import commented_toml  # noqa: PLC0415
+    from brewster.training.recipe import read_template  # noqa: PLC0415
+
+    print_out(commented_toml(read_template(name)).rstrip())
 
 
 def _print_plan(recipe: CompactRecipe | LoraRecipe, card: str | None) -> None:

@@ -1,1 +1,1 @@
-"""What lights a scene: files in folders, told apart by name and sha256, and worlds that are computed."""
+"""Environment maps and pictures of scenes: files in folders, identified by name and sha256, and procedural ones."""

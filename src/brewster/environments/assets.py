@@ -1,7 +1,7 @@
-"""Where scenes find their light: maps and pictures in folders, by name and sha256, or computed when built in.
+"""Environment maps and pictures of scenes: read from folders by name and sha256, or computed if they are builtin.
 
 assets = Assets([Path("hdri"), Path("photos")])
-assets.map_light(Map(source=Source(file="builtin:street:7")))  # (H, 2 H, 3) float32
+assets.map_light(EnvironmentMap(source=AssetSource(file="builtin:street:7")))  # (H, 2 H, 3) float32
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.environments.procedural.rooms import WORLDS, painting
+from brewster.environments.procedural.rooms import ENVIRONMENTS, painting
 from brewster.errors import BrewsterError, RecipeError, UnsupportedPhoto
 from brewster.photo import Photo
 from brewster.scene.world import BUILTIN, AssetSource, EnvironmentMap, Plane
@@ -24,37 +24,39 @@ from brewster.srgb import REC709_LUMINANCE
 Float32 = NDArray[np.float32]
 
 BUILTIN_HEIGHT = 512
-_KEPT_BYTES = 300_000_000
+_CACHE_BYTES = 300_000_000
 _CLIPPED_SHARE = 0.002
 _LUMINANCE = np.array(REC709_LUMINANCE, np.float32)
 
 
 class Assets:
-    """Reads sources from folders, the first that has this very file; keeps what was used last in memory."""
+    """Reads sources from the first folder that has the exact file. A cache keeps the most recently used ones."""
 
     def __init__(self, folders: Sequence[Path] = ()) -> None:
         self._folders = tuple(folders)
-        self._kept: OrderedDict[tuple[str, str, str], Float32] = OrderedDict()
+        self._cache: OrderedDict[tuple[str, str, str], Float32] = OrderedDict()
 
-    def map_light(self, lit: EnvironmentMap) -> Float32:
-        """A lat-long map's light, (H, 2 H, 3): its mean luminance, lamps left out, is the scene's.
+    def map_light(self, environment: EnvironmentMap) -> Float32:
+        """The radiance of a lat-long map, (H, 2 H, 3), scaled so that its mean luminance without lamps is the scene's.
 
         Raises:
-            RecipeError: the file is missing, or not the one that the scene was drawn with.
-            UnsupportedPhoto: it is not 2:1, holds values that are no light, or is clipped (no HDR map).
-            PhotoError: it cannot be read.
+            RecipeError: the file is missing, or has another sha256 than the scene says.
+            UnsupportedPhoto: the map is not 2:1, has values that are not finite, is black, or is clipped (not HDR).
+            PhotoError: the file cannot be decoded.
         """
-        light: Float32 = self._once("map", lit.source, self._read_map) * np.float32(lit.luminance)
+        light: Float32 = self._cached("map", environment.source, self._read_map) * np.float32(
+            environment.luminance
+        )
         return light
 
     def plane_light(self, plane: Plane) -> Float32:
-        """A picture's light, (H, W, 3), by the file's profile or else sRGB's curve; whites raised as the plane says.
+        """The radiance of a picture, (H, W, 3), decoded by its colour profile or as sRGB, with raised highlights.
 
         Raises:
-            RecipeError: the file is missing, or not the one that the scene was drawn with.
-            PhotoError: it cannot be read.
+            RecipeError: the file is missing, or has another sha256 than the scene says.
+            PhotoError: the file cannot be decoded.
         """
-        picture = self._once("picture", plane.source, self._read_picture)
+        picture = self._cached("picture", plane.source, self._read_picture)
         bright = ((picture.max(axis=2, keepdims=True) - 0.8) / 0.2).clip(0, 1)
         mean = (picture @ _LUMINANCE).mean() + np.float32(1e-4)
         light: Float32 = (
@@ -62,33 +64,33 @@ class Assets:
         )
         return light
 
-    def _once(self, kind: str, source: AssetSource, read: Callable[[AssetSource], Float32]) -> Float32:
+    def _cached(self, kind: str, source: AssetSource, read: Callable[[AssetSource], Float32]) -> Float32:
         key = (kind, source.file, source.sha256)
-        if key not in self._kept:
-            self._kept[key] = read(source)
-            while sum(array.nbytes for array in self._kept.values()) > _KEPT_BYTES and len(self._kept) > 1:
-                self._kept.popitem(last=False)
-        self._kept.move_to_end(key)
-        return self._kept[key]
+        if key not in self._cache:
+            self._cache[key] = read(source)
+            while sum(array.nbytes for array in self._cache.values()) > _CACHE_BYTES and len(self._cache) > 1:
+                self._cache.popitem(last=False)
+        self._cache.move_to_end(key)
+        return self._cache[key]
 
     def _read_map(self, source: AssetSource) -> Float32:
         if source.file.startswith(BUILTIN):
-            name, seed = _builtin(source, WORLDS)
-            texels = WORLDS[name](seed, BUILTIN_HEIGHT)
+            name, seed = _parse_builtin(source, ENVIRONMENTS)
+            texels = ENVIRONMENTS[name](seed, BUILTIN_HEIGHT)
         else:
             texels = check_map(self._open(source).linear(), source.file)
         light: Float32 = np.maximum(texels, np.float32(0))
-        light /= _level(texels)
+        light /= _mean_luminance(texels)
         return light
 
     def _read_picture(self, source: AssetSource) -> Float32:
         if source.file.startswith(BUILTIN):
-            _, seed = _builtin(source, ("painting",))
+            _, seed = _parse_builtin(source, ("painting",))
             return painting(seed, 768, 512)
         return self._open(source).linear().clip(0, 1)
 
     def _open(self, source: AssetSource) -> Photo:
-        with naming(source.file):
+        with naming_file(source.file):
             return Photo.open(self._bytes(source))
 
     def _bytes(self, source: AssetSource) -> bytes:
@@ -100,20 +102,20 @@ class Assets:
         if paths:
             raise RecipeError(
                 f"{paths[0]} is not the file that the scene was drawn with",
-                f"its sha256 should be {source.sha256}",
+                f"expected the sha256 {source.sha256}",
                 "name the folder that holds the original",
             )
         searched = ", ".join(map(str, self._folders)) or "no folder"
         raise RecipeError(
             f"{source.file} was not found in {searched}",
-            "the scene's own files are needed",
-            "name their folders with --maps and --photos",
+            "expected the file that the scene was drawn with",
+            "name its folder with --maps or --photos",
         )
 
 
 @contextmanager
-def naming(name: str) -> Iterator[None]:
-    """Errors that arise while a file is read say which file, unless they do already."""
+def naming_file(name: str) -> Iterator[None]:
+    """Adds the name of the file to errors within this block, if they do not contain it."""
     try:
         yield
     except BrewsterError as error:
@@ -123,62 +125,64 @@ def naming(name: str) -> Iterator[None]:
 
 
 def read_bytes(path: Path) -> bytes:
-    """What the file holds.
+    """The bytes of a file.
 
     Raises:
-        RecipeError: it cannot be read.
+        RecipeError: the file cannot be read.
     """
     try:
         return path.read_bytes()
     except OSError as error:
         raise RecipeError(
-            f"{path} cannot be read ({error.strerror})", "a picture file", "leave it out"
+            f"{path} cannot be read ({error.strerror})", "expected an image file", "leave it out"
         ) from error
 
 
 def check_map(texels: Float32, name: str) -> Float32:
-    """The map, if it can light a scene.
+    """Checks that a map can light a scene, and returns it.
 
     Raises:
-        UnsupportedPhoto: it is not 2:1, holds values that are no light, is black, or clipped like an 8-bit picture.
+        UnsupportedPhoto: the map is not 2:1, has values that are not finite, is black, or is clipped like an 8-bit image.
     """
     height, width = texels.shape[:2]
     if width != 2 * height:
         raise UnsupportedPhoto(
-            f"{name} is {width} x {height}", "a lat-long map is twice as wide as high", "convert it to one"
+            f"{name} is {width} x {height}",
+            "a lat-long map is twice as wide as it is high",
+            "convert it to one",
         )
     brightest = texels.max()
     if not np.isfinite(texels).all() or brightest <= 0:
         raise UnsupportedPhoto(
-            f"{name} is not finite everywhere, or black",
-            "every texel of a map is light",
-            "repair or leave it out",
+            f"{name} is black, or has values that are not finite",
+            "expected finite radiance in every texel, above 0 in some",
+            "repair the map or leave it out",
         )
     if (texels.max(axis=2) >= brightest).mean() > _CLIPPED_SHARE:
         raise UnsupportedPhoto(
-            f"{name} is clipped: many texels share its highest value",
-            "a map has the full range of light",
+            f"{name} is clipped: many texels have its highest value",
+            "expected the full dynamic range of the light",
             "use it as a photo, or find its unclipped original",
         )
     return texels
 
 
-def _level(texels: Float32) -> np.float32:
-    """Mean luminance over the sphere of what is not brighter than ten times the mean: lamps left out."""
+def _mean_luminance(texels: Float32) -> np.float32:
+    """Mean luminance over the sphere, with values limited to ten times the mean, so that lamps hardly count."""
     height = texels.shape[0]
     share = np.sin((np.arange(height) + 0.5) / height * np.pi)[:, None]
     luminance = np.maximum(texels, 0) @ _LUMINANCE
     shares = np.broadcast_to(share / share.sum() / luminance.shape[1], luminance.shape)
-    most = 10 * (luminance * shares).sum()
-    return np.float32((np.minimum(luminance, most) * shares).sum())
+    limit = 10 * (luminance * shares).sum()
+    return np.float32((np.minimum(luminance, limit) * shares).sum())
 
 
-def _builtin(source: AssetSource, known: Iterable[str]) -> tuple[str, int]:
+def _parse_builtin(source: AssetSource, known: Iterable[str]) -> tuple[str, int]:
     _, name, seed = (*source.file.split(":"), "", "")[:3]
     if name not in known or not seed.isdigit():
         raise RecipeError(
             f"{source.file!r} is not built in",
             f"builtin:NAME:NUMBER with NAME one of {', '.join(known)}",
-            "correct the scene",
+            "correct the source in the scene",
         )
     return name, int(seed)

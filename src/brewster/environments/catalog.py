@@ -1,4 +1,4 @@
-"""What is there to light scenes with: folders of maps and photos as a catalog, or the builtin worlds."""
+"""Catalogs of environment maps and pictures to draw scenes from: folders of files, or the builtin ones."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from collections.abc import Iterator, Sequence
 from fnmatch import fnmatch
 from pathlib import Path
 
-from brewster.environments.assets import BUILTIN_HEIGHT, check_map, naming, read_bytes
+from brewster.environments.assets import BUILTIN_HEIGHT, check_map, naming_file, read_bytes
 from brewster.errors import BrewsterError, RecipeError
 from brewster.image_formats import format_of
 from brewster.photo import Photo, read_size
 from brewster.scene.sampler import Asset, Catalog
 from brewster.scene.world import BUILTIN, AssetSource
 
-_WORLD_COUNT = 8
+_ENVIRONMENT_COUNT = 8
 _PAINTING_COUNT = 64
 _CATEGORIES = {"street": "outdoor", "room": "indoor", "night": "night"}
 
@@ -28,47 +28,49 @@ BUILTIN_CATALOG = Catalog(
             category=category,
         )
         for name, category in _CATEGORIES.items()
-        for seed in range(_WORLD_COUNT)
+        for seed in range(_ENVIRONMENT_COUNT)
     ),
     pictures=tuple(
         Asset(source=AssetSource(file=f"{BUILTIN}painting:{seed}"), width=768, height=512)
         for seed in range(_PAINTING_COUNT)
     ),
 )
-"""Worlds that need no file: streets, rooms, nights, and paintings."""
+"""Maps and pictures that need no file: streets, rooms, streets at night, and paintings."""
 
 
 def read_catalog(
     maps: Sequence[Path], pictures: Sequence[Path], exclude: Sequence[str] = ()
 ) -> tuple[Catalog, list[BrewsterError]]:
-    """The maps and pictures of some folders, and what was wrong with those left out.
+    """Lists the maps and pictures of folders.
 
-    Maps are read whole; of a picture only the header, so one that is damaged further on is refused when drawn.
-    A `manifest.csv` with the columns file and category tells what a map is. Where no folder is given for maps
-    or for pictures, the builtin ones take their place. Files whose names match a pattern of `exclude` are passed over.
+    Maps are decoded and checked. Of pictures only the header is read, so that other damage is found when a picture is
+    used. A `manifest.csv` with the columns file and category gives the categories of maps. Without a folder for maps or
+    for pictures, the builtin ones are listed. File names that match a pattern of `exclude` are skipped.
+
+    Returns: the catalog, and an error for each file that cannot be used.
 
     Raises:
-        RecipeError: a folder or its manifest cannot be read, or none of its files can be used.
+        RecipeError: a folder or its manifest cannot be read, or none of the files can be used.
     """
     refused: list[BrewsterError] = []
-    found_maps = _read(maps, exclude, refused, are_maps=True) if maps else BUILTIN_CATALOG.maps
+    found_maps = _read_folders(maps, exclude, refused, are_maps=True) if maps else BUILTIN_CATALOG.maps
     found_pictures = (
-        _read(pictures, exclude, refused, are_maps=False) if pictures else BUILTIN_CATALOG.pictures
+        _read_folders(pictures, exclude, refused, are_maps=False) if pictures else BUILTIN_CATALOG.pictures
     )
     return Catalog(maps=found_maps, pictures=found_pictures), refused
 
 
-def _read(
+def _read_folders(
     folders: Sequence[Path], exclude: Sequence[str], refused: list[BrewsterError], *, are_maps: bool
 ) -> tuple[Asset, ...]:
     found: dict[str, Asset] = {}
     for folder in folders:
-        categories = _categories(folder)
-        for path in _files(folder, are_maps):
+        categories = _read_categories(folder)
+        for path in _list_files(folder, are_maps):
             if path.name in found or any(fnmatch(path.name, pattern) for pattern in exclude):
                 continue
             try:
-                found[path.name] = _asset(path, categories.get(path.name, ""), are_maps)
+                found[path.name] = _read_asset(path, categories.get(path.name, ""), are_maps)
             except BrewsterError as error:
                 refused.append(error)
     if not found:
@@ -80,9 +82,9 @@ def _read(
     return tuple(found[name] for name in sorted(found))
 
 
-def _asset(path: Path, category: str, is_map: bool) -> Asset:
+def _read_asset(path: Path, category: str, is_map: bool) -> Asset:
     data = read_bytes(path)
-    with naming(str(path)):
+    with naming_file(str(path)):
         width, height = _map_size(data, str(path)) if is_map else read_size(data)
     source = AssetSource(file=path.name, sha256=hashlib.sha256(data).hexdigest())
     return Asset(source=source, width=width, height=height, category=category)
@@ -93,12 +95,12 @@ def _map_size(data: bytes, name: str) -> tuple[int, int]:
     return width, height
 
 
-def _files(folder: Path, are_maps: bool) -> Iterator[Path]:
+def _list_files(folder: Path, are_maps: bool) -> Iterator[Path]:
     try:
         entries = sorted(folder.iterdir())
     except OSError as error:
         raise RecipeError(
-            f"{folder} cannot be read ({error.strerror})", "a folder of files", "name another folder"
+            f"{folder} cannot be read ({error.strerror})", "expected a folder of files", "name another folder"
         ) from error
     for path in entries:
         image_format = format_of(path)
@@ -106,7 +108,7 @@ def _files(folder: Path, are_maps: bool) -> Iterator[Path]:
             yield path
 
 
-def _categories(folder: Path) -> dict[str, str]:
+def _read_categories(folder: Path) -> dict[str, str]:
     try:
         with (folder / "manifest.csv").open(newline="", encoding="utf-8-sig") as file:
             return {row["file"]: row.get("category") or "" for row in csv.DictReader(file) if row.get("file")}
@@ -115,6 +117,6 @@ def _categories(folder: Path) -> dict[str, str]:
     except (UnicodeDecodeError, csv.Error) as error:
         raise RecipeError(
             f"{folder / 'manifest.csv'} cannot be read ({error})",
-            "a table with the columns file and category, as UTF-8",
-            "save it so, or remove it",
+            "expected a table with the columns file and category, in UTF-8",
+            "save it as UTF-8, or remove it",
         ) from error

@@ -1,9 +1,9 @@
-"""Downloads CC0 lat-long maps from Poly Haven: which they are, and whether they came whole.
+"""Downloads CC0 environment maps from Poly Haven and verifies their MD5 sums.
 
-    for result in pull(Order(indoor=2, outdoor=1), maps_folder()):
+    for result in pull(DownloadRequest(indoor=2, outdoor=1), maps_folder()):
         print(result.status, result.file)
 
-One connection at a time. What was begun is kept, and the next call goes on from there (brewster.download).
+Uses one connection at a time. A partial download is kept, and the next call resumes it (brewster.download).
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from brewster.files import cache_folder, write_atomically
 
 _COLUMNS = ("file", "asset", "category", "resolution", "md5", "authors", "licence")  # of manifest.csv
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,200}", re.ASCII)
-_PAUSES_S = (1.0, 2.0, 4.0, 8.0)  # between five attempts
+_RETRY_DELAYS_S = (1.0, 2.0, 4.0, 8.0)  # between five attempts
 _TIMEOUT_S = 30.0
-_PATIENCE = 5  # when so many assets in a row have failed, it is the server or the line
+_MAX_CONSECUTIVE_FAILURES = 5  # then the server or the connection is the cause, not an asset
 
 
 @final
 @dataclass(frozen=True)
 class DownloadRequest:
-    """What is wanted: how many maps of each category, which files of them, and from which server."""
+    """How many maps of each category to download, in which resolution and format, from which server."""
 
     indoor: int = 140
     outdoor: int = 30
@@ -45,7 +45,7 @@ class DownloadRequest:
 @final
 @dataclass(frozen=True)
 class DownloadResult:
-    """What became of an asset; `missing` is one that has no file of the resolution and format asked for."""
+    """The result for one asset. `missing`: it has no file of the requested resolution and format."""
 
     asset: str
     category: str
@@ -58,7 +58,7 @@ class DownloadResult:
 
 
 class _Asset(NamedTuple):
-    """A map in the server's list; its id is what the server says, and not yet safe as a file name."""
+    """A map in the list of the server. Its id is not yet checked for use as a file name."""
 
     id: str
     category: str
@@ -66,63 +66,67 @@ class _Asset(NamedTuple):
 
 
 def maps_folder() -> Path:
-    """Where maps lie unless another folder is named: brewster/maps in the user's cache folder."""
+    """The default folder for maps: brewster/maps in the cache folder of the user."""
     return cache_folder() / "maps"
 
 
-def pull(order: DownloadRequest, out: Path) -> Iterator[DownloadResult]:
-    """Downloads maps into a folder, asset by asset in order of their ids, and notes them in its manifest.csv.
+def pull(request: DownloadRequest, out: Path) -> Iterator[DownloadResult]:
+    """Downloads maps into a folder, in the order of their ids, and lists them in its manifest.csv.
 
-    A map that is there already is skipped. Where an asset has no such file, the next one takes its place; where a
-    download fails none does, so that the next call asks for the same maps.
+    A map that exists already is skipped. An asset without a suitable file is replaced by the next one. A failed
+    download is not replaced, so that the next call requests the same maps.
+
+    Yields: a result for each asset.
 
     Raises:
-        DownloadError: the server's list cannot be had, or several assets in a row failed.
-        TargetError: the folder cannot be written.
+        DownloadError: the list of the server cannot be downloaded, or several assets in a row failed.
+        TargetError: the folder cannot be written to, or holds a manifest.csv of another program.
     """
-    _read_manifest(out)  # another's manifest is refused before anything is fetched
-    assets = _list_assets(order)
-    in_a_row = 0
-    for category, asked in (("indoor", order.indoor), ("outdoor", order.outdoor)):
+    _read_manifest(out)  # refuses the manifest of another program before any download
+    assets = _list_assets(request)
+    consecutive_failures = 0
+    for category, wanted in (("indoor", request.indoor), ("outdoor", request.outdoor)):
         candidates = (asset for asset in assets if asset.category == category)
         taken = 0
-        while taken < asked and (asset := next(candidates, None)):
-            result = _settle(asset, order, out)
+        while taken < wanted and (asset := next(candidates, None)):
+            result = _download_asset(asset, request, out)
             yield result
             taken += result.status != "missing"
-            in_a_row = in_a_row + 1 if result.status == "failed" else 0
-            if in_a_row == _PATIENCE:
-                cure = "see why they did, and run again: what came is kept"
-                raise DownloadError(f"{in_a_row} assets in a row failed", "the rest was not tried", cure)
+            consecutive_failures = consecutive_failures + 1 if result.status == "failed" else 0
+            if consecutive_failures == _MAX_CONSECUTIVE_FAILURES:
+                cure = "see their errors, and run again: partial downloads are kept"
+                raise DownloadError(
+                    f"{consecutive_failures} assets in a row failed", "the others were not tried", cure
+                )
 
 
-def _settle(asset: _Asset, order: DownloadRequest, out: Path) -> DownloadResult:
+def _download_asset(asset: _Asset, request: DownloadRequest, out: Path) -> DownloadResult:
     result = DownloadResult(asset.id, asset.category)
     try:
-        target = out / _file_name(asset, order)
-        promise = _ask_for_file(asset, order)
-        if promise is None:
+        target = out / _file_name(asset, request)
+        remote = _find_remote_file(asset, request)
+        if remote is None:
             return result
-        url, size, _, md5 = promise
+        url, size, _, md5 = remote
         result = replace(result, status="skipped", file=str(target), url=url, bytes=size, md5=md5)
-        if not _is_there(target, promise):
-            if order.dry_run:
+        if not _is_downloaded(target, remote):
+            if request.dry_run:
                 return replace(result, status="planned")
-            _line().fetch(promise, target)
+            _downloader().fetch(remote, target)
             result = replace(result, status="downloaded")
     except DownloadError as error:
         return replace(result, status="failed", error=str(error))
-    if not order.dry_run:
-        row = (target.name, asset.id, asset.category, order.resolution, md5, asset.authors, "CC0")
-        _note(out, dict(zip(_COLUMNS, row, strict=True)))
+    if not request.dry_run:
+        row = (target.name, asset.id, asset.category, request.resolution, md5, asset.authors, "CC0")
+        _add_to_manifest(out, dict(zip(_COLUMNS, row, strict=True)))
     return result
 
 
-# --- what the server says (api.polyhaven.com; swagger.yml in github.com/Poly-Haven/Public-API)
+# --- the API of the server (api.polyhaven.com; swagger.yml in github.com/Poly-Haven/Public-API)
 
 
-def _list_assets(order: DownloadRequest) -> list[_Asset]:
-    listed = _fetch_json(f"{order.server.rstrip('/')}/assets?type=hdris")
+def _list_assets(request: DownloadRequest) -> list[_Asset]:
+    listed = _fetch_json(f"{request.server.rstrip('/')}/assets?type=hdris")
     return [
         _Asset(name, category, _authors(record))
         for name, record in sorted(listed.items())
@@ -131,82 +135,82 @@ def _list_assets(order: DownloadRequest) -> list[_Asset]:
 
 
 def _category(record: object) -> str | None:
-    """Indoor before outdoor; `attributes` are to replace `categories` one day, and both are looked at."""
-    categories = _dig(record, "categories")
+    """The category, indoor before outdoor. Reads `categories` and `attributes`, which will replace it."""
+    categories = _nested(record, "categories")
     words = [*categories] if isinstance(categories, list) else []
-    words.append(_dig(record, "attributes", "environment"))
+    words.append(_nested(record, "attributes", "environment"))
     return next((category for category in ("indoor", "outdoor") if category in words), None)
 
 
 def _authors(record: object) -> str:
-    authors = _dig(record, "authors")
+    authors = _nested(record, "authors")
     return "; ".join(authors)[:1000] if isinstance(authors, dict) else ""
 
 
-def _ask_for_file(asset: _Asset, order: DownloadRequest) -> RemoteFile | None:
-    url = f"{order.server.rstrip('/')}/files/{asset.id}"
-    match _dig(_fetch_json(url), "hdri", order.resolution, order.format):
+def _find_remote_file(asset: _Asset, request: DownloadRequest) -> RemoteFile | None:
+    url = f"{request.server.rstrip('/')}/files/{asset.id}"
+    match _nested(_fetch_json(url), "hdri", request.resolution, request.format):
         case None:
             return None
         case {"url": str(address), "size": int(size), "md5": str(md5)} if size > 0:
             return RemoteFile(address, size, "md5", md5.lower())
-    raise DownloadError(f"{url} promises no file", "address, size and MD5 sum", "try another --server")
+    raise DownloadError(f"{url} describes no file", "expected url, size and MD5 sum", "try another --server")
 
 
-def _file_name(asset: _Asset, order: DownloadRequest) -> str:
-    name = f"{asset.id}_{order.resolution}.{order.format}"
+def _file_name(asset: _Asset, request: DownloadRequest) -> str:
+    name = f"{asset.id}_{request.resolution}.{request.format}"
     if not _SAFE_NAME.fullmatch(name):
-        expected, cure = "letters, digits, '_', '-' and '.' only", "try another --server: this may mean harm"
-        raise DownloadError(f"{name!r} is no name for a file", expected, cure)
+        expected, cure = "expected letters, digits, '_', '-' and '.' only", "try another --server"
+        raise DownloadError(f"{name!r} is not a safe file name", expected, cure)
     return name
 
 
 def _fetch_json(url: str) -> dict[str, object]:
     try:
-        said = json.loads(_line().read(url))
+        parsed = json.loads(_downloader().read(url))
     except (ValueError, RecursionError) as error:
-        raise DownloadError(f"{url} answered no JSON ({error})", "JSON", "check --server") from error
-    if not isinstance(said, dict):
-        raise DownloadError(f"{url} answered {said!r:.40}", "a JSON object", "check --server")
-    return said
+        raise DownloadError(f"{url} answered no JSON ({error})", "expected JSON", "check --server") from error
+    if not isinstance(parsed, dict):
+        raise DownloadError(f"{url} answered {parsed!r:.40}", "expected a JSON object", "check --server")
+    return parsed
 
 
-def _dig(tree: object, *keys: str) -> object:
+def _nested(tree: object, *keys: str) -> object:
     for key in keys:
         tree = tree.get(key) if isinstance(tree, dict) else None
     return tree
 
 
-def _line() -> Downloader:
-    return Downloader(_PAUSES_S, _TIMEOUT_S, sleep)
+def _downloader() -> Downloader:
+    return Downloader(_RETRY_DELAYS_S, _TIMEOUT_S, sleep)
 
 
-# --- onto the disk
+# --- files
 
 
-def _is_there(target: Path, promise: RemoteFile) -> bool:
+def _is_downloaded(target: Path, remote: RemoteFile) -> bool:
     with target_errors(target):
-        there = target.exists()
-        if there and file_digest(target, promise.algorithm) != promise.digest:
-            expected, cure = f"one with the MD5 sum {promise.digest}", "move it away, and run again"
-            raise DownloadError(f"{target} is there, and is not the server's file", expected, cure)
-    return there
+        exists = target.exists()
+        if exists and file_digest(target, remote.algorithm) != remote.digest:
+            expected, cure = f"expected the MD5 sum {remote.digest}", "move it away, and run again"
+            raise DownloadError(f"{target} exists, and is not the file of the server", expected, cure)
+    return exists
 
 
 def _read_manifest(out: Path) -> list[dict[str, str]]:
-    """The rows for the maps that are still there."""
+    """The rows of the manifest whose maps exist."""
     path = out / "manifest.csv"
     with target_errors(path):
         text = path.read_text("utf-8", errors="replace") if path.exists() else ",".join(_COLUMNS)
         rows = csv.DictReader(io.StringIO(text, newline=""))
         if tuple(rows.fieldnames or ()) != _COLUMNS:
-            expected, cure = f"a table with the columns {','.join(_COLUMNS)}", "name another folder"
-            raise TargetError(f"{path} is not one of brewster's", expected, cure)
+            expected, cure = f"expected a table with the columns {','.join(_COLUMNS)}", "name another folder"
+            raise TargetError(f"{path} was not written by brewster", expected, cure)
         return [row for row in rows if (out / row["file"]).is_file()]
 
 
-def _note(out: Path, row: dict[str, str]) -> None:
-    """Puts a map into the manifest, which is written anew each time: stopped at any moment, it is true."""
+def _add_to_manifest(out: Path, row: dict[str, str]) -> None:
+    """Adds a map to the manifest. The file is replaced atomically, so that it is always complete."""
     rows = _read_manifest(out)
     if row not in rows:
         rows = [other for other in rows if other["file"] != row["file"]]

@@ -21,7 +21,8 @@ from brewster.evaluate.evaluation import evaluate
 from brewster.evaluate.methods import IdentityBaseline, ModelMethod
 from brewster.evaluate.results import AVERAGE, Results
 from brewster.files import write_atomically
-from brewster.scene.values import FrozenModel, read_toml
+from brewster.scene.recipe_file import read_toml
+from brewster.scene.values import FrozenModel, KeyNote
 from brewster.training import loop
 from brewster.training.recipe import CompactRecipe, LoraRecipe, data_folder, read_recipe, with_value
 from brewster.training.trainers import open_trainer
@@ -35,22 +36,31 @@ PLOT: Final = "plot.png"
 
 def _all_different(choices: list[Choice]) -> list[Choice]:
     if len({str(choice) for choice in choices}) < len(choices):
-        raise ValueError("two choices are equal")
+        raise ValueError("a value occurs twice; expected different values")
     return choices
 
 
 @final
 class AblationStudy(FrozenModel):
-    """The definition of an ablation study."""
+    """An ablation: one value of a training recipe takes each of several choices; everything else stays the same."""
 
     base: Path
-    """The base training recipe. In the file, the path is relative to the file."""
+    """The training recipe to change, relative to this file."""
     value: str
-    """The key of the value that changes, with dots: "data.rendered.mixing"."""
-    choices: Annotated[list[Choice], Field(min_length=2), AfterValidator(_all_different)]
-    """The first choice is the reference of the comparisons."""
-    benchmarks: Annotated[dict[str, Path], Field(min_length=1)]
-    """name -> folder, relative to BREWSTER_DATA."""
+    """The key that changes, with its tables: "data.rendered.mixing"."""
+    choices: Annotated[
+        list[Choice],
+        Field(min_length=2),
+        AfterValidator(_all_different),
+        KeyNote("list of values", "all different"),
+    ]
+    """The values to compare. The first one is the reference for the others."""
+    benchmarks: Annotated[
+        dict[str, Path],
+        Field(min_length=1),
+        KeyNote("table of name = folder", "at least 1 entry", instead=True),
+    ]
+    """The benchmarks to score on: a name and a folder relative to BREWSTER_DATA for each."""
 
     def label(self, choice: Choice) -> str:
         """The name of a choice in tables: "mixing 8-bit"."""
@@ -75,7 +85,7 @@ def read_study(path: Path) -> AblationStudy:
     Raises:
         RecipeError: the file is missing or not TOML, or its values are missing, unknown or invalid.
     """
-    study = read_toml(AblationStudy, path, compare="the studies in recipes/ablations/")
+    study = read_toml(AblationStudy, path, compare="docs/recipes.md")
     return study.model_copy(update={"base": path.parent / study.base})
 
 

@@ -1,9 +1,9 @@
-"""A set of rendered samples on disk: each in a folder of its own or in a shard of a hundred, and an index of all.
+"""A set of rendered samples on disk: one folder per sample or shards of a hundred samples, and an index.
 
     for entry in read_set(Path("out/window")):
         layers, scene = open_sample(entry)
 
-Everything arrives whole or not at all: it is written under a hidden name, reaches the disk, and is then renamed.
+Writing is atomic: a file or folder is written under a hidden name, flushed to disk, and then renamed.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 import brewster
 from brewster.errors import RecipeError
@@ -30,21 +29,21 @@ from brewster.photo import read_layers, write_layers
 from brewster.render.analytic import ghost_distance_px
 from brewster.render.camera_response import DevelopedSample, develop, encode_jpeg, luminance
 from brewster.render.sample import LAYERS, LightSample
+from brewster.scene.recipe_file import validated
 from brewster.scene.scene import Scene
-from brewster.scene.values import wrong_value
 
 Float32 = NDArray[np.float32]
 
 SHARD_SIZE: Final = 100
 LIGHT, SCENE = "layers.exr", "scene.toml"
 FILES: Final = (*(f"{layer}.jpg" for layer in LAYERS), LIGHT, SCENE)
-"""The files of a sample: five photographs, their linear light, and their cause."""
+"""The files of a sample: five photographs, their linear light, and their scene."""
 
-_TRUTH_QUALITY: Final = 95
-_AGAIN: Final = "delete that sample and render the set again"
+_GROUND_TRUTH_QUALITY: Final = 95
+_CURE: Final = "delete that sample and render the set again"
 
 
-# --- what is written of a sample
+# --- encoding a sample
 
 
 def _reflection_to_transmission(sample: LightSample, _: DevelopedSample) -> float:
@@ -59,21 +58,21 @@ STATISTICS: Final[dict[str, Callable[[LightSample, DevelopedSample], float]]] = 
     "overexposed": lambda _, developed: developed.overexposed,
     "ghost_px": lambda sample, _: ghost_distance_px(sample.scene),
 }
-"""Numbers to choose samples by, in every scene.toml and the index: the ratio of mean luminances, the share of
-pixels that are white in any channel, and how far apart the first two mirror images are."""
+"""Statistics for selecting samples, in every scene.toml and in the index: the ratio of mean luminances, the share of
+pixels that are clipped in any channel, and the distance between the first two mirror images in px."""
 
 
 def statistics(sample: LightSample, developed: DevelopedSample) -> dict[str, float]:
-    """Every one of STATISTICS, to six digits."""
+    """The value of each of STATISTICS, rounded to six digits."""
     return {name: float(f"{measure(sample, developed):.6g}") for name, measure in STATISTICS.items()}
 
 
 SAMPLE_FORMAT: Final = 1
-"""Raised when the same job comes to give other samples, so that no set mixes the two; see test_house_formats."""
+"""To be raised when the same job gives other samples, so that no set mixes the two. See test_house_formats."""
 
 
 def encode_sample(sample: LightSample, renderer: str) -> dict[str, bytes]:
-    """The files of a sample by name.
+    """The files of a sample: name -> bytes.
 
     Raises:
         MissingExtra: OpenEXR is not installed.
@@ -81,7 +80,9 @@ def encode_sample(sample: LightSample, renderer: str) -> dict[str, bytes]:
     developed = develop(sample)
     made = {"version": brewster.__version__, "renderer": renderer}
     outcome = {**made, **developed.camera_settings(), **statistics(sample, developed)}
-    qualities = dict.fromkeys(LAYERS, _TRUTH_QUALITY) | {"photo": sample.scene.development.jpeg_quality}
+    qualities = dict.fromkeys(LAYERS, _GROUND_TRUTH_QUALITY) | {
+        "photo": sample.scene.development.jpeg_quality
+    }
     files = {f"{name}.jpg": encode_jpeg(layer, qualities[name]) for name, layer in developed.layers().items()}
     light = {name: layer.permute(1, 2, 0).float().cpu().numpy() for name, layer in sample.layers().items()}
     files[LIGHT] = write_layers(light, {"software": f"brewster {brewster.__version__}"})
@@ -93,15 +94,15 @@ def encode_sample(sample: LightSample, renderer: str) -> dict[str, bytes]:
 
 
 def key(index: int) -> str:
-    """The name of a sample: its folder, and in a shard what its files' names begin with."""
+    """The name of a sample: that of its folder, and the prefix of its files in a shard."""
     return f"{index:06d}"
 
 
 def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Writes a sample's folder. If another process was faster, its folder stays: it holds the same.
+    """Writes the folder of a sample. If another process wrote it first, that folder stays: its content is the same.
 
     Raises:
-        TargetError: it cannot be written; the disk may be full.
+        TargetError: the file or folder cannot be written, for example because the disk is full.
     """
     with atomic_path(folder) as part:
         part.mkdir(parents=True)
@@ -109,8 +110,8 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
             write_atomically(part / name, data)
 
 
-def remove_leftovers(out: Path) -> None:
-    """Removes what killed runs have left half; nobody else may be writing there."""
+def remove_partial_files(out: Path) -> None:
+    """Removes partial files of killed runs. No other run may be writing to the folder."""
     for part in out.glob(f"{TEMPORARY_PREFIX}*"):
         discard(part)
 
@@ -119,17 +120,17 @@ def remove_leftovers(out: Path) -> None:
 
 
 def shard_name(block: int) -> str:
-    """The shard that holds the samples from 100 * block."""
+    """The name of the shard with the samples from index 100 * block."""
     return f"shard-{block:06d}.tar"
 
 
 def pack(out: Path, block: int) -> None:
-    """Moves the finished folders of a block into its shard, beside what that holds already.
+    """Moves the finished folders of a block into its shard, which keeps the samples that it has.
 
-    The tar is named as WebDataset reads it (000007.photo.jpg), and its bytes depend on the samples alone.
+    Members are named as WebDataset expects (000007.photo.jpg). The bytes depend on the samples only.
 
     Raises:
-        TargetError: it cannot be written; the disk may be full.
+        TargetError: the file or folder cannot be written, for example because the disk is full.
     """
     entries = list(read_block(out, block))
     if any(not entry.spans for entry in entries):
@@ -156,9 +157,9 @@ def _add(tar: tarfile.TarFile, entry: StoredSample) -> None:
 
 
 def _remove(folder: Path) -> None:
-    """Removes a sample's folder, which must not be seen half: it loses its name first."""
+    """Removes the folder of a sample. It is renamed first, so that no reader sees a partial sample."""
     doomed = temporary_path(folder)
-    with contextlib.suppress(OSError):  # another process was faster
+    with contextlib.suppress(OSError):  # another process has removed it
         folder.replace(doomed)
         discard(doomed)
 
@@ -168,7 +169,7 @@ def _remove(folder: Path) -> None:
 
 @dataclass(frozen=True)
 class StoredSample:
-    """A finished sample: `place` is its folder, or the shard that holds its files at `spans` (offset, length)."""
+    """A finished sample. `place` is its folder, or a shard that has its files at `spans` (offset, length)."""
 
     index: int
     place: Path
@@ -185,46 +186,50 @@ class StoredSample:
 
 
 def read_set(out: Path) -> Iterator[StoredSample]:
-    """The finished samples of a set, in the order of their indices, from folders and shards alike."""
+    """The finished samples of a set, from folders and shards, in the order of their indices."""
     for block in _blocks(out):
         yield from read_block(out, block)
 
 
 def read_block(out: Path, block: int) -> Iterator[StoredSample]:
-    """The finished samples of a hundred indices, in order; what is in the shard is not looked for elsewhere."""
+    """The finished samples of a block of a hundred indices, in order. A sample in the shard replaces its folder."""
     entries = {int(folder.name): StoredSample(int(folder.name), folder) for folder in _folders(out, block)}
     entries |= {entry.index: entry for entry in _members(out / shard_name(block))}
     yield from (entry for _, entry in sorted(entries.items()))
 
 
 def open_sample(entry: StoredSample) -> tuple[dict[str, Float32], Scene]:
-    """The five linear pictures of a sample, (H, W, 3) each, by name, and its scene.
+    """Reads a sample.
+
+    Returns: its five images by name, each (H, W, 3) in linear light, and its scene.
 
     Raises:
         MissingExtra: OpenEXR is not installed.
-        PhotoError, RecipeError: its files are damaged.
+        PhotoError: its image file is damaged.
+        RecipeError: its scene file is damaged.
     """
     light = read_layers(entry.read(LIGHT))
-    return {name: light[name] for name in LAYERS}, read_cause(entry)
+    return {name: light[name] for name in LAYERS}, read_scene_of(entry)
 
 
-def read_cause(entry: StoredSample) -> Scene:
+def read_scene_of(entry: StoredSample) -> Scene:
     """The scene of a sample.
 
     Raises:
-        RecipeError: its file is damaged.
+        RecipeError: its scene file is damaged.
     """
     try:
         table = tomllib.loads(entry.read(SCENE).decode())
-        return Scene.model_validate({name: table[name] for name in table if name != "outcome"})
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise RecipeError(f"the scene of {entry.place} is not TOML", "a sample's scene", _AGAIN) from error
-    except ValidationError as error:
-        raise wrong_value(f"the scene of {entry.place}", error, "brewster render --help") from error
+        raise RecipeError(
+            f"the scene of {entry.place} is not TOML", "expected a scene file", _CURE
+        ) from error
+    values = {name: table[name] for name in table if name != "outcome"}
+    return validated(Scene, values, owner=f"the scene of {entry.place}", compare="brewster render --help")
 
 
 def _blocks(out: Path) -> list[int]:
-    """The blocks that have a finished sample; a hundred times fewer than samples."""
+    """The numbers of the blocks with at least one finished sample."""
     with os.scandir(out) as found:
         names = (re.fullmatch(r"(?:shard-(\d{6,})\.tar|(\d{6,}))", item.name) for item in found)
         return sorted({int(name[1]) if name[1] else int(name[2]) // SHARD_SIZE for name in names if name})

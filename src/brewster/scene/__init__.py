@@ -1,1 +1,1 @@
-"""What stands before the camera: plain frozen data, printed and read as TOML; no renderer."""
+"""Scenes and scene recipes: frozen data, read from and written as TOML. No renderer."""

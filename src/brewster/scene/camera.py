@@ -1,4 +1,4 @@
-"""The camera: a thin lens before a sensor, and the axes of everything that has a heading and a pitch."""
+"""The camera, a thin lens and a sensor, and the coordinate axes of a heading and a pitch."""
 
 from __future__ import annotations
 
@@ -8,24 +8,24 @@ from typing import Annotated
 from pydantic import Field
 
 from brewster.scene.glass import Point
-from brewster.scene.values import Above0, From0, FrozenModel
+from brewster.scene.values import FrozenModel, NonNegativeFloat, PositiveFloat
 
 Axes = tuple[Point, Point, Point]
-"""Unit vectors to the right, up and back."""
+"""Unit vectors (right, up, back)."""
 
 
 class Camera(FrozenModel):
-    """Where it stands, where it looks, and its thin lens; square pixels.
+    """Position, orientation and thin lens of a camera with square pixels.
 
-    `fov_deg` spans the picture's width. An aperture of 0 is a pinhole; `focus_mm` is measured along the axis.
+    `fov_deg` is the horizontal field of view. An aperture of 0 is a pinhole. `focus_mm` is measured along the axis.
     """
 
     position_mm: Point = (0.0, 0.0, 1000.0)
     heading_deg: float = 0.0
     pitch_deg: Annotated[float, Field(ge=-80, le=80)] = 0.0
     fov_deg: Annotated[float, Field(gt=0.5, lt=150)] = 50.0
-    focus_mm: Above0 = 3000.0
-    aperture_mm: From0 = 0.0
+    focus_mm: PositiveFloat = 3000.0
+    aperture_mm: NonNegativeFloat = 0.0
     width: Annotated[int, Field(ge=16, le=16384)] = 512
     height: Annotated[int, Field(ge=16, le=16384)] = 384
 
@@ -36,22 +36,25 @@ class Camera(FrozenModel):
 
     @property
     def pixel_rad(self) -> float:
-        """The angle of a pixel's side in the middle of the picture."""
+        """The angle that a pixel spans in the middle of the image, in radians."""
         return 2 * self.half_width / self.width
 
     def corners(self) -> list[Point]:
-        """Directions (not of unit length) through the picture's four corners."""
+        """Directions through the four corners of the image, not of unit length."""
         right, up, back = axes(self.heading_deg, self.pitch_deg)
         across, down = self.half_width, self.half_width * self.height / self.width
         return [
-            _sum(_times(right, x), _times(up, y), _times(back, -1))
+            _add(_scale(right, x), _scale(up, y), _scale(back, -1))
             for x in (-across, across)
             for y in (-down, down)
         ]
 
 
 def axes(heading_deg: float, pitch_deg: float) -> Axes:
-    """The axes of what looks to `heading_deg` (0 is -z, 90 is +x), `pitch_deg` above the horizon."""
+    """The axes of an object that faces `heading_deg` (0 is -z, 90 is +x), `pitch_deg` above the horizon.
+
+    Returns: unit vectors (right, up, back) in world coordinates.
+    """
     heading, pitch = math.radians(heading_deg), math.radians(pitch_deg)
     ahead = (math.sin(heading) * math.cos(pitch), math.sin(pitch), -math.cos(heading) * math.cos(pitch))
     right = (math.cos(heading), 0.0, math.sin(heading))
@@ -60,7 +63,7 @@ def axes(heading_deg: float, pitch_deg: float) -> Axes:
         right[2] * ahead[0] - right[0] * ahead[2],
         right[0] * ahead[1] - right[1] * ahead[0],
     )
-    return right, up, _times(ahead, -1)
+    return right, up, _scale(ahead, -1)
 
 
 def dot(one: Point, other: Point) -> float:
@@ -68,10 +71,10 @@ def dot(one: Point, other: Point) -> float:
     return sum(a * b for a, b in zip(one, other, strict=True))
 
 
-def _times(point: Point, factor: float) -> Point:
+def _scale(point: Point, factor: float) -> Point:
     return point[0] * factor, point[1] * factor, point[2] * factor
 
 
-def _sum(*points: Point) -> Point:
+def _add(*points: Point) -> Point:
     x, y, z = (sum(values) for values in zip(*points, strict=True))
     return x, y, z

@@ -1,7 +1,7 @@
-"""The glass: one pane or several, how thick, what kind, how it stands.
+"""The glass: one or more panes, their material, and the position of the glazing.
 
-The first pane is the one nearest to the camera. A glazing looks at the camera: its heading and pitch are those
-of a camera that looks straight through it.
+The first pane is the one nearest to the camera. Heading and pitch of a glazing are those of a camera whose axis is
+perpendicular to the glass.
 """
 
 from __future__ import annotations
@@ -10,66 +10,66 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from brewster.scene.values import Above0, From0, FrozenModel
+from brewster.scene.values import FrozenModel, NonNegativeFloat, PositiveFloat
 
 Point = tuple[float, float, float]
-"""Millimetres in the world: x to the right, y up, -z ahead."""
+"""World coordinates in mm: x to the right, y up, -z ahead."""
 
-ORDINARY_INDEX = 1.5
+DEFAULT_INDEX = 1.5
 
 
 class Pane(FrozenModel):
-    """One sheet of glass. A wedge turns its far surface about the vertical axis."""
+    """One sheet of glass. `wedge_deg` rotates its far surface about the vertical axis."""
 
     thickness_mm: Annotated[float, Field(gt=0, le=200)] = 4.0
-    index: Annotated[float, Field(ge=1, le=3)] = ORDINARY_INDEX
-    absorption_per_m: tuple[From0, From0, From0] = (0.0, 0.0, 0.0)
-    """Beer-Lambert coefficients for red, green and blue light."""
+    index: Annotated[float, Field(ge=1, le=3)] = DEFAULT_INDEX
+    absorption_per_m: tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat] = (0.0, 0.0, 0.0)
+    """Beer-Lambert absorption coefficients for red, green and blue."""
     roughness: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """The GGX width (alpha) of both surfaces: 0 is polished, 0.05 satin, 0.2 frosted."""
+    """GGX width (alpha) of both surfaces: 0 is polished, 0.05 satin, 0.2 frosted."""
     wedge_deg: Annotated[float, Field(ge=-5, le=5)] = 0.0
 
 
 class Glazing(FrozenModel):
-    """Panes with equal gaps of air between them, and where they stand.
+    """Panes with equal air gaps between them, and their position.
 
-    `frame_mm` is the width and height of the opening in a black wall (None: the glass fills the view);
-    `radii_mm` are the radii of curvature of a lens's near and far surface, positive where it bulges towards
-    the camera. Only the tracer renders framed and curved glass.
+    `frame_mm` is the width and height of an opening in a black wall that holds the glass; None means that the glass
+    fills the view. `radii_mm` are the radii of curvature of the near and the far surface of a lens, positive where a
+    surface is convex towards the camera. Only the Mitsuba renderer supports framed and curved glass.
     """
 
     panes: Annotated[tuple[Pane, ...], Field(min_length=1, max_length=3)] = (Pane(),)
-    gap_mm: From0 = 0.0
+    gap_mm: NonNegativeFloat = 0.0
     position_mm: Point = (0.0, 0.0, 0.0)
     heading_deg: float = 0.0
     pitch_deg: Annotated[float, Field(ge=-80, le=80)] = 0.0
-    frame_mm: tuple[Above0, Above0] | None = None
+    frame_mm: tuple[PositiveFloat, PositiveFloat] | None = None
     radii_mm: tuple[float, float] | None = None
 
     @model_validator(mode="after")
-    def _stands(self) -> Glazing:
+    def _check_geometry(self) -> Glazing:
         if len(self.panes) > 1 and self.gap_mm == 0:
-            raise ValueError("panes stand apart: gap_mm is above 0 when there is more than one")
+            raise ValueError("gap_mm is 0; several panes need a gap above 0")
         if self.radii_mm and (len(self.panes) > 1 or not all(self.radii_mm) or self.frame_mm is None):
-            raise ValueError("curved glass is one pane with two radii other than 0, in a frame")
+            raise ValueError("curved glass needs one pane, two radii other than 0, and a frame")
         return self
 
     @property
     def depth_mm(self) -> float:
-        """From the first surface to the last."""
+        """The distance from the first surface to the last."""
         return sum(pane.thickness_mm for pane in self.panes) + self.gap_mm * (len(self.panes) - 1)
 
     @property
     def is_flat(self) -> bool:
-        """Whether the analytic renderer can render it: flat, and filling the view."""
+        """Whether the glass is flat and fills the view, as the analytic renderer requires."""
         return self.radii_mm is None and self.frame_mm is None
 
     @property
     def is_rough(self) -> bool:
-        """Whether any surface scatters."""
+        """Whether any surface is rough."""
         return any(pane.roughness > 0 for pane in self.panes)
 
     @property
     def is_wedged(self) -> bool:
-        """Whether any pane's surfaces are not parallel."""
+        """Whether the surfaces of any pane are not parallel."""
         return any(pane.wedge_deg != 0 for pane in self.panes)

@@ -1,7 +1,7 @@
-"""A scene recipe: how scenes of one kind are distributed. TOML in, frozen values out.
+"""Scene recipes: the distributions that random scenes of one kind are drawn from. TOML in, frozen values out.
 
-Ranges are uniform, `_log` ranges uniform in the logarithm; `_probability` is the share of scenes that have it.
-The packaged recipes lie in `recipes/` beside this file.
+A range is sampled uniformly; where its key ends in `_log`, uniformly in the logarithm. A `_probability` is the share
+of scenes that have the feature. The packaged recipes are the TOML files in `recipes/` next to this file.
 """
 
 from __future__ import annotations
@@ -12,111 +12,163 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import Field, model_validator
 
 from brewster.errors import RecipeError
+from brewster.scene.recipe_file import read_toml
 from brewster.scene.scene import WhiteBalance
-from brewster.scene.values import From0, FrozenModel, LogRange, Positive, Range, Share, read_toml
+from brewster.scene.values import (
+    FrozenModel,
+    JpegQualityRange,
+    KeyNote,
+    LogRange,
+    NonNegativeFloat,
+    Pixels,
+    PositiveFloat,
+    PositiveInt,
+    Range,
+    Share,
+)
 
 _FOLDER: Final = Path(__file__).parent / "recipes"
+_COMPARE: Final = "docs/recipes.md"
 RECIPES: Final = tuple(sorted(path.stem for path in _FOLDER.glob("*.toml")))
 """The names of the packaged recipes."""
 
 
 class GlassRecipe(FrozenModel):
-    """The glass of one kind of scene."""
+    """The glass: panes, thickness, refractive index, tint, roughness."""
 
     double_probability: Share = 0.0
+    """Probability of double glazing: two panes with air between them."""
     gap_mm: Range = (6.0, 20.0)
+    """Width of the air gap of double glazing."""
     thickness_mm: LogRange = (3.0, 6.0)
+    """Thickness of a pane."""
     structural_probability: Share = 0.0
+    """Probability of thick structural glass."""
     structural_mm: LogRange = (10.0, 40.0)
+    """Thickness of a pane of structural glass."""
     index: Range = (1.45, 1.65)
-    tints: tuple[tuple[From0, From0, From0], ...] = ((4.0, 1.5, 2.5),)
-    """Absorption per metre for red, green and blue; clear float glass is a little green."""
+    """Refractive index, the same for all panes of a scene; at least 1."""
+    tints: Annotated[
+        tuple[tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat], ...], KeyNote(unit="1/m")
+    ] = ((4.0, 1.5, 2.5),)
+    """Absorption coefficients for red, green and blue, one of which is drawn. Clear float glass is slightly green."""
     tint_strength_log: LogRange = (0.3, 2.0)
+    """Factor on the absorption coefficients."""
     rough_probability: Share = 0.0
+    """Probability of rough glass."""
     roughness_log: LogRange = (0.01, 0.1)
+    """GGX width (alpha) of rough glass: 0.05 is satin, 0.2 frosted."""
     wedge_probability: Share = 0.0
+    """Probability of panes whose two surfaces are not parallel."""
     wedge_deg_log: LogRange = (0.01, 0.3)
+    """Angle between the two surfaces of such a pane."""
     pitch_deg: Range = (0.0, 0.0)
+    """Tilt of the glazing, above the horizon positive."""
 
     @model_validator(mode="after")
-    def _is_glass(self) -> Self:
+    def _check_values(self) -> Self:
         if self.index[0] < 1:
-            raise ValueError(f"glass has an index of 1 or more, and this begins at {self.index[0]:g}")
+            raise ValueError(f"index starts at {self.index[0]:g}, and a refractive index is at least 1")
         if self.gap_mm[0] <= 0 and self.double_probability:
-            raise ValueError(f"panes stand apart: gap_mm begins at {self.gap_mm[0]:g}")
+            raise ValueError(f"gap_mm starts at {self.gap_mm[0]:g}, and double glazing needs a gap above 0")
         if not self.tints:
-            raise ValueError("tints has at least one colour")
+            raise ValueError("tints is empty, and at least one colour is needed")
         return self
 
 
 class CameraRecipe(FrozenModel):
-    """Cameras that look at the glass."""
+    """The camera: its size in pixels, its position in front of the glass, its lens."""
 
-    width: Annotated[int, Field(ge=16)] = 512
-    height: Annotated[int, Field(ge=16)] = 384
+    width: Pixels = 512
+    """Width of the image."""
+    height: Pixels = 384
+    """Height of the image."""
     distance_mm_log: LogRange = (300.0, 3000.0)
+    """Distance of the camera from the glass."""
     incidence_deg: Range = (-35.0, 35.0)
+    """Horizontal angle between the optical axis and the normal of the glass."""
     pitch_deg: Range = (-12.0, 12.0)
+    """Angle of the optical axis above the horizon."""
     fov_deg: Range = (30.0, 90.0)
+    """Horizontal field of view. A map of low resolution raises the lower end; see most_px_per_texel."""
     pinhole_probability: Share = 0.7
+    """Probability of a pinhole camera, which has no defocus."""
     aperture_mm_log: LogRange = (1.0, 15.0)
+    """Aperture diameter of a camera with a lens."""
     focus_on_front_probability: Share = 0.15
-    """Of a lens that is set on what is mirrored, instead of on what is behind the glass."""
+    """Probability that the lens is focused on the mirrored content instead of the content behind the glass."""
 
 
 class SideRecipe(FrozenModel):
-    """What one side may hold. A map is taken only where a pixel spans at least 1 / most_px_per_texel texels."""
+    """The content on one side of the glass: an environment map, a picture on a plane, or both."""
 
     map_probability: Share = 1.0
+    """Probability of an environment map. Without one there is always a picture."""
     maps: tuple[str, ...] = ()
-    """Wanted categories; none means any."""
-    most_px_per_texel: Annotated[float, Field(gt=0)] = 2.5
+    """Categories of maps to draw from, such as indoor, outdoor or night; empty for all."""
+    most_px_per_texel: PositiveFloat = 2.5
+    """A map is used only if a texel of it covers at most this many pixels."""
     dome_probability: Share = 0.0
+    """Probability that the map is on a sphere of finite radius around the glass instead of at infinity."""
     radius_mm_log: LogRange = (3000.0, 10_000.0)
+    """Radius of that sphere."""
     picture_probability: Share = 0.0
+    """Probability of a picture on a plane, in front of the map if there is one."""
     distance_mm_log: LogRange = (1000.0, 8000.0)
+    """Distance of the picture from the glass."""
     fill: Range = (1.05, 1.5)
-    """The picture's width over the width that would just cover the view."""
+    """Width of the picture over the width that exactly covers the view."""
     turn_deg: Range = (0.0, 0.0)
+    """Rotation of the picture about the vertical axis; about the horizontal axis it is half as large."""
     highlights: Range = (0.0, 0.0)
+    """Extra brightness of clipped whites in a picture: white is (1 + highlights) times as bright."""
     luminance_log: LogRange = (1.0, 1.0)
+    """Mean luminance of the content. Only the ratio between the two sides matters."""
 
 
 class DevelopmentRecipe(FrozenModel):
-    """How the photographs are developed; see `Development`."""
+    """The camera response: from linear light to an 8-bit photograph."""
 
     exposure: LogRange = (0.2, 0.5)
+    """Mean luminance of the photo I after exposure, where clipped values count as 1."""
     white_balance: Annotated[tuple[WhiteBalance, ...], Field(min_length=1)] = (
         "none",
         "grey-world",
         "white-patch",
         "grey-edge",
     )
+    """Methods of automatic white balance, one of which is drawn."""
     white_balance_strength: Range = (0.3, 1.0)
+    """Share of the estimated white balance that is applied; at most 1."""
     contrast: Range = (-0.1, 0.5)
+    """Strength of an S-shaped tone curve: 0 is the sRGB curve, negative values flatten it."""
     shot_noise: Range = (0.0, 0.02)
+    """Standard deviation at white of noise that grows with the square root of the light, in I only."""
     read_noise: Range = (0.0, 0.004)
-    jpeg_quality: tuple[Annotated[int, Field(ge=1, le=100)], Annotated[int, Field(ge=1, le=100)]] = (60, 97)
-
-    @model_validator(mode="after")
-    def _rises(self) -> Self:
-        if self.jpeg_quality[0] > self.jpeg_quality[1]:
-            raise ValueError(f"jpeg_quality goes up, and this goes from {self.jpeg_quality[0]}")
-        return self
+    """Standard deviation of noise that does not depend on the light, in I only."""
+    jpeg_quality: JpegQualityRange = (60, 97)
+    """JPEG quality of the photo I; the other images are written with quality 95."""
 
 
 class SceneRecipe(FrozenModel):
     """One kind of scene."""
 
     name: str
+    """The name of the recipe. Recipes of different names draw different scenes from the same seed."""
     about: str
+    """A description of the scenes."""
     orders: Literal["all", "paper"] = "all"
-    samples: Positive = 8
-    rough_samples: Positive = 16
+    """Light paths in T and R. all: every order of reflection, so that I = T + R. paper: the single paths of the paper."""
+    samples: PositiveInt = 8
+    """Rays per pixel, where random sampling is needed (lenses), and at most that many elsewhere."""
+    rough_samples: PositiveInt = 16
+    """Rays per pixel for scenes with rough glass."""
     glass: GlassRecipe = GlassRecipe()
     camera: CameraRecipe = CameraRecipe()
     behind: SideRecipe = SideRecipe()
+    """The content behind the glass, which the transmission shows."""
     front: SideRecipe = SideRecipe()
+    """The content in front of the glass, which the reflection shows. It has the same keys as [behind]."""
     development: DevelopmentRecipe = DevelopmentRecipe()
 
 
@@ -124,14 +176,15 @@ def read_scene_recipe(name: str) -> SceneRecipe:
     """A packaged recipe by its name, or one of your own by its path.
 
     Raises:
-        RecipeError: unknown, missing, not TOML, or with values that are missing, unknown or impossible.
+        RecipeError: the name is unknown, the file is missing or not TOML, or keys are missing, unknown or have
+            impossible values.
     """
     if name in RECIPES:
-        return read_toml(SceneRecipe, _FOLDER / f"{name}.toml", compare="the packaged recipes")
+        return read_toml(SceneRecipe, _FOLDER / f"{name}.toml", compare=_COMPARE)
     if not name.endswith(".toml"):
         raise RecipeError(
             f"there is no recipe {name!r}",
-            f"known are {', '.join(RECIPES)}",
-            "name one, or give a .toml file",
+            f"the packaged recipes are {', '.join(RECIPES)}",
+            "name one of them, or a .toml file",
         )
-    return read_toml(SceneRecipe, Path(name), compare="the packaged recipes")
+    return read_toml(SceneRecipe, Path(name), compare=_COMPARE)

@@ -1,4 +1,4 @@
-"""Draws scenes: (recipe, catalog, seed, index) to a Scene, the same on every machine.
+"""Draws random scenes: (recipe, catalog, seed, index) -> Scene, the same on every machine.
 
 scene = draw(read_scene_recipe("window"), catalog, seed=7, index=12)
 """
@@ -21,12 +21,12 @@ from brewster.scene.scene import Development, Scene
 from brewster.scene.values import FrozenModel
 from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
 
-_TRIES: Final = 100
-_FAR_MM: Final = 1e6
+_MAX_ATTEMPTS: Final = 100
+_MAX_FOCUS_MM: Final = 1e6
 
 
 class Asset(FrozenModel):
-    """A file that can light a scene: its size, and a category such as indoor, outdoor or night."""
+    """A map or a picture: its source, its size in px, and a category such as indoor, outdoor or night."""
 
     source: AssetSource
     width: int
@@ -35,66 +35,68 @@ class Asset(FrozenModel):
 
 
 class Catalog(FrozenModel):
-    """The maps and pictures to draw from."""
+    """The environment maps and pictures to draw from."""
 
     maps: tuple[Asset, ...] = ()
     pictures: tuple[Asset, ...] = ()
 
 
 def draw(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) -> Scene:
-    """The scene of this number. What turns out impossible (a view that grazes the glass, say) is drawn again.
+    """The scene of this index. An impossible one (such as a view that grazes the glass) is drawn again.
 
     Raises:
-        RecipeError: the recipe asks for maps or pictures that the catalog lacks, or for the impossible.
+        RecipeError: the catalog has no suitable maps or pictures, or no scene was possible in 100 attempts.
     """
-    rng = _NamedRng(f"{recipe.name}/{seed}/{index}")
+    rng = _SceneRng(f"{recipe.name}/{seed}/{index}")
     reason = ""
-    for _ in range(_TRIES):
+    for _ in range(_MAX_ATTEMPTS):
         try:
-            return _try(recipe, catalog, rng, seed, index)
+            return _draw_once(recipe, catalog, rng, seed, index)
         except ValidationError as error:
             reason = error.errors()[0]["msg"].removeprefix("Value error, ")
     raise RecipeError(
-        f"the recipe {recipe.name!r} gave no possible scene in {_TRIES} tries", reason, "change its ranges"
+        f"the recipe {recipe.name!r} gave no possible scene in {_MAX_ATTEMPTS} attempts",
+        reason,
+        "change its ranges",
     )
 
 
-def _six(number: float) -> float:
-    """Six digits, so that scenes read well."""
+def _six_digits(number: float) -> float:
+    """The number rounded to six digits, so that scene files stay readable."""
     return float(f"{number:.6g}")
 
 
-class _NamedRng(Random):
-    """Random numbers by the words of a recipe."""
+class _SceneRng(Random):
+    """Random numbers from the value types of a recipe."""
 
-    def within(self, bounds: tuple[float, float]) -> float:
-        return _six(self.uniform(*bounds))
+    def from_range(self, bounds: tuple[float, float]) -> float:
+        return _six_digits(self.uniform(*bounds))
 
-    def within_log(self, bounds: tuple[float, float]) -> float:
-        return _six(math.exp(self.uniform(*map(math.log, bounds))))
+    def from_log_range(self, bounds: tuple[float, float]) -> float:
+        return _six_digits(math.exp(self.uniform(*map(math.log, bounds))))
 
-    def chance(self, probability: float) -> bool:
+    def bernoulli(self, probability: float) -> bool:
         return self.random() < probability
 
 
 @dataclass(frozen=True)
 class _PartialScene:
-    """What is settled when the sides are drawn."""
+    """The parts of a scene that are drawn before its two sides."""
 
-    rng: _NamedRng
+    rng: _SceneRng
     catalog: Catalog
     glass: Glazing
     camera: Camera
 
 
-def _try(recipe: SceneRecipe, catalog: Catalog, rng: _NamedRng, seed: int, index: int) -> Scene:
-    glass = _glass(recipe.glass, rng)
+def _draw_once(recipe: SceneRecipe, catalog: Catalog, rng: _SceneRng, seed: int, index: int) -> Scene:
+    glass = _draw_glazing(recipe.glass, rng)
     behind_map = _choose_map(recipe.behind, recipe.camera, catalog, rng)
     front_map = _choose_map(recipe.front, recipe.camera, catalog, rng)
-    camera = _camera(recipe, [(recipe.behind, behind_map), (recipe.front, front_map)], rng)
+    camera = _draw_camera(recipe, [(recipe.behind, behind_map), (recipe.front, front_map)], rng)
     draft = _PartialScene(rng, catalog, glass, camera)
-    behind = _side(recipe.behind, behind_map, draft, glass.depth_mm)
-    front = _side(recipe.front, front_map, draft, _camera_in_glass(camera, glass)[2])
+    behind = _draw_side(recipe.behind, behind_map, draft, glass.depth_mm)
+    front = _draw_side(recipe.front, front_map, draft, _camera_in_glass_frame(camera, glass)[2])
     return Scene(
         recipe=recipe.name,
         seed=seed,
@@ -103,162 +105,170 @@ def _try(recipe: SceneRecipe, catalog: Catalog, rng: _NamedRng, seed: int, index
         orders=recipe.orders,
         samples=recipe.rough_samples if glass.is_rough else recipe.samples,
         glass=glass,
-        camera=_focused(recipe.camera, draft, behind, front),
+        camera=_focus_camera(recipe.camera, draft, behind, front),
         behind=behind,
         front=front,
-        development=_development(recipe.development, rng),
+        development=_draw_development(recipe.development, rng),
     )
 
 
-def _glass(recipe: GlassRecipe, rng: _NamedRng) -> Glazing:
-    count = 2 if rng.chance(recipe.double_probability) else 1
-    structural = rng.chance(recipe.structural_probability)
-    tint, strength = rng.choice(recipe.tints), rng.within_log(recipe.tint_strength_log)
-    rough = rng.within_log(recipe.roughness_log) if rng.chance(recipe.rough_probability) else 0.0
-    wedged = rng.chance(recipe.wedge_probability)
-    red, green, blue = (_six(colour * strength) for colour in tint)
-    index = rng.within(recipe.index)
+def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
+    count = 2 if rng.bernoulli(recipe.double_probability) else 1
+    structural = rng.bernoulli(recipe.structural_probability)
+    tint, strength = rng.choice(recipe.tints), rng.from_log_range(recipe.tint_strength_log)
+    rough = rng.from_log_range(recipe.roughness_log) if rng.bernoulli(recipe.rough_probability) else 0.0
+    wedged = rng.bernoulli(recipe.wedge_probability)
+    red, green, blue = (_six_digits(colour * strength) for colour in tint)
+    index = rng.from_range(recipe.index)
 
     def pane() -> Pane:
         return Pane(
-            thickness_mm=rng.within_log(recipe.structural_mm if structural else recipe.thickness_mm),
+            thickness_mm=rng.from_log_range(recipe.structural_mm if structural else recipe.thickness_mm),
             index=index,
             absorption_per_m=(red, green, blue),
             roughness=rough,
-            wedge_deg=rng.within_log(recipe.wedge_deg_log) * rng.choice((-1, 1)) if wedged else 0.0,
+            wedge_deg=rng.from_log_range(recipe.wedge_deg_log) * rng.choice((-1, 1)) if wedged else 0.0,
         )
 
     return Glazing(
         panes=tuple(pane() for _ in range(count)),
-        gap_mm=rng.within(recipe.gap_mm) if count > 1 else 0.0,
-        pitch_deg=rng.within(recipe.pitch_deg),
+        gap_mm=rng.from_range(recipe.gap_mm) if count > 1 else 0.0,
+        pitch_deg=rng.from_range(recipe.pitch_deg),
     )
 
 
-def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng: _NamedRng) -> Asset | None:
-    """A map that is sharp enough for the widest view that the recipe allows; None for a side of pictures."""
+def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng: _SceneRng) -> Asset | None:
+    """A map with enough resolution for the widest view of the recipe; None for a side with a picture only."""
     wanted = [asset for asset in catalog.maps if not recipe.maps or asset.category in ("", *recipe.maps)]
-    sharp = [asset for asset in wanted if _least_fov(asset, recipe, camera) <= camera.fov_deg[1]]
-    if not rng.chance(recipe.map_probability) or (not sharp and recipe.picture_probability > 0):
+    sharp = [asset for asset in wanted if _min_fov_deg(asset, recipe, camera) <= camera.fov_deg[1]]
+    if not rng.bernoulli(recipe.map_probability) or (not sharp and recipe.picture_probability > 0):
         return None
     if not sharp:
         raise RecipeError(
-            f"of {len(catalog.maps)} maps none fits the recipe",
-            f"categories {', '.join(recipe.maps) or 'any'}, and texels finer than {recipe.most_px_per_texel:g} px"
+            f"none of {len(catalog.maps)} maps fits the recipe",
+            f"expected categories {', '.join(recipe.maps) or 'any'}, and texels finer than {recipe.most_px_per_texel:g} px"
             f" at {camera.fov_deg[1]:g} degrees",
-            "give other --maps, larger ones, or a smaller --size",
+            "give other --maps or larger ones, or a smaller --size",
         )
     return rng.choice(sharp)
 
 
-def _least_fov(asset: Asset, recipe: SideRecipe, camera: CameraRecipe) -> float:
-    """The narrowest view in degrees in which a texel of the map is not too many pixels wide."""
+def _min_fov_deg(asset: Asset, recipe: SideRecipe, camera: CameraRecipe) -> float:
+    """The smallest field of view in degrees in which a texel of the map does not cover too many pixels."""
     return camera.width * 360 / asset.width / recipe.most_px_per_texel
 
 
-def _camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]], rng: _NamedRng) -> Camera:
-    """A camera whose axis meets the glass near its middle; where it focuses is settled later."""
+def _draw_camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]], rng: _SceneRng) -> Camera:
+    """A camera whose axis meets the glass near its middle. Its focus is set later."""
     wanted = recipe.camera
-    least = max([wanted.fov_deg[0], *(_least_fov(asset, side, wanted) for side, asset in maps if asset)])
-    heading, pitch = rng.within(wanted.incidence_deg), rng.within(wanted.pitch_deg)
+    min_fov_deg = max(
+        [wanted.fov_deg[0], *(_min_fov_deg(asset, side, wanted) for side, asset in maps if asset)]
+    )
+    heading, pitch = rng.from_range(wanted.incidence_deg), rng.from_range(wanted.pitch_deg)
     _, _, back = axes(heading, pitch)
-    away = rng.within_log(wanted.distance_mm_log) / max(back[2], 0.1)
-    x, y, z = (_six(away * part) for part in back)
+    distance_mm = rng.from_log_range(wanted.distance_mm_log) / max(back[2], 0.1)
+    x, y, z = (_six_digits(distance_mm * part) for part in back)
     return Camera(
         position_mm=(x, y, z),
         heading_deg=heading,
         pitch_deg=pitch,
-        fov_deg=rng.within((least, wanted.fov_deg[1])),
+        fov_deg=rng.from_range((min_fov_deg, wanted.fov_deg[1])),
         width=wanted.width,
         height=wanted.height,
     )
 
 
-def _side(recipe: SideRecipe, asset: Asset | None, draft: _PartialScene, nearest_mm: float) -> Side:
+def _draw_side(recipe: SideRecipe, asset: Asset | None, draft: _PartialScene, nearest_mm: float) -> Side:
     """A map, a picture, or both; the picture stands further from the glass than `nearest_mm`."""
     rng = draft.rng
-    luminance = rng.within_log(recipe.luminance_log)
+    luminance = rng.from_log_range(recipe.luminance_log)
     world = plane = None
     if asset:
-        is_dome = rng.chance(recipe.dome_probability)
+        is_dome = rng.bernoulli(recipe.dome_probability)
         world = EnvironmentMap(
             source=asset.source,
-            heading_deg=rng.within((0, 360)),
+            heading_deg=rng.from_range((0, 360)),
             luminance=luminance,
-            radius_mm=rng.within_log(recipe.radius_mm_log) if is_dome else math.inf,
+            radius_mm=rng.from_log_range(recipe.radius_mm_log) if is_dome else math.inf,
         )
-    if rng.chance(recipe.picture_probability) or not asset:
-        plane = _plane(recipe, draft, luminance, nearest_mm + rng.within_log(recipe.distance_mm_log))
+    if rng.bernoulli(recipe.picture_probability) or not asset:
+        plane = _draw_plane(recipe, draft, luminance, nearest_mm + rng.from_log_range(recipe.distance_mm_log))
     return Side(map=world, plane=plane)
 
 
-def _plane(recipe: SideRecipe, draft: _PartialScene, luminance: float, distance_mm: float) -> Plane:
-    """A picture that covers as much of the view, straight or mirrored, as the recipe says."""
+def _draw_plane(recipe: SideRecipe, draft: _PartialScene, luminance: float, distance_mm: float) -> Plane:
+    """A picture whose width is `fill` times what covers the view, seen directly or mirrored."""
     if not draft.catalog.pictures:
         raise RecipeError(
-            "there are no pictures to draw from", "the recipe asks for them", "name a folder with --photos"
+            "there are no pictures to draw from", "the recipe needs pictures", "name a folder with --photos"
         )
     rng, asset = draft.rng, draft.rng.choice(draft.catalog.pictures)
-    (left, right), (bottom, top) = _reach(draft.camera, draft.glass, distance_mm)
+    (left, right), (bottom, top) = _visible_extent(draft.camera, draft.glass, distance_mm)
     cover = max(right - left, (top - bottom) * asset.width / asset.height)
     return Plane(
         source=asset.source,
-        distance_mm=_six(distance_mm),
-        offset_mm=(_six((left + right) / 2), _six((bottom + top) / 2)),
-        width_mm=_six(cover * rng.within(recipe.fill)),
-        heading_deg=rng.within(recipe.turn_deg),
-        pitch_deg=rng.within(recipe.turn_deg) / 2,
+        distance_mm=_six_digits(distance_mm),
+        offset_mm=(_six_digits((left + right) / 2), _six_digits((bottom + top) / 2)),
+        width_mm=_six_digits(cover * rng.from_range(recipe.fill)),
+        heading_deg=rng.from_range(recipe.turn_deg),
+        pitch_deg=rng.from_range(recipe.turn_deg) / 2,
         luminance=luminance,
-        highlights=rng.within(recipe.highlights),
+        highlights=rng.from_range(recipe.highlights),
     )
 
 
-def _camera_in_glass(camera: Camera, glass: Glazing) -> Point:
+def _camera_in_glass_frame(camera: Camera, glass: Glazing) -> Point:
     (x, y, z), (at_x, at_y, at_z) = camera.position_mm, glass.position_mm
-    return _in_glass((x - at_x, y - at_y, z - at_z), glass)
+    return _to_glass_frame((x - at_x, y - at_y, z - at_z), glass)
 
 
-def _in_glass(vector: Point, glass: Glazing) -> Point:
+def _to_glass_frame(vector: Point, glass: Glazing) -> Point:
     right, up, back = axes(glass.heading_deg, glass.pitch_deg)
     return dot(vector, right), dot(vector, up), dot(vector, back)
 
 
-def _reach(
+def _visible_extent(
     camera: Camera, glass: Glazing, distance_mm: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """What the view spans on a plane this far beyond the glass, or as far before it in the mirror: x and y, in mm."""
-    x, y, z = _camera_in_glass(camera, glass)
+    """The ranges of x and y, in mm, that the view covers on a plane at this distance behind the glass.
+
+    A mirrored plane at the same distance in front of the glass covers the same ranges.
+    """
+    x, y, z = _camera_in_glass_frame(camera, glass)
     places = []
     for corner in camera.corners():
-        across, upward, towards = _in_glass(corner, glass)
-        away = (z + distance_mm) / max(-towards, 1e-3)
-        places.append((x + away * across, y + away * upward))
+        across, upward, towards = _to_glass_frame(corner, glass)
+        length = (z + distance_mm) / max(-towards, 1e-3)
+        places.append((x + length * across, y + length * upward))
     xs, ys = zip(*places, strict=True)
     return (min(xs), max(xs)), (min(ys), max(ys))
 
 
-def _focused(recipe: CameraRecipe, draft: _PartialScene, behind: Side, front: Side) -> Camera:
-    """The camera with its lens set on something of the scene."""
+def _focus_camera(recipe: CameraRecipe, draft: _PartialScene, behind: Side, front: Side) -> Camera:
+    """The camera with its lens focused on the content of one side."""
     rng, camera = draft.rng, draft.camera
-    on = front if rng.chance(recipe.focus_on_front_probability) else behind
-    is_pinhole, aperture = rng.chance(recipe.pinhole_probability), rng.within_log(recipe.aperture_mm_log)
-    away = _camera_in_glass(camera, draft.glass)[2] + on.distance_mm
-    slant = _in_glass(axes(camera.heading_deg, camera.pitch_deg)[2], draft.glass)[2]
+    on = front if rng.bernoulli(recipe.focus_on_front_probability) else behind
+    is_pinhole, aperture = (
+        rng.bernoulli(recipe.pinhole_probability),
+        rng.from_log_range(recipe.aperture_mm_log),
+    )
+    distance_mm = _camera_in_glass_frame(camera, draft.glass)[2] + on.distance_mm
+    slant = _to_glass_frame(axes(camera.heading_deg, camera.pitch_deg)[2], draft.glass)[2]
     return camera.model_copy(
         update={
-            "focus_mm": _six(min(away / max(slant, 0.1), _FAR_MM)),
+            "focus_mm": _six_digits(min(distance_mm / max(slant, 0.1), _MAX_FOCUS_MM)),
             "aperture_mm": 0.0 if is_pinhole else aperture,
         }
     )
 
 
-def _development(recipe: DevelopmentRecipe, rng: _NamedRng) -> Development:
+def _draw_development(recipe: DevelopmentRecipe, rng: _SceneRng) -> Development:
     return Development(
-        exposure=rng.within_log(recipe.exposure),
+        exposure=rng.from_log_range(recipe.exposure),
         white_balance=rng.choice(recipe.white_balance),
-        white_balance_strength=rng.within(recipe.white_balance_strength),
-        contrast=rng.within(recipe.contrast),
-        shot_noise=rng.within(recipe.shot_noise),
-        read_noise=rng.within(recipe.read_noise),
+        white_balance_strength=rng.from_range(recipe.white_balance_strength),
+        contrast=rng.from_range(recipe.contrast),
+        shot_noise=rng.from_range(recipe.shot_noise),
+        read_noise=rng.from_range(recipe.read_noise),
         jpeg_quality=rng.randint(*recipe.jpeg_quality),
     )

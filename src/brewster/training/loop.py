@@ -86,7 +86,7 @@ def run(trainer: Trainer, out: Path, on_step: StepCallback) -> None:
     completed_steps = _resume_or_initialize(trainer, out / CHECKPOINT)
     if is_main_process():
         _truncate_log(completed_steps, out / LOG)
-    started, steps = time.monotonic(), 0 if recipe.data.is_none else recipe.steps
+    started, steps = time.monotonic(), 0 if recipe.data.is_empty else recipe.steps
     with closing(TensorBoardLog(out, completed_steps)) as event_log:
         for step in range(completed_steps + 1, 1 + steps):
             metrics, is_last = trainer.training_step(step - 1), step == recipe.steps

@@ -1,6 +1,6 @@
-"""A training recipe: TOML in, frozen values out, unknown or impossible ones refused by name.
+"""Training recipes: the settings of one training run. TOML in, frozen values out.
 
-Paths in a recipe are relative to the folder that `BREWSTER_DATA` names.
+Paths of data in a recipe are relative to the folder that the environment variable BREWSTER_DATA names.
 """
 
 from __future__ import annotations
@@ -9,11 +9,10 @@ import os
 import tomllib
 from collections.abc import Iterator
 from contextlib import suppress
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self, TypeVar
 
-from pydantic import AfterValidator, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from brewster.errors import RecipeError
 from brewster.models.diffusion.panels import Direction, Panel, PanelLayout
@@ -23,24 +22,34 @@ from brewster.models.diffusion.task import PAPER_PX, DecompositionTask, Objectiv
 from brewster.models.networks import DEFAULT_NETWORK, LARGEST_STRIDE, NETWORKS
 from brewster.models.zoo import TINY
 from brewster.options import Quantisation
-from brewster.scene.values import Above0, From0, FrozenModel, Positive, Seed, Share, read_toml, wrong_value
-from brewster.training.data.mixtures import MixRecipe, Target
-from brewster.training.data.online import Mixing
+from brewster.scene.recipe_file import read_toml, similar_key, validated
+from brewster.scene.values import (
+    FrozenModel,
+    KeyNote,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    Seed,
+    Share,
+)
+from brewster.training.data.data_recipe import DataRecipe
+from brewster.training.data.mixtures import MixRecipe
 
-_COMPARE = "the recipes in recipes/train/"
+_COMPARE: Final = "docs/recipes.md"
 
-ENCODED: Final = ".safetensors"
-"""The ending of an encoded prompt's file."""
+_TEMPLATE_FOLDER: Final = Path(__file__).parent / "recipes"
+TEMPLATES: Final = tuple(sorted(path.stem for path in _TEMPLATE_FOLDER.glob("*.toml")))
+"""The names of the packaged recipes to start from: one for the compact network, one for a LoRA."""
+
+ENCODED_SUFFIX: Final = ".safetensors"
+"""The file name suffix of an encoded prompt."""
 
 
-def _rising_from_0(sizes: list[tuple[float, int]]) -> list[tuple[float, int]]:
+def _ascending_from_0(sizes: list[tuple[float, int]]) -> list[tuple[float, int]]:
     starts, sides = zip(*sizes, strict=True)
     if starts[0] != 0 or list(starts) != sorted(set(starts)) or list(sides) != sorted(sides):
-        raise ValueError("the shares start at 0 and rise, and so do the sides")
+        raise ValueError("expected shares that start at 0 and increase, and sides that never decrease")
     return sizes
-
-
-Side = Annotated[int, Field(gt=0, multiple_of=LARGEST_STRIDE)]
 
 
 def _known_network(name: str) -> str:
@@ -49,223 +58,175 @@ def _known_network(name: str) -> str:
     return name
 
 
-Sizes = Annotated[list[tuple[Share, Side]], Field(min_length=1), AfterValidator(_rising_from_0)]
-
-
-class RenderedRecipe(FrozenModel):
-    """Rendered samples: `sets` that `brewster render` made, or a scene `recipe` to render while the network learns."""
-
-    sets: tuple[Path, ...] = ()
-    recipe: str | None = None
-    """A packaged scene recipe by its name, or a TOML file, relative to this recipe."""
-    count: Annotated[int, Field(ge=0)] | None = None
-    """How many different samples; by default all of the sets, and of live ones no end. 0: none at all."""
-    share: Share = 1.0
-    """Of what pairs leave of each batch; mixtures of photos are the rest."""
-    mixing: Mixing = "light"
-    target: Target = "background"
-    orders: Literal["all", "paper"] | None = None
-    """Instead of the scene recipe's own."""
-    seed: Seed | None = None
-    """Of the scenes; by default this recipe's."""
-    maps: tuple[Path, ...] = ()
-    photos: tuple[Path, ...] = ()
-    """Worlds of live scenes; the builtin ones where there is no folder."""
-
-    @model_validator(mode="after")
-    def _comes_from_one_place(self) -> Self:
-        if bool(self.sets) == bool(self.recipe):
-            raise ValueError(
-                "rendered samples come either from sets, on disk, or from a recipe, live: name one of the two"
-            )
-        told = [
-            name for name in ("orders", "seed", "maps", "photos") if getattr(self, name) not in (None, ())
-        ]
-        if self.sets and told:
-            raise ValueError(
-                f"sets are rendered already, so that {', '.join(told)} can change nothing in them"
-            )
-        return self
-
-
-class DataRecipe(FrozenModel):
-    """What a network learns from: folders relative to BREWSTER_DATA, and file names in them to leave out.
-
-    Of each batch `pairs_share` are real pairs, `rendered.share` of the others are rendered, and the rest are
-    mixtures of photos and maps. What has a share of 0 is listed but neither read nor used.
-    """
-
-    photos: tuple[Path, ...] = ()
-    maps: tuple[Path, ...] = ()
-    pairs: tuple[Path, ...] = ()
-    pairs_share: Share = 0.0
-    rendered: RenderedRecipe | None = None
-    exclude: tuple[str, ...] = ()
-    held_out: tuple[str, ...] = ()
-    """Photos and maps that are not learnt from either: the compact model is validated on mixtures of them."""
-    validate_on: tuple[Path, ...] = ()
-    validate_at_most: Positive = 40
-    """Pairs of each folder in `validate_on`, evenly spaced in order of name."""
-
-    @property
-    def never_trained_on(self) -> tuple[str, ...]:
-        """File names that training leaves out."""
-        return self.exclude + self.held_out
-
-    @property
-    def rendered_share(self) -> float:
-        """How much of what pairs leave is rendered: 0 if there is no sample."""
-        return self.rendered.share if self.rendered and self.rendered.count != 0 else 0.0
-
-    @property
-    def is_none(self) -> bool:
-        """Whether everything that is listed has a share, or a count, of 0."""
-        return not (self.photos or self.pairs_share or self.rendered_share)
-
-    @model_validator(mode="after")
-    def _has_sources(self) -> Self:
-        if not (self.photos or self.pairs or self.rendered):
-            raise ValueError("a network learns from photos, pairs or rendered, and here is none of them")
-        if self.pairs_share and not self.pairs:
-            raise ValueError(f"pairs_share is {self.pairs_share:g}, and there are no pairs")
-        if self.pairs and "pairs_share" not in self.model_fields_set:
-            raise ValueError("with pairs, pairs_share says how much of each batch they are; it may be 0")
-        if self.photos and self.rendered and "share" not in self.rendered.model_fields_set:
-            raise ValueError("with photos, rendered.share says how much is rendered; it may be 0 or 1")
-        if not (self.photos or self.is_none or self.pairs_share == 1 or self.rendered_share == 1):
-            raise ValueError(
-                "pairs and rendered samples leave a part of each batch, and there are no photos for it"
-            )
-        return self
+Side = Annotated[int, Field(gt=0, multiple_of=LARGEST_STRIDE)]
+Sizes = Annotated[
+    list[tuple[Share, Side]],
+    Field(min_length=1),
+    AfterValidator(_ascending_from_0),
+    KeyNote(
+        "list of [share, side]",
+        f"shares from 0 to 1, the first 0, increasing; sides multiples of {LARGEST_STRIDE}, never decreasing",
+        "px",
+        instead=True,
+    ),
+]
 
 
 class TrainingRecipe(FrozenModel):
-    """One run, whatever learns in it."""
+    """The settings of every training run."""
 
     seed: Seed
-    steps: Positive
-    batch: Positive
-    learning_rate: Above0
-    warmup_steps: Positive
-    weight_decay: From0
-    report_every: Positive
-    checkpoint_every: Positive
+    """Seed of all random numbers. The same recipe and data give the same weights."""
+    steps: PositiveInt
+    """Number of training steps."""
+    batch: PositiveInt
+    """Samples per training step."""
+    learning_rate: PositiveFloat
+    """Peak learning rate of AdamW."""
+    warmup_steps: PositiveInt
+    """Steps over which the learning rate rises linearly from 0 to its peak."""
+    weight_decay: NonNegativeFloat
+    """Weight decay of AdamW."""
+    report_every: PositiveInt
+    """Steps between two reports: log line, validation, example images."""
+    checkpoint_every: PositiveInt
+    """Steps between two checkpoints, from which a stopped run resumes."""
     data: DataRecipe
 
 
 class CompactRecipe(TrainingRecipe):
-    """A run of a compact network. `sizes` lists (share of the run, side in px): small pictures first."""
+    """A training run of a compact network."""
 
-    network: Annotated[str, AfterValidator(_known_network)] = DEFAULT_NETWORK
-    """A name in the table of `brewster.models.networks`."""
+    network: Annotated[
+        str, AfterValidator(_known_network), KeyNote(allowed=f"one of {', '.join(NETWORKS)}")
+    ] = DEFAULT_NETWORK
+    """The network, a name in the table of `brewster.models.networks`."""
     sizes: Sizes
-    encoder_learning_rate: Above0
+    """Side of the training images from each share of the run on. Small images first make training faster."""
+    encoder_learning_rate: PositiveFloat
+    """Peak learning rate of the pretrained encoder."""
     average_decay: Share
+    """Decay per step of the exponential moving average (EMA) of the weights, which is exported."""
     decay_share: Share = 1.0
-    """The last share of the run, over which the learning rate falls to zero along a cosine; constant before."""
+    """Last share of the run, over which the learning rate falls to zero along a cosine. Before, it is constant."""
     precision: Literal["float32", "auto"] = "float32"
-    """auto: bfloat16 where the processor computes it natively. Depthwise convolutions and the head stay float32."""
+    """auto: bfloat16 where the processor supports it. Depthwise convolutions and the head stay in float32."""
     start_from: tuple[Path, ...] = ()
-    """Checkpoints, relative to the recipe: this run starts from the mean of their averaged weights."""
+    """Checkpoints, relative to this recipe. The run starts from the mean of their averaged weights."""
     mix: MixRecipe = MixRecipe()
 
     @model_validator(mode="after")
-    def _divides(self) -> Self:
-        real = _divide(self.batch, "pairs_share", self.data.pairs_share)
-        _divide(self.batch - real, "rendered.share", self.data.rendered_share)
+    def _check_shares(self) -> Self:
+        real = _share_of(self.batch, "pairs_share", self.data.pairs_share)
+        _share_of(self.batch - real, "rendered.share", self.data.rendered_share)
         return self
 
     def size_at(self, step: int) -> int:
-        """Side of the training pictures in px at this step, a multiple of 32."""
+        """Side of the training images at this step in px, a multiple of 32."""
         return [size for start, size in self.sizes if step >= start * self.steps][-1]
 
 
 class LoraRecipe(TrainingRecipe):
-    """A run of a LoRA on a large backbone; the defaults are the paper's, or the usual ones where it is silent.
+    """A training run of a LoRA on a large backbone. Defaults are the paper's, or common values where it gives none.
 
-    Each sample of a batch is a real pair with the chance `data.pairs_share`, else a rendered one, whole and in its
-    own aspect ratio: neither mixtures nor live scenes, which are square.
+    Each sample of a batch is a real pair with probability `data.pairs_share`, else a rendered one, uncropped and in
+    its own aspect ratio. Mixtures and scenes rendered during training are square, and are not supported.
     """
 
     backbone: str
-    """A name in the table, a hub id, a folder, or "tiny:" and a name: that backbone's toy twin, random weights."""
-    rank: Positive = 16
-    alpha: Positive = 16
+    """A name in the table of backbones, a hub id, a folder, or "tiny:NAME" for a toy version with random weights."""
+    rank: PositiveInt = 16
+    """Rank of the LoRA matrices."""
+    alpha: PositiveInt = 16
+    """Scale of the LoRA: its output is multiplied by alpha / rank."""
     quantise: Quantisation | None = None
+    """Quantisation of the frozen backbone. Not set: none."""
     panels: tuple[Panel, ...] = ("I", "T", "R")
+    """The images that the model generates side by side: photo I, transmission T, reflection R. T is required."""
     direction: Direction = "side by side"
-    budget_px: Positive = PAPER_PX
-    """The most pixels that all panels have together."""
-    panel_weights: dict[Panel, From0] = Field(default_factory=dict)
-    """How much each panel counts in the loss, 1 if not named."""
+    """How the panels are arranged in the composite image."""
+    budget_px: PositiveInt = PAPER_PX
+    """Largest number of pixels of all panels together."""
+    panel_weights: Annotated[
+        dict[Panel, NonNegativeFloat],
+        KeyNote("table of panel = weight", 'panels "I", "T", "R"; weights at least 0', instead=True),
+    ] = Field(default_factory=dict)
+    """Weight of each panel in the loss; 1 for panels that are not listed."""
     objective: Objective = "flow"
-    """From noise to panels in many steps, or from the photo, in every panel, to what it lacks in one."""
-    guidance: From0 = 1.0
-    """While learning; 1 is none where it takes a second prediction."""
+    """flow: flow matching, from noise to panels in many steps. one_step: from the photo to the panels in one step."""
+    guidance: NonNegativeFloat = 1.0
+    """Guidance scale during training. 1 means none for backbones with classifier-free guidance."""
     logit_mean: float = 0.0
-    logit_deviation: Above0 = 1.0
-    """Of the times that it learns at, logit-normal (Esser et al. 2024), before the shift for the resolution."""
+    """Mean of the logit-normal distribution of training times (Esser et al. 2024), before the resolution shift."""
+    logit_deviation: PositiveFloat = 1.0
+    """Standard deviation of that distribution."""
     flip: bool = True
-    """Whether every sample is also seen mirrored."""
+    """Whether every sample is also used mirrored left to right."""
     crops: Annotated[int, Field(ge=0)] = 0
-    """How many different crops of each sample are learnt beside the whole."""
+    """Number of different crops of each sample, in addition to the uncropped sample."""
     reflections: Literal["given", "difference"] = "given"
-    """Pairs without a reflection are refused where R is a panel, or R is what photo - transmission leaves in light."""
+    """R of real pairs. given: pairs without a reflection image are refused. difference: R = photo - transmission, linear."""
     prompt: str = "paper"
-    """A prompt by name, which the backbone's own text encoder encodes, or an encoded one: a .safetensors file,
-    relative to the recipe."""
+    """A prompt by name, encoded with the text encoder of the backbone, or an encoded one: a .safetensors file,
+    relative to this recipe."""
 
     @property
     def layout(self) -> PanelLayout:
-        """How the panels stand."""
+        """The arrangement of the panels."""
         return PanelLayout(self.panels, self.direction)
 
     @property
     def task(self) -> DecompositionTask:
-        """What is learnt, as those need it who use it: they are guided as in the paper, or as it was learnt in one step."""
+        """The task of the trained adapter. Inference uses the paper's guidance, or in one step that of training."""
         guidance = GUIDANCE if self.objective == "flow" else self.guidance
         return DecompositionTask(self.layout, self.budget_px, self.objective, guidance)
 
     @model_validator(mode="after")
-    def _can_be_learnt(self) -> Self:
+    def _check_consistency(self) -> Self:
         rendered = self.data.rendered
         if self.data.photos or self.data.maps or (rendered and rendered.recipe):
             raise ValueError(
-                "a large backbone learns from rendered sets and pairs; photos, maps and live scenes give squares"
+                "a LoRA is trained on rendered sets and pairs only; remove photos, maps and rendered.recipe"
             )
         if "T" not in self.panels or len(set(self.panels)) < len(self.panels):
-            raise ValueError(f"the panels are {list(self.panels)}: each once, and T among them")
+            raise ValueError(f"panels is {list(self.panels)}; each panel may occur once, and T is required")
         if self.quantise and self.backbone.startswith(TINY):
-            raise ValueError("a toy twin is never quantised")
-        if self.prompt not in PROMPTS and not self.prompt.endswith(ENCODED):
-            raise ValueError(f"prompt is {self.prompt!r}: one of {', '.join(PROMPTS)}, or a {ENCODED} file")
+            raise ValueError("a toy backbone (tiny:) cannot be quantised; remove quantise")
+        if self.prompt not in PROMPTS and not self.prompt.endswith(ENCODED_SUFFIX):
+            raise ValueError(
+                f"prompt is {self.prompt!r}: one of {', '.join(PROMPTS)}, or a {ENCODED_SUFFIX} file"
+            )
         if not any(self.panel_weights.get(panel, 1) for panel in self.panels):
-            raise ValueError("panel_weights leaves nothing to learn: every panel counts 0")
+            raise ValueError("panel_weights gives every panel the weight 0; at least one must be above 0")
         return self
 
 
 AnyRecipe = TypeVar("AnyRecipe", bound=TrainingRecipe)
 
 
-def _divide(samples: int, name: str, share: float) -> int:
-    """The share's number of samples; a share between 0 and 1 must leave some on both sides."""
+def _share_of(samples: int, name: str, share: float) -> int:
+    """The number of samples of a share. A share between 0 and 1 must give at least one, and leave at least one."""
     part = round(samples * share)
     if samples and 0 < share < 1 and part in (0, samples):
-        raise ValueError(f"{name} = {share:g} gives {part} of {samples} samples, not some of them")
+        raise ValueError(
+            f"{name} = {share:g} gives {part} of {samples} samples; raise batch or change the share"
+        )
     return part
 
 
 def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
-    """Reads and checks a recipe; one that names a backbone is a large one's.
+    """Reads and checks a recipe, and resolves its paths that are relative to the file.
+
+    Returns: a LoraRecipe if the file has the key `backbone`, else a CompactRecipe.
 
     Raises:
-        RecipeError: missing, not TOML, or with values that are missing, unknown or impossible.
+        RecipeError: the file is missing or not TOML, or keys are missing, unknown or have impossible values.
     """
-    recipe = read_toml(_kind(path), path, compare=_COMPARE)
+    recipe = _read_unresolved(path)
     changes: dict[str, Any] = {}
     if isinstance(recipe, CompactRecipe):
         changes["start_from"] = tuple(path.parent / start for start in recipe.start_from)
-    if isinstance(recipe, LoraRecipe) and recipe.prompt.endswith(ENCODED):
+    if isinstance(recipe, LoraRecipe) and recipe.prompt.endswith(ENCODED_SUFFIX):
         changes["prompt"] = str(path.parent / recipe.prompt)
     rendered = recipe.data.rendered
     if rendered and rendered.recipe and rendered.recipe.endswith(".toml"):
@@ -274,57 +235,81 @@ def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
     return recipe.model_copy(update=changes)
 
 
-def _kind(path: Path) -> type[CompactRecipe] | type[LoraRecipe]:
-    with suppress(OSError, ValueError):  # which read_toml tells
+def read_template(name: str) -> CompactRecipe | LoraRecipe:
+    """A packaged recipe to start from (one of TEMPLATES), or a recipe file. Paths stay as they are written.
+
+    Raises:
+        RecipeError: the name is unknown, or what `read_recipe` raises.
+    """
+    if name in TEMPLATES:
+        return _read_unresolved(_TEMPLATE_FOLDER / f"{name}.toml")
+    if not name.endswith(".toml"):
+        raise RecipeError(
+            f"there is no training recipe {name!r}",
+            f"the packaged recipes are {', '.join(TEMPLATES)}",
+            "name one of them, or a .toml file",
+        )
+    return _read_unresolved(Path(name))
+
+
+def _read_unresolved(path: Path) -> CompactRecipe | LoraRecipe:
+    return read_toml(_recipe_class(path), path, compare=_COMPARE)
+
+
+def _recipe_class(path: Path) -> type[CompactRecipe] | type[LoraRecipe]:
+    with suppress(OSError, ValueError):  # read_toml reports these errors
         if "backbone" in tomllib.loads(path.read_text("utf-8")):
             return LoraRecipe
     return CompactRecipe
 
 
-def with_value(recipe: AnyRecipe, dotted: str, value: object) -> AnyRecipe:
-    """The recipe with one value changed, named as in `data.rendered.mixing`, and checked again as a whole.
+def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
+    """A copy of the recipe with one value changed, checked again as a whole.
+
+    Args:
+        recipe: the recipe to change.
+        key_path: the key with its tables, such as "data.rendered.mixing".
+        value: the new value.
 
     Raises:
-        RecipeError: the recipe has no place of this name, or the value is impossible there.
+        RecipeError: the recipe has no such key, or the value is impossible there.
     """
-    known = list(_names(recipe))
-    if dotted not in known:
-        close = get_close_matches(dotted, known, n=1)
+    if key_path not in _key_paths(recipe):
+        close = similar_key(type(recipe), key_path.split("."))
         raise RecipeError(
-            f"the recipe has no {dotted}",
-            "the name of a value, with the names of its tables and dots before it, such as data.pairs_share",
-            f"did you mean {close[0]}?" if close else "look for it in the recipe",
+            f"the recipe has no key {key_path}",
+            "expected a key with its tables, such as data.pairs_share",
+            f"did you mean {close}?" if close else f"see {_COMPARE}",
         )
-    table = place = recipe.model_dump(exclude_unset=True)
-    *way, last = dotted.split(".")
-    for name in way:
-        place = place.setdefault(name, {})
-    place[last] = value
-    try:
-        return type(recipe).model_validate(table)
-    except ValidationError as error:
-        raise wrong_value(f"the recipe with {dotted} = {value!r}", error, _COMPARE) from error
+    values = target = recipe.model_dump(exclude_unset=True)
+    *tables, last = key_path.split(".")
+    for name in tables:
+        target = target.setdefault(name, {})
+    target[last] = value
+    owner = f"the recipe with {key_path} = {value!r}"
+    return validated(type(recipe), values, owner=owner, compare=_COMPARE)
 
 
-def _names(values: FrozenModel, before: str = "") -> Iterator[str]:
+def _key_paths(values: FrozenModel, prefix: str = "") -> Iterator[str]:
+    """The paths of all keys and tables that the recipe has; those of an optional table only if it is set."""
     for name in type(values).model_fields:
-        yield before + name
-        inside = getattr(values, name)
-        if isinstance(inside, FrozenModel):
-            yield from _names(inside, f"{before}{name}.")
+        yield prefix + name
+        inner = getattr(values, name)
+        if isinstance(inner, FrozenModel):
+            yield from _key_paths(inner, f"{prefix}{name}.")
 
 
 def data_folder() -> Path:
-    """Where recipes find their data: `BREWSTER_DATA`.
+    """The folder that the environment variable BREWSTER_DATA names.
 
     Raises:
-        RecipeError: the variable is unset or names no folder.
+        RecipeError: the variable is not set, or the folder does not exist.
     """
     folder = os.environ.get("BREWSTER_DATA", "")
     if not Path(folder or "/nowhere").is_dir():
         raise RecipeError(
             f"BREWSTER_DATA is {folder!r}",
-            "the folder that a recipe's paths start from",
+            "expected the folder that the paths in a recipe are relative to",
             "export BREWSTER_DATA=/path/to/data",
         )
     return Path(folder)

@@ -17,11 +17,12 @@ from brewster.environments.assets import Assets
 from brewster.environments.catalog import read_catalog
 from brewster.errors import RecipeError
 from brewster.scene.recipe import SceneRecipe, read_scene_recipe
+from brewster.training.data.data_recipe import DataRecipe, RenderedRecipe
 from brewster.training.data.image_loading import read_maps, read_pairs, read_photos, source_weights
 from brewster.training.data.mixtures import InterleavedStream, Mixtures, Pairs, Stream, TrainingBatch
 from brewster.training.data.online import OnlineRendered
 from brewster.training.data.rendered import CachedRendered, RenderedSets
-from brewster.training.recipe import CompactRecipe, DataRecipe, RenderedRecipe, data_folder
+from brewster.training.recipe import CompactRecipe, data_folder
 
 
 def open_stream(recipe: CompactRecipe, device: torch.device | str = "cpu") -> Stream:
@@ -96,15 +97,15 @@ def _interleave(share: float, first: Callable[[], Stream], second: Callable[[], 
 
 def _open_mixtures(recipe: CompactRecipe) -> Stream:
     data = recipe.data
-    if data.is_none:
+    if data.is_empty:
         return _empty_stream
     folders = resolve_folders(data.photos)
     return Mixtures(
-        read_photos(folders, data.never_trained_on),
-        read_maps(resolve_folders(data.maps), data.never_trained_on),
+        read_photos(folders, data.excluded_files),
+        read_maps(resolve_folders(data.maps), data.excluded_files),
         recipe.mix,
         seed=recipe.seed,
-        weights=source_weights(folders, data.never_trained_on),
+        weights=source_weights(folders, data.excluded_files),
     )
 
 
@@ -132,7 +133,7 @@ def _open_online(
     recipe: CompactRecipe, rendered: RenderedRecipe, device: torch.device | str
 ) -> OnlineRendered:
     maps, photos = resolve_folders(rendered.maps), resolve_folders(rendered.photos)
-    catalog, refused = read_catalog(maps, photos, recipe.data.never_trained_on)
+    catalog, refused = read_catalog(maps, photos, recipe.data.excluded_files)
     if (
         refused
     ):  # a warning in a log of hours would be overlooked, and the run would train on less data than listed

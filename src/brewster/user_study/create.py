@@ -19,7 +19,7 @@ from typing import Final, final
 
 import brewster
 from brewster.errors import BrewsterError, PhotoError, TargetError
-from brewster.files import write_atomically
+from brewster.files import atomic_path, write_atomically
 from brewster.photo import Photo
 from brewster.user_study.degrade import degrade
 from brewster.user_study.folders import Key, find_pictures, shorten_list

@@ -1,7 +1,7 @@
-"""Textured rectangles around a viewer, and the lat-long map that shows them: the kit of the procedural worlds.
+"""Textured rectangles around a viewer, and their rendering as a lat-long map. Base of the procedural environments.
 
-A world paints each surface flat on a `Canvas`, hangs it in space as a `Quad` with its light baked in, and
-`render` casts rays at all of them. Lengths are metres, the viewer is the origin, y is up, light is linear.
+An environment paints each surface on a flat `Canvas` and places it in space as a `Quad` with baked lighting. `render`
+casts rays at all quads. Lengths are in metres, the viewer is at the origin, y is up, light is linear.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Colour: TypeAlias = Sequence[float] | Floats
 Box: TypeAlias = tuple[float, float, float, float]
 """Left, top, width and height in metres from the upper left corner of a canvas."""
 Lighting: TypeAlias = Callable[[Floats, Floats], Floats]
-"""Light on points (h, w, 3) of a surface with a unit normal (3,): irradiance / pi, (h, w, 3)."""
+"""(points (h, w, 3), unit normal (3,)) -> irradiance / pi at the points, (h, w, 3)."""
 
 _STRIP_ROWS: Final = 32
 
@@ -32,20 +32,20 @@ def vector(*values: float) -> Floats:
 
 
 def unit(values: Floats) -> Floats:
-    """The same direction, (..., 3), with length 1."""
+    """The vectors (..., 3), normalised to length 1."""
     directed: Floats = values / np.linalg.norm(values, axis=-1, keepdims=True)
     return directed
 
 
 def tint(random: Generator, value: float, saturation: float) -> Floats:
-    """A colour (3,) of roughly this brightness: mostly warm, often blue, sometimes of any hue."""
+    """A random colour (3,) of about this brightness: half of them warm, a third blue, the others of any hue."""
     hues = random.normal(0.92, 0.05), random.normal(0.38, 0.05), random.uniform()
     phase = hues[random.choice(3, p=(0.5, 0.3, 0.2))] + vector(0, 1 / 3, 2 / 3)
     return np.clip(value * (1 + saturation * np.cos(2 * np.pi * phase)), 0.01, 1).astype(np.float32)
 
 
 def resize(picture: Floats, height: int, width: int, *, wrap: bool = False) -> Floats:
-    """Bilinear interpolation of (h, w, ...) between texel centres; no smoothing when it shrinks."""
+    """Bilinear interpolation of (h, w, ...) between texel centres, without a low-pass filter when it shrinks."""
     return _stretch(_stretch(picture, height, 0, wrap), width, 1, wrap)
 
 
@@ -66,7 +66,7 @@ def _stretch(picture: Floats, size: int, axis: int, wrap: bool) -> Floats:
 
 
 def fractal(random: Generator, height: int, width: int, cells: float = 4, octaves: int = 5) -> Floats:
-    """Tileable noise (height, width) at several scales, mean 0, deviation 1; `cells` span the height."""
+    """Tileable fractal noise (height, width) of mean 0 and standard deviation 1; `cells` span the height."""
     total = np.zeros((1, 1), np.float32)
     for octave in range(octaves):
         rows = max(1, round(cells * 2**octave))
@@ -80,7 +80,7 @@ def fractal(random: Generator, height: int, width: int, cells: float = 4, octave
 
 
 def lettering(random: Generator, count: int, height: int, width: int) -> Floats:
-    """The mask (height, width) of a line of `count` letter-like glyphs with gaps between words."""
+    """The mask (height, width) of a line of `count` random glyphs with gaps between words."""
     glyphs = np.zeros((count, 9, 6), np.float32)
     bars = random.uniform(size=(count, 3)) < 0.6
     stems = random.uniform(size=(count, 4)) < 0.6
@@ -96,7 +96,7 @@ def lettering(random: Generator, count: int, height: int, width: int) -> Floats:
 
 @dataclass
 class Canvas:
-    """A surface seen flat: what is painted on it shows radiance = colour * (light + glow) where opaque."""
+    """A flat surface to paint on. Where it is opaque, its radiance is colour * (light + glow)."""
 
     width: float
     height: float
@@ -112,7 +112,7 @@ class Canvas:
         self.pixels[:] = (*self.colour, 1, 0)
 
     def area(self, box: Box) -> Floats:
-        """The texels (h, w, 5) of a box, as a view to paint on; empty where it leaves the canvas."""
+        """A view of the texels (h, w, 5) of a box, cropped to the canvas."""
         left, top, width, height = (self.density * side for side in box)
         rows = slice(max(0, round(top)), max(0, round(top + height)))
         return self.pixels[rows, max(0, round(left)) : max(0, round(left + width))]
@@ -122,28 +122,28 @@ class Canvas:
         self.area(box)[:] = (*colour, 1, glow)
 
     def paste(self, picture: Floats, box: Box, *, glow: float = 0) -> None:
-        """Paints a picture (h, w, 3), stretched into the box."""
+        """Paints a picture (h, w, 3), scaled to the box."""
         area = self.area(box)
         area[..., :3] = resize(picture, *area.shape[:2])
         area[..., 3:] = (1, glow)
 
     def write(self, random: Generator, box: Box, colour: Colour, *, glow: float = 0) -> None:
-        """Writes one line of letter-like glyphs that fills the box."""
+        """Writes one line of random glyphs that fills the box."""
         area = self.area(box)
         if min(area.shape[:2]) > 2:
             count = max(1, round(box[2] / box[3] * 1.3))
             mask = lettering(random, count, *area.shape[:2])[..., None]
             area += (np.array((*colour, 1, glow), np.float32) - area) * mask
 
-    def roughen(self, random: Generator, amount: float, cells: float = 6, octaves: int = 6) -> None:
-        """Weathers the colours by fractal noise; `amount` is its relative deviation."""
+    def add_noise(self, random: Generator, amount: float, cells: float = 6, octaves: int = 6) -> None:
+        """Multiplies the colours by fractal noise of relative standard deviation `amount`."""
         height, width = self.pixels.shape[:2]
         noise = fractal(random, height, width, cells, octaves)
         self.pixels[..., :3] *= np.clip(1 + amount * noise, 0.2, 2)[..., None]
 
 
 class PaintingTexture:
-    """A picture (h, w, c) and its halvings, looked up at any scale."""
+    """A mipmap of a picture (h, w, c)."""
 
     def __init__(self, picture: Floats) -> None:
         levels = [picture]
@@ -155,7 +155,7 @@ class PaintingTexture:
         self._starts = np.cumsum([0, *(self._rows * self._columns)[:-1]], dtype=np.int32)
 
     def sample(self, across: Floats, down: Floats, footprint: Floats) -> Floats:
-        """Texels (n, c) at places 0..1 that repeat; `footprint` is the span of a sample in finest texels."""
+        """Texels (n, c) at coordinates that repeat with period 1; `footprint` is the size of a sample in finest texels."""
         level = np.log2(np.maximum(footprint, 1)).astype(np.int32)
         level = np.minimum(level, len(self._starts) - 1)
         rows, columns = self._rows[level], self._columns[level]
@@ -166,7 +166,7 @@ class PaintingTexture:
 
 
 class Quad:
-    """A canvas hung in space between `corner`, `corner + across` and `corner + down`, lit once and for all."""
+    """A canvas in space, spanned by `across` and `down` from `corner`, with baked lighting."""
 
     def __init__(self, canvas: Canvas, corner: Floats, sides: tuple[Floats, Floats], light: Lighting) -> None:
         across, down = sides
@@ -179,7 +179,7 @@ class Quad:
 
     @cached_property
     def forms(self) -> Floats:
-        """The matrix (3, 3) that takes a direction to its place (across, down, 1) over the distance there."""
+        """The matrix (3, 3) from a direction to its coordinates (across, down, 1) divided by the distance."""
         corner, across, down = self._outline
         return np.linalg.inv(np.stack([across, down, corner], 1).astype(np.float64)).astype(np.float32)
 
@@ -188,7 +188,7 @@ class Quad:
         """Radiance and opacity (h, w, 4)."""
         corner, across, down = self._outline
         pixels = self._canvas.pixels
-        del self._canvas  # the largest thing in memory, and from here on of no use
+        del self._canvas  # large, and not used from here on
         fine = 8 / (1 + self.distance / 6)
         lattice = [int(np.clip(np.linalg.norm(side) * fine, 4, 128)) for side in (down, across)]
         rows, columns = ((np.arange(count, dtype=np.float32) + 0.5) / count for count in lattice)
@@ -199,7 +199,7 @@ class Quad:
 
     @cached_property
     def bounds(self) -> tuple[float, float, float, float]:
-        """Least and largest azimuth and polar angle that it spans, in radians."""
+        """Smallest and largest azimuth, smallest and largest polar angle, in radians."""
         corner, across, down = self._outline
         step = np.linspace(0, 1, 65)[:, None]
         path = [corner + step * across, corner + across + step * down]
@@ -207,14 +207,14 @@ class Quad:
         x, y, z = np.concatenate(path).T
         turns = np.unwrap(np.arctan2(x, -z))
         polar = np.arctan2(np.hypot(x, z), y)
-        if abs(turns[-1] - turns[0]) > 3:  # the outline runs around a pole
+        if abs(turns[-1] - turns[0]) > 3:  # the outline encloses a pole
             return 0, 2 * np.pi, *((0, polar.max()) if y[0] > 0 else (polar.min(), np.pi))
         return turns.min(), turns.max(), polar.min() - 0.03, polar.max() + 0.03
 
 
 @dataclass(frozen=True)
 class Glow:
-    """A small round light: its angular radius is far below what a map resolves, its energy is not."""
+    """A small round light, smaller than a texel of the map. Its energy is preserved."""
 
     position: Floats
     radius: float
@@ -223,28 +223,31 @@ class Glow:
 
 
 @dataclass(frozen=True)
-class ProceduralWorld:
-    """What surrounds the viewer."""
+class ProceduralEnvironment:
+    """Everything around the viewer."""
 
     quads: Sequence[Quad]
     glows: Sequence[Glow]
     sky: Callable[[Floats, float], Floats]
-    """Radiance (h, w, 3) in unit directions (h, w, 3) where no surface is; the texel's angle comes second."""
+    """(unit directions (h, w, 3), angle of a texel) -> radiance (h, w, 3), where there is no surface."""
     turn: float
-    """Azimuth of the world's -z axis in the map, in radians."""
+    """Azimuth of the -z axis of the environment in the map, in radians."""
 
 
-def render(world: ProceduralWorld, height: int) -> NDArray[np.float32]:
-    """The lat-long map (height, 2 height, 3) of a world, at four rays a texel, in strips that fit a cache."""
+def render(world: ProceduralEnvironment, height: int) -> NDArray[np.float32]:
+    """The lat-long map (height, 2 height, 3) of an environment, with four rays per texel.
+
+    It is rendered in strips that fit into the processor cache.
+    """
     strips = [_strip(world, height, top) for top in range(0, height, _STRIP_ROWS)]
     picture: NDArray[np.float32] = np.concatenate(strips).astype(np.float32)
     for glow in world.glows:
-        if not _hidden(world, glow.position):
+        if not _is_occluded(world, glow.position):
             _add_glow(picture, glow, world.turn)
     return picture
 
 
-def _strip(world: ProceduralWorld, height: int, top: int) -> Floats:
+def _strip(world: ProceduralEnvironment, height: int, top: int) -> Floats:
     rows = min(_STRIP_ROWS, height - top)
     polar = (np.arange(2 * top, 2 * (top + rows)) + 0.5) * (np.pi / (2 * height))
     closeness = np.zeros((2 * rows, 4 * height), np.float32)
@@ -255,7 +258,7 @@ def _strip(world: ProceduralWorld, height: int, top: int) -> Floats:
         if inside.size:
             chosen = slice(inside[0], inside[-1] + 1)
             for columns in _columns(quad, world.turn, 4 * height):
-                _cast(quad, world.turn, polar[chosen], (columns, closeness[chosen], colours[chosen]))
+                _rasterise(quad, world.turn, polar[chosen], (columns, closeness[chosen], colours[chosen]))
     blocks = colours.reshape(rows, 2, 2 * height, 2, 3)
     solid = blocks[:, 0, :, 0] + blocks[:, 0, :, 1] + blocks[:, 1, :, 0] + blocks[:, 1, :, 1]
     free = (closeness == 0).reshape(rows, 2, 2 * height, 2).mean((1, 3), dtype=np.float32)[..., None]
@@ -266,7 +269,7 @@ def _strip(world: ProceduralWorld, height: int, top: int) -> Floats:
 
 
 def directions(height: int, turn: float, top: int, rows: int) -> Floats:
-    """Unit directions (rows, 2 height, 3), in a world turned by `turn`, of the texel centres from row `top`."""
+    """Unit directions (rows, 2 height, 3) of texel centres from row `top`, in an environment rotated by `turn`."""
     polar = (np.arange(top, top + rows) + 0.5)[:, None] * (np.pi / height)
     azimuth = (np.arange(2 * height) + 0.5) * (np.pi / height) - turn
     parts = np.sin(polar) * np.sin(azimuth), np.cos(polar) + 0 * azimuth, -np.sin(polar) * np.cos(azimuth)
@@ -274,7 +277,7 @@ def directions(height: int, turn: float, top: int, rows: int) -> Floats:
 
 
 def _columns(quad: Quad, turn: float, width: int) -> list[slice]:
-    """The columns of samples that a quad may touch: one range, or two where it crosses the seam."""
+    """The columns that a quad may cover: one range, or two where it crosses the seam of the map."""
     low, high = ((angle + turn) * width / (2 * np.pi) for angle in quad.bounds[:2])
     first, count = int(np.floor(low)) % width, int(np.ceil(high) - np.floor(low)) + 1
     if count >= width:
@@ -285,8 +288,8 @@ def _columns(quad: Quad, turn: float, width: int) -> list[slice]:
     ]
 
 
-def _cast(quad: Quad, turn: float, polar: Floats, target: tuple[slice, Floats, Floats]) -> None:
-    """Draws a quad on the samples of some rows and columns wherever it is closer than what is there."""
+def _rasterise(quad: Quad, turn: float, polar: Floats, target: tuple[slice, Floats, Floats]) -> None:
+    """Draws a quad on some rows and columns, where it is closer than the surfaces drawn before."""
     columns, closeness, colours = target[0], target[1][:, target[0]], target[2][:, target[0]]
     width = target[1].shape[1]
     azimuth = (np.arange(columns.start, columns.stop) + 0.5) * (2 * np.pi / width) - turn
@@ -299,7 +302,7 @@ def _cast(quad: Quad, turn: float, polar: Floats, target: tuple[slice, Floats, F
     across, down, near = across[hit], down[hit], near[hit]
     if not near.size:
         return
-    # A ray's spot grows with distance, and once more where the surface is seen at a flat angle.
+    # The footprint of a ray grows with distance, and with the angle to the normal of the surface.
     spot = quad.density * 2 * np.pi / width / near * np.maximum(near * quad.distance, 0.01) ** -0.6
     texels = quad.texture.sample(across / near, down / near, spot)
     opaque = texels[:, 3] > 0.5
@@ -309,7 +312,7 @@ def _cast(quad: Quad, turn: float, polar: Floats, target: tuple[slice, Floats, F
     colours[hit] = texels[:, :3]
 
 
-def _hidden(world: ProceduralWorld, position: Floats) -> bool:
+def _is_occluded(world: ProceduralEnvironment, position: Floats) -> bool:
     for quad in world.quads:
         across, down, near = quad.forms @ position
         if near > 1.05 and 0 <= across < near and 0 <= down < near:
@@ -320,7 +323,7 @@ def _hidden(world: ProceduralWorld, position: Floats) -> bool:
 
 
 def _add_glow(picture: Floats, glow: Glow, turn: float) -> None:
-    """Adds a disc of at least three texels that sends exactly the glow's energy."""
+    """Adds a disc at least three texels wide with exactly the energy of the glow."""
     height, texel = picture.shape[0], np.pi / picture.shape[0]
     distance = float(np.linalg.norm(glow.position))
     aim, radius = glow.position / distance, glow.radius / distance

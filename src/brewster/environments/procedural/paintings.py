@@ -1,8 +1,8 @@
-"""Invented pictures: paintings, posters, portraits, cut-out trees and people, and the finishes of a room.
+"""Procedural pictures: paintings, posters, portraits, trees and people as cut-outs, and wall and floor finishes.
 
     picture = painting(seed=7, width=768, height=512)
 
-They stand for what hangs on walls and lies behind glass: rich in edges and texture at several scales.
+They are used as pictures on walls and behind glass, with edges and texture at several scales.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from brewster.environments.procedural.canvas import Canvas, Floats, fractal, let
 
 
 def painting(seed: int, width: int, height: int) -> NDArray[np.float32]:
-    """A picture (height, width, 3), linear light in 0..1, of a kind that the seed chooses."""
+    """A picture (height, width, 3) in linear light, 0..1. The seed chooses its kind."""
     random = Generator(PCG64(seed))
     kind = (_abstract, _poster, _landscape, _portrait)[random.integers(4)]
     picture = kind(random, height, width)
@@ -25,26 +25,26 @@ def painting(seed: int, width: int, height: int) -> NDArray[np.float32]:
 
 
 def _grid(height: int, width: int) -> tuple[Floats, Floats]:
-    """Coordinates (1, w) and (h, 1) of texel centres, in heights from the middle; y points down."""
+    """Coordinates (1, w) and (h, 1) of texel centres relative to the middle, in heights; y points down."""
     x = ((np.arange(width, dtype=np.float32) + 0.5) - width / 2) / height
     y = (np.arange(height, dtype=np.float32) + 0.5) / height - 0.5
     return x[None, :], y[:, None]
 
 
 def _inside(distance: Floats, height: int) -> Floats:
-    """The coverage (h, w, 1) of what lies below distance 0, smooth over about a texel."""
+    """The coverage (h, w, 1) of a signed distance, antialiased over about a texel."""
     result: Floats = np.clip(0.5 - distance * (0.7 * height), 0, 1)[..., None]
     return result
 
 
 def _ellipse(grid: tuple[Floats, Floats], centre: tuple[float, float], radii: tuple[float, float]) -> Floats:
-    """About the distance (h, w) to an ellipse, negative inside."""
+    """The approximate signed distance (h, w) to an ellipse, negative inside."""
     x, y = (grid[0] - centre[0]) / radii[0], (grid[1] - centre[1]) / radii[1]
     result: Floats = (np.sqrt(x * x + y * y) - 1) * min(radii)
     return result
 
 
-def _blob(
+def _paint_ellipse(
     picture: Floats,
     centre: tuple[float, float],
     radii: tuple[float, float],
@@ -60,18 +60,18 @@ def _blob(
         part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
         mask = _inside(_ellipse((x[:, part[1]], y[part[0]]), centre, radii), height)
         if shade is None:
-            _cover(picture[part], 0.5 * mask, colour)
+            _blend(picture[part], 0.5 * mask, colour)
         else:
-            _cover(picture[part], mask, colour * shade[part][..., None])
+            _blend(picture[part], mask, colour * shade[part][..., None])
 
 
-def _cover(picture: Floats, mask: Floats, colour: Floats) -> None:
-    """Lays a colour (..., 3) over a picture where the mask (h, w, 1) says."""
+def _blend(picture: Floats, mask: Floats, colour: Floats) -> None:
+    """Blends a colour (..., 3) into a picture by the mask (h, w, 1)."""
     picture += (colour - picture) * mask
 
 
 def _abstract(random: Generator, height: int, width: int) -> Floats:
-    """Brush strokes over a mottled ground, coarse ones first."""
+    """Brush strokes on a mottled background, from coarse to fine."""
     palette = [tint(random, random.uniform(0.05, 0.6), random.uniform(0.2, 1)) for _ in range(6)]
     mottle = np.clip(0.5 + 0.3 * fractal(random, height, width, 3), 0, 1)[..., None]
     picture = palette[0] + (palette[1] - palette[0]) * mottle
@@ -82,7 +82,7 @@ def _abstract(random: Generator, height: int, width: int) -> Floats:
 
 
 def _stroke(random: Generator, picture: Floats, size: float, paint: tuple[Floats, Floats]) -> None:
-    """One bent stroke, `size` heights long, of a colour streaked by bristles."""
+    """One curved stroke, `size` heights long, with streaks of bristles."""
     height, width = picture.shape[:2]
     colour, bristles = paint
     reach = max(4, round(size * height * random.uniform(0.6, 1.2)))
@@ -95,7 +95,7 @@ def _stroke(random: Generator, picture: Floats, size: float, paint: tuple[Floats
     streak = bristles[(aside * 400).astype(np.int32) % 256, (along * 30).astype(np.int32) % 256]
     ragged = thick * np.clip((0.42 + 0.06 * streak - np.abs(along)) * 20, 0, 1)
     mask = np.clip((ragged - np.abs(aside)) * reach + 0.5, 0, 1) * np.clip(streak, 0.2, 1)
-    _cover(part, mask[..., None], colour * streak[..., None])
+    _blend(part, mask[..., None], colour * streak[..., None])
 
 
 def _poster(random: Generator, height: int, width: int) -> Floats:
@@ -107,34 +107,34 @@ def _poster(random: Generator, height: int, width: int) -> Floats:
     slope = grid[0] * np.cos(angle) + grid[1] * np.sin(angle)
     for ink in inks:
         band = np.abs(slope - random.uniform(-0.6, 0.6)) - random.uniform(0.02, 0.15)
-        _cover(picture, _inside(band, height), ink)
+        _blend(picture, _inside(band, height), ink)
     for _ in range(random.integers(1, 6)):
         place = random.uniform(-0.45, 0.45) * width / height, random.uniform(-0.3, 0.4)
         radius = random.uniform(0.05, 0.3)
         disc = _ellipse(grid, place, (radius, radius))
         if random.uniform() < 0.5:
             disc = np.maximum(disc, np.abs(np.mod(slope * random.uniform(12, 30), 1) - 0.5) * 0.04 - 0.01)
-        _cover(picture, _inside(disc, height), inks[random.integers(4)])
+        _blend(picture, _inside(disc, height), inks[random.integers(4)])
     ink = vector(0.9, 0.88, 0.8) if ground.mean() < 0.25 else vector(0.02, 0.02, 0.03)
-    _print(random, picture, (0.05, random.uniform(0.1, 0.2), int(random.integers(4, 11))), ink)
+    _print_line(random, picture, (0.05, random.uniform(0.1, 0.2), int(random.integers(4, 11))), ink)
     top = random.uniform(0.6, 0.75)
     for line in range(random.integers(2, 7)):
-        _print(random, picture, (top + 0.05 * line, 0.03, int(random.integers(18, 36))), ink)
+        _print_line(random, picture, (top + 0.05 * line, 0.03, int(random.integers(18, 36))), ink)
     return picture
 
 
-def _print(random: Generator, picture: Floats, line: tuple[float, float, int], ink: Floats) -> None:
+def _print_line(random: Generator, picture: Floats, line: tuple[float, float, int], ink: Floats) -> None:
     """Prints a line at (top, size) in heights, of a number of glyphs, as wide as the margins allow."""
     height, width = picture.shape[:2]
     top, tall = round(line[0] * height), max(2, round(line[1] * height))
     wide = min(round(width * 0.9), max(4, round(tall * 0.75 * line[2])))
     part = picture[top : top + tall, width // 20 :][:, :wide]
     if part.size:
-        _cover(part, lettering(random, line[2], *part.shape[:2])[..., None], ink)
+        _blend(part, lettering(random, line[2], *part.shape[:2])[..., None], ink)
 
 
 def _landscape(random: Generator, height: int, width: int) -> Floats:
-    """Sky, a sun, ranges of hills that fade with distance, trees in front, sometimes water."""
+    """Sky, a sun, ranges of hills that fade with distance, and trees in front."""
     x, y = _grid(height, width)
     zenith, haze = (
         tint(random, 0.3, 0.5) * vector(0.6, 0.9, 1.5),
@@ -142,9 +142,9 @@ def _landscape(random: Generator, height: int, width: int) -> Floats:
     )
     picture: Floats = zenith + (haze - zenith) * np.clip(y * 1.6 + 0.7 + 0 * x, 0, 1)[..., None] ** 1.5
     clouds = np.clip(fractal(random, height, width, 4, 7) * 0.5 - 0.1, 0, 0.9) * np.clip(0.3 - y, 0, 1)
-    _cover(picture, clouds[..., None] * 1.5, vector(0.95, 0.92, 0.9))
+    _blend(picture, clouds[..., None] * 1.5, vector(0.95, 0.92, 0.9))
     sun = random.uniform(-0.5, 0.5), random.uniform(-0.4, 0)
-    _cover(picture, _inside(_ellipse((x, y), sun, (0.04, 0.04)), height), vector(1, 0.95, 0.8))
+    _blend(picture, _inside(_ellipse((x, y), sun, (0.04, 0.04)), height), vector(1, 0.95, 0.8))
     ground = tint(random, 0.12, 0.4) * vector(0.9, 1.2, 0.6)
     texture = 1 + 0.35 * fractal(random, height, width, 50, 4)
     layers = random.integers(4, 7)
@@ -155,12 +155,12 @@ def _landscape(random: Generator, height: int, width: int) -> Floats:
             ridge = ridge - np.abs(_ridge(random, width, 60)) * 0.02 * near
         colour = haze * (1 - near) * 0.6 + ground * (0.4 + 0.6 * near)
         shade = (texture * np.clip(1.2 - (y - ridge) * 1.5, 0.3, 1.2))[..., None]
-        _cover(picture, _inside(ridge - y, height), colour * (1 + (shade - 1) * near))
+        _blend(picture, _inside(ridge - y, height), colour * (1 + (shade - 1) * near))
     return picture
 
 
 def _ridge(random: Generator, width: int, bumps: int = 3) -> Floats:
-    """A line of noise (width,) with this many bumps and finer ones on them."""
+    """Fractal noise (width,) with this number of bumps at the coarsest scale."""
     line = np.zeros(width, np.float32)
     for octave in range(6):
         line += resize(random.standard_normal((1, bumps * 2**octave), np.float32), 1, width)[0] * 0.5**octave
@@ -168,7 +168,7 @@ def _ridge(random: Generator, width: int, bumps: int = 3) -> Floats:
 
 
 def _portrait(random: Generator, height: int, width: int) -> Floats:
-    """A person's head and shoulders before lights out of focus."""
+    """Head and shoulders of a person, with defocused lights in the background."""
     grid = _grid(height, width)
     ground = tint(random, random.uniform(0.05, 0.4), random.uniform(0.1, 0.6))
     picture = ground * np.clip(1 + 0.35 * fractal(random, height, width, 2, 4), 0.2, 3)[..., None]
@@ -176,7 +176,7 @@ def _portrait(random: Generator, height: int, width: int) -> Floats:
         place = random.uniform(-0.5, 0.5) * width / height, random.uniform(-0.5, 0.5)
         radius = random.uniform(0.02, 0.09)
         colour = tint(random, 0.6, 0.6)
-        _blob(picture, place, (radius, radius), colour)
+        _paint_ellipse(picture, place, (radius, radius), colour)
     skin = vector(0.62, 0.36, 0.25) * random.uniform(0.2, 1.1)
     hair, cloth = (
         vector(0.4, 0.25, 0.14) * random.uniform(0.05, 1.4),
@@ -204,12 +204,12 @@ def _portrait(random: Generator, height: int, width: int) -> Floats:
         parts.append(((side, -0.02), (0.011, 0.011), vector(0.02, 0.02, 0.03), light))
         parts.append(((side, -0.055), (0.036, 0.007), hair * 0.7, strands))
     for (right, down), radii, colour, shade in parts:
-        _blob(picture, (middle + right, top + down), radii, colour, shade)
+        _paint_ellipse(picture, (middle + right, top + down), radii, colour, shade)
     return picture
 
 
 def tree(random: Generator, height: float, density: float) -> Canvas:
-    """A tree cut out of its surroundings, `height` metres tall, as wide as tall."""
+    """A cut-out tree, `height` metres tall and wide."""
     canvas = Canvas(height, height, density)
     size = canvas.pixels.shape[0]
     x, y = _grid(size, size)
@@ -231,7 +231,7 @@ def tree(random: Generator, height: float, density: float) -> Canvas:
 
 
 def figure(random: Generator, height: float, density: float) -> Canvas:
-    """A standing person cut out of the surroundings, `height` metres tall."""
+    """A cut-out standing person, `height` metres tall."""
     canvas = Canvas(height * 0.4, height, density)
     rows, columns = canvas.pixels.shape[:2]
     grid = _grid(rows, columns)
@@ -257,7 +257,7 @@ def figure(random: Generator, height: float, density: float) -> Canvas:
 
 
 def outside(random: Generator) -> Floats:
-    """What a window shows (24, 24, 3): sky over roofs and trees, out of focus, about 1 at its brightest."""
+    """The defocused view from a window (24, 24, 3): sky, roofs and trees, about 1 at its brightest."""
     sky = vector(0.6, 0.8, 1) if random.uniform() < 0.6 else vector(0.95, 0.97, 1)
     down = np.linspace(0, 1, 24, dtype=np.float32)[:, None, None]
     view = sky + (vector(1, 1, 1) - sky) * down + np.zeros((24, 24, 1), np.float32)
@@ -272,7 +272,7 @@ def outside(random: Generator) -> Floats:
 
 
 def wallpaper(random: Generator, canvas: Canvas) -> None:
-    """Plaster, stripes, bricks or panels, above a skirting board."""
+    """Paints plaster, stripes, bricks or panels above a skirting board."""
     choice = random.uniform()
     if choice < 0.2:
         period = round(canvas.density * random.uniform(0.08, 0.3))
@@ -288,14 +288,14 @@ def wallpaper(random: Generator, canvas: Canvas) -> None:
         for left in np.arange(0.1, canvas.width, 0.7):
             canvas.area((left, canvas.height - 1.0, 0.55, 0.8))[..., :3] *= 0.8
             canvas.area((left + 0.03, canvas.height - 0.97, 0.55, 0.8))[..., :3] *= 1.25
-    canvas.roughen(random, random.uniform(0.01, 0.05), 10)
-    canvas.roughen(random, random.uniform(0.01, 0.06), 100, 2)
+    canvas.add_noise(random, random.uniform(0.01, 0.05), 10)
+    canvas.add_noise(random, random.uniform(0.01, 0.06), 100, 2)
     canvas.rect((0, canvas.height - 0.1, canvas.width, 0.1), vector(0.7, 0.69, 0.66))
     canvas.rect((0, canvas.height - 0.11, canvas.width, 0.015), vector(0.2, 0.2, 0.2))
 
 
 def door(random: Generator, canvas: Canvas, left: float) -> None:
-    """A panelled door at `left` of a wall."""
+    """Paints a panelled door at `left` of a wall."""
     colour, top = tint(random, random.uniform(0.15, 0.7), 0.3), canvas.height - 2.05
     canvas.rect((left - 0.08, top - 0.08, 1.06, 2.2), colour * 0.7)
     canvas.rect((left, top, 0.9, 2.05), colour)
@@ -306,7 +306,7 @@ def door(random: Generator, canvas: Canvas, left: float) -> None:
 
 
 def hang_pictures(random: Generator, canvas: Canvas, left: float, wide: float) -> None:
-    """One large picture or several small ones, in frames with a mount."""
+    """Paints one large framed picture or several small ones."""
     count = int(random.integers(1, 4))
     each = wide / count
     for index in range(count):
@@ -324,14 +324,14 @@ def hang_pictures(random: Generator, canvas: Canvas, left: float, wide: float) -
 
 
 def curtain(area: Floats, cloth: Floats, glow: float) -> None:
-    """Folds of cloth that a little of the window's light comes through."""
+    """Paints folds of cloth that transmit a little of the light of the window."""
     folds = 0.65 + 0.35 * np.cos(np.arange(area.shape[1], dtype=np.float32) * 0.9)
     area[..., :3] = cloth * folds[:, None]
     area[..., 3:] = (1, glow)
 
 
 def flooring(random: Generator, canvas: Canvas) -> None:
-    """Planks, tiles or carpet."""
+    """Paints planks, tiles or carpet."""
     choice, colour = random.uniform(), np.array(canvas.colour, np.float32)
     if choice < 0.5:
         wood = vector(0.36, 0.22, 0.12) * random.uniform(0.4, 1.5)
@@ -348,11 +348,11 @@ def flooring(random: Generator, canvas: Canvas) -> None:
             for column, left in enumerate(np.arange(0, canvas.width, size)):
                 shade = (colour, other)[(row + column) % 2] * random.uniform(0.9, 1.1)
                 canvas.rect((left, top, size - 0.015, size - 0.015), shade)
-    canvas.roughen(random, 0.1 if choice < 0.8 else 0.25, 30)
+    canvas.add_noise(random, 0.1 if choice < 0.8 else 0.25, 30)
 
 
 def rug(random: Generator, canvas: Canvas) -> None:
-    """A rug of nested borders with a woven middle."""
+    """Paints a rug of nested borders with a woven middle."""
     width, height = canvas.width * random.uniform(0.3, 0.6), canvas.height * random.uniform(0.3, 0.6)
     left, top = (canvas.width - width) * random.uniform(), (canvas.height - height) * random.uniform()
     for inset in (0.0, 0.06, 0.16, 0.22):

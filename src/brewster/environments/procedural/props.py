@@ -1,4 +1,4 @@
-"""What stands in the procedural worlds: upright and flat surfaces, boxes, windows, cars, and their light."""
+"""Objects of the procedural environments: surfaces, boxes, windows, cars, facades, and the lighting."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from brewster.environments.procedural.canvas import (
 
 UP: Final = vector(0, 1, 0)
 Painter: TypeAlias = Callable[[str, float, float], Canvas]
-"""Paints a face ("front", "back", "left", "right", "top" or "bottom") of a box, of a width and height."""
+"""(face, width, height) -> canvas; a face is "front", "back", "left", "right", "top" or "bottom" of a box."""
 
 
 @dataclass(frozen=True)
 class Lamp:
-    """A lamp that lights surfaces: intensity (3,) per steradian, all around or to one side."""
+    """A point light of intensity (3,) per steradian: to all sides, or to one half-space."""
 
     position: Floats
     intensity: Floats
@@ -37,16 +37,16 @@ class Lamp:
 
 @dataclass
 class SceneLighting:
-    """The light of a world: ambient light, lamps, and dark contacts (x, z, half width, half depth) on a floor."""
+    """Lighting: ambient light, lamps, and contact shadows (x, z, half width, half depth) on the floor."""
 
     ambient: Floats
     floor: float
-    """Its height, below 0."""
+    """The height of the floor, below 0."""
     lamps: list[Lamp] = field(default_factory=list)
     contacts: list[tuple[float, float, float, float]] = field(default_factory=list)
 
     def __call__(self, points: Floats, normal: Floats) -> Floats:
-        """Light (h, w, 3) on points of a surface: irradiance / pi."""
+        """Irradiance / pi (h, w, 3) at points of a surface."""
         light: Floats = np.zeros_like(points) + self.ambient * (0.8 + 0.2 * normal[1])
         middle, span = (points[0, 0] + points[-1, -1]) / 2, np.linalg.norm(points[0, 0] - points[-1, -1]) / 2
         for lamp in self.lamps:
@@ -61,7 +61,7 @@ class SceneLighting:
         return light * self.shade(points, normal)
 
     def shade(self, points: Floats, normal: Floats) -> Floats:
-        """What the contacts leave (h, w, 1) of the light on a floor; all of it elsewhere."""
+        """The factor (h, w, 1) of the contact shadows on the floor; 1 on other surfaces."""
         left = np.ones((*points.shape[:2], 1), np.float32)
         if normal[1] < 0.9 or points[0, 0, 1] > self.floor + 0.01:
             return left
@@ -72,16 +72,16 @@ class SceneLighting:
         return left
 
 
-def upright(canvas: Canvas, foot: Floats, towards: Floats | None, light: Lighting) -> Quad:
-    """A canvas that stands on the middle of its lower edge and faces a direction, or the viewer."""
+def vertical_quad(canvas: Canvas, foot: Floats, towards: Floats | None, light: Lighting) -> Quad:
+    """A vertical canvas with the middle of its lower edge at `foot`, facing a direction or the viewer."""
     facing = unit(-foot * vector(1, 0, 1)) if towards is None else towards
     across = np.cross(-facing, UP) * canvas.width
     rise = UP * canvas.height
     return Quad(canvas, foot - across / 2 + rise, (across, -rise), light)
 
 
-def flat(canvas: Canvas, centre: Floats, light: Lighting, turn: float = 0) -> Quad:
-    """A canvas that lies level, its top towards -z before it turns about the vertical."""
+def horizontal_quad(canvas: Canvas, centre: Floats, light: Lighting, turn: float = 0) -> Quad:
+    """A horizontal canvas. Its top is towards -z before the rotation about the vertical axis."""
     across = vector(np.cos(turn), 0, np.sin(turn)) * canvas.width
     down = vector(-np.sin(turn), 0, np.cos(turn)) * canvas.height
     return Quad(canvas, centre - across / 2 - down / 2, (across, down), light)
@@ -90,7 +90,7 @@ def flat(canvas: Canvas, centre: Floats, light: Lighting, turn: float = 0) -> Qu
 def box(
     paint: Painter, foot: Floats, size: tuple[float, float, float], light: Lighting, turn: float = 0
 ) -> list[Quad]:
-    """The faces of a box (width, height, depth) that the viewer sees; its front is towards +z before it turns."""
+    """The visible faces of a box (width, height, depth). Its front is towards +z before the rotation."""
     width, height, depth = size
     ahead, aside = vector(-np.sin(turn), 0, np.cos(turn)), vector(np.cos(turn), 0, np.sin(turn))
     faces = []
@@ -102,20 +102,20 @@ def box(
     ):
         middle = foot + normal * (reach / 2)
         if normal @ middle < -0.02:
-            faces.append(upright(paint(name, wide, height), middle, normal, light))
+            faces.append(vertical_quad(paint(name, wide, height), middle, normal, light))
     if foot[1] + height < -0.02:
-        faces.append(flat(paint("top", width, depth), foot + UP * height, light, turn))
+        faces.append(horizontal_quad(paint("top", width, depth), foot + UP * height, light, turn))
     elif foot[1] > 0.02:
-        faces.append(flat(paint("bottom", width, depth), foot, light, turn))
+        faces.append(horizontal_quad(paint("bottom", width, depth), foot, light, turn))
     return faces
 
 
-def plain(random: Generator, colour: Colour, density: float = 40, grain: float = 0.12) -> Painter:
-    """Paints every face in one weathered colour."""
+def plain_painter(random: Generator, colour: Colour, density: float = 40, grain: float = 0.12) -> Painter:
+    """A painter that paints every face in one colour with noise."""
 
     def paint(_face: str, width: float, height: float) -> Canvas:
         canvas = Canvas(width, height, density, colour)
-        canvas.roughen(random, grain, 6, 4)
+        canvas.add_noise(random, grain, 6, 4)
         return canvas
 
     return paint
@@ -123,19 +123,19 @@ def plain(random: Generator, colour: Colour, density: float = 40, grain: float =
 
 @dataclass(frozen=True)
 class WindowStyle:
-    """How the windows of one building look."""
+    """The style of the windows of one building."""
 
     frame: Floats
     columns: int
     rows: int
     lit: float
-    """The share with the light on; 0 in daylight."""
+    """The share of lit windows; 0 in daylight."""
     sky: Floats
-    """The sky that the glass mirrors."""
+    """The colour of the sky that the glass reflects."""
 
 
 def window(random: Generator, canvas: Canvas, place: Box, panes: WindowStyle) -> None:
-    """Paints a window: glass that mirrors the sky or shows a lit room, curtains or a blind, glazing bars."""
+    """Paints a window: glass that reflects the sky or shows a lit room, curtains or a blind, glazing bars."""
     left, top, width, height = place
     canvas.rect(place, panes.frame)
     bar = min(0.07, width / 8)
@@ -155,15 +155,15 @@ def window(random: Generator, canvas: Canvas, place: Box, panes: WindowStyle) ->
         slant = np.linspace(0, random.uniform(-0.5, 0.5), glass.shape[1], dtype=np.float32)[:, None]
         glass[..., :3] = panes.sky * random.uniform(0.05, 0.45) * np.clip(fall + slant, 0.1, 1.2) + 0.01
         glass[..., 4] = 0 if panes.lit else 0.7
-    _drape(random, glass)
+    _add_curtains(random, glass)
     for index in range(1, panes.columns):
         canvas.rect((left + width * index / panes.columns - bar / 2, top, bar, height), panes.frame)
     for index in range(1, panes.rows):
         canvas.rect((left, top + height * index / panes.rows - bar / 2, width, bar), panes.frame)
 
 
-def _drape(random: Generator, glass: Floats) -> None:
-    """Hangs curtains at the sides of a window, or a blind from its top, or nothing."""
+def _add_curtains(random: Generator, glass: Floats) -> None:
+    """Paints curtains at the sides of a window, or a blind at its top, or nothing."""
     height, width = glass.shape[:2]
     choice, cloth = random.uniform(), tint(random, 0.5, 0.15)
     if choice < 0.3:
@@ -177,7 +177,7 @@ def _drape(random: Generator, glass: Floats) -> None:
 
 
 def car(random: Generator, foot: Floats, away: bool, light: Lighting, *, night: bool) -> list[Quad]:
-    """A parked car along z that shows its tail lamps to the viewer if it points away, else its head lamps."""
+    """A parked car along z. The viewer sees its tail lights if it points away, else its headlights."""
     colour = tint(random, random.uniform(0.02, 0.6), random.choice([0.0, 0.1, 0.8]))
     lamps = vector(0.6, 0.02, 0.02) if away else vector(0.9, 0.9, 0.85)
 
@@ -213,7 +213,7 @@ def car(random: Generator, foot: Floats, away: bool, light: Lighting, *, night: 
 
 
 def _wheel(canvas: Canvas, middle: float) -> None:
-    """A wheel at the lower edge of a car's side."""
+    """Paints a wheel at the lower edge of the side of a car."""
     rows, columns = canvas.pixels.shape[:2]
     y, x = np.ogrid[:rows, :columns]
     radius = np.hypot(x - middle * canvas.density, y - (rows - 8)) / canvas.density
@@ -222,9 +222,9 @@ def _wheel(canvas: Canvas, middle: float) -> None:
 
 
 def bookshelf(random: Generator) -> Painter:
-    """Paints a box as a shelf whose front is full of books."""
+    """A painter of a shelf full of books."""
     wood = vector(0.35, 0.23, 0.13) * random.uniform(0.2, 1.9)
-    sides = plain(random, wood, 60)
+    sides = plain_painter(random, wood, 60)
 
     def paint(face: str, width: float, height: float) -> Canvas:
         if face != "front":
@@ -247,9 +247,9 @@ def bookshelf(random: Generator) -> Painter:
 
 
 def cabinet(random: Generator) -> Painter:
-    """Paints a box as a cabinet with drawers or doors."""
+    """A painter of a cabinet with drawers or doors."""
     colour = tint(random, random.uniform(0.1, 0.6), 0.3)
-    sides = plain(random, colour, 60)
+    sides = plain_painter(random, colour, 60)
     columns, rows = int(random.integers(1, 4)), int(random.integers(1, 4))
 
     def paint(face: str, width: float, height: float) -> Canvas:
@@ -270,7 +270,7 @@ def cabinet(random: Generator) -> Painter:
 def facade(
     random: Generator, wide: float, floors: int, *, density: float, night: bool, sky: Floats
 ) -> Canvas:
-    """The front of a house: a grid of windows of a few kinds over a shop or an entrance, below a cornice."""
+    """The front of a house: a grid of windows above a shop or an entrance, below a cornice."""
     storey, bays = random.uniform(2.8, 3.7), max(2, round(wide / random.uniform(1.8, 4.2)))
     bay = wide / bays
     wall = tint(random, random.uniform(0.12, 0.6), random.uniform(0.05, 0.3)) * vector(1.1, 1, 0.88)
@@ -289,12 +289,12 @@ def facade(
     cornice.area((0, 0.4, wide, 0.15))[..., :3] *= 0.4
     canvas = Canvas(wide, 0.7 + storey * (floors + 1.15), density, wall)
     canvas.pixels = np.concatenate([cornice.pixels, body, base.pixels])
-    canvas.roughen(random, random.uniform(0.06, 0.16), 8)
+    canvas.add_noise(random, random.uniform(0.06, 0.16), 8)
     return canvas
 
 
 def _cells(random: Generator, blank: Canvas, panes: WindowStyle) -> Floats:
-    """A few kinds (n, h, w, 5) of one bay of one storey, with the same window in different use."""
+    """Variants (n, h, w, 5) of one bay of one storey: the same window with different content."""
     width, height = blank.width, blank.height
     share, tall = random.uniform(0.4, 0.92), random.uniform(0.45, 0.85)
     place = (width * (1 - share) / 2, height * (1 - tall) * 0.45, width * share, height * tall)
@@ -327,7 +327,7 @@ def _cells(random: Generator, blank: Canvas, panes: WindowStyle) -> Floats:
 
 
 def _ground_floor(random: Generator, canvas: Canvas, panes: WindowStyle) -> Canvas:
-    """Shop windows below signs, doors between them, a plinth."""
+    """Paints shop windows below signs, doors between them, and a plinth."""
     bottom, left = canvas.height, 0.3
     glow = 8 if panes.lit else 0
     shops = random.uniform() < 0.7
@@ -354,7 +354,7 @@ def _ground_floor(random: Generator, canvas: Canvas, panes: WindowStyle) -> Canv
 
 
 def _wares(random: Generator, canvas: Canvas, place: tuple[float, float, float], glow: float) -> None:
-    """Things on show from (left, top) over a width, about a metre tall."""
+    """Paints goods in a shop window, from (left, top) over a width, about 1 m tall."""
     left, top, wide = place
     offset = 0.0
     while offset < wide - 0.4:

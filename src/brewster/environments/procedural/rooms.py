@@ -1,9 +1,9 @@
-"""Worlds made from nothing but a seed, for a machine that has no HDR maps: a street, a night street, a room.
+"""Procedural environment maps from a seed, for machines without HDR maps: a street, a street at night, a room.
 
-    picture = WORLDS["street"](7, 512)  # (512, 1024, 3), linear radiance around the viewer
+    picture = ENVIRONMENTS["street"](7, 512)  # (512, 1024, 3), linear radiance around the viewer
     poster = painting(seed=7, width=768, height=512)  # (512, 768, 3), linear, 0..1
 
-The same seed gives the same bytes. Radiance 1 is about what a white sheet shows in a world's shade.
+The same seed gives the same bytes. Radiance 1 is about that of a white sheet in the shade.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from brewster.environments.procedural.canvas import (
     Canvas,
     Floats,
     Glow,
-    ProceduralWorld,
+    ProceduralEnvironment,
     Quad,
     render,
     resize,
@@ -46,25 +46,25 @@ from brewster.environments.procedural.props import (
     bookshelf,
     box,
     cabinet,
-    flat,
-    plain,
-    upright,
+    horizontal_quad,
+    plain_painter,
+    vertical_quad,
 )
-from brewster.environments.procedural.streets import street_world
+from brewster.environments.procedural.streets import street_environment
 
-__all__ = ["WORLDS", "night", "painting", "room", "street"]
+__all__ = ["ENVIRONMENTS", "night", "painting", "room", "street"]
 
 _DENSITY: Final = 90.0
 
 
 def street(seed: int, height: int) -> NDArray[np.float32]:
     """A street by day, radiance (height, 2 height, 3): the sky is about 1, its sun 1e3 to 1e5."""
-    return render(street_world(Generator(PCG64(seed)), night=False), height)
+    return render(street_environment(Generator(PCG64(seed)), night=False), height)
 
 
 def night(seed: int, height: int) -> NDArray[np.float32]:
     """A street at night, radiance (height, 2 height, 3): the road is about 1, its lamps 1e2 to 1e4."""
-    return render(street_world(Generator(PCG64(seed)), night=True), height)
+    return render(street_environment(Generator(PCG64(seed)), night=True), height)
 
 
 def room(seed: int, height: int) -> NDArray[np.float32]:
@@ -72,16 +72,16 @@ def room(seed: int, height: int) -> NDArray[np.float32]:
     return render(_BoxRoom(Generator(PCG64(seed))).world(), height)
 
 
-WORLDS: Final[dict[str, Callable[[int, int], NDArray[np.float32]]]] = {
+ENVIRONMENTS: Final[dict[str, Callable[[int, int], NDArray[np.float32]]]] = {
     "street": street,
     "room": room,
     "night": night,
 }
-"""A world by its name: (seed, height) to a lat-long map (height, 2 height, 3), linear light."""
+"""Name -> function (seed, height) that returns a lat-long map (height, 2 height, 3) in linear light."""
 
 
 class _BoxRoom:
-    """A box room around the viewer: its walls, its light, and the furniture in it so far."""
+    """A box-shaped room around the viewer: its walls, its lighting, and the furniture placed so far."""
 
     def __init__(self, random: Generator) -> None:
         self.random = random
@@ -102,7 +102,7 @@ class _BoxRoom:
         self.glows: list[Glow] = []
 
     def light(self, points: Floats, normal: Floats) -> Floats:
-        """Lamps and windows, darker towards the corners, and sunlight that falls in."""
+        """Irradiance / pi of lamps and windows, darker in corners, and of sunlight through the windows."""
         total = self.lamps(points, normal)
         for end in (self.low, self.high):
             corner = 1 - 0.3 * np.exp(-np.abs(points - end) / 0.3)
@@ -118,8 +118,8 @@ class _BoxRoom:
                     total += inside[..., None] * self.lamps.shade(points, normal) * facing * self.sunlight
         return total
 
-    def world(self) -> ProceduralWorld:
-        """The finished room; what lights it comes first, textures are lit when they are shown."""
+    def world(self) -> ProceduralEnvironment:
+        """Builds the room. Lights come first; lighting is baked into textures when they are rendered."""
         random = self.random
         paint = tint(random, random.uniform(0.3, 0.75), random.uniform(0, 0.2))
         ways = [vector(0, 0, 1), vector(-1, 0, 0), vector(0, 0, -1), vector(1, 0, 0)]
@@ -135,15 +135,15 @@ class _BoxRoom:
         self._ceiling()
         self._floor()
         for inward in ways:
-            self._along(inward)
+            self._furnish_wall(inward)
         for _ in range(random.integers(3, 9)):
-            self._free_standing()
-        return ProceduralWorld(
+            self._place_free_standing()
+        return ProceduralEnvironment(
             self.quads, self.glows, lambda ways, _texel: np.zeros_like(ways), random.uniform(0, 2 * np.pi)
         )
 
-    def _foot(self, inward: Floats) -> tuple[Floats, float]:
-        """The middle of a wall's lower edge, and its length."""
+    def _wall_base(self, inward: Floats) -> tuple[Floats, float]:
+        """The middle of the lower edge of a wall, and the length of the wall."""
         middle = (self.low + self.high) / 2
         foot = np.where(inward > 0, self.low, np.where(inward < 0, self.high, middle))
         foot[1] = self.floor
@@ -152,7 +152,7 @@ class _BoxRoom:
 
     def _wall(self, inward: Floats, colour: Floats, role: str) -> None:
         random = self.random
-        foot, long = self._foot(inward)
+        foot, long = self._wall_base(inward)
         canvas = Canvas(long, self.tall, _DENSITY, colour)
         wallpaper(random, canvas)
         left = random.uniform(0.3, 0.8)
@@ -167,12 +167,12 @@ class _BoxRoom:
             elif role != "bare":
                 hang_pictures(random, canvas, left, wide)
             left += wide + random.uniform(0.3, 1.2)
-        self.quads.append(upright(canvas, foot, inward, self.light))
+        self.quads.append(vertical_quad(canvas, foot, inward, self.light))
 
     def _opening(
         self, place: tuple[float, float, float], canvas: Canvas, foot: Floats, inward: Floats
     ) -> None:
-        """A window at (left, width, sill height) of a wall: the blurred view, its light, bars and curtains."""
+        """Adds a window at (left, width, sill height) of a wall: blurred view, light, bars and curtains."""
         random, (left, wide, sill) = self.random, place
         top = random.uniform(0.25, 0.45)
         tall = self.tall - sill - top
@@ -196,13 +196,13 @@ class _BoxRoom:
         self.openings.append((middle, inward, wide, tall))
 
     def _ceiling(self) -> None:
-        """A ceiling with lamps of one kind, or none by day, as bright as lighting the room takes."""
+        """Adds a ceiling with lamps of one kind, or none by day. Their radiance follows from the size of the room."""
         random, size = self.random, self.high - self.low
         canvas = Canvas(float(size[0]), float(size[2]), 60, vector(0.8, 0.79, 0.76) * random.uniform(0.7, 1))
         if random.uniform() < 0.3:
             canvas.pixels[::36, :, :3] *= 0.7
             canvas.pixels[:, ::36, :3] *= 0.7
-        canvas.roughen(random, 0.03)
+        canvas.add_noise(random, 0.03)
         colour = vector(1, random.uniform(0.75, 0.98), random.uniform(0.5, 0.95))
         shapes = [(0.6, 0.6, 3.0), (0.12, 1.2, 1.8), (1.2, 0.12, 1.8), (0.11, 0.11, 1.4), (0.2, 0.2, 2.2)]
         wide, deep, gap = shapes[random.integers(len(shapes))]
@@ -225,14 +225,14 @@ class _BoxRoom:
             self._pendant(colour)
         self.lamps.ambient = self.lamps.ambient + colour * (0.35 * light if rows[0] else 0)
         centre = vector(middle[0], self.high[1], middle[2])
-        self.quads.append(flat(canvas, centre, self.light))
+        self.quads.append(horizontal_quad(canvas, centre, self.light))
 
     def _pendant(self, colour: Floats) -> None:
-        """A lamp that hangs from the ceiling, its bulb below a shade."""
+        """Adds a pendant lamp: a bulb below a shade."""
         share = vector(*self.random.uniform(0.25, 0.75, 3))
         place = self.low + share * (self.high - self.low)
         place[1] = self.high[1] - self.random.uniform(0.5, 0.9)
-        dark, cloth = (plain(self.random, tint(self.random, value, 0.6)) for value in (0.03, 0.3))
+        dark, cloth = (plain_painter(self.random, tint(self.random, value, 0.6)) for value in (0.03, 0.3))
         self.quads += box(dark, place, (0.015, float(self.high[1] - place[1]), 0.015), self.light)
         self.quads += box(cloth, place + UP * 0.05, (0.34, 0.2, 0.34), self.light, self.random.uniform(0, 1))
         self.glows.append(Glow(place, 0.05, colour * 300))
@@ -245,10 +245,10 @@ class _BoxRoom:
         if random.uniform() < 0.6:
             rug(random, canvas)
         middle = (self.low + self.high) / 2
-        self.quads.append(flat(canvas, vector(middle[0], self.floor, middle[2]), self.light))
+        self.quads.append(horizontal_quad(canvas, vector(middle[0], self.floor, middle[2]), self.light))
 
-    def _put(self, foot: Floats, size: tuple[float, float, float], turn: float) -> bool:
-        """Reserves the floor for a piece of furniture, unless the viewer or another piece is there."""
+    def _reserve_floor(self, foot: Floats, size: tuple[float, float, float], turn: float) -> bool:
+        """Reserves floor space for a piece of furniture. Returns False if the viewer or another piece is there."""
         reach = max(size[0], size[2]) / 2
         if np.hypot(foot[0], foot[2]) < reach + 0.7:
             return False
@@ -260,10 +260,10 @@ class _BoxRoom:
         self.lamps.contacts.append((float(foot[0]), float(foot[2]), float(across / 2), float(deep / 2)))
         return True
 
-    def _along(self, inward: Floats) -> None:
-        """Shelves, cabinets and sofas along a wall."""
+    def _furnish_wall(self, inward: Floats) -> None:
+        """Adds shelves, cabinets and sofas along a wall."""
         random = self.random
-        middle, long = self._foot(inward)
+        middle, long = self._wall_base(inward)
         turn = float(np.arctan2(-inward[0], inward[2]))
         lit = any(np.array_equal(inward, way) for _, way, _, _ in self.openings)
         for offset in np.arange(-long / 2 + 1.1, long / 2 - 1, random.uniform(1.2, 2)):
@@ -273,7 +273,7 @@ class _BoxRoom:
             if kind == "sofa":
                 wide, deep = random.uniform(1.5, 2.2), 0.85
             foot = middle + np.cross(-inward, UP) * offset + inward * (deep / 2 + 0.02)
-            if kind == "nothing" or not self._put(foot, (wide, tall, deep), turn):
+            if kind == "nothing" or not self._reserve_floor(foot, (wide, tall, deep), turn):
                 continue
             if kind == "plant":
                 self._plant(foot)
@@ -290,11 +290,11 @@ class _BoxRoom:
         canvas = Canvas(1.1, 0.65, 120, vector(0.015, 0.015, 0.015))
         picture = painting(int(random.integers(1 << 30)), 126, 72)
         canvas.paste(picture, (0.03, 0.03, 1.04, 0.56), glow=random.choice([0.05, 2.5]))
-        self.quads.append(upright(canvas, foot, inward, self.light))
+        self.quads.append(vertical_quad(canvas, foot, inward, self.light))
 
     def _sofa(self, foot: Floats, size: tuple[float, float, float], turn: float) -> None:
         wide, _, deep = size
-        cloth = plain(self.random, tint(self.random, self.random.uniform(0.05, 0.4), 0.6), 60, 0.2)
+        cloth = plain_painter(self.random, tint(self.random, self.random.uniform(0.05, 0.4), 0.6), 60, 0.2)
         ahead, aside = vector(-np.sin(turn), 0, np.cos(turn)), vector(np.cos(turn), 0, np.sin(turn))
         back = foot - ahead * (deep / 2 - 0.1)
         self.quads += box(cloth, foot, (wide, 0.42, deep), self.light, turn)
@@ -304,19 +304,19 @@ class _BoxRoom:
                 cloth, foot + aside * side * (wide / 2 - 0.08), (0.16, 0.6, deep), self.light, turn
             )
         for place in np.arange(-wide / 2 + 0.45, wide / 2 - 0.3, 0.6):
-            cushion = plain(self.random, tint(self.random, 0.35, 0.9), 60, 0.2)
+            cushion = plain_painter(self.random, tint(self.random, 0.35, 0.9), 60, 0.2)
             seat = back + aside * place + ahead * 0.2 + UP * 0.42
             self.quads += box(cushion, seat, (0.4, 0.36, 0.12), self.light, turn)
 
     def _plant(self, foot: Floats) -> None:
         tall = self.random.uniform(0.7, 1.5)
         self.quads += box(
-            plain(self.random, tint(self.random, 0.3, 0.5)), foot, (0.3, 0.3, 0.3), self.light, 0.4
+            plain_painter(self.random, tint(self.random, 0.3, 0.5)), foot, (0.3, 0.3, 0.3), self.light, 0.4
         )
-        self.quads.append(upright(tree(self.random, tall, 90), foot + UP * 0.25, None, self.light))
+        self.quads.append(vertical_quad(tree(self.random, tall, 90), foot + UP * 0.25, None, self.light))
 
-    def _free_standing(self) -> None:
-        """A table with chairs, a person or a floor lamp in the room."""
+    def _place_free_standing(self) -> None:
+        """Adds a table with chairs, a person or a floor lamp."""
         random = self.random
         margin = vector(0.8, 0, 0.8)
         share = vector(random.uniform(), 0, random.uniform())
@@ -325,16 +325,18 @@ class _BoxRoom:
         kind, turn = random.choice(["table", "table", "person", "lamp"]), random.uniform(0, 2 * np.pi)
         if kind == "table":
             size = random.uniform(0.8, 1.6), 0.74, random.uniform(0.6, 0.9)
-            if self._put(foot, size, turn):
+            if self._reserve_floor(foot, size, turn):
                 self._table(foot, size, turn)
-        elif kind == "person" and self._put(foot, (0.5, 1.7, 0.4), 0):
-            self.quads.append(upright(figure(random, random.uniform(1.55, 1.85), 90), foot, None, self.light))
-        elif kind == "lamp" and self._put(foot, (0.4, 1.6, 0.4), 0):
+        elif kind == "person" and self._reserve_floor(foot, (0.5, 1.7, 0.4), 0):
+            self.quads.append(
+                vertical_quad(figure(random, random.uniform(1.55, 1.85), 90), foot, None, self.light)
+            )
+        elif kind == "lamp" and self._reserve_floor(foot, (0.4, 1.6, 0.4), 0):
             self._floor_lamp(foot)
 
     def _table(self, foot: Floats, size: tuple[float, float, float], turn: float) -> None:
         random, (wide, tall, deep) = self.random, size
-        wood = plain(random, vector(0.35, 0.22, 0.12) * random.uniform(0.4, 1.6), 60, 0.2)
+        wood = plain_painter(random, vector(0.35, 0.22, 0.12) * random.uniform(0.4, 1.6), 60, 0.2)
         ahead, aside = vector(-np.sin(turn), 0, np.cos(turn)), vector(np.cos(turn), 0, np.sin(turn))
         self.quads += box(wood, foot + UP * (tall - 0.05), (wide, 0.05, deep), self.light, turn)
         for right in (-0.45, 0.45):
@@ -350,9 +352,9 @@ class _BoxRoom:
             )
             bulk = random.uniform(0.05, 0.25), random.uniform(0.03, 0.3), random.uniform(0.05, 0.2)
             self.quads += box(
-                plain(random, tint(random, 0.3, 0.9)), thing, bulk, self.light, random.uniform(0, 3)
+                plain_painter(random, tint(random, 0.3, 0.9)), thing, bulk, self.light, random.uniform(0, 3)
             )
-        seat = plain(random, tint(random, 0.2, 0.6), 60, 0.2)
+        seat = plain_painter(random, tint(random, 0.2, 0.6), 60, 0.2)
         for side in (-1, 1):
             chair = foot + ahead * side * (deep / 2 + 0.3)
             if np.hypot(chair[0], chair[2]) > 1:
@@ -369,10 +371,12 @@ class _BoxRoom:
             canvas = Canvas(width, height, 80)
             canvas.rect((0, 0, width, height), colour, glow=5)
             canvas.area((0, 0, width, 0.05))[..., 4] = 15
-            canvas.roughen(self.random, 0.1)
+            canvas.add_noise(self.random, 0.1)
             return canvas
 
-        self.quads += box(plain(self.random, vector(0.1, 0.1, 0.1)), foot, (0.03, 1.4, 0.03), self.light)
+        self.quads += box(
+            plain_painter(self.random, vector(0.1, 0.1, 0.1)), foot, (0.03, 1.4, 0.03), self.light
+        )
         self.quads += box(shade, foot + UP * 1.35, (0.36, 0.26, 0.36), self.light, 0.6)
         self.lamps.lamps.append(Lamp(foot + UP * 1.5, colour * 1.2))
         self.glows.append(Glow(foot + UP * 1.66, 0.03, colour * 400))

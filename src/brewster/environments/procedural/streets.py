@@ -1,4 +1,4 @@
-"""A street between two rows of houses, by day or by night, as a `ProceduralWorld` that `surfaces.render` shows."""
+"""A street between two rows of houses, by day or by night, as a `ProceduralEnvironment` for `canvas.render`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from brewster.environments.procedural.canvas import (
     Floats,
     Glow,
     PaintingTexture,
-    ProceduralWorld,
+    ProceduralEnvironment,
     Quad,
     fractal,
     tint,
@@ -28,19 +28,19 @@ from brewster.environments.procedural.props import (
     box,
     car,
     facade,
-    flat,
-    plain,
-    upright,
+    horizontal_quad,
+    plain_painter,
+    vertical_quad,
 )
 
 _END: Final = 90.0
-"""How far the houses reach, in metres either way."""
+"""Half the length of the street in m."""
 _SUN_RADIUS: Final = 0.00465
 
 
 @dataclass(frozen=True)
 class _Sky:
-    """The dome: a gradient, clouds and, by day, the light around the sun."""
+    """The sky: a gradient, clouds and, by day, the halo of the sun."""
 
     zenith: Floats
     horizon: Floats
@@ -68,7 +68,7 @@ class _Sky:
         return result
 
     def _thickness(self, ways: Floats, rise: Floats, texel: float) -> Floats:
-        """How much cloud (h, w, 1) lies in each direction: a flat layer that bends down at the horizon."""
+        """The thickness (h, w, 1) of clouds in each direction: a flat layer that curves down at the horizon."""
         height = rise + 0.1
         places = [(ways[..., axis] / height * 0.35 % 1).ravel() for axis in (0, 2)]
         spot = (texel * 0.35 * 512 / height**1.5).ravel()
@@ -111,7 +111,7 @@ def _night_sky(random: Generator) -> _Sky:
 
 
 class _Street:
-    """The layout of one street, the light in it, and everything that stands in it so far."""
+    """The layout of one street, its lighting, and the objects placed so far."""
 
     def __init__(self, random: Generator, *, night: bool) -> None:
         self.random, self.night = random, night
@@ -127,7 +127,7 @@ class _Street:
         self.glows: list[Glow] = []
 
     def light(self, points: Floats, normal: Floats) -> Floats:
-        """Lamps and sky, less of it deep in the street, and the sun where houses and trees let it through."""
+        """Irradiance / pi of lamps, sky (less of it near the ground), and the sun with shadows of houses and trees."""
         depth = np.clip((points[..., 1:2] - self.ground) / 12, 0, 1)
         total = self.lamps(points, normal) * (1 if self.night else 0.65 + 0.35 * depth)
         facing = float(normal @ self.sky.sun)
@@ -158,7 +158,7 @@ class _Street:
         return lit
 
 
-def street_world(random: Generator, *, night: bool) -> ProceduralWorld:
+def street_environment(random: Generator, *, night: bool) -> ProceduralEnvironment:
     """A street with houses, trees, cars, people and lamps."""
     street = _Street(random, night=night)
     if night:
@@ -178,7 +178,7 @@ def street_world(random: Generator, *, night: bool) -> ProceduralWorld:
     if not night and street.sky.sunlight.any():
         radiance = street.sky.sunlight / _SUN_RADIUS**2
         street.glows.append(Glow(street.sky.sun * 1000, _SUN_RADIUS * 1000, radiance))
-    return ProceduralWorld(street.quads, street.glows, street.sky, random.uniform(0, 2 * np.pi))
+    return ProceduralEnvironment(street.quads, street.glows, street.sky, random.uniform(0, 2 * np.pi))
 
 
 def _row_of_houses(street: _Street, side: int) -> None:
@@ -207,7 +207,7 @@ def _house(street: _Street, foot: Floats, wide: float, floors: int) -> None:
         night=street.night,
         sky=street.sky.horizon,
     )
-    street.quads.append(upright(front, foot, towards, street.light))
+    street.quads.append(vertical_quad(front, foot, towards, street.light))
     start = int(foot[2] - wide / 2 + 128)
     street.roofs[side][start : start + round(wide)] = foot[1] + front.height
     gable = Canvas(12, front.height, 8, front.colour)
@@ -215,22 +215,22 @@ def _house(street: _Street, foot: Floats, wide: float, floors: int) -> None:
         gable.rect(
             (random.uniform(1, 10), front.height - 2.5 - 3.2 * index, 0.9, 1.3), vector(0.04, 0.05, 0.06)
         )
-    gable.roughen(random, 0.15)
+    gable.add_noise(random, 0.15)
     end = -np.sign(foot[2])  # the end that the viewer sees
     corner = foot + vector(side * 6, 0, end * wide / 2)
     if abs(foot[2]) > wide / 2:
-        street.quads.append(upright(gable, corner, vector(0, 0, end), street.light))
+        street.quads.append(vertical_quad(gable, corner, vector(0, 0, end), street.light))
     if random.uniform() < 0.45:
         _roof(street, foot + UP * front.height, wide, side)
 
 
 def _roof(street: _Street, eave: Floats, wide: float, side: int) -> None:
-    """A slope of tiles with skylights, up from the eave."""
+    """Adds a tiled roof with skylights above the eave."""
     random = street.random
     slope = vector(-side * random.uniform(3, 5), -random.uniform(2, 4), 0)
     canvas = Canvas(wide, float(np.linalg.norm(slope)), 12, tint(random, 0.12, 0.3) + vector(0.06, 0.01, 0))
     canvas.pixels[::3, :, :3] *= 0.7
-    canvas.roughen(random, 0.25, 12)
+    canvas.add_noise(random, 0.25, 12)
     for left in np.arange(1.5, wide - 1.5, random.uniform(2.5, 5)):
         canvas.rect((left, 1.2, 0.9, 1.3), vector(0.5, 0.55, 0.6), glow=0)
     across = vector(0, 0, side) * wide
@@ -238,7 +238,7 @@ def _roof(street: _Street, eave: Floats, wide: float, side: int) -> None:
 
 
 def _paving(street: _Street) -> None:
-    """Road, kerbs, pavements and marks: fine close by, coarse far off and a little lower."""
+    """Adds road, kerbs, pavements and markings: a fine canvas nearby, and a coarse one, slightly lower, far away."""
     random = street.random
     asphalt, slabs = random.uniform(0.05, 0.12), tint(random, random.uniform(0.2, 0.4), 0.06)
     stripes = random.uniform() < 0.4
@@ -256,16 +256,16 @@ def _paving(street: _Street) -> None:
         if stripes and long < 50:
             for start in np.arange(left + 0.4, right - 0.4, 1.0):
                 canvas.rect((start, long / 2 - 11, 0.5, 3.5), vector(0.6, 0.6, 0.58))
-        canvas.roughen(random, 0.06, long / 3, 3)
-        canvas.roughen(random, 0.1, long * 6, 2)
+        canvas.add_noise(random, 0.06, long / 3, 3)
+        canvas.add_noise(random, 0.1, long * 6, 2)
         centre = vector(
             (street.reach[1] - street.reach[-1]) / 2, street.ground - (0.04 if long > 50 else 0), 0
         )
-        street.quads.append(flat(canvas, centre, street.light))
+        street.quads.append(horizontal_quad(canvas, centre, street.light))
 
 
 def _ends(street: _Street) -> None:
-    """What closes the street: a house across it, or hills."""
+    """Adds a house or hills at both ends of the street."""
     random = street.random
     for end in (-1, 1):
         foot = vector(random.uniform(-10, 10), street.ground, end * (_END + random.uniform(5, 40)))
@@ -275,10 +275,10 @@ def _ends(street: _Street) -> None:
             )
         else:
             canvas = Canvas(300, 30, 3, vector(0.1, 0.12, 0.08))
-            canvas.roughen(random, 0.4, 5)
+            canvas.add_noise(random, 0.4, 5)
             ridge = 30 + 25 * fractal(random, 4, canvas.pixels.shape[1], 1, 6)[0]
             canvas.pixels[..., 3] = np.arange(canvas.pixels.shape[0])[:, None] > ridge
-        street.quads.append(upright(canvas, foot, vector(0, 0, -end), street.light))
+        street.quads.append(vertical_quad(canvas, foot, vector(0, 0, -end), street.light))
 
 
 def _trees(street: _Street, side: int, *, park: bool) -> None:
@@ -292,12 +292,12 @@ def _trees(street: _Street, side: int, *, park: bool) -> None:
             near = float(np.hypot(foot[0], foot[2]))
             if near > 3:
                 canvas = tree(random, typical * random.uniform(0.7, 1.3), float(np.clip(170 / near, 4, 28)))
-                street.quads.append(upright(canvas, foot, None, street.light))
+                street.quads.append(vertical_quad(canvas, foot, None, street.light))
                 street.crowns.append((foot + UP * canvas.height * 0.6, canvas.height * 0.3))
 
 
 def _light_lamps(street: _Street) -> None:
-    """Street lamps of one kind along both kerbs, their light first so that all else receives it."""
+    """Adds street lamps along both kerbs. They come first, since lighting is baked into everything else."""
     random = street.random
     tall, gap = random.uniform(5, 8), random.uniform(16, 26)
     colour = vector(1, random.uniform(0.5, 0.9), random.uniform(0.15, 0.8)) * random.uniform(100, 250)
@@ -307,24 +307,28 @@ def _light_lamps(street: _Street) -> None:
         place = vector(side * (street.reach[side] - street.pavement - 0.5), street.ground + tall, z)
         street.lamps.lamps.append(Lamp(place, colour, -UP))
         street.glows.append(Glow(place - UP * 0.12, 0.16, colour / (np.pi * 0.16**2)))
-        street.quads += box(plain(random, vector(0.1, 0.1, 0.1)), place, (0.9, 0.12, 0.35), street.light)
+        street.quads += box(
+            plain_painter(random, vector(0.1, 0.1, 0.1)), place, (0.9, 0.12, 0.35), street.light
+        )
 
 
 def _poles(street: _Street, side: int) -> None:
-    """Lamp posts, road signs on posts, and signs that hang out from the houses."""
+    """Adds posts, road signs on posts, and signs that hang from the houses."""
     random = street.random
     kerb = street.reach[side] - street.pavement + 0.3
     for z in np.arange(-55 + random.uniform(0, 15), 60, random.uniform(12, 20)):
         foot = vector(side * kerb, street.ground, z)
         tall = random.uniform(2.5, 6)
         street.quads.append(
-            upright(Canvas(0.12, tall, 30, vector(0.15, 0.16, 0.16)), foot, None, street.light)
+            vertical_quad(Canvas(0.12, tall, 30, vector(0.15, 0.16, 0.16)), foot, None, street.light)
         )
         face = Canvas(0.7, 0.7, 90, tint(random, 0.4, 1))
         face.rect((0.06, 0.06, 0.58, 0.58), vector(0.8, 0.8, 0.8))
         face.write(random, (0.1, 0.2, 0.5, 0.28), tint(random, 0.05, 1))
         towards = vector(0, 0, -np.sign(z))
-        street.quads.append(upright(face, foot + UP * (tall - 0.6) + towards * 0.08, towards, street.light))
+        street.quads.append(
+            vertical_quad(face, foot + UP * (tall - 0.6) + towards * 0.08, towards, street.light)
+        )
         if random.uniform() < 0.6:
             _hanging_sign(
                 street, vector(side * (street.reach[side] - 0.6), street.ground + random.uniform(3, 5), z + 4)
@@ -342,7 +346,7 @@ def _hanging_sign(street: _Street, foot: Floats) -> None:
     for top in np.arange(0.18, tall - 0.5, 0.5):
         canvas.write(random, (0.12, top, 0.86, 0.36), ink, glow=glow)
     towards = vector(0, 0, -np.sign(foot[2]))
-    street.quads.append(upright(canvas, foot, towards, street.light))
+    street.quads.append(vertical_quad(canvas, foot, towards, street.light))
     if glow:
         street.lamps.lamps.append(Lamp(foot + UP * tall / 2, colour * glow * 0.4))
 
@@ -371,11 +375,15 @@ def _people(street: _Street) -> None:
         side = random.choice([-1, 1])
         x = street.reach[side] - random.uniform(0.5, street.pavement - 0.3)
         foot = vector(side * x, street.ground, random.uniform(-30, 30))
-        street.quads.append(upright(figure(random, random.uniform(1.55, 1.9), 60), foot, None, street.light))
+        street.quads.append(
+            vertical_quad(figure(random, random.uniform(1.55, 1.9), 60), foot, None, street.light)
+        )
     for _ in range(4):  # posters on a column
         side = random.choice([-1, 1])
         foot = vector(side * (street.reach[side] - 0.8), street.ground, random.uniform(-20, 20))
         picture = painting(int(random.integers(1 << 30)), 96, 144)
         canvas = Canvas(1.2, 2.2, 80, vector(0.1, 0.1, 0.1))
         canvas.paste(picture, (0.08, 0.08, 1.04, 1.6), glow=6 if street.night else 0)
-        street.quads.append(upright(canvas, foot, unit(vector(-side, 0, -np.sign(foot[2]))), street.light))
+        street.quads.append(
+            vertical_quad(canvas, foot, unit(vector(-side, 0, -np.sign(foot[2]))), street.light)
+        )

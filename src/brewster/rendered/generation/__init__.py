@@ -1,1 +1,1 @@
-"""How is a set rendered? A job, who does it (this process, several, or a cluster), and the overview of what was made."""
+"""Generation of rendered sets: the job, its executors (one process, several, a Ray cluster), index and preview."""

@@ -1,10 +1,10 @@
-"""Renders a set: what there is to do, in which order, and when it may begin; `workers` and `cluster` do it.
+"""Renders a set: the job, the schedule of its tasks, and the lock. The executors are in `workers` and `ray_cluster`.
 
-    job = Job(Path("out/window"), read_scene_recipe("window"), read_catalog([], [])[0], seed=7)
-    build(job, range(1000), Workers(job, 8))
+    job = RenderJob(Path("out/window"), read_scene_recipe("window"), read_catalog([], [])[0], seed=7)
+    build(job, range(1000), ProcessExecutor(job, 8))
 
-A sample is a function of (job, index) alone and is written whole by the process that rendered it. So what is there
-is done, a killed run needs no memory, and neither memory nor the cost of a sample grows with the count.
+A sample depends on (job, index) only and is written atomically by the process that rendered it. So existing samples are
+finished, a killed run can resume without other state, and memory and time per sample do not grow with the count.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from brewster.scene.sampler import Catalog
 RECORD: Final = "set.toml"
 _LOCK: Final = ".lock"
 FATAL: Final = (TargetError, MissingExtra, DeviceError)
-"""Errors that the next sample would meet too: they end the run."""
+"""Errors that every sample would raise; they end the run."""
 
 
 @final
 @dataclass(frozen=True)
 class RenderJob:
-    """What is rendered, and where. But for the folders, another value makes another set.
+    """What to render, and where. Any other value, except of `out` and `folders`, gives another set.
 
-    `renderer` is one of workers.RENDERERS or "module:function"; `folders` hold the files of the catalog.
+    `renderer` is a name in workers.RENDERERS or "module:function". `folders` hold the files of the catalog.
     """
 
     out: Path
@@ -50,7 +50,7 @@ class RenderJob:
     folders: tuple[Path, ...] = ()
 
     def record(self) -> dict[str, Any]:
-        """The values that a set's bytes depend on, for set.toml."""
+        """The values that the bytes of the set depend on, for set.toml."""
         return {
             "format": store.SAMPLE_FORMAT,
             "renderer": self.renderer,
@@ -63,26 +63,27 @@ class RenderJob:
 @final
 @dataclass(frozen=True)
 class RenderTask:
-    """Samples to render, by index, or blocks of a hundred to pack into their shards."""
+    """Indices of samples to render, or of blocks of a hundred samples to pack into shards."""
 
-    do: Literal["render", "pack"]
-    numbers: tuple[int, ...]
+    kind: Literal["render", "pack"]
+    indices: tuple[int, ...]
 
-    def lost(self, why: str) -> list[RenderResult]:
-        """The results if nobody could finish it."""
-        told = f"{why}; a sample must fit into memory; use fewer --workers, or a smaller --size."
-        first = 1 if self.do == "render" else store.SHARD_SIZE
+    def failed_results(self, why: str) -> list[RenderResult]:
+        """The results if no worker could finish the task."""
+        message = f"{why}; a sample must fit into memory; use fewer --workers, or a smaller --size."
+        first = 1 if self.kind == "render" else store.SHARD_SIZE
         return [
-            RenderResult(number * first, "failed", error=told, kind="WorkerLost") for number in self.numbers
+            RenderResult(number * first, "failed", error=message, kind="WorkerLost")
+            for number in self.indices
         ]
 
 
 @final
 @dataclass(frozen=True)
 class RenderResult:
-    """What became of a sample (or, if packing failed, of its block).
+    """The result for one sample or, if packing failed, for the first sample of its block.
 
-    `kind` is the class of the error; `fatal` is the error itself if it ends the run.
+    `kind` is the name of the error's class. `fatal` is the error itself if it ends the run.
     """
 
     index: int
@@ -93,26 +94,26 @@ class RenderResult:
     fatal: BrewsterError | None = None
 
 
-Report = Callable[[RenderResult], None]
+ResultCallback = Callable[[RenderResult], None]
 
 
 class Executor(AbstractContextManager[Any], Protocol):
-    """Does tasks somewhere, a bounded number at a time; what it has begun ends with the context."""
+    """Runs tasks, a limited number at a time. Leaving the context ends the running tasks."""
 
     chunk: int
-    """How many samples make a task."""
+    """The number of samples per task."""
 
-    def has_room(self) -> bool:
-        """Whether it would begin one more now."""
+    def has_capacity(self) -> bool:
+        """Whether another task can be submitted now."""
 
     def is_busy(self) -> bool:
-        """Whether a task is under way."""
+        """Whether any task is running."""
 
     def submit(self, task: RenderTask) -> None:
-        """Begins a task."""
+        """Starts a task."""
 
     def wait(self) -> Sequence[RenderResult]:
-        """Waits until something happens; the results of what was finished, if anything was."""
+        """Waits for an event. Returns: the results of finished tasks, possibly none."""
 
 
 def build(
@@ -121,59 +122,70 @@ def build(
     executor: Executor,
     *,
     shards: bool = False,
-    report: Report = lambda _: None,
+    report: ResultCallback = lambda _: None,
 ) -> None:
-    """Renders the samples that are not there yet, moves them into shards if asked, and writes the index.
+    """Renders the missing samples, packs them into shards on request, and writes the index.
 
-    A sample that fails is reported and left out; the same call tries it again.
+    A sample that fails is reported and skipped. The next call tries it again.
+
+    Args:
+        job: what to render, and where.
+        indices: the indices of the samples.
+        executor: runs the tasks.
+        shards: whether to pack each hundred samples into a tar file.
+        report: called with the result of every sample.
 
     Raises:
-        TargetError: the folder holds something else, another run is writing there, or it is full or read-only.
+        TargetError: the folder holds something else, another run is writing there, the disk is full or read-only.
         MissingExtra, DeviceError: the renderer cannot run here.
     """
-    with _alone_in(job.out):
-        _agree(job)
-        store.remove_leftovers(job.out)
+    with _exclusive_lock(job.out):
+        _check_record(job)
+        store.remove_partial_files(job.out)
         try:
             with executor:
-                _work(_Schedule(job.out, indices, executor.chunk, shards=shards, report=report), executor)
+                _run_tasks(
+                    _Schedule(job.out, indices, executor.chunk, shards=shards, report=report), executor
+                )
         finally:
-            store.remove_leftovers(job.out)
+            store.remove_partial_files(job.out)
         write_index(job.out)
 
 
-def _work(schedule: _Schedule, executor: Executor) -> None:
+def _run_tasks(schedule: _Schedule, executor: Executor) -> None:
     while True:
-        task = schedule.next() if executor.has_room() else None
+        task = schedule.next() if executor.has_capacity() else None
         if task:
             executor.submit(task)
         elif executor.is_busy():
             for result in executor.wait():
                 if result.fatal:
                     raise result.fatal
-                schedule.note(result)
+                schedule.record_result(result)
         else:
             return
 
 
 @final
 class _Schedule:
-    """What is still to do, block by block: the samples that are missing, and the shards that are complete."""
+    """The remaining tasks, block by block: missing samples to render, and complete blocks to pack."""
 
-    def __init__(self, out: Path, indices: range, chunk: int, *, shards: bool, report: Report) -> None:
+    def __init__(
+        self, out: Path, indices: range, chunk: int, *, shards: bool, report: ResultCallback
+    ) -> None:
         self._out, self._indices, self._chunk = out, indices, chunk
         self._shards, self._report = shards, report
         self._packs: deque[int] = deque()
         self._left: dict[int, int] = {}
-        """Block -> how many of its samples are still to be rendered before it can be packed."""
-        self._renders = self._walk()
+        """Block -> number of samples to render before it can be packed."""
+        self._renders = self._plan_tasks()
 
     def next(self) -> RenderTask | None:
-        """The next task; None if there is none, or none until a result is noted."""
+        """The next task; None if there is none, or none before another result."""
         return RenderTask("pack", (self._packs.popleft(),)) if self._packs else next(self._renders, None)
 
-    def note(self, result: RenderResult) -> None:
-        """Learns what became of a sample; with its last one, a block can be packed, unless one has failed."""
+    def record_result(self, result: RenderResult) -> None:
+        """Counts a result. When all samples of a block are rendered, the block is scheduled for packing."""
         block = result.index // store.SHARD_SIZE
         if result.status == "failed":
             self._left.pop(block, None)
@@ -184,18 +196,18 @@ class _Schedule:
                 self._packs.append(block)
         self._report(result)
 
-    def _walk(self) -> Iterator[RenderTask]:
+    def _plan_tasks(self) -> Iterator[RenderTask]:
         size, wanted = store.SHARD_SIZE, self._indices
         for block in range(wanted.start // size, -(-wanted.stop // size)):
-            there = {entry.index for entry in store.read_block(self._out, block)}
+            present = {entry.index for entry in store.read_block(self._out, block)}
             here = range(max(wanted.start, block * size), min(wanted.stop, (block + 1) * size))
-            missing = [index for index in here if index not in there]
+            missing = [index for index in here if index not in present]
             if self._shards and missing:
                 self._left[block] = len(missing)
             elif self._shards and store.has_folders(self._out, block):
                 yield RenderTask("pack", (block,))
             for index in here:
-                if index in there:
+                if index in present:
                     self._report(RenderResult(index, "skipped"))
             for at in range(0, len(missing), self._chunk):
                 yield RenderTask("render", tuple(missing[at : at + self._chunk]))
@@ -205,14 +217,16 @@ class _Schedule:
 
 
 @contextmanager
-def _alone_in(out: Path) -> Iterator[None]:
-    """Holds the folder's lock, which is released by the operating system if the process is killed."""
+def _exclusive_lock(out: Path) -> Iterator[None]:
+    """Holds the lock of the folder. It is released by the operating system if the process is killed."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         (out / _LOCK).touch()
     except OSError as error:
         raise TargetError(
-            f"{out} cannot be written to ({error.strerror})", "a folder for the set", "name another one"
+            f"{out} cannot be written to ({error.strerror})",
+            "expected a folder for the set",
+            "name another one",
         ) from error
     lock = filelock.FileLock(out / _LOCK, blocking=False, fallback_to_soft=False)
     _acquire(lock, out)
@@ -227,31 +241,33 @@ def _acquire(lock: filelock.BaseFileLock, out: Path) -> None:
         lock.acquire()
     except filelock.Timeout as error:
         raise TargetError(
-            f"another run is writing in {out}", "one writes at a time", "wait for it, or name another folder"
+            f"another run is writing in {out}",
+            "only one run can write at a time",
+            "wait for it, or name another folder",
         ) from error
     except OSError as error:
         raise TargetError(
             f"{out} cannot be locked ({error.strerror})",
-            "the file system must know locks, or two runs could mix",
-            "name a folder on another one",
+            "locks keep two runs from writing to the same set",
+            "name a folder on a file system with locks",
         ) from error
 
 
-def _agree(job: RenderJob) -> None:
-    """Records the job in a new set; in one that is there, the job must be the same."""
+def _check_record(job: RenderJob) -> None:
+    """Writes the record of the job into a new set, or compares it with the record of an existing set."""
     path, text = job.out / RECORD, tomli_w.dumps(job.record())
     if not path.exists():
-        _refuse_foreign(job.out)
+        _check_is_set(job.out)
         write_atomically(path, text.encode())
         return
-    there, asked = dict(_values(_read_record(path))), dict(_values(tomllib.loads(text)))
-    for name in {**there, **asked}:
-        old, new = there.get(name, "not set"), asked.get(name, "not set")
+    present, requested = dict(_flatten(_read_record(path))), dict(_flatten(tomllib.loads(text)))
+    for name in {**present, **requested}:
+        old, new = present.get(name, "not set"), requested.get(name, "not set")
         if old != new:
             raise TargetError(
-                f"{job.out} holds another set: its {name} is {old}, and {new} was asked for",
-                "a folder holds one set",
-                "name another folder, or ask for the same",
+                f"{job.out} holds another set: its {name} is {old}, and {new} was requested",
+                "a folder holds one set only",
+                "name another folder, or use the same settings",
             )
 
 
@@ -260,22 +276,24 @@ def _read_record(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text("utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise TargetError(
-            f"{path} cannot be read ({error})", "it records what the folder holds", "name another folder"
+            f"{path} cannot be read ({error})", "expected the record of a set", "name another folder"
         ) from error
 
 
-def _refuse_foreign(out: Path) -> None:
+def _check_is_set(out: Path) -> None:
     foreign = next((path for path in out.iterdir() if not path.name.startswith(".")), None)
     if foreign:
         raise TargetError(
-            f"{out} holds {foreign.name} and is no set", "a set has a folder of its own", "name a new folder"
+            f"{out} holds {foreign.name} and is no set",
+            "expected an empty folder or a set",
+            "name a new folder",
         )
 
 
-def _values(table: dict[str, Any], before: str = "") -> Iterator[tuple[str, object]]:
-    """Every value in nested tables with its dotted name."""
+def _flatten(table: dict[str, Any], before: str = "") -> Iterator[tuple[str, object]]:
+    """Yields (dotted name, value) for every value of nested tables."""
     for name, value in table.items():
         if isinstance(value, dict):
-            yield from _values(value, f"{before}{name}.")
+            yield from _flatten(value, f"{before}{name}.")
         else:
             yield f"{before}{name}", value

@@ -1,4 +1,4 @@
-"""A set seen from above: index.parquet, a row a sample to choose them by, and preview.png, a sheet of the first."""
+"""Overviews of a set: index.parquet with a row per sample, and preview.png, a contact sheet of the first samples."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from brewster.render.sample import LAYERS
 from brewster.rendered.store import SCENE, STATISTICS, StoredSample, read_set
 
 INDEX, PREVIEW = "index.parquet", "preview.png"
-_ROWS_AT_ONCE: Final = 1000
+_BATCH_ROWS: Final = 1000
 
 
 # --- the index
@@ -59,16 +59,16 @@ COLUMNS: Final = {
     "renderer": ("string", "outcome.renderer"),
     "version": ("string", "outcome.version"),
 }
-"""A column of the index -> its type and where it stands in scene.toml; of panes, the one nearest to the camera."""
+"""Column of the index -> its type and its path in scene.toml. The first pane is the one nearest to the camera."""
 
 
 def write_index(out: Path) -> None:
-    """Writes index.parquet: a row a sample, in order. Its bytes depend on the samples and their places alone.
+    """Writes index.parquet, a row per sample in order. Its bytes depend on the samples and their locations only.
 
     Raises:
-        TargetError: it cannot be written; the disk may be full.
+        TargetError: the file cannot be written, for example because the disk is full.
     """
-    import pyarrow as pa  # noqa: PLC0415  (readers of a set do without it)
+    import pyarrow as pa  # noqa: PLC0415  (not needed to read a set)
     from pyarrow import parquet  # noqa: PLC0415
 
     kinds = {"index": "int64", "place": "string", "panes": "int64"} | {
@@ -77,18 +77,18 @@ def write_index(out: Path) -> None:
     schema = pa.schema([(name, pa.type_for_alias(kind)) for name, kind in kinds.items()])
     rows = map(_row, read_set(out))
     with atomic_path(out / INDEX) as part, parquet.ParquetWriter(part, schema) as writer:
-        while some := list(islice(rows, _ROWS_AT_ONCE)):
-            writer.write_batch(pa.RecordBatch.from_pylist(some, schema=schema))
+        while batch := list(islice(rows, _BATCH_ROWS)):
+            writer.write_batch(pa.RecordBatch.from_pylist(batch, schema=schema))
 
 
 def _row(entry: StoredSample) -> dict[str, Any]:
     scene = tomllib.loads(entry.read(SCENE).decode())
     own = {"index": entry.index, "place": entry.place.name, "panes": len(scene["glass"]["panes"])}
-    return own | {name: _at(scene, path.split(".")) for name, (_, path) in COLUMNS.items()}
+    return own | {name: _lookup(scene, path.split(".")) for name, (_, path) in COLUMNS.items()}
 
 
-def _at(table: Any, path: list[str]) -> Any:  # noqa: ANN401  (what TOML holds)
-    """The value there, or None where the scene has no such part."""
+def _lookup(table: Any, path: list[str]) -> Any:  # noqa: ANN401  (what TOML holds)
+    """The value at a path, or None where the scene has no such part."""
     for step in path:
         if isinstance(table, dict) and step not in table:
             return None
@@ -104,10 +104,10 @@ _WHITE: Final = 255
 
 
 def write_preview(out: Path) -> None:
-    """Writes preview.png: the first forty samples, the five photographs of each in a row.
+    """Writes preview.png: the first 40 samples, each a row of its five photographs.
 
     Raises:
-        TargetError: it cannot be written.
+        TargetError: the file cannot be written.
     """
     strips = [_strip(entry) for entry in islice(read_set(out), _SHEET_ROWS * _SHEET_COLUMNS)]
     columns = [np.concatenate(strips[at : at + _SHEET_ROWS]) for at in range(0, len(strips), _SHEET_ROWS)]
@@ -126,7 +126,7 @@ def _strip(entry: StoredSample) -> NDArray[np.uint8]:
 
 
 def _cell(data: bytes) -> NDArray[np.uint8]:
-    """A photograph made small, in the middle of a white cell (120, 160, 3)."""
+    """A photograph, scaled down and centred in a white cell (120, 160, 3)."""
     pixels = torch.from_numpy(Photo.open(data).pixels.copy()).permute(2, 0, 1)[None].float()
     scale = min((cell - 4) / side for cell, side in zip(_CELL, pixels.shape[2:], strict=True))
     height, width = (max(1, round(side * scale)) for side in pixels.shape[2:])

@@ -1,6 +1,6 @@
-"""The same work on many machines, by Ray: each node writes what it renders into the folder that all of them share.
+"""Executor of render tasks on a Ray cluster. Each node writes its samples into a folder that all nodes share.
 
-No pixel passes through the head: it sends indices and gets back what became of them.
+The head node sends indices and receives results; no image data passes through it.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ from typing import Any, Final, Self, final
 
 from brewster.errors import DeviceError, MissingExtra
 from brewster.rendered.generation.job import RenderJob, RenderResult, RenderTask
-from brewster.rendered.generation.workers import TRIES, TaskRunner
+from brewster.rendered.generation.workers import MAX_ATTEMPTS, TaskRunner
 from brewster.worker_setup import single_torch_thread
 
 LOCAL: Final = "local"
-_PATIENCE_S: Final = 10.0
-_AHEAD: Final = 2
-"""Tasks under way for each processor, so that none waits for the head."""
+_CONNECT_TIMEOUT_S: Final = 10.0
+_TASKS_PER_CPU: Final = 2
+"""Submitted tasks per processor, so that no processor waits for the head node."""
 
 
 @final
 class RayExecutor:
-    """The executor of a Ray cluster at an address, or of one on this machine alone ("local").
+    """Runs tasks on the Ray cluster at an address, or on a cluster on this machine only ("local").
 
-    A task whose node is lost is tried on another.
+    A task whose node is lost is tried on another node.
     """
 
     chunk = 4
@@ -35,93 +35,95 @@ class RayExecutor:
         self._job, self._address, self._workers = job, address, workers
         self._tasks: dict[Any, RenderTask] = {}
 
-    def has_room(self) -> bool:
-        """Whether a processor may soon be idle; nodes come and go."""
+    def has_capacity(self) -> bool:
+        """Whether more tasks can be submitted. The number of nodes may change."""
         processors = int(self._ray.cluster_resources().get("CPU", 1))
-        return len(self._tasks) < _AHEAD * max(1, processors)
+        return len(self._tasks) < _TASKS_PER_CPU * max(1, processors)
 
     def is_busy(self) -> bool:
-        """Whether any task is under way."""
+        """Whether any task is running."""
         return bool(self._tasks)
 
     def submit(self, task: RenderTask) -> None:
-        """Sends a task to wherever there is place."""
-        self._tasks[self._perform.remote(self._sent_job, task)] = task
+        """Sends a task to the cluster."""
+        self._tasks[self._run_task.remote(self._job_ref, task)] = task
 
     def wait(self) -> list[RenderResult]:
-        """The results of the next task that is done."""
+        """The results of the next finished task."""
         (done, *_), _ = self._ray.wait(list(self._tasks), num_returns=1)
         task = self._tasks.pop(done)
         try:
             results: list[RenderResult] = self._ray.get(done)
         except self._ray.exceptions.RayError as error:
-            return self._blame(task, type(error).__name__)
+            return self._handle_lost_task(task, type(error).__name__)
         return results
 
-    def _blame(self, task: RenderTask, why: str) -> list[RenderResult]:
-        """Of several numbers that were lost together, only one may be to blame: each is tried alone."""
-        if len(task.numbers) == 1:
-            return task.lost(f"its process or node was lost {TRIES} times ({why})")
-        for number in task.numbers:
-            self.submit(RenderTask(task.do, (number,)))
+    def _handle_lost_task(self, task: RenderTask, reason: str) -> list[RenderResult]:
+        """Submits each sample of a lost task alone, since only one of them may be the cause."""
+        if len(task.indices) == 1:
+            return task.failed_results(f"its process or node was lost {MAX_ATTEMPTS} times ({reason})")
+        for number in task.indices:
+            self.submit(RenderTask(task.kind, (number,)))
         return []
 
     def __enter__(self) -> Self:
-        """Joins the cluster, or starts one.
+        """Connects to the cluster, or starts a local one.
 
         Raises:
             MissingExtra: Ray is not installed.
-            DeviceError: no cluster answers at the address.
+            DeviceError: no cluster responds at the address.
         """
         self._ray = _ray()
-        alone = {"num_cpus": self._workers, "include_dashboard": False} if self._address == LOCAL else {}
+        local_options = (
+            {"num_cpus": self._workers, "include_dashboard": False} if self._address == LOCAL else {}
+        )
         try:
-            _knock(self._address)
-            self._ray.init(self._address, log_to_driver=False, logging_level="error", **alone)
+            _check_reachable(self._address)
+            self._ray.init(self._address, log_to_driver=False, logging_level="error", **local_options)
         except (OSError, RuntimeError, ValueError) as error:
             raise DeviceError(
                 f"there is no cluster at {self._address} ({error})",
-                "a Ray cluster that runs, HOST:PORT, or local",
+                "expected a running Ray cluster as HOST:PORT, or local",
                 "start one: ray start --head",
             ) from error
-        self._perform = self._ray.remote(max_retries=TRIES - 1, num_cpus=1)(_perform)
-        self._sent_job = self._ray.put(self._job)
+        self._run_task = self._ray.remote(max_retries=MAX_ATTEMPTS - 1, num_cpus=1)(_run_task)
+        self._job_ref = self._ray.put(self._job)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Leaves the cluster, which stops what it still does for us."""
+        """Disconnects from the cluster, which ends the running tasks."""
         self._tasks.clear()
         self._ray.shutdown()
 
 
 def _ray() -> ModuleType:
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reads it when it is imported
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray reads it on import
     try:
         ray = importlib.import_module("ray")
     except ImportError as error:
         raise MissingExtra(
-            "a cluster needs the ray package", "it is not installed", "run: pip install 'brewster[cluster]'"
+            "a cluster needs the package ray", "it is not installed", "run: pip install 'brewster[cluster]'"
         ) from error
-    # Ray tells of lost processes on standard output, which belongs to --json, and has no option for that.
+    # Ray reports lost processes on standard output, which is reserved for --json. It has no option to turn that off.
     importlib.import_module("ray._private.worker")._worker_logs_enabled = False  # type: ignore[attr-defined]
     return ray
 
 
-def _knock(address: str) -> None:
-    """Raises OSError if nobody listens at HOST:PORT: Ray itself would ask there for many minutes."""
+def _check_reachable(address: str) -> None:
+    """Raises OSError if nothing listens at HOST:PORT. Ray itself would retry for many minutes."""
     host, _, port = address.rpartition(":")
     if host and port.isdigit() and "/" not in host:
-        socket.create_connection((host, int(port)), timeout=_PATIENCE_S).close()
+        socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT_S).close()
 
 
-_hands: list[tuple[RenderJob, TaskRunner]] = []
-"""Of this process, which does many tasks of one job: the maps that it has read are read once."""
+_runners: list[tuple[RenderJob, TaskRunner]] = []
+"""The job and the task runner of this process. They are kept between tasks, so that maps are read once."""
 
 
-def _perform(job: RenderJob, task: RenderTask) -> list[RenderResult]:
-    if not _hands or _hands[0][0] != job:
-        _hands[:] = [(job, TaskRunner(job))]
+def _run_task(job: RenderJob, task: RenderTask) -> list[RenderResult]:
+    if not _runners or _runners[0][0] != job:
+        _runners[:] = [(job, TaskRunner(job))]
     with single_torch_thread():
-        return _hands[0][1](task)
+        return _runners[0][1](task)

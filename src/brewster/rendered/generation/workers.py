@@ -1,6 +1,7 @@
-"""Who renders a set: this process, or several of them, each with one thread, each writing what it has made.
+"""Executors of render tasks on one machine: in this process, or in several processes.
 
-One thread each: torch sums in another order with more, and the bytes of a sample would depend on the machine.
+Every process uses one thread. With more, torch sums in another order, and the bytes of a sample would depend on the
+number of cores.
 """
 
 from __future__ import annotations
@@ -35,32 +36,32 @@ RENDERERS: Final = {
     "analytic": "brewster.render.analytic:render",
     "mitsuba": "brewster.render.mitsuba.renderer:trace",
 }
-"""What makes a sample of a scene -> the module and function that do it."""
+"""Name of a renderer -> its module and function."""
 
-TRIES: Final = 3
-"""How often a task may cost a worker its life before it is given up."""
+MAX_ATTEMPTS: Final = 3
+"""Number of workers that may die at the same task before the task fails."""
 
 
 @final
 class TaskRunner:
-    """Does the tasks of a job, one after another; what fails becomes a result."""
+    """Runs the tasks of a job in this process. Errors are returned as results."""
 
     def __init__(self, job: RenderJob) -> None:
         self._job, self._assets = job, Assets(job.folders)
 
     def __call__(self, task: RenderTask) -> list[RenderResult]:
-        """The results of rendering; packing has none unless it fails."""
-        if task.do == "render":
-            return [self._attempt(index, lambda index=index: self._render(index)) for index in task.numbers]  # type: ignore[misc]
+        """Runs a task. Returns: a result per sample; for packing, results of failures only."""
+        if task.kind == "render":
+            return [self._attempt(index, lambda index=index: self._render(index)) for index in task.indices]  # type: ignore[misc]
         tried = [
             self._attempt(block * store.SHARD_SIZE, lambda block=block: store.pack(self._job.out, block))  # type: ignore[misc]
-            for block in task.numbers
+            for block in task.indices
         ]
         return [result for result in tried if result.error]
 
     def _render(self, index: int) -> None:
         folder = self._job.out / store.key(index)
-        if not folder.is_dir():  # a task that is tried again may be half done
+        if not folder.is_dir():  # the previous worker may have finished a part of the task
             scene = draw(self._job.recipe, self._job.catalog, self._job.seed, index)
             sample = find_renderer(self._job.renderer)(scene, self._assets)
             store.write_folder(folder, store.encode_sample(sample, self._job.renderer))
@@ -74,43 +75,48 @@ class TaskRunner:
             return RenderResult(index, "failed", error=str(error), kind=type(error).__name__, fatal=fatal)
         except MemoryError:
             return RenderResult(
-                index, "failed", error="it does not fit into memory; use fewer --workers", kind="MemoryError"
+                index,
+                "failed",
+                error="the sample does not fit into memory; use fewer --workers",
+                kind="MemoryError",
             )
-        except Exception as bug:  # noqa: BLE001  (one sample must not cost the others)
-            told = f"brewster stumbled ({type(bug).__name__}: {bug}); please report it"
-            return RenderResult(index, "failed", error=told, kind=type(bug).__name__)
+        except Exception as bug:  # noqa: BLE001  (one sample must not end the run)
+            message = f"internal error ({type(bug).__name__}: {bug}); please report it"
+            return RenderResult(index, "failed", error=message, kind=type(bug).__name__)
         return RenderResult(index, "rendered", time.perf_counter() - started)
 
 
 def find_renderer(name: str) -> Renderer:
-    """A renderer by its name in RENDERERS, or as "module:function"."""
+    """A renderer by its name in RENDERERS or by "module:function"."""
     module, _, function = RENDERERS.get(name, name).partition(":")
     found: Renderer = getattr(importlib.import_module(module), function)
     return found
 
 
 def render_again(path: Path, folder: Path, folders: Sequence[Path] = (), renderer: str | None = None) -> None:
-    """Renders a scene file into a folder of its own, by the renderer that it names unless one is given.
+    """Renders a scene file into a new folder, by default with the renderer that the file names.
 
     Raises:
-        RecipeError: the scene cannot be read, or a file that it needs is missing.
-        TargetError: the folder holds something already, or cannot be written.
+        RecipeError: the scene cannot be read, or a file that it uses is missing.
+        TargetError: the folder is not empty, or cannot be written.
     """
     scene = read_scene(path)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise TargetError(f"{folder} is taken", "nothing is overwritten unasked", "name a new folder with -o")
-    chosen = renderer or _renderer_of(path)
+        raise TargetError(f"{folder} exists", "expected a new or empty folder", "name another one with -o")
+    chosen = renderer or _recorded_renderer(path)
     with single_torch_thread():
         sample = find_renderer(chosen)(scene, Assets(folders))
         store.write_folder(folder, store.encode_sample(sample, chosen))
 
 
-def _renderer_of(path: Path) -> str:
-    """The renderer that a scene file names; one of ours, as a file may not choose what code is run."""
+def _recorded_renderer(path: Path) -> str:
+    """The renderer that a scene file names. Only names in RENDERERS are allowed, so that a file cannot run other code."""
     name = tomllib.loads(path.read_text("utf-8")).get("outcome", {}).get("renderer", "analytic")
     if name not in RENDERERS:
         raise RecipeError(
-            f"{path} was rendered by {name!r}", f"one of {', '.join(RENDERERS)}", "choose it with --renderer"
+            f"{path} was rendered by {name!r}",
+            f"expected one of {', '.join(RENDERERS)}",
+            "choose it with --renderer",
         )
     return str(name)
 
@@ -120,30 +126,30 @@ def _renderer_of(path: Path) -> str:
 
 @final
 class SerialExecutor:
-    """Runs tasks in this process."""
+    """Runs tasks in this process, one at a time."""
 
     chunk = 1
 
     def __init__(self, job: RenderJob) -> None:
-        self._hand, self._threads = TaskRunner(job), single_torch_thread()
+        self._runner, self._threads = TaskRunner(job), single_torch_thread()
         self._task: RenderTask | None = None
 
-    def has_room(self) -> bool:
-        """Whether nothing is to do."""
+    def has_capacity(self) -> bool:
+        """Whether no task is waiting."""
         return self._task is None
 
     def is_busy(self) -> bool:
-        """Whether something is to do."""
+        """Whether a task is waiting."""
         return self._task is not None
 
     def submit(self, task: RenderTask) -> None:
-        """Keeps the task until somebody waits for it."""
+        """Stores the task, which `wait` runs."""
         self._task = task
 
     def wait(self) -> list[RenderResult]:
-        """Does the task."""
+        """Runs the task. Returns: its results."""
         task, self._task = self._task, None
-        return self._hand(task) if task else []
+        return self._runner(task) if task else []
 
     def __enter__(self) -> Self:
         self._threads.__enter__()
@@ -167,7 +173,7 @@ class _Worker:
 
 @final
 class ProcessExecutor:
-    """Processes that do one task at a time; one that dies is replaced, and its task is tried again."""
+    """Runs tasks in several processes, one task each. A dead process is replaced and its task is tried again."""
 
     chunk = 1
 
@@ -176,52 +182,54 @@ class ProcessExecutor:
         self._idle: list[_Worker] = []
         self._busy: dict[Connection, tuple[_Worker, RenderTask, int]] = {}
 
-    def has_room(self) -> bool:
-        """Whether a worker is idle, or could still be hired."""
+    def has_capacity(self) -> bool:
+        """Whether a worker is idle or can be started."""
         return len(self._busy) < self._count
 
     def is_busy(self) -> bool:
-        """Whether any worker works."""
+        """Whether any worker has a task."""
         return bool(self._busy)
 
     def submit(self, task: RenderTask) -> None:
-        """Gives the task to a worker."""
-        self._give(task, 1)
+        """Sends the task to a worker."""
+        self._assign(task, 1)
 
     def wait(self) -> list[RenderResult]:
-        """The results of the next worker that is done; none if it died and another one tries."""
+        """The results of the next finished task; none if a worker died and its task is tried again."""
         pipe = connection.wait(list(self._busy))[0]
         assert isinstance(pipe, Connection)
-        worker, task, tries = self._busy.pop(pipe)
+        worker, task, attempt = self._busy.pop(pipe)
         try:
             results: list[RenderResult] = pipe.recv()
         except (EOFError, OSError):
-            return self._handle_dead_worker(worker, task, tries)
+            return self._handle_dead_worker(worker, task, attempt)
         self._idle.append(worker)
         return results
 
-    def _give(self, task: RenderTask, tries: int) -> None:
+    def _assign(self, task: RenderTask, attempt: int) -> None:
         worker = self._idle.pop() if self._idle else self._spawn()
-        self._busy[worker.pipe] = (worker, task, tries)
-        with suppress(OSError):  # it is dead: its pipe ends, which wait() will notice
+        self._busy[worker.pipe] = (worker, task, attempt)
+        with suppress(OSError):  # the worker is dead: its pipe is closed, which wait() detects
             worker.pipe.send(task)
 
     def _spawn(self) -> _Worker:
         context = get_context("spawn")
         ours, theirs = context.Pipe()
-        process = context.Process(target=_serve, args=(theirs, self._job), daemon=True)
-        with _deaf_to_interrupts():
+        process = context.Process(target=_worker_main, args=(theirs, self._job), daemon=True)
+        with _interrupts_blocked():
             process.start()
         theirs.close()
         return _Worker(process, ours)
 
-    def _handle_dead_worker(self, worker: _Worker, task: RenderTask, tries: int) -> list[RenderResult]:
+    def _handle_dead_worker(self, worker: _Worker, task: RenderTask, attempt: int) -> list[RenderResult]:
         worker.pipe.close()
         worker.process.join()
-        if tries < TRIES:
-            self._give(task, tries + 1)
+        if attempt < MAX_ATTEMPTS:
+            self._assign(task, attempt + 1)
             return []
-        return task.lost(f"its worker died {TRIES} times (exit code {worker.process.exitcode})")
+        return task.failed_results(
+            f"its worker died {MAX_ATTEMPTS} times (exit code {worker.process.exitcode})"
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -229,7 +237,7 @@ class ProcessExecutor:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Idle workers go home when their pipe ends; others are stopped in what they do."""
+        """Closes all pipes, at which idle workers exit. After an error, busy workers are killed."""
         for worker in [*self._idle, *(worker for worker, _, _ in self._busy.values())]:
             worker.pipe.close()
             if error:
@@ -240,12 +248,15 @@ class ProcessExecutor:
 
 
 @contextmanager
-def _deaf_to_interrupts() -> Iterator[None]:
-    """Processes started here never see Ctrl-C, which a terminal sends to all: who started them will stop them."""
-    if sys.platform == "win32":  # it has no signal masks; _serve ignores Ctrl-C as soon as it runs
+def _interrupts_blocked() -> Iterator[None]:
+    """Blocks SIGINT in processes started within this block.
+
+    A terminal sends Ctrl-C to all processes of a group. The parent process stops its workers itself.
+    """
+    if sys.platform == "win32":  # no signal masks there; _worker_main ignores Ctrl-C as soon as it runs
         yield
         return
-    resource_tracker.ensure_running()  # or it would start below, and lift the mask
+    resource_tracker.ensure_running()  # otherwise it would start below and unblock the signal
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -253,11 +264,11 @@ def _deaf_to_interrupts() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _serve(pipe: Connection, job: RenderJob) -> None:
-    """A worker's life: tasks until the pipe ends."""
+def _worker_main(pipe: Connection, job: RenderJob) -> None:
+    """Main function of a worker: runs tasks until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    exit_with_parent()  # the next run may be at the same sample
-    hand = TaskRunner(job)
+    exit_with_parent()  # a resumed run may render the same sample
+    runner = TaskRunner(job)
     with single_torch_thread(), suppress(EOFError):
         while True:
-            pipe.send(hand(pipe.recv()))
+            pipe.send(runner(pipe.recv()))

@@ -28,6 +28,7 @@ from brewster.training.loop import StepCallback, run
 from brewster.training.losses import check_finite, psnr_gain_db, separation_loss, tone_ratio
 from brewster.training.recipe import CompactRecipe
 from brewster.training.streams import held_out_mixtures, open_stream, validation_pairs
+from brewster.worker_setup import single_torch_thread
 
 ValidationPairs = Mapping[str, list[tuple[Tensor, Tensor]]]
 """folder -> pairs of photo and ground truth, each float (1, 3, h, w), sRGB-encoded."""

@@ -12,14 +12,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Final, Literal, Protocol
+from typing import TYPE_CHECKING, Final, Literal, Protocol
 
 import torch
-from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
-from brewster.scene.values import FrozenModel, LogRange, Range, Share
+from brewster.scene.values import FrozenModel, JpegQualityRange, LogRange, Range, Share
 from brewster.srgb import to_encoded, to_linear
 from brewster.training.data import effects
 from brewster.training.data.sample_rng import SampleRng
@@ -72,59 +71,79 @@ that the pane lets through: photo = T + R in linear light."""
 
 
 class MixRecipe(FrozenModel):
-    """The distributions of a mixture. Ranges are uniform; `_log` ranges are uniform in the logarithm.
+    """Distributions of mixtures of photos: a background behind glass plus a reflection, in linear light.
 
-    The defaults are the values of the shipped model; a recipe states only what it changes. Luminances are linear; lengths are
-    in pixels of a picture with a side of 256 px.
+    The defaults are those of the shipped model. Luminances are linear. Lengths in pixels refer to an image of 256 px
+    and scale with the size of the training images.
     """
 
     target: Target = "transmission"
+    """What the network predicts behind the glass: the transmission T, or the background B without glass."""
     crop: Range = (0.35, 1.0)
-    """Side of the crop, relative to the photo's shorter side."""
+    """Side of the crop over the shorter side of the photo."""
     temperature: Range = (-0.35, 0.35)
+    """Colour temperature of the light: logarithm of the gain of red, and minus that of blue."""
     background_map_probability: Share = 0.2
-    """Share of backgrounds that are views of an HDR map instead of a photo."""
+    """Probability that the background is a view of an environment map instead of a photo."""
     background_level_log: LogRange = (0.03, 0.5)
     """Mean luminance of the background before the camera's exposure."""
     highlight_boost: Range = (0.0, 6.0)
-    """Added brightness of the white parts of a photo, whose true luminance was clipped: a factor of 1 + this value."""
+    """Extra brightness of the white parts of a photo, whose true luminance was clipped: factor minus 1."""
     shadow_probability: Share = 0.15
-    """Share of backgrounds with a hard shadow."""
+    """Probability of a hard shadow on the background."""
 
     absent_probability: Share = 0.12
-    """Share of samples without glass, from which a network learns not to change plain photos."""
+    """Probability of a sample without glass, so that the network leaves plain photos unchanged."""
     partial_probability: Share = 0.12
-    """Share of samples whose glass covers only a part of the picture."""
+    """Probability of glass that covers only a part of the image."""
     transmittance: Range = (0.85, 1.0)
+    """Transmittance t of the pane: T = t B."""
     veil_probability: Share = 0.1
+    """Probability of a veil: uniform light that the pane scatters."""
     veil: Range = (0.0, 0.1)
-    """Uniform scattered light of the pane, relative to the mean of the photo."""
+    """Luminance of the veil over the mean of the photo."""
 
     reflection_map_probability: Share = 0.4
+    """Probability that the reflection is a view of an environment map instead of a photo."""
     reflection_ratio_log: LogRange = (0.04, 2.0)
-    """Mean of the reflection without its lamps, relative to the mean of the background."""
+    """Mean luminance of the reflection, without its lamps, over that of the background."""
     reflection_contrast_log: LogRange = (0.8, 1.8)
-    """Exponent on the luminance of the reflected scene: above 1, only bright objects remain visible in the reflection."""
+    """Exponent on the luminance of the reflected scene. Above 1, its lights stand out from dark surroundings."""
     lamp_probability: Share = 0.15
+    """Probability of small lamps in the reflection."""
     sign_probability: Share = 0.08
+    """Probability of a sign with letters in the reflection."""
     sharp_probability: Share = 0.45
+    """Probability of a reflection without defocus blur."""
     blur_px_log: LogRange = (0.3, 5.0)
+    """Radius of the defocus blur of the other reflections."""
     ghost_probability: Share = 0.4
+    """Probability of a ghost: a displaced copy of the reflection from the second surface of the pane."""
     ghost_weight: Range = (0.4, 0.95)
+    """Weight of the ghost."""
     ghost_px: float = 6.0
+    """Largest displacement of the ghost in each direction."""
     falloff_probability: Share = 0.5
+    """Probability of a reflection that fades smoothly across the image."""
     edge_probability: Share = 0.3
+    """Probability of a reflection that ends at a straight edge, such as a frame."""
 
     exposure: Range = (0.2, 0.55)
-    """Largest mean luminance of the exposed photo."""
+    """Largest mean luminance of the photo after exposure."""
     overexposed_probability: Share = 0.2
-    """Share of photos whose exposure makes a part of the background white."""
+    """Probability of an overexposed photo, in which a part of the background is white."""
     overexposed_share: Range = (0.005, 0.15)
+    """Share of white pixels in such a photo."""
     gamma_log: LogRange = (0.8, 1.25)
+    """Exponent on the encoded values."""
     contrast: Range = (-0.3, 0.5)
+    """Strength of an S-shaped tone curve on the encoded values: 0 is none, negative values flatten it."""
     noise: Range = (0.0, 0.012)
+    """Standard deviation of Gaussian noise on the encoded photo."""
     jpeg_probability: Share = 0.3
-    jpeg_quality: tuple[Annotated[int, Field(ge=1, le=100)], Annotated[int, Field(ge=1, le=100)]] = (60, 97)
+    """Probability of JPEG compression of the photo."""
+    jpeg_quality: JpegQualityRange = (60, 97)
+    """Quality of the JPEG compression."""
 
 
 class Mixtures:

@@ -18,11 +18,11 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from brewster.environments.assets import naming
+from brewster.environments.assets import naming_file
 from brewster.errors import RecipeError
 from brewster.photo import Photo
 from brewster.render.camera_response import encode_jpeg, to_uint8
-from brewster.rendered.store import SCENE, StoredSample, key, read_cause, read_set
+from brewster.rendered.store import SCENE, StoredSample, key, read_scene_of, read_set
 from brewster.scene.values import Range
 from brewster.srgb import to_encoded
 from brewster.training.data.alpha_blend import blended_layers
@@ -164,7 +164,7 @@ def _entries(folder: Path) -> list[StoredSample]:
 
 def _blended_sample(entry: StoredSample) -> Tensor:
     with _file_errors(entry, SCENE):
-        scene = read_cause(entry)
+        scene = read_scene_of(entry)
     background, mirror = (_picture(entry, name).permute(2, 0, 1) / 255 for name in ("background", "mirror"))
     photo, *layers = blended_layers(background, mirror, scene)
     seen = Photo.open(encode_jpeg(photo, scene.development.jpeg_quality)).pixels.copy()
@@ -174,7 +174,7 @@ def _blended_sample(entry: StoredSample) -> Tensor:
 def _picture(entry: StoredSample, layer: str) -> Tensor:
     """Reads a layer of a sample, (H, W, 3) sRGB uint8."""
     name = f"{layer}.jpg"
-    with _file_errors(entry, name), naming(f"{name} of sample {key(entry.index)} in {entry.place}"):
+    with _file_errors(entry, name), naming_file(f"{name} of sample {key(entry.index)} in {entry.place}"):
         return torch.from_numpy(Photo.open(entry.read(name)).pixels.copy())
 
 

@@ -44,7 +44,7 @@ from brewster.training.lora.latents import (
 )
 from brewster.training.lora.model_card import write_card
 from brewster.training.losses import check_finite, psnr_gain_db
-from brewster.training.recipe import ENCODED, LoraRecipe
+from brewster.training.recipe import ENCODED_SUFFIX, LoraRecipe
 from brewster.training.streams import validation_pairs
 
 LORA_FOLDER: Final = "lora"
@@ -241,7 +241,7 @@ def _check_batch(recipe: LoraRecipe) -> None:
 
 
 def _load_prompt(recipe: LoraRecipe, backbone: Backbone) -> PromptEmbedding:
-    if recipe.prompt.endswith(ENCODED):
+    if recipe.prompt.endswith(ENCODED_SUFFIX):
         return load_prompt(Path(recipe.prompt), backbone.name)
     return encode_prompt(recipe.backbone, PROMPTS[recipe.prompt])
 

@@ -1,0 +1,78 @@
+"""The reference of all recipe keys, made from their pydantic models: `make docs` writes docs/recipes.md.
+
+.venv/bin/python -m brewster.cli.recipe_reference > docs/recipes.md
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+import click
+
+from brewster.evaluate.ablation import AblationStudy
+from brewster.scene.recipe import SceneRecipe
+from brewster.scene.recipe_file import default_of
+from brewster.scene.recipe_keys import RecipeKey, RecipeTable, recipe_tables
+from brewster.scene.values import FrozenModel
+from brewster.training.recipe import CompactRecipe, LoraRecipe
+
+_BEGINNING: Final = """# Recipe keys
+
+`make docs` generates this page from the recipe models; a test checks that it is up to date.
+
+Recipes are TOML files. `brewster render --show-recipe window` and `brewster train --show-recipe compact` (or `lora`)
+print a complete recipe with all defaults and a comment for each key, ready to be edited. Both take the path of a recipe
+file, too. A wrong recipe is refused with one line for each problem."""
+
+RECIPE_KINDS: Final[dict[str, tuple[type[FrozenModel], str]]] = {
+    "Scene recipes": (
+        SceneRecipe,
+        "For `brewster render --recipe`: the distributions that random scenes are drawn from.",
+    ),
+    "Training recipes of a compact network": (
+        CompactRecipe,
+        "For `brewster train`, without the key `backbone`.",
+    ),
+    "Training recipes of a LoRA": (LoraRecipe, "For `brewster train`, with the key `backbone`."),
+    "Ablations": (AblationStudy, "For `brewster ablate`."),
+}
+"""Title of a section of the page -> the model of its recipes, and what they are for."""
+
+
+def recipe_reference() -> str:
+    """The page, in Markdown: a table of keys for each table of each kind of recipe."""
+    return "\n\n".join([_BEGINNING, *_sections()]) + "\n"
+
+
+def _sections() -> Iterator[str]:
+    seen: dict[type[FrozenModel], str] = {}
+    for title, (model, purpose) in RECIPE_KINDS.items():
+        yield f"## {title}\n\n{purpose}"
+        for table in recipe_tables(model):
+            yield f"### [{table.path}]\n\n{table.meaning}" if table.path else table.meaning
+            if table.model in seen:
+                yield f"The keys are those of {seen[table.model]}."
+            else:
+                yield _rows(table)
+            seen.setdefault(table.model, f'`[{table.path}]` in "{title}"')
+
+
+def _rows(table: RecipeTable) -> str:
+    head = ["| key | type | allowed values | unit | default | meaning |", "|---|---|---|---|---|---|"]
+    return "\n".join([*head, *map(_row, table.keys)])
+
+
+def _row(key: RecipeKey) -> str:
+    cells = (f"`{key.path}`", key.kind, key.allowed, key.unit, _default(key), key.meaning)
+    return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+
+
+def _default(key: RecipeKey) -> str:
+    words = default_of(key)
+    value = words.removeprefix("default ")
+    return words if value == words else f"`{value}`"
+
+
+if __name__ == "__main__":
+    click.echo(recipe_reference(), nl=False)

@@ -1,0 +1,244 @@
+"""Recipes as TOML files: read and checked with all problems named at once, and written with all defaults.
+
+recipe = read_toml(SceneRecipe, Path("mine.toml"), compare="docs/recipes.md")
+print(commented_toml(recipe))
+"""
+
+from __future__ import annotations
+
+import re
+import textwrap
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails, to_jsonable_python
+
+from brewster.errors import RecipeError
+from brewster.scene.recipe_keys import (
+    REQUIRED,
+    RecipeKey,
+    choices,
+    describe,
+    names_in,
+    recipe_keys,
+    recipe_tables,
+)
+from brewster.scene.values import FrozenModel
+
+Model = TypeVar("Model", bound=FrozenModel)
+
+_WIDTH: Final = 100
+_ESCAPES: Final = {code: f"\\u{code:04x}" for code in (*range(32), 127, ord('"'), ord("\\"))}
+_LONGEST_VALUE: Final = 60
+
+
+# --- reading
+
+
+def read_toml(model: type[Model], path: Path, *, compare: str) -> Model:
+    """Reads and checks a TOML file; `compare` names what a user can compare a wrong file with.
+
+    Returns: the values as an instance of `model`.
+
+    Raises:
+        RecipeError: the file is missing or not TOML, or keys are missing, unknown or have impossible values.
+    """
+    try:
+        values = tomllib.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise RecipeError(f"{path} cannot be read", "expected a TOML file", f"see {compare}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise RecipeError(
+            f"{path} is not TOML ({error})", "expected a TOML file", "correct that place"
+        ) from error
+    return validated(model, values, owner=str(path), compare=compare)
+
+
+def validated(model: type[Model], values: Mapping[str, Any], *, owner: str, compare: str) -> Model:
+    """The values as an instance of `model`; `owner` is what error messages call their source.
+
+    Raises:
+        RecipeError: keys are missing, unknown or have impossible values; one sentence for each.
+    """
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        problems = {
+            str(problem): problem
+            for problem in (_problem(model, values, details, (owner, compare)) for details in error.errors())
+        }
+        first, *others = problems.values()
+        raise RecipeError(first.happened, first.expected, first.cure, tuple(others)) from error
+
+
+def _problem(
+    model: type[FrozenModel], values: Mapping[str, Any], details: ErrorDetails, names: tuple[str, str]
+) -> RecipeError:
+    """One of pydantic's errors as a sentence: file, key and value; what is allowed; what to do."""
+    owner, compare = names
+    location, kind = details["loc"], details["type"]
+    path, value = _look_up(values, location)
+    cure = f"compare with {compare}"
+    if kind == "missing":
+        missing = [*path, str(location[-1])]
+        return RecipeError(f"{owner}: {_dotted(missing)} is missing", _expected(model, missing), "add it")
+    if kind == "extra_forbidden" or location[-1:] == ("[key]",):
+        return _unknown_key(model, path, value, owner)
+    message = details["msg"].removeprefix("Value error, ")
+    if isinstance(value, Mapping):
+        subject = f"{owner}: [{_dotted(path)}]" if path else owner
+        return RecipeError(f"{subject} contradicts itself", message, cure)
+    happened = f"{owner}: {_dotted(path)} is {_shortened(value)}"
+    if kind == "value_error":
+        return RecipeError(happened, message, cure)
+    if kind == "finite_number":
+        return RecipeError(happened, "expected a finite number", cure)
+    names_of = [choice for choice in choices(model, path) if isinstance(choice, str)]
+    close = get_close_matches(str(value), names_of, n=1)
+    return RecipeError(happened, _expected(model, path), f'did you mean "{close[0]}"?' if close else cure)
+
+
+def _look_up(
+    values: Any,  # noqa: ANN401  (what TOML holds)
+    location: Sequence[str | int],
+) -> tuple[list[str | int], Any]:
+    """The part of pydantic's location that the values hold, and the value there.
+
+    Behind it pydantic may name a member of a union, or "[key]".
+    """
+    path: list[str | int] = []
+    for part in location:
+        is_key = isinstance(values, Mapping) and part in values
+        is_index = isinstance(values, Sequence) and isinstance(part, int) and part < len(values)
+        if not (is_key or is_index):
+            break
+        values = values[part]
+        path.append(part)
+    return path, values
+
+
+def _unknown_key(
+    model: type[FrozenModel], path: Sequence[str | int], value: object, owner: str
+) -> RecipeError:
+    table = path[:-1]
+    subject = f"[{_dotted(table)}]" if table else "the recipe"
+    close = similar_key(model, path)
+    return RecipeError(
+        f"{owner}: there is no key {_dotted(path)} (its value is {_shortened(value)})",
+        f"expected a key of {subject}"
+        if close
+        else f"{subject} has the keys {', '.join(names_in(model, table))}",
+        f"did you mean {close}?" if close else "remove it",
+    )
+
+
+def similar_key(model: type[FrozenModel], path: Sequence[str | int]) -> str | None:
+    """The known key that an unknown one resembles: one of its table, or one of the same name in another table."""
+    *table, name = path
+    close = get_close_matches(str(name), names_in(model, table), n=1)
+    if close:
+        return _dotted([*table, close[0]])
+    paths = [key.path for key in recipe_keys(model)] + [table.path for table in recipe_tables(model)]
+    return next((known for known in paths if known.rpartition(".")[2] == name), None)
+
+
+def _expected(model: type[FrozenModel], path: Sequence[str | int]) -> str:
+    return f"expected {describe(model, path)}"
+
+
+def _dotted(path: Sequence[str | int]) -> str:
+    return ".".join(map(str, path))
+
+
+def _shortened(value: object) -> str:
+    text = _toml(value)
+    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}..."
+
+
+# --- writing
+
+
+def commented_toml(recipe: FrozenModel) -> str:
+    """The recipe as TOML: every key, those with default values too, each below a comment with its description.
+
+    An optional key that is not set is a comment. Reading the text gives an equal recipe.
+    """
+    values = recipe.model_dump(mode="json")
+    lines: list[str] = []
+    for table in recipe_tables(type(recipe)):
+        is_set = _value_at(values, table.path) is not None
+        if table.path:
+            lines += ["", *_comment(table.meaning), _line(f"[{table.path}]", is_set=is_set)]
+        for key in table.keys:
+            value = _value_at(values, key.path) if is_set else _plain_default(key)
+            lines += _key_lines(key, value, is_set=is_set)
+    return "\n".join(lines) + "\n"
+
+
+def _key_lines(key: RecipeKey, value: object, *, is_set: bool) -> Iterator[str]:
+    """The description of a key as comments, and its value."""
+    yield from _comment(f"{key.meaning} ({', '.join(_facts(key))})")
+    name = key.path.rpartition(".")[2]
+    is_given = is_set and value is not None
+    yield _line(f"{name} = {'' if value is None else _toml(value)}".rstrip(), is_set=is_given)
+
+
+def _facts(key: RecipeKey) -> Iterator[str]:
+    """Type, allowed values, unit and default of a key in words."""
+    yield key.kind
+    if key.allowed:
+        yield key.allowed
+    if key.unit:
+        yield f"in {key.unit}"
+    yield default_of(key)
+
+
+def default_of(key: RecipeKey) -> str:
+    """The default of a key in words."""
+    value = _plain_default(key)
+    if key.default is REQUIRED:
+        return "required"
+    return "not set by default" if value is None else f"default {_toml(value)}"
+
+
+def _plain_default(key: RecipeKey) -> object:
+    return None if key.default is REQUIRED else to_jsonable_python(key.default)
+
+
+def _comment(text: str) -> list[str]:
+    return textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False)
+
+
+def _line(text: str, *, is_set: bool) -> str:
+    return text if is_set else f"# {text}"
+
+
+def _value_at(values: Any, path: str) -> Any:  # noqa: ANN401
+    for name in path.split(".") if path else ():
+        values = values.get(name) if values else None
+    return values
+
+
+def _toml(value: object) -> str:
+    """A value on one line, as TOML."""
+    match value:
+        case bool():
+            return str(value).lower()
+        case Mapping():
+            pairs = [f"{_toml_key(name)} = {_toml(inner)}" for name, inner in value.items()]
+            return f"{{ {', '.join(pairs)} }}" if pairs else "{}"
+        case list() | tuple():
+            return f"[{', '.join(map(_toml, value))}]"
+        case str():
+            return f'"{value.translate(_ESCAPES)}"'
+        case _:
+            return str(value)
+
+
+def _toml_key(name: object) -> str:
+    text = str(name)
+    return text if re.fullmatch(r"[A-Za-z0-9_-]+", text) else _toml(text)

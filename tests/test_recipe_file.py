@@ -1,0 +1,152 @@
+"""Recipe files: all problems are reported at once, and a recipe is printed with all its keys."""
+
+import pickle
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from brewster.errors import RecipeError
+from brewster.scene.recipe import RECIPES, SceneRecipe, read_scene_recipe
+from brewster.scene.recipe_file import commented_toml, read_toml
+from brewster.scene.recipe_keys import recipe_keys
+from brewster.training.recipe import TEMPLATES, LoraRecipe, read_recipe, read_template
+
+TRAINING = sorted((Path(__file__).parents[1] / "recipes").glob("**/*.toml"))
+
+
+@pytest.fixture
+def problems(tmp_path):
+    def problems(text, read=lambda path: read_toml(SceneRecipe, path, compare="docs/recipes.md")):
+        (tmp_path / "mine.toml").write_text(text)
+        with pytest.raises(RecipeError) as caught:
+            read(tmp_path / "mine.toml")
+        return str(caught.value).replace(f"{tmp_path}/", "").splitlines()
+
+    return problems
+
+
+# --- errors
+
+
+def test_all_problems_are_reported_at_once_with_file_key_value_and_what_is_allowed(problems):
+    text = """
+name = "mine"
+samples = 0
+[glass]
+double_probability = 2
+thickness_mm = [5, 4]
+[behind]
+map_probabilty = 0.5
+[developmnt]
+contrast = [0, 1]
+"""
+    assert problems(text) == [
+        "mine.toml: about is missing; expected a string; add it.",
+        "mine.toml: samples is 0; expected an integer, above 0; compare with docs/recipes.md.",
+        "mine.toml: glass.double_probability is 2; expected a number, from 0 to 1; compare with docs/recipes.md.",
+        (
+            "mine.toml: glass.thickness_mm is [5, 4]; expected low <= high, and low is 5, high is 4; compare with"
+            " docs/recipes.md."
+        ),
+        (
+            "mine.toml: there is no key behind.map_probabilty (its value is 0.5); expected a key of [behind];"
+            " did you mean behind.map_probability?"
+        ),
+        (
+            "mine.toml: there is no key developmnt (its value is { contrast = [0, 1] }); expected a key of the recipe;"
+            " did you mean development?"
+        ),
+    ]
+
+
+def test_a_key_in_the_wrong_table_is_named_with_its_own(problems):
+    [line] = problems('name = "mine"\nabout = ""\nfov_deg = [30, 40]')
+    assert line.endswith("did you mean camera.fov_deg?")
+
+
+def test_a_misspelt_choice_is_corrected_and_an_unknown_key_lists_the_known_ones(problems):
+    lines = problems('name = "mine"\nabout = ""\norders = "papr"\n[glass]\nsparkle = true')
+    assert lines[1].endswith(
+        'orders is "papr"; expected a string, one of "all", "paper"; did you mean "paper"?'
+    ) or (
+        lines[0].endswith('orders is "papr"; expected a string, one of "all", "paper"; did you mean "paper"?')
+    )
+    assert any("[glass] has the keys double_probability, gap_mm" in line for line in lines)
+
+
+def test_problems_of_a_training_recipe_are_reported_alike(problems):
+    text = 'backbone = "kontext"\nrnk = 4\nseed = 1.5\npanel_weights = { X = 1 }\n[data]\npairs = ["a"]\npairs_share = 3'
+    found = "\n".join(problems(text, read_recipe))
+    assert "seed is 1.5; expected an integer" in found
+    assert "steps is missing" in found
+    assert "data.pairs_share is 3" in found
+    assert "there is no key panel_weights.X (its value is 1); [panel_weights] has the keys I, T, R" in found
+    assert "there is no key rnk (its value is 4); expected a key of the recipe; did you mean rank?" in found
+
+
+def test_an_error_with_several_problems_survives_another_process(problems, tmp_path):
+    (tmp_path / "mine.toml").write_text("")
+    with pytest.raises(RecipeError) as caught:
+        read_toml(SceneRecipe, tmp_path / "mine.toml", compare="docs/recipes.md")
+    assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
+    assert len(caught.value.sentences()) == 2
+
+
+def test_the_command_prints_a_line_for_each_problem(bare, tmp_path):
+    (tmp_path / "mine.toml").write_text("samples = 0")
+    code, out, err = bare("render", "out", "--recipe", "mine.toml")
+    assert (code, out) == (1, b"")
+    assert [line.split(";")[0] for line in err.splitlines()] == [
+        "error: mine.toml: name is missing",
+        "error: mine.toml: about is missing",
+        "error: mine.toml: samples is 0",
+    ]
+
+
+# --- recipes as text
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_scene_recipe_that_is_printed_and_read_is_the_same(name):
+    recipe = read_scene_recipe(name)
+    assert SceneRecipe.model_validate(tomllib.loads(commented_toml(recipe))) == recipe
+
+
+@pytest.mark.parametrize("name", [*TEMPLATES, *map(str, TRAINING)])
+def test_a_training_recipe_that_is_printed_and_read_is_the_same(name):
+    if "ablations" in name and "benchmarks" in Path(name).read_text():
+        pytest.skip("an ablation")
+    recipe = read_template(name)
+    assert type(recipe).model_validate(tomllib.loads(commented_toml(recipe))) == recipe
+
+
+def test_every_key_is_printed_below_its_meaning():
+    text = commented_toml(read_template("lora"))
+    for key in recipe_keys(LoraRecipe):
+        name = key.path.rpartition(".")[2]
+        assert f"\n{name} =" in text or f"\n# {name} =" in text
+        assert key.meaning.split()[0] in text
+
+
+def test_the_commands_show_recipes(bare, tmp_path):
+    code, out, _ = bare("render", "--show-recipe", "office")
+    assert (code, out.decode()) == (0, commented_toml(read_scene_recipe("office")))
+    (tmp_path / "mine.toml").write_bytes(out)
+    assert bare("render", "--show-recipe", "mine.toml")[1] == out
+    code, out, _ = bare("train", "--show-recipe", "compact")
+    assert (code, out.decode()) == (0, commented_toml(read_template("compact")))
+    (tmp_path / "compact.toml").write_bytes(out)
+    assert bare("train", "--show-recipe", "compact.toml")[1] == out
+
+
+def test_an_unknown_recipe_cannot_be_shown(bare):
+    code, _, err = bare("train", "--show-recipe", "compat")
+    assert (code, err) == (
+        1,
+        (
+            "error: there is no training recipe 'compat'; the packaged recipes are compact, lora;"
+            " name one of them, or a .toml file.\n"
+        ),
+    )
+    assert bare("train")[0] == 2

@@ -1,0 +1,85 @@
+"""Descriptions of recipe keys: complete, and in words that state the constraints."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pytest
+from pydantic import Field
+
+from brewster.cli.recipe_reference import RECIPE_KINDS, recipe_reference
+from brewster.scene.recipe_keys import REQUIRED, describe, recipe_keys, recipe_tables
+from brewster.scene.values import FrozenModel, KeyNote, LogRange, Pixels, Share
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+class Inner(FrozenModel):
+    """An inner table."""
+
+    width_px: Pixels = 64
+    """A width."""
+    mode: Literal["fast", "slow"] | None = None
+    """A mode."""
+
+
+class Outer(FrozenModel):
+    """A recipe."""
+
+    length_mm_log: LogRange = (1.0, 2.0)
+    """A length,
+    over two lines."""
+    shares: Annotated[list[Share], Field(min_length=1), KeyNote(allowed="all different")]
+    """Some shares."""
+    inner: Inner | None = None
+    """An optional table."""
+
+
+def keys(model):
+    return {key.path: key for key in recipe_keys(model)}
+
+
+def test_a_key_has_type_allowed_values_unit_default_and_meaning():
+    found = keys(Outer)
+    assert list(found) == ["length_mm_log", "shares", "inner.width_px", "inner.mode"]
+    length = found["length_mm_log"]
+    assert (length.kind, length.unit, length.default) == ("range [low, high]", "mm", (1.0, 2.0))
+    assert length.allowed == "each above 0, sampled uniformly in the logarithm"
+    assert length.meaning == "A length, over two lines."
+    shares = found["shares"]
+    assert (shares.kind, shares.default) == ("list of numbers", REQUIRED)
+    assert shares.allowed == "each from 0 to 1, at least 1 entry, all different"
+    assert (found["inner.width_px"].allowed, found["inner.width_px"].unit) == ("at least 16", "px")
+    assert found["inner.mode"].allowed == 'one of "fast", "slow"'
+
+
+def test_tables_are_listed_with_what_they_are_about():
+    assert [(table.path, table.meaning) for table in recipe_tables(Outer)] == [
+        ("", "A recipe."),
+        ("inner", "An optional table."),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("path", "words"),
+    [
+        (["shares", 3], "a number, from 0 to 1"),
+        (["length_mm_log", 1], "a number, above 0"),
+        (["inner", "mode"], 'a string, one of "fast", "slow"'),
+        (["inner", "width_px"], "an integer, at least 16"),
+    ],
+)
+def test_a_place_inside_a_value_is_described_too(path, words):
+    assert describe(Outer, path) == words
+
+
+@pytest.mark.parametrize("title", RECIPE_KINDS)
+def test_every_key_of_every_recipe_is_explained_in_a_sentence(title):
+    model, _ = RECIPE_KINDS[title]
+    for key in recipe_keys(model):
+        assert key.meaning[:1].isupper() or key.meaning.partition(":")[0].isalnum(), key.path
+        assert key.meaning.endswith("."), key.path
+    assert all(table.meaning.endswith(".") for table in recipe_tables(model))
+
+
+def test_the_reference_in_the_docs_is_up_to_date():
+    assert (DOCS / "recipes.md").read_text() == recipe_reference(), "run make docs"
