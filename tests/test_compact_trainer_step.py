@@ -185,7 +185,9 @@ def test_the_loss_of_a_reflection_is_scaled_by_its_weight(lora, monkeypatch):
     encoded = one._latents(SampleRng(1, 0, 0))
     parts = []
     for weight in (1.0, 0.25):
-        monkeypatch.setattr(one, "_latents", lambda rng, weight=weight: replace(encoded, weight=weight))
+        monkeypatch.setattr(
+            one, "_latents", lambda rng, weight=weight: replace(encoded, reflection_weight=weight)
+        )
         parts.append({name: part.item() for name, part in one._losses(SampleRng(1, 0, 0)).items()})
     whole, quarter = parts
     assert quarter["panel_R"] == pytest.approx(whole["panel_R"] / 4, rel=1e-5)
