@@ -93,7 +93,7 @@ def endless(self, source, **options):
     while source.name == "06.jpg":
         separate(self, source, **options)
         Path("at work").touch()
-        interrupts.heed()
+        interrupts.raise_pending()
     return separate(self, source, **options)
 Separator.__call__ = endless
 sys.exit(main(sys.argv[1:]))

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import click
 
-from brewster.cli.evaluate import print_tables, tell_failures, tell_of
+from brewster.cli.evaluate import print_failures, print_remarks, print_tables
 from brewster.cli.extras import require_extra
-from brewster.cli.terminal import interrupts, say
+from brewster.cli.terminal import interrupts, print_status
 
 
 @click.command
@@ -50,20 +50,20 @@ def ablate(
     from brewster.evaluate.ablation import ablate as run  # noqa: PLC0415  (wakes torch, in two seconds)
     from brewster.evaluate.ablation import read_study  # noqa: PLC0415
 
-    read, name = read_study(study), study.stem
+    ablation, name = read_study(study), study.stem
     if base:
-        read, name = read.model_copy(update={"base": base}), f"{name}-{base.stem}"
+        ablation, name = ablation.model_copy(update={"base": base}), f"{name}-{base.stem}"
     out = out or Path("out") / "ablations" / name
-    parts = read.open_benchmarks()
-    is_whole = tell_of(parts, quiet=quiet)
+    benchmarks = ablation.open_benchmarks()
+    is_complete = print_remarks(benchmarks, quiet=quiet)
 
-    def report(choice: str, step: int, steps: int, numbers: Mapping[str, float], logged: bool) -> None:
-        interrupts.heed()
+    def report(choice: str, step: int, steps: int, metrics: Mapping[str, float], logged: bool) -> None:
+        interrupts.raise_pending()
         if logged and not quiet:
-            say(f"{choice}, step {step} of {steps}: loss {numbers['loss']:.4f}")
+            print_status(f"{choice}, step {step} of {steps}: loss {metrics['loss']:.4f}")
 
-    results = run(read, parts, out, workers=workers, report=report)
+    results = run(ablation, benchmarks, out, workers=workers, report=report)
     if not quiet:
         print_tables(results)
-        say(f"all of it is in {out}")
-    context.exit(0 if tell_failures(results, quiet=quiet) and is_whole else 1)
+        print_status(f"all of it is in {out}")
+    context.exit(0 if print_failures(results, quiet=quiet) and is_complete else 1)

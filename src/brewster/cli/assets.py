@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from brewster.cli.terminal import complain, one_line, progress, say, standard_output, write_out
+from brewster.cli.terminal import one_line, print_error, print_status, progress, standard_output, write_out
 
 if TYPE_CHECKING:
     from brewster.environments.polyhaven import DownloadRequest, DownloadResult
@@ -68,7 +68,7 @@ def pull(
     out: Path | None,
     as_json: bool,
     quiet: bool,
-    **asked: Any,  # noqa: ANN401  (the fields of Order)
+    **options: Any,  # noqa: ANN401  (the fields of DownloadRequest)
 ) -> None:
     """Download CC0 maps (360-degree HDR photographs) from Poly Haven into the folder OUT.
 
@@ -80,32 +80,32 @@ def pull(
     """
     from brewster.environments.polyhaven import DownloadRequest, maps_folder  # noqa: PLC0415  (wakes urllib)
 
-    order = DownloadRequest(**asked)
-    results = _fetch(order, out or maps_folder(), as_json=as_json, quiet=quiet)
+    request = DownloadRequest(**options)
+    results = _fetch(request, out or maps_folder(), as_json=as_json, quiet=quiet)
     if not quiet:
-        _own_up(order, results)
-        say("powered by Poly Haven, polyhaven.com")  # its terms of service ask for these words
+        _print_shortfall(request, results)
+        print_status("powered by Poly Haven, polyhaven.com")  # its terms of service ask for these words
     context.exit(1 if any(result.error for result in results) else 0)
 
 
-def _fetch(order: DownloadRequest, folder: Path, *, as_json: bool, quiet: bool) -> list[DownloadResult]:
+def _fetch(request: DownloadRequest, folder: Path, *, as_json: bool, quiet: bool) -> list[DownloadResult]:
     """Fetches the maps and tells of each; those that failed are named at the end, whatever the end is."""
     from brewster.environments.polyhaven import pull as fetch  # noqa: PLC0415
 
     results: list[DownloadResult] = []
-    talks_over_bar = as_json and standard_output.stream.isatty()
+    shares_terminal = as_json and standard_output.stream.isatty()
     try:
-        with progress(order.indoor + order.outdoor, shown=not quiet and not talks_over_bar) as advance:
-            for result in fetch(order, folder):
+        with progress(request.indoor + request.outdoor, shown=not quiet and not shares_terminal) as advance:
+            for result in fetch(request, folder):
                 results.append(result)
-                _tell(result, as_json=as_json, quiet=quiet)
+                _print_result(result, as_json=as_json, quiet=quiet)
                 advance(sum(result.status != "missing" for result in results), result.asset)
     finally:
-        _sum_up(results, quiet=quiet)
+        _print_summary(results, quiet=quiet)
     return results
 
 
-def _tell(result: DownloadResult, *, as_json: bool, quiet: bool) -> None:
+def _print_result(result: DownloadResult, *, as_json: bool, quiet: bool) -> None:
     if as_json:
         write_out(f"{json.dumps(asdict(result))}\n".encode())
     elif result.status == "planned":
@@ -113,27 +113,27 @@ def _tell(result: DownloadResult, *, as_json: bool, quiet: bool) -> None:
     if quiet:
         return
     if result.status == "missing":
-        say(f"{result.asset}: passed over, it has no such file")
+        print_status(f"{result.asset}: passed over, it has no such file")
     elif result.status == "skipped":
-        say(f"{result.file}: skipped, it is there")
+        print_status(f"{result.file}: skipped, it is there")
     elif result.status == "downloaded":
-        say(f"{result.asset} -> {result.file} ({(result.bytes or 0) / 1e6:.1f} MB)")
+        print_status(f"{result.asset} -> {result.file} ({(result.bytes or 0) / 1e6:.1f} MB)")
 
 
-def _sum_up(results: Sequence[DownloadResult], *, quiet: bool) -> None:
+def _print_summary(results: Sequence[DownloadResult], *, quiet: bool) -> None:
     counts = Counter(result.status for result in results)
     if counts and not quiet:
-        say(", ".join(f"{count} {status}" for status, count in sorted(counts.items())))
+        print_status(", ".join(f"{count} {status}" for status, count in sorted(counts.items())))
     for result in results:
         if result.error:
-            complain(f"{result.asset}: {result.error}")
+            print_error(f"{result.asset}: {result.error}")
 
 
-def _own_up(order: DownloadRequest, results: Sequence[DownloadResult]) -> None:
+def _print_shortfall(request: DownloadRequest, results: Sequence[DownloadResult]) -> None:
     """Says aloud when the server has fewer maps than were asked for."""
-    for category, asked in (("indoor", order.indoor), ("outdoor", order.outdoor)):
+    for category, requested in (("indoor", request.indoor), ("outdoor", request.outdoor)):
         found = sum(result.category == category and result.status != "missing" for result in results)
-        if found < asked:
-            say(
-                f"{found} of {asked} {category} maps: the server has no more in {order.resolution} {order.format}"
+        if found < requested:
+            print_status(
+                f"{found} of {requested} {category} maps: the server has no more in {request.resolution} {request.format}"
             )

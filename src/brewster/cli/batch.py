@@ -19,11 +19,11 @@ import click
 
 from brewster.cli.terminal import (
     Advance,
-    complain,
     interrupts,
     one_line,
+    print_error,
+    print_status,
     progress,
-    say,
     standard_output,
     write_out,
 )
@@ -166,10 +166,10 @@ class SeparationBatch:
                 self._show_progress = partial(_show_progress, advance, len(entries), task.name)
                 entry = self._do(task, bugs)
                 if entry.error:
-                    interrupts.heed()  # a dropped Ctrl-C may be all that was wrong
+                    interrupts.raise_pending()  # a dropped Ctrl-C may be all that was wrong
                 entries.append(entry)
                 self._tell(entry)
-                interrupts.heed()
+                interrupts.raise_pending()
         self._sum_up(entries)
         if bugs:
             raise bugs[0]  # ours, not the user's: the rest was done first, now it is shown whole
@@ -242,7 +242,7 @@ class SeparationBatch:
             own = separation.photo.file_info.container
             container = SUFFIXES[target.suffix.lower()] if target else self.options.container(layer, own)
             data = getattr(separation, layer).encode(container)
-            interrupts.heed()
+            interrupts.raise_pending()
             if target is None:
                 write_out(data)
             else:
@@ -259,11 +259,11 @@ class SeparationBatch:
         if self.quiet or entry.error:
             return
         if entry.status == "skipped":
-            say(f"{entry.source}: skipped, its layers are there (--overwrite makes them again)")
+            print_status(f"{entry.source}: skipped, its layers are there (--overwrite makes them again)")
         elif entry.status == "separated":
-            say(f"{entry.source} -> {outputs} ({sum(entry.seconds.values()):.1f} s)")
+            print_status(f"{entry.source} -> {outputs} ({sum(entry.seconds.values()):.1f} s)")
             if entry.doubtful:
-                say(
+                print_status(
                     f"{entry.source}: doubtful, the model redrew the photo (reconstruction_error {entry.reconstruction_error:.2f}): look at it"
                 )
 
@@ -272,16 +272,16 @@ class SeparationBatch:
         for entry in entries:
             counts[entry.status] += 1
         if len(entries) > 1 and not self.quiet:
-            say(", ".join(f"{count} {status}" for status, count in counts.items() if count))
+            print_status(", ".join(f"{count} {status}" for status, count in counts.items() if count))
         for entry in entries:
             if entry.error:
                 is_named = entry.error.startswith(f"{entry.source} ")
-                complain(entry.error if is_named else f"{entry.source}: {entry.error}")
+                print_error(entry.error if is_named else f"{entry.source}: {entry.error}")
 
 
 def _show_progress(advance: Advance, before: int, name: str, share: float) -> None:
     """A large model takes minutes for a photo: the bar moves between two of them, too, and Ctrl-C is heeded."""
-    interrupts.heed()
+    interrupts.raise_pending()
     advance(before + share, name)
 
 

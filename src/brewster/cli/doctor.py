@@ -20,12 +20,12 @@ from brewster.cli.terminal import print_out
 from brewster.errors import BrewsterError, MissingExtra
 from brewster.models import zoo
 
-_OLDEST: Final = (3, 11)
+_MIN_PYTHON: Final = (3, 11)
 _OPTIONAL_FORMATS: Final = {"exr": "exr", "heic": "heic"}
 _GIF: Final = bytes.fromhex(
     "47494638396101000100800000ffffff00000021f90401000000002c00000000010001000002024401003b"
 )
-_MARKS: Final = {"ok": "ok", "missing": "--", "broken": "!!"}
+_SYMBOLS: Final = {"ok": "ok", "missing": "--", "broken": "!!"}
 
 
 @final
@@ -49,22 +49,24 @@ def doctor(context: click.Context, *, as_json: bool) -> None:
 
     Each thing that is missing comes with the line that installs it.
     """
-    checks = list(examine())
-    is_well = all(check.status == "ok" for check in checks if check.needed)
+    checks = list(run_checks())
+    is_healthy = all(check.status == "ok" for check in checks if check.needed)
     if as_json:
-        print_out(json.dumps({"ok": is_well, "checks": [asdict(check) for check in checks]}))
+        print_out(json.dumps({"ok": is_healthy, "checks": [asdict(check) for check in checks]}))
     else:
         _print(checks)
         print_out(
-            "All that is needed works." if is_well else "Something needed does not work: see !! and -- above."
+            "All that is needed works."
+            if is_healthy
+            else "Something needed does not work: see !! and -- above."
         )
-    context.exit(0 if is_well else 1)
+    context.exit(0 if is_healthy else 1)
 
 
-def examine() -> Iterator[Check]:
+def run_checks() -> Iterator[Check]:
     """Looks at everything, in the order in which one thing needs the other."""
     version = platform.python_version()
-    if sys.version_info >= _OLDEST:
+    if sys.version_info >= _MIN_PYTHON:
         yield Check("python", "python", "ok", f"{version}, {platform.platform()}")
     else:
         yield Check("python", "python", "broken", version, "install Python 3.11 or newer")
@@ -72,7 +74,7 @@ def examine() -> Iterator[Check]:
     yield from _devices()
     yield from _formats()
     yield from _models()
-    yield from _tracer()
+    yield from _mitsuba()
     yield from _large()
 
 
@@ -169,7 +171,7 @@ def _models() -> Iterator[Check]:
             yield Check("models", row["name"], "ok", f"sha256 {row['sha256']}")
 
 
-def _tracer() -> Iterator[Check]:
+def _mitsuba() -> Iterator[Check]:
     """Whether Mitsuba can be imported, and the LLVM that compiles its kernels."""
     version = _version("mitsuba")
     if version is None:
@@ -183,12 +185,12 @@ def _tracer() -> Iterator[Check]:
         yield Check("tracer", "mitsuba", "broken", str(error), variant.cure(str(error)), needed=False)
         return
     yield Check("tracer", "mitsuba", "ok", version)
-    found = variant.probe()
-    if found.variant == variant.COMPILED:
-        yield Check("tracer", "llvm", "ok", found.library or "the one Dr.Jit finds")
+    probed = variant.probe()
+    if probed.variant == variant.COMPILED:
+        yield Check("tracer", "llvm", "ok", probed.library or "the one Dr.Jit finds")
     else:
-        about = f"none works, rendering is several times slower ({found.reason})"
-        yield Check("tracer", "llvm", "missing", about, variant.INSTALL_LLVM, needed=False)
+        detail = f"none works, rendering is several times slower ({probed.reason})"
+        yield Check("tracer", "llvm", "missing", detail, variant.INSTALL_LLVM, needed=False)
 
 
 def _large() -> Iterator[Check]:
@@ -196,15 +198,15 @@ def _large() -> Iterator[Check]:
     if _version("diffusers") is None:
         return
     version = _version("bitsandbytes")
-    about = version or "not installed; for nf4 and 8-bit AdamW on NVIDIA cards"
+    detail = version or "not installed; for nf4 and 8-bit AdamW on NVIDIA cards"
     cure = None if version else "pip install bitsandbytes"
-    yield Check("large", "bitsandbytes", "ok" if version else "missing", about, cure, needed=False)
+    yield Check("large", "bitsandbytes", "ok" if version else "missing", detail, cure, needed=False)
     from brewster.models.diffusion.lazy_imports import has_token  # noqa: PLC0415  (wakes torch)
 
-    found = has_token()
-    about = "found" if found else "none; gated models such as FLUX.1 Kontext want one"
-    cure = None if found else "hf auth login"
-    yield Check("large", "hub token", "ok" if found else "missing", about, cure, needed=False)
+    token_found = has_token()
+    detail = "found" if token_found else "none; gated models such as FLUX.1 Kontext want one"
+    cure = None if token_found else "hf auth login"
+    yield Check("large", "hub token", "ok" if token_found else "missing", detail, cure, needed=False)
 
 
 def _print(checks: list[Check]) -> None:
@@ -214,4 +216,4 @@ def _print(checks: list[Check]) -> None:
             print_out(check.area)
         area = check.area
         cure = f"\n{'':8}{check.cure}" if check.cure else ""
-        print_out(f"  {_MARKS[check.status]}  {check.name:16} {check.detail}{cure}")
+        print_out(f"  {_SYMBOLS[check.status]}  {check.name:16} {check.detail}{cure}")

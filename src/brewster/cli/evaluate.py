@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, final, get_args
 import click
 
 from brewster.cli.extras import require_extra
-from brewster.cli.terminal import complain, interrupts, progress, say, write_out
+from brewster.cli.terminal import interrupts, print_error, print_status, progress, write_out
 from brewster.options import Device, Quality
 
 if TYPE_CHECKING:
@@ -175,7 +175,7 @@ class _Size(click.ParamType[int]):
     help="Check all that was named, print the names of the cases, and measure nothing.",
 )
 @click.pass_context
-def evaluate(context: click.Context, /, *, dry_run: bool, **asked: Any) -> None:  # noqa: ANN401  (the fields of _Order)
+def evaluate(context: click.Context, /, *, dry_run: bool, **options: Any) -> None:  # noqa: ANN401  (the fields of _EvaluateCommand)
     """Measure models and other methods' pictures on benchmarks, with the unprocessed input as baseline.
 
     The tables go to standard output; results.json (every picture), tables.md, table.tex, table.csv and report.html (a
@@ -185,13 +185,13 @@ def evaluate(context: click.Context, /, *, dry_run: bool, **asked: Any) -> None:
     the exit code is 1.
     """
     require_extra("evaluate", "evaluating")
-    order = _EvaluateRequest(**asked)
-    context.exit(0 if (order.tell() if dry_run else order.run()) else 1)
+    command = _EvaluateCommand(**options)
+    context.exit(0 if (command.list_cases() if dry_run else command.run()) else 1)
 
 
 @final
 @dataclass(frozen=True)
-class _EvaluateRequest:
+class _EvaluateCommand:
     """What was asked for; imports wait until it is carried out, as torch takes two seconds to wake."""
 
     benchmarks: tuple[tuple[str, str], ...]
@@ -209,38 +209,42 @@ class _EvaluateRequest:
     as_json: bool
     quiet: bool
 
-    def tell(self) -> bool:
+    def list_cases(self) -> bool:
         """Says what there is; whether all of it can be measured."""
         from brewster.evaluate.evaluation import check  # noqa: PLC0415
 
-        found, methods = self._found(), self._methods()
-        is_whole = tell_of(found, quiet=self.quiet)
-        check(found, methods, self._protocol())
-        for part in found:
-            say(f"{part.title}: {len(part.cases)} pictures")
-            write_out("".join(f"{part.name}/{case.name}\n" for case in part.cases).encode(errors=_ODD))
+        benchmarks, methods = self._read_benchmarks(), self._methods()
+        is_complete = print_remarks(benchmarks, quiet=self.quiet)
+        check(benchmarks, methods, self._config())
+        for benchmark in benchmarks:
+            print_status(f"{benchmark.title}: {len(benchmark.cases)} pictures")
+            write_out(
+                "".join(f"{benchmark.name}/{case.name}\n" for case in benchmark.cases).encode(
+                    errors=_ENCODE_ERRORS
+                )
+            )
         for method in methods:
-            say(f"method: {method.name}")
-        return is_whole
+            print_status(f"method: {method.name}")
+        return is_complete
 
     def run(self) -> bool:
         """Measures and prints; whether nothing was left out and nothing failed."""
         from brewster.evaluate.evaluation import PAGE  # noqa: PLC0415
         from brewster.evaluate.evaluation import evaluate as measure  # noqa: PLC0415
 
-        protocol, found, methods = self._protocol(), self._found(), self._methods()
-        is_whole = tell_of(found, quiet=self.quiet)
-        total = len(methods) * sum(len(part.cases) for part in found)
+        config, benchmarks, methods = self._config(), self._read_benchmarks(), self._methods()
+        is_complete = print_remarks(benchmarks, quiet=self.quiet)
+        total = len(methods) * sum(len(benchmark.cases) for benchmark in benchmarks)
         with progress(total, shown=not self.quiet) as advance:
 
             def report(done: int, _of: int, row: ScoreRow) -> None:
-                interrupts.heed()
+                interrupts.raise_pending()
                 advance(done, f"{row.benchmark}/{row.case} {row.method}")
 
             results = measure(
-                found,
+                benchmarks,
                 methods,
-                protocol,
+                config,
                 self.out,
                 workers=self.workers,
                 shown=self.pictures,
@@ -250,69 +254,74 @@ class _EvaluateRequest:
             write_out(f"{json.dumps(results)}\n".encode())
         elif not self.quiet:
             print_tables(results)
-            say(f"all of it is in {self.out}; {self.out / PAGE} shows the pictures")
-        return tell_failures(results, quiet=self.quiet) and is_whole
+            print_status(f"all of it is in {self.out}; {self.out / PAGE} shows the pictures")
+        return print_failures(results, quiet=self.quiet) and is_complete
 
-    def _found(self) -> list[Benchmark]:
+    def _read_benchmarks(self) -> list[Benchmark]:
         from brewster.benchmarks.registry import read_benchmark  # noqa: PLC0415
 
-        return [part for name, folder in self.benchmarks for part in read_benchmark(name, Path(folder))]
+        return [
+            benchmark for name, folder in self.benchmarks for benchmark in read_benchmark(name, Path(folder))
+        ]
 
-    def _protocol(self) -> EvaluationConfig:
+    def _config(self) -> EvaluationConfig:
         from brewster.evaluate.config import EvaluationConfig  # noqa: PLC0415
 
-        chosen: dict[str, Any] = {"size": self.size, "quality": self.quality, "paper": self.paper}
+        values: dict[str, Any] = {"size": self.size, "quality": self.quality, "paper": self.paper}
         if self.metrics is not None:
-            chosen["metrics"] = tuple(name.strip() for name in self.metrics.split(","))
+            values["metrics"] = tuple(name.strip() for name in self.metrics.split(","))
         if self.thresholds is not None:
-            chosen["thresholds"] = self.thresholds
-        return EvaluationConfig(**chosen)
+            values["thresholds"] = self.thresholds
+        return EvaluationConfig(**values)
 
     def _methods(self) -> list[Method]:
         from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder  # noqa: PLC0415
         from brewster.models.zoo import model_name  # noqa: PLC0415
 
         models = [(name or model_name(model), model) for name, model in self.models]
-        answers = self.out / "predictions"
+        predictions = self.out / "predictions"
         return [
             IdentityBaseline(),
-            *(ModelMethod(name, model, answers / name, self.quality, self.device) for name, model in models),
+            *(
+                ModelMethod(name, model, predictions / name, self.quality, self.device)
+                for name, model in models
+            ),
             *(PredictionFolder(name, Path(folder)) for name, folder in self.predictions),
         ]
 
 
-_ODD: Final = "backslashreplace"
+_ENCODE_ERRORS: Final = "backslashreplace"
 """How names are printed that are no text."""
 
 
-def tell_of(parts: Sequence[Benchmark], *, quiet: bool) -> bool:
+def print_remarks(benchmarks: Sequence[Benchmark], *, quiet: bool) -> bool:
     """Says what is odd about benchmarks; whether nothing was left out."""
-    for part in parts:
-        for remark in () if quiet else part.remarks:
-            say(f"{part.title}: {remark}")
-        for reason in part.refused:
-            complain(f"{part.title}: {reason}")
-    return not any(part.refused for part in parts)
+    for benchmark in benchmarks:
+        for remark in () if quiet else benchmark.remarks:
+            print_status(f"{benchmark.title}: {remark}")
+        for reason in benchmark.refused:
+            print_error(f"{benchmark.title}: {reason}")
+    return not any(benchmark.refused for benchmark in benchmarks)
 
 
 def print_tables(results: Results) -> None:
     """The tables, on standard output."""
     from brewster.evaluate.report.tables import overview  # noqa: PLC0415
 
-    write_out(overview(results).encode(errors=_ODD))
+    write_out(overview(results).encode(errors=_ENCODE_ERRORS))
 
 
-def tell_failures(results: Results, *, quiet: bool) -> bool:
+def print_failures(results: Results, *, quiet: bool) -> bool:
     """Says what is odd about methods and names what could not be scored; whether there was nothing of the second."""
     from brewster.evaluate.report.tables import failures, remarks  # noqa: PLC0415
 
     for remark in () if quiet else remarks(results):
-        say(remark)
+        print_status(remark)
     for name in results["unmeasured"]:
-        say(f"{name} was not measured: no picture has the truth that it needs")
+        print_status(f"{name} was not measured: no picture has the truth that it needs")
     for error in failures(results):
-        complain(error)
+        print_error(error)
     count = sum(len(picture["errors"]) for picture in results["pictures"])
     if count:
-        complain(f"{count} {'answer' if count == 1 else 'answers'} could not be scored")
+        print_error(f"{count} {'answer' if count == 1 else 'predictions'} could not be scored")
     return not count

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from brewster.cli.extras import require_extra
-from brewster.cli.terminal import complain, print_out, say
+from brewster.cli.terminal import print_error, print_out, print_status
 from brewster.errors import BrewsterError, ModelError
 from brewster.files import write_atomically
 from brewster.models import zoo
@@ -48,7 +48,7 @@ def list_models(*, as_json: bool) -> None:
 def card(*, name: str, scores: Path | None) -> None:
     """Print the card of a model, or of a LoRA's folder: licence, training data, scores, where it fails."""
     if scores:
-        _put_scores(Path(name), scores)
+        _update_scores(Path(name), scores)
     is_folder = name not in zoo.MODELS and Path(name).is_dir()
     print_out(_read_card(Path(name)) if is_folder else zoo.find_model(name).card())
 
@@ -73,7 +73,7 @@ def verify(context: click.Context, *, names: tuple[str, ...], as_json: bool) -> 
         print_out(json.dumps(rows))
     for row in rows:
         if row["error"]:
-            complain(row["error"])
+            print_error(row["error"])
         elif not as_json:
             print_out(f"{row['name']}: {row['sha256']}")
     context.exit(1 if any(row["error"] for row in rows) else 0)
@@ -97,7 +97,7 @@ def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: boo
 
     plan = hub.plan_push(folder, repo_id, message=message, public=public)
     for remark in plan.remarks:
-        say(remark)
+        print_status(remark)
     address = None if dry_run else hub.push(plan)
     if as_json:
         print_out(json.dumps(plan.about() | {"address": address}))
@@ -127,7 +127,7 @@ def _read_card(folder: Path) -> str:
         ) from error
 
 
-def _put_scores(folder: Path, scores: Path) -> None:
+def _update_scores(folder: Path, scores: Path) -> None:
     """Replaces what the card in this folder says was measured."""
     require_extra("train", "writing a card")
     from brewster.evaluate.report.tables import overview  # noqa: PLC0415  (wakes torch)
@@ -135,12 +135,12 @@ def _put_scores(folder: Path, scores: Path) -> None:
 
     try:
         results = json.loads(scores.read_text("utf-8"))
-        told = [overview(results), *(f"- {choice}" for choice in results["protocol"]["choices"])]
+        lines = [overview(results), *(f"- {choice}" for choice in results["protocol"]["choices"])]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ModelError(
             f"{scores} cannot be read ({error!r})",
             "the results.json that brewster evaluate wrote",
             "name that file",
         ) from error
-    text = with_measured(_read_card(folder), "\n".join(told))
+    text = with_measured(_read_card(folder), "\n".join(lines))
     write_atomically(folder / _CARD, text.encode(), overwrite=True)

@@ -13,15 +13,15 @@ import click
 from click.core import ParameterSource
 
 from brewster.cli.extras import require_extra
-from brewster.cli.terminal import complain, interrupts, progress, say, standard_output, write_out
+from brewster.cli.terminal import interrupts, print_error, print_status, progress, standard_output, write_out
 
 if TYPE_CHECKING:
     from brewster.rendered.generation.job import Executor, RenderJob, RenderResult
     from brewster.scene.recipe import SceneRecipe
 
-_OF_THE_TRACER: Final = frozenset({"mitsuba", "mitsuba-oidn"})
-_OF_A_SCENE: Final = {"out", "output", "scene", "renderer", "maps", "photos", "quiet"}
-_MOST_WORKERS: Final = 8
+_MITSUBA_PACKAGES: Final = frozenset({"mitsuba", "mitsuba-oidn"})
+_SCENE_OPTIONS: Final = {"out", "output", "scene", "renderer", "maps", "photos", "quiet"}
+_MAX_WORKERS: Final = 8
 _FOLDER: Final = click.Path(path_type=Path, file_okay=False, exists=True)
 
 
@@ -126,7 +126,7 @@ def render(
     out: Path | None,
     output: Path | None,
     scene: Path | None,
-    **asked: Any,  # noqa: ANN401  (the fields of _Order)
+    **options: Any,  # noqa: ANN401  (the fields of _RenderCommand)
 ) -> None:
     """Render photographs through glass whose truth is known, into the folder OUT.
 
@@ -139,18 +139,18 @@ def render(
     """
     if (out is None) == (output is None):
         raise click.UsageError("Name one folder to render into: brewster render OUT.")
-    require_extra("render", "rendering", without=_OF_THE_TRACER)
-    order = _RenderRequest(out or output or Path(), **asked)
+    require_extra("render", "rendering", without=_MITSUBA_PACKAGES)
+    command = _RenderCommand(out or output or Path(), **options)
     if scene:
-        _refuse_out_of_place(context)
-        order.render_again(scene)
+        _reject_set_options(context)
+        command.render_again(scene)
     else:
-        context.exit(0 if order.render_set() else 1)
+        context.exit(0 if command.render_set() else 1)
 
 
 @final
 @dataclass(frozen=True)
-class _RenderRequest:
+class _RenderCommand:
     """What was asked for; imports wait until it is carried out, as torch takes two seconds to wake."""
 
     out: Path
@@ -176,37 +176,37 @@ class _RenderRequest:
 
         render_again(scene, self.out, (*self.maps, *self.photos), self.renderer)
         if not self.quiet:
-            say(f"{scene} -> {self.out}")
+            print_status(f"{scene} -> {self.out}")
 
     def render_set(self) -> bool:
         """Renders a set and tells; whether all went well."""
         from brewster.rendered.generation.job import build  # noqa: PLC0415
         from brewster.rendered.generation.preview import write_preview  # noqa: PLC0415
 
-        job, told = self._job(), _RenderProgress(self.as_json, self.quiet)
-        over_bar = self.as_json and standard_output.stream.isatty()
-        with progress(self.count, shown=not self.quiet and not over_bar) as advance:
+        job, printer = self._job(), _RenderPrinter(self.as_json, self.quiet)
+        shares_terminal = self.as_json and standard_output.stream.isatty()
+        with progress(self.count, shown=not self.quiet and not shares_terminal) as advance:
 
             def report(result: RenderResult) -> None:
-                told.tell(result)
-                advance(told.counts.total(), f"sample {result.index}")
-                interrupts.heed()
+                printer.print_result(result)
+                advance(printer.counts.total(), f"sample {result.index}")
+                interrupts.raise_pending()
 
             indices = range(self.first, self.first + self.count)
             build(job, indices, self._executor(job), shards=self.shards, report=report)
         if self.preview:
             write_preview(self.out)
-        told.sum_up(self.out)
-        return not told.counts["failed"]
+        printer.print_summary(self.out)
+        return not printer.counts["failed"]
 
     def _job(self) -> RenderJob:
         from brewster.environments.catalog import read_catalog  # noqa: PLC0415
         from brewster.rendered.generation.job import RenderJob  # noqa: PLC0415
 
         recipe = self._recipe()
-        catalog, left_out = read_catalog(self.maps, self.photos)
-        for error in left_out:
-            complain(f"left out: {error}")
+        catalog, errors = read_catalog(self.maps, self.photos)
+        for error in errors:
+            print_error(f"left out: {error}")
         folders = tuple(folder.resolve() for folder in (*self.maps, *self.photos))
         return RenderJob(self.out.resolve(), recipe, catalog, self.seed, self.renderer or "analytic", folders)
 
@@ -228,37 +228,39 @@ class _RenderRequest:
             from brewster.rendered.generation.ray_cluster import RayExecutor  # noqa: PLC0415
 
             return RayExecutor(job, self.cluster, self.workers)
-        workers = min(_MOST_WORKERS, os.cpu_count() or 1) if self.workers is None else self.workers
+        workers = min(_MAX_WORKERS, os.cpu_count() or 1) if self.workers is None else self.workers
         return ProcessExecutor(job, workers) if workers else SerialExecutor(job)
 
 
 @final
-class _RenderProgress:
+class _RenderPrinter:
     """Tells of samples as they come, and counts them: what is kept does not grow."""
 
     def __init__(self, as_json: bool, quiet: bool) -> None:
         self._as_json, self._quiet = as_json, quiet
         self.counts: Counter[str] = Counter()
 
-    def tell(self, result: RenderResult) -> None:
+    def print_result(self, result: RenderResult) -> None:
         """One line at once for what was rendered or failed."""
         self.counts[result.status] += 1
         if self._as_json:
             row = {name: value for name, value in asdict(result).items() if name != "fatal"}
             write_out(f"{json.dumps(row)}\n".encode())
         if result.error:
-            complain(f"sample {result.index}: {result.error}")
+            print_error(f"sample {result.index}: {result.error}")
         elif result.status == "rendered" and not self._quiet:
-            say(f"sample {result.index} ({result.seconds:.1f} s)")
+            print_status(f"sample {result.index} ({result.seconds:.1f} s)")
 
-    def sum_up(self, out: Path) -> None:
+    def print_summary(self, out: Path) -> None:
         """How many there were of each kind."""
         if not self._quiet:
-            say(f"{out}: " + ", ".join(f"{count} {status}" for status, count in sorted(self.counts.items())))
+            print_status(
+                f"{out}: " + ", ".join(f"{count} {status}" for status, count in sorted(self.counts.items()))
+            )
 
 
-def _refuse_out_of_place(context: click.Context) -> None:
+def _reject_set_options(context: click.Context) -> None:
     """A scene says all of its sample; what chooses samples of a set has nothing to choose."""
-    for name in context.params.keys() - _OF_A_SCENE:
+    for name in context.params.keys() - _SCENE_OPTIONS:
         if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
             raise click.UsageError(f"--scene renders what the scene says, and --{name} belongs to a set.")

@@ -68,7 +68,7 @@ def _option(field: dataclasses.Field[Any], hint: object) -> Callable[[_Command],
     default = ",".join(field.default) if isinstance(field.default, tuple) else field.default
     return click.option(
         name,
-        type=_kind(hint, field),
+        type=_param_type(hint, field),
         default=default,
         show_default=default is not None,
         metavar="NUMBER" if hint in (int, float) else None,
@@ -76,10 +76,10 @@ def _option(field: dataclasses.Field[Any], hint: object) -> Callable[[_Command],
     )
 
 
-def _kind(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[Any]:
+def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[Any]:
     low, high = field.metadata.get("ge"), field.metadata.get("le")
     if NoneType in get_args(hint):
-        return _kind(get_args(hint)[0], field)
+        return _param_type(get_args(hint)[0], field)
     if hint is float:
         return _RangedNumber(low, high)
     if hint is int:
@@ -115,7 +115,7 @@ def separate(
     quiet: bool,
     dry_run: bool,
     overwrite: bool,
-    **asked: object,
+    **values: object,
 ) -> None:
     """Separate photographs taken through glass.
 
@@ -129,19 +129,19 @@ def separate(
     """
     one_file = goes_to_one_file(photos, output)
     if one_file and context.get_parameter_source("layers") is ParameterSource.DEFAULT:
-        asked["layers"] = ("transmission",)
+        values["layers"] = ("transmission",)
     try:
-        options = Options(**cast("dict[str, Any]", asked))
+        options = Options(**cast("dict[str, Any]", values))
     except BrewsterError as error:
         raise click.UsageError(str(error)) from error
     tasks = plan(photos, output, options)
     if None in tasks[0].targets.values() and not dry_run:
-        _refuse_occupied_output(as_json=as_json)
+        _reject_shared_output(as_json=as_json)
     batch = SeparationBatch(options, overwrite=overwrite, dry_run=dry_run, as_json=as_json, quiet=quiet)
     context.exit(0 if batch.run(tasks) else 1)
 
 
-def _refuse_occupied_output(*, as_json: bool) -> None:
+def _reject_shared_output(*, as_json: bool) -> None:
     """A picture goes to standard output: nothing else may, and nobody may be reading there."""
     if as_json:
         raise click.UsageError("--json and a picture cannot share standard output: name the picture with -o.")

@@ -12,7 +12,7 @@ from typing import Any, Final, get_args
 import click
 
 from brewster.cli.extras import require_extra
-from brewster.cli.terminal import print_out, say
+from brewster.cli.terminal import print_out, print_status
 from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.options import Device
 
@@ -25,7 +25,7 @@ _WARNING: Final = (
 )
 
 
-def at_an_address(port: int, token_help: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+def address_options(port: int, token_help: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """The options that every server has: --host, --port and --token."""
 
     def decorated(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -53,11 +53,11 @@ def at_an_address(port: int, token_help: str) -> Callable[[Callable[..., Any]], 
     return decorated
 
 
-def invite(url: str, token: str | None, *, opens: bool = False) -> None:
+def print_link(url: str, token: str | None, *, opens: bool = False) -> None:
     """Says on standard output where the server is, with the token, and opens it in the browser if it shall."""
     link = f"{url}?token={token}" if token else url
     print_out(link)
-    say("Ctrl-C stops the server")
+    print_status("Ctrl-C stops the server")
     if opens:
         webbrowser.open(link)
 
@@ -70,7 +70,7 @@ def _read_token(_context: click.Context, _parameter: click.Parameter, token: str
 
 
 @click.command
-@at_an_address(
+@address_options(
     8417,
     "Let in only who brings this token; auto makes one. Needed, and so made, for every address but this machine's own.",
 )
@@ -146,13 +146,13 @@ def serve(
     from brewster.web.separation import separation  # noqa: PLC0415
 
     if not is_loopback(host):
-        say(_WARNING.format(host=host))
+        print_status(_WARNING.format(host=host))
         token = token or AUTO
     token = secrets.token_urlsafe(16) if token == AUTO else token
-    shelf = ModelCache(models, device=device)
-    shelf.separator(shelf.names[0])  # what is wrong with the model is said now
-    router = separation(shelf, JobQueue(queue=queue, seconds=timeout), max_pixels=max_pixels)
+    model_cache = ModelCache(models, device=device)
+    model_cache.separator(model_cache.names[0])  # what is wrong with the model is said now
+    router = separation(model_cache, JobQueue(queue=queue, seconds=timeout), max_pixels=max_pixels)
     app = web.application(router, guard=RequestLimits.at(host, token=token, max_bytes=max_bytes))
     with contextlib.suppress(KeyboardInterrupt):  # the usual end
-        web.serve(app, host=host, port=port, on_ready=lambda url: invite(url, token, opens=opens))
-    say("stopped")
+        web.serve(app, host=host, port=port, on_ready=lambda url: print_link(url, token, opens=opens))
+    print_status("stopped")

@@ -14,8 +14,8 @@ import click
 
 from brewster.cli.evaluate import NamedValue
 from brewster.cli.extras import require_extra
-from brewster.cli.serve import AUTO, at_an_address, invite
-from brewster.cli.terminal import print_out, progress, say, write_out
+from brewster.cli.serve import AUTO, address_options, print_link
+from brewster.cli.terminal import print_out, print_status, progress, write_out
 from brewster.errors import BrewsterError
 
 _NAME: Final = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)*", re.IGNORECASE)
@@ -108,21 +108,21 @@ def create(
             "tables tell methods apart by name",
             "give each its own",
         )
-    text = CONSENT if consent is None else _text(consent)
+    text = CONSENT if consent is None else _read_consent(consent)
     chosen = StudyOptions(
         datasets=datasets, pairs=pairs, catches=catches, all_pairs=all_pairs, seed=seed, consent=text
     )
     total = len(find_pictures(inputs, datasets)) * (1 + len(folders)) + CATCH_POOL
     with progress(total, shown=True) as advance:
-        made = freeze(out, inputs, folders, chosen, lambda done: advance(done, "copying")).description
-    say(
-        f"{out}: {len(made.comparisons)} comparisons of {len(made.methods)} methods; a participant sees "
-        f"{made.pairs} of them and {made.catches} catch trials (seed {made.seed})"
+        description = freeze(out, inputs, folders, chosen, lambda done: advance(done, "copying")).description
+    print_status(
+        f"{out}: {len(description.comparisons)} comparisons of {len(description.methods)} methods; a participant sees "
+        f"{description.pairs} of them and {description.catches} catch trials (seed {description.seed})"
     )
-    say(f"next: brewster study serve {out}")
+    print_status(f"next: brewster study serve {out}")
 
 
-def _text(path: Path) -> str:
+def _read_consent(path: Path) -> str:
     try:
         return path.read_text("utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
@@ -147,7 +147,7 @@ def _read_names(_context: click.Context, _parameter: click.Parameter, names: tup
 
 @study.command
 @click.argument("folder", metavar="STUDY", type=_FOLDER)
-@at_an_address(8420, "Let in only who brings this token; auto makes one and keeps it in STUDY/token.")
+@address_options(8420, "Let in only who brings this token; auto makes one and keeps it in STUDY/token.")
 @click.option(
     "--called",
     multiple=True,
@@ -173,18 +173,20 @@ def serve(
     from brewster.web.middleware import RequestLimits, is_loopback  # noqa: PLC0415
     from brewster.web.study import participants  # noqa: PLC0415
 
-    made = read_study(folder)
-    made.refuse_changed()
+    frozen_study = read_study(folder)
+    frozen_study.refuse_changed()
     if not is_loopback(host):
-        say(_WARNING.format(host=host))
+        print_status(_WARNING.format(host=host))
     token = kept_token(folder) if token == AUTO else token
     guard = RequestLimits.at(host, token=token, max_bytes=_MAX_BYTES)
     guard = replace(guard, hosts=guard.hosts | {*called})
-    store = AnswerStore(made)
-    app = web.application(participants(made, store, most=most, token=token), guard=guard, home="study.html")
+    store = AnswerStore(frozen_study)
+    app = web.application(
+        participants(frozen_study, store, most=most, token=token), guard=guard, home="study.html"
+    )
     with contextlib.closing(store), contextlib.suppress(KeyboardInterrupt):  # the usual end
-        web.serve(app, host=host, port=port, on_ready=lambda url: invite(url, token))
-    say("stopped; all answers are kept")
+        web.serve(app, host=host, port=port, on_ready=lambda url: print_link(url, token))
+    print_status("stopped; all answers are kept")
 
 
 @study.command
@@ -224,14 +226,14 @@ def report(
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415
     from brewster.user_study.study import read_study  # noqa: PLC0415
 
-    made = read_study(folder)
-    with contextlib.closing(AnswerStore(made, only_reads=True)) as store:
+    frozen_study = read_study(folder)
+    with contextlib.closing(AnswerStore(frozen_study, only_reads=True)) as store:
         answered = people(store.everything())
-    results = summarise(made, answered, ExclusionRule(most_failed, least_seconds))
+    results = summarise(frozen_study, answered, ExclusionRule(most_failed, least_seconds))
     out = folder / "report" if out is None else out
-    write(results, made, answered, out)
+    write(results, frozen_study, answered, out)
     write_out((json.dumps(results) + "\n" if as_json else overview(results)).encode())
-    say(f"all of it is in {out}")
+    print_status(f"all of it is in {out}")
 
 
 @study.command
@@ -267,15 +269,15 @@ def plan(
     """Say how many participants a difference needs, at the 5 % level."""
     from brewster.user_study.power_analysis import plan as planned  # noqa: PLC0415
 
-    answer = planned(difference=difference, tie=tie, pairs=pairs, correlation=correlation, power=power)
+    estimate = planned(difference=difference, tie=tie, pairs=pairs, correlation=correlation, power=power)
     if as_json:
-        print_out(json.dumps(asdict(answer)))
+        print_out(json.dumps(asdict(estimate)))
         return
     print_out(
-        f"{answer.participants} participants ({answer.answers} answers) show {answer.win:.1%} wins to {answer.lose:.1%} "
+        f"{estimate.participants} participants ({estimate.answers} answers) show {estimate.win:.1%} wins to {estimate.lose:.1%} "
         f"losses with {power:.0%} power at the 5 % level."
     )
     print_out(
-        f"{pairs} pairs each, correlation {correlation:g}: {answer.design_effect:.2f} answers do what an independent one "
-        f"would, and participants' own differences scatter by {answer.deviation:.0%} about the mean."
+        f"{pairs} pairs each, correlation {correlation:g}: {estimate.design_effect:.2f} answers do what an independent one "
+        f"would, and participants' own differences scatter by {estimate.deviation:.0%} about the mean."
     )

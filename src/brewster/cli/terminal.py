@@ -26,29 +26,29 @@ class _DeferredInterrupts:
     """
 
     def __init__(self) -> None:
-        self._lost = False
+        self._pending = False
 
     @contextmanager
-    def noticed(self) -> Iterator[None]:
+    def captured(self) -> Iterator[None]:
         """Notices within this block when an interrupt is dropped."""
         hook = sys.unraisablehook
 
-        def notice(dropped: UnraisableHookArgs) -> None:
+        def capture(dropped: UnraisableHookArgs) -> None:
             if dropped.exc_type is KeyboardInterrupt:
-                self._lost = True
+                self._pending = True
             else:
                 hook(dropped)
 
-        self._lost, sys.unraisablehook = False, notice
+        self._pending, sys.unraisablehook = False, capture
         try:
             yield
         finally:
             sys.unraisablehook = hook
 
-    def heed(self) -> None:
+    def raise_pending(self) -> None:
         """Raises the interrupt that was dropped, if there was one: to be called before what cannot be undone."""
-        if self._lost:
-            self._lost = False
+        if self._pending:
+            self._pending = False
             raise KeyboardInterrupt
 
 
@@ -62,15 +62,15 @@ def one_line(text: object) -> str:
     )
 
 
-def say(text: object) -> None:
+def print_status(text: object) -> None:
     """One line on standard error."""
     sys.stderr.write(f"{one_line(text)}\n")
     sys.stderr.flush()
 
 
-def complain(text: object) -> None:
+def print_error(text: object) -> None:
     """One line on standard error that says what went wrong."""
-    say(f"error: {text}")
+    print_status(f"error: {text}")
 
 
 @final
@@ -89,7 +89,7 @@ class _Output:
         """Where results are written."""
         return self._stream or sys.stdout
 
-    def take_descriptor(self) -> None:
+    def redirect_descriptor(self) -> None:
         """Points file descriptor 1 to standard error, for the rest of this process; `sys.stdout` gets another one.
 
         It is not given back, because C code keeps what it prints in a buffer until the process ends.

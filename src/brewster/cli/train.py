@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from brewster.cli.extras import require_extra
-from brewster.cli.terminal import interrupts, print_out, progress, say
+from brewster.cli.terminal import interrupts, print_out, print_status, progress
 from brewster.errors import RecipeError, TargetError
 
 if TYPE_CHECKING:
@@ -44,33 +44,33 @@ def train(*, recipe: Path, out: Path | None, plan: bool, card: str | None, quiet
     require_extra("train", "training")
     from brewster.training.recipe import LoraRecipe, read_recipe  # noqa: PLC0415  (wakes torch, in two seconds)
 
-    read, out = read_recipe(recipe), out or Path("out") / recipe.stem
-    if isinstance(read, LoraRecipe):
+    parsed, out = read_recipe(recipe), out or Path("out") / recipe.stem
+    if isinstance(parsed, LoraRecipe):
         require_extra("large", "a large backbone")
     if plan or card:
-        _print_plan(read, card)
+        _print_plan(parsed, card)
         return
-    _make(out)
+    _make_folder(out)
     from brewster.training.distributed import is_main_process  # noqa: PLC0415
     from brewster.training.loop import run  # noqa: PLC0415
     from brewster.training.trainers import open_trainer  # noqa: PLC0415
 
-    trainer = open_trainer(read)
+    trainer = open_trainer(parsed)
     quiet = quiet or not is_main_process()
-    with progress(read.steps, shown=not quiet) as advance:
+    with progress(parsed.steps, shown=not quiet) as advance:
 
-        def report(step: int, steps: int, numbers: Mapping[str, float], logged: bool) -> None:
-            interrupts.heed()
-            advance(step, f"loss {numbers['loss']:.4f}")
+        def report(step: int, steps: int, metrics: Mapping[str, float], logged: bool) -> None:
+            interrupts.raise_pending()
+            advance(step, f"loss {metrics['loss']:.4f}")
             if logged and not quiet:
-                told = ", ".join(f"{name} {value:.4g}" for name, value in numbers.items())
-                say(f"step {step} of {steps}: {told}")
+                line = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
+                print_status(f"step {step} of {steps}: {line}")
 
         run(trainer, out, report)
     if is_main_process():
         model = trainer.export(out)
         if not quiet:
-            say(f"the model is {model}")
+            print_status(f"the model is {model}")
 
 
 def _print_plan(recipe: CompactRecipe | LoraRecipe, card: str | None) -> None:
@@ -81,15 +81,17 @@ def _print_plan(recipe: CompactRecipe | LoraRecipe, card: str | None) -> None:
         raise RecipeError(
             "the recipe trains the compact network", "a large backbone's recipe", "train it without --plan"
         )
-    found = find_card(card)
-    if card is None and not is_here(found):
-        say(f"there is no graphics card here: planned for {found.name}, the paper's; --card names another")
-    estimate = plan_for(recipe, found)
+    gpu = find_card(card)
+    if card is None and not is_here(gpu):
+        print_status(
+            f"there is no graphics card here: planned for {gpu.name}, the paper's; --card names another"
+        )
+    estimate = plan_for(recipe, gpu)
     print_out(estimate.table())
     estimate.refuse_misfit()
 
 
-def _make(folder: Path) -> None:
+def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
