@@ -111,7 +111,8 @@ def test_a_stumble_of_brewster_itself_is_shown_whole_after_the_rest_is_done(
         run(".", "-o", "out")
     assert tree(tmp_path / "out") == results("b", "c")
     assert (
-        "error: a.jpg: brewster stumbled (ZeroDivisionError: a bug)" in capfdbinary.readouterr().err.decode()
+        "error: a.jpg: internal error in brewster (ZeroDivisionError: a bug)"
+        in capfdbinary.readouterr().err.decode()
     )
 
 

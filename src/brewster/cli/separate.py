@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar, cast, get_args, get_origin, get_type_h
 import click
 from click.core import ParameterSource
 
-from brewster.cli.batch import SeparationBatch, goes_to_one_file, plan
+from brewster.cli.batch import BatchCommand, is_single_output, plan
 from brewster.cli.terminal import standard_output
 from brewster.errors import BrewsterError
 from brewster.options import Options
@@ -127,17 +127,17 @@ def separate(
     Photos whose layers are there already are skipped. A photo that fails does not stop the others: it is named at
     the end, and the exit code is 1.
     """
-    one_file = goes_to_one_file(photos, output)
-    if one_file and context.get_parameter_source("layers") is ParameterSource.DEFAULT:
+    single_output = is_single_output(photos, output)
+    if single_output and context.get_parameter_source("layers") is ParameterSource.DEFAULT:
         values["layers"] = ("transmission",)
     try:
         options = Options(**cast("dict[str, Any]", values))
     except BrewsterError as error:
         raise click.UsageError(str(error)) from error
     tasks = plan(photos, output, options)
-    if None in tasks[0].targets.values() and not dry_run:
+    if single_output and output in (None, "-") and not dry_run:
         _reject_shared_output(as_json=as_json)
-    batch = SeparationBatch(options, overwrite=overwrite, dry_run=dry_run, as_json=as_json, quiet=quiet)
+    batch = BatchCommand(options, overwrite=overwrite, dry_run=dry_run, as_json=as_json, quiet=quiet)
     context.exit(0 if batch.run(tasks) else 1)
 
 
