@@ -1,4 +1,4 @@
-"""Processes that tests start, watch and kill."""
+"""Child processes of tests: start them, wait for them, and kill them."""
 
 import contextlib
 import signal
@@ -8,27 +8,27 @@ from pathlib import Path
 
 
 @contextlib.contextmanager
-def started(command, **how):
-    """A process that is killed in the end, if it has not ended by itself; Ctrl-C reaches it.
+def started(command, **options):
+    """Starts a process that accepts SIGINT, and kills it at the end of the block.
 
-    A shell starts background jobs with SIGINT ignored, and children inherit that.
+    A shell starts background jobs with SIGINT ignored, and children inherit that setting.
     """
     command = [*map(str, command)]
-    with subprocess.Popen(command, preexec_fn=_heed_interrupts, **how) as process:  # noqa: PLW1509
+    with subprocess.Popen(command, preexec_fn=_enable_interrupts, **options) as process:  # noqa: PLW1509
         try:
             yield process
         finally:
             process.kill()
 
 
-def _heed_interrupts():
+def _enable_interrupts():
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def wait_for(condition, process=None):
-    """Waits until something is so, while this process runs; only the time limit of the test ends it before."""
+    """Waits until the condition is true. Fails if the process exits first; otherwise only the time limit of the test ends it."""
     while not condition():
-        assert process is None or process.poll() is None, f"it ended, with exit code {process.returncode}"
+        assert process is None or process.poll() is None, f"the process exited with code {process.returncode}"
         time.sleep(0.01)
 
 

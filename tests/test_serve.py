@@ -78,7 +78,7 @@ def test_this_machine_alone_needs_no_token(bare, served):
 def test_a_token_that_can_be_guessed_or_breaks_a_link_is_a_wrong_usage(bare, served, token):
     code, _, err = bare("serve", "--token", token)
     assert code == 2
-    assert "16 letters" in err
+    assert "16 to 200 characters" in err
     assert not served
 
 

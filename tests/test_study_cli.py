@@ -135,7 +135,7 @@ def test_a_server_goes_on_where_a_killed_one_was_and_ends_with_ctrl_c(created):
         url = second.stdout.readline().strip()
         state = get(f"{url}{link[1:]}/trial", headers={"Host": "study.example"}).json()
         assert state["trial"] == 1
-        assert "all answers are kept" in interrupted(second)
+        assert "all answers are stored" in interrupted(second)
     assert second.returncode == 0
 
 

@@ -1,6 +1,6 @@
-"""How do I use it? The command `brewster`; click and rich are used in this room only.
+"""The command `brewster`. No other package uses click or rich.
 
-Commands import what they need when they run, so that `brewster --help` answers at once.
+Commands import slow modules when they run, so that `brewster --help` starts fast.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ _GROUP_OPTIONS = {"--help", "--version"}
 
 
 class _DefaultCommandGroup(click.Group):
-    """Whatever is no command is a photo."""
+    """A click group that treats an unknown command as a photo."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """`PHOTO...` becomes `separate PHOTO...`."""
+        """Changes `PHOTO...` to `separate PHOTO...`."""
         if args and args[0] not in self.commands and args[0] not in _GROUP_OPTIONS:
             self._reject_misspelled_command(ctx, args[0])
             args = ["separate", *args]
@@ -52,9 +52,10 @@ def _print_version(context: click.Context, _parameter: click.Parameter, requeste
     help="Print the version.",
 )
 def cli() -> None:
-    """Separate a photograph taken through glass into what is behind the glass and what is mirrored in it.
+    """Separate a photograph taken through glass into transmission and reflection.
 
-    `brewster PHOTO...` is short for `brewster separate PHOTO...`, whose options `brewster separate --help` shows.
+    The transmission is the scene behind the glass, the reflection is what the glass mirrors. `brewster PHOTO...` is
+    short for `brewster separate PHOTO...`; `brewster separate --help` shows its options.
     """
 
 
@@ -74,7 +75,7 @@ for _command in (
 
 
 def _leaf_commands(group: click.Group) -> Iterator[click.Command]:
-    """Those that do something: groups are looked into."""
+    """All commands that are not groups, also those in nested groups."""
     for command in group.commands.values():
         if isinstance(command, click.Group):
             yield from _leaf_commands(command)
@@ -88,7 +89,11 @@ for _command in _leaf_commands(cli):
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Runs the command line; returns the exit code: 0 fine, 1 an error, 2 a wrong usage, 130 Ctrl-C."""
+    """Runs the command line.
+
+    Returns:
+        The exit code: 0 success, 1 error, 2 wrong usage, 130 interrupted by Ctrl-C.
+    """
     standard_output.redirect_descriptor()
     try:
         with interrupts.captured():
@@ -97,7 +102,7 @@ def main(args: Sequence[str] | None = None) -> int:
         error.show()
         return error.exit_code
     except click.Abort:
-        print_status("stopped: what was finished is kept, and the same command goes on from there")
+        print_status("stopped: finished work is kept, and the same command resumes")
         return _EXIT_INTERRUPTED
     except BrewsterError as error:
         print_error(error)

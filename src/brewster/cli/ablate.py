@@ -1,4 +1,4 @@
-"""`brewster ablate`: a study in; a trained model for each choice, and tables that compare them, out."""
+"""`brewster ablate`: train a model for each value of one setting, and compare the models in tables."""
 
 from __future__ import annotations
 
@@ -20,34 +20,34 @@ from brewster.cli.terminal import interrupts, print_status
     "out",
     metavar="FOLDER",
     type=click.Path(path_type=Path, file_okay=False),
-    help="Where models, tables and the page go. By default out/ablations/NAME for NAME.toml, NAME-BASE with --base.",
+    help="The folder for models, tables and the report. By default out/ablations/NAME for NAME.toml, or NAME-BASE with --base.",
 )
 @click.option(
     "--base",
     metavar="RECIPE",
     type=click.Path(path_type=Path),
-    help="Another training recipe than the study's own, such as a tiny one to try it.",
+    help="A training recipe to use instead of the one in STUDY, such as a tiny one for a test run.",
 )
 @click.option(
     "--workers",
     type=click.IntRange(min=1),
     default=1,
     show_default=True,
-    help="How many processes score at once.",
+    help="Number of processes that compute scores.",
 )
-@click.option("--quiet", is_flag=True, help="Say nothing but errors, and print no tables.")
+@click.option("--quiet", is_flag=True, help="Print only errors, and no tables.")
 @click.pass_context
 def ablate(
     context: click.Context, /, *, study: Path, out: Path | None, base: Path | None, workers: int, quiet: bool
 ) -> None:
-    """Train and measure a model for each choice of the one value that STUDY, a TOML file, changes.
+    """Train and evaluate a model for each choice of the one setting that STUDY, a TOML file, varies.
 
-    The folder BREWSTER_DATA holds the data. What was stopped goes on when the same command is given again. The tables
-    go to standard output; they and report.html also into the folder named with -o.
+    The environment variable BREWSTER_DATA names the data folder. The same command resumes an interrupted run. The
+    tables go to standard output; the tables and report.html are also written to the output folder.
     """
     require_extra("train", "training")
     require_extra("evaluate", "evaluating")
-    from brewster.evaluate.ablation import ablate as run  # noqa: PLC0415  (wakes torch, in two seconds)
+    from brewster.evaluate.ablation import ablate as run  # noqa: PLC0415  (imports torch, two seconds)
     from brewster.evaluate.ablation import read_study  # noqa: PLC0415
 
     ablation, name = read_study(study), study.stem
@@ -65,5 +65,5 @@ def ablate(
     results = run(ablation, benchmarks, out, workers=workers, report=report)
     if not quiet:
         print_tables(results)
-        print_status(f"all of it is in {out}")
+        print_status(f"results are in {out}")
     context.exit(0 if print_failures(results, quiet=quiet) and is_complete else 1)

@@ -1,4 +1,4 @@
-"""`brewster doctor`: what works here, what is missing, and the line that installs it."""
+"""`brewster doctor`: what works on this machine, what is missing, and the command that installs it."""
 
 from __future__ import annotations
 
@@ -31,23 +31,26 @@ _SYMBOLS: Final = {"ok": "ok", "missing": "--", "broken": "!!"}
 @final
 @dataclass(frozen=True)
 class Check:
-    """One line: `needed` says whether brewster can do without it, `cure` what would mend it."""
+    """The result of one check: one line of the output."""
 
     area: str
     name: str
     status: Literal["ok", "missing", "broken"]
     detail: str
     cure: str | None = None
+    """The command or action that repairs it."""
     needed: bool = True
+    """False for optional parts: their status does not change the exit code."""
 
 
 @click.command
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.pass_context
 def doctor(context: click.Context, *, as_json: bool) -> None:
-    """Say what works here and what is missing.
+    """Check what works on this machine and what is missing.
 
-    Each thing that is missing comes with the line that installs it.
+    For each missing part, the output has the command that installs it. The exit code is 1 if a required part does not
+    work.
     """
     checks = list(run_checks())
     is_healthy = all(check.status == "ok" for check in checks if check.needed)
@@ -56,15 +59,15 @@ def doctor(context: click.Context, *, as_json: bool) -> None:
     else:
         _print(checks)
         print_out(
-            "All that is needed works."
+            "All required parts work."
             if is_healthy
-            else "Something needed does not work: see !! and -- above."
+            else "A required part does not work: see the lines with !! and -- above."
         )
     context.exit(0 if is_healthy else 1)
 
 
 def run_checks() -> Iterator[Check]:
-    """Looks at everything, in the order in which one thing needs the other."""
+    """Runs all checks; each part is checked after the parts that it depends on."""
     version = platform.python_version()
     if sys.version_info >= _MIN_PYTHON:
         yield Check("python", "python", "ok", f"{version}, {platform.platform()}")
@@ -97,7 +100,7 @@ def _package(package: str, module: str) -> Check:
         return Check("packages", package, "missing", "not installed", cure)
     try:
         importlib.import_module(module)
-    except (ImportError, OSError) as error:  # a library below it is missing, or is none for this machine
+    except (ImportError, OSError) as error:  # a shared library is missing, or is built for another machine
         return Check("packages", package, "broken", f"{version}: {error}", f"{cure} --force-reinstall")
     return Check("packages", package, "ok", version)
 
@@ -113,25 +116,32 @@ def _version(package: str) -> str | None:
 
 def _devices() -> Iterator[Check]:
     try:
-        from brewster.inference.onnx_backend import available_devices  # noqa: PLC0415  (wakes ONNX Runtime)
+        from brewster.inference.onnx_backend import available_devices  # noqa: PLC0415  (imports ONNX Runtime)
 
         devices = available_devices()
     except (ImportError, OSError) as error:
-        yield Check("devices", "devices", "broken", str(error), "mend the packages above")
+        yield Check("devices", "devices", "broken", str(error), "repair the packages above")
         return
     if "cuda" not in devices and shutil.which("nvidia-smi"):
         cure = "pip install onnxruntime-gpu"
-        yield Check("devices", "cuda", "missing", "there is an NVIDIA driver", cure, needed=False)
+        yield Check(
+            "devices",
+            "cuda",
+            "missing",
+            "an NVIDIA driver is installed, but onnxruntime has no CUDA",
+            cure,
+            needed=False,
+        )
     for device in devices:
-        yield Check("devices", device, "ok", "--device auto takes it" if device == devices[0] else "")
+        yield Check("devices", device, "ok", "used by --device auto" if device == devices[0] else "")
 
 
 def _formats() -> Iterator[Check]:
-    """Writes and reads a small picture in each container."""
+    """Writes and reads a small picture in each file format."""
     try:
-        from brewster.photo import DEPTHS  # noqa: PLC0415  (wakes pyvips)
+        from brewster.photo import DEPTHS  # noqa: PLC0415  (imports pyvips)
     except (ImportError, OSError) as error:
-        yield Check("formats", "formats", "broken", str(error), "mend the packages above")
+        yield Check("formats", "formats", "broken", str(error), "repair the packages above")
         return
     for container in DEPTHS:
         yield _try_format(container, "reads and writes", lambda name=container: _sample(name))  # type: ignore[misc]
@@ -139,16 +149,16 @@ def _formats() -> Iterator[Check]:
 
 
 def _sample(container: str) -> bytes:
-    import numpy as np  # noqa: PLC0415  (not for --help)
+    import numpy as np  # noqa: PLC0415  (slow to import)
 
-    from brewster.photo import Photo  # noqa: PLC0415  (wakes pyvips)
+    from brewster.photo import Photo  # noqa: PLC0415  (imports pyvips)
 
     grey = np.full((64, 64, 3), 128, np.uint8)
     return Photo.from_array(grey, encoding="srgb").encode(container)
 
 
 def _try_format(container: str, verbs: str, sample: Callable[[], bytes]) -> Check:
-    from brewster.photo import Photo  # noqa: PLC0415  (wakes pyvips)
+    from brewster.photo import Photo  # noqa: PLC0415  (imports pyvips)
 
     extra = _OPTIONAL_FORMATS.get(container)
     try:
@@ -172,14 +182,16 @@ def _models() -> Iterator[Check]:
 
 
 def _mitsuba() -> Iterator[Check]:
-    """Whether Mitsuba can be imported, and the LLVM that compiles its kernels."""
+    """Whether Mitsuba can be imported, and whether it finds LLVM, which compiles its kernels."""
     version = _version("mitsuba")
     if version is None:
         return
-    from brewster.render.mitsuba import variant  # noqa: PLC0415  (not for --help)
+    from brewster.render.mitsuba import variant  # noqa: PLC0415  (slow to import)
 
     try:
-        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # about LLVM: see below
+        with warnings.catch_warnings(
+            action="ignore", category=RuntimeWarning
+        ):  # about LLVM, which the second check reports
             variant.load()
     except MissingExtra as error:
         yield Check("tracer", "mitsuba", "broken", str(error), variant.cure(str(error)), needed=False)
@@ -187,24 +199,24 @@ def _mitsuba() -> Iterator[Check]:
     yield Check("tracer", "mitsuba", "ok", version)
     probed = variant.probe()
     if probed.variant == variant.COMPILED:
-        yield Check("tracer", "llvm", "ok", probed.library or "the one Dr.Jit finds")
+        yield Check("tracer", "llvm", "ok", probed.library or "found by Dr.Jit")
     else:
-        detail = f"none works, rendering is several times slower ({probed.reason})"
+        detail = f"not usable, so rendering is several times slower ({probed.reason})"
         yield Check("tracer", "llvm", "missing", detail, variant.INSTALL_LLVM, needed=False)
 
 
 def _large() -> Iterator[Check]:
-    """What large image models may want beyond their extra."""
+    """What large image models may need in addition to the extra `large`."""
     if _version("diffusers") is None:
         return
     version = _version("bitsandbytes")
-    detail = version or "not installed; for nf4 and 8-bit AdamW on NVIDIA cards"
+    detail = version or "not installed; needed for nf4 and 8-bit AdamW on NVIDIA GPUs"
     cure = None if version else "pip install bitsandbytes"
     yield Check("large", "bitsandbytes", "ok" if version else "missing", detail, cure, needed=False)
-    from brewster.models.diffusion.lazy_imports import has_token  # noqa: PLC0415  (wakes torch)
+    from brewster.models.diffusion.lazy_imports import has_token  # noqa: PLC0415  (imports torch)
 
     token_found = has_token()
-    detail = "found" if token_found else "none; gated models such as FLUX.1 Kontext want one"
+    detail = "found" if token_found else "not found; gated models such as FLUX.1 Kontext need one"
     cure = None if token_found else "hf auth login"
     yield Check("large", "hub token", "ok" if token_found else "missing", detail, cure, needed=False)
 

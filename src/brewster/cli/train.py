@@ -1,4 +1,4 @@
-"""`brewster train`: a recipe in; a run that can be resumed and a model file out."""
+"""`brewster train`: train a model from a recipe; the run can be resumed."""
 
 from __future__ import annotations
 
@@ -24,25 +24,27 @@ if TYPE_CHECKING:
     "out",
     metavar="FOLDER",
     type=click.Path(path_type=Path),
-    help="The folder of the run: its checkpoint, log, samples and, at the end, model.onnx or the folder lora. By default out/NAME for NAME.toml.",
+    help="The folder for checkpoint, log, samples and, at the end, model.onnx or the folder lora. By default out/NAME for NAME.toml.",
 )
 @click.option(
     "--plan",
     is_flag=True,
-    help="Estimate memory and time of a large backbone's recipe, say whether they fit, and train nothing.",
+    help="Estimate memory and time for the recipe of a large backbone, check whether they fit, and do not train.",
 )
 @click.option(
-    "--card", metavar="NAME", help="With --plan: for this graphics card, such as RTX 4090, not the one here."
+    "--card",
+    metavar="NAME",
+    help='Estimate for this graphics card, such as "RTX 4090", instead of the one in this machine; implies --plan.',
 )
-@click.option("--quiet", is_flag=True, help="Say nothing but errors.")
+@click.option("--quiet", is_flag=True, help="Print only errors.")
 def train(*, recipe: Path, out: Path | None, plan: bool, card: str | None, quiet: bool) -> None:
-    """Train a model as RECIPE, a TOML file, says.
+    """Train a model with the settings of RECIPE, a TOML file.
 
-    The folder BREWSTER_DATA holds the data. A run that was stopped goes on from its last checkpoint when the same
-    command is given again, and ends with the same weights. Under torchrun several GPUs learn a large backbone together.
+    The environment variable BREWSTER_DATA names the data folder. The same command resumes an interrupted run from its
+    last checkpoint, and ends with the same weights. Under torchrun, several GPUs train a large backbone together.
     """
     require_extra("train", "training")
-    from brewster.training.recipe import LoraRecipe, read_recipe  # noqa: PLC0415  (wakes torch, in two seconds)
+    from brewster.training.recipe import LoraRecipe, read_recipe  # noqa: PLC0415  (imports torch, two seconds)
 
     parsed, out = read_recipe(recipe), out or Path("out") / recipe.stem
     if isinstance(parsed, LoraRecipe):
@@ -79,12 +81,14 @@ def _print_plan(recipe: CompactRecipe | LoraRecipe, card: str | None) -> None:
 
     if not isinstance(recipe, LoraRecipe):
         raise RecipeError(
-            "the recipe trains the compact network", "a large backbone's recipe", "train it without --plan"
+            "the recipe trains the compact network",
+            "--plan needs the recipe of a large backbone",
+            "train it without --plan",
         )
     gpu = find_card(card)
     if card is None and not is_here(gpu):
         print_status(
-            f"there is no graphics card here: planned for {gpu.name}, the paper's; --card names another"
+            f"no graphics card found: the plan is for {gpu.name}, the paper's card; choose another with --card"
         )
     estimate = plan_for(recipe, gpu)
     print_out(estimate.table())
@@ -96,5 +100,7 @@ def _make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise TargetError(
-            f"{folder} cannot be made ({error.strerror})", "a folder for the run", "choose another with -o"
+            f"{folder} cannot be created ({error.strerror})",
+            "the run needs a folder that can be written",
+            "choose another with -o",
         ) from error
