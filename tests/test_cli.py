@@ -254,7 +254,7 @@ def test_output_of_libraries_does_not_reach_standard_output(model, tmp_path):
     done = subprocess.run(command, input=picture(), capture_output=True, check=False)
     plain = as_user("-", "--model", model, input=picture())
     assert (done.returncode, done.stdout) == (0, plain.stdout)
-    for printed in (b"in Python", b"in C", b"by a child"):
+    for place in (b"in Python", b"in C", b"by a child"):
         assert done.stderr.count(b"printed " + place) == 1
 
 

@@ -193,7 +193,7 @@ def evaluate(context: click.Context, /, *, dry_run: bool, **options: Any) -> Non
     The tables go to standard output. The output folder gets results.json (every picture), tables.md, table.tex,
     table.csv and report.html. The same command resumes an interrupted run.
 
-    Pictures are paired by name. Pictures without a partner, and pictures on which a method failed, are listed; all
+    Pictures are paired by name. If a picture has no partner, or if a method fails on it, the picture is listed, all
     others are scored, and the exit code is 1.
     """
     require_extra("evaluate", "evaluating")

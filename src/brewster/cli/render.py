@@ -89,7 +89,7 @@ class _Size(click.ParamType[tuple[int, int]]):
 @click.option(
     "--renderer",
     type=click.Choice(["analytic", "mitsuba"]),
-    help="analytic (flat glass only) or mitsuba (a path tracer for all glass); by default analytic, or the renderer that --scene names.",
+    help="The renderer: analytic for flat glass only, or mitsuba, a path tracer for all glass; by default analytic, or the renderer that --scene names.",
 )
 @click.option(
     "--maps",
