@@ -1,12 +1,12 @@
-# demo: separate a photograph.  test: everything CI runs.  test-all: slow tests and browser tests, too.
+# demo: separate photographs.  test: all tests except the slow ones.  test-all: also the slow tests, with browser and Mitsuba.
 SHELL := /bin/bash
 PYTHON ?= python3
 BIN := .venv/bin
 export BREWSTER_DATA ?= $(wildcard ../shared/data)
 PHOTO ?= tests/pictures
-# A worker that crashes ends the run (loadfile would wait for it for ever), and so does C code that hangs: pytest-timeout
-# (pyproject.toml) only ends a test that comes back to Python, eight seconds earlier.
-ENDS_RED := --max-worker-restart=0 -o faulthandler_timeout=118 -o faulthandler_exit_on_timeout=true
+# A crashed worker must end the run (loadfile would wait for it forever), and so must C code that hangs: pytest-timeout
+# (pyproject.toml) ends only tests that return to Python, eight seconds earlier.
+FAIL_FAST := --max-worker-restart=0 -o faulthandler_timeout=118 -o faulthandler_exit_on_timeout=true
 
 .PHONY: demo test test-slow test-all test-system coverage check docs docs-site bench mutants dist clean
 
@@ -14,17 +14,17 @@ demo: .venv/core
 	$(BIN)/python runs/demo.py "$(PHOTO)"
 
 test: .venv/dev
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile $(ENDS_RED)
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile $(FAIL_FAST)
 
 test-slow: .venv/dev
 	$(BIN)/python -m pytest -m slow
 
 coverage: .venv/dev
-	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile $(ENDS_RED) --cov --cov-report term
+	$(BIN)/python -m pytest --numprocesses 2 --dist loadfile $(FAIL_FAST) --cov --cov-report term
 
 test-all: test-system test test-slow
 
-# What some tests need and pip does not install; without it they are skipped.
+# System packages that some tests need; without them, these tests are skipped.
 test-system:
 	@if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; \
 	then apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq chromium libatomic1; \

@@ -1,4 +1,4 @@
-"""Every test runs offline, with one thread (two shared cores spin against each other), and leaves no trace."""
+"""Shared fixtures. Each test runs offline and with one thread (threads of parallel tests would compete for the cores)."""
 
 import io
 import os
@@ -41,7 +41,7 @@ def pytest_collection_modifyitems(items):
 
 
 def pytest_terminal_summary(terminalreporter):
-    """Which tests this machine skipped, and what would enable them."""
+    """Prints how many tests were skipped, and what they need."""
     reports = terminalreporter.getreports("skipped")
     if not reports:
         return
@@ -68,7 +68,7 @@ def random() -> np.random.Generator:
 
 @pytest.fixture(scope="session")
 def data() -> Path:
-    """The shared data; BREWSTER_DATA or ../shared/data, else the test is skipped."""
+    """The data folder, BREWSTER_DATA or ../shared/data; without it, the test is skipped."""
     named = os.environ.get("BREWSTER_DATA") or Path(__file__).parents[2] / "shared" / "data"
     folder = Path(named).resolve()
     if not folder.is_dir():
@@ -78,15 +78,17 @@ def data() -> Path:
 
 @pytest.fixture(scope="session")
 def mitsuba():
-    """Mitsuba, with one thread; the test is skipped where it cannot be imported."""
+    """Mitsuba, with one thread; the test is skipped if it cannot be imported."""
     from brewster.render.mitsuba import variant  # noqa: PLC0415
 
     try:
-        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # LLVM: see below
+        with warnings.catch_warnings(
+            action="ignore", category=RuntimeWarning
+        ):  # about LLVM: see the fixture `compiled`
             mitsuba = variant.load()
     except MissingExtra as error:
         pytest.skip(str(error))
-    import drjit  # noqa: PLC0415  (only after it is decided which LLVM it loads)
+    import drjit  # noqa: PLC0415  (only after variant.load has chosen the LLVM library)
 
     drjit.set_thread_count(1)
     return mitsuba
@@ -94,7 +96,7 @@ def mitsuba():
 
 @pytest.fixture
 def compiled(mitsuba):
-    """The test is skipped where Mitsuba's kernels cannot be compiled."""
+    """Skips the test if Mitsuba's kernels cannot be compiled."""
     from brewster.render.mitsuba import variant  # noqa: PLC0415
 
     if variant.probe().variant != variant.COMPILED:
@@ -103,7 +105,7 @@ def compiled(mitsuba):
 
 @pytest.fixture(scope="module")
 def chromium():
-    """Debian's Chromium without a window; the test is skipped where it is not installed."""
+    """Headless Chromium; the test is skipped if it is not installed."""
     program = shutil.which("chromium")
     if not program:
         pytest.skip("no browser; run: apt install chromium")
@@ -136,14 +138,14 @@ def run(model, monkeypatch, tmp_path, capfdbinary):
 
 @pytest.fixture
 def bare(run):
-    """The same for commands that take no model."""
+    """The same for commands without the option --model."""
     return lambda *args: run(*args, with_model=False)
 
 
 @pytest.fixture
 def recipe(tmp_path, monkeypatch, random):
-    """The tiny training recipe, with three photos to learn from."""
-    from brewster.training.recipe import read_recipe  # noqa: PLC0415  (wakes torch)
+    """The tiny training recipe, with three photos as training data."""
+    from brewster.training.recipe import read_recipe  # noqa: PLC0415  (imports torch)
 
     folder = tmp_path / "data" / "photos" / "permissive"
     folder.mkdir(parents=True)
@@ -156,7 +158,7 @@ def recipe(tmp_path, monkeypatch, random):
 
 @pytest.fixture
 def rendered(monkeypatch):
-    """A recipe that renders; its worlds are computed once, as that takes longer than all the rest."""
+    """A training recipe with rendered samples. Its environments are computed once, because that takes most of the time."""
     from brewster.environments.assets import Assets  # noqa: PLC0415
     from brewster.training.recipe import read_recipe  # noqa: PLC0415
 

@@ -11,7 +11,7 @@ from pathlib import Path
 def started(command, **kwargs):
     """Runs a process that receives Ctrl-C, and kills it at the end if it still runs.
 
-    A shell starts background jobs with SIGINT ignored, and children inherit that.
+    A shell starts background jobs with SIGINT ignored, and children inherit that setting.
     """
     command = [*map(str, command)]
     with subprocess.Popen(command, preexec_fn=_restore_sigint, **kwargs) as process:  # noqa: PLW1509
@@ -28,7 +28,7 @@ def _restore_sigint():
 def wait_for(condition, process=None):
     """Waits until a condition is true while the process runs; only the time limit of the test stops the wait."""
     while not condition():
-        assert process is None or process.poll() is None, f"it ended, with exit code {process.returncode}"
+        assert process is None or process.poll() is None, f"the process exited with code {process.returncode}"
         time.sleep(0.01)
 
 

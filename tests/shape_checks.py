@@ -1,8 +1,8 @@
-"""Checks the array shapes that annotations state, in every module that states some, while the tests run.
+"""Checks array shapes against the jaxtyping annotations at run time, in all tests.
 
-brewster imports jaxtyping for type checkers only (`if TYPE_CHECKING`), so that users pay nothing. Here those imports are
-made, and jaxtyping's own loader has beartype check each call of the modules' functions. Only arrays are checked: what is
-wrong with other values, functions say themselves, and tests try that.
+brewster imports jaxtyping only for type checkers (`if TYPE_CHECKING`), so that users need not install it. This import hook
+executes those imports, and jaxtyping's loader makes beartype check each call. Only arrays are checked: functions validate
+other values themselves, and tests of their own check that.
 """
 
 import sys
@@ -17,21 +17,21 @@ _CHECKED = tuple(
     f"brewster.{package}."
     for package in ("evaluate", "inference", "models", "render", "rendered", "training")
 )
-"""Metrics and studies are left out: they refuse arrays of other shapes themselves, which their tests try."""
+"""Without metrics and user studies: these raise errors of their own for wrong shapes, which their tests check."""
 
-_STATES_SHAPES = b"from jaxtyping import"
+_JAXTYPING_IMPORT = b"from jaxtyping import"
 
 
 def check_arrays(function):
-    """The function, with those of its arguments and results checked that are arrays of a stated shape."""
+    """Wraps a function so that arguments and results with an array annotation are checked."""
     hints = typing.get_type_hints(function, include_extras=True)
-    function.__annotations__ = {name: hint for name, hint in hints.items() if _states_a_shape(hint)}
+    function.__annotations__ = {name: hint for name, hint in hints.items() if _has_shape(hint)}
     return beartype(function)
 
 
-def _states_a_shape(hint):
+def _has_shape(hint):
     is_array = isinstance(hint, type) and issubclass(hint, AbstractArray)
-    return is_array or any(map(_states_a_shape, typing.get_args(hint)))
+    return is_array or any(map(_has_shape, typing.get_args(hint)))
 
 
 class _Loader(_import_hook._JaxtypingLoader):
@@ -40,7 +40,7 @@ class _Loader(_import_hook._JaxtypingLoader):
         return data.replace(b"\nif TYPE_CHECKING:", b"\nif True:") if path == self.path else data
 
     def set_data(self, path, data, **_):
-        """Keeps no bytecode: it is not that of the file."""
+        """Writes no bytecode cache, because the bytecode differs from that of the file."""
 
 
 class _Finder(MetaPathFinder):
@@ -48,18 +48,18 @@ class _Finder(MetaPathFinder):
         if not name.startswith(_CHECKED):
             return None
         spec = PathFinder.find_spec(name, path, target)
-        if spec and isinstance(spec.loader, SourceFileLoader) and states_shapes(spec.loader):
+        if spec and isinstance(spec.loader, SourceFileLoader) and has_shapes(spec.loader):
             checker = _import_hook.Typechecker("shape_checks.check_arrays")
             spec.loader = _Loader(spec.loader.name, spec.loader.path, typechecker=checker)
             return spec
         return None
 
 
-def states_shapes(loader):
-    return _STATES_SHAPES in loader.get_data(loader.path)
+def has_shapes(loader):
+    return _JAXTYPING_IMPORT in loader.get_data(loader.path)
 
 
 def check_shapes():
-    """Call it before brewster is imported."""
+    """Installs the import hook. Call it before brewster is imported."""
     assert not any(name.startswith("brewster.") for name in sys.modules)
     sys.meta_path.insert(0, _Finder())

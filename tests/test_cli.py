@@ -1,4 +1,4 @@
-"""The front door: what may be asked, what stands in the help, and where the answers go."""
+"""The command line: commands, options, help, standard input and output, errors and progress."""
 
 import os
 import pty
@@ -37,7 +37,7 @@ def commands(command=cli, path=()):
 # --- help and documentation
 
 
-def test_every_command_and_every_option_is_explained_in_a_sentence():
+def test_every_command_and_every_option_has_a_help_sentence():
     for path, command in commands():
         assert command.help, path
         for option in (param for param in command.params if isinstance(param, click.Option)):
@@ -46,7 +46,7 @@ def test_every_command_and_every_option_is_explained_in_a_sentence():
             assert option.help.endswith("."), option.help
 
 
-def test_the_reference_in_the_docs_is_the_one_that_the_commands_give():
+def test_the_reference_in_the_docs_is_up_to_date():
     assert (ROOT / "docs" / "reference.md").read_text() == reference(), "run make docs"
 
 
@@ -58,14 +58,14 @@ def test_the_reference_names_every_command_and_every_option():
             assert option.opts[-1] in text
 
 
-def test_the_version_is_the_packages(bare):
+def test_the_version_is_that_of_the_package(bare):
     assert bare("--version") == (0, f"brewster {brewster.__version__}\n".encode(), "")
 
 
-# --- the options are those of the rooms below
+# --- the options are those of the library
 
 
-def test_the_options_offer_what_the_rooms_below_take():
+def test_the_options_offer_the_values_that_the_library_accepts():
     hints = get_type_hints(Options)
     assert get_args(hints["quality"]) == tuple(QUALITIES)
     assert set(get_args(hints["device"])) == set(DEVICES)
@@ -88,7 +88,7 @@ def test_a_web_form_can_be_made_from_the_same_options():
         form.validate_python({"strength": 2})
 
 
-def test_additive_layers_are_refused_in_containers_without_floats():
+def test_additive_layers_are_rejected_in_containers_without_floats():
     with pytest.raises(BrewsterError, match="tiff or exr"):
         Options(additive=True, format="jpeg")
 
@@ -96,7 +96,7 @@ def test_additive_layers_are_refused_in_containers_without_floats():
 # --- one photo
 
 
-def test_a_photo_without_a_command_is_separated_beside_itself(run, tmp_path):
+def test_without_a_command_the_photo_is_separated_and_the_layers_are_next_to_it(run, tmp_path):
     (tmp_path / "photo.jpg").write_bytes(picture())
     code, out, err = run("photo.jpg")
     assert (code, out) == (0, b"")
@@ -107,13 +107,13 @@ def test_a_photo_without_a_command_is_separated_beside_itself(run, tmp_path):
 @pytest.mark.parametrize(
     "words", [["separate", "a.png", "-o", "x"], ["a.png", "-o", "x"], ["-o", "x", "a.png"]]
 )
-def test_separate_may_be_said_or_not_and_options_may_come_first(run, tmp_path, words):
+def test_the_word_separate_is_optional_and_options_may_come_first(run, tmp_path, words):
     (tmp_path / "a.png").write_bytes(picture(container="png"))
     assert run(*words)[0] == 0
     assert tree(tmp_path / "x") == ["a.reflection.png", "a.transmission.png"]
 
 
-def test_the_layers_are_what_the_model_says(run, tmp_path):
+def test_the_layers_are_the_output_of_the_model(run, tmp_path):
     grey = np.full((40, 40, 3), 128, np.uint8)
     (tmp_path / "a.png").write_bytes(Photo.from_array(grey, encoding="srgb").encode("png"))
     assert run("a.png")[0] == 0
@@ -124,27 +124,27 @@ def test_the_layers_are_what_the_model_says(run, tmp_path):
         )
 
 
-def test_strength_nought_gives_the_photo_back_bit_by_bit(run, tmp_path):
+def test_strength_zero_returns_the_photo_bit_by_bit(run, tmp_path):
     (tmp_path / "a.png").write_bytes(picture(container="png"))
     assert run("a.png", "--strength", 0)[0] == 0
     same = Photo.open(tmp_path / "a.transmission.png").pixels == Photo.open(tmp_path / "a.png").pixels
     assert same.all()
 
 
-def test_the_layers_asked_for_are_written_and_no_others(run, tmp_path):
+def test_only_the_requested_layers_are_written(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(picture())
     assert run("a.jpg", "--layers", "confidence,reflection", "-o", "x")[0] == 0
     assert tree(tmp_path / "x") == ["a.confidence.png", "a.reflection.jpg"]
 
 
-def test_another_container_may_be_asked_for(run, tmp_path):
+def test_another_container_can_be_requested(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(picture())
     assert run("a.jpg", "--format", "webp", "--layers", "transmission,confidence", "-o", "x")[0] == 0
     assert tree(tmp_path / "x") == ["a.confidence.png", "a.transmission.webp"]
     assert Photo.open(tmp_path / "x" / "a.transmission.webp").file_info.container == "webp"
 
 
-def test_the_suffix_of_the_photo_stays_when_its_container_is_asked_for(run, tmp_path):
+def test_the_suffix_of_the_photo_is_kept_if_its_container_is_requested(run, tmp_path):
     (tmp_path / "A.JPEG").write_bytes(picture())
     assert run("A.JPEG", "--format", "jpeg", "--layers", "transmission", "-o", "x")[0] == 0
     assert tree(tmp_path / "x") == ["A.transmission.JPEG"]
@@ -166,7 +166,7 @@ def test_a_picture_named_as_the_output_takes_the_transmission(run, tmp_path):
     assert Photo.open(tmp_path / "new" / "clear.png").file_info.container == "png"
 
 
-def test_a_folder_may_be_called_like_a_picture(run, tmp_path):
+def test_a_folder_may_have_the_name_of_a_picture(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(picture())
     (tmp_path / "old.png").mkdir()
     for folder in ("old.png", "new.png/"):
@@ -184,7 +184,7 @@ def test_standard_input_goes_to_standard_output_in_its_container(run, container)
     assert "- -> -" in err
 
 
-def test_standard_output_takes_another_layer_and_container_on_demand(run):
+def test_standard_output_accepts_another_layer_and_container(run):
     confidence = run("-", "--layers", "confidence", "--quiet", stdin=picture())
     assert confidence[0] == 0
     assert confidence[2] == ""
@@ -193,7 +193,7 @@ def test_standard_output_takes_another_layer_and_container_on_demand(run):
     assert exr.file_info.container == "exr"
 
 
-def test_a_file_may_go_to_standard_output_and_standard_input_to_a_file(run, tmp_path):
+def test_a_file_can_go_to_standard_output_and_standard_input_to_a_file(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(picture())
     code, out, _ = run("a.jpg", "-o", "-")
     assert code == 0
@@ -209,7 +209,7 @@ def test_standard_input_without_a_picture_is_an_error_and_gives_no_output(run, s
     assert err.count("\n") == 1
 
 
-def test_a_full_standard_output_is_one_line_of_error(model, tmp_path):
+def test_a_full_standard_output_gives_one_error_line(model, tmp_path):
     with Path("/dev/full").open("wb") as full:
         done = subprocess.run(
             [sys.executable, "-m", "brewster", "-", "--model", model],
@@ -226,7 +226,7 @@ def test_a_full_standard_output_is_one_line_of_error(model, tmp_path):
     )
 
 
-def test_no_picture_is_poured_into_a_terminal(run, tmp_path, monkeypatch):
+def test_no_picture_is_written_to_a_terminal(run, tmp_path, monkeypatch):
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
     code, out, err = run("-", stdin=picture())
     assert (code, out) == (2, b"")
@@ -238,29 +238,29 @@ import ctypes, os, sys
 from brewster.cli import main
 from brewster.photo import Photo
 
-quiet = Photo.open.__func__
-def loud(cls, *args, **options):
-    print("said in Python")
-    ctypes.CDLL(None).puts(b"said in C")
-    os.system("echo said by a child")
-    return quiet(cls, *args, **options)
-Photo.open = classmethod(loud)
+original = Photo.open.__func__
+def noisy(cls, *args, **options):
+    print("printed in Python")
+    ctypes.CDLL(None).puts(b"printed in C")
+    os.system("echo printed by a child")
+    return original(cls, *args, **options)
+Photo.open = classmethod(noisy)
 sys.exit(main(sys.argv[1:]))
 """
 
 
-def test_what_libraries_print_stays_out_of_standard_output(model, tmp_path):
-    """C code keeps its own buffer, which is written when the process ends: that is too late for a redirection."""
+def test_output_of_libraries_does_not_reach_standard_output(model, tmp_path):
+    """C code has its own buffer, which is written when the process exits: after any temporary redirection."""
     command = [sys.executable, "-c", NOISY, "-", "--model", model]
     done = subprocess.run(command, input=picture(), capture_output=True, check=False)
     plain = as_user("-", "--model", model, input=picture())
     assert (done.returncode, done.stdout) == (0, plain.stdout)
-    for said in (b"in Python", b"in C", b"by a child"):
-        assert done.stderr.count(b"said " + said) == 1
+    for place in (b"in Python", b"in C", b"by a child"):
+        assert done.stderr.count(b"printed " + place) == 1
 
 
-def test_a_damaged_exr_leaves_the_json_whole(model, tmp_path):
-    """OpenEXR's binding prints a warning where Python prints."""
+def test_a_damaged_exr_does_not_corrupt_the_json(model, tmp_path):
+    """The Python binding of OpenEXR prints a warning to sys.stdout."""
     light = np.zeros((8, 10, 3), np.float32)
     data = bytearray(Photo.from_array(light, encoding="linear").encode("exr"))
     data[-1] ^= 0xFF
@@ -310,7 +310,7 @@ def test_help_goes_to_standard_output():
     ],
     ids=" ".join,
 )
-def test_what_cannot_be_meant_is_a_wrong_usage(bare, tmp_path, words):
+def test_contradictory_or_invalid_arguments_are_a_wrong_usage(bare, tmp_path, words):
     (tmp_path / "a.jpg").write_bytes(picture())
     code, out, err = bare(*words)
     assert (code, out) == (2, b"")
@@ -318,7 +318,7 @@ def test_what_cannot_be_meant_is_a_wrong_usage(bare, tmp_path, words):
     assert tree(tmp_path) == ["a.jpg"]
 
 
-def test_a_misspelt_command_is_named_and_a_photo_of_that_name_is_taken(run, bare, tmp_path):
+def test_a_misspelled_command_gives_a_suggestion_unless_a_photo_has_that_name(run, bare, tmp_path):
     assert "Did you mean models?" in bare("modles")[2]
     (tmp_path / "modles").write_bytes(picture())
     assert run("modles")[0] == 0
@@ -349,7 +349,7 @@ def test_an_error_is_one_line_with_exit_code_1(run, bare, tmp_path, words, reaso
 
 
 def test_a_terminal_shows_progress_and_standard_output_stays_clean(model, tmp_path):
-    """The bar is drawn on a real terminal (a pseudo one); nothing of it goes to standard output."""
+    """The bar is drawn on a pseudo terminal; nothing of it goes to standard output."""
     for index in range(3):
         (tmp_path / f"{index}.jpg").write_bytes(picture())
     terminal, end = pty.openpty()
@@ -362,7 +362,7 @@ def test_a_terminal_shows_progress_and_standard_output_stays_clean(model, tmp_pa
         env=os.environ | {"TERM": "xterm", "COLUMNS": "200"},
     )
     os.close(end)
-    shown = os.read(terminal, 1 << 16).decode()
+    shown = os.read(terminal, 1 << 16).decode(errors="replace")  # a read may end within a character
     os.close(terminal)
     assert (done.returncode, done.stdout) == (0, b"")
     assert "\x1b[" in shown
@@ -373,7 +373,7 @@ def test_a_terminal_shows_progress_and_standard_output_stays_clean(model, tmp_pa
 # --- Python
 
 
-def test_the_names_of_the_house_are_there_in_any_order_of_import():
+def test_public_names_exist_in_any_order_of_imports():
     for start in ("import brewster", "import brewster.inference.tiles as brewster_tiles; import brewster"):
         code = f"{start}\nassert callable(brewster.separate) and callable(brewster.separate)\n"
         code += "from brewster import Separator; assert brewster.inference.Separator is Separator\n"

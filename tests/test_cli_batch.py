@@ -1,4 +1,4 @@
-"""Bad pictures, bad places and many photos: nothing is lost, nothing is half written, the rest is done."""
+"""Batches with damaged photos and unusable targets: no partial files, no lost files, and all other photos are separated."""
 
 import errno
 import os
@@ -15,7 +15,7 @@ from brewster import Photo
 from brewster.inference import Separator
 from front_door import LAYERS, errors, lines, picture, results, tree
 
-# --- bad pictures
+# --- damaged photos
 
 
 def truncated():
@@ -38,7 +38,7 @@ def cmyk():
     return pyvips.Image.black(8, 8, bands=4).copy(interpretation="cmyk").jpegsave_buffer()
 
 
-def not_a_number(folder):
+def write_exr_with_nan(folder):
     pixels = np.ones((4, 4, 3), np.float32)
     pixels[1, 2] = np.nan
     header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.NO_COMPRESSION}
@@ -46,7 +46,7 @@ def not_a_number(folder):
         file.write(str(folder / "nan.exr"))
 
 
-def test_bad_pictures_are_named_at_the_end_and_the_rest_is_done(run, tmp_path):
+def test_damaged_photos_are_named_at_the_end_and_the_others_are_separated(run, tmp_path):
     folder = tmp_path / "in"
     folder.mkdir()
     bad = {
@@ -56,11 +56,11 @@ def test_bad_pictures_are_named_at_the_end_and_the_rest_is_done(run, tmp_path):
         "empty.jpg": b"",
         "five.tiff": five_channels(),
         "half.jpg": truncated(),
-        "text.jpg": b"I am no picture.",
+        "text.jpg": b"This is not a picture.",
     }
     for name, data in bad.items():
         (folder / name).write_bytes(data)
-    not_a_number(folder)
+    write_exr_with_nan(folder)
     for name in ("a", "good", "zebra"):
         (folder / f"{name}.jpg").write_bytes(picture())
     code, out, err = run("in", "-o", "out", "--quiet")
@@ -84,7 +84,7 @@ def test_a_long_panorama_keeps_its_size(run, tmp_path):
     assert Photo.open(tmp_path / "wide.transmission.jpg").size == (20_000, 300)
 
 
-def test_a_picture_beyond_the_pixel_limit_is_refused_and_one_at_the_limit_is_not(run, tmp_path):
+def test_a_photo_above_the_pixel_limit_is_rejected_and_one_at_the_limit_is_not(run, tmp_path):
     (tmp_path / "large.jpg").write_bytes(picture(61, 40))
     (tmp_path / "small.jpg").write_bytes(picture(60, 40))
     code, _, err = run("large.jpg", "small.jpg", "--max-pixels", 2400, "-o", "out")
@@ -94,24 +94,25 @@ def test_a_picture_beyond_the_pixel_limit_is_refused_and_one_at_the_limit_is_not
     assert tree(tmp_path / "out") == results("small")
 
 
-def test_a_stumble_of_brewster_itself_is_shown_whole_after_the_rest_is_done(
+def test_an_unexpected_exception_is_raised_after_the_other_photos_are_separated(
     run, tmp_path, monkeypatch, capfdbinary
 ):
     for name in ("a", "b", "c"):
         (tmp_path / f"{name}.jpg").write_bytes(picture())
     separate = Separator.__call__
 
-    def stumble(self, source, **options):
+    def fail(self, source, **options):
         if source.name == "a.jpg":
             raise ZeroDivisionError("a bug")
         return separate(self, source, **options)
 
-    monkeypatch.setattr(Separator, "__call__", stumble)
+    monkeypatch.setattr(Separator, "__call__", fail)
     with pytest.raises(ZeroDivisionError):
         run(".", "-o", "out")
     assert tree(tmp_path / "out") == results("b", "c")
     assert (
-        "error: a.jpg: brewster stumbled (ZeroDivisionError: a bug)" in capfdbinary.readouterr().err.decode()
+        "error: a.jpg: internal error in brewster (ZeroDivisionError: a bug)"
+        in capfdbinary.readouterr().err.decode()
     )
 
 
@@ -152,10 +153,10 @@ def test_the_tree_below_a_folder_is_mirrored(run, tmp_path):
     )
 
 
-NAMES = ["with space", "Schöne Fenster é", "two\nlines", "[bold]red", "-dash", b"\xff\xfe no text"]
+NAMES = ["with space", "Schöne Fenster é", "two\nlines", "[bold]red", "-dash", b"\xff\xfe not text"]
 
 
-def test_any_name_will_do_and_errors_stay_in_one_line(run, tmp_path):
+def test_any_file_name_works_and_each_error_is_one_line(run, tmp_path):
     names = [os.fsdecode(name) for name in NAMES]
     for name in names:
         (tmp_path / f"{name}.jpg").write_bytes(picture())
@@ -187,11 +188,11 @@ def test_link_loops_end(run, tmp_path):
     assert tree(tmp_path / "out") == results("a")
 
 
-# --- places
+# --- targets
 
 
-def test_a_place_that_cannot_be_written_to_is_an_error(run, tmp_path):
-    """A path below a regular file: unlike permission bits, that stops root too."""
+def test_a_target_that_cannot_be_written_is_an_error(run, tmp_path):
+    """The target is below a regular file: unlike permission bits, this is an error for root too."""
     (tmp_path / "a.jpg").write_bytes(picture())
     (tmp_path / "file").write_bytes(b"kept")
     code, _, err = run("a.jpg", "-o", "file/below")
@@ -210,8 +211,8 @@ def test_a_read_only_folder_is_an_error(run, tmp_path):
     assert "permissions" in err
 
 
-def test_a_full_disk_leaves_no_half_file_and_the_next_photo_is_tried(run, tmp_path, monkeypatch):
-    """The disk is full when the bytes are to reach it, which is where the kernel says so at the latest."""
+def test_a_full_disk_leaves_no_partial_file_and_the_next_photo_is_tried(run, tmp_path, monkeypatch):
+    """fsync reports the full disk; it is the last call at which the kernel can report it."""
     for name in ("a", "b"):
         (tmp_path / f"{name}.jpg").write_bytes(picture())
     fsync, calls = os.fsync, []
@@ -232,7 +233,7 @@ def test_a_full_disk_leaves_no_half_file_and_the_next_photo_is_tried(run, tmp_pa
     assert lines(out)[0]["outputs"] == {"transmission": "out/a.transmission.jpg"}
 
 
-def test_a_real_limit_on_file_size_leaves_no_half_file(model, tmp_path):
+def test_a_real_limit_on_file_size_leaves_no_partial_file(model, tmp_path):
     resource = pytest.importorskip("resource")
     (tmp_path / "a.png").write_bytes(picture(400, 300, "png"))
 
@@ -248,7 +249,7 @@ def test_a_real_limit_on_file_size_leaves_no_half_file(model, tmp_path):
 
 
 @pytest.mark.parametrize("make", ["same", "symlink", "hardlink"])
-def test_a_photo_is_never_written_over_itself(run, tmp_path, make):
+def test_a_photo_is_never_overwritten_by_its_own_layer(run, tmp_path, make):
     data = picture()
     (tmp_path / "a.jpg").write_bytes(data)
     target = "a.jpg" if make == "same" else "b.jpg"
@@ -263,7 +264,7 @@ def test_a_photo_is_never_written_over_itself(run, tmp_path, make):
     assert (tmp_path / "a.jpg").read_bytes() == data
 
 
-def test_no_photo_of_the_batch_is_written_over(run, tmp_path):
+def test_no_photo_of_the_batch_is_overwritten(run, tmp_path):
     for name in ("a.jpg", "a.transmission.jpg"):
         (tmp_path / name).write_bytes(picture())
     before = (tmp_path / "a.transmission.jpg").read_bytes()
@@ -274,7 +275,7 @@ def test_no_photo_of_the_batch_is_written_over(run, tmp_path):
     assert (tmp_path / "a.transmission.transmission.jpg").exists()
 
 
-def test_two_photos_that_would_share_a_name_are_refused_before_any_is_done(run, tmp_path):
+def test_two_photos_with_the_same_target_are_rejected_before_any_is_separated(run, tmp_path):
     for folder in ("x", "y"):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "a.jpg").write_bytes(picture())
@@ -284,10 +285,10 @@ def test_two_photos_that_would_share_a_name_are_refused_before_any_is_done(run, 
     assert not (tmp_path / "out").exists()
 
 
-# --- again
+# --- finished photos
 
 
-def test_finished_photos_are_skipped_and_the_model_is_not_even_loaded(run, tmp_path):
+def test_finished_photos_are_skipped_without_loading_the_model(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(picture())
     assert run("a.jpg")[0] == 0
     times = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
@@ -298,7 +299,7 @@ def test_finished_photos_are_skipped_and_the_model_is_not_even_loaded(run, tmp_p
     assert times == {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
 
 
-def test_a_photo_half_done_gets_its_missing_layer_and_keeps_the_other(run, tmp_path):
+def test_a_missing_layer_is_added_and_the_existing_one_is_kept(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(picture())
     (tmp_path / "a.transmission.jpg").write_bytes(b"mine")
     code, out, _ = run("a.jpg", "--json")
@@ -306,7 +307,7 @@ def test_a_photo_half_done_gets_its_missing_layer_and_keeps_the_other(run, tmp_p
     assert (tmp_path / "a.transmission.jpg").read_bytes() == b"mine"
 
 
-def test_overwrite_replaces_what_is_there(run, tmp_path):
+def test_overwrite_replaces_existing_layers(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(picture())
     (tmp_path / "a.transmission.jpg").write_bytes(b"old")
     assert run("a.jpg", "--overwrite")[0] == 0
@@ -328,10 +329,10 @@ def test_the_same_photo_gives_the_same_bytes_twice(run, tmp_path):
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
 
 
-# --- what is told
+# --- output
 
 
-def test_a_dry_run_tells_what_would_be_done_and_does_nothing(run, tmp_path):
+def test_a_dry_run_prints_the_planned_files_and_writes_nothing(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(picture())
     (tmp_path / "b.jpg").write_bytes(picture())
     (tmp_path / "a.reflection.jpg").write_bytes(b"")
@@ -341,12 +342,12 @@ def test_a_dry_run_tells_what_would_be_done_and_does_nothing(run, tmp_path):
         0,
         b"a.jpg -> a.transmission.jpg\nb.jpg -> b.transmission.jpg, b.reflection.jpg\n",
     )
-    told = lines(run(".", "--dry-run", "--json")[1])
-    assert [line["status"] for line in told] == ["planned", "planned"]
+    planned = lines(run(".", "--dry-run", "--json")[1])
+    assert [line["status"] for line in planned] == ["planned", "planned"]
     assert tree(tmp_path) == before
 
 
-def test_json_says_what_became_of_every_photo(run, tmp_path, model):
+def test_json_has_the_result_of_each_photo(run, tmp_path, model):
     (tmp_path / "a.jpg").write_bytes(picture())
     (tmp_path / "b.jpg").write_bytes(b"")
     code, out, err = run(".", "--json", "--quiet")
@@ -371,7 +372,7 @@ def test_json_says_what_became_of_every_photo(run, tmp_path, model):
     assert failed["error"]
 
 
-def test_the_batch_is_summed_up(run, tmp_path):
+def test_a_batch_ends_with_a_summary(run, tmp_path):
     for name in ("a", "b", "c"):
         (tmp_path / f"{name}.jpg").write_bytes(picture())
     run("a.jpg")
@@ -379,7 +380,7 @@ def test_the_batch_is_summed_up(run, tmp_path):
     assert "1 separated, 1 skipped, 1 failed" in run(".")[2].splitlines()
 
 
-def test_quiet_says_nothing_when_all_is_well(run, tmp_path):
+def test_quiet_prints_nothing_if_no_photo_fails(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(picture())
     assert run("a.jpg", "--quiet") == (0, b"", "")
     assert run("a.jpg", "--quiet") == (0, b"", "")

@@ -27,7 +27,7 @@ def pairs(tmp_path):
 QUICK = ("--metrics", "psnr,ssim", "-o", "out")
 
 
-def test_tables_go_to_standard_output_and_all_else_into_a_folder(bare, pairs, model, tmp_path):
+def test_tables_go_to_standard_output_and_all_results_into_a_folder(bare, pairs, model, tmp_path):
     code, out, err = bare(
         "evaluate", "--benchmark", pairs, "--model", f"pane={model}", "--predictions", "theirs=theirs", *QUICK
     )
@@ -40,45 +40,45 @@ def test_tables_go_to_standard_output_and_all_else_into_a_folder(bare, pairs, mo
     assert (tmp_path / "out" / "predictions" / "pane" / "real20" / "3.reflection.png").is_file()
 
 
-def test_json_is_the_results(bare, pairs, tmp_path):
+def test_json_prints_the_results(bare, pairs, tmp_path):
     code, out, _ = bare("evaluate", "--benchmark", pairs, "--json", *QUICK)
     assert code == 0
     assert json.loads(out) == json.loads((tmp_path / "out" / "results.json").read_text())
 
 
-def test_quiet_says_nothing(bare, pairs):
+def test_quiet_prints_nothing(bare, pairs):
     assert bare("evaluate", "--benchmark", pairs, "--quiet", *QUICK) == (0, b"", "")
 
 
-def test_a_dry_run_measures_nothing(bare, pairs, tmp_path):
+def test_a_dry_run_scores_nothing(bare, pairs, tmp_path):
     code, out, err = bare("evaluate", "--benchmark", pairs, "--dry-run", *QUICK)
     assert (code, out.decode().split()) == (0, ["real20/1", "real20/2", "real20/3"])
     assert "Real20: 3 pictures" in err
     assert not (tmp_path / "out").exists()
 
 
-def test_what_has_no_partner_is_named_and_the_rest_is_measured(bare, pairs, tmp_path):
+def test_pictures_without_partner_are_named_and_the_others_are_scored(bare, pairs, tmp_path):
     paint(tmp_path / "pairs" / "blended" / "4.png", 4)
     paint(tmp_path / "pairs" / "blended" / "5.png", 5, size=(48, 32))
     paint(tmp_path / "pairs" / "transmission" / "5.png", 5)
     code, out, err = bare("evaluate", "--benchmark", pairs, "--json", *QUICK)
     assert code == 1
     assert len(json.loads(out)["pictures"]) == 3
-    told = errors(err)
-    assert any("4.png" in line for line in told)
-    assert any("blended/5:" in line and "half the scale" in line for line in told)
+    messages = errors(err)
+    assert any("4.png" in line for line in messages)
+    assert any("blended/5:" in line and "half the scale" in line for line in messages)
 
 
 def test_a_method_that_fails_on_a_picture_is_named_and_the_exit_code_is_one(bare, pairs, tmp_path):
-    (tmp_path / "theirs" / "2.png").write_bytes(b"no picture")
+    (tmp_path / "theirs" / "2.png").write_bytes(b"not a picture")
     code, out, err = bare("evaluate", "--benchmark", pairs, "--predictions", "theirs=theirs", *QUICK)
     assert code == 1
     assert "(2 of 3)" in out.decode()
-    assert any("1 answer could not be scored" in line for line in errors(err))
+    assert any("1 prediction could not be scored" in line for line in errors(err))
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "message"),
     [
         (("--benchmark", "real2=pairs"), "real20"),
         (("--benchmark", "real20=nowhere"), "nowhere"),
@@ -89,13 +89,13 @@ def test_a_method_that_fails_on_a_picture_is_named_and_the_exit_code_is_one(bare
         (("--benchmark", "real20=pairs", "--predictions", "theirs=others"), "has the name of a case"),
     ],
 )
-def test_what_cannot_be_measured_is_said_in_a_sentence(wrong, said, bare, pairs, tmp_path):
+def test_invalid_benchmarks_metrics_and_methods_give_a_clear_error(wrong, message, bare, pairs, tmp_path):
     (tmp_path / "empty").mkdir()
     write(tmp_path / "others", "a.png", data=picture())
     for dry in ((), ("--dry-run",)):
         code, out, err = bare("evaluate", "--metrics", "psnr", *wrong, *dry)
         assert (code, out) == (1, b"")
-        assert said in errors(err)[-1]
+        assert message in errors(err)[-1]
 
 
 @pytest.mark.parametrize(
@@ -115,9 +115,9 @@ def test_a_wrong_usage_has_exit_code_two(wrong, bare, pairs):
     assert bare("evaluate", *wrong)[0] == 2
 
 
-def test_thresholds_are_swept_and_sizes_reduced(bare, pairs):
-    asked = ("--metrics", "psnr,psnr_region", "--region-threshold", "0.01,0.03", "--size", "12")
-    code, out, _ = bare("evaluate", "--benchmark", pairs, "--json", "-o", "out", *asked)
+def test_several_thresholds_and_a_smaller_size_are_evaluated(bare, pairs):
+    options = ("--metrics", "psnr,psnr_region", "--region-threshold", "0.01,0.03", "--size", "12")
+    code, out, _ = bare("evaluate", "--benchmark", pairs, "--json", "-o", "out", *options)
     results = json.loads(out)
     assert code == 0
     assert list(results["metrics"]) == ["psnr", "psnr_region@0.01", "psnr_region@0.03"]
@@ -125,7 +125,7 @@ def test_thresholds_are_swept_and_sizes_reduced(bare, pairs):
 
 
 def test_the_dev_pairs_score_what_scikit_image_says(bare, data, tmp_path):
-    """The unprocessed input on the ten Nature pairs; computed here with scikit-image and PIL, and stated as measured."""
+    """The unprocessed input on the ten Nature pairs, compared with scikit-image and PIL, and with the published value."""
     folder = data / "real/dev/nature"
     code, out, _ = bare("evaluate", "--benchmark", f"nature20={folder}", "--json", *QUICK)
     assert code == 0
@@ -145,12 +145,21 @@ def test_the_dev_pairs_score_what_scikit_image_says(bare, data, tmp_path):
 
 
 @pytest.mark.slow
-def test_ctrl_c_with_two_workers_stops_soon_and_keeps_what_was_scored(tmp_path, model):
+def test_ctrl_c_with_two_workers_stops_soon_and_keeps_finished_scores(tmp_path, model):
     for i in range(60):
         paint(tmp_path / "real20" / "blended" / f"{i}.png", i, size=(400, 300), noise=20)
         paint(tmp_path / "real20" / "transmission" / f"{i}.png", i, size=(400, 300))
-    asked = ["evaluate", "--benchmark", "real20=real20", "--model", f"pane={model}", "--workers", "2", *QUICK]
-    command = [sys.executable, "-m", "brewster", *asked]
+    options = [
+        "evaluate",
+        "--benchmark",
+        "real20=real20",
+        "--model",
+        f"pane={model}",
+        "--workers",
+        "2",
+        *QUICK,
+    ]
+    command = [sys.executable, "-m", "brewster", *options]
     run = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.PIPE)
     log = tmp_path / "out" / "scores.jsonl"
     while not log.exists():

@@ -1,4 +1,4 @@
-"""Ctrl-C in mid-batch: nothing is half written, and the same command goes on."""
+"""Ctrl-C during a batch: no partial files, and the same command resumes."""
 
 import ctypes
 import os
@@ -15,7 +15,7 @@ from front_door import errors, lines, picture, results, tree
 from other_processes import started, wait_for
 
 
-def test_ctrl_c_while_a_file_is_written_leaves_no_half_file(run, tmp_path, monkeypatch):
+def test_ctrl_c_while_a_file_is_written_leaves_no_partial_file(run, tmp_path, monkeypatch):
     (tmp_path / "a.jpg").write_bytes(picture())
     fsync, calls = os.fsync, []
 
@@ -32,8 +32,8 @@ def test_ctrl_c_while_a_file_is_written_leaves_no_half_file(run, tmp_path, monke
     assert tree(tmp_path) == ["a.jpg", "a.transmission.jpg"]
 
 
-def interrupt_that_gets_lost():
-    """As when Ctrl-C is pressed while libvips logs through Python: C code has nowhere to pass the exception to."""
+def raise_interrupt_in_c_callback():
+    """Simulates Ctrl-C while libvips logs through Python: C code cannot pass the exception on."""
 
     def press():
         raise KeyboardInterrupt
@@ -41,9 +41,9 @@ def interrupt_that_gets_lost():
     ctypes.CFUNCTYPE(None)(press)()
 
 
-@pytest.mark.parametrize("goes_wrong", [False, True])
+@pytest.mark.parametrize("with_error", [False, True])
 def test_ctrl_c_that_c_code_drops_stops_the_batch_before_anything_is_written(
-    run, tmp_path, monkeypatch, goes_wrong
+    run, tmp_path, monkeypatch, with_error
 ):
     for name in ("a", "b", "c"):
         (tmp_path / f"{name}.jpg").write_bytes(picture())
@@ -51,9 +51,9 @@ def test_ctrl_c_that_c_code_drops_stops_the_batch_before_anything_is_written(
 
     def interrupted(self, source, **options):
         if source.name == "b.jpg":
-            interrupt_that_gets_lost()
-            if goes_wrong:
-                raise UnreadablePhoto("half a call", "a whole one", "do not press Ctrl-C")
+            raise_interrupt_in_c_callback()
+            if with_error:
+                raise UnreadablePhoto("the call was interrupted", "a complete call", "do not press Ctrl-C")
         return separate(self, source, **options)
 
     monkeypatch.setattr(Separator, "__call__", interrupted)
@@ -63,21 +63,21 @@ def test_ctrl_c_that_c_code_drops_stops_the_batch_before_anything_is_written(
     assert [line["source"] for line in lines(out)] == ["a.jpg"]
     assert "Traceback" not in err
     assert not errors(err)
-    assert run(".", "-o", "out")[0] == 130  # b is interrupted again: nothing of the first time is left over
+    assert run(".", "-o", "out")[0] == 130  # b is interrupted again: no state of the first run remains
     monkeypatch.setattr(Separator, "__call__", separate)
     assert run(".", "-o", "out")[0] == 0
 
 
-def test_what_else_c_code_drops_is_still_reported(run, tmp_path, monkeypatch):
+def test_other_exceptions_that_c_code_drops_are_still_reported(run, tmp_path, monkeypatch):
     dropped = []
     monkeypatch.setattr(sys, "unraisablehook", dropped.append)
     (tmp_path / "a.jpg").write_bytes(picture())
     fsync = os.fsync
 
-    def stumble():
+    def fail():
         raise ZeroDivisionError
 
-    monkeypatch.setattr(os, "fsync", lambda file: (ctypes.CFUNCTYPE(None)(stumble)(), fsync(file)))
+    monkeypatch.setattr(os, "fsync", lambda file: (ctypes.CFUNCTYPE(None)(fail)(), fsync(file)))
     assert run("a.jpg")[0] == 0
     assert [what.exc_type for what in dropped] == [ZeroDivisionError] * 2
 
@@ -93,15 +93,15 @@ def endless(self, source, **options):
     while source.name == "06.jpg":
         separate(self, source, **options)
         Path("at work").touch()
-        interrupts.heed()
+        interrupts.raise_pending()
     return separate(self, source, **options)
 Separator.__call__ = endless
 sys.exit(main(sys.argv[1:]))
 """
-"""The command line, never done with one photo."""
+"""The command line, with a loop that never finishes one photo."""
 
 
-def test_ctrl_c_in_mid_batch_leaves_whole_files_only_and_the_same_command_goes_on(run, tmp_path, model):
+def test_ctrl_c_during_a_batch_leaves_only_complete_files_and_the_same_command_resumes(run, tmp_path, model):
     names = [f"{index:02}" for index in range(12)]
     (tmp_path / "in").mkdir()
     for index, name in enumerate(names):

@@ -1,4 +1,4 @@
-"""The commands beside `separate`: models, doctor and train."""
+"""The commands models, doctor and train."""
 
 import json
 import tomllib
@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture
 def shipped(model, monkeypatch, tmp_path):
-    """A zoo with a whole model and a damaged one."""
+    """A model zoo with an intact model and a damaged one."""
     whole = zoo.ModelFile("compact", model, zoo.ModelFile("", model, None, "").digest(), "Apache-2.0")
     broken = tmp_path.parent / f"{tmp_path.name}.onnx"
     broken.write_bytes(b"half a mod")
@@ -55,7 +55,7 @@ def test_damaged_models_are_found(bare, shipped):
     assert (code, [bool(row["error"]) for row in json.loads(out)]) == (1, [False, True])
 
 
-def test_the_model_may_be_named_in_the_zoo(bare, shipped, tmp_path):
+def test_a_model_of_the_zoo_can_be_chosen_by_name(bare, shipped, tmp_path):
     (tmp_path / "a.jpg").write_bytes(picture())
     code, out, _ = bare("a.jpg", "--json")
     assert (code, json.loads(out)["model"]) == (0, "compact")
@@ -64,31 +64,31 @@ def test_the_model_may_be_named_in_the_zoo(bare, shipped, tmp_path):
 # --- doctor
 
 
-def test_the_doctor_knows_every_dependency():
+def test_the_doctor_checks_every_dependency():
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert set(CORE) == {line.split(">")[0] for line in settings["dependencies"]}
     extras = {
-        name: {line.split(">")[0] for line in lines if ";" not in line}  # of any machine
+        name: {line.split(">")[0] for line in lines if ";" not in line}  # independent of the platform
         for name, lines in settings["optional-dependencies"].items()
         if name != "dev"
     }
     assert extras == {name: set(packages) for name, packages in EXTRAS.items()}
 
 
-def test_the_doctor_finds_a_healthy_house_and_a_damaged_model(bare, shipped, monkeypatch):
+def test_the_doctor_finds_a_damaged_model_and_otherwise_reports_success(bare, shipped, monkeypatch):
     code, out, _ = bare("doctor", "--json")
-    told = json.loads(out)
-    assert (code, told["ok"]) == (1, False)
-    assert [check["name"] for check in told["checks"] if check["needed"] and check["status"] != "ok"] == [
+    output = json.loads(out)
+    assert (code, output["ok"]) == (1, False)
+    assert [check["name"] for check in output["checks"] if check["needed"] and check["status"] != "ok"] == [
         "research"
     ]
     monkeypatch.delitem(zoo.MODELS, "research")
     code, out, _ = bare("doctor")
     assert code == 0
-    assert b"All that is needed works." in out
+    assert b"All required parts work." in out
 
 
-def test_the_doctor_says_what_is_missing_and_the_line_that_installs_it(bare, shipped, monkeypatch):
+def test_the_doctor_names_a_missing_package_and_the_command_that_installs_it(bare, shipped, monkeypatch):
     monkeypatch.setitem(CORE, "no-such-package", "nothing")
     code, out, _ = bare("doctor")
     assert code == 1
@@ -96,15 +96,13 @@ def test_the_doctor_says_what_is_missing_and_the_line_that_installs_it(bare, shi
     assert b"pip install no-such-package" in out
 
 
-def test_an_extra_is_missing_if_any_of_its_packages_is_and_nothing_is_ill_for_that(
-    bare, shipped, monkeypatch
-):
+def test_an_extra_is_missing_if_one_of_its_packages_is_but_the_exit_code_is_zero(bare, shipped, monkeypatch):
     monkeypatch.delitem(zoo.MODELS, "research")
     monkeypatch.setitem(EXTRAS, "exr", {"numpy": "numpy", "no-such-package": "nothing"})
     code, out, _ = bare("doctor", "--json")
-    told = json.loads(out)
-    exr = next(check for check in told["checks"] if (check["area"], check["name"]) == ("extras", "exr"))
-    assert (code, told["ok"]) == (0, True)
+    output = json.loads(out)
+    exr = next(check for check in output["checks"] if (check["area"], check["name"]) == ("extras", "exr"))
+    assert (code, output["ok"]) == (0, True)
     assert (exr["status"], exr["detail"]) == ("missing", "without no-such-package")
     assert exr["cure"] == "pip install 'brewster[exr]'"
 
@@ -119,7 +117,7 @@ def test_a_package_that_does_not_load_is_broken(bare, shipped, monkeypatch):
 # --- train
 
 
-def test_training_without_its_extra_names_the_line_that_installs_it(bare, monkeypatch):
+def test_training_without_its_extra_names_the_command_that_installs_it(bare, monkeypatch):
     find_spec = __import__("importlib.util").util.find_spec
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None if name == "torch" else find_spec(name))
     code, _, err = bare("train", "recipe.toml", "-o", "run")
@@ -127,14 +125,14 @@ def test_training_without_its_extra_names_the_line_that_installs_it(bare, monkey
     assert "pip install 'brewster[train]'" in err
 
 
-def test_a_recipe_that_is_not_there_is_an_error_and_leaves_nothing(bare, tmp_path):
+def test_a_missing_recipe_is_an_error_and_creates_no_folder(bare, tmp_path):
     code, _, err = bare("train", "recipe.toml", "-o", "run")
     assert code == 1
     assert "recipe.toml" in err
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_tells_its_progress_and_ends_in_a_model_that_separates(bare, tmp_path, monkeypatch):
+def test_a_run_prints_its_progress_and_exports_a_model_that_separates(bare, tmp_path, monkeypatch):
     folder = tmp_path / "data" / "photos" / "permissive"
     folder.mkdir(parents=True)
     for index in range(3):
@@ -143,8 +141,10 @@ def test_a_run_tells_its_progress_and_ends_in_a_model_that_separates(bare, tmp_p
     recipe = ROOT / "recipes" / "train" / "tiny.toml"
     code, out, err = bare("train", recipe)
     assert (code, out) == (0, b"")
-    told = [line.split(",")[0].rsplit(maxsplit=1)[0] for line in err.splitlines() if line.startswith("step")]
-    assert told == ["step 3 of 6: loss", "step 6 of 6: loss"]
+    output = [
+        line.split(",")[0].rsplit(maxsplit=1)[0] for line in err.splitlines() if line.startswith("step")
+    ]
+    assert output == ["step 3 of 6: loss", "step 6 of 6: loss"]
     run = tmp_path / "out" / "tiny"
     left = {path.name for path in run.iterdir() if not path.match("events.out.tfevents.*")}  # TensorBoard's
     assert left == {"checkpoint.pt", "log.jsonl", "model.onnx", "samples.png"}
@@ -152,15 +152,15 @@ def test_a_run_tells_its_progress_and_ends_in_a_model_that_separates(bare, tmp_p
     assert Separator.load(str(run / "model.onnx"))(photo).transmission.size == (70, 50)
 
 
-def test_a_run_that_has_no_place_is_an_error(bare, tmp_path):
+def test_a_run_folder_that_cannot_be_created_is_an_error(bare, tmp_path):
     (tmp_path / "file").touch()
     code, _, err = bare("train", ROOT / "recipes" / "train" / "tiny.toml", "-o", "file/run")
     assert code == 1
-    assert err.startswith("error: file/run cannot be made")
+    assert err.startswith("error: file/run cannot be created")
 
 
-def test_a_run_goes_by_the_name_of_its_recipe_unless_told_otherwise(bare, tmp_path):
+def test_the_run_folder_has_the_name_of_the_recipe_by_default(bare, tmp_path):
     (tmp_path / "out").touch()
     code, _, err = bare("train", ROOT / "recipes" / "train" / "tiny.toml")
     assert code == 1
-    assert err.startswith("error: out/tiny cannot be made")
+    assert err.startswith("error: out/tiny cannot be created")

@@ -35,15 +35,15 @@ def fake(monkeypatch):
     monkeypatch.setitem(workers.RENDERERS, "analytic", "fake_renderer:render")
 
 
-def faked(*args, renderer="render", **how):
+def faked(*args, renderer="render", **options):
     """The command with a fake renderer, in a process of its own."""
     path = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
     command = [sys.executable, "-c", FAKED.format(renderer), "render", *map(str, args), "--workers", "0"]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=path, **how)
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=path, **options)
 
 
-def test_a_set_is_rendered_shown_and_each_of_its_scenes_rendered_again(bare, tmp_path, monkeypatch):
-    """The real renderer and worlds; these are small ones, as large ones take seconds each."""
+def test_a_set_is_rendered_with_preview_and_each_scene_can_be_rendered_again(bare, tmp_path, monkeypatch):
+    """Uses the real renderer and small environments; large ones take seconds each."""
     monkeypatch.setattr(assets, "BUILTIN_HEIGHT", 32)
     options = ("--recipe", "tiny", "--count", 2, "--seed", 7, "--size", "48x32", "--orders", "paper")
     code, out, err = bare("render", "set", *options, "--workers", 0, "--json", "--preview")
@@ -59,7 +59,7 @@ def test_a_set_is_rendered_shown_and_each_of_its_scenes_rendered_again(bare, tmp
         assert hashes(tmp_path / "again" / index) == hashes(tmp_path / "set" / index)
 
 
-def test_the_same_command_goes_on_and_a_larger_count_adds(bare, fake, tmp_path):
+def test_the_same_command_resumes_and_a_larger_count_adds_samples(bare, fake, tmp_path):
     bare("render", "set", "--recipe", "tiny", "--count", 2, "--workers", 0)
     code, out, err = bare("render", "-o", "set", "--recipe", "tiny", "--count", 3, "--workers", 0, "--json")
     assert (code, [line["status"] for line in lines(out)]) == (0, ["skipped", "skipped", "rendered"])
@@ -67,7 +67,7 @@ def test_the_same_command_goes_on_and_a_larger_count_adds(bare, fake, tmp_path):
     assert "1 rendered, 2 skipped" in err
 
 
-def test_shards_are_one_option_away(bare, fake, tmp_path):
+def test_the_option_shards_packs_samples_into_tar_files(bare, fake, tmp_path):
     assert (
         bare("render", "set", "--recipe", "tiny", "--count", 2, "--first", 99, "--workers", 0, "--shards")[0]
         == 0
@@ -77,18 +77,18 @@ def test_shards_are_one_option_away(bare, fake, tmp_path):
             assert tar.getnames() == [f"{key}.{name}" for name in store.FILES]
 
 
-def test_quiet_says_nothing(bare, fake):
+def test_quiet_prints_nothing(bare, fake):
     assert bare("render", "set", "--recipe", "tiny", "--count", 1, "--workers", 0, "--quiet") == (0, b"", "")
 
 
-def test_a_sample_that_fails_is_named_and_the_exit_code_says_so(bare, monkeypatch):
+def test_a_sample_that_fails_is_named_and_the_exit_code_is_one(bare, monkeypatch):
     monkeypatch.setitem(workers.RENDERERS, "analytic", "fake_renderer:picky")
     code, _, err = bare("render", "set", "--recipe", "tiny", "--count", 3, "--workers", 0, "--quiet")
     assert code == 1
     assert errors(err) == ["error: sample 1: sample 1 is odd; it should be even; count by two."]
 
 
-def test_another_job_in_the_folder_is_one_line(bare, fake):
+def test_another_job_in_the_folder_is_one_error_line(bare, fake):
     bare("render", "set", "--recipe", "tiny", "--count", 1, "--workers", 0)
     code, _, err = bare("render", "set", "--recipe", "tiny", "--count", 1, "--workers", 0, "--seed", 3)
     assert code == 1
@@ -98,7 +98,7 @@ def test_another_job_in_the_folder_is_one_line(bare, fake):
 
 def test_a_photo_that_cannot_light_a_scene_is_left_out_and_named(bare, fake, tmp_path):
     (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "broken.jpg").write_bytes(b"no picture")
+    (tmp_path / "photos" / "broken.jpg").write_bytes(b"not a picture")
     grey = Photo.open(next((Path(__file__).parent / "pictures").glob("mixture*.jpg")))
     grey.save(tmp_path / "photos" / "fine.jpg")
     code, _, err = bare(
@@ -126,7 +126,7 @@ def test_a_wrong_usage_is_explained(bare, args, says):
     assert says in err
 
 
-def test_what_is_missing_comes_with_the_line_that_installs_it(bare, monkeypatch):
+def test_a_missing_package_is_named_with_the_command_that_installs_it(bare, monkeypatch):
     found = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name, *rest: None if name == "torch" else found(name, *rest)
@@ -137,16 +137,16 @@ def test_what_is_missing_comes_with_the_line_that_installs_it(bare, monkeypatch)
     assert "pip install 'brewster[render]'" in err
 
 
-def test_help_wakes_nothing_heavy():
+def test_help_imports_no_heavy_library():
     code = "import sys; from brewster.cli import main; main(['render', '--help']); assert not {'torch', 'pyarrow', 'ray', 'pyvips'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
 
 
-def test_a_full_disk_is_one_line(tmp_path):
-    def little():
+def test_a_full_disk_is_one_error_line(tmp_path):
+    def limit_file_size():
         resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
 
-    run = faked("set", "--recipe", "tiny", "--count", 2, cwd=tmp_path, preexec_fn=little)
+    run = faked("set", "--recipe", "tiny", "--count", 2, cwd=tmp_path, preexec_fn=limit_file_size)
     _, err = run.communicate()
     assert run.returncode == 1
     assert err.startswith(b"error: ")
@@ -155,11 +155,11 @@ def test_a_full_disk_is_one_line(tmp_path):
     assert sorted(path.name for path in (tmp_path / "set").iterdir()) == [".lock", "set.toml"]
 
 
-def test_killed_in_the_middle_and_begun_again_it_ends_as_if_undisturbed(bare, fake, tmp_path):
+def test_a_killed_and_restarted_run_gives_the_same_set_as_an_undisturbed_one(bare, fake, tmp_path):
     command = ("--recipe", "tiny", "--count", 20, "--shards")
     run = faked("set", *command, renderer="slow", cwd=tmp_path)
-    patience = time.monotonic() + 30
-    while len(list(tmp_path.glob("set/0*"))) < 4 and time.monotonic() < patience:
+    deadline = time.monotonic() + 30
+    while len(list(tmp_path.glob("set/0*"))) < 4 and time.monotonic() < deadline:
         time.sleep(0.01)
     code, _, err = bare("render", "set", *command, "--workers", 0)
     assert (code, len(errors(err))) == (1, 1)
@@ -173,17 +173,17 @@ def test_killed_in_the_middle_and_begun_again_it_ends_as_if_undisturbed(bare, fa
 
 
 @pytest.mark.slow
-def test_the_whole_play_with_two_workers_killed_and_resumed(tmp_path):
+def test_a_run_with_two_workers_can_be_killed_and_resumed(tmp_path):
     command = ("--recipe", "tiny", "--count", 6, "--seed", 7, "--workers", 2)
     run = subprocess.Popen(
         [sys.executable, "-m", "brewster", "render", "set", *map(str, command)], cwd=tmp_path
     )
-    patience = time.monotonic() + 120
-    while not list(tmp_path.glob("set/0*")) and time.monotonic() < patience:
+    deadline = time.monotonic() + 120
+    while not list(tmp_path.glob("set/0*")) and time.monotonic() < deadline:
         time.sleep(0.05)
     run.kill()
     run.wait()
-    time.sleep(1)  # the workers have noticed
+    time.sleep(1)  # until the workers have exited
     for name in ("set", "undisturbed"):
         done = as_user("render", name, *command, "--json", cwd=tmp_path)
         assert done.returncode == 0, done.stderr

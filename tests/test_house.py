@@ -1,4 +1,4 @@
-"""The house keeps its own rules: imports, light start, documented names, a README that tells the truth."""
+"""Rules of the code base: imports, fast start, documented names, a correct README."""
 
 import ast
 import importlib
@@ -35,7 +35,7 @@ def functions():
                 yield path, node
 
 
-def test_rooms_import_from_below_only():
+def test_packages_import_only_from_lower_layers():
     done = subprocess.run(
         [Path(sys.executable).with_name("lint-imports")],
         cwd=ROOT,
@@ -47,7 +47,7 @@ def test_rooms_import_from_below_only():
 
 
 @pytest.mark.parametrize("command", [["-c", "import brewster"], ["-m", "brewster", "--help"]])
-def test_a_light_start_wakes_no_heavy_library(command):
+def test_import_and_help_load_no_heavy_library(command):
     done = subprocess.run(
         [sys.executable, "-X", "importtime", *command], capture_output=True, text=True, check=True
     )
@@ -55,8 +55,8 @@ def test_a_light_start_wakes_no_heavy_library(command):
     assert not imported & HEAVY
 
 
-def test_shapes_that_annotations_state_are_checked_while_tests_run():
-    """Without the hook of shape_checks.py, these annotations are never looked at."""
+def test_array_shapes_are_checked_against_annotations_in_tests():
+    """Without the import hook of shape_checks.py, these annotations have no effect."""
     flat = np.zeros((8, 8), np.float32)
     with pytest.raises(jaxtyping.TypeCheckError, match="image"):
         run_tiled(lambda tile: (tile, tile), flat, tile_px=16, overlap_px=2)
@@ -64,18 +64,18 @@ def test_shapes_that_annotations_state_are_checked_while_tests_run():
         run_tiled(lambda tile: (tile[..., 0],), flat[..., None].repeat(3, 2), tile_px=16, overlap_px=2)
 
 
-def test_large_image_models_have_one_door():
-    """Their libraries are imported by name when they are needed, which no import contract can see."""
-    opened = {
+def test_libraries_of_large_models_are_loaded_in_one_package_only():
+    """They are imported by name when they are needed, which import-linter cannot see."""
+    loaded = {
         (path.relative_to(SOURCE).parts[:2], library)
         for path in FILES
         for library in re.findall(r'\b(?:import_library|diffusers_class)\("?(\w+)', path.read_text())
     }
-    outside = {library for room, library in opened if room != ("models", "diffusion")}
+    outside = {library for package, library in loaded if package != ("models", "diffusion")}
     assert outside == {"accelerate"}  # training/distributed
 
 
-def test_separating_a_photo_needs_no_torch():
+def test_inference_imports_no_torch():
     code = "import brewster.inference, sys; assert not {'torch', 'scipy', 'PIL'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)
 
@@ -87,7 +87,7 @@ def test_the_signature_of_separate_shows_the_source_and_every_option():
     assert set(Options.__dataclass_fields__) - {"layers", "format"} <= set(shown.parameters)
 
 
-def test_type_checkers_know_every_public_name_and_no_other(tmp_path):
+def test_type_checkers_accept_every_public_name_and_no_other(tmp_path):
     """A module's __getattr__ would make every misspelt name an `object`."""
     (tmp_path / "user.py").write_text("""import brewster
 layer: brewster.Photo = brewster.separate("window.jpg", strength=0.5).transmission
@@ -110,7 +110,7 @@ brewster.separate()
 
 
 def test_every_public_name_is_exported_and_documented():
-    """What a module defines without an underscore and other rooms use is what it exports."""
+    """All public names that a package defines are in its `__all__`."""
     for module in (brewster.photo, brewster.inference):
         assert module.__all__ == sorted(module.__all__, key=lambda name: (not name.isupper(), name))
         defined = {
@@ -124,20 +124,20 @@ def test_every_public_name_is_exported_and_documented():
         assert name.startswith("__") or inspect.getdoc(value), name
 
 
-def test_every_module_and_every_public_function_says_what_it_is():
+def test_every_module_and_every_public_function_has_a_docstring():
     for module in pkgutil.walk_packages(brewster.__path__, "brewster."):
         if not module.name.endswith("__main__"):
             assert importlib.import_module(module.name).__doc__, module.name
     undocumented = [
         f"{path.name}:{node.name}"
         for path, node in functions()
-        if not node.name.startswith("_") and not ast.get_docstring(node) and isinstance_of_public(path, node)
+        if not node.name.startswith("_") and not ast.get_docstring(node) and is_public(path, node)
     ]
     assert not undocumented
 
 
-def isinstance_of_public(path, node):
-    """Public functions of modules and of public classes; helpers inside other functions are not."""
+def is_public(path, node):
+    """Whether it is a function of a module or a method of a public class, and not an inner function."""
     tree = ast.parse(path.read_text())
     public = [
         *tree.body,
@@ -152,7 +152,7 @@ def isinstance_of_public(path, node):
     return (node.name, node.lineno) in known and node.name not in {"forward"}
 
 
-def test_every_error_is_in_the_tree_that_its_docstring_draws():
+def test_every_error_is_in_the_tree_of_the_docstring():
     tree = inspect.getdoc(brewster.errors)
     for name, value in vars(brewster.errors).items():
         if inspect.isclass(value):
@@ -184,19 +184,21 @@ def test_the_python_in_the_readme_runs(tmp_path, monkeypatch):
     assert blocks
     picture = next((ROOT / "tests" / "pictures").glob("mixture*.jpg"))
     (tmp_path / "window.jpg").write_bytes(picture.read_bytes())
+    (tmp_path / "holiday").mkdir()
+    (tmp_path / "holiday" / "photo.jpg").write_bytes(picture.read_bytes())
     monkeypatch.chdir(tmp_path)
     for block in blocks:
         exec(compile(block, "README.md", "exec"), {})
 
 
-def test_every_link_in_the_documents_leads_somewhere():
+def test_every_link_in_the_documents_has_a_target():
     for document in [ROOT / "README.md", *ROOT.glob("docs/*.md")]:
         links = re.findall(r"\]\(([^)#]+)", document.read_text())
         for link in (link for link in links if "://" not in link):
             assert (document.parent / link).exists(), f"{document.name}: {link}"
 
 
-def test_every_test_file_is_named_after_a_module_a_package_or_the_house():
+def test_every_test_file_is_named_after_a_module_or_a_package():
     names = {path.stem for path in FILES} | {path.parent.name for path in FILES} | {"house", "report"}
     for path in (ROOT / "tests").glob("test_*.py"):
         words = path.stem.removeprefix("test_").split("_")

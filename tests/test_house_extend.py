@@ -1,4 +1,4 @@
-"""docs/how-to-extend.md is true: its blocks are applied to a copy of the package, and its checks pass there."""
+"""The examples of docs/how-to-extend.md work: they are applied to a copy of the package and run there."""
 
 import ast
 import os
@@ -26,7 +26,7 @@ def sections():
 
 @pytest.fixture
 def checkout(tmp_path):
-    """A copy of what the examples change, next to links to what they use."""
+    """A copy of the files that the examples change, with links to the files that they only read."""
     shutil.copytree(ROOT / "src", tmp_path / "src", ignore=shutil.ignore_patterns("weights"))
     (tmp_path / "src/brewster/models/weights").symlink_to(ROOT / "src/brewster/models/weights")
     shutil.copytree(ROOT / "recipes", tmp_path / "recipes")
@@ -35,7 +35,7 @@ def checkout(tmp_path):
 
 
 def apply(block, root):
-    """Puts a block where its first line says."""
+    """Inserts a block at the place that its first line names."""
     path, place = PLACE.match(block).groups()
     body, path = block.partition("\n")[2], root / path
     if block.startswith("# new file"):
@@ -48,7 +48,7 @@ def apply(block, root):
 
 
 def find(tree, place):
-    """The number of lines before the place, and its indentation."""
+    """The number of lines before the place, and the indentation there."""
     if place == "among the imports":
         return max(node.end_lineno for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)), 0
     side, name = place.split(" ")
@@ -65,7 +65,7 @@ def find(tree, place):
 
 
 def names(node):
-    """What a statement defines."""
+    """The names that a statement defines."""
     if isinstance(node, ast.ClassDef | ast.FunctionDef):
         return {node.name}
     targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
@@ -79,7 +79,7 @@ def test_every_extension_point_has_a_section():
 
 
 @pytest.mark.parametrize("section", list(sections()))
-def test_what_the_section_adds_works_and_changes_no_other_file(section, checkout):
+def test_the_example_of_each_section_works(section, checkout):
     *changes, check = sections()[section]
     for block in changes:
         apply(block, checkout)

@@ -1,8 +1,8 @@
-"""What is cached is keyed by a format number, and a changed output forces the number to be raised.
+"""Caches are keyed by format numbers: if an output changes, its format number must be increased.
 
-Each test compares a small fixed output with the numbers that are pinned here under the format's number. If one fails
-because you changed the output on purpose: raise the number named in its message by one, and pin the new output under
-it (each test prints it). Numbers are compared within what processors differ by, not to the bit.
+Each test compares a small fixed output with the values that are stored here under the format number. If a test fails
+because you changed the output on purpose, increase the number that the message names, and store the new output under it
+(the test prints it). The tolerance covers differences between processors.
 """
 
 import hashlib
@@ -168,18 +168,18 @@ MAPS = {
 
 
 def same(name, number, pinned, made, tolerance=0.0):
-    """Compares an output, lists of numbers by name, with the one pinned for this format; says what to do if it differs."""
+    """Compares an output (lists of numbers by name) with the one that is stored for this format number."""
     print(f"{number}: {made!r},")
-    assert number in pinned, f"{name} is {number}, and no output is pinned for it"
+    assert number in pinned, f"{name} is {number}, but no output is stored for it"
     for part, values in pinned[number].items():
         expected = pytest.approx(values, abs=tolerance) if tolerance else values
         assert made[part] == expected, (
-            f"{part} changed: raise {name} ({number}) by one, and pin the new output"
+            f"{part} changed: increase {name} ({number}) by one, and store the new output"
         )
 
 
 def picture(seed, height=40, width=56):
-    """Soft colours with some hard edges."""
+    """Smooth colours with some hard edges."""
     blocks = np.random.default_rng(seed).integers(0, 120, (height // 8, width // 8, 3))
     return (smooth(height, width) // 2 + np.kron(blocks, np.ones((8, 8, 1)))).astype(np.uint8)
 
@@ -189,8 +189,8 @@ def case(rendered=False):
 
 
 @pytest.fixture(scope="module")
-def leaning(tmp_path_factory):
-    """A model that sees to the left and above: turned, flipped or cut otherwise, it answers otherwise."""
+def asymmetric(tmp_path_factory):
+    """A model that depends on the pixels to the left and above, so that rotated, flipped or shifted input changes its output."""
     shares = {"transmission": 0.7, "reflection": 0.2}
     kernels = {name: np.zeros((3, 1, 3, 3), np.float32) for name in shares}
     for name, kernel in kernels.items():
@@ -201,20 +201,20 @@ def leaning(tmp_path_factory):
             helper.make_node("Conv", ["photo", f"{name}_kernel"], [name], group=3, pads=[1] * 4)
             for name in shares
         ],
-        "leaning",
+        "asymmetric",
         [helper.make_tensor_value_info("photo", TensorProto.FLOAT, shape)],
         [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name in shares],
         [onnx.numpy_helper.from_array(kernels[name], f"{name}_kernel") for name in shares],
     )
-    path = tmp_path_factory.mktemp("model") / "leaning.onnx"
+    path = tmp_path_factory.mktemp("model") / "asymmetric.onnx"
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10), path)
     return path
 
 
-def test_a_changed_answer_raises_the_format_of_answers(leaning, tmp_path):
+def test_a_changed_prediction_needs_a_new_prediction_format(asymmetric, tmp_path):
     photo, made = Photo.from_array(picture(1, 720, 960), encoding="srgb"), {}
     for quality in QUALITIES:
-        answer = ModelMethod("leaning", str(leaning), tmp_path, quality=quality).predict(case(), photo)
+        answer = ModelMethod("asymmetric", str(asymmetric), tmp_path, quality=quality).predict(case(), photo)
         layers = np.concatenate(
             [layer.pixels[7::240, 9::240, 1] for layer in (answer.transmission, answer.reflection)]
         )
@@ -225,7 +225,7 @@ def test_a_changed_answer_raises_the_format_of_answers(leaning, tmp_path):
 def scores(names):
     photo = picture(1)
     behind, mirrored = (photo * 0.85).astype(np.uint8), photo // 2
-    behind[:, :20], mirrored[:, :20] = photo[:, :20], 0  # nothing is mirrored at the left
+    behind[:, :20], mirrored[:, :20] = photo[:, :20], 0  # no reflection at the left
     behind[:16, :16] = 220  # something white
     pictures = {"photo": photo, "transmission": behind, "reflection": mirrored}
     truth = GroundTruth(case(rendered=True), Photo.from_array(photo, encoding="srgb"), pictures)
@@ -234,30 +234,30 @@ def scores(names):
     return Scorer(truth, EvaluationConfig(metrics=names)).score(MethodOutput(*layers))
 
 
-def test_a_changed_score_raises_the_format_of_scores():
+def test_a_changed_score_needs_a_new_score_format():
     names = tuple(name for name in METRICS if not name.startswith("lpips"))
     made = scores(names)
     assert None not in made.values()
     same("evaluate.runner.SCORE_FORMAT", SCORE_FORMAT, SCORES, made, 2e-6)
 
 
-def test_a_changed_lpips_raises_the_format_of_scores(data, monkeypatch):
+def test_a_changed_lpips_needs_a_new_score_format(data, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     names = tuple(name for name in METRICS if name.startswith("lpips"))
     same("evaluate.runner.SCORE_FORMAT", SCORE_FORMAT, LPIPS, scores(names), 1e-4)
 
 
-def test_a_changed_draw_raises_the_format_of_samples():
+def test_a_changed_scene_needs_a_new_sample_format():
     made = {}
     for name in ("tiny", "window"):
         recipe = read_scene_recipe(name)
         text = "".join(draw(recipe, BUILTIN_CATALOG, 7, index).to_toml() for index in range(20))
         text = re.sub(r'^version = ".*"\n', "", text, flags=re.MULTILINE)
         made[name] = hashlib.sha256(text.encode()).hexdigest()[:16]
-    same("dataset.sets.SAMPLE_FORMAT", SAMPLE_FORMAT, SCENES, made)
+    same("rendered.store.SAMPLE_FORMAT", SAMPLE_FORMAT, SCENES, made)
 
 
-def test_a_changed_rendering_raises_the_format_of_samples():
+def test_a_changed_rendering_needs_a_new_sample_format():
     scene = a_scene(
         camera={"aperture_mm": 5.0},
         panes=[{"absorption_per_m": (20.0, 5.0, 10.0)}, {}],
@@ -270,10 +270,10 @@ def test_a_changed_rendering_raises_the_format_of_samples():
     made = {f"{name}, light": layer[:, 5, 17].tolist() for name, layer in sample.layers().items()}
     made |= {name: layer[1, 3::9, 4::9].ravel().tolist() for name, layer in develop(sample).layers().items()}
     rounded = {name: [round(value, 4) for value in values] for name, values in made.items()}
-    same("dataset.sets.SAMPLE_FORMAT", SAMPLE_FORMAT, SAMPLES, rounded, 2e-3)
+    same("rendered.store.SAMPLE_FORMAT", SAMPLE_FORMAT, SAMPLES, rounded, 2e-3)
 
 
 def test_a_changed_world_raises_the_format_of_samples():
     world = ENVIRONMENTS["room"](3, 32)
     made = {"room": [round(float(value), 3) for value in np.log(world[5::11, 7::17, 1] + 0.01).ravel()]}
-    same("dataset.sets.SAMPLE_FORMAT", SAMPLE_FORMAT, MAPS, made, 0.05)
+    same("rendered.store.SAMPLE_FORMAT", SAMPLE_FORMAT, MAPS, made, 0.05)

@@ -1,4 +1,4 @@
-"""What contributors and CI are told is true: paths, make targets, versions."""
+"""CI workflows and documents for contributors are correct: paths, make targets, versions."""
 
 import re
 import tomllib
@@ -18,18 +18,20 @@ def commands(workflow):
 
 
 @pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda path: path.stem)
-def test_a_workflow_names_only_files_that_are_there(workflow):
+def test_a_workflow_names_only_files_that_exist(workflow):
     named = re.findall(r"(?:tests|runs|\.ci)/[\w/*.]+|[\w.]+\.(?:txt|toml)", commands(workflow))
     assert named
     for name in named:
         assert list(ROOT.glob(name)), name
 
 
-def test_ci_tries_every_version_of_python_that_the_package_names():
-    told = {kind.rpartition(" ")[2] for kind in PROJECT["classifiers"] if ":: 3." in kind}
+def test_ci_runs_every_python_version_of_the_package():
+    declared = {kind.rpartition(" ")[2] for kind in PROJECT["classifiers"] if ":: 3." in kind}
     (core,) = re.findall(r"python: (\[.*\])", (ROOT / ".github/workflows/check.yml").read_text())
-    assert set(yaml.safe_load(core)) == told
-    assert min(told, key=lambda version: int(version[2:])) == PROJECT["requires-python"].removeprefix(">=")
+    assert set(yaml.safe_load(core)) == declared
+    assert min(declared, key=lambda version: int(version[2:])) == PROJECT["requires-python"].removeprefix(
+        ">="
+    )
 
 
 def test_ci_runs_the_checks_and_the_tests():
@@ -37,11 +39,11 @@ def test_ci_runs_the_checks_and_the_tests():
     assert {"make check", "make test"} <= set((ROOT / ".ci/run").read_text().splitlines())
 
 
-def test_the_citation_and_the_changelog_know_the_version():
+def test_citation_and_changelog_have_the_version_of_the_package():
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == PROJECT["version"]
     assert f"\n## [{PROJECT['version']}] - 20" in (ROOT / "CHANGELOG.md").read_text()
 
 
-def test_links_for_contributors_lead_somewhere():
+def test_every_link_for_contributors_has_a_target():
     for link in re.findall(r"\]\(([^)#:]+)\)", (ROOT / "CONTRIBUTING.md").read_text()):
         assert (ROOT / link).exists(), link

@@ -1,4 +1,4 @@
-"""The list of `make mutants` keeps up with the code; running it takes minutes and is not done here."""
+"""The list of `make mutants` matches the code. Running the mutants takes minutes and is not done here."""
 
 import importlib
 import sys
@@ -28,8 +28,8 @@ def test_no_mutant_is_listed_twice():
     assert len({(mutant.file, mutant.old, mutant.new) for mutant in MUTANTS}) == len(MUTANTS)
 
 
-def test_mutants_are_spread_over_all_packages_in_proportion_to_their_size():
-    """At least sixty in all, and in every package at least half of its share of them by lines."""
+def test_every_package_has_mutants_in_proportion_to_its_size():
+    """There are at least sixty, and each package has at least half of its share by number of lines."""
     lines = Counter()
     for path in (ROOT / mutants.PACKAGE).rglob("*.py"):
         lines[package(path.relative_to(ROOT / mutants.PACKAGE))] += len(path.read_text().splitlines())

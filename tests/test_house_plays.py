@@ -1,4 +1,4 @@
-"""The scripts in runs/ work: the tiny one from beginning to end, the large ones as far as a CPU allows."""
+"""The experiments in runs/ work: the tiny one completely, the large ones as far as possible on a CPU."""
 
 import json
 import os
@@ -20,8 +20,8 @@ RUNS = ROOT / "runs"
 BIN = Path(sys.executable).parent
 
 
-def play(name, *args, path=BIN, **variables):
-    """A play in a process of its own, offline; what it printed."""
+def run_script(name, *args, path=BIN, **variables):
+    """Runs a script of runs/ offline in a process of its own, and returns its output."""
     done = subprocess.run(
         [RUNS / name, *map(str, args)],
         env=os.environ | {"PATH": f"{path}:{os.environ['PATH']}"} | variables,
@@ -41,10 +41,10 @@ def cells(table):
     return {first: rest for first, *rest in rows}
 
 
-def test_the_tiny_play_renders_learns_separates_and_measures(tmp_path):
-    told = play("tiny.sh", tmp_path)
+def test_the_tiny_experiment_renders_trains_separates_and_evaluates(tmp_path):
+    output = run_script("tiny.sh", tmp_path)
     scores = {
-        method: [float(score) for score in cells(told)[method][0].split(" / ")]
+        method: [float(score) for score in cells(output)[method][0].split(" / ")]
         for method in ("input (unprocessed)", "compact", "lora")
     }
     assert all(psnr > 5 and ssim > 0 for psnr, ssim in scores.values())
@@ -55,41 +55,41 @@ def test_the_tiny_play_renders_learns_separates_and_measures(tmp_path):
         assert made.size == Photo.open(ROOT / "tests/pictures/mixture-coffee-rocket.jpg").size
     card = (tmp_path / "card.md").read_text()
     assert "**This is a toy.**" in card
-    assert cells(card.partition("## Measured")[2])["lora"] == cells(told)["lora"]
+    assert cells(card.partition("## Measured")[2])["lora"] == cells(output)["lora"]
     assert {path.name for path in (tmp_path / "lora").iterdir()} == set(FILES)
-    assert told.splitlines()[-1] == "nothing was sent"
+    assert output.splitlines()[-1] == "nothing was sent"
 
 
-def test_the_check_of_the_full_size_runs_on_toy_twins(tmp_path, monkeypatch, capsys):
+def test_the_full_size_check_runs_on_tiny_models(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["full_size_check.py", "--tiny", "--out", str(tmp_path)])
     with pytest.raises(SystemExit, match="0"):
         runpy.run_path(str(RUNS / "full_size_check.py"), run_name="__main__")
-    told = cells(capsys.readouterr().out)
+    output = cells(capsys.readouterr().out)
     rows = json.loads((tmp_path / "full_size.json").read_text())["rows"]
     assert [(row["backbone"], row["quantise"]) for row in rows] == [("kontext", "int8"), ("klein", None)]
     assert all(row["step_s"] > 0 and row["picture_s"] > 0 and row["fits"] for row in rows)
-    assert told["measured or estimated"] == ["toy twin, not full size"] * 2
-    assert cells((tmp_path / "full_size.md").read_text()) == told
+    assert output["measured or estimated"] == ["rehearsed on a toy twin"] * 2
+    assert cells((tmp_path / "full_size.md").read_text()) == output
 
 
 @pytest.mark.slow
-def test_without_a_gpu_the_check_of_the_full_size_gives_estimates_and_says_so(tmp_path):
-    told = cells(play("full_size_check.sh", OUT=str(tmp_path), CUDA_VISIBLE_DEVICES=""))
-    assert all(kind.startswith("ESTIMATED") for kind in told["measured or estimated"])
-    assert float(told["parameters, billions"][0]) == 11.9
-    assert all(float(peak) < 24 for peak in told["peak during training, GiB"])
+def test_without_a_gpu_the_full_size_check_prints_estimates(tmp_path):
+    output = cells(run_script("full_size_check.sh", OUT=str(tmp_path), CUDA_VISIBLE_DEVICES=""))
+    assert all(kind.startswith("ESTIMATED") for kind in output["measured or estimated"])
+    assert float(output["parameters, billions"][0]) == 11.9
+    assert all(float(peak) < 24 for peak in output["peak while learning, GiB"])
 
 
-def test_every_command_of_the_papers_play_is_one_that_brewster_takes(tmp_path):
-    """A stand-in notes what it is called with; the command line then reads that, and runs nothing."""
-    calls, stand_in = tmp_path / "calls", tmp_path / "bin" / "brewster"
-    stand_in.parent.mkdir()
+def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
+    """A stub records the arguments of each call. The command line then parses them, and runs nothing."""
+    calls, stub = tmp_path / "calls", tmp_path / "bin" / "brewster"
+    stub.parent.mkdir()
     note = f"import json, sys\nopen({str(calls)!r}, 'a').write(json.dumps(sys.argv[1:]) + chr(10))\n"
-    stand_in.write_text(f"#!{sys.executable}\n{note}")
-    stand_in.chmod(0o755)
+    stub.write_text(f"#!{sys.executable}\n{note}")
+    stub.chmod(0o755)
     for folder in ("hdri", "out"):
         (tmp_path / folder).mkdir()
-    play("paper.sh", tmp_path / "out", path=stand_in.parent, BREWSTER_DATA=str(tmp_path))
+    run_script("paper.sh", tmp_path / "out", path=stub.parent, BREWSTER_DATA=str(tmp_path))
     commands = [json.loads(line) for line in calls.read_text().splitlines()]
     assert [words[0] for words in commands] == [
         "assets", "render", "train", "train", "tests/pictures/mixture-coffee-rocket.jpg", "evaluate", "models", "models",
@@ -103,17 +103,17 @@ def test_every_command_of_the_papers_play_is_one_that_brewster_takes(tmp_path):
 
 
 def read(words):
-    """What click makes of a command line, down to the last option, without running it."""
+    """Parses a command line completely, without running it."""
     command, context = cli, cli.make_context("brewster", list(words))
     while isinstance(command, click.Group):
         _, command, words = command.resolve_command(context, [*context._protected_args, *context.args])
         context = command.make_context(command.name, words, parent=context)
 
 
-def test_plays_stop_at_the_first_error_and_say_what_they_are():
-    plays = list(RUNS.glob("*.sh"))
-    assert len(plays) >= 3
-    for path in plays:
+def test_scripts_stop_at_the_first_error_and_begin_with_a_comment():
+    scripts = list(RUNS.glob("*.sh"))
+    assert len(scripts) >= 3
+    for path in scripts:
         text = path.read_text()
         assert text.startswith("#!/usr/bin/env bash\n# ")
         assert "\nset -euo pipefail\n" in text

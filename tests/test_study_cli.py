@@ -134,7 +134,7 @@ def test_a_server_continues_after_a_kill_and_stops_with_ctrl_c(created):
         url = second.stdout.readline().strip()
         state = get(f"{url}{link[1:]}/trial", headers={"Host": "study.example"}).json()
         assert state["trial"] == 1
-        assert "all answers are kept" in interrupted(second)
+        assert "all answers are stored" in interrupted(second)
     assert second.returncode == 0
 
 

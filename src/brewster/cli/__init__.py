@@ -1,6 +1,6 @@
-"""How do I use it? The command `brewster`; click and rich are used in this room only.
+"""The command `brewster`. No other package uses click or rich.
 
-Commands import what they need when they run, so that `brewster --help` answers at once.
+Commands import slow modules when they run, so that `brewster --help` starts fast.
 """
 
 from __future__ import annotations
@@ -13,36 +13,36 @@ import click
 
 import brewster
 from brewster.cli import ablate, assets, doctor, evaluate, models, render, separate, serve, study, train
-from brewster.cli.terminal import complain, interrupts, say, standard_output
+from brewster.cli.terminal import interrupts, print_error, print_status, standard_output
 from brewster.errors import BrewsterError
 
-_STOPPED = 130  # what a shell expects after Ctrl-C: 128 + SIGINT
-_OWN_OPTIONS = {"--help", "--version"}
+_EXIT_INTERRUPTED = 130  # what a shell expects after Ctrl-C: 128 + SIGINT
+_GROUP_OPTIONS = {"--help", "--version"}
 
 
-class _FrontDoor(click.Group):
-    """Whatever is no command is a photo."""
+class _DefaultCommandGroup(click.Group):
+    """A click group that treats an unknown command as a photo."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """`PHOTO...` becomes `separate PHOTO...`."""
-        if args and args[0] not in self.commands and args[0] not in _OWN_OPTIONS:
-            self._refuse_misspelt(ctx, args[0])
+        """Changes `PHOTO...` to `separate PHOTO...`."""
+        if args and args[0] not in self.commands and args[0] not in _GROUP_OPTIONS:
+            self._reject_misspelled_command(ctx, args[0])
             args = ["separate", *args]
         return super().parse_args(ctx, args)
 
-    def _refuse_misspelt(self, ctx: click.Context, word: str) -> None:
+    def _reject_misspelled_command(self, ctx: click.Context, word: str) -> None:
         close = difflib.get_close_matches(word, self.commands, n=1, cutoff=0.7)
         if close and word.isalpha() and not Path(word).exists():
             ctx.fail(f"There is neither a photo nor a command {word!r}. Did you mean {close[0]}?")
 
 
-def _print_version(context: click.Context, _parameter: click.Parameter, asked: bool) -> None:
-    if asked and not context.resilient_parsing:
+def _print_version(context: click.Context, _parameter: click.Parameter, requested: bool) -> None:
+    if requested and not context.resilient_parsing:
         click.echo(f"brewster {brewster.__version__}")
         context.exit()
 
 
-@click.group(cls=_FrontDoor, subcommand_metavar="PHOTO... | COMMAND [ARGS]...")
+@click.group(cls=_DefaultCommandGroup, subcommand_metavar="PHOTO... | COMMAND [ARGS]...")
 @click.option(
     "--version",
     is_flag=True,
@@ -52,9 +52,10 @@ def _print_version(context: click.Context, _parameter: click.Parameter, asked: b
     help="Print the version.",
 )
 def cli() -> None:
-    """Separate a photograph taken through glass into what is behind the glass and what is mirrored in it.
+    """Separate a photograph taken through glass into transmission and reflection.
 
-    `brewster PHOTO...` is short for `brewster separate PHOTO...`, whose options `brewster separate --help` shows.
+    The transmission is the scene behind the glass, the reflection is what the glass mirrors. `brewster PHOTO...` is
+    short for `brewster separate PHOTO...`; `brewster separate --help` shows its options.
     """
 
 
@@ -73,33 +74,37 @@ for _command in (
     cli.add_command(_command)
 
 
-def _commands(group: click.Group) -> Iterator[click.Command]:
-    """Those that do something: groups are looked into."""
+def _leaf_commands(group: click.Group) -> Iterator[click.Command]:
+    """All commands that are not groups, also those in nested groups."""
     for command in group.commands.values():
         if isinstance(command, click.Group):
-            yield from _commands(command)
+            yield from _leaf_commands(command)
         else:
             yield command
 
 
-for _command in _commands(cli):
+for _command in _leaf_commands(cli):
     assert _command.callback
     _command.callback = standard_output.reserved()(_command.callback)
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Runs the command line; returns the exit code: 0 fine, 1 an error, 2 a wrong usage, 130 Ctrl-C."""
-    standard_output.take_descriptor()
+    """Runs the command line.
+
+    Returns:
+        The exit code: 0 success, 1 error, 2 wrong usage, 130 interrupted by Ctrl-C.
+    """
+    standard_output.redirect_descriptor()
     try:
-        with interrupts.noticed():
+        with interrupts.captured():
             return int(cli.main(args, prog_name="brewster", standalone_mode=False) or 0)
     except click.ClickException as error:
         error.show()
         return error.exit_code
     except click.Abort:
-        say("stopped: what was finished is kept, and the same command goes on from there")
-        return _STOPPED
+        print_status("stopped: finished work is kept, and the same command resumes")
+        return _EXIT_INTERRUPTED
     except BrewsterError as error:
         for sentence in error.sentences():
-            complain(sentence)
+            print_error(sentence)
         return 1

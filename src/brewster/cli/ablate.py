@@ -1,4 +1,4 @@
-"""`brewster ablate`: a study in; a trained model for each choice, and tables that compare them, out."""
+"""`brewster ablate`: train a model for each value of one setting, and compare the models in tables."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 
 import click
 
-from brewster.cli.evaluate import print_tables, tell_failures, tell_of
+from brewster.cli.evaluate import print_failures, print_remarks, print_tables
 from brewster.cli.extras import require_extra
-from brewster.cli.terminal import interrupts, say
+from brewster.cli.terminal import interrupts, print_status
 
 
 @click.command
@@ -20,50 +20,50 @@ from brewster.cli.terminal import interrupts, say
     "out",
     metavar="FOLDER",
     type=click.Path(path_type=Path, file_okay=False),
-    help="Where models, tables and the page go. By default out/ablations/NAME for NAME.toml, NAME-BASE with --base.",
+    help="The folder for models, tables and the report. By default out/ablations/NAME for NAME.toml, or NAME-BASE with --base.",
 )
 @click.option(
     "--base",
     metavar="RECIPE",
     type=click.Path(path_type=Path),
-    help="Another training recipe than the study's own, such as a tiny one to try it.",
+    help="A training recipe to use instead of the one in STUDY, such as a tiny one for a test run.",
 )
 @click.option(
     "--workers",
     type=click.IntRange(min=1),
     default=1,
     show_default=True,
-    help="How many processes score at once.",
+    help="Number of processes that compute scores.",
 )
-@click.option("--quiet", is_flag=True, help="Say nothing but errors, and print no tables.")
+@click.option("--quiet", is_flag=True, help="Print only errors, and no tables.")
 @click.pass_context
 def ablate(
     context: click.Context, /, *, study: Path, out: Path | None, base: Path | None, workers: int, quiet: bool
 ) -> None:
-    """Train and measure a model for each choice of the one value that STUDY, a TOML file, changes.
+    """Train and evaluate a model for each choice of the one setting that STUDY, a TOML file, varies.
 
-    The folder BREWSTER_DATA holds the data. What was stopped goes on when the same command is given again. The tables
-    go to standard output; they and report.html also into the folder named with -o.
+    The environment variable BREWSTER_DATA names the data folder. The same command resumes an interrupted run. The
+    tables go to standard output; the tables and report.html are also written to the output folder.
     """
     require_extra("train", "training")
     require_extra("evaluate", "evaluating")
-    from brewster.evaluate.ablation import ablate as run  # noqa: PLC0415  (wakes torch, in two seconds)
+    from brewster.evaluate.ablation import ablate as run  # noqa: PLC0415  (imports torch, two seconds)
     from brewster.evaluate.ablation import read_study  # noqa: PLC0415
 
-    read, name = read_study(study), study.stem
+    ablation, name = read_study(study), study.stem
     if base:
-        read, name = read.model_copy(update={"base": base}), f"{name}-{base.stem}"
+        ablation, name = ablation.model_copy(update={"base": base}), f"{name}-{base.stem}"
     out = out or Path("out") / "ablations" / name
-    parts = read.open_benchmarks()
-    is_whole = tell_of(parts, quiet=quiet)
+    benchmarks = ablation.open_benchmarks()
+    is_complete = print_remarks(benchmarks, quiet=quiet)
 
-    def on_progress(choice: str, step: int, steps: int, numbers: Mapping[str, float], logged: bool) -> None:
-        interrupts.heed()
+    def on_progress(choice: str, step: int, steps: int, metrics: Mapping[str, float], logged: bool) -> None:
+        interrupts.raise_pending()
         if logged and not quiet:
-            say(f"{choice}, step {step} of {steps}: loss {numbers['loss']:.4f}")
+            print_status(f"{choice}, step {step} of {steps}: loss {metrics['loss']:.4f}")
 
-    results = run(read, parts, out, workers=workers, on_progress=on_progress)
+    results = run(ablation, benchmarks, out, workers=workers, on_progress=on_progress)
     if not quiet:
         print_tables(results)
-        say(f"all of it is in {out}")
-    context.exit(0 if tell_failures(results, quiet=quiet) and is_whole else 1)
+        print_status(f"results are in {out}")
+    context.exit(0 if print_failures(results, quiet=quiet) and is_complete else 1)

@@ -1,4 +1,4 @@
-"""`brewster assets`: what brewster does not ship and fetches when asked, such as maps to light rooms with."""
+"""`brewster assets`: download data that brewster does not include, such as environment maps."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from brewster.cli.terminal import complain, one_line, progress, say, standard_output, write_out
+from brewster.cli.terminal import one_line, print_error, print_status, progress, standard_output, write_out
 
 if TYPE_CHECKING:
     from brewster.environments.polyhaven import DownloadRequest, DownloadResult
@@ -21,91 +21,93 @@ _COUNT = click.IntRange(min=0)
 
 @click.group
 def assets() -> None:
-    """Fetch what brewster does not ship."""
+    """Download data that brewster does not include."""
 
 
 @assets.command
 @click.argument("source", type=click.Choice(["polyhaven"]))
 @click.argument("out", required=False, type=click.Path(path_type=Path))
 @click.option(
-    "--indoor", type=_COUNT, default=140, show_default=True, metavar="NUMBER", help="How many indoor maps."
+    "--indoor", type=_COUNT, default=140, show_default=True, metavar="NUMBER", help="Number of indoor maps."
 )
 @click.option(
-    "--outdoor", type=_COUNT, default=30, show_default=True, metavar="NUMBER", help="How many outdoor maps."
+    "--outdoor", type=_COUNT, default=30, show_default=True, metavar="NUMBER", help="Number of outdoor maps."
 )
 @click.option(
     "--resolution",
     type=click.Choice(["1k", "2k", "4k", "8k", "16k"]),
     default="4k",
     show_default=True,
-    help="The width of the maps, in 1024 pixels.",
+    help="The width of the maps, in units of 1024 pixels.",
 )
 @click.option(
     "--format",
     type=click.Choice(["hdr", "exr"]),
     default="hdr",
     show_default=True,
-    help="The container of the maps; reading exr needs the extra brewster[exr].",
+    help="The file format of the maps; reading exr needs the extra brewster[exr].",
 )
 @click.option(
     "--server",
     metavar="URL",
     default="https://api.polyhaven.com",
     show_default=True,
-    help="Where to ask: Poly Haven, or a mirror that answers alike.",
+    help="The server: Poly Haven, or a mirror with the same API.",
 )
 @click.option(
     "--json", "as_json", is_flag=True, help="Print one line of JSON for each map on standard output."
 )
-@click.option("--quiet", is_flag=True, help="Say nothing but errors.")
-@click.option("--dry-run", is_flag=True, help="Print what would be downloaded, and write nothing.")
+@click.option("--quiet", is_flag=True, help="Print only errors.")
+@click.option("--dry-run", is_flag=True, help="Print the planned downloads, and write nothing.")
 @click.pass_context
 def pull(
     context: click.Context,
     /,
     *,
-    source: str,  # noqa: ARG001  (there is one)
+    source: str,  # noqa: ARG001  (there is only one)
     out: Path | None,
     as_json: bool,
     quiet: bool,
-    **asked: Any,  # noqa: ANN401  (the fields of Order)
+    **options: Any,  # noqa: ANN401  (the fields of DownloadRequest)
 ) -> None:
-    """Download CC0 maps (360-degree HDR photographs) from Poly Haven into the folder OUT.
+    """Download CC0 environment maps (360-degree HDR photographs) from Poly Haven into the folder OUT.
 
-    OUT is brewster/maps in the user's cache folder unless it is named. The maps are taken in order of their ids, and
-    manifest.csv names them, their authors and their MD5 sums.
+    OUT is brewster/maps in the user's cache folder by default. The maps are chosen in the order of their ids.
+    manifest.csv lists the maps, their authors and their MD5 checksums.
 
-    Maps that are there already are skipped, and a download that was stopped goes on where it was. A map that fails
-    does not stop the others: it is named at the end, and the exit code is 1.
+    Existing maps are skipped, and interrupted downloads resume. If a map fails, the other maps are still downloaded,
+    the failed map is named at the end, and the exit code is 1.
     """
-    from brewster.environments.polyhaven import DownloadRequest, maps_folder  # noqa: PLC0415  (wakes urllib)
+    from brewster.environments.polyhaven import DownloadRequest, maps_folder  # noqa: PLC0415  (imports urllib)
 
-    order = DownloadRequest(**asked)
-    results = _fetch(order, out or maps_folder(), as_json=as_json, quiet=quiet)
+    request = DownloadRequest(**options)
+    results = _fetch(request, out or maps_folder(), as_json=as_json, quiet=quiet)
     if not quiet:
-        _own_up(order, results)
-        say("powered by Poly Haven, polyhaven.com")  # its terms of service ask for these words
+        _print_shortfall(request, results)
+        print_status(
+            "powered by Poly Haven, polyhaven.com"
+        )  # the terms of service of Poly Haven require these words
     context.exit(1 if any(result.error for result in results) else 0)
 
 
-def _fetch(order: DownloadRequest, folder: Path, *, as_json: bool, quiet: bool) -> list[DownloadResult]:
-    """Fetches the maps and tells of each; those that failed are named at the end, whatever the end is."""
+def _fetch(request: DownloadRequest, folder: Path, *, as_json: bool, quiet: bool) -> list[DownloadResult]:
+    """Downloads the maps and prints each result. Failed maps are listed at the end, also after an interruption."""
     from brewster.environments.polyhaven import pull as fetch  # noqa: PLC0415
 
     results: list[DownloadResult] = []
-    talks_over_bar = as_json and standard_output.stream.isatty()
+    shares_terminal = as_json and standard_output.stream.isatty()
     try:
-        with progress(order.indoor + order.outdoor, shown=not quiet and not talks_over_bar) as advance:
-            for result in fetch(order, folder):
+        with progress(request.indoor + request.outdoor, shown=not quiet and not shares_terminal) as advance:
+            for result in fetch(request, folder):
                 results.append(result)
-                _tell(result, as_json=as_json, quiet=quiet)
+                _print_result(result, as_json=as_json, quiet=quiet)
                 advance(sum(result.status != "missing" for result in results), result.asset)
     finally:
-        _sum_up(results, quiet=quiet)
+        _print_summary(results, quiet=quiet)
     return results
 
 
-def _tell(result: DownloadResult, *, as_json: bool, quiet: bool) -> None:
+def _print_result(result: DownloadResult, *, as_json: bool, quiet: bool) -> None:
     if as_json:
         write_out(f"{json.dumps(asdict(result))}\n".encode())
     elif result.status == "planned":
@@ -113,27 +115,27 @@ def _tell(result: DownloadResult, *, as_json: bool, quiet: bool) -> None:
     if quiet:
         return
     if result.status == "missing":
-        say(f"{result.asset}: passed over, it has no such file")
+        print_status(f"{result.asset}: not used, it has no file in this resolution and format")
     elif result.status == "skipped":
-        say(f"{result.file}: skipped, it is there")
+        print_status(f"{result.file}: skipped, it exists")
     elif result.status == "downloaded":
-        say(f"{result.asset} -> {result.file} ({(result.bytes or 0) / 1e6:.1f} MB)")
+        print_status(f"{result.asset} -> {result.file} ({(result.bytes or 0) / 1e6:.1f} MB)")
 
 
-def _sum_up(results: Sequence[DownloadResult], *, quiet: bool) -> None:
+def _print_summary(results: Sequence[DownloadResult], *, quiet: bool) -> None:
     counts = Counter(result.status for result in results)
     if counts and not quiet:
-        say(", ".join(f"{count} {status}" for status, count in sorted(counts.items())))
+        print_status(", ".join(f"{count} {status}" for status, count in sorted(counts.items())))
     for result in results:
         if result.error:
-            complain(f"{result.asset}: {result.error}")
+            print_error(f"{result.asset}: {result.error}")
 
 
-def _own_up(order: DownloadRequest, results: Sequence[DownloadResult]) -> None:
-    """Says aloud when the server has fewer maps than were asked for."""
-    for category, asked in (("indoor", order.indoor), ("outdoor", order.outdoor)):
+def _print_shortfall(request: DownloadRequest, results: Sequence[DownloadResult]) -> None:
+    """Prints a line if the server has fewer maps than requested."""
+    for category, requested in (("indoor", request.indoor), ("outdoor", request.outdoor)):
         found = sum(result.category == category and result.status != "missing" for result in results)
-        if found < asked:
-            say(
-                f"{found} of {asked} {category} maps: the server has no more in {order.resolution} {order.format}"
+        if found < requested:
+            print_status(
+                f"{found} of {requested} {category} maps found: the server has no more in {request.resolution} {request.format}"
             )

@@ -1,149 +1,115 @@
-"""Photos one after another: what is finished is passed over, what fails is named at the end, the rest is done.
-
-One photo is in memory at a time. The model is loaded when the first photo needs it.
-"""
+"""The output of `brewster separate`: progress, one line for each photo, a summary. `inference/batch.py` does the work."""
 
 from __future__ import annotations
 
 import json
 import os
 import sys
-import time
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
-from functools import cached_property, partial
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, final
+from typing import TYPE_CHECKING, final
 
 import click
 
 from brewster.cli.terminal import (
-    Advance,
-    complain,
     interrupts,
     one_line,
+    print_error,
+    print_status,
     progress,
-    say,
     standard_output,
     write_out,
 )
-from brewster.errors import BrewsterError, PhotoError, TargetError
-from brewster.files import find, write_atomically
-from brewster.image_formats import SUFFIXES, ImageFormat, format_of
+from brewster.image_formats import ImageFormat, format_of
 from brewster.options import Options
 
 if TYPE_CHECKING:
-    from brewster.inference import Separator
+    from brewster.inference import FileResult, SeparationTask
 
 
-@final
-@dataclass(frozen=True)
-class BatchItem:
-    """A photo and where its layers go; None stands for standard input and standard output."""
-
-    source: Path | None
-    targets: dict[str, Path | None]
-
-    @property
-    def name(self) -> str:
-        """The photo as it was named."""
-        return "-" if self.source is None else str(self.source)
+def is_single_output(photos: Sequence[str], output: str | None) -> bool:
+    """Whether only one layer can be written: to standard output, or to a picture named with -o."""
+    return "-" in photos or output == "-" or _is_picture_name(output)
 
 
-@final
-@dataclass
-class BatchResult:
-    """What became of a photo: a line of `--json`."""
-
-    source: str
-    status: Literal["separated", "skipped", "planned", "failed"] = "separated"
-    outputs: dict[str, str] = field(default_factory=dict)
-    model: str | None = None
-    sha256: str | None = None
-    device: str | None = None
-    seconds: dict[str, float] = field(default_factory=dict)
-    residual: float | None = None
-    reconstruction_error: float | None = None
-    doubtful: bool = False
-    error: str | None = None
-
-
-# --- what there is to do
-
-
-def goes_to_one_file(photos: Sequence[str], output: str | None) -> bool:
-    """Whether there is place for one layer only: standard output, or a picture named with -o."""
-    return "-" in photos or output == "-" or _names_a_picture(output)
-
-
-def plan(photos: Sequence[str], output: str | None, options: Options) -> list[BatchItem]:
-    """The photos in the files and folders named, each with the files for its layers.
+def plan(photos: Sequence[str], output: str | None, options: Options) -> list[SeparationTask]:
+    """The photos in the files and folders given, each with the targets of its layers.
 
     Raises:
-        click.UsageError: what was asked for does not go together.
-        TargetError: two photos would be written under one name.
-        PhotoError: there is no photo at all.
+        click.UsageError: the arguments contradict each other.
+        TargetError: two photos would be written under the same name.
+        PhotoError: there is no photo.
     """
-    if goes_to_one_file(photos, output):
-        return [_plan_one(photos, output, options)]
-    tasks = [
-        BatchItem(
-            job.source,
-            {layer: job.target(layer, options.suffix(layer, job.source)) for layer in options.layers},
-        )
-        for job in find(map(Path, photos), None if output is None else Path(output))
-    ]
-    if not tasks:
-        raise PhotoError(
-            f"there is no picture in {', '.join(photos)}",
-            f"files are taken from folders by their names ({' '.join(SUFFIXES)})",
-            "name the file itself, or another folder",
-        )
-    return tasks
+    from brewster.inference import plan_files  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
+
+    if is_single_output(photos, output):
+        return [_plan_single_output(photos, output, options)]
+    return plan_files(photos, output, options)
 
 
-def _plan_one(photos: Sequence[str], output: str | None, options: Options) -> BatchItem:
+def _plan_single_output(photos: Sequence[str], output: str | None, options: Options) -> SeparationTask:
+    from brewster.inference import SeparationTask  # noqa: PLC0415
+
     if len(photos) > 1 or Path(photos[0]).is_dir():
         raise click.UsageError("Standard input, standard output and a picture named with -o take one photo.")
     if len(options.layers) > 1:
         raise click.UsageError(
             "Standard output and a picture named with -o take one layer: choose it with --layers."
         )
-    target = None
     if output not in (None, "-"):
-        target = Path(output)
-        _refuse_format(format_of(target), options)
-    source = None if photos[0] == "-" else Path(photos[0])
-    return BatchItem(source, {options.layers[0]: target})
+        _check_format(format_of(Path(output)), options)
+    source = _StandardStream() if photos[0] == "-" else Path(photos[0])
+    target = _StandardStream() if output in (None, "-") else Path(output)
+    return SeparationTask(source, {options.layers[0]: target})
 
 
-def _refuse_format(image_format: ImageFormat | None, options: Options) -> None:
-    """The suffix of a picture named with -o sets its format; --format and --additive must agree with it."""
+def _check_format(image_format: ImageFormat | None, options: Options) -> None:
+    """The suffix of a picture named with -o decides its format; --format and --additive must agree with it."""
     if image_format is None:
-        raise click.UsageError("With standard input, -o names a picture (such as clear.jpg), or is left out.")
+        raise click.UsageError(
+            "With standard input, -o must name a picture (such as clear.jpg) or be left out."
+        )
     name = image_format.name
     if not image_format.is_writable:
-        raise click.UsageError(f"brewster writes no {name.upper()}.")
+        raise click.UsageError(f"brewster cannot write {name.upper()}: choose another suffix for -o.")
     if options.layers != ("confidence",) and options.container(options.layers[0], name) != name:
-        raise click.UsageError(f"-o names a {name} picture, but --format or --additive ask for another.")
+        raise click.UsageError(
+            f"-o names a {name} picture, but --format or --additive requires another format."
+        )
 
 
-def _names_a_picture(output: str | None) -> bool:
+def _is_picture_name(output: str | None) -> bool:
     return (
         output is not None
         and not output.endswith(("/", os.sep))
-        and Path(output).suffix.lower() in SUFFIXES
+        and format_of(Path(output)) is not None
         and not Path(output).is_dir()
     )
 
 
-# --- doing it
+@final
+class _StandardStream:
+    """Standard input as the source of a photo, standard output as the target of a layer."""
+
+    def read(self) -> bytes:
+        """The bytes of the photo."""
+        return sys.stdin.buffer.read()
+
+    def write(self, data: bytes) -> None:
+        """Writes the encoded layer.
+
+        Raises:
+            TargetError: standard output cannot be written.
+        """
+        write_out(data)
 
 
 @final
-@dataclass
-class SeparationBatch:
-    """How the photos are to be done."""
+@dataclass(frozen=True)
+class BatchCommand:
+    """Settings of a batch on the command line."""
 
     options: Options
     overwrite: bool = False
@@ -151,149 +117,74 @@ class SeparationBatch:
     as_json: bool = False
     quiet: bool = False
 
-    def run(self, tasks: Sequence[BatchItem]) -> bool:
-        """Does them all and tells; whether all went well.
+    def run(self, tasks: Sequence[SeparationTask]) -> bool:
+        """Separates all photos and prints the results.
+
+        Returns:
+            Whether no photo failed.
 
         Raises:
-            ModelError: no such model, or a damaged one.
-            DeviceError: the asked device is not there.
+            ModelError: the model does not exist or is damaged.
+            DeviceError: the requested device is not available.
         """
-        entries: list[BatchResult] = []
-        bugs: list[Exception] = []
-        self._sources = {os.path.realpath(task.source) for task in tasks if task.source}
-        talks_over_bar = self.as_json and standard_output.stream.isatty()
-        with progress(len(tasks), shown=not self.quiet and not talks_over_bar) as advance:
-            for task in tasks:
-                advance(len(entries), task.name)
-                self._show_progress = partial(_show_progress, advance, len(entries), task.name)
-                entry = self._do(task, bugs)
-                if entry.error:
-                    interrupts.heed()  # a dropped Ctrl-C may be all that was wrong
-                entries.append(entry)
-                self._tell(entry)
-                interrupts.heed()
-        self._sum_up(entries)
-        if bugs:
-            raise bugs[0]  # ours, not the user's: the rest was done first, now it is shown whole
-        return all(entry.error is None for entry in entries)
-
-    @cached_property
-    def _separator(self) -> Separator:
-        from brewster.inference import Separator  # noqa: PLC0415  (wakes ONNX Runtime and pyvips)
-
-        return Separator.load(**self.options.load_options())
-
-    def _do(self, task: BatchItem, bugs: list[Exception]) -> BatchResult:
-        entry = BatchResult(task.name)
+        results: list[FileResult] = []
         try:
-            missing = self._missing(task)
-        except BrewsterError as error:
-            return _failed(entry, error)
-        if not missing or self.dry_run:
-            entry.status = "planned" if missing else "skipped"
-            entry.outputs = {layer: str(path or "-") for layer, path in (missing or task.targets).items()}
-            return entry
-        separator = self._separator  # without a model no photo can be done: its errors end the batch
-        entry.model, entry.sha256, entry.device = separator.name, separator.sha256, separator.device
-        try:
-            self._separate(task.source, missing, entry)
-        except BrewsterError as error:
-            return _failed(entry, error)
-        except MemoryError:
-            return _failed(entry, "the photo does not fit into memory; free some, or make it smaller")
-        except Exception as bug:  # noqa: BLE001  (raised again after the other photos)
-            bugs.append(bug)
-            del bugs[1:]  # each one keeps its photo in memory
-            return _failed(entry, f"brewster stumbled ({type(bug).__name__}: {bug}); please report it")
-        return entry
+            self._separate(tasks, results)
+        finally:
+            if len(results) == len(tasks):  # also when the batch ends by raising the exception of a bug
+                self._print_summary(results)
+        return all(result.error is None for result in results)
 
-    def _missing(self, task: BatchItem) -> dict[str, Path | None]:
-        """The layers that are still to be written.
+    def _separate(self, tasks: Sequence[SeparationTask], results: list[FileResult]) -> None:
+        """Appends a result for each photo, until an error ends the batch."""
+        from brewster.inference.batch import separate_tasks  # noqa: PLC0415
 
-        Raises:
-            TargetError: one would be written over a photo.
-        """
-        for target in task.targets.values():
-            if target is not None and self._is_source(target, task.source):
-                raise TargetError(
-                    f"{target} is itself a photo to separate",
-                    "sources are never touched",
-                    "choose another name",
-                )
-        return {
-            layer: target
-            for layer, target in task.targets.items()
-            if target is None or self.overwrite or not os.path.lexists(target)
-        }
+        shares_terminal = self.as_json and standard_output.stream.isatty()
+        with progress(len(tasks), shown=not self.quiet and not shares_terminal) as advance:
 
-    def _is_source(self, target: Path, source: Path | None) -> bool:
-        if os.path.realpath(target) in self._sources:
-            return True
-        try:
-            return source is not None and target.samefile(source)
-        except OSError:  # one of them is not there
-            return False
+            def update(done: int, name: str, share: float) -> None:
+                interrupts.raise_pending()
+                advance(done + share, name)
 
-    def _separate(self, source: Path | None, targets: dict[str, Path | None], entry: BatchResult) -> None:
-        photo = source or sys.stdin.buffer.read()
-        separation = self._separator(photo, on_progress=self._show_progress, **self.options.call_options())
-        entry.seconds, entry.residual = dict(separation.seconds), separation.residual
-        entry.reconstruction_error, entry.doubtful = separation.reconstruction_error, separation.doubtful
-        started = time.perf_counter()
-        for layer, target in targets.items():
-            own = separation.photo.file_info.container
-            stated = format_of(target) if target else None
-            container = stated.name if stated else self.options.container(layer, own)
-            data = getattr(separation, layer).encode(container)
-            interrupts.heed()
-            if target is None:
-                write_out(data)
-            else:
-                write_atomically(target, data, overwrite=self.overwrite, source=source)
-            entry.outputs[layer] = str(target or "-")
-        entry.seconds["encode"] = time.perf_counter() - started
+            for result in separate_tasks(
+                tasks, self.options, overwrite=self.overwrite, dry_run=self.dry_run, on_progress=update
+            ):
+                if result.error:
+                    interrupts.raise_pending()  # a lost Ctrl-C may be the cause of the error
+                results.append(result)
+                self._print_result(result)
+                interrupts.raise_pending()
 
-    def _tell(self, entry: BatchResult) -> None:
-        outputs = ", ".join(entry.outputs.values())
+    def _print_result(self, result: FileResult) -> None:
+        outputs = ", ".join(result.outputs.values())
         if self.as_json:
-            write_out(_json_line(entry))
-        elif entry.status == "planned":
-            write_out(f"{one_line(entry.source)} -> {one_line(outputs)}\n".encode())
-        if self.quiet or entry.error:
+            write_out(_json_line(result))
+        elif result.status == "planned":
+            write_out(f"{one_line(result.source)} -> {one_line(outputs)}\n".encode())
+        if self.quiet or result.error:
             return
-        if entry.status == "skipped":
-            say(f"{entry.source}: skipped, its layers are there (--overwrite makes them again)")
-        elif entry.status == "separated":
-            say(f"{entry.source} -> {outputs} ({sum(entry.seconds.values()):.1f} s)")
-            if entry.doubtful:
-                say(
-                    f"{entry.source}: doubtful, the model redrew the photo (reconstruction_error {entry.reconstruction_error:.2f}): look at it"
+        if result.status == "skipped":
+            print_status(f"{result.source}: skipped, its layers exist (--overwrite replaces them)")
+        elif result.status == "separated":
+            print_status(f"{result.source} -> {outputs} ({sum(result.seconds.values()):.1f} s)")
+            if result.doubtful:
+                print_status(
+                    f"{result.source}: doubtful, the model redrew the photo "
+                    f"(reconstruction_error {result.reconstruction_error:.2f}): check the result"
                 )
 
-    def _sum_up(self, entries: Sequence[BatchResult]) -> None:
-        counts = dict.fromkeys(("separated", "planned", "skipped", "failed"), 0)
-        for entry in entries:
-            counts[entry.status] += 1
-        if len(entries) > 1 and not self.quiet:
-            say(", ".join(f"{count} {status}" for status, count in counts.items() if count))
-        for entry in entries:
-            if entry.error:
-                is_named = entry.error.startswith(f"{entry.source} ")
-                complain(entry.error if is_named else f"{entry.source}: {entry.error}")
+    def _print_summary(self, results: Sequence[FileResult]) -> None:
+        counts: Counter[str] = Counter(result.status for result in results)
+        if len(results) > 1 and not self.quiet:
+            order = ("separated", "planned", "skipped", "failed")
+            print_status(", ".join(f"{counts[status]} {status}" for status in order if counts[status]))
+        for result in results:
+            if result.error:
+                is_named = result.error.startswith(f"{result.source} ")
+                print_error(result.error if is_named else f"{result.source}: {result.error}")
 
 
-def _show_progress(advance: Advance, before: int, name: str, share: float) -> None:
-    """A large model takes minutes for a photo: the bar moves between two of them, too, and Ctrl-C is heeded."""
-    interrupts.heed()
-    advance(before + share, name)
-
-
-def _failed(entry: BatchResult, error: object) -> BatchResult:
-    entry.status, entry.error = "failed", str(error)
-    return entry
-
-
-def _json_line(entry: BatchResult) -> bytes:
-    said = asdict(entry)
-    said["seconds"] = {name: round(seconds, 4) for name, seconds in entry.seconds.items()}
-    return f"{json.dumps(said)}\n".encode()
+def _json_line(result: FileResult) -> bytes:
+    values = asdict(result)
+    values["seconds"] = {name: round(seconds, 4) for name, seconds in result.seconds.items()}
+    return f"{json.dumps(values)}\n".encode()

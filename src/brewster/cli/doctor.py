@@ -1,4 +1,4 @@
-"""`brewster doctor`: what works here, what is missing, and the line that installs it."""
+"""`brewster doctor`: what works on this machine, what is missing, and the command that installs it."""
 
 from __future__ import annotations
 
@@ -21,50 +21,55 @@ from brewster.errors import BrewsterError, MissingExtra
 from brewster.image_formats import FORMATS, WRITABLE
 from brewster.models import zoo
 
-_OLDEST: Final = (3, 11)
+_MIN_PYTHON: Final = (3, 11)
 _GIF: Final = bytes.fromhex(
     "47494638396101000100800000ffffff00000021f90401000000002c00000000010001000002024401003b"
 )
-_MARKS: Final = {"ok": "ok", "missing": "--", "broken": "!!"}
+_SYMBOLS: Final = {"ok": "ok", "missing": "--", "broken": "!!"}
 
 
 @final
 @dataclass(frozen=True)
 class Check:
-    """One line: `needed` says whether brewster can do without it, `cure` what would mend it."""
+    """The result of one check: one line of the output."""
 
     area: str
     name: str
     status: Literal["ok", "missing", "broken"]
     detail: str
     cure: str | None = None
+    """The command or action that repairs it."""
     needed: bool = True
+    """False for optional parts: their status does not change the exit code."""
 
 
 @click.command
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 @click.pass_context
 def doctor(context: click.Context, *, as_json: bool) -> None:
-    """Say what works here and what is missing.
+    """Check what works on this machine and what is missing.
 
-    Each thing that is missing comes with the line that installs it.
+    For each missing part, the output has the command that installs it. The exit code is 1 if a required part does not
+    work.
     """
-    checks = list(examine())
-    is_well = all(check.status == "ok" for check in checks if check.needed)
+    checks = list(run_checks())
+    is_healthy = all(check.status == "ok" for check in checks if check.needed)
     if as_json:
-        print_out(json.dumps({"ok": is_well, "checks": [asdict(check) for check in checks]}))
+        print_out(json.dumps({"ok": is_healthy, "checks": [asdict(check) for check in checks]}))
     else:
         _print(checks)
         print_out(
-            "All that is needed works." if is_well else "Something needed does not work: see !! and -- above."
+            "All required parts work."
+            if is_healthy
+            else "A required part does not work: see the lines with !! and -- above."
         )
-    context.exit(0 if is_well else 1)
+    context.exit(0 if is_healthy else 1)
 
 
-def examine() -> Iterator[Check]:
-    """Looks at everything, in the order in which one thing needs the other."""
+def run_checks() -> Iterator[Check]:
+    """Runs all checks; each part is checked after the parts that it depends on."""
     version = platform.python_version()
-    if sys.version_info >= _OLDEST:
+    if sys.version_info >= _MIN_PYTHON:
         yield Check("python", "python", "ok", f"{version}, {platform.platform()}")
     else:
         yield Check("python", "python", "broken", version, "install Python 3.11 or newer")
@@ -72,7 +77,7 @@ def examine() -> Iterator[Check]:
     yield from _devices()
     yield from _formats()
     yield from _models()
-    yield from _tracer()
+    yield from _mitsuba()
     yield from _large()
 
 
@@ -95,7 +100,7 @@ def _package(package: str, module: str) -> Check:
         return Check("packages", package, "missing", "not installed", cure)
     try:
         importlib.import_module(module)
-    except (ImportError, OSError) as error:  # a library below it is missing, or is none for this machine
+    except (ImportError, OSError) as error:  # a shared library is missing, or is built for another machine
         return Check("packages", package, "broken", f"{version}: {error}", f"{cure} --force-reinstall")
     return Check("packages", package, "ok", version)
 
@@ -111,25 +116,32 @@ def _version(package: str) -> str | None:
 
 def _devices() -> Iterator[Check]:
     try:
-        from brewster.inference.onnx_backend import available_devices  # noqa: PLC0415  (wakes ONNX Runtime)
+        from brewster.inference.onnx_backend import available_devices  # noqa: PLC0415  (imports ONNX Runtime)
 
         devices = available_devices()
     except (ImportError, OSError) as error:
-        yield Check("devices", "devices", "broken", str(error), "mend the packages above")
+        yield Check("devices", "devices", "broken", str(error), "repair the packages above")
         return
     if "cuda" not in devices and shutil.which("nvidia-smi"):
         cure = "pip install onnxruntime-gpu"
-        yield Check("devices", "cuda", "missing", "there is an NVIDIA driver", cure, needed=False)
+        yield Check(
+            "devices",
+            "cuda",
+            "missing",
+            "an NVIDIA driver is installed, but onnxruntime has no CUDA",
+            cure,
+            needed=False,
+        )
     for device in devices:
-        yield Check("devices", device, "ok", "--device auto takes it" if device == devices[0] else "")
+        yield Check("devices", device, "ok", "used by --device auto" if device == devices[0] else "")
 
 
 def _formats() -> Iterator[Check]:
-    """Writes and reads a small picture in each container."""
+    """Writes and reads a small picture in each file format."""
     try:
         importlib.import_module("brewster.photo")  # wakes pyvips
     except (ImportError, OSError) as error:
-        yield Check("formats", "formats", "broken", str(error), "mend the packages above")
+        yield Check("formats", "formats", "broken", str(error), "repair the packages above")
         return
     for container in WRITABLE:
         yield _try_format(container, "reads and writes", lambda name=container: _sample(name))  # type: ignore[misc]
@@ -137,16 +149,16 @@ def _formats() -> Iterator[Check]:
 
 
 def _sample(container: str) -> bytes:
-    import numpy as np  # noqa: PLC0415  (not for --help)
+    import numpy as np  # noqa: PLC0415  (slow to import)
 
-    from brewster.photo import Photo  # noqa: PLC0415  (wakes pyvips)
+    from brewster.photo import Photo  # noqa: PLC0415  (imports pyvips)
 
     grey = np.full((64, 64, 3), 128, np.uint8)
     return Photo.from_array(grey, encoding="srgb").encode(container)
 
 
 def _try_format(container: str, verbs: str, sample: Callable[[], bytes]) -> Check:
-    from brewster.photo import Photo  # noqa: PLC0415  (wakes pyvips)
+    from brewster.photo import Photo  # noqa: PLC0415  (imports pyvips)
 
     extra = FORMATS[container].extra
     try:
@@ -169,15 +181,17 @@ def _models() -> Iterator[Check]:
             yield Check("models", row["name"], "ok", f"sha256 {row['sha256']}")
 
 
-def _tracer() -> Iterator[Check]:
-    """Whether Mitsuba can be imported, and the LLVM that compiles its kernels."""
+def _mitsuba() -> Iterator[Check]:
+    """Whether Mitsuba can be imported, and whether it finds LLVM, which compiles its kernels."""
     version = _version("mitsuba")
     if version is None:
         return
-    from brewster.render.mitsuba import variant  # noqa: PLC0415  (not for --help)
+    from brewster.render.mitsuba import variant  # noqa: PLC0415  (slow to import)
 
     try:
-        with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # about LLVM: see below
+        with warnings.catch_warnings(
+            action="ignore", category=RuntimeWarning
+        ):  # about LLVM, which the second check reports
             variant.load()
     except MissingExtra as error:
         yield Check(
@@ -185,28 +199,28 @@ def _tracer() -> Iterator[Check]:
         )
         return
     yield Check("tracer", "mitsuba", "ok", version)
-    found = variant.probe()
-    if found.variant == variant.COMPILED:
-        yield Check("tracer", "llvm", "ok", found.library or "the one Dr.Jit finds")
+    probed = variant.probe()
+    if probed.variant == variant.COMPILED:
+        yield Check("tracer", "llvm", "ok", probed.library or "found by Dr.Jit")
     else:
-        about = f"none works, rendering is several times slower ({found.reason})"
-        yield Check("tracer", "llvm", "missing", about, variant.INSTALL_LLVM, needed=False)
+        detail = f"not usable, so rendering is several times slower ({probed.reason})"
+        yield Check("tracer", "llvm", "missing", detail, variant.INSTALL_LLVM, needed=False)
 
 
 def _large() -> Iterator[Check]:
-    """What large image models may want beyond their extra."""
+    """What large image models may need in addition to the extra `large`."""
     if _version("diffusers") is None:
         return
     version = _version("bitsandbytes")
-    about = version or "not installed; for nf4 and 8-bit AdamW on NVIDIA cards"
+    detail = version or "not installed; needed for nf4 and 8-bit AdamW on NVIDIA GPUs"
     cure = None if version else "pip install bitsandbytes"
-    yield Check("large", "bitsandbytes", "ok" if version else "missing", about, cure, needed=False)
-    from brewster.models.diffusion.lazy_imports import has_token  # noqa: PLC0415  (wakes torch)
+    yield Check("large", "bitsandbytes", "ok" if version else "missing", detail, cure, needed=False)
+    from brewster.models.diffusion.lazy_imports import has_token  # noqa: PLC0415  (imports torch)
 
-    found = has_token()
-    about = "found" if found else "none; gated models such as FLUX.1 Kontext want one"
-    cure = None if found else "hf auth login"
-    yield Check("large", "hub token", "ok" if found else "missing", about, cure, needed=False)
+    token_found = has_token()
+    detail = "found" if token_found else "not found; gated models such as FLUX.1 Kontext need one"
+    cure = None if token_found else "hf auth login"
+    yield Check("large", "hub token", "ok" if token_found else "missing", detail, cure, needed=False)
 
 
 def _print(checks: list[Check]) -> None:
@@ -216,4 +230,4 @@ def _print(checks: list[Check]) -> None:
             print_out(check.area)
         area = check.area
         cure = f"\n{'':8}{check.cure}" if check.cure else ""
-        print_out(f"  {_MARKS[check.status]}  {check.name:16} {check.detail}{cure}")
+        print_out(f"  {_SYMBOLS[check.status]}  {check.name:16} {check.detail}{cure}")

@@ -1,4 +1,4 @@
-"""`brewster evaluate`: benchmarks and methods in; tables, a page, and every picture's scores out."""
+"""`brewster evaluate`: score methods on benchmarks; writes tables, a report, and the scores of every picture."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, final, get_args
 import click
 
 from brewster.cli.extras import require_extra
-from brewster.cli.terminal import complain, interrupts, progress, say, write_out
+from brewster.cli.terminal import interrupts, print_error, print_status, progress, write_out
 from brewster.options import Device, Quality
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @final
 class NamedValue(click.ParamType[tuple[str, str]]):
-    """NAME=VALUE, as two strings; without a name that is empty, where this is allowed."""
+    """NAME=VALUE as two strings. With `needs_name=False`, VALUE alone is allowed, and the name is empty."""
 
     name = "named"
 
@@ -34,27 +34,35 @@ class NamedValue(click.ParamType[tuple[str, str]]):
     def convert(
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[str, str]:
-        """Name and value, or a usage error."""
+        """Name and value.
+
+        Raises:
+            click.BadParameter: the value is not NAME=VALUE.
+        """
         if isinstance(value, tuple):
             return value
         name, equals, rest = str(value).partition("=")
         if not equals and not self.needs_name:
             return "", name
         if not (name and rest):
-            self.fail(f"{value!r} is not NAME=VALUE; {self.example} is.", param, ctx)
+            self.fail(f"{value!r} is not NAME=VALUE, such as {self.example}.", param, ctx)
         return name, rest
 
 
 @final
 class _NumberList(click.ParamType[tuple[float, ...]]):
-    """Numbers with commas between."""
+    """Numbers separated by commas."""
 
     name = "numbers"
 
     def convert(
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[float, ...]:
-        """The numbers, or a usage error."""
+        """The numbers.
+
+        Raises:
+            click.BadParameter: the value is not a list of numbers.
+        """
         if isinstance(value, tuple):
             return value
         try:
@@ -65,12 +73,16 @@ class _NumberList(click.ParamType[tuple[float, ...]]):
 
 @final
 class _Size(click.ParamType[int]):
-    """native, or a number of pixels."""
+    """`native`, or a number of pixels."""
 
     name = "native|420|512"
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> int | None:  # type: ignore[override]
-        """The pixels, None for native, or a usage error."""
+        """The number of pixels, or None for `native`.
+
+        Raises:
+            click.BadParameter: the value is neither.
+        """
         if value == "native":
             return None
         if not str(value).isdecimal() or int(str(value)) < 1:
@@ -86,8 +98,8 @@ class _Size(click.ParamType[int]):
     type=NamedValue("real20=data/real20"),
     multiple=True,
     required=True,
-    help="A benchmark and the folder of your copy; may be given again. NAME is one of docs/evaluation.md, such as real20, "
-    "sir2, pairs (any folder of pairs) or rendered (a set of brewster render); an unknown one is answered with all.",
+    help="A benchmark and the folder of your copy; repeatable. NAME is a benchmark of docs/evaluation.md, such as real20, "
+    "sir2, pairs (any folder of pairs) or rendered (a set of brewster render). For an unknown NAME, all names are listed.",
 )
 @click.option(
     "--model",
@@ -95,14 +107,14 @@ class _Size(click.ParamType[int]):
     metavar="[NAME=]MODEL",
     type=NamedValue("ours=model.onnx", needs_name=False),
     multiple=True,
-    help="A model to run, as `brewster --model` takes it; may be given again.",
+    help="A model to run, in the form that `brewster --model` takes; repeatable.",
 )
 @click.option(
     "--predictions",
     metavar="NAME=DIR",
     type=NamedValue("RDNet=out/rdnet"),
     multiple=True,
-    help="A folder of another method's pictures, called like the cases; may be given again.",
+    help="A folder with the predictions of another method, named like the photos of the benchmark; repeatable.",
 )
 @click.option(
     "-o",
@@ -112,52 +124,52 @@ class _Size(click.ParamType[int]):
     type=click.Path(path_type=Path, file_okay=False),
     default=Path("out/evaluate"),
     show_default=True,
-    help="Where results, tables, the page and the models' layers go.",
+    help="The folder for results, tables, the report and the models' predictions.",
 )
 @click.option(
     "--metrics",
     metavar="NAME,...",
-    help="What to measure; by default all but ssim_gaussian, where there is truth for it.",
+    help="The metrics; by default all except ssim_gaussian, as far as the benchmark has the ground truth.",
 )
 @click.option(
     "--size",
     type=_Size(),
     default="native",
     show_default=True,
-    help="Reduce larger pictures to this shorter side first, photo and truth alike.",
+    help="Reduce larger pictures to this shorter side first, in pixels, photo and ground truth alike.",
 )
 @click.option(
     "--paper",
     is_flag=True,
-    help="Report the paper's protocol too: one picture a scene of Postcard and SolidObject, drawn with a published seed.",
+    help="Also report the paper's protocol: one picture per scene of Postcard and SolidObject, drawn with a published seed.",
 )
 @click.option(
     "--region-threshold",
     "thresholds",
     type=_NumberList(),
     metavar="NUMBER,...",
-    help="How much photo and truth differ where there is reflection, as a share of the full scale; several are swept.",
+    help="The least difference of photo and ground truth inside the reflection region, as a share of the full scale; several values are evaluated separately.",
 )
 @click.option(
     "--quality",
     type=click.Choice(get_args(Quality)),
     default="standard",
     show_default=True,
-    help="How closely models look.",
+    help="Number and size of the input scales of the models.",
 )
 @click.option(
     "--device",
     type=click.Choice(get_args(Device)),
     default="auto",
     show_default=True,
-    help="Where models run.",
+    help="The device that runs the models.",
 )
 @click.option(
     "--workers",
     type=click.IntRange(min=1),
     default=1,
     show_default=True,
-    help="How many processes score at once.",
+    help="Number of processes that compute scores.",
 )
 @click.option(
     "--pictures",
@@ -165,34 +177,34 @@ class _Size(click.ParamType[int]):
     default=50,
     show_default=True,
     metavar="NUMBER",
-    help="How many pictures of each benchmark the page shows, the worst of the first method first.",
+    help="Number of pictures per benchmark in the report, sorted by the score of the first method, worst first.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the results as JSON instead of the tables.")
-@click.option("--quiet", is_flag=True, help="Say nothing but errors, and print no tables.")
+@click.option("--quiet", is_flag=True, help="Print only errors, and no tables.")
 @click.option(
     "--dry-run",
     is_flag=True,
-    help="Check all that was named, print the names of the cases, and measure nothing.",
+    help="Check benchmarks and methods, print the names of the pictures, and score nothing.",
 )
 @click.pass_context
-def evaluate(context: click.Context, /, *, dry_run: bool, **asked: Any) -> None:  # noqa: ANN401  (the fields of _Order)
-    """Measure models and other methods' pictures on benchmarks, with the unprocessed input as baseline.
+def evaluate(context: click.Context, /, *, dry_run: bool, **options: Any) -> None:  # noqa: ANN401  (the fields of _EvaluateCommand)
+    """Score methods on benchmarks, with the unprocessed input as baseline.
 
-    The tables go to standard output; results.json (every picture), tables.md, table.tex, table.csv and report.html (a
-    page to look at) into the folder named with -o. A run that was stopped goes on from there.
+    The tables go to standard output. The output folder gets results.json (every picture), tables.md, table.tex,
+    table.csv and report.html. The same command resumes an interrupted run.
 
-    Pictures are paired by name. What has no partner, and what a method failed on, is named; the rest is measured, and
-    the exit code is 1.
+    Pictures are paired by name. If a picture has no partner, or if a method fails on it, the picture is listed, all
+    others are scored, and the exit code is 1.
     """
     require_extra("evaluate", "evaluating")
-    order = _EvaluateRequest(**asked)
-    context.exit(0 if (order.tell() if dry_run else order.run()) else 1)
+    command = _EvaluateCommand(**options)
+    context.exit(0 if (command.list_cases() if dry_run else command.run()) else 1)
 
 
 @final
 @dataclass(frozen=True)
-class _EvaluateRequest:
-    """What was asked for; imports wait until it is carried out, as torch takes two seconds to wake."""
+class _EvaluateCommand:
+    """The options of the command. Its methods import torch, which takes two seconds, only when they run."""
 
     benchmarks: tuple[tuple[str, str], ...]
     models: tuple[tuple[str, str], ...]
@@ -209,38 +221,42 @@ class _EvaluateRequest:
     as_json: bool
     quiet: bool
 
-    def tell(self) -> bool:
-        """Says what there is; whether all of it can be measured."""
+    def list_cases(self) -> bool:
+        """Prints pictures and methods without scoring them; returns whether every picture has its ground truth."""
         from brewster.evaluate.evaluation import check  # noqa: PLC0415
 
-        found, methods = self._found(), self._methods()
-        is_whole = tell_of(found, quiet=self.quiet)
-        check(found, methods, self._protocol())
-        for part in found:
-            say(f"{part.title}: {len(part.cases)} pictures")
-            write_out("".join(f"{part.name}/{case.name}\n" for case in part.cases).encode(errors=_ODD))
+        benchmarks, methods = self._read_benchmarks(), self._methods()
+        is_complete = print_remarks(benchmarks, quiet=self.quiet)
+        check(benchmarks, methods, self._config())
+        for benchmark in benchmarks:
+            print_status(f"{benchmark.title}: {len(benchmark.cases)} pictures")
+            write_out(
+                "".join(f"{benchmark.name}/{case.name}\n" for case in benchmark.cases).encode(
+                    errors=_ENCODE_ERRORS
+                )
+            )
         for method in methods:
-            say(f"method: {method.name}")
-        return is_whole
+            print_status(f"method: {method.name}")
+        return is_complete
 
     def run(self) -> bool:
-        """Measures and prints; whether nothing was left out and nothing failed."""
+        """Scores and prints the tables; returns whether no picture was left out and no method failed."""
         from brewster.evaluate.evaluation import PAGE  # noqa: PLC0415
         from brewster.evaluate.evaluation import evaluate as measure  # noqa: PLC0415
 
-        protocol, found, methods = self._protocol(), self._found(), self._methods()
-        is_whole = tell_of(found, quiet=self.quiet)
-        total = len(methods) * sum(len(part.cases) for part in found)
+        config, benchmarks, methods = self._config(), self._read_benchmarks(), self._methods()
+        is_complete = print_remarks(benchmarks, quiet=self.quiet)
+        total = len(methods) * sum(len(benchmark.cases) for benchmark in benchmarks)
         with progress(total, shown=not self.quiet) as advance:
 
             def on_progress(done: int, _of: int, row: ScoreRow) -> None:
-                interrupts.heed()
+                interrupts.raise_pending()
                 advance(done, f"{row.benchmark}/{row.case} {row.method}")
 
             results = measure(
-                found,
+                benchmarks,
                 methods,
-                protocol,
+                config,
                 self.out,
                 workers=self.workers,
                 shown=self.pictures,
@@ -250,69 +266,74 @@ class _EvaluateRequest:
             write_out(f"{json.dumps(results)}\n".encode())
         elif not self.quiet:
             print_tables(results)
-            say(f"all of it is in {self.out}; {self.out / PAGE} shows the pictures")
-        return tell_failures(results, quiet=self.quiet) and is_whole
+            print_status(f"results are in {self.out}; {self.out / PAGE} shows the pictures")
+        return print_failures(results, quiet=self.quiet) and is_complete
 
-    def _found(self) -> list[Benchmark]:
+    def _read_benchmarks(self) -> list[Benchmark]:
         from brewster.benchmarks.registry import read_benchmark  # noqa: PLC0415
 
-        return [part for name, folder in self.benchmarks for part in read_benchmark(name, Path(folder))]
+        return [
+            benchmark for name, folder in self.benchmarks for benchmark in read_benchmark(name, Path(folder))
+        ]
 
-    def _protocol(self) -> EvaluationConfig:
+    def _config(self) -> EvaluationConfig:
         from brewster.evaluate.config import EvaluationConfig  # noqa: PLC0415
 
-        chosen: dict[str, Any] = {"size": self.size, "quality": self.quality, "paper": self.paper}
+        values: dict[str, Any] = {"size": self.size, "quality": self.quality, "paper": self.paper}
         if self.metrics is not None:
-            chosen["metrics"] = tuple(name.strip() for name in self.metrics.split(","))
+            values["metrics"] = tuple(name.strip() for name in self.metrics.split(","))
         if self.thresholds is not None:
-            chosen["thresholds"] = self.thresholds
-        return EvaluationConfig(**chosen)
+            values["thresholds"] = self.thresholds
+        return EvaluationConfig(**values)
 
     def _methods(self) -> list[Method]:
         from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder  # noqa: PLC0415
         from brewster.models.zoo import model_name  # noqa: PLC0415
 
         models = [(name or model_name(model), model) for name, model in self.models]
-        answers = self.out / "predictions"
+        predictions = self.out / "predictions"
         return [
             IdentityBaseline(),
-            *(ModelMethod(name, model, answers / name, self.quality, self.device) for name, model in models),
+            *(
+                ModelMethod(name, model, predictions / name, self.quality, self.device)
+                for name, model in models
+            ),
             *(PredictionFolder(name, Path(folder)) for name, folder in self.predictions),
         ]
 
 
-_ODD: Final = "backslashreplace"
-"""How names are printed that are no text."""
+_ENCODE_ERRORS: Final = "backslashreplace"
+"""How file names with bytes that are not valid text are printed."""
 
 
-def tell_of(parts: Sequence[Benchmark], *, quiet: bool) -> bool:
-    """Says what is odd about benchmarks; whether nothing was left out."""
-    for part in parts:
-        for remark in () if quiet else part.remarks:
-            say(f"{part.title}: {remark}")
-        for reason in part.refused:
-            complain(f"{part.title}: {reason}")
-    return not any(part.refused for part in parts)
+def print_remarks(benchmarks: Sequence[Benchmark], *, quiet: bool) -> bool:
+    """Prints remarks and errors about benchmarks; returns whether no picture was left out."""
+    for benchmark in benchmarks:
+        for remark in () if quiet else benchmark.remarks:
+            print_status(f"{benchmark.title}: {remark}")
+        for reason in benchmark.refused:
+            print_error(f"{benchmark.title}: {reason}")
+    return not any(benchmark.refused for benchmark in benchmarks)
 
 
 def print_tables(results: Results) -> None:
-    """The tables, on standard output."""
+    """Prints the tables on standard output."""
     from brewster.evaluate.report.tables import overview  # noqa: PLC0415
 
-    write_out(overview(results).encode(errors=_ODD))
+    write_out(overview(results).encode(errors=_ENCODE_ERRORS))
 
 
-def tell_failures(results: Results, *, quiet: bool) -> bool:
-    """Says what is odd about methods and names what could not be scored; whether there was nothing of the second."""
+def print_failures(results: Results, *, quiet: bool) -> bool:
+    """Prints remarks about methods and the predictions that could not be scored; returns whether there were none of these."""
     from brewster.evaluate.report.tables import failures, remarks  # noqa: PLC0415
 
     for remark in () if quiet else remarks(results):
-        say(remark)
+        print_status(remark)
     for name in results["unmeasured"]:
-        say(f"{name} was not measured: no picture has the truth that it needs")
+        print_status(f"{name} was not computed: no picture has the ground truth that it needs")
     for error in failures(results):
-        complain(error)
+        print_error(error)
     count = sum(len(picture["errors"]) for picture in results["pictures"])
     if count:
-        complain(f"{count} {'answer' if count == 1 else 'answers'} could not be scored")
+        print_error(f"{count} {'prediction' if count == 1 else 'predictions'} could not be scored")
     return not count

@@ -1,4 +1,4 @@
-"""The optional parts of brewster: which packages each needs, and a clear refusal where one is missing."""
+"""The extras of brewster: the packages of each, and a clear error if one is missing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CORE: Final = {
     "pyvips-binary": "_libvips",
     "rich": "rich",
 }
-"""The packages that every separation needs, and the module that each brings."""
+"""The required packages, with the module that each installs."""
 
 EXTRAS: Final = {
     "exr": {"OpenEXR": "OpenEXR"},
@@ -58,11 +58,16 @@ EXTRAS: Final = {
         "uvicorn": "uvicorn",
     },
 }
-"""The packages behind each extra, and the module that each brings."""
+"""The packages of each extra, with the module that each installs."""
 
 
 def require_extra(name: str, work: str, *, without: frozenset[str] = frozenset()) -> None:
-    """Refuses the work if a package of the extra is missing, other than those it can do without.
+    """Checks that the packages of an extra are installed, except those in `without`.
+
+    Args:
+        name: the name of the extra.
+        work: what needs it, for the error message, such as "training".
+        without: packages of the extra that this work does not use.
 
     Raises:
         MissingExtra: a package is missing.

@@ -1,4 +1,4 @@
-"""`brewster models`: which there are, what their cards say, whether their files are whole; and sending a LoRA to the hub."""
+"""`brewster models`: list models, print cards, verify files, and upload a LoRA to the Hugging Face hub."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from brewster.cli.extras import require_extra
-from brewster.cli.terminal import complain, print_out, say
+from brewster.cli.terminal import print_error, print_out, print_status
 from brewster.errors import BrewsterError, ModelError
 from brewster.files import write_atomically
 from brewster.models import zoo
@@ -21,13 +21,13 @@ _CARD = "README.md"
 
 @click.group
 def models() -> None:
-    """Show the models, their cards and their files."""
+    """List, describe and verify models; upload a LoRA."""
 
 
 @models.command("list")
 @_JSON
 def list_models(*, as_json: bool) -> None:
-    """List the models that come with brewster."""
+    """List the models that are installed with brewster."""
     rows = [describe(model) for model in zoo.MODELS.values()]
     if as_json:
         print_out(json.dumps(rows))
@@ -43,12 +43,12 @@ def list_models(*, as_json: bool) -> None:
     "--scores",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    help="Put the tables of this results.json, which brewster evaluate wrote, into the card of a LoRA's folder first.",
+    help="First write the tables of this results.json of brewster evaluate into the card of the LoRA folder.",
 )
 def card(*, name: str, scores: Path | None) -> None:
-    """Print the card of a model, or of a LoRA's folder: licence, training data, scores, where it fails."""
+    """Print the card of a model or of a LoRA folder: licence, training data, scores, where it fails."""
     if scores:
-        _put_scores(Path(name), scores)
+        _update_scores(Path(name), scores)
     is_folder = name not in zoo.MODELS and Path(name).is_dir()
     print_out(_read_card(Path(name)) if is_folder else zoo.find_model(name).card())
 
@@ -56,7 +56,7 @@ def card(*, name: str, scores: Path | None) -> None:
 @models.command
 @_NAME
 def path(*, name: str) -> None:
-    """Print where the file of a model lies."""
+    """Print the path of a model file."""
     model = zoo.find_model(name)
     model.verify()
     print_out(model.path)
@@ -67,13 +67,13 @@ def path(*, name: str) -> None:
 @_JSON
 @click.pass_context
 def verify(context: click.Context, *, names: tuple[str, ...], as_json: bool) -> None:
-    """Check that the files of models, of all unless some are named, are those that were shipped."""
+    """Verify the checksums of the model files, by default of all models."""
     rows = [describe(zoo.find_model(name)) for name in names or zoo.MODELS]
     if as_json:
         print_out(json.dumps(rows))
     for row in rows:
         if row["error"]:
-            complain(row["error"])
+            print_error(row["error"])
         elif not as_json:
             print_out(f"{row['name']}: {row['sha256']}")
     context.exit(1 if any(row["error"] for row in rows) else 0)
@@ -82,22 +82,26 @@ def verify(context: click.Context, *, names: tuple[str, ...], as_json: bool) -> 
 @models.command
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.argument("repo_id", metavar="OWNER/NAME")
-@click.option("--public", is_flag=True, help="For everybody to see; without it, only you and your team.")
-@click.option("--message", metavar="TEXT", default="", help="Of the commit, if not the base and rank.")
-@click.option("--dry-run", is_flag=True, help="Check the folder, print what would be sent, and send nothing.")
+@click.option("--public", is_flag=True, help="Make the repository public; by default it is private.")
+@click.option(
+    "--message", metavar="TEXT", default="", help="The commit message; by default it names base and rank."
+)
+@click.option(
+    "--dry-run", is_flag=True, help="Check the folder, print the planned upload, and upload nothing."
+)
 @_JSON
 def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: bool, as_json: bool) -> None:
-    """Send the LoRA in FOLDER to the Hugging Face hub as OWNER/NAME, in one commit.
+    """Upload the LoRA in FOLDER to the Hugging Face hub as OWNER/NAME, in one commit.
 
-    Sent are its weights, its prompt, its recipe and its card, nothing else; places of this machine are not named. The
+    The upload has the weights, the prompt embedding, the recipe and the card. It has no paths of this machine. The
     token is HF_TOKEN, or the one of `hf auth login`.
     """
     require_extra("large", "pushing")
-    from brewster.models.diffusion.adapter import hub  # noqa: PLC0415  (wakes torch)
+    from brewster.models.diffusion.adapter import hub  # noqa: PLC0415  (imports torch)
 
     plan = hub.plan_push(folder, repo_id, message=message, public=public)
     for remark in plan.remarks:
-        say(remark)
+        print_status(remark)
     address = None if dry_run else hub.push(plan)
     if as_json:
         print_out(json.dumps(plan.to_dict() | {"address": address}))
@@ -107,7 +111,7 @@ def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: boo
 
 
 def describe(model: zoo.ModelFile) -> dict[str, Any]:
-    """A model in plain values; `error` says what is wrong with its file, or is None."""
+    """A model as JSON values; `error` is the problem with its file, or None."""
     row = {"name": model.name, "path": str(model.path), "licence": model.licence, "sha256": model.sha256}
     try:
         return row | {"sha256": model.verify(), "bytes": model.path.stat().st_size, "error": None}
@@ -122,25 +126,25 @@ def _read_card(folder: Path) -> str:
     except (OSError, UnicodeDecodeError) as error:
         raise ModelError(
             f"{path} cannot be read ({error})",
-            "the card of a LoRA, as brewster train writes it",
-            "name its folder lora",
+            "expected the card that brewster train writes into the folder lora",
+            "give the path of that folder",
         ) from error
 
 
-def _put_scores(folder: Path, scores: Path) -> None:
-    """Replaces what the card in this folder says was measured."""
+def _update_scores(folder: Path, scores: Path) -> None:
+    """Replaces the scores in the card of this folder."""
     require_extra("train", "writing a card")
-    from brewster.evaluate.report.tables import overview  # noqa: PLC0415  (wakes torch)
+    from brewster.evaluate.report.tables import overview  # noqa: PLC0415  (imports torch)
     from brewster.training.lora.model_card import with_benchmark_tables  # noqa: PLC0415
 
     try:
         results = json.loads(scores.read_text("utf-8"))
-        told = [overview(results), *(f"- {choice}" for choice in results["protocol"]["choices"])]
+        lines = [overview(results), *(f"- {choice}" for choice in results["protocol"]["choices"])]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ModelError(
             f"{scores} cannot be read ({error!r})",
-            "the results.json that brewster evaluate wrote",
-            "name that file",
+            "expected the results.json of brewster evaluate",
+            "give the path of that file",
         ) from error
-    text = with_benchmark_tables(_read_card(folder), "\n".join(told))
+    text = with_benchmark_tables(_read_card(folder), "\n".join(lines))
     write_atomically(folder / _CARD, text.encode(), overwrite=True)

@@ -1,4 +1,4 @@
-"""The reference of the command line, made from the commands themselves: `make docs` writes docs/reference.md.
+"""The reference of the command line, generated from the commands: `make docs` writes docs/reference.md.
 
 .venv/bin/python -m brewster.cli.reference > docs/reference.md
 """
@@ -14,14 +14,14 @@ from brewster.cli import cli
 
 _BEGINNING = """# The command line
 
-Made from the commands by `make docs`; a test keeps it true.
+Generated from the commands by `make docs`; a test checks that it is up to date.
 
-Exit codes: 0 all went well, 1 an error (one line `error: ...` for each on standard error), 2 a wrong usage,
-130 stopped by Ctrl-C."""
+Exit codes: 0 success, 1 error (standard error has one line `error: ...` for each), 2 wrong usage, 130 interrupted by
+Ctrl-C."""
 
 
 def reference() -> str:
-    """Every command with its options, Markdown."""
+    """Every command with its options, as Markdown."""
     return "\n\n".join([_BEGINNING, *_chapters(cli, click.Context(cli, info_name="brewster"))]) + "\n"
 
 

@@ -1,4 +1,4 @@
-"""`brewster render`: a recipe in; a set of samples out, each with its five pictures and their cause."""
+"""`brewster render`: render a set of samples from a recipe, or one sample again from its scene.toml."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from click.core import ParameterSource
 
 from brewster.cli.extras import require_extra
 from brewster.cli.terminal import (
-    complain,
     interrupts,
+    print_error,
     print_out,
+    print_status,
     progress,
-    say,
     standard_output,
     write_out,
 )
@@ -27,29 +27,33 @@ if TYPE_CHECKING:
     from brewster.rendered.generation.job import Executor, RenderJob, RenderResult
     from brewster.scene.recipe import SceneRecipe
 
-_OF_THE_TRACER: Final = frozenset({"mitsuba", "mitsuba-oidn"})
-_OF_A_SCENE: Final = {"out", "output", "scene", "renderer", "maps", "photos", "quiet"}
-_MOST_WORKERS: Final = 8
+_MITSUBA_PACKAGES: Final = frozenset({"mitsuba", "mitsuba-oidn"})
+_SCENE_OPTIONS: Final = {"out", "output", "scene", "renderer", "maps", "photos", "quiet"}
+_MAX_WORKERS: Final = 8
 _FOLDER: Final = click.Path(path_type=Path, file_okay=False, exists=True)
 
 
 @final
 class _Size(click.ParamType[tuple[int, int]]):
-    """Two numbers with an x between."""
+    """Width and height in pixels, such as 512x384."""
 
     name = "WxH"
 
     def convert(
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[int, int]:
-        """Width and height, or a usage error."""
+        """Width and height.
+
+        Raises:
+            click.BadParameter: the value is not two numbers in the range.
+        """
         if isinstance(value, tuple):
             return value
         width, _, height = str(value).lower().partition("x")
         if not all(
             side.isascii() and side.isdigit() and 16 <= int(side) <= 16384 for side in (width, height)
         ):
-            self.fail(f"{value!r} is no size; 512x384 is one, and sides go from 16 to 16384.", param, ctx)
+            self.fail(f"{value!r} is not a size; 512x384 is one, and sides go from 16 to 16384.", param, ctx)
         return int(width), int(height)
 
 
@@ -60,21 +64,21 @@ class _Size(click.ParamType[tuple[int, int]]):
     "--output",
     metavar="FOLDER",
     type=click.Path(path_type=Path),
-    help="The same as OUT.",
+    help="The folder of the set; the same as OUT.",
 )
 @click.option(
     "--recipe",
     default="window",
     show_default=True,
     metavar="NAME|FILE",
-    help="What is drawn: window, shopfront, vitrine, office, tiny, or a TOML file.",
+    help="The distribution of scenes: window, shopfront, vitrine, office, tiny, or a TOML file.",
 )
 @click.option(
     "--show-recipe",
     metavar="NAME|FILE",
-    help="Print this recipe as TOML with all defaults and a comment for each key, and render nothing.",
+    help="Print this recipe as TOML with all defaults and a comment for each key, and do not render.",
 )
-@click.option("--count", type=click.IntRange(min=0), default=10, show_default=True, help="How many samples.")
+@click.option("--count", type=click.IntRange(min=0), default=10, show_default=True, help="Number of samples.")
 @click.option(
     "--first", type=click.IntRange(min=0), default=0, show_default=True, help="The index of the first sample."
 )
@@ -83,54 +87,58 @@ class _Size(click.ParamType[tuple[int, int]]):
     type=click.IntRange(0, 2**32 - 1),
     default=0,
     show_default=True,
-    help="Another seed makes another set.",
+    help="The random seed; a set is reproducible from its recipe and seed.",
 )
-@click.option("--size", type=_Size(), help="Of the pictures, such as 512x384, if not the recipe's.")
+@click.option(
+    "--size",
+    type=_Size(),
+    help="The size of the pictures in pixels, such as 512x384; by default the recipe's.",
+)
 @click.option(
     "--orders",
     type=click.Choice(["all", "paper"]),
-    help="What T and R hold: all light, so that I = T + R, or the paper's single paths; if not the recipe's.",
+    help="The light paths in T and R: all, so that I = T + R, or only the single paths of the paper; by default the recipe's.",
 )
 @click.option(
     "--renderer",
     type=click.Choice(["analytic", "mitsuba"]),
-    help="Analytic for flat glass, or a path tracer for all glass. By default analytic, or what --scene names.",
+    help="The renderer: analytic for flat glass only, or mitsuba, a path tracer for all glass; by default analytic, or the renderer that --scene names.",
 )
 @click.option(
     "--maps",
     metavar="DIR",
     type=_FOLDER,
     multiple=True,
-    help="A folder of HDR maps to light scenes with; may be given again. Without any, built-in worlds do.",
+    help="A folder of HDR environment maps; repeatable. By default the built-in environments.",
 )
 @click.option(
     "--photos",
     metavar="DIR",
     type=_FOLDER,
     multiple=True,
-    help="A folder of photos to put before maps; may be given again.",
+    help="A folder of photos that are placed in front of the environment maps; repeatable.",
 )
 @click.option(
-    "--shards", is_flag=True, help="Pack each hundred samples into a tar, as WebDataset reads them."
+    "--shards", is_flag=True, help="Pack each hundred samples into a tar file in the WebDataset layout."
 )
-@click.option("--preview", is_flag=True, help="Make preview.png too, a sheet of the first 40 samples.")
+@click.option("--preview", is_flag=True, help="Also write preview.png, a sheet of the first 40 samples.")
 @click.option(
     "--workers",
     type=click.IntRange(min=0),
-    help="How many processes render; 0 is this one. By default one a core, and at most 8.",
+    help="Number of processes that render; 0 renders in this process. By default one per core, at most 8.",
 )
 @click.option(
-    "--cluster", metavar="local|ADDRESS", help="Render on a Ray cluster; its nodes share the folder OUT."
+    "--cluster", metavar="local|ADDRESS", help="Render on a Ray cluster; its nodes must share the folder OUT."
 )
 @click.option(
     "--scene",
     type=click.Path(path_type=Path),
-    help="Render this scene.toml again, into OUT itself, and nothing else.",
+    help="Render only the sample of this scene.toml again, directly into OUT.",
 )
 @click.option(
     "--json", "as_json", is_flag=True, help="Print one line of JSON for each sample on standard output."
 )
-@click.option("--quiet", is_flag=True, help="Say nothing but errors.")
+@click.option("--quiet", is_flag=True, help="Print only errors.")
 @click.pass_context
 def render(
     context: click.Context,
@@ -140,35 +148,35 @@ def render(
     output: Path | None,
     scene: Path | None,
     show_recipe: str | None,
-    **asked: Any,  # noqa: ANN401  (the fields of _Order)
+    **options: Any,  # noqa: ANN401  (the fields of _RenderCommand)
 ) -> None:
-    """Render photographs through glass whose truth is known, into the folder OUT.
+    """Render photographs through glass with their ground truth into the folder OUT.
 
     Each sample is a folder: photo.jpg, its layers transmission.jpg and reflection.jpg, background.jpg (without
-    glass), mirror.jpg (a mirror in place of the glass), all five in linear light in layers.exr, and scene.toml, from
-    which `brewster render --scene` makes the same bytes again. index.parquet lists all samples.
+    glass), mirror.jpg (with a mirror in place of the glass), all five in linear light in layers.exr, and scene.toml,
+    from which `brewster render --scene` writes the same bytes again. index.parquet lists all samples.
 
-    What is there is kept: the same command goes on where a run was stopped, and a larger --count adds to it. A sample
-    that fails does not stop the others: it is named, and the exit code is 1.
+    Existing samples are kept: the same command resumes an interrupted run, and a larger --count adds samples. If a
+    sample fails, the others are still rendered, the failed sample is named, and the exit code is 1.
     """
     if show_recipe:
         _show_recipe(show_recipe)
         return
     if (out is None) == (output is None):
         raise click.UsageError("Name one folder to render into: brewster render OUT.")
-    require_extra("render", "rendering", without=_OF_THE_TRACER)
-    order = _RenderRequest(out or output or Path(), **asked)
+    require_extra("render", "rendering", without=_MITSUBA_PACKAGES)
+    command = _RenderCommand(out or output or Path(), **options)
     if scene:
-        _refuse_out_of_place(context)
-        order.render_again(scene)
+        _reject_set_options(context)
+        command.render_again(scene)
     else:
-        context.exit(0 if order.render_set() else 1)
+        context.exit(0 if command.render_set() else 1)
 
 
 @final
 @dataclass(frozen=True)
-class _RenderRequest:
-    """What was asked for; imports wait until it is carried out, as torch takes two seconds to wake."""
+class _RenderCommand:
+    """The options of the command. Its methods import torch, which takes two seconds, only when they run."""
 
     out: Path
     recipe: str
@@ -188,47 +196,47 @@ class _RenderRequest:
     quiet: bool
 
     def render_again(self, scene: Path) -> None:
-        """Renders one scene."""
+        """Renders one sample again from its scene.toml."""
         from brewster.rendered.generation.workers import render_again  # noqa: PLC0415
 
         render_again(scene, self.out, (*self.maps, *self.photos), self.renderer)
         if not self.quiet:
-            say(f"{scene} -> {self.out}")
+            print_status(f"{scene} -> {self.out}")
 
     def render_set(self) -> bool:
-        """Renders a set and tells; whether all went well."""
+        """Renders a set and prints each result; returns whether no sample failed."""
         from brewster.rendered.generation.job import build  # noqa: PLC0415
         from brewster.rendered.generation.preview import write_preview  # noqa: PLC0415
 
-        job, told = self._job(), _RenderProgress(self.as_json, self.quiet)
-        over_bar = self.as_json and standard_output.stream.isatty()
-        with progress(self.count, shown=not self.quiet and not over_bar) as advance:
+        job, printer = self._job(), _RenderPrinter(self.as_json, self.quiet)
+        shares_terminal = self.as_json and standard_output.stream.isatty()
+        with progress(self.count, shown=not self.quiet and not shares_terminal) as advance:
 
             def report(result: RenderResult) -> None:
-                told.tell(result)
-                advance(told.counts.total(), f"sample {result.index}")
-                interrupts.heed()
+                printer.print_result(result)
+                advance(printer.counts.total(), f"sample {result.index}")
+                interrupts.raise_pending()
 
             indices = range(self.first, self.first + self.count)
             build(job, indices, self._executor(job), shards=self.shards, report=report)
         if self.preview:
             write_preview(self.out)
-        told.sum_up(self.out)
-        return not told.counts["failed"]
+        printer.print_summary(self.out)
+        return not printer.counts["failed"]
 
     def _job(self) -> RenderJob:
         from brewster.environments.catalog import read_catalog  # noqa: PLC0415
         from brewster.rendered.generation.job import RenderJob  # noqa: PLC0415
 
         recipe = self._recipe()
-        catalog, left_out = read_catalog(self.maps, self.photos)
-        for error in left_out:
-            complain(f"left out: {error}")
+        catalog, errors = read_catalog(self.maps, self.photos)
+        for error in errors:
+            print_error(f"left out: {error}")
         folders = tuple(folder.resolve() for folder in (*self.maps, *self.photos))
         return RenderJob(self.out.resolve(), recipe, catalog, self.seed, self.renderer or "analytic", folders)
 
     def _recipe(self) -> SceneRecipe:
-        """The recipe with the size and orders that were asked for instead of its own."""
+        """The recipe, with --size and --orders in place of its own values."""
         from brewster.scene.recipe import read_scene_recipe  # noqa: PLC0415
 
         recipe = read_scene_recipe(self.recipe)
@@ -245,33 +253,35 @@ class _RenderRequest:
             from brewster.rendered.generation.ray_cluster import RayExecutor  # noqa: PLC0415
 
             return RayExecutor(job, self.cluster, self.workers)
-        workers = min(_MOST_WORKERS, os.cpu_count() or 1) if self.workers is None else self.workers
+        workers = min(_MAX_WORKERS, os.cpu_count() or 1) if self.workers is None else self.workers
         return ProcessExecutor(job, workers) if workers else SerialExecutor(job)
 
 
 @final
-class _RenderProgress:
-    """Tells of samples as they come, and counts them: what is kept does not grow."""
+class _RenderPrinter:
+    """Prints results as they arrive, and counts them. Memory does not grow with the number of samples."""
 
     def __init__(self, as_json: bool, quiet: bool) -> None:
         self._as_json, self._quiet = as_json, quiet
         self.counts: Counter[str] = Counter()
 
-    def tell(self, result: RenderResult) -> None:
-        """One line at once for what was rendered or failed."""
+    def print_result(self, result: RenderResult) -> None:
+        """Prints one line for a sample that was rendered or failed."""
         self.counts[result.status] += 1
         if self._as_json:
             row = {name: value for name, value in asdict(result).items() if name != "fatal"}
             write_out(f"{json.dumps(row)}\n".encode())
         if result.error:
-            complain(f"sample {result.index}: {result.error}")
+            print_error(f"sample {result.index}: {result.error}")
         elif result.status == "rendered" and not self._quiet:
-            say(f"sample {result.index} ({result.seconds:.1f} s)")
+            print_status(f"sample {result.index} ({result.seconds:.1f} s)")
 
-    def sum_up(self, out: Path) -> None:
-        """How many there were of each kind."""
+    def print_summary(self, out: Path) -> None:
+        """Prints the number of samples of each status."""
         if not self._quiet:
-            say(f"{out}: " + ", ".join(f"{count} {status}" for status, count in sorted(self.counts.items())))
+            print_status(
+                f"{out}: " + ", ".join(f"{count} {status}" for status, count in sorted(self.counts.items()))
+            )
 
 
 def _show_recipe(name: str) -> None:
@@ -281,8 +291,10 @@ def _show_recipe(name: str) -> None:
     print_out(commented_toml(read_scene_recipe(name)).rstrip())
 
 
-def _refuse_out_of_place(context: click.Context) -> None:
-    """A scene says all of its sample; what chooses samples of a set has nothing to choose."""
-    for name in context.params.keys() - _OF_A_SCENE:
+def _reject_set_options(context: click.Context) -> None:
+    """With --scene, options that describe a set are a wrong usage: the scene defines the whole sample."""
+    for name in context.params.keys() - _SCENE_OPTIONS:
         if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
-            raise click.UsageError(f"--scene renders what the scene says, and --{name} belongs to a set.")
+            raise click.UsageError(
+                f"--scene renders one existing sample; --{name} belongs to a set: leave it out."
+            )

@@ -1,4 +1,4 @@
-"""`brewster separate`: the command and its options, which are made from `Options`."""
+"""`brewster separate`: the command, with one option for each field of `Options`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar, cast, get_args, get_origin, get_type_h
 import click
 from click.core import ParameterSource
 
-from brewster.cli.batch import SeparationBatch, goes_to_one_file, plan
+from brewster.cli.batch import BatchCommand, is_single_output, plan
 from brewster.cli.terminal import standard_output
 from brewster.errors import BrewsterError
 from brewster.options import Options
@@ -20,10 +20,14 @@ _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
 class _RangedNumber(click.FloatRange):
-    """A number in a range; `nan` is neither below nor above it, and no number."""
+    """A number in a range. It rejects `nan`, which comparisons with the limits do not."""
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """The number, or a usage error."""
+        """The number.
+
+        Raises:
+            click.BadParameter: the value is not a number in the range.
+        """
         number = float(super().convert(cast("float", value), param, ctx))
         if math.isnan(number):
             self.fail(f"{value} is not a number.", param, ctx)
@@ -31,7 +35,7 @@ class _RangedNumber(click.FloatRange):
 
 
 class _WordList(click.ParamType[tuple[str, ...]]):
-    """Words with commas between, each of them known."""
+    """Words from a fixed list, separated by commas."""
 
     name = "words"
 
@@ -39,13 +43,17 @@ class _WordList(click.ParamType[tuple[str, ...]]):
         self.known = known
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:  # noqa: ARG002
-        """How help shows the value."""
+        """The placeholder for the value in the help text."""
         return "LAYER,..."
 
     def convert(
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[str, ...]:
-        """The words, each once, in the known order; or a usage error."""
+        """The words without duplicates, in the order of the list.
+
+        Raises:
+            click.BadParameter: a word is not in the list.
+        """
         words = str(value).split(",")
         unknown = [word for word in words if word not in self.known]
         if unknown:
@@ -54,7 +62,7 @@ class _WordList(click.ParamType[tuple[str, ...]]):
 
 
 def _with_options(command: _Command) -> _Command:
-    """Gives a command one option for every field of `Options`."""
+    """Adds one option for each field of `Options` to a command."""
     hints = get_type_hints(Options)
     for field in reversed(dataclasses.fields(Options)):
         command = _option(field, hints[field.name])(command)
@@ -68,7 +76,7 @@ def _option(field: dataclasses.Field[Any], hint: object) -> Callable[[_Command],
     default = ",".join(field.default) if isinstance(field.default, tuple) else field.default
     return click.option(
         name,
-        type=_kind(hint, field),
+        type=_param_type(hint, field),
         default=default,
         show_default=default is not None,
         metavar="NUMBER" if hint in (int, float) else None,
@@ -76,10 +84,10 @@ def _option(field: dataclasses.Field[Any], hint: object) -> Callable[[_Command],
     )
 
 
-def _kind(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[Any]:
+def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[Any]:
     low, high = field.metadata.get("ge"), field.metadata.get("le")
     if NoneType in get_args(hint):
-        return _kind(get_args(hint)[0], field)
+        return _param_type(get_args(hint)[0], field)
     if hint is float:
         return _RangedNumber(low, high)
     if hint is int:
@@ -95,15 +103,15 @@ def _kind(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[Any]:
     "-o",
     "--output",
     metavar="FOLDER|PICTURE|-",
-    help="Where the layers go: a folder, the name of a picture for one layer, or - for standard output.",
+    help="The target of the layers: a folder, the name of a picture for one layer, or - for standard output.",
 )
 @_with_options
 @click.option(
     "--json", "as_json", is_flag=True, help="Print one line of JSON for each photo on standard output."
 )
-@click.option("--quiet", is_flag=True, help="Say nothing but errors.")
-@click.option("--dry-run", is_flag=True, help="Print what would be written, and write nothing.")
-@click.option("--overwrite", is_flag=True, help="Replace layers that are there already.")
+@click.option("--quiet", is_flag=True, help="Print only errors.")
+@click.option("--dry-run", is_flag=True, help="Print the planned files, and write nothing.")
+@click.option("--overwrite", is_flag=True, help="Replace existing layers.")
 @click.pass_context
 def separate(
     context: click.Context,
@@ -115,37 +123,37 @@ def separate(
     quiet: bool,
     dry_run: bool,
     overwrite: bool,
-    **asked: object,
+    **values: object,
 ) -> None:
-    """Separate photographs taken through glass.
+    """Separate photographs taken through glass into transmission and reflection.
 
-    PHOTO is a picture, a folder of pictures, or - for standard input. The layers of photo.jpg are written beside
-    it as photo.transmission.jpg and photo.reflection.jpg, or into the folder named with -o, where the tree below
-    a folder is mirrored. Where there is place for one layer only (standard output, or a picture named with -o),
-    it is the transmission unless --layers says otherwise.
+    PHOTO is a picture, a folder of pictures, or - for standard input. The layers of photo.jpg are written next to it
+    as photo.transmission.jpg and photo.reflection.jpg, or into the output folder, which mirrors the tree below a
+    source folder. Standard output and a picture named with -o take one layer: by default the transmission, or the one
+    named with --layers.
 
-    Photos whose layers are there already are skipped. A photo that fails does not stop the others: it is named at
-    the end, and the exit code is 1.
+    Photos whose layers exist are skipped. If a photo fails, the others are still separated, the failed photo is named
+    at the end, and the exit code is 1.
     """
-    one_file = goes_to_one_file(photos, output)
-    if one_file and context.get_parameter_source("layers") is ParameterSource.DEFAULT:
-        asked["layers"] = ("transmission",)
+    single_output = is_single_output(photos, output)
+    if single_output and context.get_parameter_source("layers") is ParameterSource.DEFAULT:
+        values["layers"] = ("transmission",)
     try:
-        options = Options(**cast("dict[str, Any]", asked))
+        options = Options(**cast("dict[str, Any]", values))
     except BrewsterError as error:
         raise click.UsageError(str(error)) from error
     tasks = plan(photos, output, options)
-    if None in tasks[0].targets.values() and not dry_run:
-        _refuse_occupied_output(as_json=as_json)
-    batch = SeparationBatch(options, overwrite=overwrite, dry_run=dry_run, as_json=as_json, quiet=quiet)
+    if single_output and output in (None, "-") and not dry_run:
+        _reject_shared_output(as_json=as_json)
+    batch = BatchCommand(options, overwrite=overwrite, dry_run=dry_run, as_json=as_json, quiet=quiet)
     context.exit(0 if batch.run(tasks) else 1)
 
 
-def _refuse_occupied_output(*, as_json: bool) -> None:
-    """A picture goes to standard output: nothing else may, and nobody may be reading there."""
+def _reject_shared_output(*, as_json: bool) -> None:
+    """Checks that a picture on standard output mixes neither with JSON nor with the text of a terminal."""
     if as_json:
         raise click.UsageError("--json and a picture cannot share standard output: name the picture with -o.")
     if standard_output.stream.isatty():
         raise click.UsageError(
-            "A picture would go to the terminal: send it on with > or |, or name it with -o."
+            "A picture would go to the terminal: redirect it with > or |, or name it with -o."
         )

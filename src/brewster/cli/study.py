@@ -1,4 +1,4 @@
-"""`brewster study`: which of two results do people prefer? Make a study, plan it, serve it, and report what it says."""
+"""`brewster study`: a user study of which of two results people prefer: create, plan, serve and report it."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ import click
 
 from brewster.cli.evaluate import NamedValue
 from brewster.cli.extras import require_extra
-from brewster.cli.serve import AUTO, at_an_address, invite
-from brewster.cli.terminal import print_out, progress, say, write_out
+from brewster.cli.serve import AUTO, address_options, print_link
+from brewster.cli.terminal import print_out, print_status, progress, write_out
 from brewster.errors import BrewsterError
 
 _NAME: Final = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)*", re.IGNORECASE)
-_MAX_BYTES: Final = 10_000  # an answer has eighty
+_MAX_BYTES: Final = 10_000  # an answer has eighty bytes
 _FOLDER: Final = click.Path(path_type=Path, file_okay=False)
 _WARNING: Final = (
-    "warning: whoever reaches {host} can take part, and nothing they send is encrypted; "
-    "behind a proxy that encrypts, keep 127.0.0.1 and give its name with --called"
+    "warning: everybody who can reach {host} can take part, and the connection is not encrypted; "
+    "behind a proxy that encrypts, keep 127.0.0.1 and give the name of the proxy with --called"
 )
 
 
 @click.group
 def study() -> None:
-    """Ask people which of two results they prefer: blind pairs, drawn at random, with catch trials.
+    """Run a user study of which of two results people prefer: blind, random pairs with catch trials.
 
-    `create` freezes a study from folders of outputs, `plan` says how many participants it needs, `serve` is the page
-    for them, and `report` what they said. docs/study.md has the definitions.
+    `create` makes a study from folders of outputs, `plan` computes the number of participants, `serve` runs the page for
+    participants, and `report` evaluates their answers. docs/study.md has the definitions.
     """
 
 
@@ -43,7 +43,7 @@ def study() -> None:
     type=_FOLDER,
     required=True,
     metavar="DIR",
-    help="The photos, or a folder of them for each dataset.",
+    help="The photos, or a folder of photos for each dataset.",
 )
 @click.option(
     "--method",
@@ -52,32 +52,39 @@ def study() -> None:
     multiple=True,
     required=True,
     metavar="NAME=DIR",
-    help="A method's outputs, called like the inputs; two or more. The first is compared with each other one.",
+    help="The outputs of a method, named like the inputs; give two or more. The first method is compared with each other method.",
 )
 @click.option(
-    "--dataset", "datasets", multiple=True, metavar="NAME", help="Take these datasets only, in this order."
+    "--dataset",
+    "datasets",
+    multiple=True,
+    metavar="NAME",
+    help="Use only this dataset; repeatable, the order is kept.",
 )
-@click.option("--all-pairs", is_flag=True, help="Compare every method with every other.")
+@click.option("--all-pairs", is_flag=True, help="Compare each method with every other method.")
 @click.option(
     "--pairs",
     type=click.IntRange(1),
     metavar="NUMBER",
-    help="Pairs a participant; by default 40, or all where there are fewer.",
+    help="Number of pairs per participant; by default 40, or all if there are fewer.",
 )
 @click.option(
     "--catches",
     type=click.IntRange(0),
     metavar="NUMBER",
-    help="Catch trials a participant, in turn two equal pictures and a spoilt one; by default 4.",
+    help="Number of catch trials per participant, alternately two equal pictures and a degraded one; by default 4.",
 )
 @click.option(
-    "--seed", type=click.IntRange(0), metavar="NUMBER", help="Of the draw; by default drawn, and kept."
+    "--seed",
+    type=click.IntRange(0),
+    metavar="NUMBER",
+    help="The random seed of the assignment; by default a random one, which the study stores.",
 )
 @click.option(
     "--consent",
     type=click.Path(path_type=Path, dir_okay=False, exists=True),
     metavar="FILE",
-    help="What participants agree to, as plain text with empty lines between paragraphs, instead of our own.",
+    help="The consent text: plain text with empty lines between paragraphs; by default the text of brewster.",
 )
 def create(
     out: Path,
@@ -91,13 +98,13 @@ def create(
     seed: int | None,
     consent: Path | None,
 ) -> None:
-    """Freeze a study in the folder OUT from folders of outputs.
+    """Create a study in the folder OUT from folders of outputs.
 
-    Pictures are paired by name, whatever their format: DIR/real/12.png and DIR/nature/3.jpg belong to the datasets real
-    and nature, DIR/12.png to the only one. What is missing, double, unreadable or of another size is named, and nothing
-    is written. The study holds copies of all pictures, and can be moved.
+    Pictures are paired by name, independent of their format: DIR/real/12.png and DIR/nature/3.jpg belong to the datasets
+    real and nature; DIR/12.png belongs to the only dataset. If a picture is missing, duplicate, unreadable or of another
+    size, it is named, and nothing is written. The study has copies of all pictures, and can be moved.
     """
-    from brewster.user_study.create import CATCH_POOL_SIZE, DEFAULT_CONSENT, StudyOptions  # noqa: PLC0415  (wakes pyvips)
+    from brewster.user_study.create import CATCH_POOL_SIZE, DEFAULT_CONSENT, StudyOptions  # noqa: PLC0415  (imports pyvips)
     from brewster.user_study.create import create as freeze  # noqa: PLC0415
     from brewster.user_study.folders import find_pictures  # noqa: PLC0415
 
@@ -105,94 +112,100 @@ def create(
     if len(folders) < len(methods):
         raise BrewsterError(
             f"two methods share a name of {', '.join(name for name, _ in methods)}",
-            "tables tell methods apart by name",
-            "give each its own",
+            "each method needs a name of its own",
+            "choose different names",
         )
-    text = DEFAULT_CONSENT if consent is None else _text(consent)
+    text = DEFAULT_CONSENT if consent is None else _read_consent(consent)
     chosen = StudyOptions(
         datasets=datasets, pairs=pairs, catches=catches, all_pairs=all_pairs, seed=seed, consent=text
     )
     total = len(find_pictures(inputs, datasets)) * (1 + len(folders)) + CATCH_POOL_SIZE
     with progress(total, shown=True) as advance:
-        made = freeze(out, inputs, folders, chosen, lambda done: advance(done, "copying")).description
-    say(
-        f"{out}: {len(made.comparisons)} comparisons of {len(made.methods)} methods; a participant sees "
-        f"{made.pairs} of them and {made.catches} catch trials (seed {made.seed})"
+        description = freeze(out, inputs, folders, chosen, lambda done: advance(done, "copying")).description
+    print_status(
+        f"{out}: {len(description.comparisons)} comparisons of {len(description.methods)} methods; a participant sees "
+        f"{description.pairs} of them and {description.catches} catch trials (seed {description.seed})"
     )
-    say(f"next: brewster study serve {out}")
+    print_status(f"next: brewster study serve {out}")
 
 
-def _text(path: Path) -> str:
+def _read_consent(path: Path) -> str:
     try:
         return path.read_text("utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
         raise BrewsterError(
-            f"{path} cannot be read ({error})", "plain text in UTF-8", "save it so"
+            f"{path} cannot be read ({error})", "expected plain text in UTF-8", "save it in that encoding"
         ) from error
 
 
 def _read_names(_context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]) -> list[str]:
-    """Names as they stand in the Host header, lower case: the guard does not look at a port there."""
+    """Names as they appear in the Host header, in lower case. The middleware compares them without the port."""
     for name in names:
         if not _NAME.fullmatch(name):
             try:
                 ipaddress.ip_address(name)
             except ValueError as error:
                 raise click.BadParameter(
-                    f"{name!r} is no bare name of a host, such as study.example.org: "
-                    "leave out https://, the port and the path; letters other than a-z as xn--."
+                    f"{name!r} is not a bare host name, such as study.example.org: "
+                    "leave out https://, the port and the path, and write letters other than a-z as xn--."
                 ) from error
     return [name.lower() for name in names]
 
 
 @study.command
 @click.argument("folder", metavar="STUDY", type=_FOLDER)
-@at_an_address(8420, "Let in only who brings this token; auto makes one and keeps it in STUDY/token.")
+@address_options(8420, "Require this token in each request; auto generates one and stores it in STUDY/token.")
 @click.option(
     "--called",
     multiple=True,
     callback=_read_names,
     metavar="NAME",
-    help="Another name that browsers call this server by, such as that of a proxy before it: study.example.org.",
+    help="Another host name of this server, such as that of a proxy in front of it: study.example.org; repeatable.",
 )
-@click.option(
-    "--most", type=click.IntRange(1), metavar="NUMBER", help="Admit no more participants than this."
-)
+@click.option("--most", type=click.IntRange(1), metavar="NUMBER", help="The largest number of participants.")
 def serve(
     folder: Path, *, host: str, port: int, called: list[str], token: str | None, most: int | None
 ) -> None:
     """Serve the page for participants until Ctrl-C.
 
-    Every answer is on the disk before it is acknowledged. A server that was stopped or killed goes on where it was.
+    Each answer is stored on the disk before it is acknowledged. The same command resumes a study after the server was
+    stopped or killed.
     """
     require_extra("web", "serving", without=frozenset({"matplotlib"}))
     from brewster.user_study.access_token import load_or_create_token  # noqa: PLC0415
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415
     from brewster.user_study.study import read_study  # noqa: PLC0415
-    from brewster.web import application as web  # noqa: PLC0415  (wakes FastAPI)
+    from brewster.web import application as web  # noqa: PLC0415  (imports FastAPI)
     from brewster.web.middleware import RequestLimits, is_loopback  # noqa: PLC0415
     from brewster.web.study import study_router  # noqa: PLC0415
 
-    made = read_study(folder)
-    made.verify_pictures()
+    frozen_study = read_study(folder)
+    frozen_study.verify_pictures()
     if not is_loopback(host):
-        say(_WARNING.format(host=host))
+        print_status(_WARNING.format(host=host))
     token = load_or_create_token(folder) if token == AUTO else token
     limits = RequestLimits.for_host(host, token=token, max_bytes=_MAX_BYTES)
     limits = replace(limits, hosts=limits.hosts | {*called})
-    store = AnswerStore(made)
+    store = AnswerStore(frozen_study)
     app = web.create_app(
-        study_router(made, store, max_participants=most, token=token), limits=limits, index="study.html"
+        study_router(frozen_study, store, max_participants=most, token=token),
+        limits=limits,
+        index="study.html",
     )
-    with contextlib.closing(store), contextlib.suppress(KeyboardInterrupt):  # the usual end
-        web.serve(app, host=host, port=port, on_ready=lambda url: invite(url, token))
-    say("stopped; all answers are kept")
+    with contextlib.closing(store), contextlib.suppress(KeyboardInterrupt):  # the usual way to stop
+        web.serve(app, host=host, port=port, on_ready=lambda url: print_link(url, token))
+    print_status("stopped; all answers are stored")
 
 
 @study.command
 @click.argument("folder", metavar="STUDY", type=_FOLDER)
 @click.option(
-    "-o", "--output", "out", type=_FOLDER, metavar="DIR", help="Where the files go; by default STUDY/report."
+    "-o",
+    "--output",
+    "out",
+    type=_FOLDER,
+    metavar="DIR",
+    help="The folder for the report; by default STUDY/report.",
 )
 @click.option(
     "--most-failed",
@@ -200,7 +213,7 @@ def serve(
     default=0.25,
     show_default=True,
     metavar="SHARE",
-    help="Leave out who fails more of the catch trials.",
+    help="Exclude participants who fail a larger share of the catch trials.",
 )
 @click.option(
     "--least-seconds",
@@ -208,16 +221,16 @@ def serve(
     default=1.5,
     show_default=True,
     metavar="SECONDS",
-    help="Leave out who takes less for half of all trials.",
+    help="Exclude participants who need less time for half of all trials.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the results as JSON instead of the tables.")
 def report(
     folder: Path, *, out: Path | None, most_failed: float, least_seconds: float, as_json: bool
 ) -> None:
-    """Say what the answers say, with and without the rule that leaves people out.
+    """Evaluate the answers, with and without the exclusion of unreliable participants.
 
-    The tables go to standard output; report.md, report.json, table.tex (the layout of the paper's Table 3), table.csv,
-    answers.csv and plot.png into a folder. The server may be running meanwhile.
+    The tables go to standard output. The folder gets report.md, report.json, table.tex (in the layout of the paper's
+    Table 3), table.csv, answers.csv and plot.png. The server may run at the same time.
     """
     require_extra("web", "reporting", without=frozenset({"fastapi", "python-multipart", "uvicorn"}))
     from brewster.user_study.report.participants import ExclusionRule, collect_answers  # noqa: PLC0415
@@ -226,14 +239,14 @@ def report(
     from brewster.user_study.store import AnswerStore  # noqa: PLC0415
     from brewster.user_study.study import read_study  # noqa: PLC0415
 
-    made = read_study(folder)
-    with contextlib.closing(AnswerStore(made, read_only=True)) as store:
+    frozen_study = read_study(folder)
+    with contextlib.closing(AnswerStore(frozen_study, read_only=True)) as store:
         answered = collect_answers(store.all_answers())
-    results = summarise(made, answered, ExclusionRule(most_failed, least_seconds))
+    results = summarise(frozen_study, answered, ExclusionRule(most_failed, least_seconds))
     out = folder / "report" if out is None else out
-    write(results, made, answered, out)
+    write(results, frozen_study, answered, out)
     write_out((json.dumps(results) + "\n" if as_json else overview(results)).encode())
-    say(f"all of it is in {out}")
+    print_status(f"the report is in {out}")
 
 
 @study.command
@@ -242,16 +255,16 @@ def report(
     type=click.FloatRange(0, 1, min_open=True),
     required=True,
     metavar="SHARE",
-    help="The win rate less the lose rate that is to be shown, such as 0.1.",
+    help="The difference of win rate and loss rate to detect, such as 0.1.",
 )
-@click.option("--tie", type=click.FloatRange(0, 1, max_open=True), default=0.25, show_default=True, metavar="SHARE", help='The rate of "similar".')  # fmt: skip
+@click.option("--tie", type=click.FloatRange(0, 1, max_open=True), default=0.25, show_default=True, metavar="SHARE", help='The share of the answer "similar".')  # fmt: skip
 @click.option(
     "--pairs",
     type=click.IntRange(1),
     default=40,
     show_default=True,
     metavar="NUMBER",
-    help="How many pairs of these two methods a participant sees.",
+    help="Number of pairs of these two methods per participant.",
 )
 @click.option(
     "--correlation",
@@ -259,27 +272,27 @@ def report(
     default=0.05,
     show_default=True,
     metavar="NUMBER",
-    help="How alike the answers of one participant are; reports estimate it.",
+    help="The correlation of the answers of one participant; `report` estimates it.",
 )
-@click.option("--power", type=click.FloatRange(0.5, 1, max_open=True), default=0.8, show_default=True, metavar="SHARE", help="How surely it is shown if it is there.")  # fmt: skip
+@click.option("--power", type=click.FloatRange(0.5, 1, max_open=True), default=0.8, show_default=True, metavar="SHARE", help="The probability of detecting the difference if it exists.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def plan(
     *, difference: float, tie: float, pairs: int, correlation: float, power: float, as_json: bool
 ) -> None:
-    """Say how many participants a difference needs, at the 5 % level."""
+    """Compute the number of participants that detect a difference at the 5 % level."""
     from brewster.user_study.power_analysis import required_participants  # noqa: PLC0415
 
-    answer = required_participants(
+    estimate = required_participants(
         difference=difference, tie=tie, pairs=pairs, correlation=correlation, power=power
     )
     if as_json:
-        print_out(json.dumps(asdict(answer)))
+        print_out(json.dumps(asdict(estimate)))
         return
     print_out(
-        f"{answer.participants} participants ({answer.answers} answers) show {answer.win:.1%} wins to {answer.lose:.1%} "
+        f"{estimate.participants} participants ({estimate.answers} answers) show {estimate.win:.1%} wins to {estimate.lose:.1%} "
         f"losses with {power:.0%} power at the 5 % level."
     )
     print_out(
-        f"{pairs} pairs each, correlation {correlation:g}: {answer.design_effect:.2f} answers do what an independent one "
-        f"would, and participants' own differences scatter by {answer.deviation:.0%} about the mean."
+        f"{pairs} pairs each, correlation {correlation:g}: {estimate.design_effect:.2f} answers have the information of one "
+        f"independent answer; the differences of single participants have a standard deviation of {estimate.deviation:.0%}."
     )

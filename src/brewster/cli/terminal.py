@@ -1,4 +1,4 @@
-"""What the command line says and where, results on standard output and all else on standard error; and Ctrl-C."""
+"""Output and Ctrl-C: results go to standard output; status lines, errors and progress bars go to standard error."""
 
 from __future__ import annotations
 
@@ -14,41 +14,41 @@ if TYPE_CHECKING:
     from sys import UnraisableHookArgs
 
 Advance = Callable[[float, str], None]
-"""Called with how many are done, perhaps in part, and what comes next, or how it goes."""
+"""Called with the number of items that are done, which may be fractional, and a text about the current item."""
 
 
 @final
 class _DeferredInterrupts:
-    """Ctrl-C that got lost.
+    """Ctrl-C that Python has dropped, to be raised later.
 
-    Where C code calls Python (libvips does, whenever it has something to log), no exception can pass: Python drops
-    a KeyboardInterrupt there, and the work would go on as if nobody had pressed anything.
+    If Ctrl-C is pressed while C code calls Python (libvips does, to write its log), the KeyboardInterrupt cannot pass
+    through the C code. Python drops it, and the work would continue.
     """
 
     def __init__(self) -> None:
-        self._lost = False
+        self._pending = False
 
     @contextmanager
-    def noticed(self) -> Iterator[None]:
-        """Notices within this block when an interrupt is dropped."""
+    def captured(self) -> Iterator[None]:
+        """Within this block, remembers a KeyboardInterrupt that Python drops."""
         hook = sys.unraisablehook
 
-        def notice(dropped: UnraisableHookArgs) -> None:
+        def capture(dropped: UnraisableHookArgs) -> None:
             if dropped.exc_type is KeyboardInterrupt:
-                self._lost = True
+                self._pending = True
             else:
                 hook(dropped)
 
-        self._lost, sys.unraisablehook = False, notice
+        self._pending, sys.unraisablehook = False, capture
         try:
             yield
         finally:
             sys.unraisablehook = hook
 
-    def heed(self) -> None:
-        """Raises the interrupt that was dropped, if there was one: to be called before what cannot be undone."""
-        if self._lost:
-            self._lost = False
+    def raise_pending(self) -> None:
+        """Raises the interrupt that was dropped, if any. Call it before every step that cannot be undone."""
+        if self._pending:
+            self._pending = False
             raise KeyboardInterrupt
 
 
@@ -56,29 +56,29 @@ interrupts = _DeferredInterrupts()
 
 
 def one_line(text: object) -> str:
-    """Text as it can stand in one line: file names may hold newlines, and bytes that are no text."""
+    """The text in one line, with unprintable characters escaped: file names may have newlines and invalid bytes."""
     return "".join(
         letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in str(text)
     )
 
 
-def say(text: object) -> None:
-    """One line on standard error."""
+def print_status(text: object) -> None:
+    """Prints one line on standard error."""
     sys.stderr.write(f"{one_line(text)}\n")
     sys.stderr.flush()
 
 
-def complain(text: object) -> None:
-    """One line on standard error that says what went wrong."""
-    say(f"error: {text}")
+def print_error(text: object) -> None:
+    """Prints one line `error: ...` on standard error."""
+    print_status(f"error: {text}")
 
 
 @final
 class _Output:
-    """Standard output, which belongs to the command: what a library prints there goes to standard error.
+    """Standard output, reserved for the results of the command: output of libraries is redirected to standard error.
 
-    Libraries print in two ways, and each is led away in its own: C code writes to file descriptor 1 (so do processes
-    that are started here), and Python code writes to `sys.stdout`, as OpenEXR does for a damaged file.
+    Libraries print in two ways, and each needs its own redirection. C code and child processes write to file
+    descriptor 1. Python code writes to `sys.stdout`, as OpenEXR does for a damaged file.
     """
 
     def __init__(self) -> None:
@@ -86,21 +86,21 @@ class _Output:
 
     @property
     def stream(self) -> TextIO:
-        """Where results are written."""
+        """The stream that results are written to."""
         return self._stream or sys.stdout
 
-    def take_descriptor(self) -> None:
-        """Points file descriptor 1 to standard error, for the rest of this process; `sys.stdout` gets another one.
+    def redirect_descriptor(self) -> None:
+        """Points file descriptor 1 to standard error for the rest of this process; `sys.stdout` gets a copy of the original.
 
-        It is not given back, because C code keeps what it prints in a buffer until the process ends.
+        The descriptor is not restored, because C code buffers its output until the process ends.
         """
         try:
-            if sys.stdout.fileno() != _STDOUT:  # a test or a notebook has put something else there
+            if sys.stdout.fileno() != _STDOUT:  # a test or a notebook has replaced it
                 return
             sys.stdout.flush()
             own = os.dup(_STDOUT)
             os.dup2(_STDERR, _STDOUT)
-        except (AttributeError, OSError):  # one of the two is closed, or none
+        except (AttributeError, OSError):  # standard output or standard error is closed
             return
         sys.stdout = open(own, "w", encoding=sys.stdout.encoding, errors=sys.stdout.errors, closefd=False)  # noqa: SIM115
 
@@ -121,42 +121,42 @@ _STDERR: Final = 2
 
 
 def print_out(text: object) -> None:
-    """One line to standard output, now.
+    """Prints one line on standard output, and flushes it.
 
     Raises:
-        TargetError: it cannot be written.
+        TargetError: standard output cannot be written, for example because the disk is full.
     """
     stream = standard_output.stream
     write_out(f"{text}\n".encode(stream.encoding or "utf-8", stream.errors or "strict"))
 
 
 def write_out(data: bytes) -> None:
-    """Bytes to standard output, now.
+    """Writes bytes to standard output, and flushes them.
 
     Raises:
-        TargetError: they cannot be written.
+        TargetError: standard output cannot be written, for example because the disk is full.
     """
     stream = standard_output.stream
     try:
         stream.buffer.write(data)
         stream.flush()
     except OSError as error:
-        # What is still in the buffer must not fail again when Python ends.
+        # Python flushes the buffer again when it exits: that must not fail a second time.
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         raise TargetError(
             f"standard output was not written ({error.strerror})",
-            "somebody must take all of it",
+            "the receiver must accept all of it",
             "write to a file with -o",
         ) from error
 
 
 @contextmanager
 def progress(total: int, *, shown: bool) -> Iterator[Advance]:
-    """A bar on standard error, if that is a terminal and the bar is to be shown."""
+    """A progress bar on standard error, if `shown` is set and standard error is a terminal."""
     if not (shown and sys.stderr.isatty()):
         yield lambda _done, _text: None
         return
-    from rich.console import Console  # noqa: PLC0415  (only a terminal pays for it)
+    from rich.console import Console  # noqa: PLC0415  (slow to import, and needed on a terminal only)
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn  # noqa: PLC0415
 
     columns = (

@@ -1,4 +1,4 @@
-"""`brewster train`: a recipe in; a run that can be resumed and a model file out."""
+"""`brewster train`: train a model from a recipe; the run can be resumed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from brewster.cli.extras import require_extra
-from brewster.cli.terminal import interrupts, print_out, progress, say
+from brewster.cli.terminal import interrupts, print_out, print_status, progress
 from brewster.errors import RecipeError, TargetError
 
 if TYPE_CHECKING:
@@ -24,22 +24,24 @@ if TYPE_CHECKING:
     "out",
     metavar="FOLDER",
     type=click.Path(path_type=Path),
-    help="The folder of the run: its checkpoint, log, samples and, at the end, model.onnx or the folder lora. By default out/NAME for NAME.toml.",
+    help="The folder for checkpoint, log, samples and, at the end, model.onnx or the folder lora. By default out/NAME for NAME.toml.",
 )
 @click.option(
     "--plan",
     is_flag=True,
-    help="Estimate memory and time of a large backbone's recipe, say whether they fit, and train nothing.",
+    help="Estimate memory and time for the recipe of a large backbone, check whether they fit, and do not train.",
 )
 @click.option(
-    "--card", metavar="NAME", help="With --plan: for this graphics card, such as RTX 4090, not the one here."
+    "--card",
+    metavar="NAME",
+    help='Estimate for this graphics card, such as "RTX 4090", instead of the one in this machine; implies --plan.',
 )
 @click.option(
     "--show-recipe",
     metavar="NAME|FILE",
-    help="Print a recipe as TOML with all defaults and a comment for each key, and train nothing: compact, lora, or a file.",
+    help="Print a recipe as TOML with all defaults and a comment for each key, and do not train: compact, lora, or a file.",
 )
-@click.option("--quiet", is_flag=True, help="Say nothing but errors.")
+@click.option("--quiet", is_flag=True, help="Print only errors.")
 def train(
     *,
     recipe: Path | None,
@@ -49,10 +51,10 @@ def train(
     show_recipe: str | None,
     quiet: bool,
 ) -> None:
-    """Train a model as RECIPE, a TOML file, says.
+    """Train a model with the settings of RECIPE, a TOML file.
 
-    The folder BREWSTER_DATA holds the data. A run that was stopped goes on from its last checkpoint when the same
-    command is given again, and ends with the same weights. Under torchrun several GPUs learn a large backbone together.
+    The environment variable BREWSTER_DATA names the data folder. The same command resumes an interrupted run from its
+    last checkpoint, and ends with the same weights. Under torchrun, several GPUs train a large backbone together.
     """
     require_extra("train", "training")
     if show_recipe:
@@ -60,35 +62,35 @@ def train(
         return
     if recipe is None:
         raise click.UsageError("Name a recipe: brewster train RECIPE.")
-    from brewster.training.recipe import LoraRecipe, read_recipe  # noqa: PLC0415  (wakes torch, in two seconds)
+    from brewster.training.recipe import LoraRecipe, read_recipe  # noqa: PLC0415  (imports torch, two seconds)
 
-    read, out = read_recipe(recipe), out or Path("out") / recipe.stem
-    if isinstance(read, LoraRecipe):
+    parsed, out = read_recipe(recipe), out or Path("out") / recipe.stem
+    if isinstance(parsed, LoraRecipe):
         require_extra("large", "a large backbone")
     if plan or card:
-        _print_plan(read, card)
+        _print_plan(parsed, card)
         return
-    _make(out)
+    _make_folder(out)
     from brewster.training.distributed import is_main_process  # noqa: PLC0415
     from brewster.training.loop import run  # noqa: PLC0415
     from brewster.training.trainers import open_trainer  # noqa: PLC0415
 
-    trainer = open_trainer(read)
+    trainer = open_trainer(parsed)
     quiet = quiet or not is_main_process()
-    with progress(read.steps, shown=not quiet) as advance:
+    with progress(parsed.steps, shown=not quiet) as advance:
 
-        def report(step: int, steps: int, numbers: Mapping[str, float], logged: bool) -> None:
-            interrupts.heed()
-            advance(step, f"loss {numbers['loss']:.4f}")
+        def report(step: int, steps: int, metrics: Mapping[str, float], logged: bool) -> None:
+            interrupts.raise_pending()
+            advance(step, f"loss {metrics['loss']:.4f}")
             if logged and not quiet:
-                told = ", ".join(f"{name} {value:.4g}" for name, value in numbers.items())
-                say(f"step {step} of {steps}: {told}")
+                line = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
+                print_status(f"step {step} of {steps}: {line}")
 
         run(trainer, out, report)
     if is_main_process():
         model = trainer.export(out)
         if not quiet:
-            say(f"the model is {model}")
+            print_status(f"the model is {model}")
 
 
 def _show_recipe(name: str) -> None:
@@ -104,20 +106,26 @@ def _print_plan(recipe: CompactRecipe | LoraRecipe, card: str | None) -> None:
 
     if not isinstance(recipe, LoraRecipe):
         raise RecipeError(
-            "the recipe trains the compact network", "a large backbone's recipe", "train it without --plan"
+            "the recipe trains the compact network",
+            "--plan needs the recipe of a large backbone",
+            "train it without --plan",
         )
-    found = find_card(card)
-    if card is None and not is_local_gpu(found):
-        say(f"there is no graphics card here: planned for {found.name}, the paper's; --card names another")
-    estimate = estimate_resources(recipe, found)
+    gpu = find_card(card)
+    if card is None and not is_local_gpu(gpu):
+        print_status(
+            f"no graphics card found: the plan is for {gpu.name}, the paper's card; choose another with --card"
+        )
+    estimate = estimate_resources(recipe, gpu)
     print_out(estimate.table())
     estimate.check_fits()
 
 
-def _make(folder: Path) -> None:
+def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise TargetError(
-            f"{folder} cannot be made ({error.strerror})", "a folder for the run", "choose another with -o"
+            f"{folder} cannot be created ({error.strerror})",
+            "the run needs a folder that can be written",
+            "choose another with -o",
         ) from error

@@ -1,7 +1,19 @@
 """Inference: separates a photo into transmission and reflection. Imports neither the renderer nor the trainer."""
 
+from brewster.inference.batch import FileResult, SeparationTask, plan_files, separate_files, separate_tasks
 from brewster.inference.predictor import QUALITIES
 from brewster.inference.separator import Separation, Separator, separate
 from brewster.options import Quality
 
-__all__ = ["QUALITIES", "Quality", "Separation", "Separator", "separate"]
+__all__ = [
+    "QUALITIES",
+    "FileResult",
+    "Quality",
+    "Separation",
+    "SeparationTask",
+    "Separator",
+    "plan_files",
+    "separate",
+    "separate_files",
+    "separate_tasks",
+]

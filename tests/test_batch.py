@@ -1,0 +1,157 @@
+"""Batches from Python: names and folders, finished and existing files, errors and bugs of single files, streams."""
+
+import io
+from pathlib import Path
+
+import pytest
+
+from brewster import Photo, Separator
+from brewster.errors import ModelError, PhotoError, TargetError
+from brewster.inference import SeparationTask, plan_files, separate_files, separate_tasks
+from brewster.options import Options
+from front_door import LAYERS, picture, results, tree
+
+
+@pytest.fixture
+def separator():
+    return Separator(lambda tile: (0.8 * tile, 0.2 * tile), name="pane", sha256="0" * 64)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder with a photo, one in a subfolder, and a damaged one between them."""
+    (tmp_path / "in" / "c").mkdir(parents=True)
+    for name in ("a.jpg", "c/d.jpg"):
+        (tmp_path / "in" / name).write_bytes(picture())
+    (tmp_path / "in" / "b.jpg").write_bytes(b"no picture")
+    return tmp_path / "in"
+
+
+def test_a_folder_is_mirrored_and_a_damaged_photo_does_not_stop_the_batch(folder, tmp_path, separator):
+    found = list(separate_files(folder, tmp_path / "out", separator=separator))
+    assert [result.status for result in found] == ["separated", "failed", "separated"]
+    assert [result.source for result in found] == [
+        str(folder / name) for name in ("a.jpg", "b.jpg", "c/d.jpg")
+    ]
+    assert [result.error is None for result in found] == [True, False, True]
+    assert tree(tmp_path / "out") == sorted(results("a") + [f"c/{name}" for name in results("d")])
+    first = found[0]
+    assert (first.model, first.sha256, first.device) == ("pane", "0" * 64, "cpu")
+    assert first.outputs == {layer: str(tmp_path / f"out/a.{layer}.jpg") for layer in LAYERS}
+    assert set(first.seconds) == {"decode", "network", "detail", "encode"}
+    assert first.residual == pytest.approx(0, abs=0.01)
+
+
+def test_layers_are_written_next_to_their_photo_by_default(tmp_path, separator):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    (result,) = separate_files(str(tmp_path / "a.jpg"), separator=separator)
+    assert result.status == "separated"
+    assert tree(tmp_path) == ["a.jpg", *results("a")]
+
+
+def test_the_options_choose_layers_and_formats(tmp_path, separator):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    options = Options(layers=("transmission", "confidence"), format="tiff", strength=0)
+    list(separate_files([tmp_path / "a.jpg"], tmp_path / "out", options, separator))
+    assert tree(tmp_path / "out") == ["a.confidence.png", "a.transmission.tiff"]
+    written, photo = Photo.open(tmp_path / "out/a.transmission.tiff"), Photo.open(tmp_path / "a.jpg")
+    assert (written.pixels == photo.pixels).all()
+
+
+def test_finished_photos_are_skipped_without_a_model_and_missing_layers_are_added(tmp_path, separator):
+    (tmp_path / "a.jpg").write_bytes(picture())
+    list(separate_files(tmp_path, separator=separator))
+    no_model = Options(model="no-such-model")
+    (skipped,) = separate_files(tmp_path, options=no_model)
+    assert (skipped.status, set(skipped.outputs)) == ("skipped", set(LAYERS))
+    (tmp_path / "a.reflection.jpg").unlink()
+    (tmp_path / "a.transmission.jpg").write_bytes(b"mine")
+    (again,) = separate_files(tmp_path, separator=separator)
+    assert list(again.outputs) == ["reflection"]
+    assert (tmp_path / "a.transmission.jpg").read_bytes() == b"mine"
+    list(separate_files(tmp_path, separator=separator, overwrite=True))
+    assert Photo.open(tmp_path / "a.transmission.jpg").size == (60, 40)
+
+
+def test_a_dry_run_names_the_files_and_writes_nothing(folder, tmp_path):
+    planned = list(separate_files(folder, tmp_path / "out", Options(model="no-such-model"), dry_run=True))
+    assert [result.status for result in planned] == ["planned"] * 3
+    assert planned[2].outputs["reflection"] == str(tmp_path / "out/c/d.reflection.jpg")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_photo_of_the_batch_is_never_overwritten(tmp_path, separator):
+    for name in ("a.jpg", "a.transmission.jpg"):
+        (tmp_path / name).write_bytes(picture())
+    sources = [tmp_path / "a.jpg", tmp_path / "a.transmission.jpg"]
+    refused, separated = separate_files(sources, separator=separator, overwrite=True)
+    assert "is itself a photo" in refused.error
+    assert separated.status == "separated"
+    assert (tmp_path / "a.transmission.jpg").read_bytes() == picture()
+
+
+def test_names_and_sources_are_checked_before_the_first_photo_is_separated(tmp_path):
+    for place in ("x", "y", "empty"):
+        (tmp_path / place).mkdir()
+    for place in ("x", "y"):
+        (tmp_path / place / "a.jpg").write_bytes(picture())
+    with pytest.raises(TargetError, match="would both be written"):
+        separate_files([tmp_path / "x/a.jpg", tmp_path / "y/a.jpg"], tmp_path / "out")
+    with pytest.raises(PhotoError, match="there is no picture in"):
+        plan_files(tmp_path / "empty")
+
+
+def test_a_photo_is_separated_when_its_result_is_requested(folder, tmp_path, separator):
+    batch = separate_files(folder, tmp_path / "out", separator=separator)
+    assert not (tmp_path / "out").exists()
+    assert next(batch).status == "separated"
+    assert tree(tmp_path / "out") == results("a")
+
+
+def test_a_model_that_does_not_exist_ends_the_batch(folder, tmp_path):
+    with pytest.raises(ModelError):
+        next(separate_files(folder, tmp_path / "out", Options(model="no-such-model")))
+
+
+def test_an_unexpected_exception_is_raised_again_after_the_last_photo(
+    folder, tmp_path, monkeypatch, separator
+):
+    call = Separator.__call__
+
+    def fail_on_first(self, source, **options):
+        if Path(source).name == "a.jpg":
+            raise ZeroDivisionError("a bug")
+        return call(self, source, **options)
+
+    monkeypatch.setattr(Separator, "__call__", fail_on_first)
+    with pytest.raises(ZeroDivisionError, match="a bug"):
+        list(separate_files(folder, tmp_path / "out", separator=separator))
+    assert tree(tmp_path / "out") == [f"c/{name}" for name in results("d")]
+
+
+def test_progress_names_the_file_and_grows_and_keyboard_interrupt_stops(folder, tmp_path, separator):
+    calls = []
+    list(
+        separate_files(
+            folder, tmp_path / "out", separator=separator, on_progress=lambda *args: calls.append(args)
+        )
+    )
+    positions = [done + share for done, _, share in calls]
+    assert positions == sorted(positions)
+    assert {Path(name).name for _, name, _ in calls} == {"a.jpg", "b.jpg", "d.jpg"}
+
+    def stop(done, _name, share):
+        if share == 1.0:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        list(separate_files(folder, tmp_path / "other", separator=separator, on_progress=stop))
+    assert not (tmp_path / "other").exists()
+
+
+def test_photos_and_layers_may_be_streams(separator):
+    layer = io.BytesIO()
+    task = SeparationTask(io.BytesIO(picture(container="png")), {"transmission": layer})
+    (result,) = separate_tasks([task], separator=separator)
+    assert (result.source, result.status, result.outputs) == ("-", "separated", {"transmission": "-"})
+    assert Photo.open(layer.getvalue()).file_info.container == "png"
