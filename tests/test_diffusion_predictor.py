@@ -139,7 +139,9 @@ def test_photos_of_any_shape_come_back_in_their_size(width, height):
 
 
 def test_a_photo_that_is_smaller_than_a_token_is_refused_with_the_size_it_takes():
-    with pytest.raises(PhotoError, match=r"15 x 40 pixels; at least 16 pixels a side, .* or use the compact model"):
+    with pytest.raises(
+        PhotoError, match=r"15 x 40 pixels; at least 16 pixels a side, .* or use the compact model"
+    ):
         Separator(DiffusionPredictor(Oracle()))(smooth(15, 40))
 
 
