@@ -102,7 +102,7 @@ def _learn_to_see(backbone, seen, steps):
         kinds = [compose(layers, LAYOUT), conditioning_image(layers["I"], LAYOUT)]
         kinds += [kinds[0], compose(dict.fromkeys("ITR", layers["I"]), LAYOUT)]
         picture = kinds[step % 4]
-        return (backbone._show(backbone._see(picture)) - picture).square().mean()
+        return (backbone._vae_decode(backbone._vae_encode(picture)) - picture).square().mean()
 
     _minimise(loss, backbone.vae, steps, peak=4e-3)
 
