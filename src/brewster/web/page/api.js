@@ -37,7 +37,8 @@ function pollProgress(job, onProgress) {
   let timer = setTimeout(poll, POLL_MS);
   async function poll() {
     const response = await fetch(`progress/${job}`).catch(() => null);
-    if (timer && response?.ok) onProgress(await response.json());
+    const progress = timer && response?.ok ? await response.json() : null;
+    if (timer && progress) onProgress(progress); // not after stop(): a late report would undo the state "done"
     if (timer) timer = setTimeout(poll, POLL_MS);
   }
   return {
