@@ -55,7 +55,7 @@ def test_another_address_is_warned_of_and_gets_a_token(bare, served):
     code, _, err = bare("serve", "--host", "0.0.0.0")
     ((guard, how),) = served
     assert code == 0
-    assert "warning: whoever reaches 0.0.0.0" in err
+    assert "warning: everybody who can reach 0.0.0.0" in err
     assert guard.any_address
     assert len(guard.token) >= 16
     assert how["host"] == "0.0.0.0"
