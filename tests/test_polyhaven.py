@@ -421,7 +421,7 @@ def test_the_command_prints_results_and_how_many_maps_are_missing(command, tmp_p
     said = err.splitlines()
     assert said[0] == "a_room -> maps/a_room_4k.hdr (0.1 MB)"
     assert said[4] == "4 downloaded"
-    assert said[5].startswith("2 of 5 outdoor maps: the server has no more")
+    assert said[5].startswith("2 of 5 outdoor maps found: the server has no more")
     assert said[6].startswith("powered by Poly Haven")
     assert len(tree(tmp_path / "maps")) == 5
 

@@ -55,7 +55,7 @@ def test_another_address_prints_a_warning_and_gets_a_token(bare, served_apps):
     code, _, err = bare("serve", "--host", "0.0.0.0")
     ((limits, kwargs),) = served_apps
     assert code == 0
-    assert "warning: whoever reaches 0.0.0.0" in err
+    assert "warning: everybody who can reach 0.0.0.0" in err
     assert limits.any_address
     assert len(limits.token) >= 16
     assert kwargs["host"] == "0.0.0.0"

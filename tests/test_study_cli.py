@@ -76,7 +76,7 @@ def test_report_prints_tables_and_writes_all_files(bare, created, random):
     assert code == 0
     assert "### ours and RDNet" in out.decode()
     assert "12 participants (12 complete), 48 answers; 0 of 48 catch trials failed." in out.decode()
-    assert "all of it is in study/report" in err
+    assert "the report is in study/report" in err
     names = {path.name for path in (created.folder / "report").iterdir()}
     assert names == {"report.json", "report.md", "table.tex", "table.csv", "answers.csv", "plot.png"}
     # replaces the first report
@@ -149,7 +149,7 @@ def test_serving_on_another_address_prints_a_warning(created):
         link = server.stdout.readline().strip()
         # the server answers only after it has installed its signal handlers
         assert get(link).status_code < 400
-        assert "nothing they send is encrypted" in interrupted(server)
+        assert "the connection is not encrypted" in interrupted(server)
     assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{22}", link)
 
 
@@ -178,7 +178,7 @@ def test_an_invalid_token_file_is_refused(bare, created):
 )
 def test_a_name_that_no_host_header_contains_is_a_wrong_argument(bare, created, name):
     code, _, err = bare("study", "serve", "study", "--called", name, "--port", 0)
-    assert (code, "no bare name of a host" in err) == (2, True)
+    assert (code, "is not a bare host name" in err) == (2, True)
 
 
 def test_report_without_answers_makes_no_database(bare, created):
