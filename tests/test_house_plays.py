@@ -68,7 +68,7 @@ def test_the_full_size_check_runs_on_tiny_models(tmp_path, monkeypatch, capsys):
     rows = json.loads((tmp_path / "full_size.json").read_text())["rows"]
     assert [(row["backbone"], row["quantise"]) for row in rows] == [("kontext", "int8"), ("klein", None)]
     assert all(row["step_s"] > 0 and row["picture_s"] > 0 and row["fits"] for row in rows)
-    assert output["measured or estimated"] == ["rehearsed on a toy twin"] * 2
+    assert output["measured or estimated"] == ["toy twin, not full size"] * 2
     assert cells((tmp_path / "full_size.md").read_text()) == output
 
 
@@ -77,7 +77,7 @@ def test_without_a_gpu_the_full_size_check_prints_estimates(tmp_path):
     output = cells(run_script("full_size_check.sh", OUT=str(tmp_path), CUDA_VISIBLE_DEVICES=""))
     assert all(kind.startswith("ESTIMATED") for kind in output["measured or estimated"])
     assert float(output["parameters, billions"][0]) == 11.9
-    assert all(float(peak) < 24 for peak in output["peak while learning, GiB"])
+    assert all(float(peak) < 24 for peak in output["peak during training, GiB"])
 
 
 def test_every_command_of_the_paper_experiment_is_valid(tmp_path):

@@ -307,7 +307,7 @@ def test_an_unreachable_server_is_explained():
 def test_a_wrong_file_from_the_server_is_deleted(server, state, cache):
     remote = remote_file(server, saved(state))
     server.bodies["/whole.pth"] = bytes(remote.size)
-    with pytest.raises(DownloadError, match="was dropped"):
+    with pytest.raises(DownloadError, match="was deleted"):
         load_alexnet(remote, digest_of(state))
     assert list(cache.iterdir()) == []
 

@@ -78,7 +78,7 @@ def test_a_loopback_address_needs_no_token(bare, served_apps):
 def test_a_short_token_or_one_that_breaks_a_link_is_a_wrong_argument(bare, served_apps, token):
     code, _, err = bare("serve", "--token", token)
     assert code == 2
-    assert "16 letters" in err
+    assert "16 to 200 characters" in err
     assert not served_apps
 
 
