@@ -11,8 +11,8 @@ from brewster.errors import TargetError
 from brewster.web.application import listen, server_url
 from brewster.web.job_queue import JobQueue
 from brewster.web.middleware import RequestLimits
+from cli_helpers import picture
 from file_server import loopback_only
-from front_door import picture
 from glass_server import BlockingBackend, make_app, raw_exchange, served_port
 from other_processes import started
 

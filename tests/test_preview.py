@@ -10,7 +10,7 @@ from brewster.inference import Separator
 from brewster.options import Options
 from brewster.srgb import to_encoded, to_linear
 from brewster.web.preview import PREVIEW_PIXELS, preview
-from front_door import picture
+from cli_helpers import picture
 from glass_server import form, make_app, pane, request
 from picture_files import exif_block, file_of, smooth
 

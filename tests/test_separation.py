@@ -19,7 +19,7 @@ from brewster.web.job_queue import JobQueue
 from brewster.web.middleware import RequestLimits
 from brewster.web.model_cache import ModelCache
 from brewster.web.separation import separation_router
-from front_door import picture
+from cli_helpers import picture
 from glass_server import BlockingBackend, client, form, make_app, pane, request
 from picture_files import exif_block, file_of, smooth
 

@@ -11,7 +11,7 @@ import pytest
 from brewster import Photo
 from brewster.photo.file_info import FileInfo
 from brewster.srgb import to_encoded, to_linear
-from front_door import picture
+from cli_helpers import picture
 from glass_server import serve_process
 from picture_files import exif_block, file_of, smooth
 

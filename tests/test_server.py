@@ -12,8 +12,8 @@ from fastapi import APIRouter, Response
 from brewster.web import server
 from brewster.web.application import create_app
 from brewster.web.middleware import RequestLimits
+from cli_helpers import picture
 from file_server import loopback_only
-from front_door import picture
 from glass_server import BlockingBackend, make_app, raw_exchange, running_server, served_port
 
 PHOTO = picture(40, 30, "png")
