@@ -5,7 +5,7 @@ import numpy as np
 from brewster import Photo
 from brewster.user_study.create import StudyOptions, create
 from brewster.user_study.study import (
-    PICTURES,
+    PICTURES_FOLDER,
     CatchTrial,
     PairedComparison,
     Study,
@@ -91,5 +91,5 @@ def choice_for(trial, outcome):
 def copy_without_answers(study, folder):
     """The same study in another folder, without answers; shares the pictures."""
     folder.mkdir()
-    (folder / PICTURES).symlink_to(study.folder / PICTURES)
+    (folder / PICTURES_FOLDER).symlink_to(study.folder / PICTURES_FOLDER)
     return Study(folder, study.description)

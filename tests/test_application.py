@@ -13,8 +13,8 @@ from brewster.web.job_queue import JobQueue
 from brewster.web.middleware import RequestLimits
 from cli_helpers import picture
 from file_server import loopback_only
-from glass_server import BlockingBackend, make_app, raw_exchange, served_port
 from other_processes import started
+from web_servers import BlockingBackend, make_app, raw_exchange, served_port
 
 HEAD = "POST /separate HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Type: multipart/form-data; boundary=x\r\n"
 PLAIN = b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"

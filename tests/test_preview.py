@@ -9,10 +9,10 @@ from brewster import Photo
 from brewster.inference import Separator
 from brewster.options import Options
 from brewster.srgb import to_encoded, to_linear
-from brewster.web.preview import PREVIEW_PIXELS, preview
+from brewster.web.preview import MAX_PREVIEW_PIXELS, preview
 from cli_helpers import picture
-from glass_server import form, make_app, pane, request
 from picture_files import exif_block, file_of, smooth
+from web_servers import form, make_app, pane, request
 
 MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
 
@@ -87,7 +87,7 @@ def test_a_large_photo_is_made_smaller_and_looks_like_its_large_separation(shipp
     photo = Photo.from_array(pixels, encoding="srgb")
     maps = Maps(preview(shipped, photo, Options(quality="draft"), lambda _: None))
     assert maps.head["full"] == list(photo.size)
-    assert maps.head["width"] * maps.head["height"] == pytest.approx(PREVIEW_PIXELS, rel=0.01)
+    assert maps.head["width"] * maps.head["height"] == pytest.approx(MAX_PREVIEW_PIXELS, rel=0.01)
     whole = shipped(photo, quality="draft").transmission
     small = 255 * to_encoded(whole.resized(maps.head["width"], maps.head["height"]).clip(0, 1))
     difference = np.abs(small - maps.at(1)[0])

@@ -20,8 +20,8 @@ from brewster.web.middleware import RequestLimits
 from brewster.web.model_cache import ModelCache
 from brewster.web.separation import separation_router
 from cli_helpers import picture
-from glass_server import BlockingBackend, client, form, make_app, pane, request
 from picture_files import exif_block, file_of, smooth
+from web_servers import BlockingBackend, client, form, make_app, pane, request
 
 MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
 SMALL = picture(40, 30, "png")

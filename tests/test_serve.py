@@ -8,7 +8,7 @@ import pytest
 from brewster.cli import serve as command
 from brewster.cli.serve import serve
 from file_server import loopback_only
-from glass_server import serve_process
+from web_servers import serve_process
 
 
 @pytest.fixture

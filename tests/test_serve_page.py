@@ -12,8 +12,8 @@ from brewster import Photo
 from brewster.photo.file_info import FileInfo
 from brewster.srgb import to_encoded, to_linear
 from cli_helpers import picture
-from glass_server import serve_process
 from picture_files import exif_block, file_of, smooth
+from web_servers import serve_process
 
 TIMEOUT_MS = 120_000  # for slow machines
 MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"

@@ -14,7 +14,7 @@ from brewster.web.application import create_app
 from brewster.web.middleware import RequestLimits
 from cli_helpers import picture
 from file_server import loopback_only
-from glass_server import BlockingBackend, make_app, raw_exchange, running_server, served_port
+from web_servers import BlockingBackend, make_app, raw_exchange, running_server, served_port
 
 PHOTO = picture(40, 30, "png")
 FORM = b'--x\r\nContent-Disposition: form-data; name="photo"; filename="a.png"\r\n\r\n%b\r\n--x--\r\n' % PHOTO

@@ -11,7 +11,7 @@ import pytest
 
 from brewster import Photo
 from brewster.errors import BrewsterError
-from brewster.user_study.assignment import TrialDraw, draw_trials
+from brewster.user_study.assignment import Trial, draw_trials
 from brewster.user_study.report import figure
 from brewster.user_study.report.bradley_terry import strengths
 from brewster.user_study.report.figure import plot
@@ -198,7 +198,7 @@ def test_alpha_is_1_for_agreement_0_for_chance_and_none_where_undefined(random):
     [(False, "left", 0), (False, "right", 2), (True, "left", 2), (True, "right", 0), (True, "similar", 1)],
 )
 def test_the_outcome_of_a_choice_depends_on_the_side_of_the_first_method(flipped, choice, means):
-    assert outcome(TrialDraw("", "", "", 0, flipped), choice) == means
+    assert outcome(Trial("", "", "", 0, flipped), choice) == means
 
 
 def participant_answers(**fields):

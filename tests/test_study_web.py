@@ -12,8 +12,8 @@ from brewster.user_study.store import AnswerStore
 from brewster.web.application import create_app
 from brewster.web.middleware import RequestLimits
 from brewster.web.study import study_router
-from glass_server import request
 from small_studies import copy_without_answers, make_study
+from web_servers import request
 
 TOKEN = "a-token-nobody-guesses"
 
@@ -79,7 +79,7 @@ def test_the_pictures_of_a_trial_are_those_that_were_drawn(app, store, study):
 def test_no_response_contains_a_method_a_dataset_or_a_file_name(app, store, study):
     link = begin(app)
     paths = ["/", link, f"{link}/trial", "/invitation", "/openapi.json"]
-    paths += [f"/page/{name}" for name in ("study.js", "study.css", "lens.js", "style.css")]
+    paths += [f"/page/{name}" for name in ("study.js", "study.css", "pan_zoom.js", "style.css")]
     paths += [f"{link}/pictures/{trial}/{side}" for trial in range(8) for side in ("photo", "left", "right")]
     answers = [request(app, "GET", path) for path in paths] + [reply(app, link, 0), reply(app, link, 99)]
     names = {picture.name.removesuffix(".png") for picture in study.description.pictures}

@@ -22,7 +22,7 @@ CHOICES: Final[tuple[Choice, ...]] = ("left", "similar", "right")
 
 @final
 @dataclass(frozen=True)
-class TrialDraw:
+class Trial:
     """One trial: the names of three pictures and their origin.
 
     A normal trial has the number of its `comparison`; `flipped` is true if the comparison's first method is on the right.
@@ -37,7 +37,7 @@ class TrialDraw:
     expected: Choice | None = None
 
 
-def draw_trials(description: StudyDescription, number: int) -> tuple[TrialDraw, ...]:
+def draw_trials(description: StudyDescription, number: int) -> tuple[Trial, ...]:
     """The trials of one participant, in the order of presentation; `number` counts participants from 0.
 
     Computes the sequence from its start: 0.3 s for participant 10,000.
@@ -99,13 +99,13 @@ def _interleave(first: Sequence[int], second: Sequence[int]) -> list[int]:
     return [comparison for comparison in interleaved if comparison is not None]
 
 
-def _comparison_trial(description: StudyDescription, number: int, flipped: bool) -> TrialDraw:
+def _comparison_trial(description: StudyDescription, number: int, flipped: bool) -> Trial:
     comparison = description.comparisons[number]
     left, right = comparison.outputs[::-1] if flipped else comparison.outputs
-    return TrialDraw(comparison.photo, left, right, number, flipped)
+    return Trial(comparison.photo, left, right, number, flipped)
 
 
-def _catch_trials(description: StudyDescription, own: Collection[int], rng: Random) -> list[TrialDraw]:
+def _catch_trials(description: StudyDescription, own: Collection[int], rng: Random) -> list[Trial]:
     """The participant's catch trials, half of each kind, on photos that they do not see otherwise, if possible."""
     photos = {description.comparisons[number].photo for number in own}
     pool = rng.sample(description.catch_pool, len(description.catch_pool))
@@ -113,9 +113,9 @@ def _catch_trials(description: StudyDescription, own: Collection[int], rng: Rand
     return [_catch_trial(catch, i, rng) for i, catch in enumerate(pool[: description.catches])]
 
 
-def _catch_trial(catch: CatchTrial, i: int, rng: Random) -> TrialDraw:
+def _catch_trial(catch: CatchTrial, i: int, rng: Random) -> Trial:
     if i % 2 == 0:
-        return TrialDraw(catch.photo, catch.good, catch.good, expected="similar")
+        return Trial(catch.photo, catch.good, catch.good, expected="similar")
     if rng.random() < 0.5:
-        return TrialDraw(catch.photo, catch.good, catch.spoilt, expected="left")
-    return TrialDraw(catch.photo, catch.spoilt, catch.good, expected="right")
+        return Trial(catch.photo, catch.good, catch.spoilt, expected="left")
+    return Trial(catch.photo, catch.spoilt, catch.good, expected="right")

@@ -24,7 +24,7 @@ from brewster.photo import Photo
 from brewster.user_study.degrade import degrade
 from brewster.user_study.folders import Key, find_pictures, shorten_list
 from brewster.user_study.study import (
-    PICTURES,
+    PICTURES_FOLDER,
     CatchTrial,
     PairedComparison,
     Study,
@@ -104,7 +104,7 @@ def create(
         options.catches, DEFAULT_CATCHES, min(CATCH_POOL_SIZE, len(files.inputs)), "catch trials"
     )
     with atomic_path(out) as folder:
-        copier = _Copier(folder / PICTURES, Random(f"{seed}/names"), on_progress)  # noqa: S311  (the seed is published)
+        copier = _Copier(folder / PICTURES_FOLDER, Random(f"{seed}/names"), on_progress)  # noqa: S311  (the seed is published)
         comparisons = tuple(_comparisons(files, pairs, copier))
         pool = tuple(_catch_pool(files, copier, Random(f"{seed}/catches")))  # noqa: S311
         description = StudyDescription(

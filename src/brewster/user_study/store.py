@@ -24,7 +24,7 @@ from threading import Lock
 from typing import Final, final
 
 from brewster.errors import BrewsterError, TargetError
-from brewster.user_study.assignment import CHOICES, Choice, TrialDraw, draw_trials
+from brewster.user_study.assignment import CHOICES, Choice, Trial, draw_trials
 from brewster.user_study.study import ANSWERS_FILE, Study
 
 MAX_SECONDS: Final = 3600.0
@@ -46,7 +46,7 @@ class Participant:
     """A participant: their number, counted from 0, and their trials in order."""
 
     number: int
-    trials: tuple[TrialDraw, ...]
+    trials: tuple[Trial, ...]
 
 
 @final
@@ -226,5 +226,5 @@ def _read_only_uri(file: Path) -> str:
     return f"{file.resolve().as_uri()}?mode=ro{'&immutable=1' if is_immutable else ''}"
 
 
-def _parse_trials(text: str) -> tuple[TrialDraw, ...]:
-    return tuple(TrialDraw(**row) for row in json.loads(text))
+def _parse_trials(text: str) -> tuple[Trial, ...]:
+    return tuple(Trial(**row) for row in json.loads(text))

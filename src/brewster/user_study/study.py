@@ -22,9 +22,9 @@ from brewster.errors import BrewsterError
 from brewster.files import write_atomically
 
 DESCRIPTION_FILE: Final = "study.json"
-PICTURES: Final = "pictures"
+PICTURES_FOLDER: Final = "pictures"
 ANSWERS_FILE: Final = "answers.sqlite"
-FORMAT: Final = 1
+FORMAT_VERSION: Final = 1
 UNNAMED_DATASET: Final = ""
 """The name of the only dataset if the source folders have no subfolders."""
 
@@ -87,7 +87,7 @@ class StudyDescription:
     pictures: tuple[StudyPicture, ...]
     comparisons: tuple[PairedComparison, ...]
     catch_pool: tuple[CatchTrial, ...]
-    format: int = FORMAT
+    format: int = FORMAT_VERSION
 
 
 _DESCRIPTION: Final = TypeAdapter(StudyDescription)
@@ -103,7 +103,7 @@ class Study:
 
     def picture_file(self, picture: str) -> Path:
         """The path of a picture."""
-        return self.folder / PICTURES / picture
+        return self.folder / PICTURES_FOLDER / picture
 
     def picture(self, name: str) -> StudyPicture:
         """The description of a picture by its name."""
@@ -135,7 +135,7 @@ class Study:
         changed = list(self.changed_pictures())
         if changed:
             raise BrewsterError(
-                f"{self.folder / PICTURES / changed[0]} is missing or changed, and {len(changed) - 1} others",
+                f"{self.folder / PICTURES_FOLDER / changed[0]} is missing or changed, and {len(changed) - 1} others",
                 "all participants of a study see the same pictures",
                 "copy the study again from its original folder",
             )
@@ -177,10 +177,10 @@ def read_study(folder: Path) -> Study:
             "an unchanged file written by `brewster study create`",
             "create the study again",
         ) from error
-    if description.format != FORMAT:
+    if description.format != FORMAT_VERSION:
         raise BrewsterError(
             f"{path} has format {description.format}",
-            f"this version reads format {FORMAT}",
+            f"this version reads format {FORMAT_VERSION}",
             f"use brewster {description.brewster}",
         )
     return Study(folder, description)

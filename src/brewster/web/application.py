@@ -37,7 +37,7 @@ from brewster.web.middleware import SECURITY_HEADERS, LimitMiddleware, RequestLi
 from brewster.web.request_schema import validation_message
 from brewster.web.server import create_server
 
-PAGE: Final = Path(__file__).parent / "page"
+PAGE_FOLDER: Final = Path(__file__).parent / "page"
 _STATUS_CODES: Final[dict[type[BrewsterError], int]] = {
     PhotoTooLarge: 413,
     UnreadablePhoto: 422,
@@ -66,14 +66,14 @@ def create_app(*routers: APIRouter, limits: RequestLimits, index: str = "index.h
     for router in routers:
         app.include_router(router)
     _add_page(app, "/", index)
-    for file in sorted(PAGE.iterdir()):
+    for file in sorted(PAGE_FOLDER.iterdir()):
         _add_page(app, f"/page/{file.name}", file.name)
     return app
 
 
 def page_response(name: str) -> Response:
     """A file of web/page/; browsers revalidate it on each use."""
-    return FileResponse(PAGE / name, headers={"Cache-Control": "no-cache"})
+    return FileResponse(PAGE_FOLDER / name, headers={"Cache-Control": "no-cache"})
 
 
 def _add_page(app: FastAPI, path: str, name: str) -> None:

@@ -22,7 +22,7 @@ from brewster.options import Options
 from brewster.photo import Photo
 from brewster.srgb import to_encoded
 
-PREVIEW_PIXELS: Final = 1_400_000
+MAX_PREVIEW_PIXELS: Final = 1_400_000
 """Larger photos are reduced to about this number of pixels, which fills a window."""
 
 RANGE_MIN, RANGE_MAX = -1.0, 2.0
@@ -72,7 +72,7 @@ def preview(
 
 
 def _preview_size(size: tuple[int, int]) -> tuple[int, int]:
-    scale = min(1.0, math.sqrt(PREVIEW_PIXELS / math.prod(size)))
+    scale = min(1.0, math.sqrt(MAX_PREVIEW_PIXELS / math.prod(size)))
     return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 

@@ -182,7 +182,7 @@ class _StudyRoutes:
         return TrialResponse(trial=trial, trials=count, width=photo.width, height=photo.height)
 
 
-def _trial(participant: Participant, trial: int) -> assignment.TrialDraw:
+def _trial(participant: Participant, trial: int) -> assignment.Trial:
     if not 0 <= trial < len(participant.trials):
         raise HTTPException(404, f"there is no trial {trial}; load the page again")
     return participant.trials[trial]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Final, Literal, final
 
-from brewster.user_study.assignment import Choice, TrialDraw
+from brewster.user_study.assignment import Choice, Trial
 from brewster.user_study.store import Participant, StoredAnswer
 
 OUTCOMES: Final = ("win", "tie", "lose")
@@ -74,7 +74,7 @@ def _participant_answers(participant: Participant, answers: Mapping[int, StoredA
     )
 
 
-def outcome(trial: TrialDraw, choice: Choice) -> int:
+def outcome(trial: Trial, choice: Choice) -> int:
     """The outcome of a choice for the first method of the comparison, as an index of OUTCOMES."""
     if choice == "similar":
         return 1

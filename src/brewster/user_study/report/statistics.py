@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 RESAMPLES: Final = 10_000
 SEED: Final = 20_261_121
-_EQUAL: Final = 1e-9
+_TOLERANCE: Final = 1e-9
 
 Floats = NDArray[np.float64]
 
@@ -130,14 +130,14 @@ def with_agreement_bounds(
         dataset.
     """
     bound, shares = bounds[..., None], rows[..., :3]
-    is_one, is_zero = shares > 1 - _EQUAL, shares < _EQUAL
+    is_one, is_zero = shares > 1 - _TOLERANCE, shares < _TOLERANCE
     lows = np.where(is_one, bound, np.where(is_zero, 0.0, np.nan))
     highs = np.where(is_one, 1.0, np.where(is_zero, 1 - bound, np.nan))
     lows, highs = (
         np.concatenate([own, own[..., :1] - other[..., 2:]], axis=-1)
         for own, other in ((lows, highs), (highs, lows))
     )
-    return np.where(ends[1] - ends[0] < _EQUAL, np.stack([lows, highs]), ends)
+    return np.where(ends[1] - ends[0] < _TOLERANCE, np.stack([lows, highs]), ends)
 
 
 def _expanded_percentiles(participants: int) -> tuple[float, float]:

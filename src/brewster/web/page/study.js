@@ -1,7 +1,7 @@
 // The page of the user study: consent, trials, end. The server stores the progress of a participant. The page requests
 // the next trial, shows its three pictures, and continues after the server has acknowledged the answer.
 
-import { Lens } from "./lens.js";
+import { PanZoom } from "./pan_zoom.js";
 
 const PARTICIPANT_TOKEN = location.pathname.match(/^\/s\/([^/]+)/)?.[1];
 const MIN_ANSWER_DELAY = 300; // ms; earlier answers are ignored, because a double click belongs to the previous pictures
@@ -10,7 +10,7 @@ const KEYS = { 1: "left", 2: "similar", 3: "right", ArrowLeft: "left", ArrowRigh
 const byId = (id) => document.getElementById(id);
 const sections = ["invitation", "trial", "finish", "error"];
 const frames = { left: frame("left"), photo: frame("photo"), right: frame("right") };
-const lens = new Lens(byId("pictures"), Object.values(frames));
+const panZoom = new PanZoom(byId("pictures"), Object.values(frames));
 const preloaded = []; // the pictures of the next trial, held in memory
 let state = null; // the current trial, as returned by the server
 let shownAt = null; // time at which its pictures were shown; null while no answer is accepted
@@ -121,7 +121,7 @@ async function showTrial(next) {
   byId("pictures").classList.toggle("tall", next.width < next.height);
   for (const side of sides) frames[side].firstElementChild.src = pictureUrl(next.trial, side);
   await Promise.all(sides.map((side) => frames[side].firstElementChild.decode()));
-  lens.reset(next.width, next.height);
+  panZoom.reset(next.width, next.height);
   byId("trial").classList.remove("waiting");
   updateChoices(null, false);
   byId("announcement").textContent = number;
@@ -164,16 +164,16 @@ addEventListener("keydown", (event) => {
   if (byId("trial").hidden || event.ctrlKey || event.metaKey || event.altKey) return;
   const answers = event.key in KEYS ? !event.shiftKey : event.key === "Enter" && byId("choices").contains(event.target);
   if (event.repeat && answers) return event.preventDefault(); // a held key counts as one answer
-  if (event.shiftKey ? lens.press(`Shift+${event.key}`) || lens.press(event.key) : lens.press(event.key)) event.preventDefault();
+  if (event.shiftKey ? panZoom.press(`Shift+${event.key}`) || panZoom.press(event.key) : panZoom.press(event.key)) event.preventDefault();
   else if (event.key in KEYS && !event.shiftKey) {
     event.preventDefault();
     choose(KEYS[event.key]);
   }
 });
 
-for (const button of byId("zoom").children) button.addEventListener("click", () => lens.zoom(button.dataset.zoom));
+for (const button of byId("zoom").children) button.addEventListener("click", () => panZoom.zoom(button.dataset.zoom));
 byId("pictures").addEventListener("zoomed", () => {
-  document.querySelector("[data-zoom=full]").setAttribute("aria-pressed", lens.isFull);
+  document.querySelector("[data-zoom=full]").setAttribute("aria-pressed", panZoom.isFull);
 });
 
 byId("copy").addEventListener("click", async () => {

@@ -5,7 +5,7 @@ const MAX_PIXEL_SIZE = 8; // maximum size of a picture pixel in screen pixels
 const ZOOM_STEP = 1.5;
 const PAN_STEP = 0.12;
 
-export class Lens {
+export class PanZoom {
   #scale = 1;
   #x = 0; // offsets of the left and upper edge, in shares of the frame: 0 or less
   #y = 0;
