@@ -1,11 +1,12 @@
 // The page of the user study: consent, trials, end. The server stores the progress of a participant. The page requests
-// the next trial, shows its three pictures, and continues after the server has acknowledged the answer.
+// the next trial, shows its three pictures, sends the answer, and continues after the server has acknowledged it.
 
 import { PanZoom } from "./pan_zoom.js";
 
 const PARTICIPANT_TOKEN = location.pathname.match(/^\/s\/([^/]+)/)?.[1];
-const MIN_ANSWER_DELAY = 300; // ms; earlier answers are ignored, because a double click belongs to the previous pictures
-const KEYS = { 1: "left", 2: "similar", 3: "right", ArrowLeft: "left", ArrowRight: "right" }; // the arrows up and down scroll
+// In ms. Earlier answers are ignored, because they may be the second click of a double click in the previous trial.
+const MIN_ANSWER_DELAY = 300;
+const KEYS = { 1: "left", 2: "similar", 3: "right", ArrowLeft: "left", ArrowRight: "right" }; // the up and down arrows scroll
 
 const byId = (id) => document.getElementById(id);
 const sections = ["invitation", "trial", "finish", "error"];
@@ -26,7 +27,8 @@ function show(section) {
 
 // --- requests
 
-// Sends a request and returns the response data. Repeats it after network and server errors; throws after client errors.
+// Sends a request and returns the data of the response. Repeats the request after a network or server error, and throws after
+// a client error.
 async function send(path, body) {
   for (let wait = 1; ; wait = Math.min(2 * wait, 15)) {
     try {
@@ -57,7 +59,7 @@ function notice(text) {
   byId("notice").hidden = !text;
 }
 
-function fail(error) {
+function showError(error) {
   byId("error-text").textContent = error.message;
   show("error");
 }
@@ -82,7 +84,7 @@ byId("agreement").addEventListener("submit", async (event) => {
   try {
     location.assign((await send("/participants", { agreed: true })).link);
   } catch (error) {
-    fail(error);
+    showError(error);
   }
 });
 
@@ -111,7 +113,7 @@ async function showTrial(next) {
   state = next;
   if (next.trial === null) return finish(next);
   const number = `Pair ${next.trial + 1} of ${next.trials}`;
-  byId("where").textContent = number;
+  byId("position").textContent = number;
   byId("bar").value = next.trial / next.trials;
   byId("trial").classList.add("waiting");
   show("trial");
@@ -148,7 +150,7 @@ async function choose(choice) {
     const answer = await send(`/s/${PARTICIPANT_TOKEN}/answers`, { trial: state.trial, choice, seconds });
     await showTrial(answer.next);
   } catch (error) {
-    fail(error);
+    showError(error);
   }
 }
 
@@ -191,5 +193,5 @@ byId("retry").addEventListener("click", () => location.reload());
 try {
   await (PARTICIPANT_TOKEN ? showTrial(await send(`/s/${PARTICIPANT_TOKEN}/trial`)) : showInvitation());
 } catch (error) {
-  fail(error);
+  showError(error);
 }
