@@ -23,7 +23,7 @@ check_shapes()
 from brewster import Photo  # noqa: E402
 from brewster.cli import main  # noqa: E402
 from brewster.errors import MissingExtra  # noqa: E402
-from front_door import write_pane  # noqa: E402
+from cli_helpers import write_pane  # noqa: E402
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 

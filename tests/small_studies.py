@@ -5,7 +5,7 @@ import numpy as np
 from brewster import Photo
 from brewster.user_study.create import StudyOptions, create
 from brewster.user_study.study import (
-    PICTURES,
+    PICTURES_FOLDER,
     CatchTrial,
     PairedComparison,
     Study,
@@ -17,7 +17,7 @@ from brewster.user_study.study import (
 def make_description(
     pictures=20, *, methods=("ours", "RDNet"), datasets=("real", "nature"), pairs=8, catches=2, seed=7
 ):
-    """A description without picture files: `pictures` for each dataset, the first method against each of the others."""
+    """A description without picture files, with `pictures` photos in each dataset; compares the first method with each other."""
     photos = [(dataset, str(i)) for dataset in datasets for i in range(pictures)]
     comparisons = [
         PairedComparison(
@@ -37,7 +37,7 @@ def make_description(
         seed=seed,
         pairs=pairs,
         catches=catches,
-        consent="Yes?",
+        consent="The consent text.",
         methods=tuple(methods),
         datasets=tuple(datasets),
         pictures=tuple(StudyPicture(name, 3, 2, "", "") for name in sorted(names)),
@@ -89,7 +89,7 @@ def choice_for(trial, outcome):
 
 
 def copy_without_answers(study, folder):
-    """The same study in another folder, without answers; shares the pictures."""
+    """The same study in another folder, without answers; the folder links to the pictures."""
     folder.mkdir()
-    (folder / PICTURES).symlink_to(study.folder / PICTURES)
+    (folder / PICTURES_FOLDER).symlink_to(study.folder / PICTURES_FOLDER)
     return Study(folder, study.description)

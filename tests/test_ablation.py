@@ -16,7 +16,7 @@ from brewster.errors import RecipeError
 from brewster.evaluate import ablation as module
 from brewster.evaluate.ablation import ablate, read_study
 from brewster.training.recipe import read_recipe, with_value
-from front_door import as_user
+from cli_helpers import as_user
 
 RECIPES = Path(__file__).parents[1] / "recipes" / "ablations"
 STUDIES = [path for path in sorted(RECIPES.glob("*.toml")) if "base" in tomllib.loads(path.read_text())]

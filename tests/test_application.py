@@ -1,4 +1,4 @@
-"""The application over a real socket."""
+"""The application, tested over a real socket."""
 
 import signal
 import socket
@@ -11,10 +11,10 @@ from brewster.errors import TargetError
 from brewster.web.application import listen, server_url
 from brewster.web.job_queue import JobQueue
 from brewster.web.middleware import RequestLimits
+from cli_helpers import picture
 from file_server import loopback_only
-from front_door import picture
-from glass_server import BlockingBackend, make_app, raw_exchange, served_port
 from other_processes import started
+from web_servers import BlockingBackend, make_app, raw_exchange, served_port
 
 HEAD = "POST /separate HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Type: multipart/form-data; boundary=x\r\n"
 PLAIN = b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
@@ -35,8 +35,8 @@ def post_request(body=FORM):
     return head(f"Content-Length: {len(body)}"), body
 
 
-def status(answer):
-    return int(answer.split(b" ", 2)[1]) if answer else None
+def status(response):
+    return int(response.split(b" ", 2)[1]) if response else None
 
 
 def chunk(data):
@@ -45,16 +45,16 @@ def chunk(data):
 
 def test_a_photo_is_separated_over_a_socket():
     with served_port(make_app()) as port:
-        answer = raw_exchange(port, *post_request())
-    assert status(answer) == 200
-    assert b"server:" not in answer.lower().partition(b"\r\n\r\n")[0]
+        response = raw_exchange(port, *post_request())
+    assert status(response) == 200
+    assert b"server:" not in response.lower().partition(b"\r\n\r\n")[0]
 
 
-def test_an_upload_that_is_too_large_gets_a_response_to_its_end():
+def test_an_upload_that_is_too_large_gets_a_complete_response():
     """A client that sends everything before it reads must receive the response, not a broken connection."""
     with served_port(make_app(limits=RequestLimits(max_bytes=10_000))) as port:
-        long = bytes(3_000_000)
-        assert status(raw_exchange(port, head(f"Content-Length: {len(long)}"), long)) == 413
+        body = bytes(3_000_000)
+        assert status(raw_exchange(port, head(f"Content-Length: {len(body)}"), body)) == 413
         chunked = [chunk(bytes(100_000)) for _ in range(30)]
         assert status(raw_exchange(port, head("Transfer-Encoding: chunked"), *chunked, chunk(b""))) == 413
         assert status(raw_exchange(port, *post_request())) == 200
@@ -62,9 +62,9 @@ def test_an_upload_that_is_too_large_gets_a_response_to_its_end():
 
 def test_a_slow_upload_is_refused():
     with served_port(make_app(limits=RequestLimits(body_seconds=0.1))) as port:
-        answer = raw_exchange(port, head(f"Content-Length: {len(FORM)}"), FORM[:50])
-        assert status(answer) == 408
-        assert b"send it again" in answer
+        response = raw_exchange(port, head(f"Content-Length: {len(FORM)}"), FORM[:50])
+        assert status(response) == 408
+        assert b"send it again" in response
         # a request without a body: on a slow machine a body could exceed the limit, too
         assert status(raw_exchange(port, PLAIN)) == 200
 
@@ -76,9 +76,9 @@ def test_an_interrupted_upload_releases_its_place():
             with socket.create_connection(("127.0.0.1", port)) as connection:
                 connection.sendall(head(f"Content-Length: {len(FORM)}") + FORM[:end])
         # the server has not yet released the place of the last upload
-        while status(answer := raw_exchange(port, *post_request())) == 503:
-            assert b"Retry-After" in answer or b"retry-after" in answer
-        assert status(answer) == 200
+        while status(response := raw_exchange(port, *post_request())) == 503:
+            assert b"Retry-After" in response or b"retry-after" in response
+        assert status(response) == 200
     assert job_queue.jobs == 0
 
 
@@ -95,11 +95,11 @@ def test_a_broken_connection_stops_the_work():
 
 
 @pytest.mark.parametrize(
-    "rubbish", [b"\x16\x03\x01\x02\x00", b"GET / HTTP/9\r\n\r\n", b"\r\n\r\nnonsense\r\n\r\n"]
+    "invalid_bytes", [b"\x16\x03\x01\x02\x00", b"GET / HTTP/9\r\n\r\n", b"\r\n\r\nnonsense\r\n\r\n"]
 )
-def test_a_request_that_is_not_http_is_refused(rubbish):
+def test_a_request_that_is_not_http_is_refused(invalid_bytes):
     with served_port(make_app()) as port:
-        assert status(raw_exchange(port, rubbish + b"\r\n\r\n")) in (400, None)
+        assert status(raw_exchange(port, invalid_bytes + b"\r\n\r\n")) in (400, None)
         assert status(raw_exchange(port, *post_request())) == 200
 
 
@@ -121,7 +121,7 @@ def test_serve_returns_to_its_caller_after_a_signal(signal_number):
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with started([sys.executable, "-c", SERVING], **pipes) as process:
         url = process.stdout.readline()
-        # the server answers only after it has installed its signal handlers
+        # the server responds only after it has installed its signal handlers
         raw_exchange(int(url.split(":")[2].strip("/\n")), PLAIN)
         process.send_signal(signal_number)
         out, err = process.communicate()

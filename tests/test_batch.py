@@ -9,7 +9,7 @@ from brewster import Photo, Separator
 from brewster.errors import ModelError, PhotoError, TargetError
 from brewster.inference import SeparationTask, plan_files, separate_files, separate_tasks
 from brewster.options import Options
-from front_door import LAYERS, picture, results, tree
+from cli_helpers import LAYERS, picture, results, tree
 
 
 @pytest.fixture

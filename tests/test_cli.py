@@ -22,7 +22,7 @@ from brewster.image_formats import WRITABLE
 from brewster.inference import QUALITIES
 from brewster.inference.onnx_backend import DEVICES
 from brewster.options import Options
-from front_door import as_user, lines, picture, tree
+from cli_helpers import as_user, lines, picture, tree
 
 ROOT = Path(__file__).parents[1]
 

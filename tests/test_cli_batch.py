@@ -13,7 +13,7 @@ import pyvips
 
 from brewster import Photo
 from brewster.inference import Separator
-from front_door import LAYERS, errors, lines, picture, results, tree
+from cli_helpers import LAYERS, errors, lines, picture, results, tree
 
 # --- damaged photos
 

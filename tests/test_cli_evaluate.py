@@ -12,7 +12,7 @@ from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from benchmark_folders import paint, picture, write
-from front_door import errors
+from cli_helpers import errors
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import pytest
 from brewster import Photo
 from brewster.errors import UnreadablePhoto
 from brewster.inference import Separator
-from front_door import errors, lines, picture, results, tree
+from cli_helpers import errors, lines, picture, results, tree
 from other_processes import started, wait_for
 
 

@@ -10,7 +10,7 @@ import pytest
 from brewster import Photo, Separator
 from brewster.cli.extras import CORE, EXTRAS
 from brewster.models import zoo
-from front_door import picture
+from cli_helpers import picture
 
 ROOT = Path(__file__).parents[1]
 

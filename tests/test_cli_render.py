@@ -18,7 +18,7 @@ from brewster.cli import main
 from brewster.environments import assets
 from brewster.rendered import store
 from brewster.rendered.generation import workers
-from front_door import as_user, errors, lines
+from cli_helpers import as_user, errors, lines
 from set_folders import hashes
 
 FAKED = """

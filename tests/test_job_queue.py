@@ -1,3 +1,5 @@
+"""The job queue: limits, time limit, cancellation and progress."""
+
 import asyncio
 import contextlib
 from threading import Event
@@ -25,7 +27,7 @@ class BlockingWork:
             self.ended.append("stopped")
             raise
         self.ended.append("done")
-        return "answer"
+        return "result"
 
 
 class Client:
@@ -44,36 +46,36 @@ async def submit(job_queue, work, client=None, name=None):
         return await job_queue.run_job(job, work, client or Client())
 
 
-async def until(is_so):
-    while not is_so():
+async def wait_until(condition):
+    while not condition():
         await asyncio.sleep(0.001)
 
 
 def test_a_job_returns_its_result_and_releases_its_place():
     async def scenario(job_queue, work):
         work.proceed.set()
-        assert await submit(job_queue, work) == "answer"
-        await until(lambda: not job_queue.jobs)
+        assert await submit(job_queue, work) == "result"
+        await wait_until(lambda: not job_queue.jobs)
 
     asyncio.run(scenario(JobQueue(), BlockingWork()))
 
 
 def test_an_exception_of_the_work_is_raised():
-    def fails(on_progress):
-        raise KeyError("mine")
+    def raise_error(on_progress):
+        raise KeyError("the error")
 
-    with pytest.raises(KeyError, match="mine"):
-        asyncio.run(submit(JobQueue(), fails))
+    with pytest.raises(KeyError, match="the error"):
+        asyncio.run(submit(JobQueue(), raise_error))
 
 
 def test_a_full_queue_refuses_with_retry_after():
     async def scenario(job_queue, work):
         waiting = [asyncio.create_task(submit(job_queue, work)) for _ in range(3)]
-        await until(lambda: job_queue.jobs == 3)
+        await wait_until(lambda: job_queue.jobs == 3)
         with pytest.raises(HTTPException, match="full with 3 photos") as refused:
             await submit(job_queue, work)
         work.proceed.set()
-        assert await asyncio.gather(*waiting) == ["answer"] * 3
+        assert await asyncio.gather(*waiting) == ["result"] * 3
         return refused.value
 
     refused = asyncio.run(scenario(JobQueue(workers=1, max_waiting=2), BlockingWork()))
@@ -86,14 +88,14 @@ def test_a_client_that_disconnects_stops_its_own_work_only():
         client = Client()
         leaving = asyncio.create_task(submit(job_queue, work, client))
         staying = asyncio.create_task(submit(job_queue, other))
-        await until(work.started.is_set)
+        await wait_until(work.started.is_set)
         client.disconnected.set()
         with pytest.raises(ClientDisconnect):
             await leaving
         assert job_queue.jobs == 2  # the thread still runs and uses memory
         work.proceed.set()
         other.proceed.set()
-        assert await staying == "answer"
+        assert await staying == "result"
 
     work, other = BlockingWork(), BlockingWork()
     asyncio.run(scenario(JobQueue(), work, other))
@@ -103,10 +105,10 @@ def test_a_client_that_disconnects_stops_its_own_work_only():
 def test_waiting_work_whose_client_disconnects_never_starts():
     async def scenario(job_queue, work, late):
         first = asyncio.create_task(submit(job_queue, work))
-        await until(work.started.is_set)
+        await wait_until(work.started.is_set)
         client = Client()
         second = asyncio.create_task(submit(job_queue, late, client))
-        await until(lambda: job_queue.jobs == 2)
+        await wait_until(lambda: job_queue.jobs == 2)
         client.disconnected.set()
         with pytest.raises(ClientDisconnect):
             await second
@@ -125,22 +127,22 @@ def test_work_that_takes_too_long_is_stopped():
             await submit(job_queue, work)
         assert refused.value.status_code == 504
         work.proceed.set()
-        await until(lambda: not job_queue.jobs)
+        await wait_until(lambda: not job_queue.jobs)
 
     work = BlockingWork()
     asyncio.run(scenario(JobQueue(timeout_seconds=0.01), work))
     assert work.ended == ["stopped"]
 
 
-def test_a_server_that_stops_cancels_the_work():
+def test_cancelling_the_request_cancels_the_work():
     async def scenario(job_queue, work):
         task = asyncio.create_task(submit(job_queue, work))
-        await until(work.started.is_set)
+        await wait_until(work.started.is_set)
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await task
         work.proceed.set()
-        await until(lambda: not job_queue.jobs)
+        await wait_until(lambda: not job_queue.jobs)
 
     work = BlockingWork()
     asyncio.run(scenario(JobQueue(), work))
@@ -153,7 +155,7 @@ def test_progress_contains_the_place_in_the_queue_and_the_share():
             asyncio.create_task(submit(job_queue, work, name=f"job-{number}"))
             for number, work in enumerate(works)
         ]
-        await until(lambda: job_queue.jobs == 3 and job_queue.progress("job-0").share == 0.25)
+        await wait_until(lambda: job_queue.jobs == 3 and job_queue.progress("job-0").share == 0.25)
         progress = [job_queue.progress(f"job-{number}") for number in range(3)]
         for work in works:
             work.proceed.set()
@@ -165,7 +167,7 @@ def test_progress_contains_the_place_in_the_queue_and_the_share():
     assert progress == [("working", 0), ("waiting", 1), ("waiting", 2)]
 
 
-def test_two_jobs_cannot_have_one_name():
+def test_two_jobs_cannot_have_the_same_name():
     job_queue = JobQueue()
     with job_queue.reserve("one"):
         with pytest.raises(HTTPException, match="choose another name"), job_queue.reserve("one"):

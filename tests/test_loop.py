@@ -13,7 +13,7 @@ from brewster.training.compact.trainer import CompactTrainer, train
 from brewster.training.data.image_loading import read_photos
 from brewster.training.loop import run
 from brewster.training.recipe import with_value
-from front_door import picture
+from cli_helpers import picture
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 

@@ -1,3 +1,5 @@
+"""The checks of host, origin, token and body size."""
+
 import asyncio
 import string
 
@@ -9,9 +11,9 @@ from hypothesis import strategies as st
 
 from brewster.web.application import create_app
 from brewster.web.middleware import RequestLimits, is_loopback
-from glass_server import client, request
+from web_servers import client, request
 
-TOKEN = "a-token-nobody-guesses"
+TOKEN = "a-token-for-the-tests"
 
 
 def app_with(limits):
@@ -30,7 +32,7 @@ def app():
 
 
 @pytest.fixture
-def locked():
+def app_with_token():
     return app_with(RequestLimits(token=TOKEN))
 
 
@@ -42,7 +44,7 @@ def post(app, **what):
 
 
 @pytest.mark.parametrize("host", ["localhost", "localhost:8417", "127.0.0.1:9", "[::1]:8417", "LOCALHOST"])
-def test_the_names_of_this_machine_are_accepted(app, host):
+def test_the_loopback_names_are_accepted(app, host):
     assert request(app, "GET", "/", headers={"host": host}).status_code == 200
 
 
@@ -69,9 +71,9 @@ def test_the_names_of_this_machine_are_accepted(app, host):
 )
 def test_a_foreign_host_is_refused(app, host):
     for method in ("GET", "POST"):
-        answer = request(app, method, "/", headers={"host": host})
-        assert answer.status_code == 421
-        assert "does not name this server" in answer.json()["error"]
+        response = request(app, method, "/", headers={"host": host})
+        assert response.status_code == 421
+        assert "does not name this server" in response.json()["error"]
 
 
 @given(name=st.text(string.ascii_lowercase + string.digits + ".-", min_size=1))
@@ -122,9 +124,9 @@ def test_only_loopback_counts_as_this_machine(host, is_local):
     ],
 )
 def test_a_post_from_another_site_is_refused(app, headers):
-    answer = post(app, headers=headers)
-    assert answer.status_code == 403
-    assert "another site" in answer.json()["error"]
+    response = post(app, headers=headers)
+    assert response.status_code == 403
+    assert "another site" in response.json()["error"]
 
 
 @pytest.mark.parametrize(
@@ -134,12 +136,12 @@ def test_a_post_from_the_same_origin_or_without_origin_is_accepted(app, headers)
     assert post(app, content=b"abc", headers=headers).json() == 3
 
 
-def test_there_is_no_cors(app):
+def test_no_response_has_cors_headers(app):
     origin = {"origin": "http://evil.com", "access-control-request-method": "POST"}
     for method in ("GET", "OPTIONS"):
-        answer = request(app, method, "/length", headers=origin)
-        assert not [name for name in answer.headers if name.startswith("access-control")]
-        assert answer.status_code == 405
+        response = request(app, method, "/length", headers=origin)
+        assert not [name for name in response.headers if name.startswith("access-control")]
+        assert response.status_code == 405
 
 
 def test_the_response_to_a_bug_has_security_headers():
@@ -155,23 +157,23 @@ def test_the_response_to_a_bug_has_security_headers():
         async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as http:
             return await http.get("/bug")
 
-    answer = asyncio.run(once())
-    assert answer.status_code == 500
-    assert "default-src 'none'" in answer.headers["content-security-policy"]
+    response = asyncio.run(once())
+    assert response.status_code == 500
+    assert "default-src 'none'" in response.headers["content-security-policy"]
 
 
 def test_every_response_has_security_headers(app):
-    for answer in (
+    for response in (
         request(app, "GET", "/"),
         request(app, "GET", "/", headers={"host": "evil.com"}),
         request(app, "GET", "/none"),
     ):
-        policy = answer.headers["content-security-policy"]
+        policy = response.headers["content-security-policy"]
         assert "default-src 'none'" in policy
         assert "frame-ancestors 'none'" in policy
         assert "unsafe" not in policy
-        assert answer.headers["x-content-type-options"] == "nosniff"
-        assert answer.headers["referrer-policy"] == "no-referrer"
+        assert response.headers["x-content-type-options"] == "nosniff"
+        assert response.headers["referrer-policy"] == "no-referrer"
 
 
 # --- token
@@ -187,18 +189,21 @@ def test_every_response_has_security_headers(app):
         {"authorization": "Bearer \xe9"},
     ],
 )
-def test_requests_without_the_token_are_refused(locked, headers):
+def test_requests_without_the_token_are_refused(app_with_token, headers):
     for method, path in (("GET", "/"), ("GET", "/openapi.json"), ("POST", "/length")):
-        answer = request(
-            locked, method, path, headers={name: value.encode("latin-1") for name, value in headers.items()}
+        response = request(
+            app_with_token,
+            method,
+            path,
+            headers={name: value.encode("latin-1") for name, value in headers.items()},
         )
-        assert answer.status_code == 401
-        assert "token" in answer.json()["error"]
-    assert request(locked, "GET", "/?token=wrong").status_code == 401
+        assert response.status_code == 401
+        assert "token" in response.json()["error"]
+    assert request(app_with_token, "GET", "/?token=wrong").status_code == 401
 
 
-def test_a_bearer_token_is_accepted(locked):
-    assert post(locked, headers={"authorization": f"Bearer {TOKEN}"}).json() == 0
+def test_a_bearer_token_is_accepted(app_with_token):
+    assert post(app_with_token, headers={"authorization": f"Bearer {TOKEN}"}).json() == 0
 
 
 def test_a_link_with_the_token_sets_a_cookie_and_redirects():
@@ -218,24 +223,26 @@ def test_a_link_with_the_token_sets_a_cookie_and_redirects():
 @pytest.mark.parametrize(
     "path", ["//evil.com/", "/%0d%0aSet-Cookie:x=y", "/%22%3E%3Cscript%3E", "/\\evil.com"]
 )
-def test_the_redirect_stays_on_this_server(locked, path):
-    answer = request(locked, "GET", httpx.URL(f"http://localhost:8417{path}", params={"token": TOKEN}))
-    target = answer.headers["refresh"].removeprefix("0; url=")
+def test_the_redirect_stays_on_this_server(app_with_token, path):
+    response = request(
+        app_with_token, "GET", httpx.URL(f"http://localhost:8417{path}", params={"token": TOKEN})
+    )
+    target = response.headers["refresh"].removeprefix("0; url=")
     assert target.startswith("/")
     assert not target.startswith("//")
     assert not set(target) & set('\r\n"<>\\')
-    assert len(answer.headers.get_list("set-cookie")) == 1
+    assert len(response.headers.get_list("set-cookie")) == 1
 
 
 # --- body size
 
 
 def chunks(count, size=30):
-    async def give():
+    async def generate():
         for _ in range(count):
             yield b"x" * size
 
-    return give()
+    return generate()
 
 
 def test_a_body_up_to_the_limit_is_accepted(app):
@@ -245,9 +252,9 @@ def test_a_body_up_to_the_limit_is_accepted(app):
 
 @pytest.mark.parametrize("content", [lambda: b"x" * 101, lambda: chunks(4), lambda: chunks(1000)])
 def test_a_larger_body_is_refused_with_and_without_content_length(app, content):
-    answer = post(app, content=content())
-    assert answer.status_code == 413
-    assert answer.json()["error"] == "the upload is larger than 0.0001 MB; send a smaller file"
+    response = post(app, content=content())
+    assert response.status_code == 413
+    assert response.json()["error"] == "the upload is larger than 0.0001 MB; send a smaller file"
 
 
 @pytest.mark.parametrize("length", ["-1", "1e3", "\u00b2", "9" * 20, "9" * 5000])
@@ -257,12 +264,12 @@ def test_an_invalid_content_length_is_refused(app, length):
 
 
 def test_a_body_that_takes_too_long_is_refused():
-    waiting = asyncio.Event
+    never_set = asyncio.Event
 
     async def slow():
         yield b"x"
-        await waiting().wait()
+        await never_set().wait()
 
-    answer = post(app_with(RequestLimits(body_seconds=0.01)), content=slow())
-    assert answer.status_code == 408
-    assert "longer than 0.01 seconds" in answer.json()["error"]
+    response = post(app_with(RequestLimits(body_seconds=0.01)), content=slow())
+    assert response.status_code == 408
+    assert "longer than 0.01 seconds" in response.json()["error"]

@@ -18,8 +18,8 @@ from brewster.cli import cli
 from brewster.environments import polyhaven
 from brewster.environments.polyhaven import DownloadRequest, maps_folder, pull
 from brewster.errors import DownloadError, TargetError
+from cli_helpers import errors, lines, tree
 from file_server import loopback_only
-from front_door import errors, lines, tree
 
 IN, OUT = {"categories": ["indoor", "urban"]}, {"categories": ["outdoor", "night"]}
 BOTH = {"categories": ["outdoor", "indoor"]}

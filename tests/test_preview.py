@@ -1,3 +1,5 @@
+"""The preview: its maps, and the formula with which the browser computes the layers."""
+
 import json
 import math
 from pathlib import Path
@@ -9,10 +11,10 @@ from brewster import Photo
 from brewster.inference import Separator
 from brewster.options import Options
 from brewster.srgb import to_encoded, to_linear
-from brewster.web.preview import PREVIEW_PIXELS, preview
-from front_door import picture
-from glass_server import form, make_app, pane, request
+from brewster.web.preview import MAX_PREVIEW_PIXELS, preview
+from cli_helpers import picture
 from picture_files import exif_block, file_of, smooth
+from web_servers import form, make_app, pane, request
 
 MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
 
@@ -44,24 +46,24 @@ def maps_of(photo, backend=pane, **options):
 
 
 @pytest.fixture(scope="module")
-def shipped():
+def compact_separator():
     return Separator.load(device="cpu")
 
 
 @pytest.fixture(scope="module")
-def mixture(shipped):
-    return Maps(preview(shipped, Photo.open(MIXTURE), Options(quality="draft"), lambda _: None))
+def mixture(compact_separator):
+    return Maps(preview(compact_separator, Photo.open(MIXTURE), Options(quality="draft"), lambda _: None))
 
 
 @pytest.mark.parametrize("strength", [0, 0.25, 0.5, 1])
-def test_the_browser_s_formula_equals_the_separation_of_the_server(shipped, mixture, strength):
-    made = shipped(Photo.open(MIXTURE), strength=strength, quality="draft")
+def test_the_formula_of_the_browser_equals_the_separation_of_the_server(compact_separator, mixture, strength):
+    separation = compact_separator(Photo.open(MIXTURE), strength=strength, quality="draft")
     shown = mixture.at(strength)
-    for layer, ours in zip((made.transmission, made.reflection), shown, strict=True):
+    for layer, ours in zip((separation.transmission, separation.reflection), shown, strict=True):
         difference = np.abs(layer.pixels.astype(int) - ours)
         assert difference.max() <= 2
         assert difference.mean() < 0.2
-    assert np.abs(made.confidence.pixels[..., 0].astype(int) - mixture.confidence_map).max() <= 1
+    assert np.abs(separation.confidence.pixels[..., 0].astype(int) - mixture.confidence_map).max() <= 1
 
 
 def out_of_range(tile):
@@ -73,22 +75,24 @@ def out_of_range(tile):
 @pytest.mark.parametrize("strength", [0.1, 0.5, 0.9])
 def test_layers_that_are_clipped_at_full_strength_are_correct_below_it(strength):
     data = picture(120, 90, "png")
-    made = Separator(out_of_range)(data, strength=strength)
+    separation = Separator(out_of_range)(data, strength=strength)
     for layer, ours in zip(
-        (made.transmission, made.reflection), maps_of(data, out_of_range).at(strength), strict=True
+        (separation.transmission, separation.reflection),
+        maps_of(data, out_of_range).at(strength),
+        strict=True,
     ):
         difference = np.abs(layer.pixels.astype(int) - ours)
         assert np.quantile(difference, 0.99) <= 2
 
 
 @pytest.mark.slow
-def test_a_large_photo_is_made_smaller_and_looks_like_its_large_separation(shipped):
+def test_the_preview_of_a_large_photo_matches_its_reduced_separation(compact_separator):
     pixels = np.kron(Photo.open(MIXTURE).pixels, np.ones((4, 4, 1), np.uint8))
     photo = Photo.from_array(pixels, encoding="srgb")
-    maps = Maps(preview(shipped, photo, Options(quality="draft"), lambda _: None))
+    maps = Maps(preview(compact_separator, photo, Options(quality="draft"), lambda _: None))
     assert maps.head["full"] == list(photo.size)
-    assert maps.head["width"] * maps.head["height"] == pytest.approx(PREVIEW_PIXELS, rel=0.01)
-    whole = shipped(photo, quality="draft").transmission
+    assert maps.head["width"] * maps.head["height"] == pytest.approx(MAX_PREVIEW_PIXELS, rel=0.01)
+    whole = compact_separator(photo, quality="draft").transmission
     small = 255 * to_encoded(whole.resized(maps.head["width"], maps.head["height"]).clip(0, 1))
     difference = np.abs(small - maps.at(1)[0])
     assert difference.mean() < 0.5
@@ -126,7 +130,7 @@ def test_a_wide_gamut_photo_is_shown_in_srgb():
     assert maps.photo[0, 0, 0] > 240  # the red primary of P3 is outside sRGB
 
 
-def test_a_picture_brighter_than_white_is_clipped_to_the_range():
+def test_a_photo_brighter_than_white_is_clipped_to_the_range():
     light = Photo.from_array(np.full((20, 30, 3), 3.0, np.float32), encoding="linear")
     maps = maps_of(light.encode("tiff"))
     assert maps.photo.min() == 255
@@ -141,8 +145,8 @@ def test_progress_reaches_the_end():
 
 
 def test_the_preview_route_returns_the_maps_and_refuses_invalid_files():
-    answer = request(make_app(), "POST", "/preview", **form(picture(60, 40, "png"), quality="draft"))
-    assert Maps(answer.content).head["full"] == [60, 40]
+    response = request(make_app(), "POST", "/preview", **form(picture(60, 40, "png"), quality="draft"))
+    assert Maps(response.content).head["full"] == [60, 40]
     refused = request(make_app(), "POST", "/preview", **form(b"no picture"))
     assert refused.status_code == 422
     assert "no picture" in refused.json()["error"]

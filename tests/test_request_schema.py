@@ -1,3 +1,5 @@
+"""The form of a request: its fields, errors, schema and file names."""
+
 import asyncio
 import string
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -49,28 +51,28 @@ def refused(data, **kwargs):
 
 @pytest.mark.parametrize("charset", [b"undefined", b"punycode"])
 def test_an_unusable_charset_is_a_damaged_form(charset):
-    status, sentence = refused(
+    status, message = refused(
         body(("photo", b"", "a.jpg"), ("strength", b"\xff-1")),
         kind=b"multipart/form-data; boundary=x; charset=" + charset,
     )
     assert status == 400
-    assert "UTF-8" in sentence
+    assert "UTF-8" in message
 
 
 # --- values
 
 
 def test_a_photo_alone_gets_the_default_options():
-    made = parse()
-    assert (made.photo, made.name) == (b"bytes", "a.jpg")
-    assert made.options == Options(max_pixels=1000)
+    request = parse()
+    assert (request.photo, request.name) == (b"bytes", "a.jpg")
+    assert request.options == Options(max_pixels=1000)
 
 
 def test_every_client_option_is_read():
-    made = parse(
+    request = parse(
         strength="0.5", quality="best", format="tiff", additive="true", model="mine", layers="reflection"
     )
-    assert made.options == Options(
+    assert request.options == Options(
         strength=0.5,
         quality="best",
         format="tiff",
@@ -93,7 +95,7 @@ def test_an_empty_field_counts_as_omitted():
 
 
 @pytest.mark.parametrize(
-    ("fields", "sentence"),
+    ("fields", "part"),
     [
         ({"strength": "1.5"}, "strength is '1.5'"),
         ({"strength": "nan"}, "strength is 'nan'"),
@@ -111,11 +113,11 @@ def test_an_empty_field_counts_as_omitted():
         ({"quality": "x" * 500}, "'" + "x" * 40 + "'"),
     ],
 )
-def test_a_wrong_value_is_named_in_the_message(fields, sentence):
+def test_a_wrong_value_is_named_in_the_message(fields, part):
     data = body(("photo", b"bytes", "a.jpg"), *((name, value.encode()) for name, value in fields.items()))
     status, message = refused(data)
     assert status == 422
-    assert sentence in message
+    assert part in message
     assert len(message) < 300
 
 
@@ -174,7 +176,7 @@ def test_a_safe_name_is_never_a_path_and_fits_every_file_system(name):
 
 
 @given(stem=st.text(string.ascii_letters + string.digits + "äöü日本 -_()", min_size=1).filter(str.strip))
-def test_a_harmless_name_stays_unchanged(stem):
+def test_a_safe_name_stays_unchanged(stem):
     name = f"{stem.strip()[:30].strip()}.jpg"
     assert safe_name(name) == name
 
@@ -192,7 +194,7 @@ def test_a_harmless_name_stays_unchanged(stem):
         ("x" * 1000 + ".JPG", "x" * 120 + ".JPG"),
     ],
 )
-def test_hostile_names_become_safe(name, safe):
+def test_unsafe_names_are_replaced(name, safe):
     assert safe_name(name) == safe
 
 
@@ -207,6 +209,6 @@ def test_hostile_names_become_safe(name, safe):
         ("a.b", Options(), "a.b.transmission.webp"),
     ],
 )
-def test_layers_are_named_as_the_command_line_names_them(name, options, target):
+def test_layers_have_the_file_names_of_the_command_line(name, options, target):
     assert SeparationRequest(b"", name, options).target("transmission", "webp") == target
     assert Path(SeparationRequest(b"", name, options).target("confidence", "webp")).suffix == ".png"

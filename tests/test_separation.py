@@ -1,3 +1,5 @@
+"""The HTTP API that separates photos: responses, errors, the job queue, and the OpenAPI document."""
+
 import asyncio
 import io
 import zipfile
@@ -19,9 +21,9 @@ from brewster.web.job_queue import JobQueue
 from brewster.web.middleware import RequestLimits
 from brewster.web.model_cache import ModelCache
 from brewster.web.separation import separation_router
-from front_door import picture
-from glass_server import BlockingBackend, client, form, make_app, pane, request
+from cli_helpers import picture
 from picture_files import exif_block, file_of, smooth
+from web_servers import BlockingBackend, client, form, make_app, pane, request
 
 MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
 SMALL = picture(40, 30, "png")
@@ -36,9 +38,9 @@ def separate(app, photo=SMALL, name="window.png", **fields):
     return request(app, "POST", "/separate", **form(photo, name, **fields))
 
 
-def error_of(answer):
-    assert set(answer.json()) == {"error"}
-    return answer.json()["error"]
+def error_of(response):
+    assert set(response.json()) == {"error"}
+    return response.json()["error"]
 
 
 # --- responses
@@ -48,15 +50,15 @@ def test_the_server_returns_the_bytes_of_the_command_line(bare, tmp_path):
     app = create_app(
         separation_router(ModelCache(device="cpu"), JobQueue(), max_pixels=10**8), limits=RequestLimits()
     )
-    answer = separate(app, MIXTURE.read_bytes(), MIXTURE.name, quality="draft", strength="0.7")
+    response = separate(app, MIXTURE.read_bytes(), MIXTURE.name, quality="draft", strength="0.7")
     bare(MIXTURE, "-o", tmp_path, "--quality", "draft", "--strength", "0.7", "--device", "cpu")
-    with zipfile.ZipFile(io.BytesIO(answer.content)) as archive:
+    with zipfile.ZipFile(io.BytesIO(response.content)) as archive:
         assert archive.testzip() is None
-        made = {name: archive.read(name) for name in archive.namelist()}
-    assert made == {path.name: path.read_bytes() for path in tmp_path.glob("*.jpg")}
-    assert len(made) == 2
+        files = {name: archive.read(name) for name in archive.namelist()}
+    assert files == {path.name: path.read_bytes() for path in tmp_path.glob("*.jpg")}
+    assert len(files) == 2
     (row,) = request(app, "GET", "/models").json()
-    assert answer.headers["brewster-sha256"] == row["sha256"]
+    assert response.headers["brewster-sha256"] == row["sha256"]
     assert "where it fails" in row["card"].lower()
 
 
@@ -70,15 +72,15 @@ def test_the_server_returns_the_bytes_of_the_command_line(bare, tmp_path):
         ({"layers": "reflection,transmission"}, "application/zip", "window.zip"),
     ],
 )
-def test_one_layer_is_a_picture_and_several_are_a_zip(app, fields, kind, name):
-    answer = separate(app, **fields)
-    assert answer.status_code == 200
-    assert answer.headers["content-type"] == kind
-    assert f'filename="{name}"' in answer.headers["content-disposition"]
+def test_one_layer_is_an_image_and_several_are_a_zip(app, fields, kind, name):
+    response = separate(app, **fields)
+    assert response.status_code == 200
+    assert response.headers["content-type"] == kind
+    assert f'filename="{name}"' in response.headers["content-disposition"]
     if kind != "application/zip":
         expected = Separator(pane)(SMALL, additive="additive" in fields)
         layer = fields["layers"]
-        assert answer.content == getattr(expected, layer).encode(kind.removeprefix("image/"))
+        assert response.content == getattr(expected, layer).encode(kind.removeprefix("image/"))
 
 
 def test_the_headers_describe_the_separation(app):
@@ -94,7 +96,7 @@ def test_the_same_photo_gives_the_same_bytes(app):
     assert separate(app).content == separate(app).content
 
 
-def test_a_photo_keeps_its_profile_and_its_camera(app):
+def test_a_layer_has_the_orientation_and_the_metadata_of_the_photo(app):
     photo = file_of(smooth(), "jpeg", exif=exif_block(6), icc_profile=Photo.open(SMALL).file_info.icc)
     layer = Photo.open(separate(app, photo, "a.jpg", layers="transmission").content)
     assert layer.size == (48, 64)
@@ -107,30 +109,30 @@ def test_no_file_name_breaks_the_response(app, name):
     head = f'form-data; name="photo"; filename="{name}"'.replace("\r", "").replace("\n", "")
     data = b"--x\r\nContent-Disposition: %b\r\n\r\n%b\r\n--x--\r\n" % (head.encode(errors="replace"), SMALL)
     kind = {"content-type": "multipart/form-data; boundary=x"}
-    answer = request(app, "POST", "/separate", content=data, headers=kind)
-    assert answer.status_code in (200, 400, 422)
-    if answer.status_code == 200:
-        (sentence,) = answer.headers.get_list("content-disposition")
-        assert sentence.isprintable()
-        given_name = unquote(sentence.partition("''")[2])
-        assert given_name.endswith(".zip")
-        assert not set(given_name) & set('/\\\r\n"')
+    response = request(app, "POST", "/separate", content=data, headers=kind)
+    assert response.status_code in (200, 400, 422)
+    if response.status_code == 200:
+        (disposition,) = response.headers.get_list("content-disposition")
+        assert disposition.isprintable()
+        file_name = unquote(disposition.partition("''")[2])
+        assert file_name.endswith(".zip")
+        assert not set(file_name) & set('/\\\r\n"')
 
 
 @pytest.mark.parametrize(
     "name", ["../../a.png", "a\nb.png", "ä日本.png", "x" * 1000 + ".png", '".png', "%2e%2e%2f.png"]
 )
-def test_a_hostile_name_gives_a_harmless_one(app, name):
-    answer = separate(app, name=name, layers="transmission")
-    assert answer.status_code == 200
-    assert Path(unquote(answer.headers["content-disposition"].partition("''")[2])).suffix == ".png"
+def test_an_unsafe_file_name_is_replaced_by_a_safe_one(app, name):
+    response = separate(app, name=name, layers="transmission")
+    assert response.status_code == 200
+    assert Path(unquote(response.headers["content-disposition"].partition("''")[2])).suffix == ".png"
 
 
-# --- errors, each with a status and a message
+# --- errors
 
 
 @pytest.mark.parametrize(
-    ("photo", "status", "sentence"),
+    ("photo", "status", "message"),
     [
         (b"", 422, "empty"),
         (b"hello", 422, "no known image format"),
@@ -139,30 +141,30 @@ def test_a_hostile_name_gives_a_harmless_one(app, name):
         (file_of(smooth(200, 300), "png"), 413, "pixels"),
     ],
 )
-def test_uploads_that_are_no_photos_are_refused(photo, status, sentence):
-    answer = separate(make_app(max_pixels=5000), photo)
-    assert answer.status_code == status
-    if sentence:
-        assert sentence in error_of(answer)
+def test_uploads_that_cannot_be_decoded_are_refused(photo, status, message):
+    response = separate(make_app(max_pixels=5000), photo)
+    assert response.status_code == status
+    if message:
+        assert message in error_of(response)
 
 
-def test_an_unsupported_kind_of_picture_is_refused(app):
+def test_an_unsupported_kind_of_image_is_refused(app):
     from PIL import Image  # noqa: PLC0415
 
     data = io.BytesIO()
     Image.new("CMYK", (8, 8)).save(data, "jpeg")
-    answer = separate(app, data.getvalue(), "a.jpg")
-    assert answer.status_code == 415
-    assert "CMYK" in error_of(answer)
+    response = separate(app, data.getvalue(), "a.jpg")
+    assert response.status_code == 415
+    assert "CMYK" in error_of(response)
 
 
 def test_wrong_values_are_refused_before_any_work():
-    def never(tile):
+    def fail_if_called(tile):
         raise AssertionError
 
-    answer = separate(make_app(never), strength="7")
-    assert answer.status_code == 422
-    assert "strength is '7'" in error_of(answer)
+    response = separate(make_app(fail_if_called), strength="7")
+    assert response.status_code == 422
+    assert "strength is '7'" in error_of(response)
 
 
 def test_unknown_paths_and_methods_are_refused(app):
@@ -183,10 +185,10 @@ def test_a_bug_is_reported_without_its_traceback():
         async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as http:
             return await http.post("/separate", **form(SMALL))
 
-    answer = asyncio.run(once())
-    assert answer.status_code == 500
-    assert "please report it" in error_of(answer)
-    assert "secret" not in answer.text
+    response = asyncio.run(once())
+    assert response.status_code == 500
+    assert "please report it" in error_of(response)
+    assert "secret" not in response.text
 
 
 # --- the job queue
@@ -232,7 +234,7 @@ def test_a_full_server_returns_retry_after_and_continues():
     assert late.status_code == 503
     assert late.headers["retry-after"].isdecimal()
     assert "try again" in error_of(late)
-    assert [answer.status_code for answer in first] == [200, 200]
+    assert [response.status_code for response in first] == [200, 200]
 
 
 def test_work_beyond_the_time_limit_is_cancelled():
@@ -240,13 +242,13 @@ def test_work_beyond_the_time_limit_is_cancelled():
 
     async def wait():
         async with client(make_app(backend, job_queue=JobQueue(timeout_seconds=0.01))) as http:
-            answer = await http.post("/separate", **form(SMALL))
+            response = await http.post("/separate", **form(SMALL))
             backend.proceed.set()
-            return answer
+            return response
 
-    answer = asyncio.run(wait())
-    assert answer.status_code == 504
-    assert "draft" in error_of(answer)
+    response = asyncio.run(wait())
+    assert response.status_code == 504
+    assert "draft" in error_of(response)
 
 
 def test_progress_is_available_while_the_job_runs():
@@ -270,15 +272,15 @@ def test_progress_is_available_while_the_job_runs():
 
 
 def test_an_invalid_job_name_is_refused(app):
-    answer = request(app, "POST", "/separate?job=../x", **form(SMALL))
-    assert answer.status_code == 422
-    assert "job" in error_of(answer)
+    response = request(app, "POST", "/separate?job=../x", **form(SMALL))
+    assert response.status_code == 422
+    assert "job" in error_of(response)
 
 
 # --- OpenAPI
 
 
-def test_openapi_describes_every_field_and_every_refusal(app):
+def test_openapi_describes_every_field_and_every_error(app):
     api = request(app, "GET", "/openapi.json").json()
     assert set(api["paths"]) == {"/separate", "/progress/{job}", "/models", "/health"}
     post = api["paths"]["/separate"]["post"]
@@ -291,12 +293,12 @@ def test_no_documentation_page_fetches_assets_from_elsewhere(app):
     assert request(app, "GET", "/docs").status_code == request(app, "GET", "/redoc").status_code == 404
 
 
-TRIED = make_app(limits=RequestLimits(hosts=frozenset({"testserver"})))
+SCHEMA_APP = make_app(limits=RequestLimits(hosts=frozenset({"testserver"})))
 """An application with the host name that schemathesis uses."""
-SCHEMA = schemathesis.openapi.from_asgi("/openapi.json", TRIED)
+SCHEMA = schemathesis.openapi.from_asgi("/openapi.json", SCHEMA_APP)
 
 
-UNFIT = [  # the schema cannot express which options contradict each other, and in a form 0 is valid for false
+EXCLUDED_CHECKS = [  # the schema cannot express which options contradict each other, and in a form 0 is valid for false
     positive_data_acceptance,
     negative_data_rejection,
 ]
@@ -308,4 +310,4 @@ def test_the_server_conforms_to_its_openapi_document(case):
     photo = case.body.get("photo") if isinstance(case.body, dict) else None
     if isinstance(photo, str | bytes):  # random bytes are not a picture
         case.body["photo"] = SMALL
-    case.call_and_validate(excluded_checks=UNFIT)
+    case.call_and_validate(excluded_checks=EXCLUDED_CHECKS)

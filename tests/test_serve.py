@@ -1,3 +1,5 @@
+"""The command `brewster serve`."""
+
 import json
 import re
 import urllib.error
@@ -8,7 +10,7 @@ import pytest
 from brewster.cli import serve as command
 from brewster.cli.serve import serve
 from file_server import loopback_only
-from glass_server import serve_process
+from web_servers import serve_process
 
 
 @pytest.fixture
@@ -23,8 +25,8 @@ def reachable(monkeypatch):
 
 def get(url, **headers):
     try:
-        with urllib.request.urlopen(urllib.request.Request(url, headers=headers)) as answer:
-            return answer.status, answer.read()
+        with urllib.request.urlopen(urllib.request.Request(url, headers=headers)) as response:
+            return response.status, response.read()
     except urllib.error.HTTPError as error:
         return error.code, error.read()
 
@@ -75,7 +77,7 @@ def test_a_loopback_address_needs_no_token(bare, served_apps):
 
 
 @pytest.mark.parametrize("token", ["short", "with space and more", "semi;colon;semi;colon", ""])
-def test_a_short_token_or_one_that_breaks_a_link_is_a_wrong_argument(bare, served_apps, token):
+def test_a_short_token_or_one_with_forbidden_characters_is_a_wrong_argument(bare, served_apps, token):
     code, _, err = bare("serve", "--token", token)
     assert code == 2
     assert "16 to 200 characters" in err
@@ -92,14 +94,14 @@ def test_models_that_are_missing_or_share_a_name_are_refused_at_the_start(bare, 
     assert not served_apps
 
 
-def test_a_port_that_is_taken_is_an_error_and_no_traceback(bare, reachable):
+def test_a_port_in_use_is_an_error_without_a_traceback(bare, reachable):
     with reachable.create_server(("127.0.0.1", 0)) as taken:
         code, _, err = bare("serve", "--port", taken.getsockname()[1])
     assert code == 1
     assert err.startswith("error: 127.0.0.1 port")
 
 
-def test_the_page_opens_in_the_browser_only_when_asked(monkeypatch, capsys):
+def test_the_page_opens_in_the_browser_only_if_requested(monkeypatch, capsys):
     opened = []
     monkeypatch.setattr(command.webbrowser, "open", opened.append)
     command.print_link("http://127.0.0.1:1/", None, opens=False)

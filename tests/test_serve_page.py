@@ -1,4 +1,4 @@
-"""The page in a real browser with a real server."""
+"""The page, tested in a real browser with a real server."""
 
 import base64
 import io
@@ -11,11 +11,11 @@ import pytest
 from brewster import Photo
 from brewster.photo.file_info import FileInfo
 from brewster.srgb import to_encoded, to_linear
-from front_door import picture
-from glass_server import serve_process
+from cli_helpers import picture
 from picture_files import exif_block, file_of, smooth
+from web_servers import serve_process
 
-TIMEOUT_MS = 120_000  # for slow machines
+TIMEOUT_MS = 120_000  # long, because the machine may be slow
 MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
 
 
@@ -135,7 +135,7 @@ def test_the_layers_on_the_page_are_those_of_the_server_to_two_code_values(open_
             assert difference(canvas(page, "right"), Photo.open(made).pixels).max() <= 2
 
 
-def test_a_wide_gamut_photo_and_a_rotated_one_look_right(open_page):
+def test_wide_gamut_and_rotated_photos_have_the_right_colours_and_orientation(open_page):
     import pyvips  # noqa: PLC0415
 
     colours = np.kron(np.array([[[230, 60, 60], [60, 200, 60]]], np.uint8), np.ones((30, 30, 1), np.uint8))
@@ -152,7 +152,7 @@ def test_a_wide_gamut_photo_and_a_rotated_one_look_right(open_page):
     assert (canvas(page, "left") == np.rot90(smooth(), -1)).all()
 
 
-def test_the_page_works_with_the_keyboard_alone(open_page, run):
+def test_the_page_works_with_the_keyboard_only(open_page, run):
     data = picture(90, 60, "png")
     file = {"name": "window.png", "mimeType": "image/png", "buffer": data}
     page = open_page()
@@ -215,7 +215,7 @@ def test_a_phone_shows_everything_without_horizontal_scrolling(open_page):
 
 
 def test_zoom_and_pan_move_both_sides_together(open_page):
-    """At strength 0 both sides show the same ramp, so an offset between them would be a step."""
+    """At strength 0 both sides show the same ramp, so an offset between the sides would be visible as a step."""
     page = open_page()
     ramp = np.repeat(np.linspace(20, 220, 240).astype(np.uint8)[None, :, None], 120, axis=0)
     upload(page, ("a.png", file_of(ramp, "png")))
@@ -290,15 +290,15 @@ def test_many_photos_are_downloaded_as_one_zip_with_unique_names(open_page, run)
 
 def test_photos_can_be_pasted_and_dropped(open_page):
     page = open_page()
-    give = """([kind, bytes]) => {
-        const carried = new DataTransfer();
-        carried.items.add(new File([new Uint8Array(bytes)], `${kind}.png`, { type: "image/png" }));
-        const event = kind === "paste" ? new ClipboardEvent(kind, { clipboardData: carried, bubbles: true })
-            : new DragEvent(kind, { dataTransfer: carried, bubbles: true, cancelable: true });
+    send_event = """([kind, bytes]) => {
+        const transfer = new DataTransfer();
+        transfer.items.add(new File([new Uint8Array(bytes)], `${kind}.png`, { type: "image/png" }));
+        const event = kind === "paste" ? new ClipboardEvent(kind, { clipboardData: transfer, bubbles: true })
+            : new DragEvent(kind, { dataTransfer: transfer, bubbles: true, cancelable: true });
         document.body.dispatchEvent(event);
     }"""
     for kind in ("paste", "drop"):
-        page.evaluate(give, [kind, list(picture(60, 40, "png"))])
+        page.evaluate(send_event, [kind, list(picture(60, 40, "png"))])
         page.get_by_role("button", name=f"{kind}.png").first.wait_for()
     page.wait_for_selector("li.done >> nth=1")
     assert "2 of 2 are done" in page.locator("#announcement").inner_text()
@@ -317,7 +317,7 @@ def test_a_change_of_quality_repeats_the_preview(open_page):
 
 
 def hold_requests(page, path):
-    """Leaves requests of the page to this path without a response, until `page.unroute(path)`."""
+    """Gives no response to requests for this path, until `page.unroute(path)`."""
     page.route(path, lambda route: None)
 
 
@@ -344,7 +344,7 @@ def test_the_previous_quality_shows_the_previous_maps_again(open_page):
     page.wait_for_selector("li.done >> nth=1")
 
 
-def test_the_focus_moves_on_when_its_button_disappears(open_page):
+def test_the_focus_moves_to_the_next_button_when_its_button_disappears(open_page):
     page = open_page()
     hold_requests(page, "**/preview?*")
     page.set_input_files("#files", [{"name": "a.png", "mimeType": "", "buffer": picture(90, 60, "png")}])

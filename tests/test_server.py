@@ -1,4 +1,4 @@
-"""Idle clients and the shutdown of the server, over a real socket."""
+"""Idle clients and the shutdown of the server, tested over a real socket."""
 
 import asyncio
 import errno
@@ -12,9 +12,9 @@ from fastapi import APIRouter, Response
 from brewster.web import server
 from brewster.web.application import create_app
 from brewster.web.middleware import RequestLimits
+from cli_helpers import picture
 from file_server import loopback_only
-from front_door import picture
-from glass_server import BlockingBackend, make_app, raw_exchange, running_server, served_port
+from web_servers import BlockingBackend, make_app, raw_exchange, running_server, served_port
 
 PHOTO = picture(40, 30, "png")
 FORM = b'--x\r\nContent-Disposition: form-data; name="photo"; filename="a.png"\r\n\r\n%b\r\n--x--\r\n' % PHOTO
@@ -23,7 +23,7 @@ POST = (
     b"POST /separate HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n"
     b"Content-Type: multipart/form-data; boundary=x\r\nContent-Length: %d\r\n\r\n%b" % (len(FORM), FORM)
 )
-LONG = 8_000_000
+LONG_BYTES = 8_000_000
 
 
 @pytest.fixture(autouse=True)
@@ -38,17 +38,17 @@ def frequent_checks(monkeypatch):
 
 
 @pytest.fixture
-def long():
+def app_with_long_response():
     """An application with a long response."""
     router = APIRouter()
-    router.get("/long")(lambda: Response(bytes(LONG)))
+    router.get("/long")(lambda: Response(bytes(LONG_BYTES)))
     return create_app(router, limits=RequestLimits())
 
 
-def slow_client(port, width=1 << 12):
+def slow_client(port, buffer_bytes=1 << 12):
     """A connection that has requested the long response and has a small receive buffer."""
     connection = socket.socket()
-    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, width)
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffer_bytes)
     connection.settimeout(30)
     connection.connect(("127.0.0.1", port))
     connection.sendall(GET.replace(b"/health", b"/long"))
@@ -57,13 +57,13 @@ def slow_client(port, width=1 << 12):
 
 def read_to_end(connection):
     """All bytes until the connection is closed."""
-    got = bytearray()
+    received = bytearray()
     try:
         while more := connection.recv(1 << 16):
-            got += more
+            received += more
     except ConnectionResetError:
         pass
-    return bytes(got)
+    return bytes(received)
 
 
 @pytest.mark.parametrize("start", [b"", b"G", GET[:-2]])
@@ -79,9 +79,9 @@ def test_half_a_request_after_a_complete_one_is_closed(frequent_checks):
         socket.create_connection(("127.0.0.1", port), timeout=30) as connection,
     ):
         connection.sendall(GET)
-        answer = b""
-        while not answer.endswith(b"}"):
-            answer += connection.recv(1 << 16)
+        response = b""
+        while not response.endswith(b"}"):
+            response += connection.recv(1 << 16)
         connection.sendall(GET[:20])
         assert read_to_end(connection) == b""
 
@@ -89,19 +89,19 @@ def test_half_a_request_after_a_complete_one_is_closed(frequent_checks):
 def test_work_may_take_longer_than_the_idle_limit(frequent_checks):
     backend = BlockingBackend()
     with served_port(make_app(backend)) as port:
-        answers = []
-        client = Thread(target=lambda: answers.append(raw_exchange(port, POST)))
+        responses = []
+        client = Thread(target=lambda: responses.append(raw_exchange(port, POST)))
         client.start()
         backend.started.wait()
         time.sleep(0.5)  # several idle checks
         backend.proceed.set()
         client.join()
-    assert b"200 OK" in answers[0]
+    assert b"200 OK" in responses[0]
 
 
-def test_a_client_that_never_reads_is_closed_and_a_slow_one_is_not(monkeypatch, long):
+def test_a_client_that_never_reads_is_closed_and_a_slow_one_is_not(monkeypatch, app_with_long_response):
     monkeypatch.setattr(server, "IDLE_CHECK_SECONDS", 0.4)
-    with running_server(long) as (port, running):
+    with running_server(app_with_long_response) as (port, running):
         with slow_client(port) as silent:
             while not running.server_state.connections:
                 time.sleep(0.01)
@@ -110,36 +110,36 @@ def test_a_client_that_never_reads_is_closed_and_a_slow_one_is_not(monkeypatch, 
                     break
                 time.sleep(0.01)
             assert not running.server_state.connections
-            assert len(read_to_end(silent)) < LONG
+            assert len(read_to_end(silent)) < LONG_BYTES
         with slow_client(port, 1 << 16) as slow:
             head = bytearray()
             for _ in range(60):  # longer than three idle checks
                 head += slow.recv(1 << 16)
                 time.sleep(0.02)
-            assert len(head) < LONG
-            assert len(head) + len(read_to_end(slow)) > LONG
+            assert len(head) < LONG_BYTES
+            assert len(head) + len(read_to_end(slow)) > LONG_BYTES
 
 
-def test_a_server_that_stops_answers_running_requests(monkeypatch, caplog):
+def test_a_server_that_stops_sends_an_error_for_running_requests(monkeypatch, caplog):
     monkeypatch.setattr(server, "GRACE_SECONDS", 0.1)
-    backend, answers = BlockingBackend(), []
+    backend, responses = BlockingBackend(), []
     with running_server(make_app(backend)) as (port, running):
-        client = Thread(target=lambda: answers.append(raw_exchange(port, POST)))
+        client = Thread(target=lambda: responses.append(raw_exchange(port, POST)))
         client.start()
         backend.started.wait()
         running.should_exit = True
         client.join()
         backend.proceed.set()
-    (answer,) = answers
-    assert answer.startswith(b"HTTP/1.1 503")
-    assert b"being stopped" in answer
-    assert b"nosniff" in answer
+    (response,) = responses
+    assert response.startswith(b"HTTP/1.1 503")
+    assert b"being stopped" in response
+    assert b"nosniff" in response
     assert not caplog.records
 
 
-def test_a_server_that_stops_during_a_response_logs_nothing(monkeypatch, caplog, long):
+def test_a_server_that_stops_during_a_response_logs_nothing(monkeypatch, caplog, app_with_long_response):
     monkeypatch.setattr(server, "GRACE_SECONDS", 0.1)
-    with running_server(long) as (port, running), slow_client(port) as silent:
+    with running_server(app_with_long_response) as (port, running), slow_client(port) as silent:
         assert silent.recv(100).startswith(b"HTTP/1.1 200")
         running.should_exit = True
         while running.server_state.connections:

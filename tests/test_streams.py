@@ -15,7 +15,7 @@ from brewster.training.data.online import OnlineRendered
 from brewster.training.data.rendered import RenderedSets
 from brewster.training.recipe import read_recipe, with_value
 from brewster.training.streams import open_stream, validation_pairs
-from front_door import picture
+from cli_helpers import picture
 from set_folders import make
 
 TINY = Path(__file__).parents[1] / "recipes/ablations/tiny.toml"

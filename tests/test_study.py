@@ -1,4 +1,4 @@
-"""Creating a study: pairing, errors, and that nothing reveals the method of a picture."""
+"""Creating a study: pairing, errors, and names and files that do not reveal the method of a picture."""
 
 import hashlib
 import json
@@ -26,7 +26,7 @@ def folders(tmp_path):
     }
 
 
-def test_a_study_is_read_as_it_was_made(tmp_path):
+def test_reading_a_study_returns_what_was_created(tmp_path):
     study = make_study(tmp_path)
     assert read_study(study.folder) == study
     assert study.description.datasets == ("nature", "real")
@@ -35,7 +35,7 @@ def test_a_study_is_read_as_it_was_made(tmp_path):
     assert not list(study.changed_pictures())
 
 
-def test_the_first_method_is_compared_with_each_other_or_all_with_all(tmp_path):
+def test_the_first_method_or_every_method_is_compared_with_each_other_method(tmp_path):
     names = ("ours", "RDNet", "DSIT")
     assert make_study(tmp_path / "a", methods=names).pairs_of_methods == (("ours", "RDNet"), ("ours", "DSIT"))
     assert len(make_study(tmp_path / "b", methods=names, all_pairs=True).pairs_of_methods) == 3
@@ -46,13 +46,13 @@ def test_pictures_without_folders_are_one_dataset(tmp_path):
     assert study.description.datasets == ("",)
 
 
-def test_named_datasets_are_taken_in_their_order_and_no_others(tmp_path):
+def test_only_the_chosen_datasets_are_used_in_the_given_order(tmp_path):
     study = make_study(tmp_path, datasets=("real",))
     assert study.description.datasets == ("real",)
     assert {row.dataset for row in study.description.comparisons} == {"real"}
 
 
-def test_the_outputs_of_brewster_itself_are_found(tmp_path, folders):
+def test_outputs_named_by_brewster_are_found(tmp_path, folders):
     inputs, methods = folders
     for path in sorted(methods["ours"].rglob("*.png")):
         path.rename(path.with_suffix(".transmission.png"))
@@ -70,9 +70,9 @@ def test_a_picture_is_copied_without_loss_from_any_format(tmp_path, folders):
     row = next(row for row in study.description.comparisons if (row.dataset, row.name) == ("real", "1"))
     copied = Photo.open(study.picture_file(row.photo))
     assert np.array_equal(copied.pixels, Photo.open(inputs / "real/1.tif").pixels)
-    about = study.picture(row.photo)
-    assert about.source_sha256 == hashlib.sha256((inputs / "real/1.tif").read_bytes()).hexdigest()
-    assert (about.width, about.height) == copied.size
+    description = study.picture(row.photo)
+    assert description.source_sha256 == hashlib.sha256((inputs / "real/1.tif").read_bytes()).hexdigest()
+    assert (description.width, description.height) == copied.size
 
 
 def test_file_names_and_bytes_reveal_neither_method_nor_picture(tmp_path):
@@ -111,7 +111,7 @@ def test_all_problems_of_the_files_are_listed_at_once_and_nothing_is_written(tmp
     for message in (
         f"ours has no {methods['ours'] / 'real/2'}.*",
         f"{methods['ours'] / 'nature/1.png'} has no input",
-        f"{methods['RDNet'] / 'real/1.png'} has 12x18 pixels, its input 24x18",
+        f"{methods['RDNet'] / 'real/1.png'} has 12x18 pixels, but its input has 24x18",
         f"{methods['RDNet'] / 'real/10.png'}: ",
         f"RDNet has no {methods['RDNet'] / 'nature/other'}.*",
     ):
@@ -119,10 +119,10 @@ def test_all_problems_of_the_files_are_listed_at_once_and_nothing_is_written(tmp
     assert sorted(path.name for path in tmp_path.iterdir()) == ["RDNet", "inputs", "ours"]
 
 
-def test_one_name_in_two_formats_is_refused(tmp_path, folders):
+def test_two_files_with_the_same_name_are_refused(tmp_path, folders):
     inputs, methods = folders
     write_pictures(methods["ours"], ["real/2"], suffix=".jpg")
-    with pytest.raises(BrewsterError, match=r"2\.jpg and .*2\.png share a name"):
+    with pytest.raises(BrewsterError, match=r"2\.jpg and .*2\.png have the same name"):
         create(tmp_path / "study", inputs, methods)
 
 
@@ -134,7 +134,7 @@ def test_one_name_in_two_formats_is_refused(tmp_path, folders):
         (StudyOptions(catches=5), "5 catch trials .* at most 4"),
     ],
 )
-def test_requests_beyond_the_available_pictures_are_refused(tmp_path, folders, options, message):
+def test_options_beyond_the_available_pictures_are_refused(tmp_path, folders, options, message):
     with pytest.raises(BrewsterError, match=message):
         create(tmp_path / "study", *folders, options)
 
@@ -170,7 +170,7 @@ def test_an_invalid_description_is_refused_with_the_key_of_the_error(tmp_path):
     text = json.loads((study.folder / "study.json").read_text())
     for change, message in (
         ({"pairs": "many"}, "pairs: "),
-        ({"surprise": 1}, "surprise: "),
+        ({"unknown": 1}, "unknown: "),
         ({"format": 2}, "format 2"),
     ):
         (study.folder / "study.json").write_text(json.dumps(text | change))
@@ -191,7 +191,7 @@ def test_catch_pictures_are_clearly_degraded_outputs(tmp_path):
         assert catch.spoilt not in outputs
 
 
-def test_degrading_works_in_light_and_dark_and_keeps_the_mean(random):
+def test_degrading_preserves_the_mean_of_dark_and_light_pictures(random):
     for level in (20, 128, 235):
         flat = np.full((60, 80, 3), level, np.uint8)
         spoilt = degrade(flat, 1)
@@ -200,14 +200,14 @@ def test_degrading_works_in_light_and_dark_and_keeps_the_mean(random):
     assert np.array_equal(degrade(flat, 1), spoilt)
 
 
-def test_a_study_that_was_moved_is_the_same_study(tmp_path):
+def test_a_moved_study_stays_valid(tmp_path):
     study = make_study(tmp_path)
     moved = study.folder.rename(tmp_path / "elsewhere")
     assert read_study(moved) == replace(study, folder=moved)
     read_study(moved).verify_pictures()
 
 
-def test_pictures_next_to_subfolders_with_pictures_are_refused_unless_datasets_are_named(tmp_path, folders):
+def test_pictures_next_to_subfolders_with_pictures_are_refused_unless_datasets_are_chosen(tmp_path, folders):
     inputs, methods = folders
     write_pictures(inputs, ["stray"])
     with pytest.raises(BrewsterError, match=r"stray\.png\) and subfolders with pictures \(nature, real\)"):
@@ -216,7 +216,7 @@ def test_pictures_next_to_subfolders_with_pictures_are_refused_unless_datasets_a
     assert len(study.description.comparisons) == 4
 
 
-def test_a_picture_named_like_a_layer_counts_if_its_photo_has_no_transmission(tmp_path):
+def test_a_picture_named_like_a_layer_is_used_if_there_is_no_transmission_of_its_photo(tmp_path):
     names = ("window.reflection", "window", "b.confidence")
     study = make_study(tmp_path, names=names)
     assert {row.name for row in study.description.comparisons} == set(names)

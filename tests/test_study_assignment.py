@@ -12,46 +12,44 @@ from small_studies import make_description
 SIZES = st.integers(1, 60).flatmap(lambda count: st.tuples(st.just(count), st.integers(1, count)))
 
 
-def assigned(count, pairs, seed, participants):
+def assigned_items(count, pairs, seed, participants):
     row = list(islice(comparison_sequence(count, pairs, seed), participants * pairs))
     return [row[i * pairs : (i + 1) * pairs] for i in range(participants)]
 
 
 @given(SIZES, st.integers(0, 2**32), st.integers(1, 30))
-def test_nobody_sees_a_pair_twice_and_every_pair_is_seen_equally_often_within_one(sizes, seed, participants):
+def test_no_participant_gets_a_comparison_twice_and_counts_differ_by_at_most_one(sizes, seed, participants):
     count, pairs = sizes
     seen = Counter(dict.fromkeys(range(count), 0))
-    for own in assigned(count, pairs, seed, participants):
-        numbers = [comparison for comparison, _ in own]
+    for items in assigned_items(count, pairs, seed, participants):
+        numbers = [comparison for comparison, _ in items]
         assert len(set(numbers)) == pairs
         seen.update(numbers)
         assert max(seen.values()) - min(seen.values()) <= 1
 
 
 @given(SIZES, st.integers(0, 2**32), st.integers(1, 30))
-def test_each_comparison_has_its_first_method_left_and_right_equally_often_within_one(
-    sizes, seed, participants
-):
+def test_left_and_right_counts_of_a_comparison_differ_by_at_most_one(sizes, seed, participants):
     balance = Counter()
-    for own in assigned(*sizes, seed, participants):
-        balance.update({comparison: 1 if flipped else -1 for comparison, flipped in own})
+    for items in assigned_items(*sizes, seed, participants):
+        balance.update({comparison: 1 if flipped else -1 for comparison, flipped in items})
         assert all(abs(value) <= 1 for value in balance.values())
 
 
 @given(SIZES, st.integers(0, 2**32), st.integers(1, 30))
 def test_no_participant_sees_one_method_much_more_often_on_one_side(sizes, seed, participants):
-    for own in assigned(*sizes, seed, participants):
-        right = sum(flipped for _, flipped in own)
-        assert abs(2 * right - len(own)) <= 4
+    for items in assigned_items(*sizes, seed, participants):
+        right = sum(flipped for _, flipped in items)
+        assert abs(2 * right - len(items)) <= 4
 
 
-def test_a_study_of_the_paper_s_size_is_balanced():
+def test_a_study_with_the_size_of_the_paper_is_balanced():
     """100 participants with 40 of 2 x 181 pairs each."""
-    participants = assigned(362, 40, 1, 100)
-    rights = [sum(flipped for _, flipped in own) for own in participants]
+    participants = assigned_items(362, 40, 1, 100)
+    rights = [sum(flipped for _, flipped in items) for items in participants]
     assert min(rights) >= 18
     assert max(rights) <= 22
-    assert set(Counter(comparison for own in participants for comparison, _ in own).values()) == {11, 12}
+    assert set(Counter(comparison for items in participants for comparison, _ in items).values()) == {11, 12}
 
 
 def test_trials_depend_on_seed_and_number_only():
@@ -71,7 +69,7 @@ def test_trials_are_the_same_in_every_version():
     assert first == [(4, False), (1, True), (5, False), (7, True)]
 
 
-def test_sides_and_pictures_agree_with_what_the_trial_says():
+def test_the_pictures_of_a_trial_match_its_comparison_and_sides():
     study = make_description()
     for trial in draw_trials(study, 3):
         if trial.comparison is not None:
@@ -80,7 +78,7 @@ def test_sides_and_pictures_agree_with_what_the_trial_says():
             assert row.outputs == ((trial.right, trial.left) if trial.flipped else (trial.left, trial.right))
 
 
-def test_catch_trials_are_of_both_kinds_and_on_photos_that_are_not_the_participant_s_own():
+def test_catch_trials_have_both_kinds_and_use_photos_of_no_other_trial():
     study = make_description(catches=4)
     for number in range(20):
         trials = draw_trials(study, number)
@@ -93,17 +91,17 @@ def test_catch_trials_are_of_both_kinds_and_on_photos_that_are_not_the_participa
             trial.photo for trial in trials if not trial.expected
         }
         for trial in catches:
-            pressed = {"left": trial.left, "right": trial.right, "similar": trial.left}[trial.expected]
-            assert pressed == "good"
+            chosen = {"left": trial.left, "right": trial.right, "similar": trial.left}[trial.expected]
+            assert chosen == "good"
             assert (trial.expected == "similar") == (trial.left == trial.right)
 
 
 def test_the_order_does_not_reveal_the_catch_trials():
-    places = Counter(
-        place
+    positions = Counter(
+        position
         for number in range(120)
-        for place, trial in enumerate(draw_trials(make_description(), number))
+        for position, trial in enumerate(draw_trials(make_description(), number))
         if trial.expected
     )
-    assert len(places) == 10
-    assert min(places.values()) > 10
+    assert len(positions) == 10
+    assert min(positions.values()) > 10

@@ -12,12 +12,12 @@ from brewster.web.application import create_app
 from brewster.web.middleware import RequestLimits
 from brewster.web.study import study_router
 from file_server import loopback_only
-from glass_server import served_port
 from small_studies import copy_without_answers, make_study
+from web_servers import served_port
 
 READY = "#trial:not(.waiting):not([hidden])"
 
-NAMED = {
+ACCESSIBLE_NAMES = {
     "img": ["Result A", "Photo, with the reflection", "Result B"],
     "button": ["Zoom in", "Zoom out", "Show all", "Full size", "Copy your personal link"],
     "progressbar": ["Pair 1 of 4"],
@@ -31,13 +31,13 @@ def _network_off(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def original(tmp_path_factory):
-    return make_study(tmp_path_factory.mktemp("original"), size=(240, 180), catches=0)
+def study_with_pictures(tmp_path_factory):
+    return make_study(tmp_path_factory.mktemp("study_with_pictures"), size=(240, 180), catches=0)
 
 
 @pytest.fixture
-def store(original, tmp_path):
-    with closing(AnswerStore(copy_without_answers(original, tmp_path / "study"))) as store:
+def store(study_with_pictures, tmp_path):
+    with closing(AnswerStore(copy_without_answers(study_with_pictures, tmp_path / "study"))) as store:
         yield store
 
 
@@ -81,7 +81,7 @@ def begin(page):
     page.wait_for_selector(READY)
 
 
-def test_the_whole_study_works_with_the_keyboard_alone(open_page, url, store):
+def test_the_whole_study_works_with_the_keyboard_only(open_page, url, store):
     page = open_page(url)
     page.wait_for_selector("#invitation:not([hidden])")
     for key in ("Tab", "Space", "Tab", "Enter"):
@@ -97,7 +97,7 @@ def test_the_whole_study_works_with_the_keyboard_alone(open_page, url, store):
     assert all(0.3 < answer.seconds < 60 for answer in answers.values())
 
 
-def test_a_participant_continues_with_their_link_on_another_device_and_with_no_other_link(open_page, url):
+def test_a_participant_continues_on_another_device_with_the_personal_link_only(open_page, url):
     page = open_page(url)
     begin(page)
     press(page, "1")
@@ -117,13 +117,13 @@ def test_the_pictures_of_the_trial_are_shown_on_their_sides_and_have_names(open_
     ((participant, _),) = store.all_answers()
     page.wait_for_timeout(300)  # the fade-in of the pictures
     for side in ("left", "photo", "right"):
-        seen = Photo.open(page.locator(f".{side} .frame").screenshot()).linear()
-        truth = Photo.open(store.study.picture_file(getattr(participant.trials[0], side)))
-        difference = np.abs(seen - truth.resized(*seen.shape[1::-1]))
+        shown = Photo.open(page.locator(f".{side} .frame").screenshot()).linear()
+        expected = Photo.open(store.study.picture_file(getattr(participant.trials[0], side)))
+        difference = np.abs(shown - expected.resized(*shown.shape[1::-1]))
         assert np.median(difference) < 0.002  # not the mean, because the browser smooths edges
-    places = [page.locator(f".{side} .frame").bounding_box()["x"] for side in ("left", "photo", "right")]
-    assert places == sorted(places)
-    for role, names in NAMED.items():
+    positions = [page.locator(f".{side} .frame").bounding_box()["x"] for side in ("left", "photo", "right")]
+    assert positions == sorted(positions)
+    for role, names in ACCESSIBLE_NAMES.items():
         for name in names:
             expect(page.get_by_role(role, name=name)).to_be_visible()
     assert page.get_by_role("heading", level=1).all_inner_texts() == ["Which result looks better?"]
@@ -164,7 +164,7 @@ def test_zoom_and_pan_apply_to_all_three_pictures_and_are_reset_for_new_ones(ope
     assert transforms() == whole
 
 
-def test_an_answer_lost_by_the_network_is_sent_until_it_is_stored(open_page, url, store):
+def test_an_answer_without_acknowledgement_is_sent_again(open_page, url, store):
     page = open_page(url)
     begin(page)
     posts = []

@@ -1,4 +1,4 @@
-"""The command `brewster study`."""
+"""The commands `brewster study create, plan, serve, report`."""
 
 import json
 import os
@@ -34,12 +34,12 @@ def folders(tmp_path):
 
 
 @pytest.fixture
-def created(bare, folders, tmp_path):
+def study(bare, folders, tmp_path):
     assert bare("study", "create", "study", *folders, "--seed", 4)[0] == 0
     return read_study(tmp_path / "study")
 
 
-def answer_all(study, participants, rng):
+def add_answers(study, participants, rng):
     store = AnswerStore(study)
     for _ in range(participants):
         participant = store.participant(store.admit())
@@ -57,9 +57,9 @@ def test_create_prints_a_summary_and_the_next_command(bare, folders):
 
 
 def test_create_accepts_a_consent_text(bare, folders, tmp_path):
-    (tmp_path / "consent.txt").write_text("Our own words.\n")
+    (tmp_path / "consent.txt").write_text("A consent text.\n")
     bare("study", "create", "study", *folders, "--consent", "consent.txt")
-    assert read_study(tmp_path / "study").description.consent == "Our own words."
+    assert read_study(tmp_path / "study").description.consent == "A consent text."
 
 
 def test_create_exits_with_1_for_wrong_files_and_with_2_for_wrong_arguments(bare, folders, tmp_path):
@@ -70,21 +70,21 @@ def test_create_exits_with_1_for_wrong_files_and_with_2_for_wrong_arguments(bare
     assert not (tmp_path / "study").exists()
 
 
-def test_report_prints_tables_and_writes_all_files(bare, created, random):
-    answer_all(created, 12, random)
+def test_report_prints_tables_and_writes_all_files(bare, study, random):
+    add_answers(study, 12, random)
     code, out, err = bare("study", "report", "study")
     assert code == 0
     assert "### ours and RDNet" in out.decode()
     assert "12 participants (12 complete), 48 answers; 0 of 48 catch trials failed." in out.decode()
     assert "the report is in study/report" in err
-    names = {path.name for path in (created.folder / "report").iterdir()}
+    names = {path.name for path in (study.folder / "report").iterdir()}
     assert names == {"report.json", "report.md", "table.tex", "table.csv", "answers.csv", "plot.png"}
     # replaces the first report
     code, out, _ = bare("study", "report", "study", "--json", "--least-seconds", 99)
     assert json.loads(out)["excluded"] == {"failed": 0, "fast": 12}
 
 
-def test_report_without_answers_or_without_a_study_is_an_error(bare, created):
+def test_report_without_answers_or_without_a_study_is_an_error(bare, study):
     code, _, err = bare("study", "report", "study")
     assert (code, "has no answers yet" in err) == (1, True)
     code, _, err = bare("study", "report", "nowhere")
@@ -107,68 +107,68 @@ listen = application.listen
 application.listen = lambda host, port: listen("127.0.0.1", port)
 sys.exit(main(sys.argv[1:]))
 """
-"""The command line with servers that always bind to a loopback address, whatever --host is."""
+"""A program that runs the command line; servers bind to a loopback address, independent of --host."""
 
 
-def serve(folder, *args):
-    """A server in its own process, killed at the end if it still runs; its first line of output is a link."""
+def serve_study(folder, *args):
+    """Starts a server in a separate process, which is killed at the end if it still runs. Its first line of output is a link."""
     command = [sys.executable, "-c", ON_LOOPBACK, "study", "serve", folder, "--port", "0", *args]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     return started(command, **pipes, env={**os.environ, "PYTHONUNBUFFERED": "1"})
 
 
-def interrupted(server):
+def stop_server(server):
     """Stops a server with Ctrl-C; returns its standard error."""
     server.send_signal(signal.SIGINT)
     return server.communicate()[1]
 
 
-def test_a_server_continues_after_a_kill_and_stops_with_ctrl_c(created):
-    with serve(created.folder) as first:
+def test_a_server_continues_after_a_kill_and_stops_with_ctrl_c(study):
+    with serve_study(study.folder) as first:
         url = first.stdout.readline().strip()
         assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", url)
         link = post(f"{url}participants", json={"agreed": True}).json()["link"]
         given = {"trial": 0, "choice": "right", "seconds": 3}
         assert post(f"{url}{link[1:]}/answers", json=given).json()["kept"] == "right"
-    with serve(created.folder, "--called", "study.example") as second:
+    with serve_study(study.folder, "--called", "study.example") as second:
         url = second.stdout.readline().strip()
         state = get(f"{url}{link[1:]}/trial", headers={"Host": "study.example"}).json()
         assert state["trial"] == 1
-        assert "all answers are stored" in interrupted(second)
+        assert "all answers are stored" in stop_server(second)
     assert second.returncode == 0
 
 
-def test_serving_a_study_whose_pictures_changed_is_refused(bare, created):
-    next((created.folder / "pictures").iterdir()).unlink()
+def test_serving_a_study_whose_pictures_changed_is_refused(bare, study):
+    next((study.folder / "pictures").iterdir()).unlink()
     code, _, err = bare("study", "serve", "study")
     assert (code, "missing or changed" in err) == (1, True)
 
 
-def test_serving_on_another_address_prints_a_warning(created):
-    with serve(created.folder, "--host", "0.0.0.0", "--token", "auto") as server:
+def test_serving_on_another_address_prints_a_warning(study):
+    with serve_study(study.folder, "--host", "0.0.0.0", "--token", "auto") as server:
         link = server.stdout.readline().strip()
-        # the server answers only after it has installed its signal handlers
+        # the server responds only after it has installed its signal handlers
         assert get(link).status_code < 400
-        assert "the connection is not encrypted" in interrupted(server)
+        assert "the connection is not encrypted" in stop_server(server)
     assert re.fullmatch(r"http://127\.0\.0\.1:\d+/\?token=[\w-]{22}", link)
 
 
-def test_an_automatic_token_is_stored_for_its_owner_only_and_links_survive_a_restart(created):
-    with serve(created.folder, "--token", "auto") as first:
+def test_an_automatic_token_is_stored_for_its_owner_only_and_links_survive_a_restart(study):
+    with serve_study(study.folder, "--token", "auto") as first:
         url, _, token = first.stdout.readline().strip().partition("?token=")
         bearer = {"Authorization": f"Bearer {token}"}
         link = post(f"{url}participants", json={"agreed": True}, headers=bearer).json()["link"]
-    place = created.folder / "token"
-    assert place.read_text().strip() == token
-    assert place.stat().st_mode & 0o777 == 0o600
-    with serve(created.folder, "--token", "auto") as second:
+    path = study.folder / "token"
+    assert path.read_text().strip() == token
+    assert path.stat().st_mode & 0o777 == 0o600
+    with serve_study(study.folder, "--token", "auto") as second:
         url = second.stdout.readline().strip().partition("?")[0]
         assert get(url + link[1:]).status_code == 200
-        interrupted(second)
+        stop_server(second)
 
 
-def test_an_invalid_token_file_is_refused(bare, created):
-    (created.folder / "token").write_text("short\n")
+def test_an_invalid_token_file_is_refused(bare, study):
+    (study.folder / "token").write_text("short\n")
     code, _, err = bare("study", "serve", "study", "--token", "auto")
     assert (code, "contains no valid token" in err) == (1, True)
 
@@ -176,29 +176,29 @@ def test_an_invalid_token_file_is_refused(bare, created):
 @pytest.mark.parametrize(
     "name", ["study.example.org:443", "https://study.example.org", "study.example.org/", "", "bücher.example"]
 )
-def test_a_name_that_no_host_header_contains_is_a_wrong_argument(bare, created, name):
+def test_a_name_that_cannot_be_in_a_host_header_is_a_wrong_argument(bare, study, name):
     code, _, err = bare("study", "serve", "study", "--called", name, "--port", 0)
     assert (code, "is not a bare host name" in err) == (2, True)
 
 
-def test_report_without_answers_makes_no_database(bare, created):
+def test_report_without_answers_creates_no_database(bare, study):
     bare("study", "report", "study")
-    assert sorted(path.name for path in created.folder.iterdir()) == ["pictures", "study.json"]
+    assert sorted(path.name for path in study.folder.iterdir()) == ["pictures", "study.json"]
 
 
 @pytest.mark.skipif(
     os.geteuid() == 0 and not shutil.which("setpriv"), reason="root writes to read-only folders"
 )
-def test_a_read_only_study_is_reported_into_another_folder(created, random, tmp_path):
-    answer_all(created, 3, random)
-    created.folder.chmod(0o555)
-    tame = ["setpriv", "--inh-caps=-all", "--bounding-set=-all"] if os.geteuid() == 0 else []
-    command = [*tame, sys.executable, "-m", "brewster", "study", "report", str(created.folder)]
+def test_a_read_only_study_is_reported_into_another_folder(study, random, tmp_path):
+    add_answers(study, 3, random)
+    study.folder.chmod(0o555)
+    without_root_rights = ["setpriv", "--inh-caps=-all", "--bounding-set=-all"] if os.geteuid() == 0 else []
+    command = [*without_root_rights, sys.executable, "-m", "brewster", "study", "report", str(study.folder)]
     done = subprocess.run(
         [*command, "-o", str(tmp_path / "out")], capture_output=True, text=True, check=False
     )
     refused = subprocess.run(command, capture_output=True, text=True, check=False)
-    created.folder.chmod(0o755)
+    study.folder.chmod(0o755)
     assert done.returncode == 0, done.stderr
     assert "3 participants" in done.stdout
     assert refused.returncode == 1  # checks that the folder was read-only

@@ -13,10 +13,12 @@ from brewster.user_study.report.statistics import (
 )
 
 
-def shown(rng, participants, pairs, chances, correlation, studies):
+def detection_rate(rng, participants, pairs, rates_of_outcomes, correlation, studies):
     """The share of simulated studies whose interval of the difference does not contain 0."""
-    own = rng.dirichlet(np.array(chances) * (1 / correlation - 1), (participants, studies))
-    counts = rng.multinomial(pairs, own)[:, :, None].astype(float)
+    probabilities = rng.dirichlet(
+        np.array(rates_of_outcomes) * (1 / correlation - 1), (participants, studies)
+    )
+    counts = rng.multinomial(pairs, probabilities)[:, :, None].astype(float)
     draws = rates(resampled_counts(bootstrap_weights(participants, 1000), counts), np.ones((studies, 1)))
     lows, highs = bootstrap_interval(draws, participants)[..., 0, 3]
     return ((lows > 0) | (highs < 0)).mean()
@@ -26,28 +28,30 @@ def shown(rng, participants, pairs, chances, correlation, studies):
     ("difference", "tie", "pairs", "correlation"),
     [(0.1, 0.25, 40, 0.05), (0.15, 0.4, 20, 0.02), (0.1, 0.1, 40, 0.15)],
 )
-def test_a_study_of_the_planned_size_shows_the_difference_with_the_stated_power(
+def test_a_study_of_the_computed_size_detects_the_difference_with_the_given_power(
     difference, tie, pairs, correlation
 ):
-    answer = required_participants(difference=difference, tie=tie, pairs=pairs, correlation=correlation)
+    analysis = required_participants(difference=difference, tie=tie, pairs=pairs, correlation=correlation)
     rng = np.random.default_rng(6)
-    power = shown(rng, answer.participants, pairs, (answer.win, tie, answer.lose), correlation, 400)
+    power = detection_rate(
+        rng, analysis.participants, pairs, (analysis.win, tie, analysis.lose), correlation, 400
+    )
     assert power == pytest.approx(0.8, abs=3 * np.sqrt(0.8 * 0.2 / 400))
 
 
-def test_without_a_difference_five_percent_of_studies_find_one():
+def test_without_a_difference_five_percent_of_studies_detect_one():
     same = (1 - 0.25) / 2
-    assert shown(np.random.default_rng(7), 100, 40, (same, 0.25, same), 0.05, 400) == pytest.approx(
+    assert detection_rate(np.random.default_rng(7), 100, 40, (same, 0.25, same), 0.05, 400) == pytest.approx(
         0.05, abs=0.03
     )
 
 
-def test_the_formula_by_hand():
+def test_the_number_of_participants_equals_a_manual_calculation():
     """(1.95996 + 0.84162)^2 x 0.74 x 2.95 / (40 x 0.01) + 1.95996^2 / 2 = 42.84 + 1.92."""
-    answer = required_participants(difference=0.1, tie=0.25)
-    assert (answer.participants, answer.answers) == (45, 1800)
-    assert answer.design_effect == pytest.approx(2.95)
-    assert (answer.win, answer.lose) == pytest.approx((0.425, 0.325))
+    analysis = required_participants(difference=0.1, tie=0.25)
+    assert (analysis.participants, analysis.answers) == (45, 1800)
+    assert analysis.design_effect == pytest.approx(2.95)
+    assert (analysis.win, analysis.lose) == pytest.approx((0.425, 0.325))
 
 
 def test_smaller_differences_and_higher_correlations_need_more_participants():

@@ -1,4 +1,4 @@
-"""The report: on simulated participants with known preferences, and against published and independent results."""
+"""The report: simulated participants with known preferences, and comparisons with published and independent results."""
 
 import csv
 import io
@@ -11,7 +11,7 @@ import pytest
 
 from brewster import Photo
 from brewster.errors import BrewsterError
-from brewster.user_study.assignment import TrialDraw, draw_trials
+from brewster.user_study.assignment import Trial, draw_trials
 from brewster.user_study.report import figure
 from brewster.user_study.report.bradley_terry import strengths
 from brewster.user_study.report.figure import plot
@@ -36,7 +36,7 @@ from brewster.user_study.store import Participant, StoredAnswer
 from brewster.user_study.study import Study
 from small_studies import choice_for, make_description
 
-TRUTH = np.array([0.45, 0.28, 0.27])
+RATES = np.array([0.45, 0.28, 0.27])
 TABLE_3 = {  # of the paper: Real, Nature, Postcard, SolidObject, Wildscene, Average
     "RDNet": [
         (49.38, 21.25, 29.37),
@@ -58,12 +58,12 @@ TABLE_3 = {  # of the paper: Real, Nature, Postcard, SolidObject, Wildscene, Ave
 PICTURES = np.array([20.0, 20, 20, 20, 101])
 
 
-def simulated(rng, participants, studies, *, pairs=40, correlation=0.05):
-    """Counts (participants, studies, 1, 3): each participant has their own probabilities around TRUTH, with this correlation.
+def simulate_counts(rng, participants, studies, *, pairs=40, correlation=0.05):
+    """Counts (participants, studies, 1, 3). The probabilities of each participant vary around RATES, with this correlation.
 
-    Of Dirichlet probabilities with concentration a, every score's intraclass correlation is 1 / (1 + a).
+    For Dirichlet probabilities with concentration a, the intraclass correlation of every score is 1 / (1 + a).
     """
-    probabilities = rng.dirichlet(TRUTH * (1 / correlation - 1), (participants, studies))
+    probabilities = rng.dirichlet(RATES * (1 / correlation - 1), (participants, studies))
     return rng.multinomial(pairs, probabilities)[:, :, None].astype(float)
 
 
@@ -71,7 +71,7 @@ def simulated(rng, participants, studies, *, pairs=40, correlation=0.05):
 
 
 def test_the_average_of_the_paper_weights_datasets_by_their_pictures():
-    """Reproduces all rates of DSIT; of RDNet the loss rate and the sum of win and tie, between which 0.76 has moved."""
+    """For DSIT all rates match. For RDNet the loss rate and win + tie match; 0.76 points are in win instead of tie."""
     by_pictures, by_datasets = averages(np.array(TABLE_3["DSIT"][:5]), PICTURES)
     assert np.abs(by_pictures - TABLE_3["DSIT"][5]).max() < 0.006
     assert np.abs(by_datasets - TABLE_3["DSIT"][5]).max() > 4
@@ -104,19 +104,19 @@ def intervals(counts):
 
 
 @pytest.mark.parametrize("participants", [100, 12])
-def test_intervals_cover_the_truth_at_their_stated_rate(participants):
+def test_intervals_contain_the_true_rates_in_95_percent_of_studies(participants):
     """400 studies with 40 pairs for each participant: 95 % within three standard errors."""
     studies = 400
-    lows, highs = intervals(simulated(np.random.default_rng(1), participants, studies))
-    truth = np.append(TRUTH, TRUTH[0] - TRUTH[2])
-    covered = ((lows <= truth) & (truth <= highs)).mean(axis=0)
+    lows, highs = intervals(simulate_counts(np.random.default_rng(1), participants, studies))
+    true_values = np.append(RATES, RATES[0] - RATES[2])
+    covered = ((lows <= true_values) & (true_values <= highs)).mean(axis=0)
     assert np.all(np.abs(covered - 0.95) < 3 * np.sqrt(0.95 * 0.05 / studies)), covered
 
 
 def test_intervals_that_ignore_participants_would_be_too_narrow():
-    counts = simulated(np.random.default_rng(2), 100, 50, correlation=0.1)
+    counts = simulate_counts(np.random.default_rng(2), 100, 50, correlation=0.1)
     lows, highs = intervals(counts)
-    naive = 2 * 1.96 * np.sqrt(TRUTH * (1 - TRUTH) / 4000)
+    naive = 2 * 1.96 * np.sqrt(RATES * (1 - RATES) / 4000)
     assert (highs - lows)[:, :3].mean(axis=0) / naive == pytest.approx(np.sqrt(1 + 39 * 0.1), rel=0.05)
 
 
@@ -132,7 +132,7 @@ def test_a_dataset_without_answers_has_no_rate_and_does_not_affect_others():
 
 
 def test_the_simulated_intraclass_correlation_is_estimated():
-    counts = simulated(np.random.default_rng(3), 4000, 1, correlation=0.08)[:, 0, 0]
+    counts = simulate_counts(np.random.default_rng(3), 4000, 1, correlation=0.08)[:, 0, 0]
     assert intraclass_correlation(counts) == pytest.approx(0.08, abs=0.01)
     assert intraclass_correlation(counts[:1]) is None
     assert intraclass_correlation(np.tile([0.0, 3, 0], (5, 1))) is None
@@ -152,7 +152,7 @@ def test_strengths_equal_those_of_choix(random, methods):
     assert ours.sum() == pytest.approx(0)
 
 
-def test_strengths_of_two_are_the_logit_of_their_share():
+def test_the_difference_of_two_strengths_is_the_logit_of_the_win_rate():
     assert np.diff(strengths(np.array([[0, 30.0], [10, 0]]))) == pytest.approx([-np.log(3)])
 
 
@@ -161,20 +161,20 @@ def test_strengths_of_many_tables_are_those_of_each(random):
     tables[2, 0] = 0  # the first method never wins
     together = strengths(tables)
     assert np.isnan(together[2]).all()
-    for table, worth in zip(np.delete(tables, 2, 0), np.delete(together, 2, 0), strict=True):
-        assert worth == pytest.approx(strengths(table))
+    for table, strength in zip(np.delete(tables, 2, 0), np.delete(together, 2, 0), strict=True):
+        assert strength == pytest.approx(strengths(table))
 
 
 def test_strengths_converge_for_very_unequal_methods():
     wins = np.array([[0, 5000.0, 0], [0.5, 0, 5000], [0, 0.5, 0]])
-    worth = strengths(wins)
-    assert np.diff(worth) == pytest.approx([-np.log(10_000)] * 2)
+    strength = strengths(wins)
+    assert np.diff(strength) == pytest.approx([-np.log(10_000)] * 2)
 
 
 # --- agreement
 
 
-def test_alpha_is_that_of_krippendorff_s_own_example():
+def test_alpha_of_the_example_of_krippendorff_is_reproduced():
     """Krippendorff 2011, part C: four observers, twelve units, missing values; nominal alpha is 0.743."""
     observers = "123321412...", "1233224125.3", ".3332342251.", "12332441251."
     ratings = np.array(
@@ -185,12 +185,12 @@ def test_alpha_is_that_of_krippendorff_s_own_example():
 
 def test_alpha_is_1_for_agreement_0_for_chance_and_none_where_undefined(random):
     assert alpha(np.array([[4.0, 0, 0], [0, 3, 0]])) == 1
-    assert alpha(random.multinomial(20, TRUTH, 2000).astype(float)) == pytest.approx(0, abs=0.01)
+    assert alpha(random.multinomial(20, RATES, 2000).astype(float)) == pytest.approx(0, abs=0.01)
     assert alpha(np.array([[4.0, 0, 0], [5, 0, 0]])) is None
     assert alpha(np.array([[1.0, 0, 0], [0, 1, 0]])) is None
 
 
-# --- who counts
+# --- outcomes and exclusion
 
 
 @pytest.mark.parametrize(
@@ -198,7 +198,7 @@ def test_alpha_is_1_for_agreement_0_for_chance_and_none_where_undefined(random):
     [(False, "left", 0), (False, "right", 2), (True, "left", 2), (True, "right", 0), (True, "similar", 1)],
 )
 def test_the_outcome_of_a_choice_depends_on_the_side_of_the_first_method(flipped, choice, means):
-    assert outcome(TrialDraw("", "", "", 0, flipped), choice) == means
+    assert outcome(Trial("", "", "", 0, flipped), choice) == means
 
 
 def participant_answers(**fields):
@@ -221,11 +221,11 @@ def participant_answers(**fields):
         ({"catches": 1, "failed": 1}, "failed"),
     ],
 )
-def test_the_rule_excludes_inattentive_participants_only(fields, reason):
+def test_the_rule_excludes_participants_who_fail_catch_trials_or_are_too_fast(fields, reason):
     assert ExclusionRule().reason(participant_answers(**fields)) == reason
 
 
-def answered(description, number, rng, probabilities, *, catches=1.0, seconds=6.0, trials=None):
+def simulate_participant(description, number, rng, probabilities, *, catches=1.0, seconds=6.0, trials=None):
     """A participant who chooses outcomes with these probabilities and passes this share of the catch trials."""
     row = draw_trials(description, number)
     answers = {}
@@ -240,29 +240,29 @@ def answered(description, number, rng, probabilities, *, catches=1.0, seconds=6.
 
 
 @pytest.fixture(scope="module")
-def hundred(tmp_path_factory):
+def hundred_participants(tmp_path_factory):
     """100 participants x 40 pairs of three methods; five fail all catch trials, and five are too fast."""
     description = make_description(pictures=50, methods=("ours", "R&D_Net", "DSIT"), pairs=40, catches=4)
     rng = np.random.default_rng(4)
     records = [
-        answered(
+        simulate_participant(
             description,
             number,
             rng,
-            TRUTH if number >= 10 else [0, 0, 1],
+            RATES if number >= 10 else [0, 0, 1],
             catches=0.95 if number >= 5 else 0.0,
             seconds=0.6 if 5 <= number < 10 else 6.0,
             trials=20 if number == 99 else None,
         )
         for number in range(100)
     ]
-    study = Study(tmp_path_factory.mktemp("hundred"), description)
+    study = Study(tmp_path_factory.mktemp("hundred_participants"), description)
     participants = collect_answers(records)
     return study, participants, summarise(study, participants, ExclusionRule())
 
 
-def test_the_results_of_a_hundred_simulated_participants_are_correct(hundred):
-    _, _, results = hundred
+def test_the_results_of_a_hundred_simulated_participants_are_correct(hundred_participants):
+    _, _, results = hundred_participants
     included, everyone = results["included"], results["everyone"]
     assert results["excluded"] == {"failed": 6, "fast": 4}
     assert (included["participants"], everyone["participants"], included["complete"]) == (90, 100, 89)
@@ -270,19 +270,19 @@ def test_the_results_of_a_hundred_simulated_participants_are_correct(hundred):
     for table in included["tables"]:
         row = next(row for row in table["rows"] if row["key"] == "/average")
         found = [row[name]["mean"] for name in ("win", "tie", "lose")]
-        assert found == pytest.approx(TRUTH, abs=0.05)
+        assert found == pytest.approx(RATES, abs=0.05)
         assert all(
             row[name]["low"] < row[name]["mean"] < row[name]["high"] for name in ("win", "tie", "lose")
         )
-        spoilt = next(row for row in everyone["tables"][0]["rows"] if row["key"] == "/average")
-        assert spoilt["lose"]["mean"] > row["lose"]["mean"] + 0.03
-    worth = {name: entry["mean"] for name, entry in included["strengths"].items()}
-    assert worth["ours"] - worth["DSIT"] == pytest.approx(np.log(0.59 / 0.41), abs=0.15)
+        with_excluded = next(row for row in everyone["tables"][0]["rows"] if row["key"] == "/average")
+        assert with_excluded["lose"]["mean"] > row["lose"]["mean"] + 0.03
+    strength = {name: entry["mean"] for name, entry in included["strengths"].items()}
+    assert strength["ours"] - strength["DSIT"] == pytest.approx(np.log(0.59 / 0.41), abs=0.15)
     assert abs(included["agreement"]) < 0.05
 
 
-def test_results_are_plain_json_and_the_same_in_any_order(hundred):
-    study, participants, results = hundred
+def test_results_are_plain_json_and_the_same_in_any_order(hundred_participants):
+    study, participants, results = hundred_participants
     assert json.loads(json.dumps(results, allow_nan=False)) == results
     assert (
         summarise(study, participants[::-1], ExclusionRule())["included"]["tables"][0]["rows"][0]["win"][
@@ -292,8 +292,8 @@ def test_results_are_plain_json_and_the_same_in_any_order(hundred):
     )
 
 
-def test_the_files_of_a_report_agree_with_each_other(hundred, tmp_path):
-    study, participants, results = hundred
+def test_the_files_of_a_report_agree_with_each_other(hundred_participants, tmp_path):
+    study, participants, results = hundred_participants
     write(results, study, participants, tmp_path)
     assert json.loads((tmp_path / "report.json").read_text()) == results
     assert Photo.open(tmp_path / "plot.png").size[0] > 800
@@ -305,8 +305,8 @@ def test_the_files_of_a_report_agree_with_each_other(hundred, tmp_path):
     assert wins / row["answers"] == pytest.approx(row["win"]["mean"], abs=1e-6)
 
 
-def test_latex_has_the_layout_of_the_paper_and_no_bare_specials(hundred):
-    _, _, results = hundred
+def test_latex_has_the_layout_of_the_paper_and_escapes_special_characters(hundred_participants):
+    _, _, results = hundred_participants
     text = to_latex(results)
     rows = [line for line in text.splitlines() if line.endswith(r"\\")]
     assert all(line.count(" & ") + line.startswith(" & ") >= 6 for line in rows)
@@ -314,8 +314,8 @@ def test_latex_has_the_layout_of_the_paper_and_no_bare_specials(hundred):
     assert [line.split(" & ")[0] for line in rows[1::2]] == ["real", "nature", "Average"]
 
 
-def test_markdown_is_complete_and_csv_has_a_line_for_each_number(hundred):
-    _, _, results = hundred
+def test_markdown_is_complete_and_csv_has_a_line_for_each_number(hundred_participants):
+    _, _, results = hundred_participants
     text = to_markdown(results)
     for part in (
         "6 for wrong answers, 4 for short times",
@@ -329,21 +329,21 @@ def test_markdown_is_complete_and_csv_has_a_line_for_each_number(hundred):
     assert {line["group"] for line in lines} == {"included", "everyone"}
 
 
-def test_without_answers_there_is_no_report(hundred):
-    study, *_ = hundred
+def test_without_answers_there_is_no_report(hundred_participants):
+    study, *_ = hundred_participants
     with pytest.raises(BrewsterError, match="no answers yet"):
         summarise(study, [], ExclusionRule())
 
 
-def test_one_participant_gives_rates_without_intervals(hundred):
-    study, participants, _ = hundred
+def test_one_participant_gives_rates_without_intervals(hundred_participants):
+    study, participants, _ = hundred_participants
     row = summarise(study, participants[20:21], ExclusionRule())["included"]["tables"][0]["rows"][-1]
     assert row["win"]["mean"] is not None
     assert row["win"]["low"] is None
 
 
-def test_a_rule_that_excludes_everyone_still_gives_the_results_of_all(hundred):
-    study, participants, _ = hundred
+def test_a_rule_that_excludes_everyone_still_gives_the_results_of_all(hundred_participants):
+    study, participants, _ = hundred_participants
     results = summarise(study, participants[:5], ExclusionRule())
     assert results["included"]["participants"] == 0
     assert to_latex(results).startswith("% the rule excludes everyone")
@@ -354,14 +354,16 @@ def test_a_rule_that_excludes_everyone_still_gives_the_results_of_all(hundred):
 # --- names
 
 
-def named(tmp_path, datasets, methods):
+def make_study_with_names(tmp_path, datasets, methods):
     description = make_description(pictures=3, datasets=datasets, methods=methods, catches=0)
     rng, study = np.random.default_rng(5), Study(tmp_path, description)
-    return study, collect_answers([answered(description, number, rng, TRUTH) for number in range(6)])
+    return study, collect_answers(
+        [simulate_participant(description, number, rng, RATES) for number in range(6)]
+    )
 
 
 def test_a_dataset_named_average_differs_from_the_average(tmp_path):
-    study, participants = named(tmp_path, ("Average", "real"), ("ours", "RDNet"))
+    study, participants = make_study_with_names(tmp_path, ("Average", "real"), ("ours", "RDNet"))
     results = summarise(study, participants, ExclusionRule())
     lines = csv.DictReader(io.StringIO(to_csv(results)))
     titles = {line["key"]: line["dataset"] for line in lines}
@@ -371,11 +373,13 @@ def test_a_dataset_named_average_differs_from_the_average(tmp_path):
         assert "Average (dataset)" in text
 
 
-def test_the_plot_has_a_bar_for_each_row_and_shows_names_literally(tmp_path, monkeypatch, recwarn):
+def test_the_plot_has_a_bar_for_each_row_and_does_not_interpret_names_as_formulas(
+    tmp_path, monkeypatch, recwarn
+):
     axes = []
     draw_bars = figure._bars
     monkeypatch.setattr(figure, "_bars", lambda axis, *rest: (axes.append(axis), draw_bars(axis, *rest)))
-    study, participants = named(tmp_path, ("$x^$", "\u96e8"), ("$a_{b$", "RDNet"))
+    study, participants = make_study_with_names(tmp_path, ("$x^$", "\u96e8"), ("$a_{b$", "RDNet"))
     results = summarise(study, participants, ExclusionRule())
     for row in results["included"]["tables"][0]["rows"]:
         row["title"] = "alike" if row["key"] in ("\u96e8", "/average") else row["title"]
@@ -388,8 +392,8 @@ def test_the_plot_has_a_bar_for_each_row_and_shows_names_literally(tmp_path, mon
     assert not [str(warning.message) for warning in recwarn]
 
 
-def test_a_plot_of_all_participants_has_a_title(hundred, monkeypatch):
-    study, participants, _ = hundred
+def test_a_plot_of_all_participants_has_a_title(hundred_participants, monkeypatch):
+    study, participants, _ = hundred_participants
     titles = []
     monkeypatch.setattr("matplotlib.figure.Figure.suptitle", lambda _self, text, **_how: titles.append(text))
     for count in (20, 5):  # the rule excludes the first five
@@ -397,19 +401,19 @@ def test_a_plot_of_all_participants_has_a_title(hundred, monkeypatch):
     assert titles == ["All participants: the rule excludes everyone"]
 
 
-def test_answers_csv_has_the_reason_of_each_exclusion(hundred, tmp_path):
-    study, participants, results = hundred
+def test_answers_csv_has_the_reason_of_each_exclusion(hundred_participants, tmp_path):
+    study, participants, results = hundred_participants
     write(results, study, participants, tmp_path)
     lines = csv.DictReader(io.StringIO((tmp_path / "answers.csv").read_text()))
     reasons = {int(line["participant"]): line["left_out"] for line in lines}
     assert [reasons[i] for i in range(5)] == ["failed"] * 5
-    # one of the fast ones fails catch trials, too
+    # one of the fast participants also fails catch trials
     assert {reasons[i] for i in range(5, 10)} == {"failed", "fast"}
     assert {reasons[i] for i in range(10, 100)} == {""}
 
 
-def test_strengths_that_are_equal_in_all_resamples_have_no_interval(hundred):
-    study, *_ = hundred
+def test_strengths_that_are_equal_in_all_resamples_have_no_interval(hundred_participants):
+    study, *_ = hundred_participants
     tied = [participant_answers(number=i, votes={0: 1, 1: 1}) for i in range(5)]
-    worth = summarise(study, tied, ExclusionRule())["included"]["strengths"]["ours"]
-    assert worth == {"mean": pytest.approx(0), "low": None, "high": None}
+    strength = summarise(study, tied, ExclusionRule())["included"]["strengths"]["ours"]
+    assert strength == {"mean": pytest.approx(0), "low": None, "high": None}

@@ -1,4 +1,4 @@
-"""The store of answers: durable before the acknowledgement, without duplicates, with concurrent writers and kills."""
+"""The store of answers: durable before acknowledgement, without duplicates, with concurrent writers and killed processes."""
 
 import os
 import re
@@ -58,14 +58,14 @@ def test_the_first_answer_is_final(store):
     ]
 
 
-def test_tokens_are_random_and_others_are_unknown(store):
+def test_tokens_are_random_and_other_tokens_are_unknown(store):
     tokens = {store.admit() for _ in range(20)}
     assert len(tokens) == 20
     assert all(re.fullmatch(r"[\w-]{32}", token) for token in tokens)
     assert store.participant("0") is None
 
 
-def test_only_the_date_of_a_participant_is_stored(store):
+def test_only_number_token_date_and_trials_of_a_participant_are_stored(store):
     store.admit()
     with sqlite3.connect(store.study.answers_file) as database:
         columns = [row[1] for row in database.execute("PRAGMA table_info(participants)")]
@@ -94,7 +94,7 @@ def test_impossible_times_are_clipped(store):
     assert [answer.seconds for answer in answers_by_participant(store)[0].values()] == [0, 3600]
 
 
-def test_two_servers_and_many_threads_lose_nothing_and_number_nobody_twice(store):
+def test_two_servers_and_many_threads_lose_no_answer_and_assign_each_number_once(store):
     other = AnswerStore(store.study)
 
     def take_part(number):
@@ -113,7 +113,7 @@ def test_two_servers_and_many_threads_lose_nothing_and_number_nobody_twice(store
 
 def test_a_file_that_is_not_a_database_is_an_error(tmp_path):
     study = make_empty_study(tmp_path / "study")
-    study.answers_file.write_bytes(b"no database at all, but long enough to be read as a header" * 20)
+    study.answers_file.write_bytes(b"not a database, but long enough to be read as a header" * 20)
     with pytest.raises(BrewsterError, match=r"answers\.sqlite cannot be used"):
         AnswerStore(study)
 
@@ -167,11 +167,11 @@ def test_a_copy_after_kill_9_has_all_answers_and_the_file_alone_has_them_after_r
     copied = answers_by_participant(AnswerStore(read_study(tmp_path / "copy"), read_only=True))
     assert sum(map(len, copied.values())) >= 15
     store = AnswerStore(read_study(tmp_path / "study"))
-    assert answers_by_participant(alone(store.study, tmp_path / "alone")) == copied
+    assert answers_by_participant(open_without_log(store.study, tmp_path / "alone")) == copied
     store.close()
 
 
-def alone(study, folder):
+def open_without_log(study, folder):
     """The answers of a copy of answers.sqlite without its log."""
     folder.mkdir()
     shutil.copy(study.answers_file, folder)
@@ -183,7 +183,7 @@ def test_closing_a_store_moves_all_answers_into_the_file(store, tmp_path):
     participant = store.participant(store.admit())
     store.record_answer(participant, 0, "left", seconds=2)
     store.close()
-    assert len(answers_by_participant(alone(store.study, tmp_path / "alone"))[0]) == 1
+    assert len(answers_by_participant(open_without_log(store.study, tmp_path / "alone"))[0]) == 1
     other.close()
 
 
@@ -196,6 +196,6 @@ def test_a_reader_creates_no_database_and_sees_new_answers(store):
     with pytest.raises(BrewsterError, match="cannot be used"):
         reader.admit()
     reader.close()
-    nobody = make_empty_study(store.study.folder / "nobody")
-    assert answers_by_participant(AnswerStore(nobody, read_only=True)) == {}
-    assert not nobody.answers_file.exists()
+    empty = make_empty_study(store.study.folder / "empty")
+    assert answers_by_participant(AnswerStore(empty, read_only=True)) == {}
+    assert not empty.answers_file.exists()

@@ -12,20 +12,20 @@ from brewster.user_study.store import AnswerStore
 from brewster.web.application import create_app
 from brewster.web.middleware import RequestLimits
 from brewster.web.study import study_router
-from glass_server import request
 from small_studies import copy_without_answers, make_study
+from web_servers import request
 
-TOKEN = "a-token-nobody-guesses"
+TOKEN = "a-token-for-the-tests"
 
 
 @pytest.fixture(scope="module")
-def original(tmp_path_factory):
-    return make_study(tmp_path_factory.mktemp("original"), consent="First.\n\n<b>Second</b>.")
+def study_with_pictures(tmp_path_factory):
+    return make_study(tmp_path_factory.mktemp("study_with_pictures"), consent="First.\n\n<b>Second</b>.")
 
 
 @pytest.fixture
-def study(original, tmp_path):
-    return copy_without_answers(original, tmp_path / "study")
+def study(study_with_pictures, tmp_path):
+    return copy_without_answers(study_with_pictures, tmp_path / "study")
 
 
 @pytest.fixture
@@ -39,13 +39,13 @@ def app(study, store):
     return create_app(study_router(study, store), limits=RequestLimits(), index="study.html")
 
 
-def begin(app):
-    answer = request(app, "POST", "/participants", json={"agreed": True})
-    assert answer.status_code == 201
-    return answer.json()["link"]
+def admit_participant(app):
+    response = request(app, "POST", "/participants", json={"agreed": True})
+    assert response.status_code == 201
+    return response.json()["link"]
 
 
-def reply(app, link, trial, choice="left", seconds=2.5):
+def post_answer(app, link, trial, choice="left", seconds=2.5):
     return request(
         app, "POST", f"{link}/answers", json={"trial": trial, "choice": choice, "seconds": seconds}
     )
@@ -54,47 +54,50 @@ def reply(app, link, trial, choice="left", seconds=2.5):
 def test_a_participant_who_agrees_gets_a_link_and_all_trials(app, store):
     invitation = request(app, "GET", "/invitation").json()
     assert invitation == {"consent": "First.\n\n<b>Second</b>.", "trials": 8, "is_open": True}
-    link = begin(app)
+    link = admit_participant(app)
     state = request(app, "GET", f"{link}/trial").json()
     for trial in range(8):
         assert state == {"trial": trial, "trials": 8, "width": 24, "height": 18}
-        answer = reply(app, link, trial, "similar").json()
-        assert answer["kept"] == "similar"
-        state = answer["next"]
+        response = post_answer(app, link, trial, "similar").json()
+        assert response["kept"] == "similar"
+        state = response["next"]
     assert state["trial"] is None
     ((_, answers),) = store.all_answers()
     assert [answer.seconds for answer in answers.values()] == [2.5] * 8
 
 
 def test_the_pictures_of_a_trial_are_those_that_were_drawn(app, store, study):
-    link = begin(app)
+    link = admit_participant(app)
     participant = store.participant(link.removeprefix("/s/"))
     for number, trial in enumerate(participant.trials):
         for side in ("photo", "left", "right"):
-            answer = request(app, "GET", f"{link}/pictures/{number}/{side}")
-            assert answer.content == study.picture_file(getattr(trial, side)).read_bytes()
-            assert answer.headers["content-type"] == "image/png"
+            response = request(app, "GET", f"{link}/pictures/{number}/{side}")
+            assert response.content == study.picture_file(getattr(trial, side)).read_bytes()
+            assert response.headers["content-type"] == "image/png"
 
 
 def test_no_response_contains_a_method_a_dataset_or_a_file_name(app, store, study):
-    link = begin(app)
+    link = admit_participant(app)
     paths = ["/", link, f"{link}/trial", "/invitation", "/openapi.json"]
-    paths += [f"/page/{name}" for name in ("study.js", "study.css", "lens.js", "style.css")]
+    paths += [f"/page/{name}" for name in ("study.js", "study.css", "pan_zoom.js", "style.css")]
     paths += [f"{link}/pictures/{trial}/{side}" for trial in range(8) for side in ("photo", "left", "right")]
-    answers = [request(app, "GET", path) for path in paths] + [reply(app, link, 0), reply(app, link, 99)]
+    responses = [request(app, "GET", path) for path in paths] + [
+        post_answer(app, link, 0),
+        post_answer(app, link, 99),
+    ]
     names = {picture.name.removesuffix(".png") for picture in study.description.pictures}
-    for answer in answers:
-        sent = b"\n".join([*(b"%s: %s" % pair for pair in answer.headers.raw), answer.content]).lower()
+    for response in responses:
+        sent = b"\n".join([*(b"%s: %s" % pair for pair in response.headers.raw), response.content]).lower()
         for word in ("secretlus", "rivalino", "nature/", *names):
             assert word.encode() not in sent
-        if answer.headers["content-type"] == "image/png":  # no header reveals the age of the file
-            assert not {"etag", "last-modified", "content-disposition"} & set(answer.headers)
+        if response.headers["content-type"] == "image/png":  # no header reveals the age of the file
+            assert not {"etag", "last-modified", "content-disposition"} & set(response.headers)
 
 
 def test_an_answer_sent_twice_is_stored_once(app, store):
-    link = begin(app)
-    assert reply(app, link, 0, "left").json()["kept"] == "left"
-    again = reply(app, link, 0, "right").json()
+    link = admit_participant(app)
+    assert post_answer(app, link, 0, "left").json()["kept"] == "left"
+    again = post_answer(app, link, 0, "right").json()
     assert (again["kept"], again["next"]["trial"]) == ("left", 1)
     ((_, answers),) = store.all_answers()
     assert len(answers) == 1
@@ -111,9 +114,9 @@ def test_an_answer_sent_twice_is_stored_once(app, store):
     ],
 )
 def test_an_invalid_answer_is_refused_with_a_message(app, store, wrong):
-    answer = request(app, "POST", f"{begin(app)}/answers", json=wrong)
-    assert answer.status_code == 422
-    assert answer.json()["error"]
+    response = request(app, "POST", f"{admit_participant(app)}/answers", json=wrong)
+    assert response.status_code == 422
+    assert response.json()["error"]
     assert [len(answers) for _, answers in store.all_answers()] == [0]
 
 
@@ -125,32 +128,32 @@ def test_without_agreement_there_is_no_link(app, store):
 
 def test_an_unknown_link_is_an_error(app):
     for path in ("/s/nobody/trial", "/s/nobody/link", "/s/nobody/pictures/0/left"):
-        answer = request(app, "GET", path)
-        assert answer.status_code == 404
-        assert "this link is unknown" in answer.json()["error"]
-    assert reply(app, "/s/nobody", 0).status_code == 404
+        response = request(app, "GET", path)
+        assert response.status_code == 404
+        assert "this link is unknown" in response.json()["error"]
+    assert post_answer(app, "/s/nobody", 0).status_code == 404
     whole = request(app, "GET", "/s/nobody")
     assert (whole.status_code, "<title>Compare pictures" in whole.text) == (404, True)
 
 
 def test_trials_beyond_the_last_are_an_error(app):
-    link = begin(app)
+    link = admit_participant(app)
     for trial in (-1, 8):
         assert request(app, "GET", f"{link}/pictures/{trial}/left").status_code == 404
     assert request(app, "GET", f"{link}/pictures/0/middle").status_code == 422
-    assert reply(app, link, 8).status_code == 404
+    assert post_answer(app, link, 8).status_code == 404
 
 
-def test_a_full_study_admits_nobody_and_its_participants_continue(study, store):
+def test_a_full_study_admits_no_one_else_and_its_participants_can_continue(study, store):
     app = create_app(
         study_router(study, store, max_participants=1), limits=RequestLimits(), index="study.html"
     )
-    link = begin(app)
+    link = admit_participant(app)
     assert not request(app, "GET", "/invitation").json()["is_open"]
     refused = request(app, "POST", "/participants", json={"agreed": True})
     assert refused.status_code == 403
     assert "all the participants" in refused.json()["error"]
-    assert reply(app, link, 0).status_code == 200
+    assert post_answer(app, link, 0).status_code == 200
 
 
 def test_a_personal_link_contains_the_token_of_the_server(study, store):
@@ -167,7 +170,7 @@ def test_a_personal_link_contains_the_token_of_the_server(study, store):
 
 
 def test_a_16_bit_picture_is_shown_as_8_bit_srgb(tmp_path):
-    """The pixels are those that `brewster evaluate` measures."""
+    """The page shows the pixels that `brewster evaluate` scores."""
     make_study(tmp_path, names=("a",))
     deep = Photo.from_array(np.full((18, 24, 3), 30_000, np.uint16), encoding="srgb")
     for folder in ("inputs", "Secretlus", "Rivalino"):
@@ -176,7 +179,7 @@ def test_a_16_bit_picture_is_shown_as_8_bit_srgb(tmp_path):
     study = create(tmp_path / "again", tmp_path / "inputs", methods)
     with closing(AnswerStore(study)) as store:
         app = create_app(study_router(study, store), limits=RequestLimits(), index="study.html")
-        shown = Photo.open(request(app, "GET", f"{begin(app)}/pictures/0/photo").content)
+        shown = Photo.open(request(app, "GET", f"{admit_participant(app)}/pictures/0/photo").content)
     assert shown.pixels.dtype == np.uint8
     assert np.array_equal(shown.pixels, deep.srgb_8bit())
 
@@ -189,23 +192,23 @@ def test_all_assets_of_the_page_are_served_locally(app):
 
 
 def test_an_answer_that_cannot_be_written_is_not_acknowledged_and_can_be_sent_again(app, store):
-    link = begin(app)
+    link = admit_participant(app)
     store._database.execute("PRAGMA query_only = ON")  # like a full or read-only disk
-    refused = reply(app, link, 0)
+    refused = post_answer(app, link, 0)
     assert refused.status_code == 500  # the page repeats requests that fail with 500 or more
     assert refused.json()["error"].startswith("answers.sqlite cannot be used")
     store._database.execute("PRAGMA query_only = OFF")
-    assert reply(app, link, 0, "right").json()["kept"] == "right"
+    assert post_answer(app, link, 0, "right").json()["kept"] == "right"
 
 
 def test_a_missing_picture_is_a_permanent_error(tmp_path):
     study = make_study(tmp_path)
     with closing(AnswerStore(study)) as store:
         app = create_app(study_router(study, store), limits=RequestLimits(), index="study.html")
-        link = begin(app)
+        link = admit_participant(app)
         trial = store.participant(link.removeprefix("/s/")).trials[0]
         study.picture_file(trial.left).unlink()
-        answer = request(app, "GET", f"{link}/pictures/0/left")
-    assert answer.status_code == 410  # the page repeats requests that fail with 500 or more
-    assert answer.json()["error"].startswith("a picture is missing on the server")
-    assert trial.left.removesuffix(".png") not in answer.text
+        response = request(app, "GET", f"{link}/pictures/0/left")
+    assert response.status_code == 410  # the page repeats requests that fail with 500 or more
+    assert response.json()["error"].startswith("a picture is missing on the server")
+    assert trial.left.removesuffix(".png") not in response.text

@@ -30,15 +30,15 @@ def load_or_create_token(folder: Path) -> str:
         token = path.read_text("latin-1").strip()
     except OSError as error:
         raise TargetError(
-            f"{path} cannot be used ({error.strerror or error})",
-            "the token of the study is stored in this file",
-            "make it readable and writable, or pass a token: --token TOKEN",
+            f"{path} cannot be read or written ({error.strerror or error})",
+            "expected a file that can store the token of the study",
+            "make the file readable and writable, or pass a token: --token TOKEN",
         ) from error
     if not _PATTERN.fullmatch(token):
         raise BrewsterError(
             f"{path} contains no valid token",
-            "16 to 200 characters of A-Z a-z 0-9 _ and -",
-            "delete the file to create a new token; links sent out earlier need the old token",
+            "expected 16 to 200 characters of A-Z a-z 0-9 _ and -",
+            "restore the file, or delete it to create a new token, which makes the links sent out earlier invalid",
         )
     return token
 

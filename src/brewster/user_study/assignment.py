@@ -1,9 +1,9 @@
-"""Assignment of comparisons to participants, a function of the study's seed and the participant's number only.
+"""Assign comparisons to participants; the result depends only on the seed of the study and the number of the participant.
 
 All participants share one infinite sequence of rounds. Each round is a random permutation of all comparisons, and each
-participant takes the next `pairs` items. At any time the counts of two comparisons differ by at most 1. Every second
-round swaps the sides of each comparison, so each method is shown left and right equally often. The sequence is computed
-again from the seed; no state is stored.
+participant takes the next `pairs` items. At any time, the assignment counts of any two comparisons differ by at most 1.
+Every second round swaps the sides of each comparison, so each method is shown left and right equally often.
+The sequence is computed again from the seed; no state is stored.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ CHOICES: Final[tuple[Choice, ...]] = ("left", "similar", "right")
 
 @final
 @dataclass(frozen=True)
-class TrialDraw:
-    """One trial: the names of three pictures and their origin.
+class Trial:
+    """One trial: the names of its three pictures, and the comparison or the catch trial that they belong to.
 
-    A normal trial has the number of its `comparison`; `flipped` is true if the comparison's first method is on the right.
-    A catch trial has `comparison` None and the `expected` choice.
+    In a normal trial, `comparison` is the number of the comparison, and `flipped` is true if the first method of the
+    comparison is on the right. In a catch trial, `comparison` is None, and `expected` is the correct choice.
     """
 
     photo: str
@@ -37,17 +37,17 @@ class TrialDraw:
     expected: Choice | None = None
 
 
-def draw_trials(description: StudyDescription, number: int) -> tuple[TrialDraw, ...]:
+def draw_trials(description: StudyDescription, number: int) -> tuple[Trial, ...]:
     """The trials of one participant, in the order of presentation; `number` counts participants from 0.
 
-    Computes the sequence from its start: 0.3 s for participant 10,000.
+    The sequence is computed from its start, which takes 0.3 s for participant 10,000.
     """
     count, pairs = len(description.comparisons), description.pairs
     sequence = comparison_sequence(count, pairs, description.seed)
-    own = list(itertools.islice(sequence, number * pairs, (number + 1) * pairs))
+    assigned = list(itertools.islice(sequence, number * pairs, (number + 1) * pairs))
     rng = Random(f"{description.seed}/participant/{number}")  # noqa: S311  (not a secret: the seed is published)
-    trials = [_comparison_trial(description, comparison, flipped) for comparison, flipped in own]
-    trials += _catch_trials(description, {comparison for comparison, _ in own}, rng)
+    trials = [_comparison_trial(description, comparison, flipped) for comparison, flipped in assigned]
+    trials += _catch_trials(description, {comparison for comparison, _ in assigned}, rng)
     rng.shuffle(trials)
     return tuple(trials)
 
@@ -55,8 +55,9 @@ def draw_trials(description: StudyDescription, number: int) -> tuple[TrialDraw, 
 def comparison_sequence(count: int, pairs: int, seed: int) -> Iterator[tuple[int, bool]]:
     """The infinite sequence of (comparison number, sides swapped).
 
-    Items `n * pairs` to `(n + 1) * pairs` belong to participant n and contain no comparison twice. For each comparison,
-    the counts of both orders differ by at most 1 at any time; for each participant they are nearly equal.
+    Items `n * pairs` to `(n + 1) * pairs - 1` belong to participant n and contain no comparison twice. For each
+    comparison, the numbers of items with and without swapped sides differ by at most 1 at any time; for each participant
+    they are nearly equal.
 
     Args:
         count: number of comparisons.
@@ -67,16 +68,16 @@ def comparison_sequence(count: int, pairs: int, seed: int) -> Iterator[tuple[int
     order: list[int] = []
     for round_number in itertools.count():
         rng = Random(f"{seed}/round/{round_number}")  # noqa: S311
-        # the previous round ended with this many comparisons of a participant who continues in this round
-        handed_out = round_number * count % pairs
-        seen, missing = set(order[len(order) - handed_out :]), -handed_out % pairs
-        order = _unseen_first(rng.sample(range(count), count), seen, missing)
+        # a participant may take the last `carried_over` items of the previous round and the first `needed` ones of this round
+        carried_over = round_number * count % pairs
+        seen, needed = set(order[len(order) - carried_over :]), -carried_over % pairs
+        order = _unseen_first(rng.sample(range(count), count), seen, needed)
         if round_number % 2:  # swap the sides of the previous round, and alternate left and right
             sides = [
-                _unseen_first([c for c in order if flips[c] is flip], seen, missing // 2)
+                _unseen_first([c for c in order if flips[c] is flip], seen, needed // 2)
                 for flip in (False, True)
             ]
-            order = _unseen_first(_interleave(*sides), seen, missing)
+            order = _unseen_first(_interleave(*sides), seen, needed)
             flips = {comparison: not flip for comparison, flip in flips.items()}
         else:
             start = rng.random() < 0.5
@@ -85,9 +86,9 @@ def comparison_sequence(count: int, pairs: int, seed: int) -> Iterator[tuple[int
 
 
 def _unseen_first(order: Sequence[int], seen: Collection[int], count: int) -> list[int]:
-    """Move the first `count` unseen comparisons to the front.
+    """Move the first `count` comparisons that are not in `seen` to the front.
 
-    A participant whose items span two rounds then gets no comparison twice.
+    Then a participant whose items belong to two rounds gets no comparison twice.
     """
     front = dict.fromkeys([comparison for comparison in order if comparison not in seen][:count])
     return [*front, *(comparison for comparison in order if comparison not in front)]
@@ -99,23 +100,27 @@ def _interleave(first: Sequence[int], second: Sequence[int]) -> list[int]:
     return [comparison for comparison in interleaved if comparison is not None]
 
 
-def _comparison_trial(description: StudyDescription, number: int, flipped: bool) -> TrialDraw:
+def _comparison_trial(description: StudyDescription, number: int, flipped: bool) -> Trial:
     comparison = description.comparisons[number]
     left, right = comparison.outputs[::-1] if flipped else comparison.outputs
-    return TrialDraw(comparison.photo, left, right, number, flipped)
+    return Trial(comparison.photo, left, right, number, flipped)
 
 
-def _catch_trials(description: StudyDescription, own: Collection[int], rng: Random) -> list[TrialDraw]:
-    """The participant's catch trials, half of each kind, on photos that they do not see otherwise, if possible."""
-    photos = {description.comparisons[number].photo for number in own}
+def _catch_trials(description: StudyDescription, assigned: Collection[int], rng: Random) -> list[Trial]:
+    """The catch trials of a participant, alternating between the two kinds.
+
+    Photos that the participant does not see in another trial are used first. `assigned` contains the numbers of the
+    comparisons of the participant.
+    """
+    photos = {description.comparisons[number].photo for number in assigned}
     pool = rng.sample(description.catch_pool, len(description.catch_pool))
     pool.sort(key=lambda catch: catch.photo in photos)
     return [_catch_trial(catch, i, rng) for i, catch in enumerate(pool[: description.catches])]
 
 
-def _catch_trial(catch: CatchTrial, i: int, rng: Random) -> TrialDraw:
+def _catch_trial(catch: CatchTrial, i: int, rng: Random) -> Trial:
     if i % 2 == 0:
-        return TrialDraw(catch.photo, catch.good, catch.good, expected="similar")
+        return Trial(catch.photo, catch.good, catch.good, expected="similar")
     if rng.random() < 0.5:
-        return TrialDraw(catch.photo, catch.good, catch.spoilt, expected="left")
-    return TrialDraw(catch.photo, catch.spoilt, catch.good, expected="right")
+        return Trial(catch.photo, catch.good, catch.spoilt, expected="left")
+    return Trial(catch.photo, catch.spoilt, catch.good, expected="right")

@@ -2,8 +2,8 @@
 
     create(Path("out/study"), Path("inputs"), {"ours": Path("out/ours"), "RDNet": Path("out/rdnet")})
 
-All files are checked before anything is written; one error lists all problems. Pictures are stored as upright 8-bit sRGB
-PNG without metadata: every browser shows them alike, and neither format nor EXIF reveals the method.
+All files are checked before anything is written, and one error lists all problems. Pictures are stored as upright 8-bit
+sRGB PNG without metadata, so every browser shows the same pixels, and neither format nor EXIF reveals the method.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from brewster.photo import Photo
 from brewster.user_study.degrade import degrade
 from brewster.user_study.folders import Key, find_pictures, shorten_list
 from brewster.user_study.study import (
-    PICTURES,
+    PICTURES_FOLDER,
     CatchTrial,
     PairedComparison,
     Study,
@@ -52,8 +52,13 @@ and nothing else about you or your device."""
 class StudyOptions:
     """Options of a new study.
 
-    `pairs` and `catches` count the comparisons and catch trials of one participant. None takes DEFAULT_PAIRS and
-    DEFAULT_CATCHES, or fewer if the study has fewer pictures.
+    Attributes:
+        datasets: the datasets to use; all if empty.
+        pairs: number of comparisons for each participant. None means DEFAULT_PAIRS, or all if there are fewer.
+        catches: number of catch trials for each participant. None means DEFAULT_CATCHES, or all if there are fewer.
+        all_pairs: whether each method is compared with each other method, instead of the first method only.
+        seed: the seed of the assignment; None chooses a random one.
+        consent: the text that participants agree to.
     """
 
     datasets: Sequence[str] = ()
@@ -83,11 +88,14 @@ def create(
     """Create a study of all pictures in the folder `inputs`.
 
     Args:
-        out: the folder of the new study; it must not exist or be empty.
+        out: the folder of the new study. It must be empty, or not exist yet.
         inputs: the folder of photos with reflections.
         methods: the folder of outputs by method name. The first method is compared with each of the others.
         options: sizes, seed and consent text.
         on_progress: called after each copied picture with the number of pictures copied so far.
+
+    Returns:
+        The study in the folder `out`.
 
     Raises:
         BrewsterError: there are fewer than two methods; files are missing, unreadable or of different sizes; or `options`
@@ -104,7 +112,7 @@ def create(
         options.catches, DEFAULT_CATCHES, min(CATCH_POOL_SIZE, len(files.inputs)), "catch trials"
     )
     with atomic_path(out) as folder:
-        copier = _Copier(folder / PICTURES, Random(f"{seed}/names"), on_progress)  # noqa: S311  (the seed is published)
+        copier = _Copier(folder / PICTURES_FOLDER, Random(f"{seed}/names"), on_progress)  # noqa: S311  (the seed is published)
         comparisons = tuple(_comparisons(files, pairs, copier))
         pool = tuple(_catch_pool(files, copier, Random(f"{seed}/catches")))  # noqa: S311
         description = StudyDescription(
@@ -129,25 +137,25 @@ def create(
 def _pair_pictures(inputs: Path, methods: Mapping[str, Path], datasets: Sequence[str]) -> _StudyFiles:
     if len(methods) < 2:
         raise BrewsterError(
-            f"the study has {len(methods)} method",
-            "a study compares two or more methods",
+            f"the number of methods is {len(methods)}",
+            "expected two or more methods",
             "add another --method NAME=DIR",
         )
     files = _StudyFiles(
         find_pictures(inputs, datasets),
         {name: find_pictures(path, datasets) for name, path in methods.items()},
     )
-    misfits = [*_unpaired(files, inputs, methods), *_unfit_files(files)]
-    if misfits:
+    problems = [*_pairing_problems(files, inputs, methods), *_file_problems(files)]
+    if problems:
         raise BrewsterError(
-            f"{len(misfits)} {'picture does' if len(misfits) == 1 else 'pictures do'} not fit: {shorten_list(misfits)}",
-            "every input has one output of each method, of the same size",
+            f"the pictures have {len(problems)} {'problem' if len(problems) == 1 else 'problems'}: {shorten_list(problems)}",
+            "expected one output of each method for every input, with the size of the input",
             "fix these files and run the command again; nothing was written",
         )
     return files
 
 
-def _unpaired(files: _StudyFiles, inputs: Path, methods: Mapping[str, Path]) -> Iterator[str]:
+def _pairing_problems(files: _StudyFiles, inputs: Path, methods: Mapping[str, Path]) -> Iterator[str]:
     for name, outputs in files.outputs.items():
         for dataset, stem in files.inputs.keys() - outputs.keys():
             yield f"{name} has no {methods[name] / dataset / stem}.*"
@@ -155,8 +163,8 @@ def _unpaired(files: _StudyFiles, inputs: Path, methods: Mapping[str, Path]) -> 
             yield f"{outputs[key]} has no input in {inputs / key[0]}"
 
 
-def _unfit_files(files: _StudyFiles) -> Iterator[str]:
-    """Files that cannot be decoded, and outputs whose size differs from that of the input."""
+def _file_problems(files: _StudyFiles) -> Iterator[str]:
+    """Yield a message for each file that cannot be decoded, and for each output whose size differs from that of its input."""
     sizes: dict[Path, tuple[int, int]] = {}
     for path in [
         *files.inputs.values(),
@@ -169,8 +177,8 @@ def _unfit_files(files: _StudyFiles) -> Iterator[str]:
     for outputs, (key, photo) in product(files.outputs.values(), files.inputs.items()):
         output = outputs.get(key)
         if output in sizes and photo in sizes and sizes[output] != sizes[photo]:
-            (wide, high), (width, height) = sizes[output], sizes[photo]
-            yield f"{output} has {wide}x{high} pixels, its input {width}x{height}"
+            (output_width, output_height), (width, height) = sizes[output], sizes[photo]
+            yield f"{output} has {output_width}x{output_height} pixels, but its input has {width}x{height}"
 
 
 def _limited(requested: int | None, default: int, maximum: int, what: str) -> int:
@@ -185,7 +193,7 @@ def _limited(requested: int | None, default: int, maximum: int, what: str) -> in
 
 def _require_empty(out: Path) -> None:
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
-        raise TargetError(f"{out} is not empty", "a new study needs an empty folder", "choose another folder")
+        raise TargetError(f"{out} is not empty", "expected an empty or new folder", "choose another folder")
 
 
 # --- copying pictures under random names
@@ -202,7 +210,7 @@ class _Copier:
     pictures: dict[Path, StudyPicture] = field(default_factory=dict)
 
     def copy(self, path: Path) -> str:
-        """Copy a picture if it is not copied yet; returns its new name."""
+        """Copy a picture, unless it is copied already. Returns its new name."""
         if path not in self.pictures:
             data = path.read_bytes()
             self.pictures[path] = self.write(Photo.open(data), hashlib.sha256(data).hexdigest())
@@ -210,7 +218,7 @@ class _Copier:
         return self.pictures[path].name
 
     def copy_degraded(self, path: Path) -> str:
-        """Write a degraded copy of a picture; returns its new name."""
+        """Write a degraded copy of a picture. Returns its new name."""
         key = path / "degraded"  # a key that no source file has
         data = path.read_bytes()
         degraded = Photo.from_array(
@@ -219,12 +227,12 @@ class _Copier:
         self.pictures[key] = self.write(degraded, hashlib.sha256(data).hexdigest())
         return self.pictures[key].name
 
-    def write(self, photo: Photo, source: str) -> StudyPicture:
-        """Write a picture as PNG without metadata."""
+    def write(self, photo: Photo, source_sha256: str) -> StudyPicture:
+        """Write a picture as PNG without metadata. Returns its description."""
         name = f"{self.rng.getrandbits(64):016x}.png"
         data = Photo.from_array(photo.srgb_8bit(), encoding="srgb").encode("png")
         write_atomically(self.folder / name, data)
-        return StudyPicture(name, *photo.size, hashlib.sha256(data).hexdigest(), source)
+        return StudyPicture(name, *photo.size, hashlib.sha256(data).hexdigest(), source_sha256)
 
 
 def _comparisons(
@@ -237,7 +245,7 @@ def _comparisons(
 
 
 def _catch_pool(files: _StudyFiles, copier: _Copier, rng: Random) -> Iterator[CatchTrial]:
-    """Photos for catch trials, at most CATCH_POOL_SIZE, each with the output of a random method and a degraded copy of it."""
+    """Photos for catch trials, at most CATCH_POOL_SIZE, each with the output of a random method and a degraded copy of this output."""
     for key in rng.sample(list(files.inputs), min(CATCH_POOL_SIZE, len(files.inputs))):
         output = files.outputs[rng.choice(list(files.outputs))][key]
         yield CatchTrial(

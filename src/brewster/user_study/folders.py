@@ -1,4 +1,4 @@
-"""Find the pictures of a folder by dataset and name: `real/12.png` is picture 12 of the dataset real."""
+"""Find the pictures in a folder by dataset and name: `real/12.png` is picture 12 of the dataset real."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from brewster.image_formats import SUFFIXES
 from brewster.user_study.study import UNNAMED_DATASET
 
 Key = tuple[str, str]
-"""Dataset and stem."""
+"""The dataset of a picture, and its file name without the suffix (the stem)."""
 
 _MAX_LISTED: Final = 8
 _TRANSMISSION: Final = ".transmission"
@@ -28,17 +28,17 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
 
     Args:
         folder: the folder to search; subfolders are searched one level deep.
-        datasets: the datasets to take, in this order; all of them if empty.
+        datasets: the datasets to use, in this order; all of them if empty.
 
     Returns:
         Paths by (dataset, stem), in natural order (2 before 10).
 
     Raises:
-        BrewsterError: the folder contains no picture; a dataset is missing; two files have one name; or pictures are both
+        BrewsterError: the folder contains no picture; a dataset is missing; two files have the same name; or pictures are both
             in the folder and in its subfolders, and `datasets` is empty.
     """
     if not folder.is_dir():
-        raise BrewsterError(f"{folder} is not a folder", "a folder with pictures", "check the path")
+        raise BrewsterError(f"{folder} is not a folder", "expected a folder with pictures", "check the path")
     subfolders = {
         _normalised(subfolder.name): subfolder
         for subfolder in folder.iterdir()
@@ -51,12 +51,12 @@ def find_pictures(folder: Path, datasets: Sequence[str] = ()) -> dict[Key, Path]
     if missing := [name for name in datasets if name not in stems_by_dataset]:
         raise BrewsterError(
             f"{folder} has no dataset {missing[0]!r}",
-            f"a subfolder with pictures; there {'is' if len(stems_by_dataset) == 1 else 'are'} {', '.join(stems_by_dataset) or 'none'}",
+            f"expected the name of a subfolder with pictures ({', '.join(stems_by_dataset) or 'there are none'})",
             "check the name",
         )
-    if not datasets and (own := _list_pictures(folder)):
-        _require_one_layout(folder, list(stems_by_dataset), list(own))
-        stems_by_dataset = {UNNAMED_DATASET: own}
+    if not datasets and (top_level := _list_pictures(folder)):
+        _require_one_layout(folder, list(stems_by_dataset), list(top_level))
+        stems_by_dataset = {UNNAMED_DATASET: top_level}
     found: defaultdict[Key, list[Path]] = defaultdict(list)
     for name in dict.fromkeys(datasets or stems_by_dataset):
         for path, stem in stems_by_dataset[name].items():
@@ -74,28 +74,33 @@ def shorten_list(items: Sequence[str]) -> str:
 def _require_unique_names(folder: Path, found: dict[Key, list[Path]]) -> None:
     if not found:
         raise BrewsterError(
-            f"{folder} contains no picture", "pictures, or subfolders with pictures", "check the path"
+            f"{folder} contains no picture",
+            "expected pictures, or subfolders with pictures",
+            "check the path",
         )
     duplicates = [" and ".join(sorted(map(str, paths))) for paths in found.values() if len(paths) > 1]
     if duplicates:
         raise BrewsterError(
-            f"{shorten_list(duplicates)} share a name",
-            "pictures are paired by name without the suffix",
+            f"{shorten_list(duplicates)} have the same name",
+            "expected different names without the suffix, because pictures are paired by name",
             "keep one file of each name",
         )
 
 
-def _require_one_layout(folder: Path, subfolders: Sequence[str], own: Sequence[Path]) -> None:
+def _require_one_layout(folder: Path, subfolders: Sequence[str], top_level: Sequence[Path]) -> None:
     if subfolders:
         raise BrewsterError(
-            f"{folder} contains pictures ({shorten_list([path.name for path in own])}) and subfolders with pictures ({', '.join(subfolders)})",
-            "pictures either in the folder or in subfolders, one for each dataset",
-            "move the pictures into a subfolder, or name the subfolders to take: --dataset NAME",
+            f"{folder} contains pictures ({shorten_list([path.name for path in top_level])}) and subfolders with pictures ({', '.join(subfolders)})",
+            "expected pictures either in the folder or in subfolders, one for each dataset",
+            "move the pictures into a subfolder, or choose subfolders: --dataset NAME",
         )
 
 
 def _list_pictures(folder: Path) -> dict[Path, str]:
-    """The stem of each picture in a folder, in natural order, without reflections and confidence maps of separated photos."""
+    """The stems of the pictures in a folder, by path and in natural order.
+
+    Reflections and confidence maps are left out if the folder contains the transmission of the same photo.
+    """
     pictures = {
         path: _normalised(path.stem)
         for path in folder.iterdir()
@@ -112,7 +117,7 @@ def _list_pictures(folder: Path) -> dict[Path, str]:
 
 
 def _normalised(name: str) -> str:
-    """The name in Unicode form NFC; some file systems store an accented letter as two characters."""
+    """The name in Unicode form NFC; some file systems store an accented letter as two code points."""
     return unicodedata.normalize("NFC", name)
 
 

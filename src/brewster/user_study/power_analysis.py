@@ -18,8 +18,9 @@ from brewster.errors import BrewsterError
 class PowerAnalysis:
     """The required number of participants, and the quantities that it is computed from.
 
-    `win` and `lose` are the assumed rates. `design_effect` is the number of real answers that carry as much information
-    as one independent answer. `deviation` is the standard deviation of the difference between participants.
+    `answers` is the number of participants times the number of pairs. `win` and `lose` are the assumed rates.
+    `design_effect` is the number of real answers that carry as much information as one independent answer. `deviation` is
+    the standard deviation, over participants, of the difference between win and lose rate.
     """
 
     participants: int
@@ -55,18 +56,18 @@ def required_participants(
         level: the significance level, the probability of detecting a difference that does not exist.
 
     Raises:
-        BrewsterError: `difference` is not above 0, or the rates do not sum to 1.
+        BrewsterError: `difference` is not above 0, or the lose rate would be negative.
     """
     win, lose = (1 - tie + difference) / 2, (1 - tie - difference) / 2
     if not (0 < difference <= 1 and 0 <= tie < 1 and lose >= 0):
         raise BrewsterError(
             f"a difference of {difference:g} with a tie rate of {tie:g} means {win:.0%} wins and {lose:.0%} losses",
-            "a difference above 0 and rates that sum to 1",
-            "choose a smaller difference or a smaller tie rate",
+            "expected a difference above 0, and no rate below 0",
+            "choose a difference above 0 that is at most 1 minus the tie rate",
         )
     variance = 1 - tie - difference**2
     design_effect = 1 + (pairs - 1) * correlation
-    critical, reached = NormalDist().inv_cdf(1 - level / 2), NormalDist().inv_cdf(power)
-    minimum = (critical + reached) ** 2 * variance * design_effect / (pairs * difference**2) + critical**2 / 2
+    z_level, z_power = NormalDist().inv_cdf(1 - level / 2), NormalDist().inv_cdf(power)
+    minimum = (z_level + z_power) ** 2 * variance * design_effect / (pairs * difference**2) + z_level**2 / 2
     count = math.ceil(minimum)
     return PowerAnalysis(count, count * pairs, win, lose, design_effect, math.sqrt(variance * correlation))

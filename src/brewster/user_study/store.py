@@ -4,9 +4,10 @@
     participant = store.participant(store.admit())
     store.record_answer(participant, 0, "left", seconds=4.2)
 
-For a participant the database has a number, the token of their personal link, and the date of the consent; no name and no
-address. The trials are drawn once, at admission, and stored, so a later version of brewster cannot change them. The first
-answer to a trial is final: a second one, for example after a lost acknowledgement, changes nothing.
+For each participant, the database contains a number, the token of the personal link, the date of the consent and the
+trials; it contains no name and no address. The trials are drawn once, at admission, and stored, so a later version of
+brewster cannot change them. The first answer to a trial is final: a second one, for example after a lost acknowledgement,
+changes nothing.
 """
 
 from __future__ import annotations
@@ -24,10 +25,11 @@ from threading import Lock
 from typing import Final, final
 
 from brewster.errors import BrewsterError, TargetError
-from brewster.user_study.assignment import CHOICES, Choice, TrialDraw, draw_trials
+from brewster.user_study.assignment import CHOICES, Choice, Trial, draw_trials
 from brewster.user_study.study import ANSWERS_FILE, Study
 
 MAX_SECONDS: Final = 3600.0
+"""Longer times are stored as this value."""
 _TIMEOUT_SECONDS: Final = 30.0
 _SCHEMA: Final = """
 CREATE TABLE IF NOT EXISTS participants (
@@ -43,10 +45,10 @@ CREATE TABLE IF NOT EXISTS answers (
 @final
 @dataclass(frozen=True)
 class Participant:
-    """A participant: their number, counted from 0, and their trials in order."""
+    """A participant: the number, counted from 0, and the trials in order of presentation."""
 
     number: int
-    trials: tuple[TrialDraw, ...]
+    trials: tuple[Trial, ...]
 
 
 @final
@@ -118,7 +120,7 @@ class AnswerStore:
         return token
 
     def participant(self, token: str) -> Participant | None:
-        """The participant with this token, or None."""
+        """The participant with this token, or None if the token is unknown."""
         with self._reading() as database:
             row = database.execute(
                 "SELECT number, trials FROM participants WHERE token = ?", (token,)
@@ -153,7 +155,7 @@ class AnswerStore:
         if not 0 <= trial < len(participant.trials) or choice not in CHOICES:
             raise BrewsterError(
                 f"trial {trial} was answered with {choice!r}",
-                f"trials 0 to {len(participant.trials) - 1} and {', '.join(CHOICES)} exist",
+                f"expected a trial from 0 to {len(participant.trials) - 1} and one of the choices {', '.join(CHOICES)}",
                 "load the page again",
             )
         seconds_shown = min(max(seconds, 0.0), MAX_SECONDS)
@@ -169,7 +171,7 @@ class AnswerStore:
         return stored
 
     def all_answers(self) -> Iterator[tuple[Participant, dict[int, StoredAnswer]]]:
-        """Yield every participant, in order of number, with their answers by trial; the answers may be empty."""
+        """Yield every participant, in order of number, and a dict of the answers by trial, which may be empty."""
         with self._reading() as database:
             rows = database.execute("SELECT participant, trial, choice, seconds FROM answers").fetchall()
             # read participants after answers: another process may admit participants in between
@@ -208,7 +210,7 @@ class AnswerStore:
         except sqlite3.Error as error:
             raise TargetError(
                 f"{ANSWERS_FILE} cannot be used ({error})",  # without the folder: participants may see this message
-                "a database created by brewster, on a local disk with free space",
+                "expected a database created by brewster, on a local disk with free space",
                 "fix the problem and start again; all acknowledged answers are stored",
             ) from error
 
@@ -226,5 +228,5 @@ def _read_only_uri(file: Path) -> str:
     return f"{file.resolve().as_uri()}?mode=ro{'&immutable=1' if is_immutable else ''}"
 
 
-def _parse_trials(text: str) -> tuple[TrialDraw, ...]:
-    return tuple(TrialDraw(**row) for row in json.loads(text))
+def _parse_trials(text: str) -> tuple[Trial, ...]:
+    return tuple(Trial(**row) for row in json.loads(text))

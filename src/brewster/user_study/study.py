@@ -22,9 +22,9 @@ from brewster.errors import BrewsterError
 from brewster.files import write_atomically
 
 DESCRIPTION_FILE: Final = "study.json"
-PICTURES: Final = "pictures"
+PICTURES_FOLDER: Final = "pictures"
 ANSWERS_FILE: Final = "answers.sqlite"
-FORMAT: Final = 1
+FORMAT_VERSION: Final = 1
 UNNAMED_DATASET: Final = ""
 """The name of the only dataset if the source folders have no subfolders."""
 
@@ -47,7 +47,11 @@ class StudyPicture:
 @final
 @dataclass(frozen=True)
 class PairedComparison:
-    """Two methods on one photo: dataset and name of the photo, and the names of the three pictures."""
+    """A comparison of two methods on one photo.
+
+    `dataset` and `name` identify the source file. `photo` and `outputs` are names of pictures; `outputs` has the order of
+    `methods`.
+    """
 
     dataset: str
     name: str
@@ -59,7 +63,10 @@ class PairedComparison:
 @final
 @dataclass(frozen=True)
 class CatchTrial:
-    """Pictures for a catch trial, which tests attention: an output is compared with itself or with a degraded copy."""
+    """Pictures for a catch trial, which tests attention: an output is compared with itself or with a degraded copy.
+
+    `photo`, `good` and `spoilt` are names of pictures: the photo, the output, and the degraded copy of the output.
+    """
 
     dataset: str
     name: str
@@ -87,7 +94,7 @@ class StudyDescription:
     pictures: tuple[StudyPicture, ...]
     comparisons: tuple[PairedComparison, ...]
     catch_pool: tuple[CatchTrial, ...]
-    format: int = FORMAT
+    format: int = FORMAT_VERSION
 
 
 _DESCRIPTION: Final = TypeAdapter(StudyDescription)
@@ -101,12 +108,12 @@ class Study:
     folder: Path
     description: StudyDescription
 
-    def picture_file(self, picture: str) -> Path:
-        """The path of a picture."""
-        return self.folder / PICTURES / picture
+    def picture_file(self, name: str) -> Path:
+        """The path of the picture with this name."""
+        return self.folder / PICTURES_FOLDER / name
 
     def picture(self, name: str) -> StudyPicture:
-        """The description of a picture by its name."""
+        """The description of the picture with this name."""
         return self._by_name[name]
 
     @property
@@ -135,8 +142,8 @@ class Study:
         changed = list(self.changed_pictures())
         if changed:
             raise BrewsterError(
-                f"{self.folder / PICTURES / changed[0]} is missing or changed, and {len(changed) - 1} others",
-                "all participants of a study see the same pictures",
+                f"pictures of the study are missing or changed: {len(changed)}, such as {self.picture_file(changed[0])}",
+                "expected all pictures as `brewster study create` wrote them",
                 "copy the study again from its original folder",
             )
 
@@ -159,7 +166,7 @@ def read_study(folder: Path) -> Study:
     """Read the study in a folder.
 
     Raises:
-        BrewsterError: the description cannot be read, is invalid, or has a format of another version.
+        BrewsterError: the description cannot be read, is invalid, or has the format of another version.
     """
     path = folder / DESCRIPTION_FILE
     try:
@@ -167,20 +174,20 @@ def read_study(folder: Path) -> Study:
     except OSError as error:
         raise BrewsterError(
             f"{path} cannot be read ({error.strerror or error})",
-            "a folder created by `brewster study create`",
+            "expected a folder created by `brewster study create`",
             "check the path",
         ) from error
     except ValidationError as error:
         first = error.errors()[0]
         raise BrewsterError(
             f"{path} is not a valid description of a study ({'.'.join(map(str, first['loc']))}: {first['msg']})",
-            "an unchanged file written by `brewster study create`",
-            "create the study again",
+            "expected an unchanged file written by `brewster study create`",
+            "restore the original file, or create the study again",
         ) from error
-    if description.format != FORMAT:
+    if description.format != FORMAT_VERSION:
         raise BrewsterError(
             f"{path} has format {description.format}",
-            f"this version reads format {FORMAT}",
-            f"use brewster {description.brewster}",
+            f"expected format {FORMAT_VERSION}",
+            f"use brewster {description.brewster}, which created the study",
         )
     return Study(folder, description)

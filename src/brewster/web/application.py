@@ -37,7 +37,7 @@ from brewster.web.middleware import SECURITY_HEADERS, LimitMiddleware, RequestLi
 from brewster.web.request_schema import validation_message
 from brewster.web.server import create_server
 
-PAGE: Final = Path(__file__).parent / "page"
+PAGE_FOLDER: Final = Path(__file__).parent / "page"
 _STATUS_CODES: Final[dict[type[BrewsterError], int]] = {
     PhotoTooLarge: 413,
     UnreadablePhoto: 422,
@@ -56,24 +56,24 @@ def create_app(*routers: APIRouter, limits: RequestLimits, index: str = "index.h
 
     Args:
         routers: the routes of the API.
-        limits: checked before every request.
+        limits: the limits that every request must satisfy.
         index: the file in web/page/ that is served at `/`.
     """
     app = FastAPI(title="brewster", version=brewster.__version__, docs_url=None, redoc_url=None)
     app.add_middleware(LimitMiddleware, limits=limits)
-    for kind in (ClientDisconnect, HTTPException, RequestValidationError, BrewsterError, Exception):
-        app.add_exception_handler(kind, _error_response)
+    for error_class in (ClientDisconnect, HTTPException, RequestValidationError, BrewsterError, Exception):
+        app.add_exception_handler(error_class, _error_response)
     for router in routers:
         app.include_router(router)
     _add_page(app, "/", index)
-    for file in sorted(PAGE.iterdir()):
+    for file in sorted(PAGE_FOLDER.iterdir()):
         _add_page(app, f"/page/{file.name}", file.name)
     return app
 
 
 def page_response(name: str) -> Response:
-    """A file of web/page/; browsers revalidate it on each use."""
-    return FileResponse(PAGE / name, headers={"Cache-Control": "no-cache"})
+    """The response with a file of web/page/; browsers revalidate the file on each use."""
+    return FileResponse(PAGE_FOLDER / name, headers={"Cache-Control": "no-cache"})
 
 
 def _add_page(app: FastAPI, path: str, name: str) -> None:
@@ -81,7 +81,7 @@ def _add_page(app: FastAPI, path: str, name: str) -> None:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Open a listening socket; port 0 takes a free port.
+    """Open a listening socket; port 0 chooses a free port.
 
     Raises:
         TargetError: the address or the port cannot be used.
@@ -92,7 +92,7 @@ def listen(host: str, port: int) -> socket.socket:
     except OSError as error:
         raise TargetError(
             f"{host} port {port} cannot be used ({error.strerror})",
-            "an address of this machine and a free port",
+            "expected an address of this machine and a free port",
             "choose others with --host and --port",
         ) from error
 
@@ -116,7 +116,7 @@ def serve(
     Args:
         app: the application.
         host: the address to bind to.
-        port: the port; 0 takes a free port.
+        port: the port; 0 chooses a free port.
         on_ready: called with the URL when the socket is open.
 
     Raises:

@@ -1,11 +1,11 @@
-"""A job queue with a few worker threads, a limited number of waiting jobs, a time limit, and cancellation.
+"""A job queue with worker threads, a limited number of waiting jobs, a time limit, and cancellation.
 
     job_queue = JobQueue()
     with job_queue.reserve("a name") as job:
         result = await job_queue.run_job(job, work, request.receive)
 
-`work(on_progress)` runs in a thread and calls `on_progress(share)` often. This call raises JobCancelled if the client has
-disconnected or the time limit is exceeded.
+`work(on_progress)` runs in a thread and often calls `on_progress` with the completed fraction, 0 to 1. This call raises
+JobCancelled if the client has disconnected or the time limit is exceeded.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ class JobProgress:
     ahead: int
     """Number of jobs before this one while it waits, running jobs included; 0 while it runs."""
     share: float
-    """The completed share, 0..1."""
+    """The completed fraction, 0 to 1."""
 
 
 @final
 @dataclass(eq=False)
 class SeparationJob:
-    """One job, from the reservation of its place until its thread has finished."""
+    """One job. It exists from the reservation of its place in the queue until its thread has finished."""
 
     share: float = 0.0
     is_working: bool = False
@@ -55,13 +55,17 @@ class SeparationJob:
     cancelled: Event = field(default_factory=Event)
 
     def on_progress(self, share: float) -> None:
-        """Record the completed share; raises JobCancelled if the job is cancelled."""
+        """Record the completed fraction.
+
+        Raises:
+            JobCancelled: the job is cancelled.
+        """
         if self.cancelled.is_set():
             raise JobCancelled
         self.share = share
 
     def run(self, work: Callable[[ProgressCallback], Result]) -> Result:
-        """Run the work function; called in a worker thread."""
+        """Run the work function and return its result. This method is called in a worker thread."""
         self.on_progress(0)
         self.is_working = True
         return work(self.on_progress)
@@ -73,8 +77,8 @@ class JobQueue:
 
     Args:
         workers: number of threads.
-        max_waiting: number of jobs that may wait; more are refused.
-        timeout_seconds: how long a job may wait and run in total.
+        max_waiting: maximum number of waiting jobs; further jobs are refused.
+        timeout_seconds: maximum total time for which a job waits and runs.
     """
 
     def __init__(self, *, workers: int = 1, max_waiting: int = 16, timeout_seconds: float = 300) -> None:
@@ -97,7 +101,9 @@ class JobQueue:
 
     @contextmanager
     def reserve(self, name: str | None = None) -> Iterator[SeparationJob]:
-        """Reserve a place for a job, before its upload is read. The place is released when no thread works on the job.
+        """Reserve a place for a job, before its upload is read.
+
+        The place is released at the end of the `with` block, or later, when the thread of the job has finished.
 
         Raises:
             HTTPException: 503 if the queue is full; 409 if a job with this name exists.
@@ -142,14 +148,14 @@ class JobQueue:
             ClientDisconnect: the client has disconnected.
         """
         future: Future[Result] = self._pool.submit(job.run, work)
-        job.future, answer = future, asyncio.wrap_future(future)
+        job.future, result = future, asyncio.wrap_future(future)
         disconnected = asyncio.ensure_future(_wait_for_disconnect(receive))
         try:
             done, _ = await asyncio.wait(
-                (answer, disconnected), timeout=self.timeout_seconds, return_when=asyncio.FIRST_COMPLETED
+                (result, disconnected), timeout=self.timeout_seconds, return_when=asyncio.FIRST_COMPLETED
             )
-            if answer in done:
-                return answer.result()
+            if result in done:
+                return result.result()
             if disconnected in done:
                 raise ClientDisconnect
             raise HTTPException(
@@ -158,7 +164,7 @@ class JobQueue:
             )
         finally:
             job.cancelled.set()
-            answer.cancel()
+            result.cancel()
             disconnected.cancel()
 
 

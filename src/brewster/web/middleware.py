@@ -2,8 +2,8 @@
 
     app.add_middleware(LimitMiddleware, limits=RequestLimits.for_host("127.0.0.1"))
 
-A page of another site must not use a local server through the user's browser. So a request with a foreign Host header (DNS
-rebinding) is refused, and so is a POST from a foreign origin. There are no CORS headers.
+A page of another site must not use a local server through the browser of the user. So the middleware refuses a request with
+a foreign Host header (DNS rebinding) and a POST request from a foreign origin. It sends no CORS headers.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class RequestLimits:
     hosts: frozenset[str] = LOOPBACK
     """Host names and addresses that a Host header may contain."""
     any_address: bool = False
-    """Whether the Host header may contain any IP address. DNS rebinding needs a name, so this is safe."""
+    """Whether the Host header may contain any IP address. This is safe, because DNS rebinding needs a host name."""
     token: str | None = None
     """The token that every request needs: in `Authorization: Bearer`, or in the cookie that a GET with `?token=` sets."""
     max_bytes: int = 100_000_000
@@ -64,12 +64,16 @@ class RequestLimits:
 
     @property
     def cookie_name(self) -> str:
-        """The name of the cookie, different for each token: servers on one host share cookies, even with different ports."""
+        """The name of the cookie. It depends on the token, because servers on the same host share cookies, even with other ports."""
         return f"brewster-{hashlib.sha256((self.token or '').encode()).hexdigest()[:8]}"
 
     @classmethod
     def for_host(cls, host: str, *, token: str | None = None, max_bytes: int = 100_000_000) -> RequestLimits:
-        """Limits of a server bound to an address; it may be called by this address, its host name, or a loopback address."""
+        """The limits of a server that is bound to an address.
+
+        A Host header may contain this address, the host name of the machine, or a loopback address. With a wildcard
+        address, it may contain any IP address.
+        """
         if is_loopback(host):
             return cls(LOOPBACK | {host}, token=token, max_bytes=max_bytes)
         names = {host.lower(), socket.gethostname().lower()}
@@ -83,7 +87,7 @@ class RequestLimits:
         return name in self.hosts or (self.any_address and _is_ip_address(name))
 
     def accepts_token(self, token: str | None) -> bool:
-        """Whether the token is correct, or none is needed. The comparison takes constant time."""
+        """Whether the token is correct, or the server needs none. The comparison takes constant time."""
         if self.token is None or token is None:
             return self.token is None
         return secrets.compare_digest(token.encode(), self.token.encode())
@@ -119,7 +123,7 @@ class LimitMiddleware:
                 )(scope, exchange.receive, exchange.forward)
 
     def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
-        """The response that refuses a request, or None to pass it on."""
+        """The response that refuses a request, or None if the request is accepted."""
         limits, method = self.limits, scope["method"]
         if not limits.allows_host(headers.get("host", "")):
             return _error_response(
@@ -145,7 +149,7 @@ class LimitMiddleware:
 
 @final
 class _Exchange:
-    """One request and its response: limits size and time of the body, and adds SECURITY_HEADERS to the response."""
+    """One request and its response. Limits the size and the time of the body, and adds SECURITY_HEADERS to the response."""
 
     def __init__(self, limits: RequestLimits, receive: Receive, send: Send) -> None:
         self._limits, self._receive, self._send = limits, receive, send
@@ -154,7 +158,7 @@ class _Exchange:
         self._deadline = asyncio.get_running_loop().time() + limits.body_seconds
 
     async def receive(self) -> Message:
-        """Receive the next part of the body; after its end, the disconnection of the client.
+        """Receive the next part of the body, or the message that the client has disconnected after the end of the body.
 
         Raises:
             HTTPException: 413 if the body is too large; 408 if it takes too long.
@@ -176,7 +180,11 @@ class _Exchange:
         return message
 
     async def send(self, message: Message) -> None:
-        """Send a message. The last one waits for the rest of the body: a client whose upload is cut off reads no response."""
+        """Send a message. The last message is delayed until the whole body is received.
+
+        If the response ended earlier, the connection would be closed during the upload, and the client would not read the
+        response.
+        """
         is_end = message["type"] == "http.response.body" and not message.get("more_body", False)
         if not is_end or self._is_complete:
             await self.forward(message)
@@ -204,8 +212,8 @@ class _Exchange:
             return
 
 
-def _error_response(status: int, sentence: str) -> Response:
-    return JSONResponse({"error": sentence}, status)
+def _error_response(status: int, message: str) -> Response:
+    return JSONResponse({"error": message}, status)
 
 
 def _body_too_long(limits: RequestLimits) -> HTTPException:
@@ -214,10 +222,10 @@ def _body_too_long(limits: RequestLimits) -> HTTPException:
 
 
 def _redirect_with_cookie(path: str, limits: RequestLimits) -> Response:
-    """A page that sets the cookie and loads the address without the token.
+    """The response that sets the cookie and then loads the address without the token.
 
-    This is a page with a refresh and not an HTTP redirect: browsers send a SameSite=strict cookie only with a navigation
-    that starts on a page of this server.
+    The response is a page with a Refresh header instead of an HTTP redirect: browsers send a SameSite=strict cookie only
+    if the navigation starts on a page of this server.
     """
     target = "/" + quote(path.lstrip("/"))
     response = HTMLResponse(_REDIRECT_PAGE.format(target), headers={"Refresh": f"0; url={target}"})
@@ -225,12 +233,12 @@ def _redirect_with_cookie(path: str, limits: RequestLimits) -> Response:
     return response
 
 
-def _request_token(headers: Headers, cookie: str) -> str | None:
+def _request_token(headers: Headers, cookie_name: str) -> str | None:
     """The token of the Authorization header or the cookie, or None."""
-    kind, _, token = headers.get("authorization", "").partition(" ")
-    if kind.lower() == "bearer":
+    scheme, _, token = headers.get("authorization", "").partition(" ")
+    if scheme.lower() == "bearer":
         return token.strip()
-    return cookie_parser(headers.get("cookie", "")).get(cookie)
+    return cookie_parser(headers.get("cookie", "")).get(cookie_name)
 
 
 def _is_same_origin(headers: Headers) -> bool:

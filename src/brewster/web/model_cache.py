@@ -1,4 +1,4 @@
-"""The models of a server: those of its command line and those of the zoo, each loaded once."""
+"""The models of a server: those of its command line and those of the zoo. Each model is loaded once, on first use."""
 
 from __future__ import annotations
 
@@ -30,8 +30,11 @@ class ModelCache:
     """Models by name, the default first. Clients choose a model by name, never by path.
 
     Args:
-        models: names or paths of models, before those of the zoo.
+        models: names or paths of models; they come before the models of the zoo.
         device: the device for all models, as in `Separator.load`.
+
+    Raises:
+        ModelError: a model does not exist, or two models have the same name.
     """
 
     def __init__(self, models: Sequence[str] = (), *, device: str = "auto") -> None:
@@ -46,7 +49,7 @@ class ModelCache:
         if name in self._sources:
             raise ModelError(
                 f"{source} and {self._sources[name]} have the same name {name}",
-                "clients choose models by name",
+                "expected different names, because clients choose models by name",
                 "rename one of the files",
             )
         self._sources[name] = source
@@ -57,7 +60,7 @@ class ModelCache:
         return list(self._sources)
 
     def rows(self) -> list[ModelRow]:
-        """Name, licence, digest and card of each model."""
+        """The name, licence, digest and card of each model."""
         return [_model_row(name, source) for name, source in self._sources.items()]
 
     def separator(self, name: str) -> Separator:
@@ -79,6 +82,6 @@ def _model_row(name: str, source: str) -> ModelRow:
     model = zoo.find_model(source)
     try:
         card = model.card()
-    except ModelError:  # a model file of the user has no card
+    except ModelError:  # a model file that is not in the zoo has no card
         card = None
     return ModelRow(name=name, licence=model.licence, sha256=model.sha256, card=card)

@@ -1,10 +1,10 @@
 """Small maps of a separation, from which the browser computes the layers at any strength.
 
-The photo is reduced first and then separated in floating point, so the layers are not rounded or clipped. The browser
-computes in linear light, in page/light.js:
+The photo is reduced first and then separated in floating point, so the layers are not rounded or clipped. page/light.js
+computes, in linear light:
 
-    transmission = max(photo + strength x (transmission at 1 - photo), 0)
-    reflection   = min(strength x reflection at 1, photo)
+    transmission = max(photo + strength x (transmission at strength 1 - photo), 0)
+    reflection   = min(strength x reflection at strength 1, photo)
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from brewster.options import Options
 from brewster.photo import Photo
 from brewster.srgb import to_encoded
 
-PREVIEW_PIXELS: Final = 1_400_000
-"""Larger photos are reduced to about this number of pixels, which fills a window."""
+MAX_PREVIEW_PIXELS: Final = 1_400_000
+"""Larger photos are reduced to about this number of pixels, which is enough for a window."""
 
 RANGE_MIN, RANGE_MAX = -1.0, 2.0
 """The linear light of the 16-bit values 0 and 65535 in the transmission map."""
 
 _SMALL_STRENGTH: Final = 1 / 64
-"""The strength of the separation. At so small a strength no layer is clipped, and the layers scale linearly to 1."""
+"""The strength of the separation. At this strength no layer is clipped, so the layers can be scaled to strength 1."""
 
 
 def preview(
@@ -41,16 +41,16 @@ def preview(
         separator: the model.
         photo: the photo at full size.
         options: the options of the request; `strength` and `additive` are ignored.
-        on_progress: called with the completed share, 0..1.
+        on_progress: called with the completed fraction, 0 to 1.
 
     Returns:
-        One line of JSON with `width`, `height`, `full` (the size of the photo), `range` and `doubtful`, and then four maps of
-        width x height pixels, row by row: the photo (3 bytes for each pixel, sRGB), the transmission at strength 1 (3
+        One line of JSON with `width`, `height`, `full` (the width and height of the photo), `range` and `doubtful`, and
+        then four maps of width x height pixels, row by row: the photo (3 bytes for each pixel, sRGB), the transmission at strength 1 (3
         little-endian 16-bit values, linear over `range`), the reflection at strength 1 (3 bytes, sRGB), and the confidence
         (1 byte).
 
     Raises:
-        BrewsterError: as `Separator` does.
+        BrewsterError: `Separator` cannot separate the photo.
     """
     width, height = _preview_size(photo.size)
     small = photo.resized(width, height)
@@ -68,11 +68,11 @@ def preview(
         _to_srgb_bytes(reflection),
         layers.confidence.pixels,
     )
-    return b"".join((json.dumps(head).encode(), b"\n", *(map_.tobytes() for map_ in maps)))
+    return b"".join((json.dumps(head).encode(), b"\n", *(array.tobytes() for array in maps)))
 
 
 def _preview_size(size: tuple[int, int]) -> tuple[int, int]:
-    scale = min(1.0, math.sqrt(PREVIEW_PIXELS / math.prod(size)))
+    scale = min(1.0, math.sqrt(MAX_PREVIEW_PIXELS / math.prod(size)))
     return max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
 
 
@@ -81,5 +81,7 @@ def _to_srgb_bytes(linear: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 
 def _to_uint16(linear: NDArray[np.float32]) -> NDArray[np.uint16]:
-    share: NDArray[np.float32] = (np.clip(linear, RANGE_MIN, RANGE_MAX) - RANGE_MIN) / (RANGE_MAX - RANGE_MIN)
-    return np.rint(65535 * share).astype(np.dtype("<u2"), copy=False)
+    scaled: NDArray[np.float32] = (np.clip(linear, RANGE_MIN, RANGE_MAX) - RANGE_MIN) / (
+        RANGE_MAX - RANGE_MIN
+    )
+    return np.rint(65535 * scaled).astype(np.dtype("<u2"), copy=False)

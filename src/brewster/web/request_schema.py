@@ -23,7 +23,7 @@ FIELDS: Final = ("layers", "strength", "quality", "format", "additive", "model")
 """The options that a client may set; the server sets the others."""
 _OPTIONS: Final = TypeAdapter(Options)
 _MAX_NAME_BYTES: Final = 120
-_PHOTO: Final = {
+_PHOTO_SCHEMA: Final = {
     "type": "string",
     "contentMediaType": "application/octet-stream",
     "description": "The photo as an image file.",
@@ -37,11 +37,11 @@ class SeparationRequest:
 
     photo: bytes
     name: str
-    """The file name of the photo: a safe name without a path."""
+    """The file name of the photo, as returned by `safe_name`."""
     options: Options
 
     def target(self, layer: str, container: str) -> str:
-        """The file name of a layer, as the command line names it; `container` is the format of the photo."""
+        """The file name of a layer, equal to that of the command line; `container` is the format of the photo."""
         source = Path(self.name)
         if source.suffix.lower() not in SUFFIXES:
             source = Path(f"{self.name}.{container}")
@@ -58,10 +58,10 @@ async def read_form(request: Request, models: Sequence[str], max_pixels: int) ->
     Args:
         request: the request.
         models: the names of the models, the default first.
-        max_pixels: the limit for the size of the photo.
+        max_pixels: the maximum number of pixels of the photo.
 
     Raises:
-        HTTPException: 415 if the body is not a form; 400 if the form is damaged; 422 if a field or value is invalid.
+        HTTPException: 415 if the body is not a form; 400 if the form is damaged; 422 if a field or a value is invalid.
         BrewsterError: two options contradict each other.
         ClientDisconnect: the upload is incomplete.
     """
@@ -100,22 +100,29 @@ class _InMemoryParser(MultiPartParser):
 def form_schema(models: Sequence[str]) -> dict[str, Any]:
     """The JSON schema of the form, for the OpenAPI document."""
     known = _OPTIONS.json_schema()["properties"]
-    fields = {"photo": _PHOTO, **{name: _as_field(known[name]) for name in FIELDS}}
-    about = "The model to use, one of `GET /models`."
-    fields["model"] = known["model"] | {"default": models[0], "enum": list(models), "description": about}
+    fields = {"photo": _PHOTO_SCHEMA, **{name: _as_field(known[name]) for name in FIELDS}}
+    description = "The model to use, one of `GET /models`."
+    fields["model"] = known["model"] | {
+        "default": models[0],
+        "enum": list(models),
+        "description": description,
+    }
     return {"type": "object", "required": ["photo"], "properties": fields}
 
 
 def _as_field(schema: dict[str, Any]) -> dict[str, Any]:
-    """The schema without null: a form has no null, and an optional field is omitted instead."""
+    """The schema without the type null, because a form has no null: an optional field is omitted instead."""
     if "anyOf" not in schema:
         return schema
-    (kind,) = (kind for kind in schema["anyOf"] if kind["type"] != "null")
-    return {"description": schema["description"], **kind}
+    (not_null,) = (choice for choice in schema["anyOf"] if choice["type"] != "null")
+    return {"description": schema["description"], **not_null}
 
 
 def safe_name(name: str) -> str:
-    """The last component of a file name, without characters that file systems or headers forbid, and limited in length."""
+    """The last component of a file name, with at most _MAX_NAME_BYTES bytes before the suffix.
+
+    Characters that file systems or headers forbid are replaced by underscores.
+    """
     last = unicodedata.normalize("NFC", re.split(r"[/\\]", name)[-1])
     plain = "".join(letter if letter.isprintable() and letter not in '<>:"|?*' else "_" for letter in last)
     path = Path(plain.strip(". ") or "photo")
@@ -152,5 +159,5 @@ def _options(form: FormData, models: Sequence[str], max_pixels: int) -> Options:
 
 
 def _ordered_layers(layers: Sequence[str]) -> list[str]:
-    """Each layer once, in the order of the command line; unknown names come last, for the validation to refuse."""
+    """Each layer once, in the order of the command line. Unknown names come last, and the validation refuses them."""
     return [layer for layer in dict.fromkeys((*LAYERS, *layers)) if layer in layers]

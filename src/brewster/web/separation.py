@@ -31,8 +31,6 @@ from brewster.web.model_cache import ModelCache, ModelRow
 from brewster.web.preview import preview
 from brewster.web.request_schema import SeparationRequest, form_schema, read_form
 
-_MEDIA_TYPES: Final = {"exr": "image/x-exr", "hdr": "image/vnd.radiance"}
-"""Media types by format; those of other formats are image/ and the name of the format."""
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # the earliest date of zip; a fixed date makes the archive reproducible
 
 
@@ -80,7 +78,7 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
     Args:
         model_cache: the models that clients can choose.
         job_queue: runs the separations.
-        max_pixels: the limit for the size of a photo.
+        max_pixels: the maximum number of pixels of a photo.
     """
     router = APIRouter()
     content = {"multipart/form-data": {"schema": form_schema(model_cache.names)}}
@@ -94,9 +92,9 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
 
     @router.post("/separate", responses=_RESPONSES, response_class=Response, openapi_extra=body)
     async def separate(request: Request, job: JobName = None) -> Response:
-        """Separate a photo. One layer is returned as a picture in the format and colour space of the photo, several as a zip.
+        """Separate a photo. One layer is returned as an image in the format and colour space of the photo, several as a zip.
 
-        Files are named as on the command line. The work stops if the client disconnects.
+        The names of the files are those of the command line. The separation stops if the client disconnects.
         """
         return await run(request, job, _separate)
 
@@ -106,11 +104,11 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
 
     @router.get("/progress/{job}", responses={404: _ERROR})
     async def progress(job: str) -> JobProgress:
-        """The progress of a job with a name; 404 before the job begins and after its end."""
+        """The progress of the job with this name. The status is 404 before the job begins and after its end."""
         found = job_queue.progress(job)
         if found is None:
             raise HTTPException(
-                404, "there is no job with this name now; it has ended or has not arrived yet"
+                404, "there is no job with this name; it has ended, or its request has not arrived yet"
             )
         return found
 
@@ -128,7 +126,7 @@ def separation_router(model_cache: ModelCache, job_queue: JobQueue, *, max_pixel
 
 
 def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: ProgressCallback) -> Response:
-    """The layers of a photo as files."""
+    """Separate a photo. Returns one layer as an image file, or several layers as a zip."""
     started = time.perf_counter()
     options = form.options
     separation = model_cache.separator(options.model)(
@@ -136,7 +134,7 @@ def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: Pro
     )
     files = {}
     for layer in options.layers:
-        on_progress(1)  # raises JobCancelled: encoding takes time too
+        on_progress(1)  # raises JobCancelled; encoding takes time, too
         name = form.target(layer, separation.photo.file_info.container)
         files[name] = getattr(separation, layer).encode(SUFFIXES[Path(name).suffix.lower()].name)
     name, data = (
@@ -171,7 +169,7 @@ def _media_type(name: str) -> str:
 
 
 def _zip(files: Mapping[str, bytes]) -> bytes:
-    """A zip archive of files, stored without compression since pictures are compressed already."""
+    """A zip archive of files by name. It is not compressed, because image files are compressed already."""
     archive_file = io.BytesIO()
     with zipfile.ZipFile(archive_file, "w", zipfile.ZIP_STORED) as archive:
         for name, data in files.items():

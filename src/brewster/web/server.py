@@ -16,9 +16,10 @@ from fastapi import FastAPI
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 IDLE_CHECK_SECONDS: Final = 10.0
-"""Interval of the idle check. A client that neither completes a request head nor receives a byte is closed after 2 checks."""
+"""Interval of the idle check. A connection is closed at the second check if the client neither completes the head of a
+request nor receives a byte between the checks."""
 GRACE_SECONDS: Final = 2.0
-"""How long running requests may continue after the shutdown begins."""
+"""The time for which running requests may continue after the shutdown begins."""
 _BACKLOG: Final = 128
 _SEND_BUFFER_BYTES: Final = 1 << 17  # a larger kernel buffer would hide whether a slow client still receives
 
@@ -41,7 +42,10 @@ def create_server(app: FastAPI) -> uvicorn.Server:
 
 @final
 class QuietServer(uvicorn.Server):
-    """Cancels late requests itself at shutdown: LimitMiddleware then sends an error message, and uvicorn logs nothing."""
+    """A uvicorn server that logs nothing at shutdown.
+
+    It cancels requests that run longer than GRACE_SECONDS; LimitMiddleware then sends an error message for each of them.
+    """
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start serving."""
@@ -101,6 +105,6 @@ class TimeoutProtocol(H11Protocol):
 
 
 def _handle_loop_error(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """Ignore errors of accept(): with too many connections asyncio would log one for each connection every second."""
-    if not any(noise in context["message"] for noise in ("socket.accept()", "_start_serving")):
+    """Ignore errors of accept(): with too many connections, asyncio would log an error for each of them every second."""
+    if not any(ignored in context["message"] for ignored in ("socket.accept()", "_start_serving")):
         loop.default_exception_handler(context)

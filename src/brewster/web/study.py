@@ -2,8 +2,8 @@
 
     create_app(study_router(study, AnswerStore(study)), limits=limits, index="study.html")
 
-No response contains the name of a method, file or dataset: a picture is the left, right or photo of a trial, and only the
-personal link of the participant gives access to it.
+No response contains the name of a method, file or dataset. A picture is requested by its trial and its side (`photo`, `left`
+or `right`), and only with the personal link of the participant.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class _Strict(BaseModel):
 
 
 class Invitation(_Strict):
-    """The information before the consent: the consent text, and the number of trials."""
+    """The information before the consent: the consent text, the number of trials, and whether more participants are admitted."""
 
     consent: str
     trials: int
@@ -52,7 +52,10 @@ class PersonalLink(_Strict):
 
 
 class TrialResponse(_Strict):
-    """The first trial without an answer, counted from 0, and the size of its pictures in px; no trial if all have answers."""
+    """The first trial without an answer, and the size of its pictures in px.
+
+    `trial` counts from 0 and is None if all trials have answers. `trials` is the number of all trials.
+    """
 
     trial: int | None
     trials: int
@@ -69,7 +72,7 @@ class AnswerRequest(_Strict):
 
 
 class AnswerResponse(_Strict):
-    """The stored choice, which is that of the first answer to the trial, and the next trial."""
+    """The stored choice `kept`, which is that of the first answer to the trial, and the next trial."""
 
     kept: Choice
     next: TrialResponse
@@ -87,7 +90,7 @@ def study_router(
     Args:
         study: the study.
         store: its answers.
-        max_participants: how many participants are admitted at most.
+        max_participants: maximum number of participants; None means no limit.
         token: the token of the server, which is added to personal links.
     """
     routes, router = _StudyRoutes(study, store, max_participants, token), APIRouter(tags=["study"])
@@ -104,7 +107,7 @@ def study_router(
 @final
 @dataclass(frozen=True)
 class _StudyRoutes:
-    """The handlers of the routes. FastAPI runs them in threads, since they wait for the disk."""
+    """The handlers of the routes. FastAPI runs them in threads, because they wait for the disk."""
 
     study: Study
     store: AnswerStore
@@ -112,7 +115,7 @@ class _StudyRoutes:
     token: str | None
 
     def invitation(self) -> Invitation:
-        """The consent text and the number of trials."""
+        """The information that is shown before the consent."""
         description = self.study.description
         is_open = self.max_participants is None or self.store.count_participants() < self.max_participants
         return Invitation(
@@ -120,7 +123,7 @@ class _StudyRoutes:
         )
 
     def admit(self, _agreement: Annotated[ConsentRequest, Body()]) -> PersonalLink:
-        """Admit a participant who agrees to take part; returns their personal link."""
+        """Admit a participant who agrees to take part. Returns the personal link."""
         participant_token = self.store.admit(max_participants=self.max_participants)
         if participant_token is None:
             raise HTTPException(
@@ -129,7 +132,7 @@ class _StudyRoutes:
         return self._link(participant_token)
 
     def begin(self, participant_token: Token) -> Response:
-        """The page of a personal link. For an unknown link the status is 404, and the page shows the error."""
+        """The page of a personal link. If the link is unknown, the status is 404, and the page shows the error."""
         response = page_response("study.html")
         response.status_code = 404 if self.store.participant(participant_token) is None else 200
         return response
@@ -182,7 +185,7 @@ class _StudyRoutes:
         return TrialResponse(trial=trial, trials=count, width=photo.width, height=photo.height)
 
 
-def _trial(participant: Participant, trial: int) -> assignment.TrialDraw:
+def _trial(participant: Participant, trial: int) -> assignment.Trial:
     if not 0 <= trial < len(participant.trials):
         raise HTTPException(404, f"there is no trial {trial}; load the page again")
     return participant.trials[trial]

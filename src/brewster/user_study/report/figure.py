@@ -8,16 +8,20 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 _BAR_COLOURS: Final = {"win": "#1f6f8b", "tie": "#d9d9d4", "lose": "#d98243"}
-_SHARE_COLOURS: Final = {"win": "white", "tie": "#333333", "lose": "#222222"}
+_LABEL_COLOURS: Final = {"win": "white", "tie": "#333333", "lose": "#222222"}
 _HEADING_COLOURS: Final = {"win": "#1f6f8b", "tie": "#666666", "lose": "#a8561b"}
-_MIN_LABELLED_SHARE: Final = 0.06
-"""Smaller shares get no label, because it does not fit into the bar."""
+_MIN_LABELLED_RATE: Final = 0.06
+"""Smaller rates get no label, because a label does not fit into so short a bar."""
 _AVERAGE_KEYS: Final = ("/average",)
 _EVERYONE_TITLE: Final = "All participants: the rule excludes everyone"
 
 
 def plot(results: Mapping[str, Any]) -> bytes:
-    """The plot as PNG bytes: participants after the exclusion rule, or all participants if the rule excludes everyone."""
+    """Plot the results after the exclusion rule, or those of all participants if the rule excludes everyone.
+
+    Returns:
+        The plot as the bytes of a PNG file.
+    """
     from matplotlib.figure import Figure  # noqa: PLC0415  (an optional dependency, and slow to import)
 
     included = results["included"]["tables"]
@@ -39,7 +43,7 @@ def plot(results: Mapping[str, Any]) -> bytes:
 
 
 def _plotted_rows(results: Mapping[str, Any], table: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """The rows of the average and, if there are several, of the datasets; without rows that have no answers."""
+    """The rows to plot: the datasets, if there are several, and the average. Rows without answers are left out."""
     datasets = results["study"]["datasets"]
     keys = [*(datasets if len(datasets) > 1 else ()), *_AVERAGE_KEYS]
     return [row for row in table["rows"] if row["key"] in keys and row["win"]["mean"] is not None]
@@ -52,12 +56,12 @@ def _bars(axis: Any, table: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]
         widths = [row[name]["mean"] for row in rows]
         axis.barh(positions, widths, left=starts, color=colour, height=0.72, edgecolor="white", linewidth=0.8)
         for i, (start, width) in enumerate(zip(starts, widths, strict=True)):
-            if width >= _MIN_LABELLED_SHARE:
+            if width >= _MIN_LABELLED_RATE:
                 axis.text(
                     start + width / 2,
                     i,
                     f"{100 * width:.0f} %",
-                    color=_SHARE_COLOURS[name],
+                    color=_LABEL_COLOURS[name],
                     ha="center",
                     va="center",
                     fontsize=8,

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Final, Literal, final
 
-from brewster.user_study.assignment import Choice, TrialDraw
+from brewster.user_study.assignment import Choice, Trial
 from brewster.user_study.store import Participant, StoredAnswer
 
 OUTCOMES: Final = ("win", "tie", "lose")
-"""Outcomes from the view of the first method of a comparison."""
+"""The outcomes of a comparison for its first method."""
 
 Reason = Literal["failed", "fast"]
 
@@ -22,7 +22,7 @@ class ParticipantAnswers:
     """The answers of one participant.
 
     `votes` maps the number of a comparison to an index of OUTCOMES. `catches` is the number of answered catch trials,
-    `failed` the number of wrong answers among them. `seconds` is the median time for a trial.
+    `failed` is the number of wrong answers to them. `seconds` is the median time for a trial.
     """
 
     number: int
@@ -36,7 +36,7 @@ class ParticipantAnswers:
 @final
 @dataclass(frozen=True)
 class ExclusionRule:
-    """Exclude participants who fail more than a share of the catch trials or whose median time is too short."""
+    """Excludes a participant if failed / catches > `max_failed`, or if the median time for a trial is below `min_seconds`."""
 
     max_failed: float = 0.25
     min_seconds: float = 1.5
@@ -48,7 +48,7 @@ class ExclusionRule:
         )
 
     def reason(self, participant: ParticipantAnswers) -> Reason | None:
-        """Why the participant is excluded, or None."""
+        """The reason why the participant is excluded, or None if the participant is included."""
         if participant.failed > self.max_failed * participant.catches:
             return "failed"
         return "fast" if participant.seconds < self.min_seconds else None
@@ -57,7 +57,7 @@ class ExclusionRule:
 def collect_answers(
     records: Iterable[tuple[Participant, Mapping[int, StoredAnswer]]],
 ) -> list[ParticipantAnswers]:
-    """The answers of all participants with at least one; incomplete participants are included."""
+    """The answers of each participant with at least one answer; incomplete participants are included."""
     return [_participant_answers(participant, answers) for participant, answers in records if answers]
 
 
@@ -74,7 +74,7 @@ def _participant_answers(participant: Participant, answers: Mapping[int, StoredA
     )
 
 
-def outcome(trial: TrialDraw, choice: Choice) -> int:
+def outcome(trial: Trial, choice: Choice) -> int:
     """The outcome of a choice for the first method of the comparison, as an index of OUTCOMES."""
     if choice == "similar":
         return 1

@@ -49,6 +49,7 @@ AVERAGES: Final = {
 The first row weights each dataset by its number of pictures, as the paper does."""
 _DIGITS: Final = 6
 _MIN_SPREAD: Final = 1e-6
+"""If the strength of a method varies less over the resamples, the strengths get no interval."""
 
 Results = dict[str, Any]
 """The content of report.json; docs/study.md describes it."""
@@ -72,7 +73,7 @@ def summarise(study: Study, participants: Sequence[ParticipantAnswers], rule: Ex
     if not any(participant.votes for participant in participants):
         raise BrewsterError(
             f"{study.folder} has no answers yet",
-            "a report needs at least one answer",
+            "expected at least one answer to a comparison",
             "send participants the address that `brewster study serve` prints",
         )
     reasons = [rule.reason(participant) for participant in participants]
@@ -123,7 +124,7 @@ def _group(study: Study, participants: Sequence[ParticipantAnswers]) -> dict[str
     }
     if not participants:
         return summary
-    counts, pictures = _counts(study, participants), _pictures(study)
+    counts, pictures = _counts(study, participants), _picture_counts(study)
     weights = bootstrap_weights(len(participants))
     agreement = alpha(_ratings(study, participants))
     return summary | {
@@ -154,15 +155,15 @@ def _table_indices(study: Study) -> list[tuple[int, int]]:
     return [(pairs[row.methods], datasets[row.dataset]) for row in study.description.comparisons]
 
 
-def _pictures(study: Study) -> Floats:
-    """Number of pictures by pair of methods and dataset."""
+def _picture_counts(study: Study) -> Floats:
+    """Number of pictures: (pairs of methods, datasets)."""
     pictures = np.zeros((len(study.pairs_of_methods), len(study.description.datasets)))
     np.add.at(pictures, tuple(np.array(_table_indices(study)).T), 1)
     return pictures
 
 
 def _ratings(study: Study, participants: Sequence[ParticipantAnswers]) -> Floats:
-    """Number of answers by comparison and outcome."""
+    """Number of answers: (comparisons, outcomes)."""
     ratings = np.zeros((len(study.description.comparisons), len(OUTCOMES)))
     for participant in participants:
         np.add.at(ratings, (list(participant.votes), list(participant.votes.values())), 1)
@@ -173,7 +174,7 @@ def _ratings(study: Study, participants: Sequence[ParticipantAnswers]) -> Floats
 
 
 def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> list[dict[str, Any]]:
-    """A table for each pair of methods: a row for each dataset, then the averages."""
+    """A table for each pair of methods, with a row for each dataset and a row for each of the AVERAGES."""
     means = rates(counts.sum(axis=0), pictures)
     ends = bootstrap_interval(rates(resampled_counts(weights, counts), pictures), len(counts))
     lows, highs = with_agreement_bounds(means, ends, agreement_bounds(counts, pictures))
@@ -203,10 +204,10 @@ def _tables(study: Study, counts: Floats, pictures: Floats, weights: Floats) -> 
 
 
 def _strengths(study: Study, counts: Floats, weights: Floats) -> dict[str, Any]:
-    """The strength of each method.
+    """The strength of each method, with its interval.
 
-    There is no interval if the strengths of a resample have no maximum, because a method only won or only lost, or if all
-    resamples are equal.
+    There is no interval if the likelihood of a resample has no maximum, because a method only won or only lost. There is
+    also none if all resamples are equal.
     """
     wins = _wins(study, counts)
     means = strengths(wins.sum(axis=0))
@@ -223,7 +224,7 @@ def _strengths(study: Study, counts: Floats, weights: Floats) -> dict[str, Any]:
 
 
 def _wins(study: Study, counts: Floats) -> Floats:
-    """Number of wins of each method against each other one, a tie being half a win: (participants, methods, methods)."""
+    """Number of wins of each method against each other method: (participants, methods, methods). A tie is half a win."""
     methods = study.description.methods
     wins = np.zeros((len(counts), len(methods), len(methods)))
     for i, (first, second) in enumerate(study.pairs_of_methods):
@@ -247,7 +248,7 @@ def _round(value: float | None) -> float | None:
 
 
 def write(results: Results, study: Study, participants: Sequence[ParticipantAnswers], out: Path) -> None:
-    """Write all files of a report into the folder `out`, and replace those of an earlier report.
+    """Write all files of a report into the folder `out`; files of an earlier report are replaced.
 
     Raises:
         TargetError: a file cannot be written.

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 RESAMPLES: Final = 10_000
 SEED: Final = 20_261_121
-_EQUAL: Final = 1e-9
+_TOLERANCE: Final = 1e-9
 
 Floats = NDArray[np.float64]
 
@@ -38,7 +38,7 @@ def bootstrap_weights(participants: int, resamples: int = RESAMPLES) -> Float64[
 def resampled_counts(
     weights: Float64[Floats, "r p"], counts: Float64[Floats, "p ..."]
 ) -> Float64[Floats, "r ..."]:
-    """The sum of the counts over the participants of each resample."""
+    """The counts of each resample, summed over its participants."""
     totals: Floats = (weights @ counts.reshape(len(counts), -1)).reshape(len(weights), *counts.shape[1:])
     return totals
 
@@ -53,8 +53,8 @@ def rates(
         pictures: number of pictures of each dataset.
 
     Returns:
-        A row for each dataset, then three averages: weighted by pictures (as in the paper), mean of the datasets, and all
-        answers together. NaN without answers.
+        A row for each dataset, then three averages: the mean weighted by the number of pictures (as in the paper), the
+        mean of the datasets, and the rates of all answers together. Rows without answers are NaN.
     """
     with np.errstate(invalid="ignore"):
         shares = counts / counts.sum(axis=-1, keepdims=True)
@@ -67,7 +67,7 @@ def rates(
 def averages(
     shares: Float64[Floats, "... d k"], pictures: Float64[Floats, "... d"]
 ) -> Float64[Floats, "... 2 k"]:
-    """Two averages over datasets: weighted by their number of pictures, as in the paper's Table 3, and unweighted.
+    """Two means over datasets: one weighted by the number of pictures, as in the paper's Table 3, and one unweighted.
 
     The leading axes of the two arguments broadcast: `shares` may have an axis of resamples that `pictures` lacks.
     """
@@ -82,7 +82,7 @@ def bootstrap_interval(draws: Float64[Floats, "r ..."], participants: int) -> Fl
     participants.
 
     Args:
-        draws: a statistic of each resample; values that are not finite are ignored.
+        draws: the values of a statistic, one for each resample; values that are not finite are ignored.
         participants: number of participants in each resample.
 
     Returns:
@@ -105,7 +105,7 @@ def agreement_bounds(
 
     If all answers agree, the bootstrap has no spread. The bound is then that of Clopper and Pearson (1934) for n successes of
     n trials, 0.025^(1 / n). Here n is the number of participants, not of answers, since answers of one participant are not
-    independent. Averages of the bounds bound the averages.
+    independent. The bound of an average of rates is the average of their bounds.
     """
     sizes = counts.sum(axis=-1)
     with np.errstate(divide="ignore"):
@@ -126,18 +126,18 @@ def with_agreement_bounds(
         bounds: the result of `agreement_bounds`.
 
     Returns:
-        The intervals; NaN if the width is 0 although answers differ, for example if one participant has answered about a
-        dataset.
+        The intervals; NaN if the width is 0 although answers differ, for example if only one participant has answered
+        comparisons of a dataset.
     """
     bound, shares = bounds[..., None], rows[..., :3]
-    is_one, is_zero = shares > 1 - _EQUAL, shares < _EQUAL
+    is_one, is_zero = shares > 1 - _TOLERANCE, shares < _TOLERANCE
     lows = np.where(is_one, bound, np.where(is_zero, 0.0, np.nan))
     highs = np.where(is_one, 1.0, np.where(is_zero, 1 - bound, np.nan))
     lows, highs = (
         np.concatenate([own, own[..., :1] - other[..., 2:]], axis=-1)
         for own, other in ((lows, highs), (highs, lows))
     )
-    return np.where(ends[1] - ends[0] < _EQUAL, np.stack([lows, highs]), ends)
+    return np.where(ends[1] - ends[0] < _TOLERANCE, np.stack([lows, highs]), ends)
 
 
 def _expanded_percentiles(participants: int) -> tuple[float, float]:

@@ -12,11 +12,12 @@ _DEFINITIONS: Final = """\
 Rates are shares of the answers about a pair of methods. Average weights each dataset by its number of pictures, as the \
 paper's Table 3 does; the rows below it are the unweighted mean of the datasets and the rates of all answers together.
 Intervals are 95 % expanded percentile intervals of 10,000 bootstrap resamples of whole participants; if all answers \
-agree, they are those of Clopper and Pearson with one answer for each participant. They cover other participants who see \
-these pictures, not other pictures.
-Difference is win minus lose. Correlation is the intraclass correlation of the scores 1, 0, -1 of a participant, an input \
-of `brewster study plan`.
-Strength is that of the Bradley-Terry model over all answers; a tie is half a win for each method, and the mean is 0.
+agree, they are those of Clopper and Pearson with one answer for each participant. They apply to other participants who \
+see these pictures; they do not apply to other pictures.
+Difference is win minus lose. Correlation is the intraclass correlation of the scores 1, 0, -1 (win, tie, lose) of a \
+participant, an input of `brewster study plan`.
+Strength is the parameter of a method in the Bradley-Terry model of all answers; a tie is half a win for each method, and \
+the mean is 0.
 Agreement is Krippendorff's alpha of win, tie and lose over comparisons; 1 is perfect, 0 is chance."""
 
 Results = Mapping[str, Any]
@@ -104,7 +105,7 @@ def _interval_text(entry: Mapping[str, Any], sign: str = "", join: str = " to ")
 
 def _strength_text(entry: Mapping[str, Any]) -> str:
     if entry["mean"] is None:
-        return "unbounded: a method has only won or only lost"
+        return "no value, because a method has only won or only lost"
     mean = f"{entry['mean']:+.3f}"
     return mean if entry["low"] is None else f"{mean} ({entry['low']:+.3f} to {entry['high']:+.3f})"
 
@@ -152,12 +153,12 @@ def to_latex(results: Results) -> str:
 def _latex_row(tables: Iterable[Mapping[str, Any]], key: str) -> str:
     rows = [next(row for row in table["rows"] if row["key"] == key) for table in tables]
     entries = [row[name] for row in rows for name in ("win", "tie", "lose")]
-    above = ["--" if entry["mean"] is None else f"{100 * entry['mean']:.2f}\\%" for entry in entries]
-    below = [
+    rates = ["--" if entry["mean"] is None else f"{100 * entry['mean']:.2f}\\%" for entry in entries]
+    intervals = [
         "" if entry["low"] is None else f"\\scriptsize {_interval_text(entry, join='--')}"
         for entry in entries
     ]
-    return " & ".join([_escape(rows[0]["title"]), *above]) + " \\\\\n" + " & ".join(["", *below]) + r" \\"
+    return " & ".join([_escape(rows[0]["title"]), *rates]) + " \\\\\n" + " & ".join(["", *intervals]) + r" \\"
 
 
 # --- CSV
@@ -176,8 +177,8 @@ def to_csv(results: Results) -> str:
             for row in pair["rows"]:
                 for name in ("win", "tie", "lose", "difference"):
                     ends = row[name].values()
-                    place = [key, pair["first"], pair["second"], row["key"], row["title"]]
-                    table.writerow([*place, name, *ends, row["answers"]])
+                    columns = [key, pair["first"], pair["second"], row["key"], row["title"]]
+                    table.writerow([*columns, name, *ends, row["answers"]])
     return text.getvalue()
 
 

@@ -1,9 +1,10 @@
-// The client of the HTTP API. A failed request throws an Error whose message is a sentence for the user.
+// The client of the HTTP API. A failed request throws an Error whose message can be shown to the user.
 
 const POLL_MS = 300;
-const MAX_RETRIES = 60; // how often a request is repeated while the queue of the server is full
+const MAX_RETRIES = 60; // maximum number of repetitions of a request while the queue of the server is full
 
-// Sends a photo with options to a path and returns the response. Calls `onProgress({state, ahead, share})` meanwhile.
+// Sends a photo with options to a path and returns the response. Until then, it calls `onProgress({state, ahead, share})`
+// repeatedly; `share` is the completed fraction.
 export async function send(path, file, options, { signal, onProgress }) {
   const form = new FormData();
   for (const [name, value] of Object.entries(options)) form.append(name, value);
@@ -21,6 +22,7 @@ export async function send(path, file, options, { signal, onProgress }) {
   }
 }
 
+// Returns the available models.
 export async function models() {
   const response = await fetch("models").catch(throwNetworkError);
   if (!response.ok) throw new Error(await errorMessage(response));
@@ -38,7 +40,7 @@ function pollProgress(job, onProgress) {
   async function poll() {
     const response = await fetch(`progress/${job}`).catch(() => null);
     const progress = timer && response?.ok ? await response.json() : null;
-    if (timer && progress) onProgress(progress); // not after stop(): a late report would undo the state "done"
+    if (timer && progress) onProgress(progress); // not after stop(): a late report would overwrite the state "done"
     if (timer) timer = setTimeout(poll, POLL_MS);
   }
   return {
@@ -56,8 +58,8 @@ function throwNetworkError(error) {
 
 async function errorMessage(response) {
   const body = await response.json().catch(() => ({}));
-  const sentence = body.error ?? `the server returned status ${response.status}`;
-  return `${sentence[0].toUpperCase()}${sentence.slice(1).replace(/\.?$/, ".")}`;
+  const message = body.error ?? `the server returned status ${response.status}`;
+  return `${message[0].toUpperCase()}${message.slice(1).replace(/\.?$/, ".")}`;
 }
 
 function randomJobName() {

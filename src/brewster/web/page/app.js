@@ -11,10 +11,10 @@ const LAYER_DESCRIPTIONS = {
   reflection: "The light that the glass reflects.",
   confidence: "White: the separation is certain. Black: it is uncertain.",
 };
-const TRANSPARENT_PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw=="; // one transparent pixel
-const LAYERS = "transmission,reflection"; // in the zip
+const TRANSPARENT_PIXEL = "data:image/gif;base64,R0lGODlhAQABAAAAACH5BAEKAAEALAAAAAABAAEAAAICTAEAOw==";
+const ZIP_LAYERS = "transmission,reflection"; // the layers in the zip of all photos
 
-const photos = []; // {file, row, state, share, ahead, error, strength, maps, madeWith, controller, isSuperseded}
+const photos = []; // {file, row, state, share, ahead, error, strength, maps, mapSettings, controller, isSuperseded}
 let current = null; // the photo that is shown
 let shown = null; // the maps of the current photo
 const byId = (id) => document.getElementById(id);
@@ -24,7 +24,8 @@ const compare = byId("compare");
 
 const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).value;
 const settings = () => ({ quality: chosen("quality"), model: byId("model").value });
-const isFresh = (photo) => photo.madeWith === JSON.stringify(settings());
+// Whether the maps of a photo were computed with the current settings.
+const hasCurrentMaps = (photo) => photo.mapSettings === JSON.stringify(settings());
 
 // --- adding and removing photos
 
@@ -95,18 +96,18 @@ async function separate(photo) {
   try {
     const response = await send("preview", photo.file, requestSettings, { signal: photo.controller.signal, onProgress });
     photo.maps = await response.blob();
-    Object.assign(photo, { state: "done", madeWith: JSON.stringify(requestSettings) });
+    Object.assign(photo, { state: "done", mapSettings: JSON.stringify(requestSettings) });
     announce(`${photo.file.name} is separated`);
   } catch (error) {
     const isStopped = error.name === "AbortError";
-    const previousState = isFresh(photo) ? "done" : "waiting"; // its old maps may be needed again
+    const previousState = hasCurrentMaps(photo) ? "done" : "waiting"; // the old maps are valid if the settings were reset
     const state = isStopped && photo.isSuperseded ? previousState : "failed";
     Object.assign(photo, { state, error: isStopped ? null : error.message });
     if (photo.error) announce(`${photo.file.name} failed`);
   }
   photo.controller = null;
   if (!photos.includes(photo)) return;
-  if (photo.state === "done" && !isFresh(photo)) photo.state = "waiting"; // the settings have changed since the request
+  if (photo.state === "done" && !hasCurrentMaps(photo)) photo.state = "waiting"; // the settings have changed since the request
   refresh(photo);
   if (photo === current) await show();
   startNext();
@@ -118,20 +119,20 @@ function retry(photo) {
   startNext();
 }
 
-// Called after a change of the settings. A photo whose maps fit the new settings is not processed again.
+// Called after a change of the settings. A photo is processed again unless its maps were computed with the new settings.
 function applySettings() {
   for (const photo of photos) {
     photo.controller?.abort();
-    Object.assign(photo, { state: isFresh(photo) ? "done" : "waiting", error: null, isSuperseded: true });
+    Object.assign(photo, { state: hasCurrentMaps(photo) ? "done" : "waiting", error: null, isSuperseded: true });
   }
   refresh();
   show();
   startNext();
 }
 
-function announce(sentence) {
+function announce(message) {
   const done = photos.filter((photo) => photo.state === "done").length;
-  byId("announcement").textContent = photos.length > 1 ? `${sentence}, ${done} of ${photos.length} are done` : sentence;
+  byId("announcement").textContent = photos.length > 1 ? `${message}, ${done} of ${photos.length} are done` : message;
 }
 
 // --- the current photo
@@ -256,14 +257,14 @@ function showExportError(problem) {
   byId("export-error").hidden = !problem;
 }
 
-const fullSize = (photo, layers, signal, onShare) =>
+const requestFullSize = (photo, layers, signal, onShare) =>
   send("separate", photo.file, { layers, strength: photo.strength, ...settings() }, {
     signal,
     onProgress: ({ share }) => onShare(share),
   });
 
 async function exportLayer(signal) {
-  const response = await fullSize(current, chosen("view"), signal, (share) => (byId("export-progress").value = share));
+  const response = await requestFullSize(current, chosen("view"), signal, (share) => (byId("export-progress").value = share));
   return { name: fileNameOf(response), blob: await response.blob() };
 }
 
@@ -276,7 +277,7 @@ async function exportAll(signal) {
     const onShare = (share) => (byId("export-progress").value = (index + share) / done.length);
     onShare(0);
     try {
-      const response = await fullSize(photo, LAYERS, signal, onShare);
+      const response = await requestFullSize(photo, ZIP_LAYERS, signal, onShare);
       files.push(...readZip(await response.arrayBuffer()));
     } catch (error) {
       if (error.name === "AbortError") throw error;

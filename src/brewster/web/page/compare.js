@@ -1,17 +1,17 @@
-// <glass-compare>: two pictures of one size, separated by a movable line. Zoom and pan apply to both.
-// Draw on its canvases `left` and `right`, call `show(...)`, and call `paint()` after each change.
+// <glass-compare>: compares two images of the same size, separated by a movable line. Zoom and pan apply to both.
+// Draw on the canvases `left` and `right`, call `show(...)`, and call `paint()` after each change.
 
-const MAX_PIXEL_SIZE = 8; // maximum size of a picture pixel in screen pixels
-const GRAB_DISTANCE = 28; // distance to the line in CSS pixels within which a pointer drags it while the picture is zoomed
+const MAX_PIXEL_SIZE = 8; // maximum size of an image pixel in screen pixels
+const GRAB_DISTANCE = 28; // in CSS pixels: in a zoomed image, a pointer at most this far from the line drags the line
 
 class GlassCompare extends HTMLElement {
   left = document.createElement("canvas");
   right = document.createElement("canvas");
-  #split = 0.5; // position of the line as a share of the visible width of the picture
-  #zoom = 1; // 1 shows the whole picture
-  #centre = { x: 0.5, y: 0.5 }; // the picture point in the middle of the view, as shares of width and height
+  #split = 0.5; // position of the line as a fraction of the visible width of the image
+  #zoom = 1; // 1 shows the whole image
+  #centre = { x: 0.5, y: 0.5 }; // the image point in the middle of the view, as fractions of width and height
   #pointers = new Map();
-  #dragged = null; // what the pointer drags: "line" or "picture"
+  #dragged = null; // what the pointer drags: "line" or "image"
 
   connectedCallback() {
     this.tabIndex = 0;
@@ -43,12 +43,12 @@ class GlassCompare extends HTMLElement {
     this.paint();
   }
 
-  // Shows the whole picture, with the line in the middle.
+  // Shows the whole image, with the line in the middle.
   reset() {
     [this.#split, this.#zoom, this.#centre] = [0.5, 1, { x: 0.5, y: 0.5 }];
   }
 
-  // Zooms by a factor around a point of the view, by default its middle. A factor of 0 shows the whole picture.
+  // Zooms by a factor around a point of the view, by default its middle. A factor of 0 shows the whole image.
   zoomBy(factor, x = this.clientWidth / 2, y = this.clientHeight / 2) {
     const before = this.#placement();
     const maxZoom = Math.max(1, (MAX_PIXEL_SIZE * this.left.width) / this.#fit().width / (window.devicePixelRatio || 1));
@@ -59,14 +59,14 @@ class GlassCompare extends HTMLElement {
     this.paint();
   }
 
-  // The size of the whole picture in the view, in CSS pixels. Small pictures are enlarged at most by a factor of 2.
+  // The size of the whole image in the view, in CSS pixels. Small images are enlarged by a factor of at most 2.
   #fit() {
     const { width, height } = this.left;
     const scale = Math.min(this.clientWidth / width, this.clientHeight / height, 2);
     return { width: width * scale, height: height * scale };
   }
 
-  // The position and size of the picture in the view, in CSS pixels. Limits the pan, so that the picture covers the view.
+  // The position and size of the image in the view, in CSS pixels. Limits the pan, so that the image covers the view.
   #placement() {
     const fit = this.#fit();
     const [width, height] = [fit.width * this.#zoom, fit.height * this.#zoom];
@@ -78,7 +78,7 @@ class GlassCompare extends HTMLElement {
     return { left, top, width, height };
   }
 
-  // The left and right ends of the visible part of the picture, and the position of the line, in CSS pixels.
+  // The left and right ends of the visible part of the image, and the position of the line, in CSS pixels.
   #visible(placement = this.#placement()) {
     const [from, to] = [Math.max(0, placement.left), Math.min(this.clientWidth, placement.left + placement.width)];
     return { from, to, line: from + this.#split * (to - from) };
@@ -132,7 +132,7 @@ class GlassCompare extends HTMLElement {
     this.setPointerCapture(event.pointerId);
     this.#pointers.set(event.pointerId, point);
     const isNear = Math.abs(point.x - this.#visible().line) < GRAB_DISTANCE;
-    this.#dragged = this.#zoom === 1 || isNear ? "line" : "picture";
+    this.#dragged = this.#zoom === 1 || isNear ? "line" : "image";
     if (this.#dragged === "line" && this.#pointers.size === 1 && event.pointerType === "mouse") this.#moveLine(point.x);
   }
 
@@ -151,7 +151,7 @@ class GlassCompare extends HTMLElement {
     const distance = (point) => Math.hypot(point.x - other.x, point.y - other.y) || 1;
     this.zoomBy(distance(now) / distance(before), (now.x + other.x) / 2, (now.y + other.y) / 2);
     this.#pan((now.x - before.x) / 2, (now.y - before.y) / 2);
-    this.#dragged = "picture";
+    this.#dragged = "image";
   }
 
   _pointerup(event) {
@@ -180,11 +180,11 @@ class GlassCompare extends HTMLElement {
     const step = (to - from) / 100;
     const onLine = { ArrowLeft: line - step, ArrowDown: line - step, ArrowRight: line + step, ArrowUp: line + step,
       PageDown: line - 10 * step, PageUp: line + 10 * step, Home: from, End: to };
-    const onPicture = { ArrowLeft: [60, 0], ArrowRight: [-60, 0], ArrowUp: [0, 60], ArrowDown: [0, -60] };
+    const onImage = { ArrowLeft: [60, 0], ArrowRight: [-60, 0], ArrowUp: [0, 60], ArrowDown: [0, -60] };
     const zooms = { "+": 1.5, "=": 1.5, "-": 1 / 1.5, 0: 0 };
     if (event.key in zooms) this.zoomBy(zooms[event.key]);
     else if (event.target === this.line && event.key in onLine) this.#moveLine(onLine[event.key]);
-    else if (event.target === this && event.key in onPicture) this.#pan(...onPicture[event.key]);
+    else if (event.target === this && event.key in onImage) this.#pan(...onImage[event.key]);
     else return;
     event.preventDefault();
   }

@@ -19,11 +19,11 @@ export function readMaps(buffer) {
   const end = new Uint8Array(buffer).indexOf(10);
   const head = JSON.parse(new TextDecoder().decode(buffer.slice(0, end)));
   const count = head.width * head.height;
-  let at = end + 1;
+  let offset = end + 1;
   const read = (kind, length) => {
     const bytes = length * kind.BYTES_PER_ELEMENT;
-    at += bytes;
-    return new kind(buffer.slice(at - bytes, at));
+    offset += bytes;
+    return new kind(buffer.slice(offset - bytes, offset));
   };
   const photo = read(Uint8Array, 3 * count);
   const numbers = read(Uint16Array, 3 * count);

@@ -1,16 +1,17 @@
 // The page of the user study: consent, trials, end. The server stores the progress of a participant. The page requests
-// the next trial, shows its three pictures, and continues after the server has acknowledged the answer.
+// the next trial, shows its three pictures, sends the answer, and continues after the server has acknowledged it.
 
-import { Lens } from "./lens.js";
+import { PanZoom } from "./pan_zoom.js";
 
 const PARTICIPANT_TOKEN = location.pathname.match(/^\/s\/([^/]+)/)?.[1];
-const MIN_ANSWER_DELAY = 300; // ms; earlier answers are ignored, because a double click belongs to the previous pictures
-const KEYS = { 1: "left", 2: "similar", 3: "right", ArrowLeft: "left", ArrowRight: "right" }; // the arrows up and down scroll
+// In ms. Earlier answers are ignored, because they may be the second click of a double click in the previous trial.
+const MIN_ANSWER_DELAY = 300;
+const KEYS = { 1: "left", 2: "similar", 3: "right", ArrowLeft: "left", ArrowRight: "right" }; // the up and down arrows scroll
 
 const byId = (id) => document.getElementById(id);
 const sections = ["invitation", "trial", "finish", "error"];
 const frames = { left: frame("left"), photo: frame("photo"), right: frame("right") };
-const lens = new Lens(byId("pictures"), Object.values(frames));
+const panZoom = new PanZoom(byId("pictures"), Object.values(frames));
 const preloaded = []; // the pictures of the next trial, held in memory
 let state = null; // the current trial, as returned by the server
 let shownAt = null; // time at which its pictures were shown; null while no answer is accepted
@@ -26,7 +27,8 @@ function show(section) {
 
 // --- requests
 
-// Sends a request and returns the response data. Repeats it after network and server errors; throws after client errors.
+// Sends a request and returns the data of the response. Repeats the request after a network or server error, and throws after
+// a client error.
 async function send(path, body) {
   for (let wait = 1; ; wait = Math.min(2 * wait, 15)) {
     try {
@@ -57,7 +59,7 @@ function notice(text) {
   byId("notice").hidden = !text;
 }
 
-function fail(error) {
+function showError(error) {
   byId("error-text").textContent = error.message;
   show("error");
 }
@@ -82,7 +84,7 @@ byId("agreement").addEventListener("submit", async (event) => {
   try {
     location.assign((await send("/participants", { agreed: true })).link);
   } catch (error) {
-    fail(error);
+    showError(error);
   }
 });
 
@@ -111,7 +113,7 @@ async function showTrial(next) {
   state = next;
   if (next.trial === null) return finish(next);
   const number = `Pair ${next.trial + 1} of ${next.trials}`;
-  byId("where").textContent = number;
+  byId("position").textContent = number;
   byId("bar").value = next.trial / next.trials;
   byId("trial").classList.add("waiting");
   show("trial");
@@ -121,7 +123,7 @@ async function showTrial(next) {
   byId("pictures").classList.toggle("tall", next.width < next.height);
   for (const side of sides) frames[side].firstElementChild.src = pictureUrl(next.trial, side);
   await Promise.all(sides.map((side) => frames[side].firstElementChild.decode()));
-  lens.reset(next.width, next.height);
+  panZoom.reset(next.width, next.height);
   byId("trial").classList.remove("waiting");
   updateChoices(null, false);
   byId("announcement").textContent = number;
@@ -148,7 +150,7 @@ async function choose(choice) {
     const answer = await send(`/s/${PARTICIPANT_TOKEN}/answers`, { trial: state.trial, choice, seconds });
     await showTrial(answer.next);
   } catch (error) {
-    fail(error);
+    showError(error);
   }
 }
 
@@ -164,16 +166,16 @@ addEventListener("keydown", (event) => {
   if (byId("trial").hidden || event.ctrlKey || event.metaKey || event.altKey) return;
   const answers = event.key in KEYS ? !event.shiftKey : event.key === "Enter" && byId("choices").contains(event.target);
   if (event.repeat && answers) return event.preventDefault(); // a held key counts as one answer
-  if (event.shiftKey ? lens.press(`Shift+${event.key}`) || lens.press(event.key) : lens.press(event.key)) event.preventDefault();
+  if (event.shiftKey ? panZoom.press(`Shift+${event.key}`) || panZoom.press(event.key) : panZoom.press(event.key)) event.preventDefault();
   else if (event.key in KEYS && !event.shiftKey) {
     event.preventDefault();
     choose(KEYS[event.key]);
   }
 });
 
-for (const button of byId("zoom").children) button.addEventListener("click", () => lens.zoom(button.dataset.zoom));
+for (const button of byId("zoom").children) button.addEventListener("click", () => panZoom.zoom(button.dataset.zoom));
 byId("pictures").addEventListener("zoomed", () => {
-  document.querySelector("[data-zoom=full]").setAttribute("aria-pressed", lens.isFull);
+  document.querySelector("[data-zoom=full]").setAttribute("aria-pressed", panZoom.isFull);
 });
 
 byId("copy").addEventListener("click", async () => {
@@ -191,5 +193,5 @@ byId("retry").addEventListener("click", () => location.reload());
 try {
   await (PARTICIPANT_TOKEN ? showTrial(await send(`/s/${PARTICIPANT_TOKEN}/trial`)) : showInvitation());
 } catch (error) {
-  fail(error);
+  showError(error);
 }

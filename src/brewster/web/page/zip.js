@@ -1,11 +1,12 @@
 // Merges the zips of the server into one. Their files are uncompressed, and the local headers contain the sizes.
 
+// The signatures of the three kinds of records.
 const LOCAL = 0x04034b50;
 const CENTRAL = 0x02014b50;
 const END = 0x06054b50;
-const LIMIT = 0xffffffff;
+const MAX_BYTES = 0xffffffff; // a zip without the ZIP64 extension is not larger
 
-// `files` are results of `readZip`; a name that is already used gets a number in front.
+// Creates a zip from files as returned by `readZip`. If a name is already used, a number is put before it.
 export function createZip(files) {
   const parts = [];
   const centralRecords = [];
@@ -21,12 +22,13 @@ export function createZip(files) {
     at += local.length + file.data.byteLength;
   }
   const size = centralRecords.reduce((sum, row) => sum + row.length, 0);
-  if (at + size > LIMIT) throw new Error("The zip would be larger than 4 GB. Download the photos one by one.");
+  if (at + size > MAX_BYTES) throw new Error("The zip would be larger than 4 GB. Download the photos one by one.");
   const count = [[2, centralRecords.length], [2, centralRecords.length]];
   const end = littleEndian([[4, END], [2, 0], [2, 0], ...count, [4, size], [4, at], [2, 0]]);
   return new Blob([...parts, ...centralRecords, end], { type: "application/zip" });
 }
 
+// Returns the files of a zip as {name, crc, data}.
 export function readZip(buffer) {
   const view = new DataView(buffer);
   const files = [];

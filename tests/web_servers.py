@@ -1,4 +1,4 @@
-"""Web servers for tests: applications without a network, on a thread, or in their own process."""
+"""Web servers for tests: applications without a network, in a thread, or in a separate process."""
 
 import asyncio
 import contextlib
@@ -42,7 +42,7 @@ class FakeModelCache:
 
 
 class BlockingBackend:
-    """A pane that blocks until `proceed` is set."""
+    """A backend that blocks until `proceed` is set, and counts its tiles."""
 
     def __init__(self):
         self.tiles, self.started, self.proceed = 0, Event(), Event()
@@ -77,19 +77,20 @@ def request(app, method, path, **kwargs):
 
 
 def form(photo, name="window.png", **fields):
+    """The arguments of httpx for a form with a photo."""
     return {"files": {"photo": (name, photo)}, "data": fields}
 
 
 @contextlib.contextmanager
 def served_port(app):
-    """Runs an application on a thread; yields its port."""
+    """Runs an application in a thread; yields its port."""
     with running_server(app) as (port, _):
         yield port
 
 
 @contextlib.contextmanager
 def running_server(app):
-    """Runs an application on a thread; yields its port and the server."""
+    """Runs an application in a thread; yields its port and the server."""
     with listen("127.0.0.1", 0) as listening:
         running = create_server(app)
         thread = Thread(target=running.run, kwargs={"sockets": [listening]})
@@ -106,15 +107,15 @@ def raw_exchange(port, *pieces):
     with socket.create_connection(("127.0.0.1", port)) as connection:
         for piece in pieces:
             connection.sendall(piece)
-        answer = b""
+        response = b""
         while more := connection.recv(1 << 16):
-            answer += more
-    return answer
+            response += more
+    return response
 
 
 @contextlib.contextmanager
 def serve_process(*args):
-    """Runs `brewster serve` in its own process; yields its first line, a link, and checks the exit code at the end."""
+    """Runs `brewster serve` in a separate process. Yields its first line of output, a link; checks the exit code at the end."""
     command = [sys.executable, "-m", "brewster", "serve", "--port", "0", "--device", "cpu", *map(str, args)]
     kwargs = {"stdout": subprocess.PIPE, "text": True, "env": {**os.environ, "PYTHONUNBUFFERED": "1"}}
     with started(command, **kwargs) as process:

@@ -1,13 +1,13 @@
-// Synchronised zoom and pan for several frames that show pictures of one size.
-// A frame has the aspect ratio of its picture. Offsets are shares of the frame, so all frames show the same part.
+// Synchronised pan and zoom for several frames that show pictures of the same size.
+// A frame has the aspect ratio of its picture. Offsets are fractions of the frame size, so all frames show the same part.
 
 const MAX_PIXEL_SIZE = 8; // maximum size of a picture pixel in screen pixels
-const ZOOM_STEP = 1.5;
-const PAN_STEP = 0.12;
+const ZOOM_STEP = 1.5; // factor
+const PAN_STEP = 0.12; // fraction of the frame size
 
-export class Lens {
+export class PanZoom {
   #scale = 1;
-  #x = 0; // offsets of the left and upper edge, in shares of the frame: 0 or less
+  #x = 0; // offsets of the left and upper edge, as fractions of the frame size: 0 or less
   #y = 0;
   #size = [1, 1];
   #pointers = new Map();
@@ -44,7 +44,7 @@ export class Lens {
     return this.#scale > 1 && Math.abs(this.#scale / this.#fullScale() - 1) < 1e-3;
   }
 
-  // Handles a key; returns whether the key has a function here.
+  // Handles a key. Returns true if the key zooms or pans.
   press(key) {
     const zooms = { "+": "in", "=": "in", "-": "out", _: "out", 0: "fit", f: "full", F: "full" };
     const pans = { "Shift+ArrowLeft": [PAN_STEP, 0], "Shift+ArrowRight": [-PAN_STEP, 0], "Shift+ArrowUp": [0, PAN_STEP], "Shift+ArrowDown": [0, -PAN_STEP] };
