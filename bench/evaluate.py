@@ -34,7 +34,7 @@ def main(data: Path, count: int = 500) -> None:
         first, last = (max(part) / 2**20 for part in (memory[:quarter], memory[-quarter:]))
         rate = count / seconds[workers]
         print(
-            f"{workers} workers: {rate:.2f} images per second, all metrics, for the unprocessed input and one folder"
+            f"--workers {workers}: {rate:.2f} images per second, all metrics, for the unprocessed input and one folder"
         )
         print(f"  memory of all processes: {first:.2f} GiB in the first quarter, {last:.2f} GiB in the last")
     print(f"two workers are {seconds[1] / seconds[2]:.2f} times as fast as one")

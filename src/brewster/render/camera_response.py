@@ -73,13 +73,10 @@ class DevelopedSample:
 
 
 def develop(sample: LightSample) -> DevelopedSample:
-    """Applies exposure, white balance, noise and tone curve with the settings in the scene's `development`.
+    """Applies exposure, white balance, noise and tone curve, as the scene's `development` describes them.
 
     Exposure is rounded to a thousandth of a stop before it is applied, and gains to four decimals. So the recorded
     values are exactly the applied ones, and rounding errors of different devices do not change them.
-
-    Returns:
-        The five encoded images, and the exposures and gains that were applied.
     """
     development = sample.scene.development
     white_balance = _white_balance(sample.photo, development)
