@@ -35,7 +35,7 @@ def main(data: Path) -> None:
     cases = [case for part in parts for case in part.cases]
     frr_seconds = run_frr(cases)
     models = [ModelMethod(name, name, OUT / "predictions" / name, device="cpu") for name in MODELS]
-    (OUT / SCORES).unlink(missing_ok=True)  # scores of an earlier run have the times of that run
+    (OUT / SCORES).unlink(missing_ok=True)  # stored scores would have no new times
     scored = {}
     results = evaluate(
         parts,

@@ -39,7 +39,7 @@ def main(data: Path, recipes: list[Path]) -> None:
 
 
 def print_row(name: str, pairs: Iterable[tuple[Tensor, Tensor]]) -> None:
-    """Prints the quantiles over all pairs. Those without reflection are included, because training uses them."""
+    """Prints the quantiles over all pairs. Mixtures without a reflection are included, as in training."""
     rows = [statistics(to_linear(photo), to_linear(truth)) for photo, truth in pairs]
     cells = [
         " ".join(f"{value:.2f}" for value in np.nanquantile([row[key] for row in rows], QUANTILES))
