@@ -36,18 +36,18 @@ def main(data: Path) -> None:
     frr_seconds = run_frr(cases)
     models = [ModelMethod(name, name, OUT / "predictions" / name, device="cpu") for name in MODELS]
     (OUT / SCORES).unlink(missing_ok=True)  # stored scores would have no new times
-    scored = {}
+    timed = {}
     results = evaluate(
         parts,
         [IdentityBaseline(), *models, PredictionFolder("fast-reflection-removal", OUT / "frr")],
         EvaluationConfig(),
         OUT,
-        on_progress=lambda _done, _total, row: scored.setdefault(row.method, []).append(row),
+        on_progress=lambda _done, _total, row: timed.setdefault(row.method, []).append(row),
     )
     print(overview(results))
     for model in models:
-        megapixels = sum(row.width * row.height for row in scored[model.name]) / 1e6
-        model_seconds = sum(row.seconds for row in scored[model.name])
+        megapixels = sum(row.width * row.height for row in timed[model.name]) / 1e6
+        model_seconds = sum(row.seconds for row in timed[model.name])
         print(f"{model.name}: {model_seconds / megapixels:.2f} s per megapixel on these small images")
     print(f"fast-reflection-removal: {frr_seconds:.2f} s per megapixel")
 
