@@ -2,8 +2,11 @@
 
     python bench/compare_renderers.py [SAMPLES] [NAME]
 
-Each scene is rendered twice by both, with different random numbers, to estimate the noise. If only noise separates
-the renderers, mse(a - b) of the two means a and b equals mse(a1 - a2) / 4 + mse(b1 - b2) / 4: the last column is 1.
+SAMPLES is the number of Mitsuba's rays per pixel (default 1024); NAME selects the scenes whose names contain it.
+
+Each renderer renders each scene twice, with different random numbers: a1 and a2 by ours, b1 and b2 by Mitsuba. With the
+means a and b, the last column is mse(a - b) / (mse(a1 - a2) / 4 + mse(b1 - b2) / 4). It is 1 if only noise separates
+the renderers.
 """
 
 from __future__ import annotations
@@ -29,15 +32,19 @@ from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
 STREET = EnvironmentMap(source=AssetSource(file="builtin:street:3"), heading_deg=200)
 ROOM = EnvironmentMap(source=AssetSource(file="builtin:room:2"), heading_deg=70)
 DOME = ROOM.model_copy(update={"radius_mm": 4000.0})
-ART = Plane(source=AssetSource(file="builtin:painting:5"), distance_mm=60, width_mm=700, luminance=0.6)
-PORTRAIT = Plane(source=AssetSource(file="builtin:painting:8"), distance_mm=900, width_mm=800, luminance=2.0)
+NEAR_PAINTING = Plane(
+    source=AssetSource(file="builtin:painting:5"), distance_mm=60, width_mm=700, luminance=0.6
+)
+FAR_PAINTING = Plane(
+    source=AssetSource(file="builtin:painting:8"), distance_mm=900, width_mm=800, luminance=2.0
+)
 CAMERA = Camera(width=128, height=96, fov_deg=36, heading_deg=4, position_mm=(-40, 0, 700), focus_mm=2500)
 LENS = CAMERA.model_copy(update={"aperture_mm": 20.0})
 CLEAR, THICK = Pane(), Pane(thickness_mm=20)
 TINTED = Pane(thickness_mm=10, absorption_per_m=(30, 8, 14))
 
 FAR = {"behind": Side(map=STREET), "front": Side(map=ROOM)}
-NEAR = {"behind": Side(map=STREET, plane=ART), "front": Side(map=DOME, plane=PORTRAIT)}
+NEAR = {"behind": Side(map=STREET, plane=NEAR_PAINTING), "front": Side(map=DOME, plane=FAR_PAINTING)}
 SCENES = {
     "single, far": Scene(camera=CAMERA, **FAR),
     "single, paper orders": Scene(camera=CAMERA, orders="paper", **FAR),
@@ -65,40 +72,44 @@ SCENES = {
 def averaged_polarisations() -> Iterator[None]:
     """Averages s- and p-polarised light at every microfacet of our rough glass, as Mitsuba's colour variants do."""
 
-    def averaged(cosine: Tensor, here: float, beyond: float) -> tuple[Tensor, Tensor]:
-        s, p = separate(cosine, here, beyond)
+    def averaged(cosine: Tensor, index_in: float, index_out: float) -> tuple[Tensor, Tensor]:
+        s, p = polarised(cosine, index_in, index_out)
         return (s + p) / 2, (s + p) / 2
 
-    separate = rough_glass._reflectances
+    polarised = rough_glass._reflectances
     rough_glass._reflectances = averaged
     try:
         yield
     finally:
-        rough_glass._reflectances = separate
+        rough_glass._reflectances = polarised
 
 
 def compare(scene: Scene, assets: Assets, samples: int) -> list[str]:
-    """One row each for I, T, B, R and MR: ratio of the means - 1, its standard error, PSNR and error over noise."""
+    """Renders a scene with both renderers. Returns a row of the table for each of I, T, B, R and MR."""
     with averaged_polarisations():
-        ours, again = render(scene, assets), render(_reseeded(scene, 1), assets)
-    polarised = scene.camera.heading_deg > 30
-    first, second = (
+        ours = render(scene, assets), render(_reseeded(scene, 1), assets)
+    polarised = scene.camera.heading_deg > 30  # elsewhere, s and p hardly differ
+    theirs = tuple(
         trace(_reseeded(scene, seed), assets, noise=0, max_samples=samples, polarised=polarised)
         for seed in (2, 3)
     )
-    return [_row(name, ours, again, first, second) for name in LAYERS]
+    return [_row(name, ours, theirs) for name in LAYERS]
 
 
-def _row(name: str, ours: LightSample, again: LightSample, first: LightSample, second: LightSample) -> str:
-    one, two, a, b = (getattr(sample, name).double() for sample in (ours, again, first, second))
-    mine, theirs = (one + two) / 2, (a + b) / 2
-    error = (mine - theirs).square().mean()
-    noise = ((one - two).square().mean() + (a - b).square().mean()) / 4
-    pixels = math.sqrt(a[0].numel())
-    spread = math.sqrt(float(((a - b).mean(0).var() + (one - two).mean(0).var()) / 4)) / pixels
-    ratio = float(mine.mean() / theirs.mean()) - 1
-    psnr = 10 * math.log10(float(theirs.clamp(max=1).max() ** 2 / error.clamp(min=1e-20)))
-    return f"{100 * ratio:+.3f} ({100 * spread / float(theirs.mean()):.3f}) | {psnr:.1f} | {float(error / noise):.2f}"
+def _row(name: str, ours: tuple[LightSample, ...], theirs: tuple[LightSample, ...]) -> str:
+    """Ratio of the means - 1 with its standard error, PSNR, and squared error over that expected from noise."""
+    a1, a2, b1, b2 = (getattr(sample, name).double() for sample in (*ours, *theirs))
+    a, b = (a1 + a2) / 2, (b1 + b2) / 2
+    error = (a - b).square().mean()
+    noise = ((a1 - a2).square().mean() + (b1 - b2).square().mean()) / 4
+    variance = ((b1 - b2).mean(0).var() + (a1 - a2).mean(0).var()) / 4
+    standard_error = math.sqrt(float(variance)) / math.sqrt(a[0].numel())
+    ratio = float(a.mean() / b.mean()) - 1
+    psnr = 10 * math.log10(float(b.clamp(max=1).max() ** 2 / error.clamp(min=1e-20)))
+    return (
+        f"{100 * ratio:+.3f} ({100 * standard_error / float(b.mean()):.3f}) | {psnr:.1f} | "
+        f"{float(error / noise):.2f}"
+    )
 
 
 def _reseeded(scene: Scene, seed: int) -> Scene:
@@ -106,7 +117,7 @@ def _reseeded(scene: Scene, seed: int) -> Scene:
 
 
 def main() -> None:
-    """Prints a Markdown table of the scenes whose name contains NAME, or of all."""
+    """Prints a Markdown table."""
     torch.set_num_threads(2)
     samples = int(sys.argv[1]) if len(sys.argv) > 1 else 1024
     assets = Assets()

@@ -1,7 +1,8 @@
-"""`brewster evaluate` with all metrics on 500 images of 540x400: images per second with one and two workers, and
-whether memory stays constant.
+"""Measures `brewster evaluate` with all metrics: images per second with one and two workers, and memory over time.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/evaluate.py [COUNT]
+
+COUNT images (default 500) of 540x400 are scored: the unprocessed input and one folder of predictions.
 """
 
 import os
@@ -29,25 +30,24 @@ def main(data: Path, count: int = 500) -> None:
         out = OUT / f"workers-{workers}"
         shutil.rmtree(out, ignore_errors=True)
         seconds[workers], memory = measure(out, workers)
-        first, last = (
-            max(some) / 2**20 for some in (memory[: len(memory) // 4], memory[-len(memory) // 4 :])
-        )
+        quarter = len(memory) // 4
+        first, last = (max(part) / 2**20 for part in (memory[:quarter], memory[-quarter:]))
         rate = count / seconds[workers]
         print(
-            f"{workers} workers: {rate:.2f} images per second, all metrics, the unprocessed input and one folder"
+            f"--workers {workers}: {rate:.2f} images per second, all metrics, for the unprocessed input and one folder"
         )
         print(f"  memory of all processes: {first:.2f} GiB in the first quarter, {last:.2f} GiB in the last")
     print(f"two workers are {seconds[1] / seconds[2]:.2f} times as fast as one")
     same = (OUT / "workers-1/results.json").read_bytes() == (OUT / "workers-2/results.json").read_bytes()
-    print(f"their results.json files are {'equal' if same else 'NOT EQUAL'}")
+    print(f"the results.json files of both runs are {'equal' if same else 'NOT EQUAL'}")
 
 
 def make_pairs(data: Path, count: int) -> None:
-    """Writes triplets and the outputs of another method, mixed from photos."""
+    """Mixes pairs from photos, and writes them with the predictions of a simulated method."""
     photos = sorted((data / "photos/permissive").glob("*.jpg"))
     rng = np.random.default_rng(7)
     for i in range(count):
-        if (OUT / "theirs" / f"{i}.png").exists():
+        if (OUT / "predictions" / f"{i}.png").exists():
             continue
         behind, mirrored = (Photo.open(photos[(i + step) % len(photos)]).resized(*SIZE) for step in (0, 17))
         reflection = 0.3 * rng.uniform() * mirrored
@@ -55,7 +55,7 @@ def make_pairs(data: Path, count: int) -> None:
             "blended": 0.9 * behind + reflection,
             "transmission": behind,
             "reflection": reflection,
-            "../theirs": 0.95 * behind + 0.3 * reflection,
+            "../predictions": 0.95 * behind + 0.3 * reflection,
         }
         for role, light in layers.items():
             pixels = np.rint(255 * to_encoded(np.clip(light, 0, 1))).astype(np.uint8)
@@ -65,19 +65,20 @@ def make_pairs(data: Path, count: int) -> None:
 def measure(out: Path, workers: int) -> tuple[float, list[float]]:
     """Wall time, and the resident memory of all processes in KiB, every second after the first image is scored."""
     command = [sys.executable, "-m", "brewster", "evaluate", "--quiet", "-o", out, "--workers", str(workers)]
-    command += ["--benchmark", f"pairs={OUT / 'pairs'}", "--predictions", f"theirs={OUT / 'theirs'}"]
+    command += ["--benchmark", f"pairs={OUT / 'pairs'}", "--predictions", f"other={OUT / 'predictions'}"]
     started, memory = time.perf_counter(), []
     process = subprocess.Popen([*command, "--pictures", "0"])
     watcher = threading.Thread(target=watch, args=(process, out, memory))
     watcher.start()
     if process.wait():
         sys.exit("brewster evaluate failed; see its error above")
-    taken = time.perf_counter() - started
+    seconds = time.perf_counter() - started
     watcher.join()
-    return taken, memory
+    return seconds, memory
 
 
 def watch(process: subprocess.Popen, out: Path, memory: list[float]) -> None:
+    """Appends the resident memory in KiB every second, from the first score until the process ends."""
     while process.poll() is None:
         if (out / SCORES).exists() and (out / SCORES).stat().st_size:
             memory.append(sum(resident_kib(pid) for pid in process_tree(process.pid)))
@@ -85,6 +86,7 @@ def watch(process: subprocess.Popen, out: Path, memory: list[float]) -> None:
 
 
 def process_tree(pid: int) -> list[int]:
+    """The ids of a process and of all its descendants; empty if it has ended."""
     try:
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     except OSError:

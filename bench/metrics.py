@@ -1,9 +1,10 @@
-"""Time per 540x400 image of our LPIPS and the arithmetic of the `lpips` package, and of our SSIM and scikit-image's.
+"""Compares the speed of our LPIPS with the `lpips` package, and of our SSIM with scikit-image, on 540x400 images.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/metrics.py
 
-One thread each, alternating, medians of 11 rounds. Our LPIPS computes the features of a ground truth once for all
-predictions, so a further prediction costs less; the package computes both images every time.
+Each uses one thread; they alternate, and the median of 11 rounds is printed. Our LPIPS computes the features of a ground
+truth once for all its predictions, so a further prediction costs less; the package computes both images every time. The
+package itself is not needed: `ReferenceLpips` repeats its operations.
 """
 
 import os
@@ -23,44 +24,47 @@ from brewster.metrics.weights import TENSOR_NAMES, load_alexnet, read_heads
 
 HEIGHT, WIDTH = 400, 540
 ROUNDS = 11
-STEPS = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))
+STRIDES_AND_PADDINGS = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))  # of AlexNet's convolutions
 GAUSSIAN = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 255}
 
 
 def main(data: Path) -> None:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    picture, truth = pair(data)
-    perceptual(picture, truth)
-    for window, how in (("uniform", {}), ("gaussian", GAUSSIAN)):
+    prediction, truth = read_pair(data)
+    measure_lpips(prediction, truth)
+    for window, options in (("uniform", {}), ("gaussian", GAUSSIAN)):
         ours_ms, reference_ms = median_ms(
-            lambda window=window: ssim(picture, truth, window=window),
-            lambda how=how: structural_similarity(truth, picture, channel_axis=2, **how),
+            lambda window=window: ssim(prediction, truth, window=window),
+            lambda options=options: structural_similarity(truth, prediction, channel_axis=2, **options),
         )
         print(
             f"SSIM {window} of 540x400: {ours_ms:.1f} ms; scikit-image {reference_ms:.1f} ms; {reference_ms / ours_ms:.2f} times as fast"
         )
-    fast, region = median_ms(lambda: psnr(picture, truth), lambda: reflection_region(picture, truth))
-    print(f"PSNR: {fast:.1f} ms; reflection region: {region:.1f} ms")
+    psnr_ms, region_ms = median_ms(
+        lambda: psnr(prediction, truth), lambda: reflection_region(prediction, truth)
+    )
+    print(f"PSNR: {psnr_ms:.1f} ms; reflection region: {region_ms:.1f} ms")
     torch.set_num_threads(threads)
 
 
-def perceptual(picture: np.ndarray, truth: np.ndarray) -> None:
-    metric, package = Lpips.load(), Package()
-    known = metric.features(truth)
-    first, reference_ms = median_ms(
-        lambda: metric.distance(metric.features(picture), metric.features(truth)),
-        lambda: package(picture, truth),
+def measure_lpips(prediction: np.ndarray, truth: np.ndarray) -> None:
+    metric, reference = Lpips.load(), ReferenceLpips()
+    truth_features = metric.features(truth)
+    first_ms, reference_ms = median_ms(
+        lambda: metric.distance(metric.features(prediction), metric.features(truth)),
+        lambda: reference(prediction, truth),
     )
-    (further,) = median_ms(lambda: metric.distance(metric.features(picture), known))
-    difference = abs(metric.distance(metric.features(picture), known) - package(picture, truth))
+    (further_ms,) = median_ms(lambda: metric.distance(metric.features(prediction), truth_features))
+    ours = metric.distance(metric.features(prediction), truth_features)
+    difference = abs(ours - reference(prediction, truth))
     print(
-        f"LPIPS of 540x400: {first:.0f} ms, each further prediction {further:.0f} ms; the lpips package's arithmetic "
-        f"{reference_ms:.0f} ms; {reference_ms / first:.2f} and {reference_ms / further:.2f} times as fast; difference {difference:.1e}"
+        f"LPIPS of 540x400: {first_ms:.0f} ms, each further prediction {further_ms:.0f} ms; the operations of the lpips "
+        f"package {reference_ms:.0f} ms; {reference_ms / first_ms:.2f} and {reference_ms / further_ms:.2f} times as fast; difference {difference:.1e}"
     )
 
 
-class Package:
+class ReferenceLpips:
     """LPIPS with the operations of the lpips package, in its order."""
 
     def __init__(self) -> None:
@@ -71,35 +75,36 @@ class Package:
         self.scale = torch.tensor([0.458, 0.448, 0.450]).view(1, 3, 1, 1)
 
     @torch.no_grad()
-    def __call__(self, picture: np.ndarray, truth: np.ndarray) -> float:
-        seen = [self.maps(self.tensor(picture)), self.maps(self.tensor(truth))]
+    def __call__(self, prediction: np.ndarray, truth: np.ndarray) -> float:
+        features = [self.features(self.tensor(prediction)), self.features(self.tensor(truth))]
         value = 0
-        for one, other, head in zip(*seen, self.heads, strict=True):
-            difference = (normal(one) - normal(other)) ** 2
+        for one, other, head in zip(*features, self.heads, strict=True):
+            difference = (unit_length(one) - unit_length(other)) ** 2
             value = value + functional.conv2d(difference, head).mean([2, 3], keepdim=True)
         return value.item()
 
     @staticmethod
-    def tensor(picture: np.ndarray) -> torch.Tensor:
-        return torch.Tensor((picture / 127.5 - 1)[:, :, :, np.newaxis].transpose((3, 2, 0, 1)))
+    def tensor(image: np.ndarray) -> torch.Tensor:
+        return torch.Tensor((image / 127.5 - 1)[:, :, :, np.newaxis].transpose((3, 2, 0, 1)))
 
-    def maps(self, values: torch.Tensor) -> list[torch.Tensor]:
-        values, maps = (values - self.shift) / self.scale, []
+    def features(self, values: torch.Tensor) -> list[torch.Tensor]:
+        values, features = (values - self.shift) / self.scale, []
         for layer, ((stride, padding), (weight, bias)) in enumerate(
-            zip(STEPS, self.convolutions, strict=True)
+            zip(STRIDES_AND_PADDINGS, self.convolutions, strict=True)
         ):
             if layer in (1, 2):
                 values = functional.max_pool2d(values, 3, 2)
             values = functional.relu(functional.conv2d(values, weight, bias, stride, padding), inplace=True)
-            maps.append(values)
-        return maps
+            features.append(values)
+        return features
 
 
-def normal(values: torch.Tensor) -> torch.Tensor:
+def unit_length(values: torch.Tensor) -> torch.Tensor:
+    """Features (1, C, H, W) scaled to length 1 over the channels."""
     return values / (torch.sqrt(torch.sum(values**2, dim=1, keepdim=True)) + 1e-10)
 
 
-def pair(data: Path) -> tuple[np.ndarray, np.ndarray]:
+def read_pair(data: Path) -> tuple[np.ndarray, np.ndarray]:
     """A real photo and its ground truth, cropped to 540x400."""
     photo = min((data / "real/dev/nature/blended").iterdir())
     (truth,) = (data / "real/dev/nature/transmission").glob(f"{photo.stem}.*")
@@ -107,14 +112,14 @@ def pair(data: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def median_ms(*runs: Callable[[], object]) -> list[float]:
-    """The median milliseconds of each function; they alternate, so that other load slows all of them alike."""
+    """The median milliseconds of each function. Calls alternate, so that other processes slow all functions alike."""
     times = [[] for _ in runs]
     for _ in range(ROUNDS + 1):
-        for run, spent in zip(runs, times, strict=True):
+        for run, run_times in zip(runs, times, strict=True):
             started = time.perf_counter()
             run()
-            spent.append(1e3 * (time.perf_counter() - started))
-    return [statistics.median(spent[1:]) for spent in times]
+            run_times.append(1e3 * (time.perf_counter() - started))
+    return [statistics.median(run_times[1:]) for run_times in times]  # the first call is a warm-up
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 """Mutation testing: applies the faults of mutants.toml one at a time, and runs the tests that should fail.
 
     make mutants                                  # all of them
-    python bench/mutants.py losses render/rays    # those whose file or text contains one of these words
+    python bench/mutants.py losses render/rays    # those with one of these texts in `file` or `old`
 
-Each runs in a temporary copy of the tree. A mutant is killed if a test fails that passes without it; exceeding the
-time limit counts as a failure. mutmut and cosmic-ray generate every possible mutation of a file, thousands here;
-neither runs a short list with a few test files each.
+The tests run in a temporary copy of the tree. A mutant is killed if a test fails that passes without it; a test that
+exceeds the time limit fails. The tools mutmut and cosmic-ray are not used, because they generate every possible mutation
+of a file (thousands here) and cannot run a short list with a few test files each.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-LIST = ROOT / "bench" / "mutants.toml"
+LIST_FILE = ROOT / "bench" / "mutants.toml"
 PACKAGE = Path("src/brewster")
-COPIED = (
+COPIED_PATHS = (
     "src",
     "tests",
     "recipes",
@@ -43,13 +43,13 @@ COPIED = (
     "pyproject.toml",
     "constraints.txt",
 )
-SECONDS = 900
-TARGET = 0.95
+TIMEOUT_S = 900
+MIN_KILLED_SHARE = 0.95
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """One fault: `old` in `file` becomes `new`, and one of `tests` should fail. `survives` explains why none can."""
+    """One fault: `old` in `file` becomes `new`, and one of `tests` should fail. `survives` explains why no test can fail."""
 
     file: str
     old: str
@@ -64,27 +64,31 @@ class Mutant:
         """The mutated source.
 
         Raises:
-            ValueError: the file is missing, `old` is not in it exactly once, or the program stays the same.
+            ValueError: the file is missing, it does not contain `old` exactly once, or the mutation changes nothing.
         """
         path = root / PACKAGE / self.file
         source = path.read_text("utf-8") if path.is_file() else ""
         if (count := source.count(self.old)) != 1:
-            raise ValueError(f"{self}: found {count} times, expected once; change this entry of {LIST.name}")
+            raise ValueError(
+                f"{self}: the fragment occurs {count} times; expected once; change this entry of {LIST_FILE.name}"
+            )
         mutated = source.replace(self.old, self.new)
         if ast.dump(ast.parse(mutated)) == ast.dump(ast.parse(source)):
-            raise ValueError(f"{self}: the program is still the same; change this entry of {LIST.name}")
+            raise ValueError(
+                f"{self}: the syntax tree is unchanged; expected a change; correct this entry of {LIST_FILE.name}"
+            )
         return mutated
 
 
 def read_list() -> list[Mutant]:
-    """Every entry of mutants.toml."""
-    entries = tomllib.loads(LIST.read_text("utf-8"))["mutant"]
+    """All entries of mutants.toml."""
+    entries = tomllib.loads(LIST_FILE.read_text("utf-8"))["mutant"]
     return [Mutant(**entry | {"tests": tuple(entry["tests"])}) for entry in entries]
 
 
-def main(words: Sequence[str]) -> int:
-    """Prints one line per mutant and the share that is killed; returns 0 if it is at least 95 %, else 1."""
-    mutants = [m for m in read_list() if not words or any(word in f"{m.file} {m.old}" for word in words)]
+def main(patterns: Sequence[str]) -> int:
+    """Prints one line per mutant and the share of killed mutants. Returns 0 if it is at least 95 %, else 1."""
+    mutants = [m for m in read_list() if not patterns or any(p in f"{m.file} {m.old}" for p in patterns)]
     for mutant in mutants:
         mutant.applied()
     _import_heavy()
@@ -95,7 +99,7 @@ def main(words: Sequence[str]) -> int:
     print(f"\n{killed} of {len(mutants)} mutants killed, {killed / max(1, len(mutants)):.1%}")
     for mutant, reason in survivors.items():
         print(f"survives: {mutant}\n    {reason}")
-    return int(killed < TARGET * len(mutants))
+    return int(killed < MIN_KILLED_SHARE * len(mutants))
 
 
 def _survives(copy: Path, mutant: Mutant) -> str:
@@ -108,19 +112,22 @@ def _survives(copy: Path, mutant: Mutant) -> str:
         is_killed, failed = _run_tests(copy, tests)
     finally:
         path.write_text(source, "utf-8")
-    reason = "" if is_killed else mutant.survives or "no reason is known: write a test"
+    reason = "" if is_killed else mutant.survives or "no reason is known; expected a failing test; write one"
     if is_killed and _run_tests(copy, failed or tests)[0]:
-        reason = f"{' '.join(failed or tests)} fails without it, too: fix that first"
+        reason = f"{' '.join(failed or tests)} fails without the mutation, too; expected it to pass; repair it first"
     result = f"SURVIVES  {reason}" if reason else f"killed    {' '.join(failed)[:100] or 'by the time limit'}"
     print(f"{time.monotonic() - started:4.0f} s  {mutant}\n        {result}", flush=True)
     return reason
 
 
 def _copy(folder: Path) -> Path:
-    """A copy of the tree without caches. Bytecode is checked by content: a mutation may keep the size and time of a file."""
+    """Copies the tree without caches. Returns the path of the copy.
+
+    Python compares bytecode with the source by content, because a mutation may keep the size and time of a file.
+    """
     copy = folder / "brewster"
     copy.mkdir()
-    for name in COPIED:
+    for name in COPIED_PATHS:
         source = ROOT / name
         if source.is_dir():
             shutil.copytree(source, copy / name, ignore=shutil.ignore_patterns("__pycache__", "*.egg-info"))
@@ -132,17 +139,23 @@ def _copy(folder: Path) -> Path:
 
 
 def _run_tests(copy: Path, tests: Sequence[str]) -> tuple[bool, list[str]]:
-    """Whether these tests fail, and the first that does. At the time limit all processes are killed."""
+    """Runs tests until the first failure or the time limit, at which all their processes are killed.
+
+    Returns:
+        Whether a test failed or the time limit was exceeded, and the ids of failed tests.
+    """
     log = copy.parent / "failed.txt"
     log.write_text("")
     process = get_context("fork").Process(target=_pytest, args=(copy, tests, log))
     process.start()
-    process.join(SECONDS)
+    process.join(TIMEOUT_S)
     with suppress(ProcessLookupError):
         os.killpg(process.pid or 0, signal.SIGKILL)
     process.join()
     if process.exitcode in {pytest.ExitCode.USAGE_ERROR, pytest.ExitCode.NO_TESTS_COLLECTED}:
-        raise ValueError(f"pytest finds no test in {' '.join(tests)}; change this entry of {LIST.name}")
+        raise ValueError(
+            f"pytest found no test in {' '.join(tests)}; expected at least one; change this entry of {LIST_FILE.name}"
+        )
     return process.exitcode != 0, log.read_text().splitlines()
 
 
@@ -176,7 +189,7 @@ def _pytest(copy: Path, tests: Sequence[str], log: Path) -> None:
 
 
 def _import_heavy() -> None:
-    """Imports what most tests need; every run is forked from this process, which saves seconds each time."""
+    """Imports libraries that most tests need: every run is forked from this process and saves these seconds."""
     os.environ |= {"OMP_NUM_THREADS": "1", "VIPS_CONCURRENCY": "1"}
     for name in (
         "torch",

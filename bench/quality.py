@@ -1,4 +1,4 @@
-"""Scores of the shipped models on the full-size development pairs, with two baselines: the unprocessed input, and
+"""Scores the shipped models on the full-size development pairs, with two baselines: the unprocessed input, and
 fast-reflection-removal 1.1 (Yang et al. 2019), which runs in a separate environment.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/quality.py
@@ -33,7 +33,7 @@ def main(data: Path) -> None:
     folders = {"nature20": data / "real/dev/nature", "real20": data / "real/dev/real"}
     parts = [part for name, folder in folders.items() for part in read_benchmark(name, folder)]
     cases = [case for part in parts for case in part.cases]
-    seconds = run_frr(cases)
+    frr_seconds = run_frr(cases)
     models = [ModelMethod(name, name, OUT / "predictions" / name, device="cpu") for name in MODELS]
     (OUT / SCORES).unlink(missing_ok=True)  # stored scores would have no new times
     timed = {}
@@ -42,18 +42,18 @@ def main(data: Path) -> None:
         [IdentityBaseline(), *models, PredictionFolder("fast-reflection-removal", OUT / "frr")],
         EvaluationConfig(),
         OUT,
-        on_progress=lambda _done, _of, row: timed.setdefault(row.method, []).append(row),
+        on_progress=lambda _done, _total, row: timed.setdefault(row.method, []).append(row),
     )
     print(overview(results))
     for model in models:
         megapixels = sum(row.width * row.height for row in timed[model.name]) / 1e6
-        taken = sum(row.seconds for row in timed[model.name])
-        print(f"{model.name}: {taken / megapixels:.2f} s per megapixel on these small images")
-    print(f"fast-reflection-removal: {seconds:.2f} s per megapixel")
+        model_seconds = sum(row.seconds for row in timed[model.name])
+        print(f"{model.name}: {model_seconds / megapixels:.2f} s per megapixel on these small images")
+    print(f"fast-reflection-removal: {frr_seconds:.2f} s per megapixel")
 
 
 def run_frr(cases: list[Case]) -> float:
-    """Writes fast-reflection-removal's outputs, at its recommended h = 0.11; returns its seconds per megapixel."""
+    """Writes the predictions of fast-reflection-removal at its recommended h = 0.11. Returns seconds per megapixel."""
     python = FRR_ENVIRONMENT / "bin/python"
     if not python.exists():
         subprocess.run([sys.executable, "-m", "venv", FRR_ENVIRONMENT], check=True)
@@ -66,7 +66,7 @@ def run_frr(cases: list[Case]) -> float:
         np.save(exchange, Photo.open(case.photo.read()).srgb_8bit())
         print(exchange, file=worker.stdin, flush=True)
         if worker.stdout.readline() != "done\n":
-            sys.exit("fast-reflection-removal failed; see its error above")
+            sys.exit("fast-reflection-removal failed; expected the line 'done'; see its error above")
         return np.load(exchange)
 
     separate(cases[0])  # the first call includes its imports

@@ -1,4 +1,4 @@
-"""Photos without reflection should stay nearly unchanged: PSNR between input and transmission for ten of them.
+"""Measures the change of ten photos without reflection: PSNR between input and transmission, higher is better.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/reflection_free.py
 

@@ -1,11 +1,11 @@
-"""Cost of the analytic renderer and of Mitsuba at equal error, in CPU-seconds, and the cost of complete sets.
+"""Compares the cost of the analytic renderer and of Mitsuba at equal error, and measures the cost of a stored sample.
 
     python bench/render.py
 
-Error is relMSE = mean((x - reference)^2 / (reference^2 + 0.01 mean(reference)^2)), averaged over the five pictures.
-The reference is our image at four times the width and height, averaged down; bench/compare_renderers.py shows that the
-two renderers agree. Mitsuba's rays are doubled until the error is 1e-3 or the next run would exceed a minute. Only in
-the second case is its cost extrapolated (error is proportional to 1 / rays).
+Costs are CPU-seconds. The error is relMSE = mean((x - reference)^2 / (reference^2 + 0.01 mean(reference)^2)), averaged
+over the five images of a sample. The reference is our image at four times the width and height, averaged down;
+bench/compare_renderers.py shows that the two renderers agree. Mitsuba's rays are doubled until the error is 1e-3 or the
+next run would exceed a minute. In the second case, the cost is extrapolated: the error is proportional to 1 / rays.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ TARGET_ERROR = 1e-3
 MAX_CPU_S = 60.0
 CAMERA = Camera(fov_deg=50, position_mm=(0, 0, 800), heading_deg=10)
 ROOM = EnvironmentMap(source=AssetSource(file="builtin:room:2"))
-ART = Plane(source=AssetSource(file="builtin:painting:5"), distance_mm=500, width_mm=2500)
+PAINTING = Plane(source=AssetSource(file="builtin:painting:5"), distance_mm=500, width_mm=2500)
 SCENES = {
     "one smooth pane, sun": Scene(camera=CAMERA, behind=Side(map=STREET), front=Side(map=ROOM)),
     "two tinted panes, near photo": Scene(
         camera=CAMERA,
         glass=Glazing(panes=(TINTED, TINTED), gap_mm=12),
-        behind=Side(plane=ART),
+        behind=Side(plane=PAINTING),
         front=Side(map=DOME),
     ),
 }
 
 
 def relative_error(sample: LightSample, reference: LightSample) -> float:
-    """relMSE, averaged over the five pictures."""
+    """relMSE, averaged over the five images."""
     errors = []
     for name in LAYERS:
         x, r = (getattr(which, name).double() for which in (sample, reference))
@@ -56,21 +56,25 @@ def relative_error(sample: LightSample, reference: LightSample) -> float:
     return float(sum(errors) / len(errors))
 
 
-def converged(scene: Scene, assets: Assets) -> LightSample:
-    """The scene at four times the size, averaged down."""
+def render_reference(scene: Scene, assets: Assets) -> LightSample:
+    """Renders a scene at four times the width and height, and averages blocks of 4 x 4 pixels."""
     camera = scene.camera.model_copy(
         update={"width": 4 * scene.camera.width, "height": 4 * scene.camera.height}
     )
     fine = render(scene.model_copy(update={"camera": camera}), assets)
-    return fine.map(lambda picture: avg_pool2d(picture[None], 4)[0])
+    return fine.map(lambda image: avg_pool2d(image[None], 4)[0])
 
 
-def mitsuba(
+def measure_mitsuba(
     scene: Scene, assets: Assets, reference: LightSample, *, denoise: bool
 ) -> tuple[float, float, int, bool]:
-    """CPU-seconds to reach TARGET_ERROR, the error reached, rays per pixel, and whether the seconds are extrapolated."""
+    """Doubles the rays until the error is at most TARGET_ERROR or the next run would exceed MAX_CPU_S.
+
+    Returns:
+        CPU-seconds at TARGET_ERROR, the last error, the last rays per pixel, and whether the seconds are extrapolated.
+    """
     samples = 4
-    trace(scene, assets, noise=0, max_samples=samples, denoise=denoise)  # compiles its kernels
+    trace(scene, assets, noise=0, max_samples=samples, denoise=denoise)  # compiles the kernels
     while True:
         start = time.process_time()
         traced = trace(scene, assets, noise=0, max_samples=samples, denoise=denoise)
@@ -82,32 +86,34 @@ def mitsuba(
         samples *= 2
 
 
-def equal_error() -> None:
+def compare_costs() -> None:
     """Prints one row per scene and variant of Mitsuba."""
     assets = Assets()
     print(
         "| scene | ours, relMSE | ours, CPU-s | Mitsuba | relMSE | CPU-s | times |\n|---|---|---|---|---|---|---|"
     )
     for name, scene in SCENES.items():
-        reference = converged(scene, assets)
-        render(scene, assets)
+        reference = render_reference(scene, assets)
+        render(scene, assets)  # warm-up: loads the maps
         start = time.process_time()
         ours = render(scene, assets)
         spent, error = time.process_time() - start, relative_error(ours, reference)
         for denoise in (False, True):
-            theirs, reached, samples, is_extrapolated = mitsuba(scene, assets, reference, denoise=denoise)
-            peer = f"{samples} rays" + (" + OIDN" if denoise else "")
+            theirs, reached, samples, is_extrapolated = measure_mitsuba(
+                scene, assets, reference, denoise=denoise
+            )
+            variant = f"{samples} rays" + (" + OIDN" if denoise else "")
             cost = f"{theirs:.1f}" + (" (extrapolated)" if is_extrapolated else "")
             print(
-                f"| {name} | {error:.1e} | {spent:.3f} | {peer} | {reached:.1e} | {cost} | {theirs / spent:.0f} |",
+                f"| {name} | {error:.1e} | {spent:.3f} | {variant} | {reached:.1e} | {cost} | {theirs / spent:.0f} |",
                 flush=True,
             )
 
 
-def cost_per_set() -> None:
-    """Prints CPU-seconds per set at 512x384, all files written, for growing counts: the cost must not grow."""
+def cost_per_sample() -> None:
+    """Prints CPU-seconds per sample at 512x384, with all files written, for rising counts: the cost must not rise."""
     recipe = read_scene_recipe("window")
-    print("| sets | CPU-s per set |\n|---|---|")
+    print("| samples | CPU-s per sample |\n|---|---|")
     for count in (10, 30, 90):
         with tempfile.TemporaryDirectory() as folder:
             job = RenderJob(Path(folder) / "set", recipe, BUILTIN_CATALOG, 7, "analytic", ())
@@ -119,8 +125,8 @@ def cost_per_set() -> None:
 def main(_: Path) -> None:
     """Both tables, on one thread."""
     torch.set_num_threads(1)
-    equal_error()
-    cost_per_set()
+    compare_costs()
+    cost_per_sample()
 
 
 if __name__ == "__main__":

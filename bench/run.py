@@ -1,8 +1,8 @@
 """Runs all benchmarks, as `make bench` does.
 
-Quality on the development pairs, compared with the unprocessed input and another method; photos without reflection;
-the cost of a 12-megapixel photo; metrics compared with other packages; a large evaluation; the renderer compared with
-Mitsuba; and both servers under load.
+They measure the quality on the development pairs, compared with the unprocessed input and another method; photos without
+reflection; the cost of a 12-megapixel photo; metrics compared with other packages; a large evaluation; the renderer
+compared with Mitsuba; and both servers under load.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/run.py
 """

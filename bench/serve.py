@@ -1,9 +1,9 @@
-"""50 photos sent by 8 clients to `brewster serve`, compared with the command line on the same photos.
+"""Measures `brewster serve` with 8 clients and 50 photos, compared with the command line on the same photos.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/serve.py
 
-Prints the ratio of throughputs and the server's memory at the start, half way and at the end. The bytes of every
-response must be equal to the file that the command line wrote for the same photo.
+Each photo is sent twice. Prints the ratio of throughputs, and the memory of the server at the start, halfway and at the
+end. The bytes of every response must be equal to those of the file that the command line writes for the same photo.
 """
 
 import json
@@ -28,7 +28,7 @@ def main(data: Path) -> None:
     photos = sorted((data / "photos/permissive").glob("*.jpg"))[:PHOTOS]
     with tempfile.TemporaryDirectory() as folder:
         from_command, seconds = separate_by_command(photos, Path(folder))
-    with server() as (url, process):
+    with RunningServer() as (url, process):
         post(url, photos[0])  # loads the model before the measurement starts
         memory, served = [resident_mb(process)], []
         for _ in range(2):
@@ -46,10 +46,12 @@ def main(data: Path) -> None:
 
 
 def check_results(results: dict[str, bytes], expected: dict[str, bytes]) -> None:
-    """Exits if a result is missing or differs from the command line's."""
+    """Exits with an error if a result is missing or differs from that of the command line."""
     wrong = [name for name, data in expected.items() if results.get(name) != data]
     if wrong or len(expected) != PHOTOS:
-        sys.exit(f"of {len(expected)} results these are missing or wrong: {', '.join(wrong)}")
+        sys.exit(
+            f"of {len(expected)} results, these are missing or wrong: {', '.join(wrong) or 'none'}; expected {PHOTOS}"
+        )
 
 
 def separate_by_command(photos: list[Path], folder: Path) -> tuple[dict[str, bytes], float]:
@@ -64,8 +66,8 @@ def separate_by_command(photos: list[Path], folder: Path) -> tuple[dict[str, byt
     return written, seconds
 
 
-class server:
-    """A context manager that runs `brewster serve`; it yields its address and its process."""
+class RunningServer:
+    """A context manager that runs `brewster serve`; `with` binds the URL and the process of the server."""
 
     def __enter__(self) -> tuple[str, subprocess.Popen]:
         command = [*BREWSTER, "serve", "--port", "0", "--device", "cpu"]
@@ -79,7 +81,7 @@ class server:
 
 
 def separate_by_clients(url: str, photos: list[Path]) -> dict[str, bytes]:
-    """The results of all photos; each client sends the next photo as soon as it has the response to the last."""
+    """Separates all photos; each client sends its next photo when it has the response to the previous one."""
     pending, results = queue.SimpleQueue(), {}
     for photo in photos:
         pending.put(photo)
@@ -101,6 +103,7 @@ def separate_by_clients(url: str, photos: list[Path]) -> dict[str, bytes]:
 
 
 def post(url: str, photo: Path) -> bytes:
+    """Sends a photo as form data. Returns the body of the response."""
     fields = [
         f'--x\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n{value}\r\n'
         for name, value in OPTIONS.items()

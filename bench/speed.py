@@ -1,9 +1,9 @@
-"""Time and memory of the command line for a 12-megapixel JPEG, and its start-up time.
+"""Measures time and memory of the command line for a 12-megapixel JPEG, and its start-up time.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/speed.py
 
-Wall time and peak memory of the whole process at quality `standard`, with the share of each stage that the tool
-reports. For comparison, the same file is only decoded and encoded twice, which shows whether the machine is busy.
+Prints wall time and peak memory of the process at quality `standard`, and the share of each stage, as `--json` reports it.
+For comparison, the same file is decoded and encoded twice without separation: a long time means that the machine is busy.
 """
 
 import json
@@ -18,8 +18,8 @@ import numpy as np
 from brewster import Photo
 
 OUT = Path("out/bench")
-SIDE_PX = (4000, 3000)
-COPY = """
+SIZE_PX = (4000, 3000)
+COPY_PROGRAM = """
 import sys
 from brewster import Photo
 for name in ("one", "two"):
@@ -29,28 +29,28 @@ for name in ("one", "two"):
 
 def main(data: Path) -> None:
     OUT.mkdir(parents=True, exist_ok=True)
-    photo = twelve_megapixels(data)
+    photo = make_large_photo(data)
     brewster = [sys.executable, "-m", "brewster"]
-    copied, _, _ = measure([sys.executable, "-c", COPY, str(photo), str(OUT)])
+    copy_wall, _, _ = measure([sys.executable, "-c", COPY_PROGRAM, str(photo), str(OUT)])
     wall, peak, line = measure(
         [*brewster, str(photo), "-o", str(OUT), "--json", "--overwrite", "--device", "cpu"]
     )
     seconds = json.loads(line)["seconds"]
     shares = ", ".join(f"{name} {value:.2f} s ({value / wall:.0%})" for name, value in seconds.items())
     print(f"12 megapixels: {wall:.2f} s, {peak / 2**20:.2f} GiB; {shares}")
-    print(f"  only decoded and encoded twice: {copied:.2f} s; ratio {wall / copied:.1f}")
-    helps = sorted(measure([*brewster, "--help"])[0] for _ in range(5))
-    bare = sorted(measure([sys.executable, "-c", "pass"])[0] for _ in range(5))
-    print(f"brewster --help: {helps[2]:.2f} s (median of 5); python alone {bare[2]:.2f} s")
+    print(f"  only decoded and encoded twice: {copy_wall:.2f} s; ratio {wall / copy_wall:.1f}")
+    help_times = sorted(measure([*brewster, "--help"])[0] for _ in range(5))
+    python_times = sorted(measure([sys.executable, "-c", "pass"])[0] for _ in range(5))
+    print(f"brewster --help: {help_times[2]:.2f} s (median of 5); python alone {python_times[2]:.2f} s")
 
 
-def twelve_megapixels(data: Path) -> Path:
-    """A photo enlarged to 4000x3000; added noise makes it as costly to encode as a camera's photo."""
+def make_large_photo(data: Path) -> Path:
+    """Writes a photo enlarged to 4000x3000. Added noise makes it as costly to encode as a photo of a camera."""
     small = Photo.open(data / "photos/permissive/kodak24__05.jpg").pixels.astype(np.float32)
     rows, columns = (
-        np.arange(side) * small.shape[axis] // side for axis, side in ((0, SIDE_PX[1]), (1, SIDE_PX[0]))
+        np.arange(side) * small.shape[axis] // side for axis, side in ((0, SIZE_PX[1]), (1, SIZE_PX[0]))
     )
-    grain = np.random.default_rng(7).normal(0, 3, (SIDE_PX[1], SIDE_PX[0], 1))
+    grain = np.random.default_rng(7).normal(0, 3, (SIZE_PX[1], SIZE_PX[0], 1))
     pixels = np.clip(small[rows][:, columns] + grain, 0, 255).astype(np.uint8)
     path = OUT / "twelve.jpg"
     Photo.from_array(pixels, encoding="srgb").save(path, overwrite=True)
@@ -58,7 +58,7 @@ def twelve_megapixels(data: Path) -> Path:
 
 
 def measure(command: list[str]) -> tuple[float, int, str]:
-    """Wall seconds, peak KiB of the process, and its standard output."""
+    """Runs a command. Returns wall seconds, peak memory in KiB, and its standard output."""
     started = time.perf_counter()
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     output = process.stdout.read()

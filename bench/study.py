@@ -1,9 +1,9 @@
-"""A hundred concurrent participants over HTTP while the server is killed ten times: is an acknowledged answer lost?
+"""Tests that no acknowledged answer is lost when the server of a study is killed while participants answer.
 
     .venv/bin/python bench/study.py
 
-The server is `brewster study serve` in a separate process, on the loopback interface, killed with SIGKILL. Afterwards
-the acknowledged answers are compared with the database.
+A hundred participants answer concurrently over HTTP, on the loopback interface. The server is `brewster study serve` in a
+separate process; it is killed with SIGKILL ten times. Then the acknowledged answers are compared with the database.
 """
 
 import asyncio
@@ -29,7 +29,7 @@ from brewster.user_study.store import AnswerStore
 
 OUT = Path("out/bench/study")
 PARTICIPANTS, KILLS = 100, 10
-SETS = {"real": 20, "nature": 20, "postcard": 20, "solidobject": 20, "wildscene": 101}
+IMAGE_COUNTS = {"real": 20, "nature": 20, "postcard": 20, "solidobject": 20, "wildscene": 101}
 
 
 class Server:
@@ -66,7 +66,7 @@ class Participants:
         )
 
     async def request(self, client, method, path, **options):
-        """The response; the request is repeated while the server is down."""
+        """Sends a request, again and again while the server is down. Returns the response."""
         while True:
             try:
                 return await client.request(method, f"{self.url}{path}", **options)
@@ -92,11 +92,11 @@ class Participants:
                 state = answer["next"]
 
 
-def make(folder):
-    """Creates a study with as many images as the paper's, 181, and three methods; all images are random and small."""
+def create_study(folder):
+    """Creates a study with 181 images, as in the paper, and three methods; the images are small and random."""
     rng = np.random.default_rng(1)
     for part in ("inputs", "ours", "RDNet", "DSIT"):
-        for name, count in SETS.items():
+        for name, count in IMAGE_COUNTS.items():
             (folder / part / name).mkdir(parents=True)
             for i in range(count):
                 blocks = np.kron(rng.integers(0, 256, (6, 8, 3)), np.ones((20, 20, 1))).astype(np.uint8)
@@ -106,6 +106,7 @@ def make(folder):
 
 
 async def run(study):
+    """Runs all participants and kills the server. Returns the participants, the number of kills, and the seconds."""
     server = Server(study.folder)
     await server.start()
     participants = Participants(server.port)
@@ -125,36 +126,35 @@ async def run(study):
 
 def main():
     shutil.rmtree(OUT, ignore_errors=True)
-    study = make(OUT)
+    study = create_study(OUT)
     participants, kills, seconds = asyncio.run(run(study))
     with sqlite3.connect(study.answers_file) as database:
-        whole = database.execute("PRAGMA integrity_check").fetchone()[0]
+        integrity = database.execute("PRAGMA integrity_check").fetchone()[0]
         rows = database.execute(
             "SELECT '/s/' || token, trial, choice FROM answers JOIN participants ON number = participant"
         ).fetchall()
     stored = {(link, trial): choice for link, trial, choice in rows}
-    answered = collect_answers(AnswerStore(study).all_answers())
-    results = summarise(study, answered, ExclusionRule(1.0, 0.0))
-    slowest = statistics.quantiles(participants.times, n=100)[98]
+    answers = collect_answers(AnswerStore(study).all_answers())
+    results = summarise(study, answers, ExclusionRule(1.0, 0.0))
+    percentile_99 = statistics.quantiles(participants.times, n=100)[98]
     lines = {
         "concurrent participants": PARTICIPANTS,
-        "kill -9": kills,
+        "kills of the server (SIGKILL)": kills,
         "answers acknowledged": len(participants.acknowledged),
-        "acknowledged and missing": sum(place not in stored for place in participants.acknowledged),
+        "acknowledged and missing": sum(key not in stored for key in participants.acknowledged),
         "stored differently than acknowledged": sum(
-            stored.get(place) != acknowledged
-            for place, (_, acknowledged) in participants.acknowledged.items()
+            stored.get(key) != acknowledged for key, (_, acknowledged) in participants.acknowledged.items()
         ),
         "acknowledged differently than sent": sum(
             sent != acknowledged for sent, acknowledged in participants.acknowledged.values()
         ),
         "stored twice": len(rows) - len(stored),
-        "stored and never acknowledged": sum(place not in participants.acknowledged for place in stored),
+        "stored and never acknowledged": sum(key not in participants.acknowledged for key in stored),
         "repeated requests": participants.retries,
-        "database": whole,
+        "integrity check of the database": integrity,
         "participants in the report": results["everyone"]["participants"],
         "answers per second": f"{len(participants.acknowledged) / seconds:.0f} (kills, restarts and {3 * len(participants.acknowledged)} images included)",
-        "response time, median and 99 %": f"{1000 * statistics.median(participants.times):.0f} ms, {1000 * slowest:.0f} ms",
+        "response time, median and 99 %": f"{1000 * statistics.median(participants.times):.0f} ms, {1000 * percentile_99:.0f} ms",
     }
     for name, value in lines.items():
         print(f"{name:34} {value}")

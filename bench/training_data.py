@@ -1,9 +1,9 @@
-"""Compares statistics of training streams with those of real datasets: do the mixtures resemble photos through glass?
+"""Compares the statistics of training streams with those of real pairs, to judge how realistic the mixtures are.
 
     BREWSTER_DATA=../shared/data .venv/bin/python bench/training_data.py recipes/train/compact-stage1.toml
 
 Prints one row per dataset and per recipe: the 10, 25, 50, 75 and 90 % quantiles over 200 images of 256 px, in linear
-light. The real pairs are only measured, never used for training.
+light. The script only measures the real pairs; it trains nothing.
 """
 
 import os
@@ -39,7 +39,7 @@ def main(data: Path, recipes: list[Path]) -> None:
 
 
 def print_row(name: str, pairs: Iterable[tuple[Tensor, Tensor]]) -> None:
-    """Prints the quantiles of all pairs, including those without reflection, as in training."""
+    """Prints the quantiles over all pairs. Mixtures without a reflection are included, as in training."""
     rows = [statistics(to_linear(photo), to_linear(truth)) for photo, truth in pairs]
     cells = [
         " ".join(f"{value:.2f}" for value in np.nanquantile([row[key] for row in rows], QUANTILES))
@@ -53,8 +53,8 @@ def fit(pair: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     scale = SIZE_PX / max(pair[0].shape[:2])
     size = [round(side * scale) for side in pair[0].shape[:2]]
     photo, truth = (
-        functional.interpolate(picture.permute(2, 0, 1)[None] / 255, size, mode="bilinear", antialias=True)[0]
-        for picture in pair
+        functional.interpolate(image.permute(2, 0, 1)[None] / 255, size, mode="bilinear", antialias=True)[0]
+        for image in pair
     )
     return photo, truth
 

@@ -1,4 +1,4 @@
-"""The analytic renderer: layers add up, match closed forms, and objects are where geometry places them."""
+"""The analytic renderer: layers add up and match closed forms; objects appear where geometry projects them."""
 
 import math
 
@@ -29,22 +29,23 @@ from worlds_of_one import (
     sun,
 )
 
-unshrunk = settings(phases=[Phase.explicit, Phase.generate], deadline=None, database=None)
-some, few = (settings(unshrunk, max_examples=count) for count in (25, 10))
-SMOOTH = {"far": around(), "dome": around(radius_mm=3000.0), "near": board()}
+without_shrinking = settings(phases=[Phase.explicit, Phase.generate], deadline=None, database=None)
+examples_25, examples_10 = (settings(without_shrinking, max_examples=count) for count in (25, 10))
+UNIFORM_SIDES = {"far": around(), "dome": around(radius_mm=3000.0), "near": board()}
 
 
-def closed_form(scene, form=all_orders):
+def closed_form(scene, throughput_of=all_orders):
     """Transmittance and reflectance at the centre of every pixel, (3, H, W) or (1, H, W)."""
     cosine = torch.from_numpy(-pixel_directions(scene.camera) @ np.array([0, 0, 1]))
-    shares = form(scene.glass, cosine)
-    return [share.reshape(-1, *cosine.shape).float() for share in (shares.transmitted, shares.reflected)]
+    throughput = throughput_of(scene.glass, cosine)
+    layers = throughput.transmitted, throughput.reflected
+    return [layer.reshape(-1, *cosine.shape).float() for layer in layers]
 
 
 # --- light adds up
 
 
-@some
+@examples_25
 @given(scenes(orders="all"))
 def test_the_photo_is_the_sum_of_its_two_layers(scene):
     sample = render(scene, WORLDS)
@@ -59,21 +60,23 @@ def test_the_photo_is_the_sum_of_its_two_layers(scene):
     )
 
 
-@few
+@examples_10
 @given(scenes(orders="all"))
 def test_the_choice_of_orders_changes_the_layers_and_not_the_photo(scene):
-    whole, paper = (
+    complete, paper = (
         render(scene.model_copy(update={"orders": orders}), WORLDS) for orders in ("all", "paper")
     )
     for name in ("photo", "background", "mirror"):
-        assert torch.equal(getattr(whole, name), getattr(paper, name))
-    little = 1e-6 * float(whole.photo.max()) + 1e-9
+        assert torch.equal(getattr(complete, name), getattr(paper, name))
+    tolerance = 1e-6 * float(complete.photo.max()) + 1e-9
     for name in ("transmission", "reflection"):
-        assert (getattr(paper, name) <= getattr(whole, name) + little).all()
-    assert paper.reflection.sum() < whole.reflection.sum() or (not scene.front.map and not scene.front.plane)
+        assert (getattr(paper, name) <= getattr(complete, name) + tolerance).all()
+    assert paper.reflection.sum() < complete.reflection.sum() or (
+        not scene.front.map and not scene.front.plane
+    )
 
 
-@few
+@examples_10
 @given(scenes(front=Side()))
 def test_without_light_in_front_there_is_no_reflection(scene):
     sample = render(scene, WORLDS)
@@ -81,7 +84,7 @@ def test_without_light_in_front_there_is_no_reflection(scene):
     assert not sample.mirror.any()
 
 
-@few
+@examples_10
 @given(scenes(behind=Side(), orders="all"))
 def test_without_light_behind_the_photo_is_the_reflection(scene):
     sample = render(scene, WORLDS)
@@ -113,7 +116,7 @@ def test_glass_with_index_one_is_invisible(side, count, aperture_mm):
     assert not sample.reflection.any()
 
 
-@pytest.mark.parametrize("side", sorted(SMOOTH))
+@pytest.mark.parametrize("side", sorted(UNIFORM_SIDES))
 @pytest.mark.parametrize("aperture_mm", [0.0, 20.0])
 @pytest.mark.parametrize("orders", ["all", "paper"])
 def test_in_uniform_light_every_pixel_equals_the_closed_form(side, aperture_mm, orders):
@@ -124,18 +127,18 @@ def test_in_uniform_light_every_pixel_equals_the_closed_form(side, aperture_mm, 
     scene = a_scene(
         camera=at(30, aperture_mm=aperture_mm, focus_mm=800),
         panes=panes,
-        behind=SMOOTH[side],
-        front=SMOOTH[side],
+        behind=UNIFORM_SIDES[side],
+        front=UNIFORM_SIDES[side],
         orders=orders,
         samples=16,
     )
     sample = render(scene, WORLDS)
-    through, back = closed_form(scene, all_orders if orders == "all" else paper_orders)
-    torch.testing.assert_close(sample.transmission, through, rtol=2e-3, atol=0)
-    torch.testing.assert_close(sample.reflection, back, rtol=1e-2, atol=0)
-    assert float(sample.reflection.mean() / back.mean()) == pytest.approx(1, abs=2e-3)
-    for bare in (sample.background, sample.mirror):
-        torch.testing.assert_close(bare, torch.ones_like(bare), rtol=1e-5, atol=0)
+    transmittance, reflectance = closed_form(scene, all_orders if orders == "all" else paper_orders)
+    torch.testing.assert_close(sample.transmission, transmittance, rtol=2e-3, atol=0)
+    torch.testing.assert_close(sample.reflection, reflectance, rtol=1e-2, atol=0)
+    assert float(sample.reflection.mean() / reflectance.mean()) == pytest.approx(1, abs=2e-3)
+    for layer in (sample.background, sample.mirror):
+        torch.testing.assert_close(layer, torch.ones_like(layer), rtol=1e-5, atol=0)
 
 
 def test_far_light_has_no_ghost_in_parallel_glass():
@@ -148,12 +151,12 @@ def test_far_light_has_no_ghost_in_parallel_glass():
         samples=1,
     )
     sample = render(scene, WORLDS)
-    through, back = closed_form(scene)
-    torch.testing.assert_close(sample.reflection, sample.mirror * back, rtol=1e-4, atol=1e-7)
-    torch.testing.assert_close(sample.transmission, sample.background * through, rtol=1e-4, atol=1e-7)
+    transmittance, reflectance = closed_form(scene)
+    torch.testing.assert_close(sample.reflection, sample.mirror * reflectance, rtol=1e-4, atol=1e-7)
+    torch.testing.assert_close(sample.transmission, sample.background * transmittance, rtol=1e-4, atol=1e-7)
 
 
-def test_a_thick_pane_brings_what_is_behind_it_nearer_by_a_third_of_its_thickness():
+def test_content_behind_a_thick_pane_appears_nearer_by_a_third_of_its_thickness():
     """The image's area grows by (distance / (distance - t (1 - 1 / n)))^2."""
     scene = a_scene(
         camera=at(0, distance_mm=1000, fov_deg=10, width=48, height=48),
@@ -162,18 +165,18 @@ def test_a_thick_pane_brings_what_is_behind_it_nearer_by_a_third_of_its_thicknes
         orders="paper",
     )
     sample = render(scene, WORLDS)
-    magnified = float(sample.transmission.sum() / sample.background.sum()) / 0.96**2
-    assert magnified == pytest.approx((1500 / 1470) ** 2, rel=2e-3)
+    area_ratio = float(sample.transmission.sum() / sample.background.sum()) / 0.96**2
+    assert area_ratio == pytest.approx((1500 / 1470) ** 2, rel=2e-3)
 
 
-def test_a_wedge_bends_the_view_by_half_its_angle():
+def test_a_wedge_deflects_rays_by_half_its_angle():
     light = Worlds(sun=sun(256, 128, 0))
     scene = a_scene(
         camera={"fov_deg": 10}, panes=[{"wedge_deg": 2.0}], behind=around("sun"), orders="paper", samples=64
     )
     sample = render(scene, light)
-    (bent, _), (straight, _) = centroid(sample.transmission), centroid(sample.background)
-    assert abs(bent - straight) * 10 / 24 == pytest.approx(1, rel=0.03)
+    (deflected_x, _), (straight_x, _) = centroid(sample.transmission), centroid(sample.background)
+    assert abs(deflected_x - straight_x) * 10 / 24 == pytest.approx(1, rel=0.03)
 
 
 def test_a_very_small_wedge_renders_like_parallel_glass():
@@ -195,7 +198,7 @@ def test_a_very_small_wedge_renders_like_parallel_glass():
 # --- positions
 
 
-def test_the_bright_right_of_a_map_is_on_the_right_and_its_top_on_top():
+def test_the_right_half_of_a_map_appears_on_the_right_and_its_top_half_at_the_top():
     right, top = (
         render(a_scene(behind=around(name, heading_deg=180)), WORLDS).background for name in ("right", "top")
     )
@@ -208,39 +211,39 @@ def test_a_camera_that_turns_right_sees_a_map_move_left(heading_deg):
     """A camera with the sun's heading sees it in the centre; a turn of 5 degrees moves it by 4 pixels."""
     light = Worlds(sun=sun(64, 32, 0))
     glass = Glazing(heading_deg=heading_deg)
-    places = []
-    for turn in (0, 5):
-        camera = at(heading_deg + turn, fov_deg=30)
+    positions = []
+    for rotation_deg in (0, 5):
+        camera = at(heading_deg + rotation_deg, fov_deg=30)
         scene = a_scene(camera=camera, glass=glass, behind=around("sun", heading_deg=heading_deg), samples=16)
-        places.append(centroid(render(scene, light).background))
+        positions.append(centroid(render(scene, light).background))
     half_texel = 360 / 128 / 2
-    pixels_a_degree = 24 / math.degrees(2 * math.tan(math.radians(15)))
-    assert places[0][0] == pytest.approx(12 + half_texel * pixels_a_degree, abs=0.1)
-    assert places[0][1] == pytest.approx(12 + half_texel * pixels_a_degree, abs=0.1)
-    assert places[0][0] - places[1][0] == pytest.approx(5 * pixels_a_degree, rel=0.03)
+    pixels_per_degree = 24 / math.degrees(2 * math.tan(math.radians(15)))
+    assert positions[0][0] == pytest.approx(12 + half_texel * pixels_per_degree, abs=0.1)
+    assert positions[0][1] == pytest.approx(12 + half_texel * pixels_per_degree, abs=0.1)
+    assert positions[0][0] - positions[1][0] == pytest.approx(5 * pixels_per_degree, rel=0.03)
 
 
-def test_a_picture_before_the_glass_is_mirrored_and_one_behind_is_not():
+def test_a_picture_in_front_of_the_glass_is_mirrored_and_one_behind_it_is_not():
     picture = np.zeros((32, 32, 3), np.float32)
-    picture[:8, 24:] = 1  # its upper right
+    picture[:8, 24:] = 1  # the upper right corner
     scene = a_scene(behind=board("corner", width_mm=300), front=board("corner", width_mm=300))
     sample = render(scene, Worlds(corner=picture))
-    right, upper = centroid(sample.background)
-    assert right > 14
-    assert upper < 10
-    left, also_upper = centroid(sample.reflection)
-    assert left == pytest.approx(24 - right, abs=0.05)
-    assert also_upper == pytest.approx(upper, abs=0.05)
+    x, y = centroid(sample.background)
+    assert x > 14
+    assert y < 10
+    mirrored_x, mirrored_y = centroid(sample.reflection)
+    assert mirrored_x == pytest.approx(24 - x, abs=0.05)
+    assert mirrored_y == pytest.approx(y, abs=0.05)
 
 
-def test_a_map_before_the_glass_is_mirrored_too():
-    right_of_who_looks_back = around("right", heading_deg=0)
-    mirror = render(a_scene(front=right_of_who_looks_back), WORLDS).mirror
+def test_a_map_in_front_of_the_glass_is_mirrored_too():
+    seen_from_the_glass = around("right", heading_deg=0)
+    mirror = render(a_scene(front=seen_from_the_glass), WORLDS).mirror
     assert mirror[:, :, :9].min() == 1
     assert mirror[:, :, 15:].max() == 0
 
 
-PLACES = st.fixed_dictionaries(
+PLANE_POSITIONS = st.fixed_dictionaries(
     {
         "distance_mm": st.floats(100, 3000),
         "offset": st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4)),
@@ -253,16 +256,16 @@ PLACES = st.fixed_dictionaries(
 
 
 def projected(scene, point, to_glass):
-    """The pixel position of a point that is given in the glass frame, for a pinhole camera."""
+    """Projects a point in the glass frame into a pinhole camera. Returns x and y in pixels."""
     in_world = point @ to_glass + np.array(scene.glass.position_mm) - np.array(scene.camera.position_mm)
     right, up, back = map(np.array, axes(scene.camera.heading_deg, scene.camera.pitch_deg))
     scale = scene.camera.width / 2 / scene.camera.half_width / -(in_world @ back)
     return scene.camera.width / 2 + in_world @ right * scale, scene.camera.height / 2 - in_world @ up * scale
 
 
-@some
-@given(PLACES)
-def test_a_plane_is_where_pinhole_geometry_projects_it(drawn):
+@examples_25
+@given(PLANE_POSITIONS)
+def test_a_plane_appears_where_pinhole_geometry_projects_it(drawn):
     """The centroid of a small plane, or of its mirror image if the plane is in front."""
     heading, pitch = drawn["glass_deg"]
     to_glass = np.array(axes(heading, pitch))
@@ -271,39 +274,39 @@ def test_a_plane_is_where_pinhole_geometry_projects_it(drawn):
     )
     position = np.array([30.0, -20.0, 70.0])
     camera["position_mm"] = tuple(np.array(camera["position_mm"]) + position)
-    bare = a_scene(
+    empty = a_scene(
         camera=camera, glass=Glazing(heading_deg=heading, pitch_deg=pitch, position_mm=tuple(position))
     )
-    eye = to_glass @ (np.array(bare.camera.position_mm) - position)
-    away = drawn["distance_mm"] + 4
-    middle = to_glass @ pixel_directions(bare.camera)[23:25, 23:25].mean((0, 1))
-    reach = (eye[2] + away) / -middle[2]
-    offset = (eye + middle * reach)[:2] + np.array(drawn["offset"]) * reach * bare.camera.half_width
+    eye = to_glass @ (np.array(empty.camera.position_mm) - position)
+    distance_mm = drawn["distance_mm"] + 4
+    axis = to_glass @ pixel_directions(empty.camera)[23:25, 23:25].mean((0, 1))
+    length = (eye[2] + distance_mm) / -axis[2]  # along the axis, from the camera to the plane
+    offset = (eye + axis * length)[:2] + np.array(drawn["offset"]) * length * empty.camera.half_width
     plane = {
-        "distance_mm": away,
-        "width_mm": reach * 0.06,
+        "distance_mm": distance_mm,
+        "width_mm": length * 0.06,
         "offset_mm": tuple(offset),
         "heading_deg": drawn["turn_deg"][0],
         "pitch_deg": drawn["turn_deg"][1],
     }
     which = "behind" if drawn["is_behind"] else "front"
-    scene = bare.model_copy(update={"behind": Side(), "front": Side(), which: board("square", **plane)})
+    scene = empty.model_copy(update={"behind": Side(), "front": Side(), which: board("square", **plane)})
     sample = render(scene, Worlds(square=np.ones((16, 16, 3), np.float32)))
-    picture = sample.background if drawn["is_behind"] else sample.mirror
-    image = projected(scene, np.array([*offset, -away]), to_glass)
-    assert centroid(picture) == pytest.approx(image, abs=0.25)
+    image = sample.background if drawn["is_behind"] else sample.mirror
+    position = projected(scene, np.array([*offset, -distance_mm]), to_glass)
+    assert centroid(image) == pytest.approx(position, abs=0.25)
 
 
 @pytest.mark.parametrize("is_behind", [True, False])
-def test_a_plane_is_as_large_as_pinhole_geometry_says(is_behind):
+def test_a_plane_has_the_size_of_its_pinhole_projection(is_behind):
     which = "behind" if is_behind else "front"
     scene = a_scene(
         **{which: board("wide", distance_mm=700, width_mm=310)}, camera={"width": 40, "height": 40}
     )
     sample = render(scene, Worlds(wide=np.ones((16, 32, 3), np.float32)))
-    picture = sample.background if is_behind else sample.mirror
-    width = 310 / 1200 / (2 * math.tan(math.radians(15))) * 40
-    assert float(picture[0].sum()) == pytest.approx(width * width / 2, rel=0.01)
+    image = sample.background if is_behind else sample.mirror
+    width_px = 310 / 1200 / (2 * math.tan(math.radians(15))) * 40
+    assert float(image[0].sum()) == pytest.approx(width_px * width_px / 2, rel=0.01)
 
 
 # --- stability
@@ -311,12 +314,15 @@ def test_a_plane_is_as_large_as_pinhole_geometry_says(is_behind):
 
 @pytest.mark.parametrize("texels", [0.5, 1, 1.3])
 def test_a_sun_of_one_texel_does_not_flicker(texels):
-    """The sun's energy in the image is constant while the camera turns by tenths of a pixel of this many texels."""
+    """The sun's energy in the image stays constant while the camera rotates in steps of a tenth of a pixel.
+
+    A pixel is `texels` texels wide.
+    """
     light, fov_deg = Worlds(sun=sun(256, 128, 0)), 360 / 512 * texels * 32
     energies = []
     for tenth in range(10):
-        turn = tenth / 10 * fov_deg / 32
-        camera = at(turn, turn / 2, fov_deg=fov_deg, width=32, height=32)
+        rotation_deg = tenth / 10 * fov_deg / 32
+        camera = at(rotation_deg, rotation_deg / 2, fov_deg=fov_deg, width=32, height=32)
         sample = render(a_scene(camera=camera, behind=around("sun"), samples=36), light)
         energies.append(float(sample.background.sum()))
     assert max(energies) / min(energies) < 1.01
@@ -340,17 +346,17 @@ def test_the_same_scene_gives_the_same_bytes(kind):
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
 def test_the_result_does_not_depend_on_the_batch_size(kind, monkeypatch):
-    whole = render(a_scene(**KINDS[kind], samples=4), WORLDS)
+    one_batch = render(a_scene(**KINDS[kind], samples=4), WORLDS)
     monkeypatch.setattr(analytic, "_CPU_BATCH_RAYS", 100)
-    strips = render(a_scene(**KINDS[kind], samples=4), WORLDS)
-    for first, second in zip(whole.layers().values(), strips.layers().values(), strict=True):
+    many_batches = render(a_scene(**KINDS[kind], samples=4), WORLDS)
+    for first, second in zip(one_batch.layers().values(), many_batches.layers().values(), strict=True):
         if kind == "rough":  # orders end by their mean weight over a batch
             assert float(first.mean()) == pytest.approx(float(second.mean()), rel=2e-3)
         else:
             torch.testing.assert_close(first, second, rtol=1e-5, atol=1e-6)
 
 
-def test_another_index_gives_other_random_numbers_and_the_same_means():
+def test_another_index_changes_the_random_numbers_and_not_the_means():
     scene = a_scene(panes=[{"wedge_deg": 0.5}], behind=around("mottled"), samples=16)
     one, other = (render(scene.model_copy(update={"index": index}), WORLDS).background for index in (0, 1))
     assert not torch.equal(one, other)
@@ -381,14 +387,14 @@ def test_a_dome_and_a_map_at_infinity_agree_when_the_dome_is_large():
 # --- ghosts
 
 
-def test_the_ghost_of_a_scene_is_the_formula_over_what_a_pixel_spans():
+def test_the_ghost_distance_of_a_scene_is_the_formula_divided_by_the_pixel_size():
     scene = a_scene(
         camera=at(30, distance_mm=1000 / math.cos(math.radians(30))), front=around(radius_mm=3000.0)
     )
     inside = math.asin(math.sin(math.radians(30)) / 1.5)
-    apart = 2 * 4 * math.tan(inside) * math.cos(math.radians(30))
+    ghost_mm = 2 * 4 * math.tan(inside) * math.cos(math.radians(30))
     assert analytic.ghost_distance_px(scene) == pytest.approx(
-        apart / (scene.camera.pixel_rad * 4000), rel=1e-3
+        ghost_mm / (scene.camera.pixel_rad * 4000), rel=1e-3
     )
 
 

@@ -11,56 +11,55 @@ from brewster.scene.camera import Camera
 from worlds_of_one import WORLDS, Worlds, a_scene, around, at, board, centroid, sun
 
 
-def lens(aperture_mm, focus_mm=500.0, **more):
+def lens_camera(aperture_mm, focus_mm=500.0, **more):
     return Camera(
         **{"width": 32, "height": 32, "fov_deg": 40, **more}, aperture_mm=aperture_mm, focus_mm=focus_mm
     )
 
 
 def test_without_an_aperture_the_camera_is_a_pinhole():
-    picture = torch.rand(3, 32, 32)
-    assert margin_px(lens(0.0)) == 0
-    assert defocus_blur(picture, lens(0.0), 0) is picture
+    image = torch.rand(3, 32, 32)
+    assert margin_px(lens_camera(0.0)) == 0
+    assert defocus_blur(image, lens_camera(0.0), 0) is image
 
 
-def test_a_tiny_aperture_is_a_pinhole_too():
+def test_a_camera_with_a_tiny_aperture_is_treated_as_a_pinhole():
     scenes = (a_scene(camera={"aperture_mm": a}, behind=around("mottled")) for a in (0.0, 0.1))
     pinhole, tiny = (render(scene, WORLDS).photo for scene in scenes)
     assert torch.equal(pinhole, tiny)
 
 
 @pytest.mark.parametrize("radius_px", [0.1, 0.5, 1.3, 4.0, 9.7])
-def test_the_disc_sums_to_one_and_has_its_own_radius(radius_px):
-    reach = math.ceil(radius_px + 0.5)
-    disc = _disc_kernel(radius_px, reach)
-    assert disc.shape == (2 * reach + 1, 2 * reach + 1)
-    assert float(disc.sum()) == pytest.approx(1, abs=1e-9)
-    assert torch.equal(disc, disc.T)
-    assert torch.equal(disc, disc.flip(0))
+def test_the_disc_kernel_sums_to_one_and_has_the_requested_radius(radius_px):
+    half_size = math.ceil(radius_px + 0.5)
+    kernel = _disc_kernel(radius_px, half_size)
+    assert kernel.shape == (2 * half_size + 1, 2 * half_size + 1)
+    assert float(kernel.sum()) == pytest.approx(1, abs=1e-9)
+    assert torch.equal(kernel, kernel.T)
+    assert torch.equal(kernel, kernel.flip(0))
     if radius_px > 1:
-        middle = float(disc[reach, reach])
-        assert 1 / middle == pytest.approx(math.pi * radius_px**2, rel=0.04)
+        centre = float(kernel[half_size, half_size])
+        assert 1 / centre == pytest.approx(math.pi * radius_px**2, rel=0.04)
 
 
 @pytest.mark.parametrize("aperture_mm", [20.0, 55.0, 100.0])
-def test_a_point_is_seen_as_a_disc_of_half_the_aperture_over_the_focus(aperture_mm):
-    camera = lens(aperture_mm)
+def test_a_point_is_blurred_to_a_disc_of_radius_aperture_over_twice_the_focus_distance(aperture_mm):
+    camera = lens_camera(aperture_mm)
     margin, radius = margin_px(camera), aperture_mm / (2 * 500) / camera.pixel_rad
     point = torch.zeros(1, 32 + 2 * margin, 32 + 2 * margin)
     point[0, margin + 14, margin + 18] = 1
-    picture = defocus_blur(point, camera, margin)
-    assert float(picture.sum()) == pytest.approx(1, abs=1e-5)
-    assert centroid(picture) == pytest.approx((18.5, 14.5), abs=1e-4)
-    assert float(1 / picture.max()) == pytest.approx(math.pi * radius**2, rel=0.05)
-    across = torch.arange(32) - 18
-    spread = float((picture[0].sum(0) * across**2).sum())
-    assert spread == pytest.approx(
-        radius**2 / 4 + 1 / 12, abs=0.06
-    )  # variance of the disc plus that of a pixel
-    assert float(picture[0, 14, across.abs() > radius + 1].max()) < 1e-6
+    image = defocus_blur(point, camera, margin)
+    assert float(image.sum()) == pytest.approx(1, abs=1e-5)
+    assert centroid(image) == pytest.approx((18.5, 14.5), abs=1e-4)
+    assert float(1 / image.max()) == pytest.approx(math.pi * radius**2, rel=0.05)
+    x = torch.arange(32) - 18
+    variance = float((image[0].sum(0) * x**2).sum())
+    variance_of_disc, variance_of_pixel = radius**2 / 4, 1 / 12
+    assert variance == pytest.approx(variance_of_disc + variance_of_pixel, abs=0.06)
+    assert float(image[0, 14, x.abs() > radius + 1].max()) < 1e-6
 
 
-def test_the_sun_through_a_lens_keeps_its_place_and_energy():
+def test_defocus_changes_neither_the_position_nor_the_energy_of_the_sun():
     light = Worlds(sun=sun(128, 64, 0))
     scenes = (
         a_scene(camera=at(0, width=48, height=48, aperture_mm=a, focus_mm=600.0), behind=around("sun"))
@@ -73,14 +72,14 @@ def test_the_sun_through_a_lens_keeps_its_place_and_energy():
 
 
 def test_light_outside_the_image_is_blurred_into_it():
-    """Light beyond the right edge is blurred into the image as far as the disc's radius."""
-    camera = lens(60.0)
+    """Light beyond the right edge reaches the image up to a distance of the disc's radius."""
+    camera = lens_camera(60.0)
     margin = margin_px(camera)
-    picture = torch.zeros(1, 32 + 2 * margin, 32 + 2 * margin)
-    picture[:, :, margin + 32 :] = 1
-    edge = defocus_blur(picture, camera, margin)[0, 16]
-    assert 0.3 < edge[31] < 0.5
-    assert edge[: 32 - margin].max() < 1e-6
+    image = torch.zeros(1, 32 + 2 * margin, 32 + 2 * margin)
+    image[:, :, margin + 32 :] = 1
+    row = defocus_blur(image, camera, margin)[0, 16]
+    assert 0.3 < row[31] < 0.5
+    assert row[: 32 - margin].max() < 1e-6
 
 
 @pytest.mark.parametrize("incidence_deg", [0, 30])
@@ -99,14 +98,19 @@ def test_defocus_by_convolution_equals_monte_carlo_integration(incidence_deg):
         )
         for wedge_deg in (0.0, 1e-9)
     )
-    for name, most in (("background", 3e-3), ("transmission", 3e-3), ("mirror", 3e-3), ("reflection", 0.01)):
-        one, other = getattr(by_convolution, name), getattr(by_monte_carlo, name)
-        assert float(((one - other).abs() / one.mean()).max()) < most, name
-        assert float(one.mean()) == pytest.approx(float(other.mean()), rel=2e-3)
+    for name, max_error in (
+        ("background", 3e-3),
+        ("transmission", 3e-3),
+        ("mirror", 3e-3),
+        ("reflection", 0.01),
+    ):
+        convolved, integrated = getattr(by_convolution, name), getattr(by_monte_carlo, name)
+        assert float(((convolved - integrated).abs() / convolved.mean()).max()) < max_error, name
+        assert float(convolved.mean()) == pytest.approx(float(integrated.mean()), rel=2e-3)
 
 
 def test_a_near_picture_is_sharp_in_the_focus_plane():
-    pictures = [
+    images = [
         render(
             a_scene(
                 camera=at(0, aperture_mm=60, focus_mm=focus_mm),
@@ -117,5 +121,5 @@ def test_a_near_picture_is_sharp_in_the_focus_plane():
         ).background
         for focus_mm in (650, 1004, 3500)
     ]
-    peaks = [float(picture.mean((0, 1)).max()) for picture in pictures]
+    peaks = [float(image.mean((0, 1)).max()) for image in images]
     assert peaks[1] > 1.1 * max(peaks[0], peaks[2])

@@ -17,45 +17,48 @@ def uniforms(count, seed=0):
     return torch.rand(2, count, generator=torch.Generator().manual_seed(seed))
 
 
-def texels(picture):
-    return torch.from_numpy(picture).permute(2, 0, 1)
+def to_texels(image):
+    """Converts an image (H, W, 3) to texels (3, H, W)."""
+    return torch.from_numpy(image).permute(2, 0, 1)
 
 
 def random_map(seed=1):
     return torch.rand(3, HEIGHT, 2 * HEIGHT, generator=torch.Generator().manual_seed(seed)) ** 4
 
 
-def centres(turn):
-    """Directions of all texels, (3, H * 2 H), and their solid angles."""
+def texel_directions(u_offset):
+    """Directions of the centres of all texels, (3, H * 2 H), and their solid angles, (H * 2 H,)."""
     v = (torch.arange(HEIGHT) + 0.5) / HEIGHT
     u = (torch.arange(2 * HEIGHT) + 0.5) / (2 * HEIGHT)
     edges = torch.cos(torch.arange(HEIGHT + 1) / HEIGHT * math.pi)
-    solid = (edges[:-1] - edges[1:]) * math.pi / HEIGHT
-    directions = uv_to_direction(u[None].expand(HEIGHT, -1), v[:, None].expand(-1, 2 * HEIGHT), turn)
-    return directions.reshape(3, -1), solid[:, None].expand(-1, 2 * HEIGHT).reshape(-1)
+    solid_angle = (edges[:-1] - edges[1:]) * math.pi / HEIGHT
+    directions = uv_to_direction(u[None].expand(HEIGHT, -1), v[:, None].expand(-1, 2 * HEIGHT), u_offset)
+    return directions.reshape(3, -1), solid_angle[:, None].expand(-1, 2 * HEIGHT).reshape(-1)
 
 
-def emitters(side, behind=True):
+def make_emitters(side, behind=True):
     view = CameraView(height_mm=1000.0, pixel_rad=0.01, aperture_mm=0.0, focus_mm=3000.0)
     return SideEmitters(side, WORLDS, view, behind=behind, to_world=torch.eye(3), device="cpu")
 
 
 def test_texture_coordinates_and_directions_are_inverse():
     u, v = uniforms(500) * 0.98 + 0.01
-    for turn in (0.0, 0.3, -0.8):
-        for before, after in zip((u, v), direction_to_uv(uv_to_direction(u, v, turn), turn), strict=True):
+    for u_offset in (0.0, 0.3, -0.8):
+        for before, after in zip(
+            (u, v), direction_to_uv(uv_to_direction(u, v, u_offset), u_offset), strict=True
+        ):
             torch.testing.assert_close(before, after, atol=1e-4, rtol=0)
     ahead, right, up = torch.tensor([[0.0, 0, -1], [1, 0, 0], [0, 1, 0]])
     assert [float(direction_to_uv(d[:, None], 0.5)[0]) for d in (ahead, right)] == pytest.approx([0.5, 0.75])
     assert float(direction_to_uv(up[:, None], 0.0)[1]) == pytest.approx(0, abs=1e-3)
 
 
-@pytest.mark.parametrize("turn", [0.0, 0.37])
+@pytest.mark.parametrize("u_offset", [0.0, 0.37])
 @pytest.mark.parametrize("outward", [(0, 0, -1), (0.6, 0, 0.8), (0, 1, 0)])
-def test_the_density_integrates_to_one_over_the_sphere(outward, turn):
-    distribution = EnvmapDistribution(random_map(), torch.tensor(outward, dtype=torch.float32), turn)
-    directions, solid = centres(turn)
-    assert float((distribution.pdf(directions, turn) * solid).sum()) == pytest.approx(1, rel=1e-3)
+def test_the_density_integrates_to_one_over_the_sphere(outward, u_offset):
+    distribution = EnvmapDistribution(random_map(), torch.tensor(outward, dtype=torch.float32), u_offset)
+    directions, solid_angle = texel_directions(u_offset)
+    assert float((distribution.pdf(directions, u_offset) * solid_angle).sum()) == pytest.approx(1, rel=1e-3)
 
 
 def test_no_direction_is_sampled_on_the_other_side_of_the_glass():
@@ -67,42 +70,44 @@ def test_no_direction_is_sampled_on_the_other_side_of_the_glass():
     assert float(distribution.pdf(-outward[:, None], 0.2)) == 0
 
 
-def test_samples_land_on_the_sun():
-    row, column, turn = 12, 60, 0.1
-    distribution = EnvmapDistribution(texels(sun(HEIGHT, row, column, light=1e4, night=0.01)), AHEAD, turn)
-    u, v = direction_to_uv(distribution.sample(uniforms(5000), turn), turn)
-    near = ((u * 2 * HEIGHT - column - 0.5).abs() <= 1.51) & ((v * HEIGHT - row - 0.5).abs() <= 1.51)
-    assert float(near.float().mean()) > 0.98
+def test_nearly_all_samples_hit_the_sun():
+    row, column, u_offset = 12, 60, 0.1
+    distribution = EnvmapDistribution(
+        to_texels(sun(HEIGHT, row, column, light=1e4, night=0.01)), AHEAD, u_offset
+    )
+    u, v = direction_to_uv(distribution.sample(uniforms(5000), u_offset), u_offset)
+    is_near_sun = ((u * 2 * HEIGHT - column - 0.5).abs() <= 1.51) & ((v * HEIGHT - row - 0.5).abs() <= 1.51)
+    assert float(is_near_sun.float().mean()) > 0.98
 
 
-@pytest.mark.parametrize("turn", [0.0, -0.25])
-def test_the_density_matches_the_frequency_of_samples(turn):
-    distribution = EnvmapDistribution(random_map(), AHEAD, turn)
+@pytest.mark.parametrize("u_offset", [0.0, -0.25])
+def test_the_density_matches_the_frequency_of_samples(u_offset):
+    distribution = EnvmapDistribution(random_map(), AHEAD, u_offset)
     count = 400_000
-    sampled = distribution.sample(uniforms(count), turn)
-    u, v = direction_to_uv(sampled, turn)
+    sampled = distribution.sample(uniforms(count), u_offset)
+    u, v = direction_to_uv(sampled, u_offset)
     cell = (v * HEIGHT).long().clamp(max=HEIGHT - 1) * 2 * HEIGHT + (u * 2 * HEIGHT).long() % (2 * HEIGHT)
-    found = torch.bincount(cell, minlength=2 * HEIGHT**2)
-    directions, solid = centres(turn)
-    expected = distribution.pdf(directions, turn) * solid * count
-    likely = expected > 20
-    chi = ((found - expected) ** 2 / expected.clamp(min=1))[likely].mean()
-    assert float(chi) == pytest.approx(1, abs=0.15)
-    assert float(distribution.pdf(sampled, turn).min()) > 0
+    counts = torch.bincount(cell, minlength=2 * HEIGHT**2)
+    directions, solid_angle = texel_directions(u_offset)
+    expected = distribution.pdf(directions, u_offset) * solid_angle * count
+    is_frequent = expected > 20
+    chi_squared = ((counts - expected) ** 2 / expected.clamp(min=1))[is_frequent].mean()
+    assert float(chi_squared) == pytest.approx(1, abs=0.15)
+    assert float(distribution.pdf(sampled, u_offset).min()) > 0
 
 
 @pytest.mark.parametrize("radius_mm", [math.inf, 1500.0], ids=["far", "dome"])
 @pytest.mark.parametrize("behind", [True, False])
 def test_the_mean_of_one_over_the_density_is_the_solid_angle(radius_mm, behind):
     """A cone of half-angle 60 degrees has a solid angle of pi, from any point inside a dome."""
-    lamp = emitters(around("soft", radius_mm=radius_mm, heading_deg=25), behind)
+    emitters = make_emitters(around("soft", radius_mm=radius_mm, heading_deg=25), behind)
     origin = torch.tensor([[300.0], [-200.0], [0.0]]).expand(3, 200_000)
-    direction, pdf = lamp.sample(origin, uniforms(200_000))
+    direction, pdf = emitters.sample(origin, uniforms(200_000))
     outward = -direction[2] if behind else direction[2]
-    inside = outward > 0.5
-    assert float((inside / pdf.clamp(min=1e-9)).mean()) == pytest.approx(math.pi, rel=0.01)
+    is_inside = outward > 0.5
+    assert float((is_inside / pdf.clamp(min=1e-9)).mean()) == pytest.approx(math.pi, rel=0.01)
     torch.testing.assert_close(direction.norm(dim=0), torch.ones(200_000))
-    torch.testing.assert_close(lamp.pdf(origin, direction), pdf)
+    torch.testing.assert_close(emitters.pdf(origin, direction), pdf)
 
 
 def test_a_black_map_can_be_sampled():

@@ -24,7 +24,7 @@ from brewster.render.rays.rough_glass import _reflectances
 from brewster.scene.glass import Glazing, Pane
 from worlds_of_one import WORLDS, a_scene, at, board
 
-some = settings(max_examples=40, deadline=None, database=None)
+examples_40 = settings(max_examples=40, deadline=None, database=None)
 COSINES = st.floats(0.05, 1)
 INDICES = st.floats(1, 2)
 TINTS = st.tuples(*[st.floats(0, 100)] * 3)
@@ -40,149 +40,157 @@ def glazing(panes):
     return Glazing(panes=tuple(panes), gap_mm=10.0 if len(panes) > 1 else 0.0)
 
 
-def exact(number):
+def float64(number):
     return torch.tensor(float(number), dtype=torch.float64)
 
 
-def surface(cosine, here, beyond):
+def surface_reflectances(cosine, index_in, index_out):
     """Fresnel reflectances for s- and p-polarised light, from the angles on both sides."""
-    one = math.acos(cosine)
-    other = math.asin(here * math.sin(one) / beyond)
-    if one < 1e-6:
-        return (((here - beyond) / (here + beyond)) ** 2,) * 2
-    s = math.sin(one - other) / math.sin(one + other)
-    p = math.tan(one - other) / math.tan(one + other)
+    theta_in = math.acos(cosine)
+    theta_out = math.asin(index_in * math.sin(theta_in) / index_out)
+    if theta_in < 1e-6:
+        return (((index_in - index_out) / (index_in + index_out)) ** 2,) * 2
+    s = math.sin(theta_in - theta_out) / math.sin(theta_in + theta_out)
+    p = math.tan(theta_in - theta_out) / math.tan(theta_in + theta_out)
     return s**2, p**2
 
 
-def slab(pane, cosine):
+def pane_throughputs(pane, cosine):
     """T and R of one clear pane for s- and p-polarised light: all orders as a geometric series."""
-    return [((1 - r) / (1 + r), 2 * r / (1 + r)) for r in surface(cosine, 1, pane.index)]
+    return [((1 - r) / (1 + r), 2 * r / (1 + r)) for r in surface_reflectances(cosine, 1, pane.index)]
 
 
 def test_a_pane_of_ordinary_glass_reflects_about_eight_percent():
-    shares = all_orders(Glazing(), exact(1))
-    assert float(shares.reflected) == pytest.approx(0.08 / 1.04, rel=1e-9)
-    assert float(shares.reflected) == pytest.approx(0.0769, abs=5e-5)
-    assert float(shares.transmitted) == pytest.approx(0.96 / 1.04, rel=1e-9)
+    throughput = all_orders(Glazing(), float64(1))
+    assert float(throughput.reflected) == pytest.approx(0.08 / 1.04, rel=1e-9)
+    assert float(throughput.reflected) == pytest.approx(0.0769, abs=5e-5)
+    assert float(throughput.transmitted) == pytest.approx(0.96 / 1.04, rel=1e-9)
 
 
 @pytest.mark.parametrize("index", [1.1, 1.5, 2.4])
 def test_p_polarised_light_is_not_reflected_at_brewsters_angle(index):
-    s, p = fresnel(exact(math.cos(math.atan(index))), index)
+    s, p = fresnel(float64(math.cos(math.atan(index))), index)
     assert float(p) == pytest.approx(0, abs=1e-12)
     assert float(s) == pytest.approx(((index**2 - 1) / (index**2 + 1)) ** 2, rel=1e-9)
 
 
-@some
+@examples_40
 @given(st.floats(0.05, 0.999), st.floats(1.01, 2.5))
-def test_a_surface_reflects_alike_from_both_sides(cosine, index):
-    inside = float(refracted_cosine(exact(cosine), index))
+def test_a_surface_has_the_same_reflectance_from_both_sides(cosine, index):
+    inside = float(refracted_cosine(float64(cosine), index))
     assert math.sqrt(1 - inside**2) * index == pytest.approx(math.sqrt(1 - cosine**2), abs=1e-9)
-    outside = [float(r) for r in fresnel(exact(cosine), index)]
-    assert outside == pytest.approx(surface(cosine, 1, index), rel=1e-6, abs=1e-9)
-    assert outside == pytest.approx(surface(inside, index, 1), rel=1e-6, abs=1e-9)
+    outside = [float(r) for r in fresnel(float64(cosine), index)]
+    assert outside == pytest.approx(surface_reflectances(cosine, 1, index), rel=1e-6, abs=1e-9)
+    assert outside == pytest.approx(surface_reflectances(inside, index, 1), rel=1e-6, abs=1e-9)
     assert outside == pytest.approx(
-        [float(r) for r in _reflectances(exact(inside), index, 1.0)], rel=1e-6, abs=1e-9
+        [float(r) for r in _reflectances(float64(inside), index, 1.0)], rel=1e-6, abs=1e-9
     )
 
 
-def test_beyond_the_critical_angle_glass_reflects_all_from_inside():
+def test_beyond_the_critical_angle_all_light_inside_the_glass_is_reflected():
     critical = math.sqrt(1 - 1 / 1.5**2)
     for cosine, is_total in ((critical - 0.01, True), (critical + 0.01, False)):
-        s, p = _reflectances(exact(cosine), 1.5, 1.0)
+        s, p = _reflectances(float64(cosine), 1.5, 1.0)
         assert (float(s) == 1, float(p) == 1) == (is_total, is_total)
 
 
-@some
+@examples_40
 @given(PANES, COSINES)
 def test_clear_glass_loses_no_light(panes, cosine):
     clear = glazing(pane.model_copy(update={"absorption_per_m": (0.0, 0.0, 0.0)}) for pane in panes)
-    shares = all_orders(clear, exact(cosine))
-    assert float(shares.transmitted + shares.reflected) == pytest.approx(1, abs=1e-9)
+    throughput = all_orders(clear, float64(cosine))
+    assert float(throughput.transmitted + throughput.reflected) == pytest.approx(1, abs=1e-9)
 
 
-@some
+@examples_40
 @given(PANES, COSINES)
-def test_tinted_glass_only_loses_light(panes, cosine):
-    shares = all_orders(glazing(panes), exact(cosine))
-    assert (shares.transmitted >= 0).all()
-    assert (shares.reflected >= 0).all()
-    assert (shares.transmitted + shares.reflected <= 1 + 1e-9).all()
+def test_tinted_glass_adds_no_light(panes, cosine):
+    throughput = all_orders(glazing(panes), float64(cosine))
+    assert (throughput.transmitted >= 0).all()
+    assert (throughput.reflected >= 0).all()
+    assert (throughput.transmitted + throughput.reflected <= 1 + 1e-9).all()
 
 
-@some
+@examples_40
 @given(PANES, COSINES)
-def test_a_stack_transmits_alike_from_both_sides(panes, cosine):
-    one, other = (all_orders(glazing(order), exact(cosine)) for order in (panes, panes[::-1]))
-    torch.testing.assert_close(one.transmitted, other.transmitted, rtol=1e-9, atol=1e-12)
+def test_a_stack_has_the_same_transmittance_from_both_sides(panes, cosine):
+    from_front, from_behind = (all_orders(glazing(stack), float64(cosine)) for stack in (panes, panes[::-1]))
+    torch.testing.assert_close(from_front.transmitted, from_behind.transmitted, rtol=1e-9, atol=1e-12)
 
 
-@some
+@examples_40
 @given(COSINES, st.floats(1.01, 2.5), st.floats(1.01, 2.5))
 def test_double_glazing_follows_the_adding_formula(cosine, first, second):
     panes = [Pane(index=first), Pane(index=second)]
-    through = back = 0.0
-    for (t1, r1), (t2, r2) in zip(slab(panes[0], cosine), slab(panes[1], cosine), strict=True):
-        through += t1 * t2 / (1 - r1 * r2) / 2
-        back += (r1 + t1**2 * r2 / (1 - r1 * r2)) / 2
-    shares = all_orders(glazing(panes), exact(cosine))
-    assert float(shares.transmitted) == pytest.approx(through, rel=1e-6)
-    assert float(shares.reflected) == pytest.approx(back, rel=1e-6)
+    transmittance = reflectance = 0.0
+    for (t1, r1), (t2, r2) in zip(
+        pane_throughputs(panes[0], cosine), pane_throughputs(panes[1], cosine), strict=True
+    ):
+        transmittance += t1 * t2 / (1 - r1 * r2) / 2
+        reflectance += (r1 + t1**2 * r2 / (1 - r1 * r2)) / 2
+    throughput = all_orders(glazing(panes), float64(cosine))
+    assert float(throughput.transmitted) == pytest.approx(transmittance, rel=1e-6)
+    assert float(throughput.reflected) == pytest.approx(reflectance, rel=1e-6)
 
 
-def test_glass_absorbs_as_beer_and_lambert_say():
+def test_absorption_follows_the_beer_lambert_law():
     pane = Pane(thickness_mm=10, absorption_per_m=(40, 0, 10))
-    left = np.exp([-0.4, 0, -0.1])
-    np.testing.assert_allclose(internal_transmittance(pane, exact(1)), left, rtol=1e-9)
-    np.testing.assert_allclose(paper_orders(glazing([pane]), exact(1)).transmitted, 0.96**2 * left, rtol=1e-9)
+    internal = np.exp([-0.4, 0, -0.1])
+    np.testing.assert_allclose(internal_transmittance(pane, float64(1)), internal, rtol=1e-9)
     np.testing.assert_allclose(
-        all_orders(glazing([pane]), exact(1)).transmitted,
-        0.96**2 * left / (1 - (0.04 * left) ** 2),
+        paper_orders(glazing([pane]), float64(1)).transmitted, 0.96**2 * internal, rtol=1e-9
+    )
+    np.testing.assert_allclose(
+        all_orders(glazing([pane]), float64(1)).transmitted,
+        0.96**2 * internal / (1 - (0.04 * internal) ** 2),
         rtol=1e-9,
     )
-    slanted = math.cos(math.asin(math.sin(math.radians(60)) / 1.5))
-    np.testing.assert_allclose(internal_transmittance(pane, exact(0.5)), left ** (1 / slanted), rtol=1e-9)
+    refracted = math.cos(math.asin(math.sin(math.radians(60)) / 1.5))
+    np.testing.assert_allclose(
+        internal_transmittance(pane, float64(0.5)), internal ** (1 / refracted), rtol=1e-9
+    )
 
 
 # --- orders, one by one
 
 
-def table_of(panes, cosine):
-    return enumerate_orders(tuple(float(sum(fresnel(exact(cosine), pane.index))) / 2 for pane in panes))
+def orders_of(panes, cosine):
+    return enumerate_orders(tuple(float(sum(fresnel(float64(cosine), pane.index))) / 2 for pane in panes))
 
 
 @settings(max_examples=40, phases=[Phase.generate], deadline=None, database=None)
 @given(PANES.filter(lambda panes: len(panes) < 3), st.floats(0.4, 1))
-def test_the_orders_shares_sum_to_the_closed_form(panes, cosine):
-    table = table_of(panes, cosine)
-    shares = order_throughputs(glazing(panes), exact(cosine), table)
-    for closed, kept, error in (
-        (all_orders(glazing(panes), exact(cosine)), lambda _: True, 1e-12),
-        (paper_orders(glazing(panes), exact(cosine)), lambda order: order.in_paper, 6e-3),
+def test_the_throughputs_of_the_orders_sum_to_the_closed_form(panes, cosine):
+    table = orders_of(panes, cosine)
+    throughputs = order_throughputs(glazing(panes), float64(cosine), table)
+    for closed, is_included, max_error in (
+        (all_orders(glazing(panes), float64(cosine)), lambda _: True, 1e-12),
+        (paper_orders(glazing(panes), float64(cosine)), lambda order: order.in_paper, 6e-3),
     ):
-        for behind, whole in ((True, closed.transmitted), (False, closed.reflected)):
-            mine = sum(
-                s for s, order in zip(shares, table, strict=True) if order.behind == behind and kept(order)
+        for behind, expected in ((True, closed.transmitted), (False, closed.reflected)):
+            total = sum(
+                throughput
+                for throughput, order in zip(throughputs, table, strict=True)
+                if order.behind == behind and is_included(order)
             )
-            assert float((mine - whole).abs().max()) < error
-    assert all((share >= -1e-9).all() for share in shares)
+            assert float((total - expected).abs().max()) < max_error
+    assert all((throughput >= -1e-9).all() for throughput in throughputs)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_the_light_added_to_the_last_order_is_little(count):
-    """For ordinary glass, the enumerated orders alone hold all but a thousandth of the light."""
+def test_little_light_is_added_to_the_last_order(count):
+    """For ordinary glass, the enumerated orders contain all but 0.1 % of the incident light."""
     panes = [Pane()] * count
     table = enumerate_orders((0.04,) * count)
-    whole = all_orders(glazing(panes), exact(1))
-    for behind, total in ((True, whole.transmitted), (False, whole.reflected)):
-        found = sum(
+    closed = all_orders(glazing(panes), float64(1))
+    for behind, total in ((True, closed.transmitted), (False, closed.reflected)):
+        enumerated = sum(
             order.count * 0.04 ** sum(order.reflections) * 0.96 ** sum(order.transmissions)
             for order in table
             if order.behind == behind
         )
-        assert found <= float(total)
-        assert found == pytest.approx(float(total), abs=1e-3)
+        assert enumerated <= float(total)
+        assert enumerated == pytest.approx(float(total), abs=1e-3)
 
 
 def test_one_pane_has_three_reflected_and_two_transmitted_orders():
@@ -198,21 +206,23 @@ def test_one_pane_has_three_reflected_and_two_transmitted_orders():
 def test_each_order_of_one_pane_is_a_term_of_the_geometric_series():
     pane = Pane(thickness_mm=10, absorption_per_m=(40, 0, 10))
     a = np.exp([-0.4, 0, -0.1])
-    first, mirror, ghost, second, _ = order_throughputs(glazing([pane]), exact(1), enumerate_orders((0.04,)))
+    first, mirror, ghost, second, _ = order_throughputs(
+        glazing([pane]), float64(1), enumerate_orders((0.04,))
+    )
     np.testing.assert_allclose(first, 0.96**2 * a, rtol=1e-9)
     np.testing.assert_allclose(mirror, 0.04, rtol=1e-9)
     np.testing.assert_allclose(ghost, 0.96**2 * 0.04 * a**2, rtol=1e-9)
-    np.testing.assert_allclose(second, 0.96**2 * 0.04**2 * a**3, rtol=5e-3)  # and all that come after
+    np.testing.assert_allclose(second, 0.96**2 * 0.04**2 * a**3, rtol=5e-3)  # includes all later orders
 
 
 def test_in_double_glazing_the_papers_reflection_never_enters_the_last_pane():
     table = enumerate_orders((0.04, 0.04))
     assert sum(order.behind and order.in_paper for order in table) == 1
-    mirrored = [order for order in table if not order.behind]
-    brightest = [order.traversals for order in mirrored[:4]]
+    reflected = [order for order in table if not order.behind]
+    brightest = [order.traversals for order in reflected[:4]]
     assert brightest == [(0, 0, 0), (2, 0, 0), (2, 2, 0), (2, 2, 2)]
-    assert [order.in_paper for order in mirrored[:4]] == [True, True, True, False]
-    for order in mirrored:
+    assert [order.in_paper for order in reflected[:4]] == [True, True, True, False]
+    for order in reflected:
         assert order.in_paper == (order.transmissions[1] == 0)
 
 
@@ -230,7 +240,7 @@ def test_the_ghost_distance_matches_the_textbook_formula():
 
 def test_lateral_shifts_follow_snells_law_in_glass_and_are_unrefracted_in_the_gap():
     first, gap, second = lateral_shifts_mm(
-        Glazing(panes=(Pane(thickness_mm=3), Pane(thickness_mm=8, index=2)), gap_mm=16), exact(0.5)
+        Glazing(panes=(Pane(thickness_mm=3), Pane(thickness_mm=8, index=2)), gap_mm=16), float64(0.5)
     )
     sine = math.sin(math.radians(60))
     assert float(first) == pytest.approx(3 * math.tan(math.asin(sine / 1.5)), rel=1e-9)
@@ -238,8 +248,8 @@ def test_lateral_shifts_follow_snells_law_in_glass_and_are_unrefracted_in_the_ga
     assert float(second) == pytest.approx(8 * math.tan(math.asin(sine / 2)), rel=1e-9)
 
 
-def line_mirrored(incidence_deg, thickness_mm):
-    """The mean reflection per column of a thin line in front of the glass, and the size of a pixel there in mm."""
+def render_mirrored_line(incidence_deg, thickness_mm):
+    """Renders the reflection of a thin line in front of the glass: its mean per column, and the pixel size there in mm."""
     before, away, slant = 600.0, 400.0, math.radians(incidence_deg)
     camera = at(incidence_deg, distance_mm=before / math.cos(slant), fov_deg=0.6, width=48, height=16)
     line = board(
@@ -254,30 +264,34 @@ def line_mirrored(incidence_deg, thickness_mm):
 
 
 @pytest.mark.parametrize(("incidence_deg", "thickness_mm"), [(20, 6), (35, 5), (45, 4.5)])
-def test_a_line_near_the_glass_is_mirrored_twice_as_far_apart_as_the_formula_says(
+def test_the_two_reflections_of_a_near_line_have_the_ghost_distance_of_the_formula(
     incidence_deg, thickness_mm
 ):
-    columns, pixel_mm = line_mirrored(incidence_deg, thickness_mm)
-    apart = ghost_distance_mm(Pane(thickness_mm=thickness_mm), incidence_deg) / pixel_mm
-    assert 7 < apart < 20
-    places = np.arange(48) + 0.5
-    main, ghost = (np.abs(places - place) < apart / 2 for place in (24, 24 - apart))
-    found, other = (np.average(places[mine], weights=columns[mine]) for mine in (main, ghost))
-    assert found == pytest.approx(24, abs=0.1)
-    assert found - other == pytest.approx(apart, rel=0.02)
-    r_s, r_p = surface(math.cos(math.radians(incidence_deg)), 1, 1.5)
-    fainter = (r_s * (1 - r_s) ** 2 + r_p * (1 - r_p) ** 2) / (r_s + r_p)
-    assert columns[ghost].sum() / columns[main].sum() == pytest.approx(fainter, rel=0.03)
+    columns, pixel_mm = render_mirrored_line(incidence_deg, thickness_mm)
+    ghost_px = ghost_distance_mm(Pane(thickness_mm=thickness_mm), incidence_deg) / pixel_mm
+    assert 7 < ghost_px < 20
+    x = np.arange(48) + 0.5
+    main, ghost = (np.abs(x - centre) < ghost_px / 2 for centre in (24, 24 - ghost_px))
+    main_x, ghost_x = (np.average(x[mask], weights=columns[mask]) for mask in (main, ghost))
+    assert main_x == pytest.approx(24, abs=0.1)
+    assert main_x - ghost_x == pytest.approx(ghost_px, rel=0.02)
+    r_s, r_p = surface_reflectances(math.cos(math.radians(incidence_deg)), 1, 1.5)
+    relative_brightness = (r_s * (1 - r_s) ** 2 + r_p * (1 - r_p) ** 2) / (r_s + r_p)
+    assert columns[ghost].sum() / columns[main].sum() == pytest.approx(relative_brightness, rel=0.03)
 
 
 def test_a_ghost_one_pixel_away_moves_the_lines_centroid_by_its_weight():
     """Orders have separate lookups unless their images are within a tenth of a pixel."""
-    columns, pixel_mm = line_mirrored(40, 0.4)
-    apart = ghost_distance_mm(Pane(thickness_mm=0.4), 40) / pixel_mm
-    assert 0.5 < apart < 1.5
+    columns, pixel_mm = render_mirrored_line(40, 0.4)
+    ghost_px = ghost_distance_mm(Pane(thickness_mm=0.4), 40) / pixel_mm
+    assert 0.5 < ghost_px < 1.5
     table = enumerate_orders((0.04,))
-    shares = order_throughputs(Glazing(), exact(math.cos(math.radians(40))), table)
-    mirrored = [(float(s), o.traversals[0] / 2) for s, o in zip(shares, table, strict=True) if not o.behind]
-    mean_order = sum(share * number for share, number in mirrored) / sum(share for share, _ in mirrored)
-    found = np.average(np.arange(48) + 0.5, weights=columns)
-    assert 24 - found == pytest.approx(apart * mean_order, abs=0.05)
+    throughputs = order_throughputs(Glazing(), float64(math.cos(math.radians(40))), table)
+    reflected = [
+        (float(weight), order.traversals[0] / 2)
+        for weight, order in zip(throughputs, table, strict=True)
+        if not order.behind
+    ]
+    mean_shift = sum(weight * shift for weight, shift in reflected) / sum(weight for weight, _ in reflected)
+    centroid_x = np.average(np.arange(48) + 0.5, weights=columns)
+    assert 24 - centroid_x == pytest.approx(ghost_px * mean_shift, abs=0.05)

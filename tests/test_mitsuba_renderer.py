@@ -24,17 +24,17 @@ RED_TOP = WHITE.copy()
 RED_TOP[:32, :, 1:] = 0
 RAMP = np.broadcast_to(((np.arange(64, dtype=np.float32) + 0.5) / 64)[:, None], (64, 64, 3))
 MOTTLED = np.random.default_rng(3).random((8, 16, 3), np.float32)
-PICTURES = {"white": WHITE, "red right": RED_RIGHT, "red top": RED_TOP, "ramp": RAMP, "mottled": MOTTLED}
+IMAGES = {"white": WHITE, "red right": RED_RIGHT, "red top": RED_TOP, "ramp": RAMP, "mottled": MOTTLED}
 
 
-class Pictures:
-    """Assets without files: the entry of `PICTURES` with the source's name."""
+class SyntheticAssets:
+    """Assets without files: the entry of `IMAGES` with the source's name."""
 
     def map_light(self, lit):
-        return PICTURES[lit.source.file] * np.float32(lit.luminance)
+        return IMAGES[lit.source.file] * np.float32(lit.luminance)
 
     def plane_light(self, plane):
-        return PICTURES[plane.source.file] * np.float32(plane.luminance)
+        return IMAGES[plane.source.file] * np.float32(plane.luminance)
 
 
 def around(name="white", **more):
@@ -51,14 +51,14 @@ def a_scene(**more):
 
 
 def traced(scene, **more):
-    return trace(scene, Pictures(), **{"noise": 0.01, "max_samples": 512, **more})
+    return trace(scene, SyntheticAssets(), **{"noise": 0.01, "max_samples": 512, **more})
 
 
-def render_one(scene, side, glass, samples=64):
+def render_image(scene, side, glass, samples=64):
     """Renders one image (H, W, 3)."""
     mitsuba = variant.load()
     with renderer._active_variant(mitsuba, variant.probe().variant):
-        mi_scene = MitsubaSceneBuilder(mitsuba, scene, Pictures()).scene_dict(
+        mi_scene = MitsubaSceneBuilder(mitsuba, scene, SyntheticAssets()).scene_dict(
             behind=side == "behind", glass=glass
         )
         return np.array(mitsuba.render(mitsuba.load_dict(mi_scene), spp=samples))
@@ -66,12 +66,12 @@ def render_one(scene, side, glass, samples=64):
 
 def at(heading_deg, distance_mm=500.0):
     """Values of a camera that looks at the glass from this heading, at the same height."""
-    turn = math.radians(heading_deg)
-    position = -distance_mm * math.sin(turn), 0, distance_mm * math.cos(turn)
+    heading = math.radians(heading_deg)
+    position = -distance_mm * math.sin(heading), 0, distance_mm * math.cos(heading)
     return {"heading_deg": heading_deg, "position_mm": position, "fov_deg": 2}
 
 
-def slab(incidence_deg, index=1.5):
+def pane_reflectances(incidence_deg, index=1.5):
     """Reflectances of one pane for s- and p-polarised light: all orders sum to 2 r / (1 + r)."""
     cosine = math.cos(math.radians(incidence_deg))
     inside = math.sqrt(1 - (1 - cosine**2) / index**2)
@@ -89,24 +89,24 @@ def test_glass_with_index_one_is_invisible():
 
 def test_a_pane_of_ordinary_glass_reflects_about_eight_percent():
     sample = traced(a_scene(camera=at(0)), noise=0.003, max_samples=4096)
-    s, _ = slab(0)
+    s, _ = pane_reflectances(0)
     assert float(sample.reflection.mean()) == pytest.approx(s, rel=0.02)
     assert float(sample.transmission.mean()) == pytest.approx(1 - s, rel=0.002)
     assert float(sample.photo.mean()) == pytest.approx(1, abs=0.003)
 
 
-def test_the_papers_layers_are_the_first_reflection_and_the_straight_path():
+def test_the_papers_layers_are_the_first_reflection_and_the_path_without_reflection():
     sample = traced(a_scene(camera=at(0), orders="paper"), noise=0.002)
     assert float(sample.reflection.mean()) == pytest.approx(0.04, rel=0.001)
     assert float(sample.transmission.mean()) == pytest.approx(0.96**2, rel=0.003)
 
 
-def test_tinted_panes_absorb_as_beer_and_lambert_say():
+def test_absorption_in_tinted_panes_follows_the_beer_lambert_law():
     panes = (
         Pane(thickness_mm=10, absorption_per_m=(40, 0, 10)),
         Pane(thickness_mm=5, absorption_per_m=(0, 0, 20)),
     )
-    light = render_one(
+    light = render_image(
         a_scene(camera=at(0), glass=Glazing(panes=panes, gap_mm=10)), "behind", "paper_transmission"
     )
     np.testing.assert_allclose(light.mean((0, 1)), 0.96**4 * np.exp([-0.4, 0, -0.2]), rtol=0.01)
@@ -116,138 +116,145 @@ def test_polarised_light_follows_the_closed_form_at_brewsters_angle(compiled):
     """Mitsuba's colour variants average s and p at each surface, which is wrong by an eighth at this angle."""
     camera = {**at(56.31), "width": 16, "height": 16}
     sample = traced(a_scene(camera=camera), polarised=True, noise=0.01)
-    s, p = slab(56.31)
+    s, p = pane_reflectances(56.31)
     assert float(sample.reflection.mean()) == pytest.approx((s + p) / 2, rel=0.02)
 
 
 def test_s_and_p_light_each_follow_the_closed_form(compiled, mitsuba):
     camera = {**at(56.31), "width": 16, "height": 16}
     with renderer._active_variant(mitsuba, renderer._variant(polarised=True)):
-        mi_scene = MitsubaSceneBuilder(mitsuba, a_scene(camera=camera), Pictures(), channel=0).scene_dict(
-            behind=False, glass="full"
-        )
+        mi_scene = MitsubaSceneBuilder(
+            mitsuba, a_scene(camera=camera), SyntheticAssets(), channel=0
+        ).scene_dict(behind=False, glass="full")
         mi_scene["integrator"] = {"type": "stokes", "nested": mi_scene["integrator"]}
         stokes = np.array(mitsuba.render(mitsuba.load_dict(mi_scene), spp=4096)).mean((0, 1))
-    whole, difference = stokes[1], abs(stokes[4])
-    s, p = slab(56.31)
-    assert whole == pytest.approx((s + p) / 2, rel=0.02)
+    intensity, difference = stokes[1], abs(stokes[4])
+    s, p = pane_reflectances(56.31)
+    assert intensity == pytest.approx((s + p) / 2, rel=0.02)
     assert difference == pytest.approx((s - p) / 2, rel=0.02)
 
 
-def red_half(picture):
+def red_half(image):
     """The name of the half that is red in a red and white image."""
-    green = picture[..., 1] / picture[..., 0].max()
+    green = image[..., 1] / image[..., 0].max()
     halves = {"left": green[:, :13], "right": green[:, -13:], "top": green[:13], "bottom": green[-13:]}
     return " ".join(name for name, half in halves.items() if half.max() < 0.05)
 
 
-def test_what_is_red_on_the_right_of_a_plane_is_red_on_the_right_of_the_picture():
+def test_the_right_half_of_a_plane_appears_on_the_right_of_the_image():
     scene = a_scene(behind=board("red right"), front=board("red right"))
     assert (
-        red_half(render_one(scene, "behind", "none"))
-        == red_half(render_one(scene, "behind", "paper_transmission"))
+        red_half(render_image(scene, "behind", "none"))
+        == red_half(render_image(scene, "behind", "paper_transmission"))
         == "right"
     )
     assert (
-        red_half(render_one(scene, "front", "mirror"))
-        == red_half(render_one(scene, "front", "paper_reflection"))
+        red_half(render_image(scene, "front", "mirror"))
+        == red_half(render_image(scene, "front", "paper_reflection"))
         == "left"
     )
 
 
-def test_what_is_red_on_the_top_of_a_plane_is_red_on_the_top_of_the_picture():
+def test_the_top_half_of_a_plane_appears_at_the_top_of_the_image():
     scene = a_scene(behind=board("red top"), front=board("red top"))
     assert (
-        red_half(render_one(scene, "behind", "none"))
-        == red_half(render_one(scene, "front", "mirror"))
+        red_half(render_image(scene, "behind", "none"))
+        == red_half(render_image(scene, "front", "mirror"))
         == "top"
     )
 
 
 @pytest.mark.parametrize("radius_mm", [math.inf, 3000])
-def test_a_map_begins_at_its_heading_and_a_mirror_shows_what_is_behind_the_camera(radius_mm):
+def test_the_left_edge_of_a_map_is_at_its_heading_and_a_mirror_shows_the_map_behind_the_camera(radius_mm):
     """A map's centre is opposite its heading; seen by a camera that faces it, its right half is at -x."""
-    turned, plain = (around("red right", heading_deg=heading, radius_mm=radius_mm) for heading in (180, 0))
-    scene = a_scene(behind=turned, front=plain)
-    assert red_half(render_one(scene, "behind", "none")) == "right"
-    assert red_half(render_one(scene, "front", "mirror")) == "left"
+    rotated, unrotated = (
+        around("red right", heading_deg=heading, radius_mm=radius_mm) for heading in (180, 0)
+    )
+    scene = a_scene(behind=rotated, front=unrotated)
+    assert red_half(render_image(scene, "behind", "none")) == "right"
+    assert red_half(render_image(scene, "front", "mirror")) == "left"
 
 
 @pytest.mark.parametrize("radius_mm", [math.inf, 3000])
 @pytest.mark.parametrize("behind", [True, False])
-def test_a_map_emits_the_light_of_its_texels_and_only_on_its_own_side(
+def test_a_map_emits_the_light_of_its_texels_on_its_own_side_only(
     radius_mm, behind, random, compiled, mitsuba
 ):
-    lit = around("mottled", heading_deg=37, radius_mm=radius_mm)
+    side = around("mottled", heading_deg=37, radius_mm=radius_mm)
     glass = Glazing(heading_deg=-20, pitch_deg=10)
-    scene = a_scene(behind=lit, front=lit, glass=glass, camera={"position_mm": (100, 0, 500)})
-    ahead = random.normal(size=(3, 4000))
-    ahead /= np.linalg.norm(ahead, axis=0)
+    scene = a_scene(behind=side, front=side, glass=glass, camera={"position_mm": (100, 0, 500)})
+    directions = random.normal(size=(3, 4000))
+    directions /= np.linalg.norm(directions, axis=0)
     to_glass = np.array(axes(glass.heading_deg, glass.pitch_deg))
     with renderer._active_variant(mitsuba, variant.COMPILED):
         mi_scene = mitsuba.load_dict(
-            MitsubaSceneBuilder(mitsuba, scene, Pictures()).scene_dict(behind=behind, glass="none")
+            MitsubaSceneBuilder(mitsuba, scene, SyntheticAssets()).scene_dict(behind=behind, glass="none")
         )
-        found = mi_scene.ray_intersect(
-            mitsuba.Ray3f(mitsuba.Point3f(0), mitsuba.Vector3f((to_glass @ ahead).astype("f4")))
+        intersection = mi_scene.ray_intersect(
+            mitsuba.Ray3f(mitsuba.Point3f(0), mitsuba.Vector3f((to_glass @ directions).astype("f4")))
         )
-        light = np.array(found.emitter(mi_scene).eval(found))
-    u = (np.arctan2(ahead[0], -ahead[2]) / (2 * np.pi) - 37 / 360) % 1
-    v = np.arccos(ahead[1]) / np.pi
+        light = np.array(intersection.emitter(mi_scene).eval(intersection))
+    u = (np.arctan2(directions[0], -directions[2]) / (2 * np.pi) - 37 / 360) % 1
+    v = np.arccos(directions[1]) / np.pi
     expected = np.stack(
         [sample_bilinear(MOTTLED, u[i : i + 1], v[i : i + 1])[0, 0] for i in range(len(u))], axis=1
     )
-    height = to_glass[2] @ ahead
-    clear = np.abs(height) > 0.01
-    np.testing.assert_allclose(light[:, clear], (expected * ((height < 0) == behind))[:, clear], atol=1e-4)
+    height = to_glass[2] @ directions
+    is_off_glass_plane = np.abs(height) > 0.01
+    np.testing.assert_allclose(
+        light[:, is_off_glass_plane], (expected * ((height < 0) == behind))[:, is_off_glass_plane], atol=1e-4
+    )
 
 
 def test_a_plane_hides_the_map_behind_it():
     plane = board("white", luminance=0.5).plane
-    light = render_one(a_scene(behind=Side(map=around().map, plane=plane)), "behind", "none")
+    light = render_image(a_scene(behind=Side(map=around().map, plane=plane)), "behind", "none")
     np.testing.assert_allclose(light, 0.5, atol=1e-3)
 
 
-def test_the_back_of_a_plane_between_camera_and_glass_is_black_on_both_sides_light():
+def test_the_back_of_a_plane_between_camera_and_glass_is_black_in_the_light_of_both_sides():
     plane = board("white", distance_mm=300, width_mm=1000).plane
     scene = a_scene(front=Side(map=around().map, plane=plane))
-    assert render_one(scene, "behind", "full").max() == render_one(scene, "front", "full").max() == 0
+    assert render_image(scene, "behind", "full").max() == render_image(scene, "front", "full").max() == 0
 
 
 @pytest.mark.parametrize(("side", "glass"), [("behind", "full"), ("behind", "none"), ("front", "mirror")])
 def test_a_frame_is_an_opening_in_a_black_wall(side, glass):
     scene = a_scene(glass=Glazing(frame_mm=(200, 44)), camera={"position_mm": (0, 0, 250)})
-    light = render_one(scene, side, glass)[..., 0]
+    light = render_image(scene, side, glass)[..., 0]
     assert (light > 0.5).sum(axis=0).tolist() == [16] * 32
 
 
 @pytest.mark.parametrize("radii_mm", [(300.0, -300.0), (-400.0, 900.0)])
-def test_a_lens_bends_light_as_the_lensmakers_formula_says(radii_mm):
-    """A ray through height y of a thin lens meets a plane at y (1 + b / a - b / f)."""
+def test_a_lens_refracts_light_according_to_the_lensmakers_equation(radii_mm):
+    """A ray through height y of a thin lens meets a plane at y (1 + b / a - b / f).
+
+    a and b are the distances of the camera and of the plane from the lens, f is its focal length.
+    """
     near, far = 400.0, 150.0
     glass = Glazing(panes=(Pane(thickness_mm=6.0),), radii_mm=radii_mm, frame_mm=(40.0, 40.0))
     camera = {"position_mm": (0, 0, near), "fov_deg": 2.0}
     scene = a_scene(glass=glass, behind=board("ramp", distance_mm=far, width_mm=100), camera=camera)
-    one, other = radii_mm
-    power = 0.5 * (1 / one - 1 / other + 0.5 * 6 / (1.5 * one * other))
-    assert slope(render_one(scene, "behind", "paper_transmission"), near) * 100 / 0.96**2 == pytest.approx(
+    r1, r2 = radii_mm
+    power = 0.5 * (1 / r1 - 1 / r2 + 0.5 * 6 / (1.5 * r1 * r2))
+    assert slope(render_image(scene, "behind", "paper_transmission"), near) * 100 / 0.96**2 == pytest.approx(
         1 + far / near - far * power, abs=0.02
     )
 
 
-def test_a_curved_mirror_is_the_lenss_own_surface():
+def test_the_mirror_image_of_a_lens_is_that_of_its_first_surface():
     """A sphere's focal length is half its radius: a ray at height y meets a plane at y (1 + b / a + 2 b / r)."""
     glass = Glazing(panes=(Pane(thickness_mm=20),), radii_mm=(300.0, 1000.0), frame_mm=(100.0, 100.0))
     scene = a_scene(glass=glass, front=board("ramp", distance_mm=1000, width_mm=4000), camera={"fov_deg": 2})
-    assert -slope(render_one(scene, "front", "mirror"), 500) * 4000 == pytest.approx(
+    assert -slope(render_image(scene, "front", "mirror"), 500) * 4000 == pytest.approx(
         1 + 1000 / 500 + 2000 / 300, rel=0.01
     )
 
 
-def slope(picture, distance_mm):
-    """How light rises to the right along the first surface, per mm; the view is 2 degrees wide."""
+def slope(image, distance_mm):
+    """The slope of light to the right along the first surface, per mm; the view is 2 degrees wide."""
     half = distance_mm * math.tan(math.radians(1))
-    return np.polyfit(np.linspace(-31 / 32, 31 / 32, 32) * half, picture[..., 0].mean(0), 1)[0]
+    return np.polyfit(np.linspace(-31 / 32, 31 / 32, 32) * half, image[..., 0].mean(0), 1)[0]
 
 
 @pytest.mark.parametrize(
@@ -261,21 +268,22 @@ def slope(picture, distance_mm):
     ids=["knife's edge", "panes that touch", "lens without edge", "sphere too small"],
 )
 def test_impossible_glass_is_refused(glass):
-    with pytest.raises(RecipeError):
+    with pytest.raises(RecipeError, match="expected"):
         traced(a_scene(glass=glass))
 
 
-def test_the_same_seed_gives_the_same_bytes_and_another_one_does_not():
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_gives_other_bytes():
     scene = a_scene(behind=around("mottled"), front=around("mottled"))
-    one, same, other = (
+    first, repeated, reseeded = (
         traced(s, max_samples=16) for s in (scene, scene, scene.model_copy(update={"seed": 1}))
     )
-    for first, second, third in zip(*(s.layers().values() for s in (one, same, other)), strict=True):
-        assert first.numpy().tobytes() == second.numpy().tobytes()
-        assert first.numpy().tobytes() != third.numpy().tobytes()
+    samples = (first, repeated, reseeded)
+    for a, b, c in zip(*(sample.layers().values() for sample in samples), strict=True):
+        assert a.numpy().tobytes() == b.numpy().tobytes()
+        assert a.numpy().tobytes() != c.numpy().tobytes()
 
 
-def test_the_noise_is_as_requested():
+def test_the_noise_is_at_most_the_requested_one():
     scene = a_scene(behind=around("mottled"), front=around("mottled"))
     errors = []
     for noise in (0.05, 0.005):
@@ -288,7 +296,7 @@ def test_the_noise_is_as_requested():
     assert 0.004 < errors[1] < 0.0055
 
 
-def test_denoising_keeps_the_light():
+def test_denoising_removes_noise_and_keeps_the_mean():
     pytest.importorskip("mitsuba_oidn")
     noisy, clean = (
         traced(a_scene(), max_samples=16, denoise=denoise).reflection for denoise in (False, True)

@@ -9,15 +9,15 @@ import pytest
 from brewster.errors import MissingExtra
 from brewster.render.mitsuba import variant
 
-TRACED = """
+TRACING_PROGRAM = """
 import warnings
 from brewster.render.mitsuba.renderer import trace
-from test_mitsuba_renderer import Pictures, a_scene
+from test_mitsuba_renderer import SyntheticAssets, a_scene
 
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     scene = a_scene(camera={"width": 16, "height": 16})
-    light = float(trace(scene, Pictures(), noise=0.01, max_samples=64).photo.mean())
+    light = float(trace(scene, SyntheticAssets(), noise=0.01, max_samples=64).photo.mean())
 assert abs(light - 1) < 0.01, light
 import mitsuba
 from brewster.errors import DeviceError
@@ -26,18 +26,18 @@ loaded = {line.split()[-1].rpartition("/")[2] for line in open("/proc/self/maps"
 print(variant.probe().variant, *loaded)
 print(*{str(warning.message) for warning in caught})
 try:
-    trace(scene, Pictures(), max_samples=4, polarised=True)
+    trace(scene, SyntheticAssets(), max_samples=4, polarised=True)
 except DeviceError as error:
     print(error)
 """
 
 
-def in_a_process(program, **settings):
-    """Runs a program with additional environment variables; returns the finished process."""
+def run_program(program, **variables):
+    """Runs a Python program with additional environment variables. Returns the finished process."""
     folders = os.pathsep.join((os.path.dirname(__file__), os.environ.get("PYTHONPATH", "")))  # noqa: PTH120
     return subprocess.run(
         [sys.executable, "-c", program],
-        env={**os.environ, "PYTHONPATH": folders, **settings},
+        env={**os.environ, "PYTHONPATH": folders, **variables},
         capture_output=True,
         text=True,
         check=False,
@@ -51,39 +51,39 @@ def test_importing_the_renderer_does_not_import_mitsuba():
 
 @pytest.mark.parametrize("name", ["/nonexistent", "libm.so.6"])
 def test_without_a_working_llvm_the_scalar_variant_renders_and_no_llvm_is_loaded(mitsuba, name):
-    done = in_a_process(TRACED, DRJIT_LIBLLVM_PATH=name)
+    done = run_program(TRACING_PROGRAM, DRJIT_LIBLLVM_PATH=name)
     assert done.returncode == 0, done.stderr
-    loaded, warning, refused = done.stdout.splitlines()
+    loaded, warning, error = done.stdout.splitlines()
     assert loaded == "scalar_rgb"
     assert "no LLVM works" in warning
     assert name in warning
     assert variant.INSTALL_LLVM in warning
-    assert variant.INSTALL_LLVM in refused
+    assert variant.INSTALL_LLVM in error
 
 
 def test_the_llvm_of_the_pip_package_comes_first_and_compiles(compiled):
     packaged = variant._packaged_llvm()
     if not packaged:
-        pytest.skip(f"no LLVM of pip: {variant.INSTALL_LLVM}")
-    unnamed = {name: value for name, value in os.environ.items() if name != variant.LLVM_PATH_VARIABLE}
+        pytest.skip(f"the LLVM of the pip package is not installed; run: {variant.INSTALL_LLVM}")
+    environment = {name: value for name, value in os.environ.items() if name != variant.LLVM_PATH_VARIABLE}
     done = subprocess.run(
         [
             sys.executable,
             "-c",
             "from brewster.render.mitsuba import variant; print(variant._candidates()[0])",
         ],
-        env=unnamed,
+        env=environment,
         capture_output=True,
         text=True,
         check=True,
     )
     assert [done.stdout.strip()] == packaged
-    done = in_a_process(TRACED, DRJIT_LIBLLVM_PATH=packaged[0])
+    done = run_program(TRACING_PROGRAM, DRJIT_LIBLLVM_PATH=packaged[0])
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == ["llvm_ad_rgb", os.path.basename(packaged[0])]  # noqa: PTH119
 
 
-def test_an_exception_of_another_library_is_still_caught_next_to_the_llvm_of_the_package(compiled):
+def test_exceptions_of_other_libraries_are_caught_when_the_llvm_of_the_package_is_loaded(compiled):
     """If the C++ runtime of the package were in the global scope, the process would end."""
     program = """
 import numpy
@@ -97,7 +97,7 @@ for fails in (lambda: mitsuba.load_dict({"type": "nonsense"}), lambda: OpenEXR.F
     except RuntimeError:
         print("caught")
 """
-    assert in_a_process(program).stdout.split() == ["caught", "caught"]
+    assert run_program(program).stdout.split() == ["caught", "caught"]
 
 
 def test_an_llvm_that_aborts_is_reported_in_one_line(monkeypatch):
@@ -118,7 +118,7 @@ def test_known_good_llvm_versions_are_tried_first(tmp_path, monkeypatch):
     assert names == ["libLLVM.so.19.1", "libLLVM-18.so.1", "libLLVM.so.21.0", None]
 
 
-def test_an_imported_drjit_has_loaded_its_llvm_so_that_no_other_is_tried(monkeypatch):
+def test_no_other_llvm_is_tried_once_drjit_is_imported(monkeypatch):
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     monkeypatch.setitem(sys.modules, "drjit", None)
     assert variant._candidates() == [None]
@@ -134,7 +134,7 @@ def test_a_missing_mitsuba_is_reported_with_its_install_command(monkeypatch):
 def test_a_missing_libatomic_is_reported_with_its_install_command(mitsuba, tmp_path):
     (tmp_path / "libatomic.so.1").touch()  # found first, but not a valid library
     program = "from brewster.render.mitsuba import variant; variant.load()"
-    done = in_a_process(program, LD_LIBRARY_PATH=str(tmp_path))
+    done = run_program(program, LD_LIBRARY_PATH=str(tmp_path))
     message = done.stderr.splitlines()[-1]
     assert "MissingExtra: mitsuba cannot be imported" in message
     assert "libatomic.so.1" in message

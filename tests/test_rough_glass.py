@@ -13,66 +13,69 @@ from brewster.scene.glass import Glazing, Pane
 from worlds_of_one import WORLDS, a_scene, around, at, soft
 
 
-def rough(alpha, count=1, samples=16, **more):
+def rough_scene(alpha, count=1, samples=16, **more):
     return a_scene(**{"camera": at(20), "panes": [{"roughness": alpha}] * count, "samples": samples, **more})
 
 
-def mean(picture):
-    return float(picture.mean())
+def mean(image):
+    return float(image.mean())
 
 
 def test_smooth_glass_is_the_limit_of_rough_glass():
     sides = {"behind": around("soft", heading_deg=50), "front": around("soft")}
-    polished, nearly = (render(rough(alpha, samples=64, **sides), WORLDS) for alpha in (0.0, 1e-3))
-    assert mean(nearly.transmission) == pytest.approx(mean(polished.transmission), rel=2e-3)
-    assert mean(nearly.reflection) == pytest.approx(mean(polished.reflection), rel=5e-3)
+    smooth, nearly_smooth = (render(rough_scene(alpha, samples=64, **sides), WORLDS) for alpha in (0.0, 1e-3))
+    assert mean(nearly_smooth.transmission) == pytest.approx(mean(smooth.transmission), rel=2e-3)
+    assert mean(nearly_smooth.reflection) == pytest.approx(mean(smooth.reflection), rel=5e-3)
 
 
 @pytest.mark.parametrize(("alpha", "count"), [(0.02, 1), (0.05, 1), (0.05, 2)])
 def test_in_uniform_light_rough_glass_creates_no_light_and_loses_little(alpha, count):
-    sample = render(rough(alpha, count, samples=2 if count == 2 else 16), WORLDS)
-    whole = mean(sample.transmission) + mean(sample.reflection)
-    assert 0.985 < whole < 1.003
+    sample = render(rough_scene(alpha, count, samples=2 if count == 2 else 16), WORLDS)
+    total = mean(sample.transmission) + mean(sample.reflection)
+    assert 0.985 < total < 1.003
     smooth = all_orders(Glazing(panes=(Pane(),) * count, gap_mm=9), torch.tensor(0.94))
     assert mean(sample.reflection) == pytest.approx(float(smooth.reflected), rel=0.05)
 
 
-def test_the_rougher_the_glass_the_softer_an_edge_behind_it():
-    edges = []
+def test_rougher_glass_blurs_an_edge_behind_it_more():
+    steepness = []
     for alpha in (0.01, 0.05, 0.15):
-        scene = rough(alpha, samples=8, camera=at(0, fov_deg=60), behind=around("right", heading_deg=180))
+        scene = rough_scene(
+            alpha, samples=8, camera=at(0, fov_deg=60), behind=around("right", heading_deg=180)
+        )
         columns = render(scene, WORLDS).transmission.mean((0, 1))
-        edges.append(float(columns.diff().max()))
-    assert edges[0] > 1.2 * edges[1] > 1.5 * edges[2]
+        steepness.append(float(columns.diff().max()))
+    assert steepness[0] > 1.2 * steepness[1] > 1.5 * steepness[2]
 
 
 @pytest.mark.parametrize(("alpha", "radius_mm"), [(0.1, float("inf")), (0.3, 2500.0)], ids=["far", "dome"])
 def test_light_sampling_does_not_change_the_mean(monkeypatch, alpha, radius_mm):
-    """A white furnace test with a light gradient."""
+    """The same light with a smooth gradient surrounds the glass on both sides."""
     side = around("soft", heading_deg=30, radius_mm=radius_mm)
-    scene = rough(alpha, samples=32, behind=side, front=side)
-    both = render(scene, WORLDS)
+    scene = rough_scene(alpha, samples=32, behind=side, front=side)
+    combined = render(scene, WORLDS)
     monkeypatch.setattr(rough_glass, "_MIN_LIGHT_SAMPLING_WEIGHT", 2.0)
-    alone = render(scene, WORLDS)
-    assert not torch.equal(both.photo, alone.photo)
-    assert mean(both.photo) == pytest.approx(mean(alone.photo), rel=5e-3)
-    assert mean(both.transmission) == pytest.approx(mean(alone.transmission), rel=5e-3)
-    assert mean(both.reflection) == pytest.approx(mean(alone.reflection), rel=0.02)  # a noisy eighth of it
+    facets_only = render(scene, WORLDS)
+    assert not torch.equal(combined.photo, facets_only.photo)
+    assert mean(combined.photo) == pytest.approx(mean(facets_only.photo), rel=5e-3)
+    assert mean(combined.transmission) == pytest.approx(mean(facets_only.transmission), rel=5e-3)
+    # The reflection is a small part of the light, so its mean has more noise.
+    assert mean(combined.reflection) == pytest.approx(mean(facets_only.reflection), rel=0.02)
 
 
 def test_light_sampling_halves_the_noise_of_a_small_sun_in_frosted_glass(monkeypatch):
     WORLDS.pictures["lamp"] = soft(64) * 0.02
     WORLDS.pictures["lamp"][30:32, :2] += 500
-    scene = rough(0.2, samples=16, camera=at(0), behind=around("lamp", heading_deg=5))
-    both = render(scene, WORLDS).transmission
+    scene = rough_scene(0.2, samples=16, camera=at(0), behind=around("lamp", heading_deg=5))
+    combined = render(scene, WORLDS).transmission
     monkeypatch.setattr(rough_glass, "_MIN_LIGHT_SAMPLING_WEIGHT", 2.0)
-    alone = render(scene, WORLDS).transmission
-    assert mean(both) == pytest.approx(mean(alone), rel=0.1)
+    facets_only = render(scene, WORLDS).transmission
+    assert mean(combined) == pytest.approx(mean(facets_only), rel=0.1)
 
-    def grain(picture):
-        return float(picture.diff(dim=2).abs().mean() / picture.mean())
+    def relative_noise(image):
+        return float(image.diff(dim=2).abs().mean() / image.mean())
 
-    assert grain(both) < grain(alone) / 2
+    assert relative_noise(combined) < relative_noise(facets_only) / 2
 
 
 def test_visible_normals_are_sampled_with_their_density():
@@ -80,22 +83,22 @@ def test_visible_normals_are_sampled_with_their_density():
     generator = torch.Generator().manual_seed(1)
     normal = torch.tensor([[0.0], [0.0], [1.0]])
     for alpha in (0.1, 0.4):
-        towards = torch.tensor([[0.6], [0.0], [0.8]]).expand(3, 200_000)
-        facet = sample_visible_normal(towards, normal, alpha, torch.rand(2, 200_000, generator=generator))
-        cosine = (facet * towards).sum(0).clamp(min=0)
-        density = vndf_over_cosine(towards, normal, facet, alpha) * cosine
-        inside = facet[2] > 0.95
-        assert float((inside / density).mean()) == pytest.approx(2 * np.pi * 0.05, rel=0.02)
+        wi = torch.tensor([[0.6], [0.0], [0.8]]).expand(3, 200_000)
+        facet = sample_visible_normal(wi, normal, alpha, torch.rand(2, 200_000, generator=generator))
+        cosine = (facet * wi).sum(0).clamp(min=0)
+        density = vndf_over_cosine(wi, normal, facet, alpha) * cosine
+        is_inside = facet[2] > 0.95
+        assert float((is_inside / density).mean()) == pytest.approx(2 * np.pi * 0.05, rel=0.02)
         assert facet.norm(dim=0) == pytest.approx(1, abs=1e-5)
 
 
 def test_smith_g1_is_one_at_normal_incidence_and_falls_towards_grazing_angles():
-    above, slanted, grazing = smith_g1(torch.tensor([1.0, 0.5, 0.05]), 0.4)
-    assert float(above) == 1
-    assert 1 > float(slanted) > float(grazing) > 0
+    normal, oblique, grazing = smith_g1(torch.tensor([1.0, 0.5, 0.05]), 0.4)
+    assert float(normal) == 1
+    assert 1 > float(oblique) > float(grazing) > 0
 
 
-def test_surfaces_are_ordered_from_the_camera_on():
+def test_the_first_surface_is_the_one_nearest_to_the_camera():
     glass = Glazing(panes=(Pane(thickness_mm=4), Pane(thickness_mm=6, wedge_deg=1)), gap_mm=10)
     stack = surfaces(glass, torch.zeros(1))
     assert [surface.height_mm for surface in stack] == [0, -4, -14, -20]

@@ -1,1 +1,1 @@
-"""Renders a scene into five linear images, and simulates the photograph that a camera would take of them."""
+"""Renders the five linear images of a scene, and simulates the camera that turns them into photographs."""

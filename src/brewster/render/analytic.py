@@ -5,8 +5,8 @@
 Smooth parallel panes need no Monte Carlo integration. All orders leave such a glazing in the same direction, so light
 from infinity needs one lookup behind the glass and one in front of it; near content needs one lookup per order, each
 shifted along the glass. Defocus of light from infinity is a convolution, because that light depends on the direction
-alone. Monte Carlo integration remains for a lens with near content, for wedges and for rough glass (`rough_glass`);
-its random numbers are the same on every device.
+alone. Monte Carlo integration is used only for a lens with near content, for wedges and for rough glass
+(`rough_glass`); its random numbers are the same on every device.
 """
 
 from __future__ import annotations
@@ -41,15 +41,18 @@ from brewster.scene.scene import Scene
 
 _MERGE_DISTANCE_PX = 0.1  # orders whose images are closer than this share one lookup
 _MAX_TABLE_REFLECTANCE = 0.08
-"""Upper limit of the reflectance for which orders are enumerated. At grazing angles the true value would give very many;
-order weights stay exact, and the light of the orders left out falls on the last order of its side."""
+"""Upper limit of the reflectance for which orders are enumerated. At grazing angles the true value would give too many
+orders. The throughput of each order is exact; the last order of each side also gets the light of the orders left out."""
 _CPU_BATCH_RAYS = 1 << 15  # small enough for the cache of a CPU
 _GPU_BATCH_RAYS = 1 << 20
 
 
 @dataclass(frozen=True)
 class _PreparedSide:
-    """One side of the glass: its emitters, and its orders in groups whose images coincide."""
+    """One side of the glass: its emitters, the depth of the surface where light exits, and its orders.
+
+    The images of the orders in a group coincide; each group needs one lookup.
+    """
 
     emitters: SideEmitters
     depth_mm: float
@@ -76,13 +79,13 @@ def render(scene: Scene, assets: Assets, device: Device = "cpu") -> LightSample:
         Linear light, float32 (3, H, W) each, on `device`.
 
     Raises:
-        RecipeError: the glass is framed or curved, which only Mitsuba renders, or a file is missing.
+        RecipeError: the glass is framed or curved (only Mitsuba renders it), or a file is missing.
         PhotoError: a file cannot be decoded, or is not an environment map.
     """
     if not scene.glass.is_flat:
         raise RecipeError(
             "the glass is framed or curved",
-            "the analytic renderer takes flat glass that fills the view",
+            "the analytic renderer expected flat glass that fills the view",
             "use --renderer mitsuba",
         )
     prepared = _prepare(scene, assets, device)
@@ -96,7 +99,7 @@ def render(scene: Scene, assets: Assets, device: Device = "cpu") -> LightSample:
 
 
 def ghost_distance_px(scene: Scene) -> float:
-    """Distance in pixels between the first two mirror images at the image centre; 0 for content at infinity."""
+    """Distance in pixels between the first two reflections of a point at the image centre; 0 if it is at infinity."""
     _, _, normal = axes(scene.glass.heading_deg, scene.glass.pitch_deg)
     _, _, back = axes(scene.camera.heading_deg, scene.camera.pitch_deg)
     incidence = math.degrees(math.acos(min(1.0, dot(back, normal))))
@@ -134,13 +137,13 @@ def _prepare_side(
 
 
 def _needs_monte_carlo(scene: Scene) -> bool:
-    """Rough or wedged glass, and a lens with near content, whose blur is not the same everywhere."""
+    """Whether the glass is rough or wedged, or a lens sees near content, whose blur varies over the image."""
     is_near = math.isfinite(min(scene.behind.distance_mm, scene.front.distance_mm))
     return scene.glass.is_rough or scene.glass.is_wedged or (scene.camera.aperture_mm > 0 and is_near)
 
 
 def _render_deterministic(prepared: _PreparedScene) -> list[Tensor]:
-    """A regular grid of rays in each pixel, as dense as the textures need, then the defocus blur if any."""
+    """Traces a regular grid of rays in each pixel, then blurs by the lens: I, T, B, R and MR, (3, H, W) each."""
     camera = prepared.scene.camera
     margin = margin_px(camera)
     width, height = camera.width + 2 * margin, camera.height + 2 * margin
@@ -155,7 +158,7 @@ def _render_deterministic(prepared: _PreparedScene) -> list[Tensor]:
 
 
 def _grid_size(prepared: _PreparedScene) -> int:
-    """Rays per pixel and axis: three per texel, limited by `samples`; with fewer, textures are filtered more."""
+    """Rays per pixel and axis: ceil(3 * texels per pixel), at most sqrt(samples); textures are filtered to match."""
     finest = max(side.emitters.texels_per_pixel() for side in (prepared.behind, prepared.front))
     return min(max(1, math.ceil(3 * finest)), math.isqrt(prepared.scene.samples))
 
@@ -188,7 +191,11 @@ def _pinhole_rays(
 
 
 def _render_monte_carlo(prepared: _PreparedScene, device: Device) -> list[Tensor]:
-    """`samples` random rays per pixel, over the pixel, the lens and, for rough glass, the microfacets."""
+    """Traces `samples` random rays per pixel, over the pixel, the lens and the microfacets of rough glass.
+
+    Returns:
+        I, T, B, R and MR, (3, H, W) each.
+    """
     scene, camera = prepared.scene, prepared.scene.camera
     count = camera.width * camera.height
     sobol = SobolPoints(scene.seed, scene.index, count, scene.samples, device)
@@ -196,8 +203,8 @@ def _render_monte_carlo(prepared: _PreparedScene, device: Device) -> list[Tensor
     total = torch.zeros(5, 3, count, device=prepared.origin.device)
     for start in range(0, count, _CPU_BATCH_RAYS):
         pixels = slice(start, min(start + _CPU_BATCH_RAYS, count))
-        for number in range(scene.samples):
-            sobol.start_sample(number, pixels)
+        for sample in range(scene.samples):
+            sobol.start_sample(sample, pixels)
             rays = _thin_lens_rays(prepared, pixels, sobol)
             total[:, :, pixels] += torch.stack(trace(prepared, rays, sobol))
     return list((total / scene.samples).view(5, 3, camera.height, camera.width))
@@ -216,7 +223,7 @@ def _thin_lens_rays(prepared: _PreparedScene, pixels: slice, sobol: SobolPoints)
         x, y = sobol.next_disc() * (camera.aperture_mm / 2)
         lens = _outer(prepared.right, x) + _outer(prepared.up, y)
         origin, direction = origin + lens, direction - lens / camera.focus_mm
-    # Half the mean distance of the samples in a pixel: the average over the samples does the rest of the filtering.
+    # Half the mean distance of the samples in a pixel: the average over the samples filters, too.
     return Rays(origin, normalize(direction), 1 / (2 * math.sqrt(prepared.scene.samples)))
 
 
@@ -229,40 +236,46 @@ def _trace_smooth(prepared: _PreparedScene, rays: Rays, _: SobolPoints | None = 
     glass = prepared.scene.glass
     point, mirrored = _mirror_at_first_surface(rays)
     cosine = mirrored[2]
-    everything = all_orders(glass, cosine)
-    kept = paper_orders(glass, cosine) if prepared.scene.orders == "paper" else everything
+    complete = all_orders(glass, cosine)
+    in_layers = paper_orders(glass, cosine) if prepared.scene.orders == "paper" else complete
     layers = []
-    for side, origin, direction, all_throughput, layer_throughput in (
-        (prepared.behind, rays.origin, rays.direction, everything.transmitted, kept.transmitted),
-        (prepared.front, point, mirrored, everything.reflected, kept.reflected),
+    for side, origin, direction, total_throughput, layer_throughput in (
+        (prepared.behind, rays.origin, rays.direction, complete.transmitted, in_layers.transmitted),
+        (prepared.front, point, mirrored, complete.reflected, in_layers.reflected),
     ):
         far = side.emitters.far_radiance(direction, rays.footprint_px)
         unattenuated = side.emitters.add_near(far, origin, direction, rays.footprint_px)
         if len(side.groups) > 1:
             total, layer = _shifted_orders(prepared, side, Rays(point, direction, rays.footprint_px), far)
         else:
-            total = all_throughput * unattenuated
-            layer = layer_throughput * unattenuated if kept is not everything else total
+            total = total_throughput * unattenuated
+            layer = layer_throughput * unattenuated if in_layers is not complete else total
         layers.append((total, layer, unattenuated))
-    (through, transmission, background), (back, reflection, mirror) = layers
-    return [through + back, transmission, background, reflection, mirror]
+    (transmitted, transmission, background), (reflected, reflection, mirror) = layers
+    return [transmitted + reflected, transmission, background, reflection, mirror]
 
 
 def _shifted_orders(
-    prepared: _PreparedScene, side: _PreparedSide, leaving: Rays, far: Tensor | None
+    prepared: _PreparedScene, side: _PreparedSide, exiting: Rays, far: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Near light of one side, looked up at the exit point of each group: the sum of all orders, and that of T or R."""
-    glass, direction = prepared.scene.glass, leaving.direction
+    """The light of a side with near content, looked up once per group, at the exit point of its first order.
+
+    `exiting` are the rays after the glass, with their points on the first surface; `far` is their light from infinity.
+
+    Returns:
+        The sum of all orders, and the sum of the orders in T or R, (3, N) each.
+    """
+    glass, direction = prepared.scene.glass, exiting.direction
     cosine = direction[2].abs()
     shifts = lateral_shifts_mm(glass, cosine)
     in_plane = normalize(direction * direction.new_tensor([1, 1, 0])[:, None])
-    surface = leaving.origin.clone()
+    surface = exiting.origin.clone()
     surface[2] = -side.depth_mm
     throughputs = iter(order_throughputs(glass, cosine, [order for group in side.groups for order in group]))
     total, layer = torch.zeros_like(direction), torch.zeros_like(direction)
     for group in side.groups:
         exit_point = surface + in_plane * _lateral_shift(group[0], shifts)
-        radiance = side.emitters.add_near(far, exit_point, direction, leaving.footprint_px)
+        radiance = side.emitters.add_near(far, exit_point, direction, exiting.footprint_px)
         weights = list(zip(group, throughputs, strict=False))
         total += sum((weight for _, weight in weights), torch.zeros_like(cosine)) * radiance
         if prepared.scene.orders == "paper":
@@ -278,9 +291,12 @@ def _lateral_shift(order: ReflectionOrder, shifts: list[Tensor]) -> Tensor:
 
 
 def _group_orders(scene: Scene, emitters: SideEmitters, *, behind: bool) -> list[list[ReflectionOrder]]:
-    """The side's orders, brightest first, grouped with those whose image is less than a tenth of a pixel away.
+    """Groups the orders of one side whose images are less than `_MERGE_DISTANCE_PX` apart.
 
     Distances are measured in the corner of the view with the largest angle of incidence, where they are greatest.
+
+    Returns:
+        The groups; the brightest order of each is first. No group if the side has only light from infinity.
     """
     if not emitters.is_near:
         return []
@@ -314,17 +330,17 @@ def _trace_rough(prepared: _PreparedScene, rays: Rays, sobol: SobolPoints) -> li
     zeros = torch.zeros(2, *rays.direction.shape, device=rays.direction.device)
     sides = {True: zeros, False: zeros.clone()}
     emitters = prepared.behind.emitters, prepared.front.emitters
-    for part in trace_orders(prepared.scene.glass, rays, *emitters, sobol):
-        sides[part.behind][0] += part.light
-        sides[part.behind][1] += part.light * (prepared.scene.orders == "all" or part.in_paper)
-    (through, transmission), (back, reflection) = sides[True], sides[False]
+    for exiting in trace_orders(prepared.scene.glass, rays, *emitters, sobol):
+        sides[exiting.behind][0] += exiting.light
+        sides[exiting.behind][1] += exiting.light * (prepared.scene.orders == "all" or exiting.in_paper)
+    (transmitted, transmission), (reflected, reflection) = sides[True], sides[False]
     point, mirrored = _mirror_at_first_surface(rays)
     background = prepared.behind.emitters.radiance(rays.origin, rays.direction, rays.footprint_px)
     mirror = prepared.front.emitters.radiance(point, mirrored, rays.footprint_px)
-    return [through + back, transmission, background, reflection, mirror]
+    return [transmitted + reflected, transmission, background, reflection, mirror]
 
 
 def _mirror_at_first_surface(rays: Rays) -> tuple[Tensor, Tensor]:
-    """Where rays meet the glass, and their directions after a perfect mirror there; (3, N) each."""
+    """Intersects rays with the first surface: the points and the directions after a perfect mirror, (3, N) each."""
     point = rays.origin - rays.direction * (rays.origin[2] / rays.direction[2])
     return point, rays.direction * rays.direction.new_tensor([1, 1, -1])[:, None]

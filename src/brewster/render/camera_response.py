@@ -1,10 +1,10 @@
-"""Simulates a camera: turns the five linear images of a sample into sRGB photographs with one setting for all.
+"""Simulates a camera: converts the five linear images of a sample into sRGB photographs.
 
     developed = develop(sample)
     encode_jpeg(developed.photo_encoded, 90)
 
-Exposure, white balance and tone curve are determined on I and applied to I, T, B and R alike, so that layers which add
-up in light still belong together. MR is often far brighter and has its own exposure. Only I has noise.
+Exposure and white balance are computed from I and applied, with the same tone curve, to I, T, B and R alike: equal light
+has equal values in all of them. MR is often far brighter and has its own exposure. Only I has noise.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from brewster.scene.scene import Development, Scene
 from brewster.srgb import REC709_LUMINANCE, to_encoded
 
 _EV_RANGE: Final = (-64.0, 32.0)
-"""Limits of the exposure in stops: wide enough for the brightest lamps; nearly black images stay dark."""
+"""Limits of the exposure in stops: low enough for the brightest lamps; at the upper limit, nearly black images stay dark."""
 
-_MAX_REACHABLE_SHARE: Final = 0.995
-"""Share of the highest possible mean that exposure aims for; the last half per cent would need a huge gain."""
+_MAX_TARGET_SHARE: Final = 0.995
+"""The target is at most this share of the highest possible mean; the last half per cent would need a huge gain."""
 
 _MAX_GAIN: Final = 3.0
-"""White balance multiplies or divides a channel by this at most."""
+"""White balance multiplies or divides a channel by at most this factor."""
 
 _MINKOWSKI_NORM: Final = 6
-"""Norm over the edges in grey-edge; the value that van de Weijer et al. found best."""
+"""Order p of the Minkowski norm over the edges in grey-edge; van de Weijer et al. found this value best."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class DevelopedSample:
     mirror_exposure_ev: float
     white_balance: tuple[float, float, float]
     overexposed: float
-    """The share of I's pixels with any channel at white."""
+    """The share of the pixels of I in which at least one channel clips, 0..1."""
 
     def layers(self) -> dict[str, Tensor]:
         """The five encoded images by name."""
@@ -76,7 +76,7 @@ def develop(sample: LightSample) -> DevelopedSample:
     """Applies exposure, white balance, noise and tone curve, as the scene's `development` describes them.
 
     Exposure is rounded to a thousandth of a stop before it is applied, and gains to four decimals. So the recorded
-    values are exactly the applied ones, and devices that sum in a different order agree.
+    values are exactly the applied ones, and rounding errors of different devices do not change them.
     """
     development = sample.scene.development
     white_balance = _white_balance(sample.photo, development)
@@ -120,9 +120,9 @@ def with_jpeg(developed: DevelopedSample) -> DevelopedSample:
 
 
 def _tone_curve(linear: Tensor, contrast: float) -> Tensor:
-    """Clips and sRGB-encodes light, then blends with the smoothstep of the encoded values by `contrast`.
+    """Encodes light: v + contrast * (smoothstep(v) - v), where v is the clipped light in sRGB encoding.
 
-    A negative contrast moves away from the smoothstep, which flattens the curve.
+    A contrast above 0 makes the curve steeper in the middle, a contrast below 0 flatter.
     """
     encoded = to_encoded(linear.clamp(0, 1)).clamp(0, 1)
     smooth = encoded * encoded * (3 - 2 * encoded)
@@ -140,15 +140,15 @@ def luminance(colour: Tensor) -> float:
 def _exposure_ev(light: Tensor, target: float) -> float:
     """The exposure in stops at which the mean luminance of light (3, H, W), clipped at white, is `target`.
 
-    The mean never falls as exposure rises, so bisection finds it. If too much of the image is black to reach the
-    target, the result is where nearly everything else is white. A black image gets 0.
+    The mean is a monotonic function of the exposure, so bisection finds the solution. If black pixels make the target
+    unreachable, the result turns nearly all other pixels white. It is 0 for a black image.
     """
 
     def mean(ev: float) -> float:
         return luminance((light * math.exp2(ev)).clamp_(0, 1).mean((1, 2)))
 
     low, high = _EV_RANGE
-    target = min(target, _MAX_REACHABLE_SHARE * mean(high))
+    target = min(target, _MAX_TARGET_SHARE * mean(high))
     if target <= 0:
         return 0.0
     while high - low > 2e-4:
@@ -163,8 +163,8 @@ def _exposure_ev(light: Tensor, target: float) -> float:
 def _white_balance(photo: Tensor, development: Development) -> tuple[float, float, float]:
     """RGB gains that correct the illuminant's colour by the requested strength and keep its luminance.
 
-    The colour is estimated on the exposed image, without pixels that clip in any channel: their colour is lost in a
-    camera too. If all pixels clip, all of them are used.
+    The colour is estimated on the exposed image, without pixels that clip in any channel, because a camera
+    loses their colour, too. If all pixels clip, all of them are used.
     """
     if development.white_balance == "none":
         return 1.0, 1.0, 1.0
@@ -176,12 +176,12 @@ def _white_balance(photo: Tensor, development: Development) -> tuple[float, floa
 
 def _gains(colour: Tensor, strength: float) -> tuple[float, float, float]:
     """RGB gains for an illuminant's colour (3,); all 1 if it is nearly black, and so has no colour."""
-    before = luminance(colour)
-    if before < 1e-9:
+    brightness = luminance(colour)
+    if brightness < 1e-9:
         return 1.0, 1.0, 1.0
-    full = before / colour.clamp(min=before * 1e-6)
+    full = brightness / colour.clamp(min=brightness * 1e-6)
     partial = full**strength
-    normalised = partial * (before / luminance(colour * partial))
+    normalised = partial * (brightness / luminance(colour * partial))
     red, green, blue = normalised.clamp(1 / _MAX_GAIN, _MAX_GAIN).tolist()
     return round(red, 4), round(green, 4), round(blue, 4)
 
@@ -192,7 +192,10 @@ def _grey_world(image: Tensor, valid: Tensor) -> Tensor:
 
 
 def _white_patch(image: Tensor, valid: Tensor) -> Tensor:
-    """White-patch: the brightest surface is white (E. H. Land, Scientific American 237, 1977); 99th percentile."""
+    """White-patch: the brightest surface is white (E. H. Land, Scientific American 237, 1977).
+
+    The 99th percentile of each channel stands for the brightest surface, so that single pixels do not matter.
+    """
     values = image[:, valid]
     return values.kthvalue(math.ceil(0.99 * values.shape[1]), dim=1).values
 
@@ -206,9 +209,9 @@ def _grey_edge(image: Tensor, valid: Tensor) -> Tensor:
     first, second = image[:, 1:, 1:] - image[:, :-1, :-1], image[:, 1:, :-1] - image[:, :-1, 1:]
     all_valid = valid[1:, 1:] & valid[:-1, :-1] & valid[1:, :-1] & valid[:-1, 1:]
     edges = torch.hypot(first, second)[:, all_valid]
-    # Scaled to 1 first: sixth powers of small differences would underflow float32.
-    steepest = edges.max().clamp(min=1e-12) if edges.numel() else 1.0
-    colour: Tensor = torch.linalg.vector_norm(edges / steepest, _MINKOWSKI_NORM, dim=1)
+    # Scale the maximum to 1 first: sixth powers of small differences would underflow float32.
+    max_edge = edges.max().clamp(min=1e-12) if edges.numel() else 1.0
+    colour: Tensor = torch.linalg.vector_norm(edges / max_edge, _MINKOWSKI_NORM, dim=1)
     return colour
 
 
@@ -217,7 +220,7 @@ _ILLUMINANT_ESTIMATORS: Final[dict[str, Callable[[Tensor, Tensor], Tensor]]] = {
     "white-patch": _white_patch,
     "grey-edge": _grey_edge,
 }
-"""Functions from an image (3, H, W) in 0..1 and a mask of valid pixels (H, W) to the illuminant's colour (3,), unscaled."""
+"""Functions from an image (3, H, W) in 0..1 and a mask of valid pixels (H, W) to the illuminant's colour (3,), up to a factor."""
 
 
 # --- noise

@@ -1,1 +1,1 @@
-"""The reference renderer: path tracing by Mitsuba 3, which validates the analytic renderer."""
+"""The reference renderer: path tracing by Mitsuba 3, to validate the analytic renderer."""

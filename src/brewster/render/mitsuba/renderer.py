@@ -2,9 +2,9 @@
 
     sample = trace(scene, Assets([Path("hdri")]), noise=0.01)
 
-It shares no optics code with the analytic renderer, so that the two check each other. Each image is lit from one side
-of the glass only; objects of the other side are black. Light is additive: I is the sum of the image lit from behind
-and the image lit from the front.
+It shares no optics code with the analytic renderer, so that each validates the other. Each image is lit from one side of
+the glass only; objects on the other side are black. Light is additive: I is the sum of the image lit from behind and the
+image lit from the front.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _POLARISED: Final = "llvm_ad_mono_polarized"
 _MIN_PASSES: Final = 4
 """Fewer passes give no useful estimate of the variance."""
 _MAX_RAYS_PER_PASS: Final = 1 << 22
-"""Needs about 1 GB of memory."""
+"""As many rays need about 1 GB of memory."""
 _RELATIVE_FLOOR: Final = 0.01
 """Share of the mean light added to each pixel before its relative error is computed, so that black pixels have one."""
 
@@ -58,9 +58,9 @@ def trace(
 
     Args:
         scene: what to render.
-        assets: where its files are.
-        noise: the relative error at which an image is finished.
-        max_samples: the most rays per pixel and image.
+        assets: the source of its maps and pictures.
+        noise: the relative error below which an image is finished.
+        max_samples: maximum number of rays per pixel and image.
         denoise: whether Intel Open Image Denoise filters the result.
         polarised: whether polarisation is traced.
 
@@ -69,7 +69,7 @@ def trace(
 
     Raises:
         MissingExtra: mitsuba cannot be imported, or `denoise` is set and mitsuba-oidn is not installed.
-        DeviceError: `polarised` is set and there is no working LLVM.
+        DeviceError: `polarised` is set, and no LLVM works.
         RecipeError: a wedge or lens has no thickness somewhere in the view, or a file is missing.
         PhotoError: a file cannot be decoded, or is not an environment map.
     """
@@ -85,13 +85,13 @@ def trace(
 @contextmanager
 def _active_variant(mi: ModuleType, name: str) -> Iterator[None]:
     """Selects a variant of Mitsuba, which is global to the process, and restores the previous one afterwards."""
-    before = mi.variant()
+    previous = mi.variant()
     mi.set_variant(name)
     try:
         yield
     finally:
-        if before:
-            mi.set_variant(before)
+        if previous:
+            mi.set_variant(previous)
 
 
 def _variant(polarised: bool) -> str:
@@ -99,7 +99,7 @@ def _variant(polarised: bool) -> str:
     if polarised and name != COMPILED:
         raise DeviceError(
             "polarised light cannot be traced",
-            "tracing it needs a working LLVM",
+            "expected a working LLVM",
             f"install LLVM 17 or newer: {INSTALL_LLVM}",
         )
     return _POLARISED if polarised else name
@@ -115,15 +115,16 @@ def _render_layers(
         _converge(estimates, noise, max_samples)
         return estimates
 
-    through, back = estimate((True, "full"), (False, "full"))
-    parts = {"transmission": through, "reflection": back}
+    lit_from_behind, lit_from_front = estimate((True, "full"), (False, "full"))
+    estimates = {"transmission": lit_from_behind, "reflection": lit_from_front}
     if scene.orders == "paper":
-        [parts["transmission"]] = estimate((True, "paper_transmission"))
-        [parts["reflection"]] = estimate((False, "paper_reflection"))
+        [estimates["transmission"]] = estimate((True, "paper_transmission"))
+        [estimates["reflection"]] = estimate((False, "paper_reflection"))
     [background] = estimate((True, "none"))
     [mirror] = estimate((False, "mirror"))
-    layers = {name: estimate.light for name, estimate in parts.items()}
-    layers |= {"photo": through.light + back.light, "background": background.light, "mirror": mirror.light}
+    layers = {name: image.light for name, image in estimates.items()}
+    layers["photo"] = lit_from_behind.light + lit_from_front.light
+    layers |= {"background": background.light, "mirror": mirror.light}
     return LightSample(scene, **{name: _to_tensor(light, denoise) for name, light in layers.items()})
 
 
@@ -140,13 +141,13 @@ def _denoiser() -> ModuleType:
     except ImportError as error:
         raise MissingExtra(
             "mitsuba_oidn is not installed",
-            "denoising needs it",
+            "expected it for denoising",
             "run: pip install 'brewster[render]'",
         ) from error
 
 
 class _RunningEstimate:
-    """The mean of an image over its passes so far, and the variance of that mean per pixel."""
+    """An image rendered in passes: the mean of the passes so far, and the variance of this mean per pixel."""
 
     def __init__(
         self, builders: Sequence[MitsubaSceneBuilder], behind: bool, glass: GlassMode, max_samples: int
@@ -186,20 +187,23 @@ class _RunningEstimate:
 
 
 def _samples_per_pass(pixels: int, max_samples: int) -> int:
-    """Rays per pixel and pass: a square number, which the sampler stratifies evenly, that memory and the passes allow."""
-    most = min(max_samples // _MIN_PASSES, _MAX_RAYS_PER_PASS // pixels)
-    return next((samples for samples in (64, 16, 4) if samples <= most), 1)
+    """Rays per pixel and pass: 64, 16, 4 or 1, as many as the memory and `_MIN_PASSES` passes allow.
+
+    These are square numbers, which the sampler stratifies evenly.
+    """
+    limit = min(max_samples // _MIN_PASSES, _MAX_RAYS_PER_PASS // pixels)
+    return next((samples for samples in (64, 16, 4) if samples <= limit), 1)
 
 
 def _converge(estimates: Sequence[_RunningEstimate], noise: float, max_samples: int) -> None:
-    """Adds passes until the sum of the images is accurate enough; each pass goes to the image with the largest error."""
+    """Adds passes until the error of the sum is at most `noise`; each pass is for the image with the largest error."""
     for estimate in estimates:
         for _ in range(_MIN_PASSES):
             estimate.add_pass()
-    while pending := [one for one in estimates if (one.passes + 1) * one.samples <= max_samples]:
-        light = np.sum([one.light.mean(axis=2) for one in estimates], axis=0)
+    while pending := [image for image in estimates if (image.passes + 1) * image.samples <= max_samples]:
+        light = np.sum([image.light.mean(axis=2) for image in estimates], axis=0)
         scale = light + _RELATIVE_FLOOR * light.mean() + np.finfo(np.float32).tiny
-        variances = [one.variance for one in estimates]
+        variances = [image.variance for image in estimates]
         if (np.sqrt(np.sum(variances, axis=0)) / scale).mean() <= noise:
             return
-        max(pending, key=lambda one: float((np.sqrt(one.variance) / scale).mean())).add_pass()
+        max(pending, key=lambda image: float((np.sqrt(image.variance) / scale).mean())).add_pass()

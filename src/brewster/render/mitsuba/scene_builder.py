@@ -1,9 +1,9 @@
 """Builds Mitsuba scenes: glass, camera and light as the dictionaries that `mitsuba.load_dict` takes.
 
-Coordinates are in the glass frame (x right, y up, z towards the camera, the origin at its position, millimetres).
-Surfaces are then z = 0, z = -thickness and so on, so float32 keeps them plane and their distances exact. A wedge w
+Coordinates are in the glass frame: x right, y up, z towards the camera, the origin at the position of the glass, in mm.
+Surfaces are then z = 0, z = -thickness and so on, so that float32 keeps them planar and their distances exact. A wedge w
 rotates a far surface about the vertical axis through (0, 0, -thickness): its normal is (sin w, 0, cos w). With a
-positive wedge the pane is thicker on the right; panes behind it are placed as if it had none.
+positive wedge the pane is thicker on the right; a wedge does not change the positions of the panes behind it.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ last pane (the paper's R); `mirror`: the first surface is a perfect mirror (MR);
 
 _BLACK: Final[Plugin] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
 _MIN_EXTINCTION_SHARE: Final = 1e-6  # Mitsuba returns NaN for a medium with an extinction of 0 in one colour
-_LENS_GRID: Final = 256  # per side of a lens
+_LENS_GRID: Final = 256  # squares of the mesh along each side of a lens
 _MIN_MAP_ROWS: Final = 512  # a map is cut off at the glass plane to within 180 / 512 degrees
 _RUSSIAN_ROULETTE_DEPTH: Final = 64
-"""Paths with fewer surfaces never end at random, so that faint orders are not noisy."""
-_WALL_MM: Final = 1e6
+"""Russian roulette ends paths only after this many surfaces, so that faint orders are not noisy."""
+_WALL_MM: Final = 1e6  # half the width of each part of the wall around a frame
 
 
 class MitsubaSceneBuilder:
-    """Builds a scene for Mitsuba: in colour, or in grey from one colour `channel` (for polarised light).
+    """Builds a scene for Mitsuba: in colour, or in grey from one `channel` 0..2 (for polarised light).
 
     Raises:
         RecipeError: a wedge has no thickness somewhere in the view.
@@ -88,7 +88,7 @@ class MitsubaSceneBuilder:
     # Camera and common helpers
 
     def _sensor(self) -> Plugin:
-        """The camera. Mitsuba's looks along +z with +x to the left; a box filter replaces its default pixel filter."""
+        """The camera. Mitsuba's cameras look along +z with +x to the left; the pixel filter is a box, not its default."""
         camera = self.scene.camera
         right, up, back = (
             self._to_glass @ axis for axis in np.array(axes(camera.heading_deg, camera.pitch_deg))
@@ -124,9 +124,13 @@ class MitsubaSceneBuilder:
         return self.mi.ScalarTransform4f(matrix)
 
     def _rectangle(
-        self, columns: ArrayLike, origin: ArrayLike, half: Sequence[float], more: Plugin
+        self, columns: ArrayLike, origin: ArrayLike, half_size: Sequence[float], properties: Plugin
     ) -> Plugin:
-        return {"type": "rectangle", "to_world": self._transform(columns, origin, (*half, 1)), **more}
+        return {
+            "type": "rectangle",
+            "to_world": self._transform(columns, origin, (*half_size, 1)),
+            **properties,
+        }
 
     def _select_channel(self, colours: ArrayLike) -> Floats:
         """Colours (..., 3) unchanged; with a `channel`, that channel three times."""
@@ -144,23 +148,24 @@ class MitsubaSceneBuilder:
     # The glass
 
     def _surfaces(self, glass: GlassMode) -> Iterator[object]:
-        """All surfaces, from the camera on. Only the frame limits the first one; the others exceed the view."""
+        """All surfaces, the one nearest to the camera first. A frame limits the first one; the others exceed the view."""
         if glass == "none":
             return
         if self._glass.radii_mm:
             yield from self._lens(*self._glass.radii_mm, glass)
             return
-        height, wide = 0.0, (self._half_extent_mm, self._half_extent_mm)
-        half = (self._glass.frame_mm[0] / 2, self._glass.frame_mm[1] / 2) if self._glass.frame_mm else wide
+        height, max_half_size = 0.0, (self._half_extent_mm, self._half_extent_mm)
+        frame = self._glass.frame_mm
+        half_size = (frame[0] / 2, frame[1] / 2) if frame else max_half_size
         for pane in self._glass.panes:
             is_entered, material = self._material(pane, glass)
-            yield self._rectangle(np.eye(3), (0, 0, height), half, material)
+            yield self._rectangle(np.eye(3), (0, 0, height), half_size, material)
             if not is_entered:
                 return
             height -= pane.thickness_mm
             yield self._far_surface(pane, height, material)
             height -= self._glass.gap_mm
-            half = wide
+            half_size = max_half_size
 
     def _far_surface(self, pane: Pane, height: float, material: Plugin) -> Plugin:
         """The pane's far surface; it ends at the edge where the two surfaces of a wedge meet."""
@@ -193,13 +198,18 @@ class MitsubaSceneBuilder:
 
     def _interior_medium(self, pane: Pane) -> Plugin:
         """Beer-Lambert absorption, per mm. Mitsuba limits colours to 1, so `scale` holds the largest coefficient."""
-        strongest = max(pane.absorption_per_m)
-        if not strongest:
+        max_absorption = max(pane.absorption_per_m)
+        if not max_absorption:
             return {}
-        share = (self._select_channel(pane.absorption_per_m) / strongest).clip(min=_MIN_EXTINCTION_SHARE)
+        share = (self._select_channel(pane.absorption_per_m) / max_absorption).clip(min=_MIN_EXTINCTION_SHARE)
         sigma = {"type": "rgb", "value": share.tolist()}
         return {
-            "interior": {"type": "homogeneous", "albedo": 0.0, "sigma_t": sigma, "scale": strongest / 1000}
+            "interior": {
+                "type": "homogeneous",
+                "albedo": 0.0,
+                "sigma_t": sigma,
+                "scale": max_absorption / 1000,
+            }
         }
 
     def _wall(self) -> Iterator[Plugin]:
@@ -207,10 +217,10 @@ class MitsubaSceneBuilder:
         if not self._glass.frame_mm:
             return
         right, top = self._glass.frame_mm[0] / 2, self._glass.frame_mm[1] / 2
-        beside, above = (_WALL_MM, _WALL_MM), (right, _WALL_MM)
+        half_side, half_top = (_WALL_MM, _WALL_MM), (right, _WALL_MM)
         for sign in (-1, 1):
-            yield self._rectangle(np.eye(3), (sign * (right + _WALL_MM), 0, 0), beside, {"bsdf": _BLACK})
-            yield self._rectangle(np.eye(3), (0, sign * (top + _WALL_MM), 0), above, {"bsdf": _BLACK})
+            yield self._rectangle(np.eye(3), (sign * (right + _WALL_MM), 0, 0), half_side, {"bsdf": _BLACK})
+            yield self._rectangle(np.eye(3), (0, sign * (top + _WALL_MM), 0), half_top, {"bsdf": _BLACK})
 
     # A lens
 
@@ -222,7 +232,7 @@ class MitsubaSceneBuilder:
         depth = near[0][..., 2] - far[0][..., 2]
         if depth.min() <= 0:
             raise RecipeError(
-                f"the lens is {depth.min():.3g} mm thick at its thinnest", "its thickness must be above 0 everywhere in the frame",
+                f"the lens is {depth.min():.3g} mm thick at its thinnest", "expected a thickness above 0 everywhere in the frame",
                 "increase thickness_mm or radii_mm, or reduce frame_mm",
             )  # fmt: skip
         yield self._mesh(*near, material)
@@ -239,15 +249,15 @@ class MitsubaSceneBuilder:
         squared = radius_mm**2 - x**2 - y**2
         if squared.min() <= 0:
             raise RecipeError(
-                f"a sphere of {abs(radius_mm):g} mm does not fill the frame", "its radius must exceed half the frame's diagonal",
+                f"a sphere of {abs(radius_mm):g} mm does not fill the frame", "expected a radius above half the frame's diagonal",
                 "increase radii_mm or reduce frame_mm",
             )  # fmt: skip
         rise = np.copysign(np.sqrt(squared), radius_mm)
         return np.stack([x, y, height - radius_mm + rise], axis=2), np.stack([x, y, rise], axis=2) / radius_mm
 
-    def _mesh(self, places: Doubles, normals: Doubles, material: Plugin) -> object:
+    def _mesh(self, points: Doubles, normals: Doubles, material: Plugin) -> object:
         """Triangles over a grid of points (rows, columns, 3); Mitsuba interpolates the normals."""
-        corner = np.arange(places[..., 0].size).reshape(places.shape[:2])
+        corner = np.arange(points[..., 0].size).reshape(points.shape[:2])
         a, b, c, d = (
             part.ravel() for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1])
         )
@@ -257,7 +267,7 @@ class MitsubaSceneBuilder:
             props[name] = self.mi.load_dict(plugin)
         mesh = self.mi.Mesh("lens", corner.size, len(faces), has_vertex_normals=True, props=props)
         values = self.mi.traverse(mesh)
-        values["vertex_positions"] = places.astype(np.float32).ravel()
+        values["vertex_positions"] = points.astype(np.float32).ravel()
         values["vertex_normals"] = normals.astype(np.float32).ravel()
         values["faces"] = faces.ravel()
         values.update()
@@ -275,7 +285,7 @@ class MitsubaSceneBuilder:
     # The light
 
     def _emitters(self, behind: bool) -> Iterator[Plugin]:
-        """One side's map and plane, and the other side's plane in black: it still hides what is behind it."""
+        """The map and the plane of the lit side, and the other side's plane in black, because it hides what is behind it."""
         envmap = (self.scene.behind if behind else self.scene.front).map
         if envmap:
             yield self._envmap(envmap, behind) if math.isinf(envmap.radius_mm) else self._dome(envmap, behind)
@@ -290,13 +300,13 @@ class MitsubaSceneBuilder:
         columns = np.array(axes(plane.heading_deg, plane.pitch_deg)) * (facing, 1, facing)
         half = plane.width_mm / 2, plane.width_mm / 2 * picture.shape[0] / picture.shape[1]
         texture = self._bitmap(picture[::-1], wrap_mode="clamp")  # v increases upwards
-        lamp = {"emitter": {"type": "area", "radiance": texture}} if is_lit else {}
+        emitter = {"emitter": {"type": "area", "radiance": texture}} if is_lit else {}
         return self._rectangle(
-            columns, (*plane.offset_mm, -facing * plane.distance_mm), half, {"bsdf": _BLACK, **lamp}
+            columns, (*plane.offset_mm, -facing * plane.distance_mm), half, {"bsdf": _BLACK, **emitter}
         )
 
     def _envmap(self, envmap: EnvironmentMap, behind: bool) -> Plugin:
-        """A map at infinity. Mitsuba places columns at texel centres, as we do, but its outer rows at the poles."""
+        """A map at infinity. Its columns are at texel centres, as in brewster, but Mitsuba's outer rows are at the poles."""
         height, width = self._map_size(envmap)
         u, v = (np.arange(width) + 0.5) / width, np.arange(2 * height + 1) / (2 * height)
         columns = self._to_glass @ np.array(axes(envmap.heading_deg, 0)).T
@@ -308,15 +318,16 @@ class MitsubaSceneBuilder:
         }
 
     def _dome(self, envmap: EnvironmentMap, behind: bool) -> Plugin:
-        """A sphere around the glass that emits inwards. Its longitude runs the other way, so the map is mirrored.
+        """A sphere around the glass that emits inwards.
 
-        Mitsuba's texture repeats in both directions: one more row at each pole keeps it from mixing the poles.
+        Mitsuba's longitude increases in the other direction, so the map is mirrored. Its texture repeats in both
+        directions: an additional row at each pole prevents interpolation between the poles.
         """
         height, width = self._map_size(envmap)
         u, v = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
         texels = np.pad(self._texels(envmap, behind, u, v)[:, ::-1], ((1, 1), (0, 0), (0, 0)), "edge")
-        inner = np.array(((1, 0, 0), (0, height / (height + 2), 1 / (height + 2)), (0, 0, 1)))
-        texture = self._bitmap(texels, wrap_mode="repeat", to_uv=self.mi.ScalarTransform3f(inner))
+        to_inner_rows = np.array(((1, 0, 0), (0, height / (height + 2), 1 / (height + 2)), (0, 0, 1)))
+        texture = self._bitmap(texels, wrap_mode="repeat", to_uv=self.mi.ScalarTransform3f(to_inner_rows))
         right, up, back = (self._to_glass @ axis for axis in np.array(axes(envmap.heading_deg, 0)))
         return {
             "type": "sphere",
@@ -327,19 +338,19 @@ class MitsubaSceneBuilder:
             "emitter": {"type": "area", "radiance": texture},
         }
 
-    def _bitmap(self, picture: Floats, **more: object) -> Plugin:
+    def _bitmap(self, image: Floats, **properties: object) -> Plugin:
         return {
             "type": "bitmap",
             "raw": True,
-            "bitmap": self.mi.Bitmap(np.ascontiguousarray(picture)),
-            **more,
+            "bitmap": self.mi.Bitmap(np.ascontiguousarray(image)),
+            **properties,
         }
 
     def _map_size(self, envmap: EnvironmentMap) -> tuple[int, int]:
         """Height and width of the map. A coarse one is enlarged by an odd factor: texel centres stay texel centres."""
         height, width = self._assets.map_light(envmap).shape[:2]
-        times = math.ceil(_MIN_MAP_ROWS / height) // 2 * 2 + 1
-        return times * height, times * width
+        factor = math.ceil(_MIN_MAP_ROWS / height) // 2 * 2 + 1
+        return factor * height, factor * width
 
     def _texels(self, envmap: EnvironmentMap, behind: bool, u: Doubles, v: Doubles) -> Floats:
         """The map's light at u and v, (rows, columns, 3); black on the other side of the glass."""
@@ -369,11 +380,13 @@ def sample_bilinear(texels: Floats, u: Doubles, v: Doubles) -> Floats:
 def _check_wedges(glass: Glazing, across: Doubles) -> None:
     """Checks that wedged panes have thickness and do not touch at these x coordinates (n,) on the first surface."""
     for number, pane in enumerate(glass.panes):
-        more = across * math.tan(math.radians(pane.wedge_deg))
+        added_mm = across * math.tan(math.radians(pane.wedge_deg))
         is_last = number == len(glass.panes) - 1
-        if (pane.thickness_mm + more).min() <= 0 or (not is_last and (glass.gap_mm - more).min() <= 0):
+        if (pane.thickness_mm + added_mm).min() <= 0 or (
+            not is_last and (glass.gap_mm - added_mm).min() <= 0
+        ):
             raise RecipeError(
                 f"the wedge of {pane.wedge_deg:g} degrees makes pane {number + 1} meet another surface",
-                "the surfaces must not meet in the view",
+                "expected surfaces that do not meet in the view",
                 "reduce wedge_deg, or increase thickness_mm and gap_mm",
             )

@@ -1,4 +1,4 @@
-"""Loads Mitsuba, compiled by a working LLVM if there is one, else as the slow scalar variant.
+"""Loads Mitsuba with a working LLVM if there is one, else prepares the slow scalar variant.
 
     mitsuba = load()
     mitsuba.set_variant(probe().variant)  # "llvm_ad_rgb" or "scalar_rgb"
@@ -65,7 +65,7 @@ assert 0 < mi.Bitmap(mi.render(scene, spp=1)).channel_count()
 
 @dataclass(frozen=True)
 class VariantProbe:
-    """The variant to use, the LLVM to load (None: the one that Dr.Jit finds), and why no LLVM works if none does."""
+    """The variant to use, the path of its LLVM (None: the one that Dr.Jit finds), and the reason if no LLVM works."""
 
     variant: str
     library: str | None = None
@@ -85,7 +85,7 @@ def load() -> ModuleType:
     """
     found = probe()
     for runtime in _runtime_libraries(found.library):
-        # Never RTLD_GLOBAL: exceptions of other C++ libraries would then end the process.
+        # Without RTLD_GLOBAL: otherwise exceptions of other C++ libraries would end the process.
         ctypes.CDLL(runtime)
     if found.library:
         os.environ[LLVM_PATH_VARIABLE] = found.library
@@ -95,12 +95,12 @@ def load() -> ModuleType:
         reason = str(error.__context__ or error)
         raise MissingExtra(
             f"mitsuba cannot be imported ({reason})",
-            "the renderer mitsuba needs it",
+            "expected it for the renderer mitsuba",
             f"run: {install_command(reason)}",
         ) from error
     if found.variant != COMPILED:
         warnings.warn(
-            f"no LLVM works for Mitsuba ({found.reason}), so rendering is several times slower; LLVM 17 or newer works;"
+            f"no LLVM works for Mitsuba ({found.reason}), so rendering is several times slower; expected LLVM 17 or newer;"
             f" install it ({INSTALL_LLVM}) or set {LLVM_PATH_VARIABLE} to its path",
             RuntimeWarning,
             stacklevel=2,
@@ -117,14 +117,16 @@ def install_command(reason: str) -> str:
 
 @lru_cache(maxsize=1)
 def probe() -> VariantProbe:
-    """Finds the variant to use: tries each LLVM in a separate process. The result is cached.
+    """Tries each LLVM in a separate process. Returns the variant to use; the result is cached.
 
     Raises:
         MissingExtra: mitsuba is not installed.
     """
     if find_spec("mitsuba") is None:
         raise MissingExtra(
-            "mitsuba is not installed", "the renderer mitsuba needs it", "run: pip install 'brewster[render]'"
+            "mitsuba is not installed",
+            "expected it for the renderer mitsuba",
+            "run: pip install 'brewster[render]'",
         )
     reasons = []
     for library in _candidates():
@@ -136,21 +138,22 @@ def probe() -> VariantProbe:
 
 
 def _candidates() -> list[str | None]:
-    """The LLVM that the user named; else the package's, those of the system, and None for Dr.Jit's own search.
+    """Paths of the LLVMs to try, in order; None stands for Dr.Jit's own search.
 
-    Of the system's, versions known to work come first. If Dr.Jit is imported already, its LLVM cannot change: that is
-    the only candidate.
+    If `DRJIT_LIBLLVM_PATH` is set, it is the only one. Otherwise, the LLVM of the pip package is first, then those of
+    the system (versions known to work first), then None. Once Dr.Jit is imported, its LLVM cannot change, so there is
+    only one candidate.
     """
-    named = os.environ.get(LLVM_PATH_VARIABLE)
-    if named or "drjit" in sys.modules:
-        return [named]
+    configured = os.environ.get(LLVM_PATH_VARIABLE)
+    if configured or "drjit" in sys.modules:
+        return [configured]
     paths = {
         path.resolve() for folder in _FOLDERS for pattern in _PATTERNS for path in Path(folder).glob(pattern)
     }
     by_version = {_version(path): str(path) for path in sorted(paths)}
     newer = sorted(version for version in by_version if version > max(_KNOWN_GOOD))
-    known = [by_version[version] for version in (*_KNOWN_GOOD, *newer) if version in by_version]
-    return [*_packaged_llvm(), *known, None]
+    ordered = [by_version[version] for version in (*_KNOWN_GOOD, *newer) if version in by_version]
+    return [*_packaged_llvm(), *ordered, None]
 
 
 def _packaged_llvm() -> list[str]:
@@ -166,7 +169,7 @@ def _packaged_llvm() -> list[str]:
 def _runtime_libraries(library: str | None) -> list[str]:
     """The C++ runtime that the package installs next to its LLVM; empty for any other LLVM.
 
-    It must be loaded first: the package creates the links through which its LLVM finds it only when Python starts.
+    It must be loaded before the LLVM. The LLVM finds it through links that the package creates only when Python starts.
     """
     folder = Path(library or "").parent / "x86_64-unknown-linux-gnu"
     return [str(folder / name) for name in _RUNTIME_LIBRARIES if (folder / name).exists()]
@@ -179,17 +182,17 @@ def _version(path: Path) -> int:
 
 
 def _failure_reason(library: str | None) -> str:
-    """Why an image cannot be rendered with this LLVM, in one line; empty if it can.
+    """Renders a test image with this LLVM in a separate process. Returns the error in one line, or "" if it succeeds.
 
-    The home folder is empty, so that Dr.Jit compiles its kernels instead of reusing cached ones of another LLVM.
+    The home folder of the process is empty, so that Dr.Jit does not reuse cached kernels of another LLVM.
     """
     with tempfile.TemporaryDirectory() as home:
-        places = {"HOME": home, "LOCALAPPDATA": home, "PYTHONUSERBASE": site.getuserbase()}
-        chosen = {LLVM_PATH_VARIABLE: library} if library else {}
+        folders = {"HOME": home, "LOCALAPPDATA": home, "PYTHONUSERBASE": site.getuserbase()}
+        llvm = {LLVM_PATH_VARIABLE: library} if library else {}
         try:
             subprocess.run(  # noqa: S603 - our own interpreter and program
                 [sys.executable, "-c", _TEST_PROGRAM, *_runtime_libraries(library)],
-                env={**os.environ, **places, **chosen},
+                env={**os.environ, **folders, **llvm},
                 capture_output=True,
                 text=True,
                 timeout=_TIMEOUT_S,

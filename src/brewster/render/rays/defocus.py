@@ -1,8 +1,9 @@
 """Defocus of distant content by a thin lens, as a convolution.
 
-The ray from lens point l through the focus point of pixel p has the direction p - l / f in the plane at distance 1,
-with f the focus distance. Light from infinity depends on direction alone, so the image is the pinhole image averaged
-over a disc of radius aperture / (2 f). Near content has no such kernel, because its blur depends on depth.
+The ray from point l on the lens to the image of pixel p in the focus plane has the direction p - l / f, where p is in
+the plane at distance 1 and f is the focus distance. Light from infinity depends on the direction alone, so its image is
+the pinhole image averaged over a disc of radius aperture / (2 f). Near content has no such kernel, because its blur
+depends on depth.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from torch.nn import functional
 from brewster.scene.camera import Camera
 
 _SUPERSAMPLING = 8  # points per pixel and axis at which the disc is tested
-_MIN_RADIUS_PX = 0.1  # smaller blur is not visible: the camera counts as a pinhole
+_MIN_RADIUS_PX = 0.1  # a smaller blur is not visible; the camera is then treated as a pinhole
 
 
 def _radius_px(camera: Camera) -> float:
@@ -24,7 +25,7 @@ def _radius_px(camera: Camera) -> float:
 
 
 def margin_px(camera: Camera) -> int:
-    """How many pixels beyond the image border the blur needs; 0 for a pinhole."""
+    """Number of pixels that the blur needs beyond each border of the image; 0 for a pinhole."""
     radius = _radius_px(camera)
     return math.ceil(radius + 0.5) if radius > _MIN_RADIUS_PX else 0
 

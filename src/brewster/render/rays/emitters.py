@@ -2,8 +2,8 @@
 
 Geometry is in the glass frame, in millimetres: the first surface is z = 0, the camera is at z > 0. Vectors are (3, N).
 Light from a map at infinity depends on the direction alone; light from a dome (a map at a finite radius) or a plane
-depends on the whole ray. A ray has a footprint, its share of a pixel and of its circle of confusion: textures are
-filtered to that size before the lookup.
+depends on the whole ray. The footprint of a ray is the part of a pixel and of its circle of confusion that the ray
+represents: textures are filtered to that size before the lookup.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from brewster.scene.world import Plane, Side
 Device = torch.device | str
 
 _MAX_TEXELS_PER_LOOKUP = 1.2
-"""A lookup with a larger footprint uses a coarser mipmap level; with more texels, a sun of one texel would flicker."""
+"""A lookup with a larger footprint uses a coarser mipmap level; with a higher limit, a sun of one texel would flicker."""
 
 
 class MipmappedTexture:
@@ -65,7 +65,7 @@ class MipmappedTexture:
 
 @dataclass(frozen=True)
 class _PlaneEmitter:
-    """A textured rectangle in the glass frame: its centre, its axes and half its sides, in mm."""
+    """A textured rectangle in the glass frame: its centre in mm, its unit axes and half its sides in mm."""
 
     texture: MipmappedTexture
     centre: Tensor
@@ -86,7 +86,7 @@ class Rays:
 
 @dataclass(frozen=True)
 class CameraView:
-    """What determines the footprint of a pixel: height above the glass, angle of a pixel, and the thin lens.
+    """The values that determine the footprint of a pixel: height above the glass, angle of a pixel, and the thin lens.
 
     An aperture of 0 means that the lens does not widen the footprint.
     """
@@ -96,13 +96,16 @@ class CameraView:
     aperture_mm: float
     focus_mm: float
 
-    def footprint_mm(self, beyond_mm: float) -> float:
-        """Width of a pixel plus its circle of confusion at this distance beyond the glass (thin lens)."""
-        distance = self.height_mm + beyond_mm
-        return self.pixel_rad * distance + self.aperture_mm * abs(1 - distance / self.focus_mm)
+    def footprint_mm(self, distance_mm: float) -> float:
+        """Width of a pixel plus its circle of confusion in mm, at a distance from the glass (thin lens).
+
+        pixel_rad * d + aperture * |1 - d / focus|, where d is the distance from the camera.
+        """
+        from_camera_mm = self.height_mm + distance_mm
+        return self.pixel_rad * from_camera_mm + self.aperture_mm * abs(1 - from_camera_mm / self.focus_mm)
 
     def footprint_rad(self) -> float:
-        """The same at infinity, as an angle."""
+        """Width of a pixel plus its circle of confusion at infinity, in radians."""
         return self.pixel_rad + self.aperture_mm / self.focus_mm
 
 
@@ -129,7 +132,7 @@ class SideEmitters:
 
     @property
     def is_dome(self) -> bool:
-        """Whether the map is at a finite radius, and so has parallax."""
+        """Whether the map is at a finite radius, so that it shows parallax."""
         return self.envmap is not None and math.isfinite(self.radius_mm)
 
     @property
@@ -138,11 +141,11 @@ class SideEmitters:
         return self.is_dome or self.plane is not None
 
     def texels_per_pixel(self) -> float:
-        """The largest number of texels across a pixel: the rays of a pixel must be dense enough for it."""
+        """The width of a pixel in texels of the map or of the plane, whichever is larger."""
         return max(self._map_footprint(1.0), self._plane_footprint(1.0))
 
     def _map_footprint(self, footprint_px: float) -> float:
-        """In texels of the map."""
+        """Converts a footprint from pixels to texels of the map."""
         if self.envmap is None:
             return 0.0
         angle = (
@@ -153,7 +156,7 @@ class SideEmitters:
         return footprint_px * angle * self.envmap.width / (2 * math.pi)
 
     def _plane_footprint(self, footprint_px: float) -> float:
-        """In texels of the plane's image."""
+        """Converts a footprint from pixels to texels of the plane's image."""
         if self.plane is None:
             return 0.0
         width_mm = self._view.footprint_mm(self.plane_distance_mm)
@@ -168,10 +171,11 @@ class SideEmitters:
     def near_radiance(
         self, origin: Tensor, direction: Tensor, footprint_px: float
     ) -> tuple[Tensor, Tensor | None]:
-        """Light of the dome and the plane along rays, and how much of the far light passes the plane.
+        """Light of the dome and the plane along rays, and the visibility of the far light.
 
         Returns:
-            Radiance (3, N), and visibility (N,) in 0..1 or None if there is no far light.
+            Radiance (3, N), and the share of the far light that the plane does not hide, (N,) in 0..1; None instead of
+            the share if there is no far light.
         """
         radiance, visibility = torch.zeros_like(direction), None
         if self.is_dome:
@@ -190,9 +194,9 @@ class SideEmitters:
         return self.add_near(self.far_radiance(direction, footprint_px), origin, direction, footprint_px)
 
     def add_near(self, far: Tensor | None, origin: Tensor, direction: Tensor, footprint_px: float) -> Tensor:
-        """All light along rays, (3, N), from their far light, as `far_radiance` returns it.
+        """Adds the light of the dome and the plane to the far light of rays, as `far_radiance` returns it: (3, N).
 
-        Rays that differ in their origins only share one lookup of the far light.
+        Far light does not depend on origins: rays with the same directions need only one call of `far_radiance`.
         """
         if not self.is_near:
             return torch.zeros_like(direction) if far is None else far
@@ -200,13 +204,13 @@ class SideEmitters:
         return near if far is None or visibility is None else near + visibility * far
 
     def lookup_map(self, direction: Tensor, footprint_px: float) -> Tensor:
-        """The map along unit directions (3, N) from its centre: (3, N)."""
+        """Light of the map in unit directions (3, N) from its centre: (3, N)."""
         assert self.envmap is not None
         u, v = direction_to_uv(self._to_world @ direction, self._u_offset)
         return self.envmap(u, v, self._map_footprint(footprint_px))
 
     def sample(self, origin: Tensor, uniforms: Tensor) -> tuple[Tensor, Tensor]:
-        """Samples directions from `origin` towards bright parts of the map.
+        """Draws directions from `origin` with a density proportional to the brightness of the map.
 
         `uniforms` are random numbers in [0, 1), (2, N).
 
@@ -232,7 +236,7 @@ class SideEmitters:
         )
 
     def _intersect_dome(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """Where rays meet the dome: unit directions from its centre, (3, N), and distances in mm, (N,)."""
+        """Intersects rays with the dome: unit directions from its centre, (3, N), and distances in mm, (N,)."""
         along = dot(origin, direction)
         distance = torch.sqrt((along**2 - dot(origin, origin) + self.radius_mm**2).clamp(min=0)) - along
         return (origin + distance * direction) / self.radius_mm, distance
@@ -248,7 +252,7 @@ class SideEmitters:
     def _plane_radiance(
         self, plane: _PlaneEmitter, origin: Tensor, direction: Tensor, footprint_px: float
     ) -> tuple[Tensor, Tensor]:
-        """The plane's light along rays, (3, N), and how much of each footprint it covers, (N,) in 0..1."""
+        """The plane's light along rays, (3, N), and the share of each footprint that it covers, (N,) in 0..1."""
         normal = torch.linalg.cross(plane.right, plane.up)
         cosine = normal @ direction
         distance = normal @ (plane.centre[:, None] - origin) / torch.where(cosine == 0, 1e-9, cosine)
@@ -265,7 +269,7 @@ class SideEmitters:
 
 
 def _plane_emitter(plane: Plane, assets: Assets, behind: bool, device: Device) -> _PlaneEmitter:
-    """The plane in the glass frame: it faces the glass, and its heading turns it about the glass's vertical axis."""
+    """Converts a plane to the glass frame. At heading 0 it faces the glass; a heading rotates it about the y axis."""
     image = torch.from_numpy(assets.plane_light(plane)).to(device)
     facing = 1.0 if behind else -1.0
     mirrored = torch.tensor([facing, 1.0, facing], device=device)

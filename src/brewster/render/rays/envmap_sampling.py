@@ -1,7 +1,7 @@
 """Importance sampling of an environment map: directions are drawn with a density proportional to brightness.
 
-Source: Pharr, Jakob and Humphreys, "Physically Based Rendering", image infinite lights. Inversion of the cumulative
-sum of luminance times solid angle finds a small sun in every sample.
+Source: Pharr, Jakob and Humphreys, "Physically Based Rendering", image infinite lights. The probability of a texel is
+luminance times solid angle, so most samples hit the sun even if it is small; the cumulative sum is inverted.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from torch.nn import functional
 from brewster.srgb import REC709_LUMINANCE
 
 _MIN_WEIGHT = 1e-3
-"""Added to each texel, as a share of the mean: wherever there may be light, the density must be above 0."""
+"""Added to each texel, as a share of the mean: the density must be above 0 wherever a lookup may return light."""
 _MIN_COSINE = -0.05
-"""A dome is seen from points other than its centre: directions slightly beyond the glass plane still count."""
+"""Minimum cosine between a sampled direction and the normal of the glass. It is below 0 because rays towards a dome do
+not start at its centre: they can hit texels slightly beyond the glass plane."""
 
 
 def direction_to_uv(direction: Tensor, u_offset: float) -> tuple[Tensor, Tensor]:
@@ -31,7 +32,7 @@ def direction_to_uv(direction: Tensor, u_offset: float) -> tuple[Tensor, Tensor]
 
 
 class EnvmapDistribution:
-    """The texels (3, H, W) of a map as a distribution of directions, restricted to the `outward` side of the glass."""
+    """The texels (3, H, W) of a map as a distribution of directions on one side of the glass, that of its normal `outward`."""
 
     def __init__(self, texels: Tensor, outward: Tensor, u_offset: float) -> None:
         _, height, width = texels.shape

@@ -40,9 +40,9 @@ def sample_visible_normal(wi: Tensor, normal: Tensor, alpha: float, uniforms: Te
 
 
 def smith_g1(cosine: Tensor, alpha: float) -> Tensor:
-    """Smith's masking function G1: the visible share of the facets from a direction (Walter et al. 2007, eq. 34).
+    """Smith's masking function G1: the share of the facets visible from a direction (Walter et al. 2007, eq. 34).
 
-    `cosine` is that of the angle between the direction and the surface normal. The shape of the result is the same.
+    `cosine` is that of the angle between the direction and the surface normal, (N,); the result is (N,), too.
     """
     tangent_squared = (1 - cosine**2).clamp(min=0) / cosine.clamp(min=1e-4) ** 2
     return 2 / (1 + torch.sqrt(1 + alpha**2 * tangent_squared))
@@ -51,8 +51,8 @@ def smith_g1(cosine: Tensor, alpha: float) -> Tensor:
 def vndf_over_cosine(wi: Tensor, normal: Tensor, facet: Tensor, alpha: float) -> Tensor:
     """The density of `sample_visible_normal` at `facet`, divided by dot(wi, facet): D G1 / dot(wi, normal), (N,).
 
-    D is the GGX distribution (Walter et al. 2007, eq. 33). The division is left out of the product because the
-    Jacobian of a reflection has the same factor in its denominator.
+    D is the GGX distribution (Walter et al. 2007, eq. 33). The factor dot(wi, facet) is left out because the Jacobian
+    of a reflection has it in its denominator.
     """
     cosine, facet_cosine = dot(wi, normal).clamp(min=1e-4), dot(facet, normal)
     ndf = alpha**2 / (math.pi * ((facet_cosine**2) * (alpha**2 - 1) + 1) ** 2)

@@ -20,7 +20,7 @@ from torch import Tensor
 from brewster.scene.glass import Glazing, Pane
 
 MIN_ORDER_WEIGHT = 1e-5
-"""Orders with less weight are not enumerated; the last order of their side gets their light."""
+"""Orders with a smaller weight are not enumerated; the last order of their side gets their light."""
 
 
 def refracted_cosine(cosine: Tensor, index: float) -> Tensor:
@@ -68,7 +68,7 @@ def paper_orders(glazing: Glazing, cosine: Tensor) -> Throughput:
 
 _TransmittanceReflectance = tuple[Tensor, Tensor]
 _SurfaceAndInterior = tuple[Tensor, Tensor | float]
-"""Of one pane and polarisation: the reflectance r of a surface, and the internal transmittance a."""
+"""The reflectance r of a surface of a pane for one polarisation, and the internal transmittance a of the pane."""
 
 
 def _by_polarisation(glazing: Glazing, cosine: Tensor) -> list[list[_SurfaceAndInterior]]:
@@ -105,10 +105,11 @@ def _combine(layers: list[_TransmittanceReflectance]) -> _TransmittanceReflectan
 
 
 def _paper_layers(panes: list[_SurfaceAndInterior]) -> _TransmittanceReflectance:
+    """Transmittance without any reflection, and reflectance without the light that enters the last pane."""
     transmittance: Tensor | float = 1.0
     for r, a in panes:
         transmittance = transmittance * (1 - r) ** 2 * a
-    # R ends at the last pane's first surface: that surface alone replaces the pane.
+    # No light of R enters the last pane, so the pane's first surface takes the place of the pane.
     first_surface, _ = panes[-1]
     before = [_slab(*pane) for pane in panes[:-1]]
     assert isinstance(transmittance, Tensor)
@@ -122,7 +123,7 @@ def _average_polarisations(polarised: list[_TransmittanceReflectance]) -> Throug
 
 @dataclass(frozen=True)
 class ReflectionOrder:
-    """Light paths through a parallel stack with the same exit side, lateral shift and throughput; `count` of them.
+    """A set of `count` light paths through a parallel stack, with equal exit side, lateral shift and throughput.
 
     `reflections` and `transmissions` at surfaces are counted per pane, `traversals` per layer: pane, gap, pane...
     `behind` is true for light that comes from behind the glass.
@@ -152,14 +153,14 @@ def enumerate_orders(reflectances: tuple[float, ...]) -> tuple[ReflectionOrder, 
     frontier: dict[_State, int] = {(0, True, *zeros): 1}
     exited: defaultdict[tuple[bool, _Counts, _Counts, _Counts], int] = defaultdict(int)
     while frontier:
-        following: defaultdict[_State, int] = defaultdict(int)
+        next_frontier: defaultdict[_State, int] = defaultdict(int)
         for state, count in frontier.items():
             for surface, down, *counts in _branches(state):
                 if surface in (-1, surfaces):
                     exited[surface == surfaces, *counts] += count  # type: ignore[index]
                 elif count * _weight(counts, reflectances) > MIN_ORDER_WEIGHT:
-                    following[(surface, down, *counts)] += count  # type: ignore[index]
-        frontier = following
+                    next_frontier[(surface, down, *counts)] += count  # type: ignore[index]
+        frontier = next_frontier
     orders = [ReflectionOrder(*key, count) for key, count in exited.items()]
     return tuple(
         sorted(orders, key=lambda o: -o.count * _weight((o.reflections, o.transmissions), reflectances))
@@ -172,7 +173,7 @@ _State = tuple[int, bool, _Counts, _Counts, _Counts]
 
 
 def _branches(state: _State) -> list[_State]:
-    """The path transmitted and the path reflected at its surface."""
+    """The states after transmission and after reflection at the surface of a path."""
     surface, down, reflections, transmissions, traversals = state
     pane = surface // 2
     ahead, back = (surface + 1, surface - 1) if down else (surface - 1, surface + 1)
@@ -192,13 +193,14 @@ def _incremented(counts: _Counts, which: int) -> _Counts:
     return (*counts[:which], counts[which] + 1, *counts[which + 1 :])
 
 
-def _traversed(traversals: _Counts, surface: int, following: int) -> _Counts:
-    """The traversals after a path went from one surface to the next; no layer lies outside the stack."""
-    layer = min(surface, following)
+def _traversed(traversals: _Counts, surface: int, next_surface: int) -> _Counts:
+    """Counts the traversal of the layer between two surfaces; there is no layer outside the stack."""
+    layer = min(surface, next_surface)
     return _incremented(traversals, layer) if 0 <= layer < len(traversals) else traversals
 
 
 def _weight(counts: tuple[_Counts, _Counts] | list[_Counts], reflectances: tuple[float, ...]) -> float:
+    """The product of the reflectances and transmittances along one path of an order, without absorption."""
     reflections, transmissions = counts[:2]
     return math.prod(
         r**reflected * (1 - r) ** transmitted
@@ -225,8 +227,8 @@ def order_throughputs(glazing: Glazing, cosine: Tensor, table: Sequence[Reflecti
         throughput = sum(
             (_surface_throughput(order, panes) for panes in polarised), torch.zeros_like(cosine)
         ) * (order.count / 2)
-        for powers, times in zip(interiors, order.traversals[::2], strict=True):
-            throughput = throughput * powers(times) if powers and times else throughput
+        for power, exponent in zip(interiors, order.traversals[::2], strict=True):
+            throughput = throughput * power(exponent) if power and exponent else throughput
         throughputs.append(throughput)
     closed_form = all_orders(glazing, cosine)
     for behind, total in ((True, closed_form.transmitted), (False, closed_form.reflected)):
@@ -238,12 +240,12 @@ def order_throughputs(glazing: Glazing, cosine: Tensor, table: Sequence[Reflecti
 
 def _powers(base: Tensor) -> Callable[[int], Tensor]:
     """A function that returns integer powers of the base; each is computed once."""
-    known = [torch.ones_like(base), base]
+    cached = [torch.ones_like(base), base]
 
     def power(exponent: int) -> Tensor:
-        while len(known) <= exponent:
-            known.append(known[-1] * base)
-        return known[exponent]
+        while len(cached) <= exponent:
+            cached.append(cached[-1] * base)
+        return cached[exponent]
 
     return power
 
@@ -253,18 +255,18 @@ def _surface_throughput(
 ) -> Tensor:
     """The product of all reflectances and transmittances along one path of an order, for one polarisation."""
     factors = [
-        power(times)
+        power(exponent)
         for (reflect, transmit), reflections, transmissions in zip(
             panes, order.reflections, order.transmissions, strict=True
         )
-        for power, times in ((reflect, reflections), (transmit, transmissions))
-        if times
+        for power, exponent in ((reflect, reflections), (transmit, transmissions))
+        if exponent
     ]
     return reduce(torch.mul, factors)
 
 
 def lateral_shifts_mm(glazing: Glazing, cosine: Tensor) -> list[Tensor]:
-    """How far one traversal of each layer (pane, gap, pane...) moves a ray along the glass, in mm, (...) each."""
+    """Shift of a ray along the glass per traversal of each layer (pane, gap, pane...), in mm, (...) each."""
     shifts = []
     for pane in glazing.panes:
         inside = refracted_cosine(cosine, pane.index)
@@ -277,6 +279,9 @@ def _tangent(cosine: Tensor) -> Tensor:
 
 
 def ghost_distance_mm(pane: Pane, incidence_deg: float) -> float:
-    """Distance between the mirror images in a pane's two surfaces, across the view: 2 t tan(theta_t) cos(theta_i)."""
+    """Distance between the mirror images in a pane's two surfaces, across the view, in mm.
+
+    2 t tan(theta_t) cos(theta_i), with the thickness t, the angle of incidence theta_i and that of refraction theta_t.
+    """
     cosine = torch.tensor(math.cos(math.radians(incidence_deg)), dtype=torch.float64)
     return float(2 * pane.thickness_mm * _tangent(refracted_cosine(cosine, pane.index)) * cosine)

@@ -1,8 +1,8 @@
-"""Rough or wedged panes: each order is traced surface by surface, through one sampled microfacet per rough surface.
+"""Rough or wedged panes: each order is traced from surface to surface, with one microfacet sample per rough surface.
 
-Every path is split into a reflected and a transmitted one at each surface; no random choice decides between them.
-A path that leaves through a rough surface towards a map uses multiple importance sampling (Veach 1997, chapter 9):
-microfacet samples alone would find a small sun so rarely that it is noise.
+At each surface every path is split into a reflected and a transmitted one, without a random choice between them. A path
+that exits through a rough surface towards a map uses multiple importance sampling (Veach 1997, chapter 9): with
+microfacet samples alone, so few rays would hit a small sun that its light would be noise.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from brewster.render.rays.vectors import dot, normalize
 from brewster.scene.glass import Glazing
 
 MIN_PATH_WEIGHT: Final = 1e-4
-"""Orders with a smaller mean weight end. It is larger than `layered_glass.MIN_ORDER_WEIGHT`: here paths cannot merge."""
+"""Paths with a smaller mean weight are not traced further. It is larger than `layered_glass.MIN_ORDER_WEIGHT`, because
+paths cannot be merged here, so their number grows faster."""
 _MAX_DISTANCE_MM: Final = 1e7
 _MIN_LIGHT_SAMPLING_WEIGHT: Final = 3e-3
 """Orders with a smaller mean weight use microfacet samples only; their noise is too faint to see."""
@@ -30,7 +31,7 @@ _MIN_LIGHT_SAMPLING_WEIGHT: Final = 3e-3
 
 @dataclass(frozen=True)
 class Surface:
-    """One surface of a pane: its height on the z axis, its normal towards the camera, (3, 1), and what is below it."""
+    """One surface of a pane: its height on the z axis, its normal towards the camera, (3, 1), and the medium below it."""
 
     height_mm: float
     normal: Tensor
@@ -52,7 +53,7 @@ class _PathState:
     surface: int
     """The surface that the rays meet next; -1 or the number of surfaces when they have left the glass."""
     down: bool
-    """Whether they go away from the camera."""
+    """Whether the rays go away from the camera."""
     reflections: int
     entered_last_pane: bool
 
@@ -89,34 +90,34 @@ def trace_orders(
 ) -> Iterator[ExitingLight]:
     """Traces every order of the rays until its weight is too small; yields the light of each order that exits.
 
-    Radiance is scaled by the squared index ratio at each refraction. These factors cancel and are left out: every
-    path starts and ends in air.
+    Each refraction scales radiance by the squared ratio of the indices. Every path starts and ends in air, so these
+    factors cancel and are left out.
     """
     stack = surfaces(glass, rays.direction)
     ones = torch.ones_like(rays.direction)
     pending = [_PathState(rays.origin, rays.direction, ones, ones, 0, True, 0, False)]
     while pending:
         path = pending.pop()
-        for following, interaction in _interact(path, stack, sobol):
-            if 0 <= following.surface < len(stack):
-                if _mean_weight(following) > MIN_PATH_WEIGHT:
-                    pending.append(following)
+        for branch, interaction in _interact(path, stack, sobol):
+            if 0 <= branch.surface < len(stack):
+                if _mean_weight(branch) > MIN_PATH_WEIGHT:
+                    pending.append(branch)
                 continue
-            is_behind = following.surface > 0
+            is_behind = branch.surface > 0
             emitters = behind if is_behind else front
-            light = _exit_radiance(following, interaction, emitters, rays.footprint_px, sobol)
-            in_paper = following.reflections == 0 if is_behind else not following.entered_last_pane
+            light = _exit_radiance(branch, interaction, emitters, rays.footprint_px, sobol)
+            in_paper = branch.reflections == 0 if is_behind else not branch.entered_last_pane
             yield ExitingLight(is_behind, in_paper, light)
 
 
 def _mean_weight(path: _PathState) -> float:
-    """The mean over all rays: microfacets turn some of them to total reflection, so a single ray is not typical."""
+    """The mean over all rays and polarisations: a single ray is not typical, because microfacets reflect some totally."""
     return float((path.s + path.p).mean()) / 2
 
 
 @dataclass(frozen=True)
 class _SurfaceInteraction:
-    """Rays at a surface, and all that is needed to evaluate another direction there (for light sampling)."""
+    """Rays at a surface, with the values that light sampling needs to evaluate other directions there."""
 
     wi: Tensor
     """Unit directions back along the rays, (3, N)."""
@@ -144,8 +145,10 @@ def _interact(
     distance = distance.nan_to_num(0, 0, 0).clamp(0, _MAX_DISTANCE_MM)
     point = path.origin + distance * path.direction
     # Beer-Lambert law over the length of each ray.
-    left = torch.exp(-surface.absorption * distance) if in_glass else torch.ones_like(surface.absorption)
-    before = replace(path, origin=point, s=path.s * left, p=path.p * left)
+    transmittance = (
+        torch.exp(-surface.absorption * distance) if in_glass else torch.ones_like(surface.absorption)
+    )
+    before = replace(path, origin=point, s=path.s * transmittance, p=path.p * transmittance)
     normal = surface.normal if path.down else -surface.normal
     wi = -path.direction
     facet = sample_visible_normal(wi, normal, surface.alpha, sobol.next_2d()) if surface.alpha else normal
@@ -155,10 +158,10 @@ def _interact(
         direction = _scattered_direction(interaction, facet)
         weights = _facet_weights(interaction, facet, direction)
         is_last_pane = path.surface == len(stack) - 2
-        yield _continued(interaction, direction, weights, is_last_pane=is_last_pane), interaction
+        yield _path_after(interaction, direction, weights, is_last_pane=is_last_pane), interaction
 
 
-def _continued(
+def _path_after(
     interaction: _SurfaceInteraction,
     direction: Tensor,
     weights: tuple[Tensor, Tensor],
@@ -208,7 +211,7 @@ def _facet_weights(
     cosine = dot(interaction.wi, facet)
     reflected = _reflectances(cosine, interaction.index_in, interaction.index_out)
     cosine_out = dot(direction, interaction.normal) * (1 if interaction.reflects else -1)
-    # Facets that are seen from behind, or that send light through the wrong side of the surface, carry nothing.
+    # Facets that are seen from behind, or that send light to the wrong side of the surface, have weight 0.
     valid = (cosine_out > 0) & (cosine > 0)
     visible = smith_g1(cosine_out, interaction.alpha) * valid if interaction.alpha else valid.float()
     s, p = ((r if interaction.reflects else 1 - r) * visible for r in reflected)
@@ -268,7 +271,7 @@ def _half_vector(interaction: _SurfaceInteraction, direction: Tensor) -> Tensor:
 def _scattering_pdf(interaction: _SurfaceInteraction, direction: Tensor) -> Tensor:
     """The density of microfacet samples at `direction`, per steradian, (N,).
 
-    The density of the facet's normal times the Jacobian of the half vector (Walter et al. 2007, eq. 14 and 17).
+    It is the density of the facet's normal times the Jacobian of the half vector (Walter et al. 2007, eq. 14 and 17).
     """
     facet = _half_vector(interaction, direction)
     cosine, cosine_out = dot(interaction.wi, facet), dot(direction, facet)

@@ -15,7 +15,7 @@ from torch.quasirandom import SobolEngine
 
 
 class SobolPoints:
-    """2-D points in [0, 1) for N pixels; each call of `next_2d` within a sample takes the next two dimensions."""
+    """2-D points in [0, 1) for N pixels; each call of `next_2d` for a sample returns the next two dimensions."""
 
     def __init__(self, seed: int, index: int, pixels: int, samples: int, device: torch.device | str) -> None:
         self._generator = torch.Generator().manual_seed(seed * 1_000_003 + index)
