@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brewster.inference.guided_upsampling import GeneratedOverride, GuidedUpsampler, enlarge_rows
+from brewster.inference.guided_upsampling import GeneratedOverride, GuidedUpsampler, upsample_rows
 from brewster.metrics import psnr
 
 
@@ -33,7 +33,7 @@ def test_a_soft_reflection_is_removed_and_sharp_detail_is_kept(sharp_scene_and_s
     photo = scene + reflection
     upsampler = fit(*(shrink(layer, 8) for layer in (photo, scene, reflection)))
     transmission, reflected = upsampler.apply(photo, 0, 160)
-    enlarged = enlarge_rows(shrink(scene, 8), 0, 160, (160, 240))
+    enlarged = upsample_rows(shrink(scene, 8), 0, 160, (160, 240))
     assert psnr(as_bytes(transmission), as_bytes(scene)) > psnr(as_bytes(enlarged), as_bytes(scene)) + 15
     assert psnr(as_bytes(reflected), as_bytes(reflection)) > 35
 
@@ -72,14 +72,14 @@ def test_no_reflection_is_brighter_than_the_photo(random):
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 40), st.integers(1, 40))
 def test_rows_computed_one_at_a_time_equal_all_rows_at_once(small_height, small_width, height, width):
     map_ = np.random.default_rng(1).random((small_height, small_width, 2), np.float32)
-    whole = enlarge_rows(map_, 0, height, (height, width))
-    rows = [enlarge_rows(map_, top, 1, (height, width)) for top in range(height)]
+    whole = upsample_rows(map_, 0, height, (height, width))
+    rows = [upsample_rows(map_, top, 1, (height, width)) for top in range(height)]
     assert (np.concatenate(rows) == whole).all()
 
 
 def test_a_ramp_stays_a_ramp_when_enlarged():
     ramp = np.arange(8, dtype=np.float32).reshape(1, 8, 1)
-    enlarged = enlarge_rows(ramp, 0, 1, (1, 32))[0, :, 0]
+    enlarged = upsample_rows(ramp, 0, 1, (1, 32))[0, :, 0]
     np.testing.assert_allclose(np.diff(enlarged[2:-2]), 0.25, atol=1e-6)
     assert enlarged.mean() == pytest.approx(ramp.mean())
 

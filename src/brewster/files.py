@@ -1,7 +1,7 @@
 """Finds input images and writes results atomically, without overwriting other files.
 
-for job in find([Path("holiday")], output_folder=Path("clear")):
-    write_atomically(job.target("transmission"), data, source=job.source)
+for paths in find([Path("holiday")], output_folder=Path("clear")):
+    write_atomically(paths.target("transmission"), data, source=paths.source)
 """
 
 from __future__ import annotations
@@ -43,8 +43,10 @@ class SeparationPaths:
     def target(self, layer: str, suffix: str | None = None) -> Path:
         """Returns the path of a layer: with `suffix`, else that of the source, or .png if brewster does not write it."""
         image_format = format_of(self.source)
-        is_kept = image_format is not None and image_format.is_writable and layer not in _PNG_LAYERS
-        return self.folder / f"{self.name}.{layer}{suffix or (self.source.suffix if is_kept else '.png')}"
+        keeps_suffix = image_format is not None and image_format.is_writable and layer not in _PNG_LAYERS
+        return (
+            self.folder / f"{self.name}.{layer}{suffix or (self.source.suffix if keeps_suffix else '.png')}"
+        )
 
 
 def find(sources: Iterable[Path], output_folder: Path | None = None) -> list[SeparationPaths]:
@@ -62,7 +64,7 @@ def find(sources: Iterable[Path], output_folder: Path | None = None) -> list[Sep
     Raises:
         TargetError: two images would be written under one name.
     """
-    jobs: dict[str, SeparationPaths] = {}
+    found: dict[str, SeparationPaths] = {}
     counts: dict[Path, Counter[str]] = {}
     for source in sources:
         for image in _image_files(source):
@@ -71,10 +73,10 @@ def find(sources: Iterable[Path], output_folder: Path | None = None) -> list[Sep
                 counts[parent] = _name_counts(parent)
             subfolder = Path() if image == source else parent.relative_to(source)
             folder = parent if output_folder is None else output_folder / subfolder
-            job = SeparationPaths(image, folder, _layer_name(image, counts[parent]))
-            jobs.setdefault(_absolute(image), job)
-    _check_unique_targets(jobs.values())
-    return list(jobs.values())
+            paths = SeparationPaths(image, folder, _layer_name(image, counts[parent]))
+            found.setdefault(_absolute(image), paths)
+    _check_unique_targets(found.values())
+    return list(found.values())
 
 
 def write_atomically(path: Path, data: bytes, *, overwrite: bool = False, source: Path | None = None) -> None:
@@ -186,20 +188,20 @@ def walk(folder: Path, is_included: Callable[[Path], bool]) -> Iterator[Path]:
     return _walk(folder, is_included, set())
 
 
-def _walk(folder: Path, is_included: Callable[[Path], bool], seen: set[tuple[int, int]]) -> Iterator[Path]:
+def _walk(folder: Path, is_included: Callable[[Path], bool], visited: set[tuple[int, int]]) -> Iterator[Path]:
     try:
         entries = sorted(folder.iterdir())
         status = folder.stat()
     except OSError:
         yield folder  # opening it reports the reason, and the rest of the batch continues
         return
-    if (status.st_dev, status.st_ino) in seen:
+    if (status.st_dev, status.st_ino) in visited:
         return
-    seen.add((status.st_dev, status.st_ino))
+    visited.add((status.st_dev, status.st_ino))
     for entry in entries:
         if _is_folder(entry):
             if not entry.name.startswith("."):
-                yield from _walk(entry, is_included, seen)
+                yield from _walk(entry, is_included, visited)
         elif is_included(entry):
             yield entry
 
@@ -233,14 +235,14 @@ def _is_input(path: Path) -> bool:
     return format_of(path) is not None and not path.name.startswith(".") and not is_result
 
 
-def _check_unique_targets(jobs: Iterable[SeparationPaths]) -> None:
-    owners: dict[str, SeparationPaths] = {}
-    for job in jobs:
-        name = job.folder / job.name
-        other = owners.setdefault(_absolute(name), job)
-        if other is not job:
+def _check_unique_targets(found: Iterable[SeparationPaths]) -> None:
+    first_with_name: dict[str, SeparationPaths] = {}
+    for paths in found:
+        name = paths.folder / paths.name
+        other = first_with_name.setdefault(_absolute(name), paths)
+        if other is not paths:
             raise TargetError(
-                f"{other.source} and {job.source} would both be written as {name}.*",
+                f"{other.source} and {paths.source} would both be written as {name}.*",
                 "each image needs its own output name",
                 "name their parent folder, whose tree is mirrored, or use different output folders",
             )

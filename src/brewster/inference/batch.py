@@ -59,7 +59,7 @@ class SeparationTask:
     @property
     def name(self) -> str:
         """The path of the photo as it was given, or `-` for a stream."""
-        return _name(self.source)
+        return _display_name(self.source)
 
 
 @final
@@ -97,7 +97,7 @@ def separate_files(
     *,
     overwrite: bool = False,
     dry_run: bool = False,
-    on_progress: BatchProgressCallback = lambda _done, _name, _share: None,
+    on_progress: BatchProgressCallback = lambda _done, _name, _fraction: None,
 ) -> Iterator[FileResult]:
     """Separates files and folders of photos, and writes the layers as files.
 
@@ -167,15 +167,15 @@ def separate_tasks(
     *,
     overwrite: bool = False,
     dry_run: bool = False,
-    on_progress: BatchProgressCallback = lambda _done, _name, _share: None,
+    on_progress: BatchProgressCallback = lambda _done, _name, _fraction: None,
 ) -> Iterator[FileResult]:
     """Separates the photos of a plan. Arguments, results and errors are those of `separate_files`."""
     batch = _Batch(tasks, options, separator, overwrite=overwrite, dry_run=dry_run)
     for done, task in enumerate(tasks):
         on_progress(done, task.name, 0.0)
         yield batch.run(task, partial(on_progress, done, task.name))
-    if batch.bug:
-        raise batch.bug
+    if batch.unexpected_error:
+        raise batch.unexpected_error
 
 
 class _Batch:
@@ -190,7 +190,7 @@ class _Batch:
         overwrite: bool,
         dry_run: bool,
     ) -> None:
-        self.bug: Exception | None = None
+        self.unexpected_error: Exception | None = None
         self._options, self._separator = options, separator
         self._overwrite, self._dry_run = overwrite, dry_run
         self._sources = {os.path.realpath(task.source) for task in tasks if isinstance(task.source, Path)}
@@ -199,32 +199,36 @@ class _Batch:
         """Separates one photo; a failure is in the result."""
         result = FileResult(task.name)
         try:
-            missing = self._missing(task)
+            targets = self._targets_to_write(task)
         except BrewsterError as error:
             return _failed(result, error)
-        if not missing or self._dry_run:
-            result.status = "planned" if missing else "skipped"
-            result.outputs = {layer: _name(target) for layer, target in (missing or task.targets).items()}
+        if not targets or self._dry_run:
+            result.status = "planned" if targets else "skipped"
+            result.outputs = {
+                layer: _display_name(target) for layer, target in (targets or task.targets).items()
+            }
             return result
         # Outside the try: no photo can be separated without a model, so its errors end the batch.
         self._separator = separator = self._separator or Separator.load(**self._options.load_options())
         result.model, result.sha256, result.device = separator.name, separator.sha256, separator.device
         try:
-            self._separate(separator, SeparationTask(task.source, missing), result, on_progress)
+            self._separate(separator, SeparationTask(task.source, targets), result, on_progress)
         except BrewsterError as error:
             return _failed(result, error)
         except MemoryError:
             return _failed(
                 result, "the photo does not fit into memory; free some memory, or reduce the photo"
             )
-        except Exception as bug:  # noqa: BLE001  (raised again after the last photo)
-            self.bug = self.bug or bug  # only the first: the traceback of each keeps its photo in memory
+        except Exception as error:  # noqa: BLE001  (raised again after the last photo)
+            self.unexpected_error = (
+                self.unexpected_error or error
+            )  # only the first: the traceback of each keeps its photo in memory
             return _failed(
-                result, f"internal error in brewster ({type(bug).__name__}: {bug}); please report it"
+                result, f"internal error in brewster ({type(error).__name__}: {error}); please report it"
             )
         return result
 
-    def _missing(self, task: SeparationTask) -> dict[str, Path | OutputStream]:
+    def _targets_to_write(self, task: SeparationTask) -> dict[str, Path | OutputStream]:
         """The layers that must be written, with their targets.
 
         Raises:
@@ -265,21 +269,21 @@ class _Batch:
         result.reconstruction_error, result.doubtful = separation.reconstruction_error, separation.doubtful
         started = time.perf_counter()
         for layer, target in task.targets.items():
-            stated = format_of(target) if isinstance(target, Path) else None
-            own = separation.photo.file_info.container
-            container = stated.name if stated else self._options.container(layer, own)
+            target_format = format_of(target) if isinstance(target, Path) else None
+            source_format = separation.photo.file_info.container
+            container = target_format.name if target_format else self._options.container(layer, source_format)
             encoded = getattr(separation, layer).encode(container)
             on_progress(1.0)
             if isinstance(target, Path):
                 write_atomically(target, encoded, overwrite=self._overwrite, source=path)
             else:
                 target.write(encoded)
-            result.outputs[layer] = _name(target)
+            result.outputs[layer] = _display_name(target)
         result.seconds["encode"] = time.perf_counter() - started
 
 
-def _name(place: object) -> str:
-    return str(place) if isinstance(place, Path) else _STREAM_NAME
+def _display_name(source_or_target: object) -> str:
+    return str(source_or_target) if isinstance(source_or_target, Path) else _STREAM_NAME
 
 
 def _failed(result: FileResult, error: object) -> FileResult:

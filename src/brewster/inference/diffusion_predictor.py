@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from brewster.errors import ModelError
-from brewster.inference.guided_upsampling import Floats, GeneratedOverride, enlarge_rows
+from brewster.inference.guided_upsampling import Floats, GeneratedOverride, upsample_rows
 from brewster.inference.predictor import Prediction, Predictor, ProgressCallback, confidence_from_spread
 from brewster.inference.tiles import run_tiled, tile_slices
 from brewster.models.diffusion.panels import PanelFit
@@ -28,9 +28,9 @@ from brewster.options import Quality
 from brewster.srgb import to_encoded, to_linear
 
 _DRAFT_STEPS: Final = 4
-_FINE_SCALE: Final = 2
+_SECOND_INPUT_SCALE: Final = 2
 """The scale of the second input of quality "best" relative to the first, per side; its tiles have the size of a panel."""
-_MIN_FINE_SCALE: Final = 1.25
+_MIN_SECOND_INPUT_SCALE: Final = 1.25
 """A second input with a smaller scale than this adds no detail and is left out."""
 
 
@@ -78,8 +78,8 @@ class DiffusionPredictor(Predictor):
         """
         task, multiple = self._pipeline.task, self._pipeline.backbone.multiple
         coarse = task.fit(size, multiple).content
-        scale = min(_FINE_SCALE, size[0] / coarse[0])
-        if quality != "best" or scale < _MIN_FINE_SCALE:
+        scale = min(_SECOND_INPUT_SCALE, size[0] / coarse[0])
+        if quality != "best" or scale < _MIN_SECOND_INPUT_SCALE:
             return [coarse]
         return [coarse, (round(scale * coarse[0]), round(scale * coarse[1]))]
 
@@ -88,23 +88,23 @@ class DiffusionPredictor(Predictor):
     ) -> Prediction:
         """Returns the mean over the inputs; the reconstruction error is that of the first input, the whole photo."""
         size = inputs[-1].shape[:2]
-        sides = [max(inputs[0].shape), *(self._tile_px for _ in inputs[1:])]
+        tile_sides = [max(inputs[0].shape), *(self._tile_px for _ in inputs[1:])]
         tiles = [
             len(tile_slices(scaled_input.shape[:2], **_tiling(side)))
-            for scaled_input, side in zip(inputs, sides, strict=True)
+            for scaled_input, side in zip(inputs, tile_sides, strict=True)
         ]
         steps = self._steps or (_DRAFT_STEPS if quality == "draft" else STEPS)
         progress = _ProgressCounter(on_progress, sum(tiles))
         predictions = []
         with self._lock:  # two at once would need twice the memory of the GPU
-            for scaled_input, side in zip(inputs, sides, strict=True):
+            for scaled_input, side in zip(inputs, tile_sides, strict=True):
                 predictions.append(
                     run_tiled(
                         lambda tile: self._predict_tile(tile, steps, progress), scaled_input, **_tiling(side)
                     )
                 )
         change, reflection, generated, spread, reconstruction_error = (
-            np.mean([enlarge_rows(map_, 0, size[0], size) for map_ in maps], axis=0)
+            np.mean([upsample_rows(map_, 0, size[0], size) for map_ in maps], axis=0)
             for maps in zip(*predictions, strict=True)
         )
         override, mean_error = None, None
@@ -141,23 +141,23 @@ class DiffusionPredictor(Predictor):
     def _predict_tile(self, tile: Floats, steps: int, progress: _ProgressCounter) -> tuple[Floats, ...]:
         """Returns change, reflection and transmission (linear light), spread of the samples and reconstruction error (encoded)."""
         height, width, _ = tile.shape
-        fit = PanelFit((width, height), _round_up((width, height), self._pipeline.backbone.multiple))
+        panel_fit = PanelFit((width, height), _round_up((width, height), self._pipeline.backbone.multiple))
         panel_input = torch.from_numpy(2 * to_encoded(tile) - 1).permute(2, 0, 1)[None]
         panels = self._pipeline(
-            fit.pad(panel_input), steps=steps, seeds=self._seeds, on_progress=progress.within_tile
+            panel_fit.pad(panel_input), steps=steps, seeds=self._seeds, on_progress=progress.within_tile
         )
         progress.tile_done()
         _check_finite(panels)
-        light = {name: _to_light(fit.crop(panel)) for name, panel in panels.items()}
-        photo = light.get("I", tile)
-        change = light["T"] - photo
-        reflection = light.get("R", np.maximum(-change, 0))
-        generated = to_encoded(_reconstruction(light, tile))
+        linear_panels = {name: _to_linear_light(panel_fit.crop(panel)) for name, panel in panels.items()}
+        photo = linear_panels.get("I", tile)
+        change = linear_panels["T"] - photo
+        reflection = linear_panels.get("R", np.maximum(-change, 0))
+        generated = to_encoded(_reconstruction(linear_panels, tile))
         return (
             change.mean(axis=0),
             reflection.mean(axis=0),
-            light["T"].mean(axis=0),
-            np.ptp(to_encoded(light["T"]), axis=0),
+            linear_panels["T"].mean(axis=0),
+            np.ptp(to_encoded(linear_panels["T"]), axis=0),
             np.abs(generated - to_encoded(tile)).mean(axis=0),
         )
 
@@ -177,11 +177,11 @@ class _ProgressCounter:
         self.done += 1
 
 
-def _reconstruction(light: Mapping[str, Floats], tile: Floats) -> Floats:
+def _reconstruction(linear_panels: Mapping[str, Floats], tile: Floats) -> Floats:
     """Returns the photo as the model generates it: panel I, or T + R; without either, the photo itself."""
-    if "I" in light:
-        return light["I"]
-    return np.minimum(light["T"] + light["R"], 1) if "R" in light else tile[None]
+    if "I" in linear_panels:
+        return linear_panels["I"]
+    return np.minimum(linear_panels["T"] + linear_panels["R"], 1) if "R" in linear_panels else tile[None]
 
 
 def _check_finite(panels: Mapping[str, torch.Tensor]) -> None:
@@ -194,7 +194,7 @@ def _check_finite(panels: Mapping[str, torch.Tensor]) -> None:
             )
 
 
-def _to_light(panels: torch.Tensor) -> NDArray[np.float32]:
+def _to_linear_light(panels: torch.Tensor) -> NDArray[np.float32]:
     """Converts panels (n, 3, h, w) in [-1, 1] to linear light (n, h, w, 3)."""
     light: NDArray[np.float32] = to_linear(((panels + 1) / 2).clamp(0, 1).permute(0, 2, 3, 1).numpy())
     return light

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float32]
 
 _RADIUS: Final = 2
-_VARIANCE_FLOOR: Final = 4e-3
-_MIN_DETAIL_ENERGY: Final = 1e-6
+_EPSILON: Final = 4e-3
+_DETAIL_EPSILON: Final = 1e-6
 """Detail energy, in linear light squared, below which the photo's detail is kept."""
 
 
@@ -37,9 +37,9 @@ class _LocalLinearMap:
     def apply(self, photo: Floats, top: int, height: int) -> Floats:
         """Returns the layer for the rows top..top+n of the full photo: `photo` and the result are (n, W, 3)."""
         rows, width, _ = photo.shape
-        layer = enlarge_rows(self.slope, top, rows, (height, width))
+        layer = upsample_rows(self.slope, top, rows, (height, width))
         layer *= photo
-        layer += enlarge_rows(self.offset, top, rows, (height, width))
+        layer += upsample_rows(self.offset, top, rows, (height, width))
         return layer
 
 
@@ -65,7 +65,7 @@ class GeneratedOverride:
             _box_mean(np.square(layer - _box_mean(layer)).mean(axis=2, keepdims=True))
             for layer in (reflection, transmission)
         )
-        weight: Floats = reflected / (reflected + transmitted + np.float32(_MIN_DETAIL_ENERGY))
+        weight: Floats = reflected / (reflected + transmitted + np.float32(_DETAIL_EPSILON))
         return cls(transmission, weight)
 
 
@@ -84,7 +84,7 @@ class GuidedUpsampler:
     ) -> GuidedUpsampler:
         """Fits to the photo, transmission - photo, and reflection at low resolution, (h, w, 3) each, linear light."""
         mean = _box_mean(photo)
-        variance = _box_mean(photo * photo) - mean**2 + _VARIANCE_FLOOR
+        variance = _box_mean(photo * photo) - mean**2 + _EPSILON
 
         def fit(layer: Floats) -> _LocalLinearMap:
             """Smoothed window slopes; the offset makes the model exact at low resolution."""
@@ -103,7 +103,7 @@ class GuidedUpsampler:
         if self.override:
             size = height, photo.shape[1]
             generated, weight = (
-                enlarge_rows(map_, top, len(photo), size)
+                upsample_rows(map_, top, len(photo), size)
                 for map_ in (self.override.transmission, self.override.weight)
             )
             transmission += weight * (np.float32(self.override.strength) * (generated - photo) - transmission)
@@ -113,7 +113,7 @@ class GuidedUpsampler:
         return transmission, np.clip(reflection, 0, np.maximum(photo, 0), out=reflection)
 
 
-def enlarge_rows(map_: Floats, top: int, rows: int, size: tuple[int, int]) -> Floats:
+def upsample_rows(map_: Floats, top: int, rows: int, size: tuple[int, int]) -> Floats:
     """Returns the rows top..top+rows of `map_` (h, w, C) enlarged to `size` (H, W) by bilinear interpolation."""
     vertical = _interpolate(map_, *_positions(map_.shape[0], top, rows, size[0]), axis=0)
     return _interpolate(vertical, *_positions(map_.shape[1], 0, size[1], size[1]), axis=1)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, final
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.inference.guided_upsampling import Floats, GeneratedOverride, enlarge_rows
+from brewster.inference.guided_upsampling import Floats, GeneratedOverride, upsample_rows
 from brewster.inference.tiles import Backend, run_tiled
 from brewster.options import Quality
 from brewster.srgb import to_encoded
@@ -101,8 +101,8 @@ class MultiScalePredictor(Predictor):
         changes, reflections = [], []
         for scaled_input in inputs:
             for transmission, reflection in self._predict_with_flip(scaled_input):
-                changes.append(enlarge_rows(transmission - scaled_input, 0, size[0], size))
-                reflections.append(enlarge_rows(reflection, 0, size[0], size))
+                changes.append(upsample_rows(transmission - scaled_input, 0, size[0], size))
+                reflections.append(upsample_rows(reflection, 0, size[0], size))
                 on_progress(len(changes) / (2 * len(inputs)))
         transmissions_encoded = to_encoded(np.maximum(inputs[-1] + np.stack(changes), 0))
         return Prediction(

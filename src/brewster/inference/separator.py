@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Final, final
 import numpy as np
 
 from brewster.errors import BrewsterError, MissingExtra, ModelError
-from brewster.inference.guided_upsampling import Floats, GuidedUpsampler, enlarge_rows
+from brewster.inference.guided_upsampling import Floats, GuidedUpsampler, upsample_rows
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.inference.predictor import (
     QUALITIES,
@@ -328,7 +328,7 @@ def _upsampled_confidence(map_: Floats, photo: Photo) -> Photo:
     width, height = photo.size
     canvas = np.empty((height, width, 1), np.uint8)
     for rows in photo.strips():
-        canvas[rows] = np.rint(255 * enlarge_rows(map_, rows.start, rows.stop - rows.start, (height, width)))
+        canvas[rows] = np.rint(255 * upsample_rows(map_, rows.start, rows.stop - rows.start, (height, width)))
     return Photo(canvas)
 
 

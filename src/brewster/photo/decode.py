@@ -22,7 +22,7 @@ from brewster.image_formats import FORMATS
 from brewster.photo import metadata
 from brewster.photo.colour import colour_space_of
 from brewster.photo.file_info import FileInfo
-from brewster.photo.hdr_formats import read_exr, read_hdr, too_large
+from brewster.photo.hdr_formats import read_exr, read_hdr, too_large_error
 from brewster.photo.lut_profiles import has_only_tables
 
 pyvips.cache_set_max(0)  # each image is read once: libvips' operation cache would only hold memory
@@ -47,7 +47,7 @@ def decode(data: bytes, max_pixels: int) -> Decoded:
         PhotoError: the image cannot be read, is unsupported or too large; see `Photo.open`.
         MissingExtra: the reader of EXR or HEIC is not installed.
     """
-    container = _container(data)
+    container = _detect_container(data)
     if container in _FLOAT_READERS:
         floats = _FLOAT_READERS[container](data, max_pixels)
         decoded = Decoded(floats.pixels, floats.alpha, floats.file_info)
@@ -72,7 +72,7 @@ def read_size(data: bytes) -> tuple[int, int]:
     Raises:
         PhotoError: as `Photo.open`.
     """
-    container = _container(data)
+    container = _detect_container(data)
     if container in _FLOAT_READERS:
         height, width = decode(data, DEFAULT_MAX_PIXELS).pixels.shape[:2]
         return width, height
@@ -95,7 +95,7 @@ def _check_profile(icc: bytes | None, *, is_float: bool) -> None:
 _FLOAT_READERS = {"exr": read_exr, "hdr": read_hdr}
 
 
-def _container(data: bytes) -> str:
+def _detect_container(data: bytes) -> str:
     if not data:
         raise UnreadablePhoto("the file is empty", "an image file has at least a header", "copy it again")
     if re.match(
@@ -114,19 +114,19 @@ def _container(data: bytes) -> str:
 
 # --- libvips
 
-_STRICT = {"tiff": "error"}  # libvips reports missing strips as errors, not as truncation
+_FAIL_ON = {"tiff": "error"}  # libvips reports missing strips as errors, not as truncation
 _GREY = ("b-w", "grey16")
 _RGB = ("srgb", "rgb", "rgb16", "scrgb")
-_TYPES = {"uchar": np.uint8, "ushort": np.uint16, "float": np.float32}
+_DTYPES = {"uchar": np.uint8, "ushort": np.uint16, "float": np.float32}
 
 
 def _decode_vips(data: bytes, container: str, max_pixels: int) -> Decoded:
     image = _open_vips(data, container, max_pixels)
     try:
         file_info = _file_info(image, data, container)
-        array = np.frombuffer(image.write_to_memory(), _TYPES[image.format])
+        array = np.frombuffer(image.write_to_memory(), _DTYPES[image.format])
     except pyvips.Error as error:
-        raise _unreadable(container, error) from error
+        raise _unreadable_error(container, error) from error
     array = _full_scale(array.reshape(image.height, image.width, image.bands), file_info.bits)
     return split_alpha(apply_orientation(array, _orientation(image, container)), file_info)
 
@@ -135,20 +135,20 @@ def _open_vips(data: bytes, container: str, max_pixels: int) -> pyvips.Image:
     """Opens an image and checks its header; pixels are decoded on demand."""
     load = getattr(pyvips.Image, FORMATS[container].vips_loader or "")
     try:
-        image = load(data, access="sequential", fail_on=_STRICT.get(container, "truncated"))
+        image = load(data, access="sequential", fail_on=_FAIL_ON.get(container, "truncated"))
         _check_supported(image, data, container, max_pixels)
     except pyvips.Error as error:
-        raise _unreadable(container, error) from error
+        raise _unreadable_error(container, error) from error
     return image
 
 
 def _orientation(image: pyvips.Image, container: str) -> int:
     """The EXIF orientation that is still to be applied; 1 where libvips has applied it."""
-    is_unapplied = FORMATS[container].is_stored_rotated and image.get_typeof("orientation")
-    return int(image.get("orientation")) if is_unapplied else 1
+    must_be_applied = FORMATS[container].is_stored_rotated and image.get_typeof("orientation")
+    return int(image.get("orientation")) if must_be_applied else 1
 
 
-def _unreadable(container: str, error: Exception | str) -> PhotoError:
+def _unreadable_error(container: str, error: Exception | str) -> PhotoError:
     lines = [line.strip() for line in str(error).splitlines()]
     message = " ".join(line for line in lines if line and not line.startswith(("unable to", "source:")))
     return UnreadablePhoto(
@@ -166,7 +166,7 @@ def _check_supported(image: pyvips.Image, data: bytes, container: str, max_pixel
         UnsupportedPhoto: an animation, several pages, CMYK, or an unsupported number or type of channels.
     """
     if image.width * image.height > max_pixels:
-        raise too_large(image.width, image.height, max_pixels)
+        raise too_large_error(image.width, image.height, max_pixels)
     if _has_frames(image, data, container):
         raise UnsupportedPhoto(
             f"the {container} is an animation or has several pages",
@@ -179,8 +179,8 @@ def _check_supported(image: pyvips.Image, data: bytes, container: str, max_pixel
             "brewster reads RGB and grey images",
             "convert it to sRGB first",
         )
-    meanings = {1: _GREY, 2: _GREY, 3: _RGB, 4: _RGB}.get(image.bands, ())
-    if image.interpretation not in meanings or image.format not in _TYPES:
+    interpretations = {1: _GREY, 2: _GREY, 3: _RGB, 4: _RGB}.get(image.bands, ())
+    if image.interpretation not in interpretations or image.format not in _DTYPES:
         raise UnsupportedPhoto(
             f"the {container} has {image.bands} channels of {image.format} ({image.interpretation})",
             "brewster reads grey or RGB, with or without alpha, of 8 or 16 bits or 32-bit floats",
@@ -192,7 +192,7 @@ def _check_supported(image: pyvips.Image, data: bytes, container: str, max_pixel
 
 def _check_tiff(tags: metadata.Tags, size: int) -> None:
     if metadata.pixel_data_end(tags) > size:  # libvips reads missing tiles as black
-        raise _unreadable("tiff", "pixels are missing")
+        raise _unreadable_error("tiff", "pixels are missing")
     if _is_raw(tags):
         raise UnsupportedPhoto(
             "the file is a camera's raw image", "a developed image is needed", "develop it first"
@@ -311,9 +311,9 @@ def _open_heic(data: bytes, max_pixels: int) -> Any:  # noqa: ANN401  (pillow-he
         if not len(heif):
             raise ValueError("no image in the file can be decoded")
         if heif.size[0] * heif.size[1] > max_pixels:
-            raise too_large(heif.size[0], heif.size[1], max_pixels)
+            raise too_large_error(heif.size[0], heif.size[1], max_pixels)
     except _HEIC_ERRORS as error:
-        raise _unreadable("heic", error) from error
+        raise _unreadable_error("heic", error) from error
     return heif
 
 
@@ -326,7 +326,7 @@ def _decode_heic(data: bytes, max_pixels: int) -> Decoded:
     try:
         array = np.array(heif)
     except _HEIC_ERRORS as error:
-        raise _unreadable("heic", error) from error
+        raise _unreadable_error("heic", error) from error
     exif, xmp = heif.info.get("exif"), heif.info.get("xmp")
     file_info = FileInfo(
         container="heic",
@@ -362,6 +362,6 @@ def apply_orientation(array: Stored, orientation: int) -> Stored:
 def split_alpha(array: Stored, file_info: FileInfo) -> Decoded:
     """Splits an array (H, W, 1..4) into contiguous colour (H, W, 1|3) and alpha (H, W) or None."""
     has_alpha = array.shape[2] in (2, 4)
-    colours = array.shape[2] - has_alpha
-    alpha = np.ascontiguousarray(array[..., colours]) if has_alpha else None
-    return Decoded(np.ascontiguousarray(array[..., :colours]), alpha, file_info)
+    colour_channels = array.shape[2] - has_alpha
+    alpha = np.ascontiguousarray(array[..., colour_channels]) if has_alpha else None
+    return Decoded(np.ascontiguousarray(array[..., :colour_channels]), alpha, file_info)

@@ -30,7 +30,7 @@ class HdrPixels:
     file_info: FileInfo
 
 
-def too_large(width: int, height: int, max_pixels: int) -> PhotoTooLarge:
+def too_large_error(width: int, height: int, max_pixels: int) -> PhotoTooLarge:
     """Returns the error for an image with more pixels than the limit."""
     return PhotoTooLarge(
         f"the image has {width} x {height} pixels ({width * height / 1e6:.3g} million)",
@@ -47,8 +47,8 @@ def _valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float,
         return None
     red, green, blue, _ = points
     area = np.linalg.det([green - red, blue - red])
-    spans = np.isfinite(points).all() and points[:, 1].all() and abs(area) > 1e-6
-    return tuple(points.ravel().tolist()) if spans else None
+    is_gamut = np.isfinite(points).all() and points[:, 1].all() and abs(area) > 1e-6
+    return tuple(points.ravel().tolist()) if is_gamut else None
 
 
 # --- OpenEXR
@@ -77,7 +77,7 @@ def read_exr(data: bytes, max_pixels: int) -> HdrPixels:
     low, high = header["dataWindow"]
     width, height = (int(side) for side in np.array(high) - np.array(low) + 1)
     if width * height > max_pixels:
-        raise too_large(width, height, max_pixels)
+        raise too_large_error(width, height, max_pixels)
     part = _exr_part(data, header_only=False)
     return _exr_pixels({name: channel.pixels for name, channel in part.channels.items()}, dict(part.header))
 
@@ -121,9 +121,9 @@ def write_exr(image: HdrPixels) -> bytes:
     planes = {name: image.pixels[..., i] for i, name in enumerate(names)}
     if image.alpha is not None:
         planes["A"] = image.alpha
-    kind: type[np.floating[Any]] = np.float16 if image.file_info.bits == 16 else np.float32
-    max_value = float(np.finfo(kind).max)
-    channels = {name: plane.clip(-max_value, max_value).astype(kind) for name, plane in planes.items()}
+    dtype: type[np.floating[Any]] = np.float16 if image.file_info.bits == 16 else np.float32
+    max_value = float(np.finfo(dtype).max)
+    channels = {name: plane.clip(-max_value, max_value).astype(dtype) for name, plane in planes.items()}
     header = {
         "compression": exr.ZIP_COMPRESSION,
         **(image.file_info.header or {}),
@@ -137,7 +137,16 @@ def write_exr(image: HdrPixels) -> bytes:
 # --- OpenEXR with several layers
 
 _LAYER_CHANNELS = ("R", "G", "B")
-_RESERVED = {"channels", "chunkCount", "compression", "dataWindow", "lineOrder", "tiles", "type", "version"}
+_RESERVED_ATTRIBUTES = {
+    "channels",
+    "chunkCount",
+    "compression",
+    "dataWindow",
+    "lineOrder",
+    "tiles",
+    "type",
+    "version",
+}
 """Attributes that OpenEXR defines itself: it silently drops text under some of these names."""
 
 
@@ -152,7 +161,7 @@ def write_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -> by
         UnsupportedPhoto: an attribute has a name that OpenEXR reserves.
     """
     exr = _openexr()
-    if reserved := _RESERVED & header.keys():
+    if reserved := _RESERVED_ATTRIBUTES & header.keys():
         raise UnsupportedPhoto(
             f"attributes are named {', '.join(sorted(reserved))}",
             "OpenEXR reserves these names",
@@ -184,9 +193,9 @@ def read_layers(data: bytes) -> dict[str, Float32]:
     stems = sorted(name.removesuffix(".R") for name in channels if name.endswith(".R"))
     names = {stem: [f"{stem}.{channel}" for channel in _LAYER_CHANNELS] for stem in stems}
     layers = {
-        stem: np.stack([channels[name].pixels.astype(np.float32) for name in three], axis=2)
-        for stem, three in names.items()
-        if channels.keys() >= set(three)
+        stem: np.stack([channels[name].pixels.astype(np.float32) for name in channel_names], axis=2)
+        for stem, channel_names in names.items()
+        if channels.keys() >= set(channel_names)
     }
     if not layers:
         raise UnreadablePhoto(
@@ -208,23 +217,23 @@ def read_hdr(data: bytes, max_pixels: int) -> HdrPixels:
         UnreadablePhoto: the image is empty or truncated.
         UnsupportedPhoto: XYZ colours, or scan lines that do not run from top to bottom.
     """
-    head, blank, rest = data.partition(b"\n\n")
-    size, _, body = rest.partition(b"\n")
-    size_match = re.fullmatch(rb"-Y (\d{1,9}) \+X (\d{1,9})\s*", size)
-    lines = head.decode("latin-1").splitlines()[1:]
-    if not blank or size_match is None or any("xyze" in line for line in lines):
+    header_text, separator, rest = data.partition(b"\n\n")
+    resolution, _, body = rest.partition(b"\n")
+    resolution_match = re.fullmatch(rb"-Y (\d{1,9}) \+X (\d{1,9})\s*", resolution)
+    lines = header_text.decode("latin-1").splitlines()[1:]
+    if not separator or resolution_match is None or any("xyze" in line for line in lines):
         raise UnsupportedPhoto(
-            f"the header of the HDR image ends in {size[:40]!r}",
+            f"the header of the HDR image ends in {resolution[:40]!r}",
             "brewster reads RGBE images with lines from top to bottom, '-Y height +X width'",
             "export it in this form",
         )
-    height, width = int(size_match[1]), int(size_match[2])
+    height, width = int(resolution_match[1]), int(resolution_match[2])
     if width * height == 0:
         raise UnreadablePhoto(
             f"the HDR image has {width} x {height} pixels", "at least one pixel is needed", "export it again"
         )
     if width * height > max_pixels:
-        raise too_large(width, height, max_pixels)
+        raise too_large_error(width, height, max_pixels)
     return HdrPixels(_from_rgbe(_scan_lines(body, width, height)), None, _hdr_file_info(lines))
 
 
@@ -240,9 +249,9 @@ def _hdr_file_info(lines: list[str]) -> FileInfo:
 
 def _scan_lines(body: bytes, width: int, height: int) -> NDArray[np.uint8]:
     """Reads bytes (H, W, 4) from run-length encoded or flat scan lines; lines of 2**15 pixels or more are flat."""
-    is_coded = width < 1 << 15 and body.startswith(b"\2\2" + width.to_bytes(2, "big"))
+    is_run_length_encoded = width < 1 << 15 and body.startswith(b"\2\2" + width.to_bytes(2, "big"))
     try:
-        if is_coded:
+        if is_run_length_encoded:
             planes = np.frombuffer(_decode_runs(body, width, height), np.uint8)
             return planes.reshape(height, 4, width).swapaxes(1, 2)
         return np.frombuffer(body, np.uint8, height * width * 4).reshape(height, width, 4)

@@ -19,9 +19,9 @@ from brewster.errors import UnsupportedPhoto
 from brewster.photo.colour import icc_tags
 from brewster.photo.file_info import FileInfo
 
-_MATRIX = {b"rXYZ", b"gXYZ", b"bXYZ", b"rTRC", b"gTRC", b"bTRC"}
-_TABLES = {b"A2B0", b"A2B1"}
-_DEPTHS = {"uint8": ("uchar", "rgb", 8), "uint16": ("ushort", "rgb16", 16)}
+_MATRIX_TAGS = {b"rXYZ", b"gXYZ", b"bXYZ", b"rTRC", b"gTRC", b"bTRC"}
+_TABLE_TAGS = {b"A2B0", b"A2B1"}
+_VIPS_FORMATS = {"uint8": ("uchar", "rgb", 8), "uint16": ("ushort", "rgb16", 16)}
 
 
 def has_only_tables(icc: bytes | None) -> bool:
@@ -32,7 +32,7 @@ def has_only_tables(icc: bytes | None) -> bool:
         tags = icc_tags(icc).keys()
     except struct.error:
         return False
-    return bool(tags & _TABLES) and not tags >= _MATRIX
+    return bool(tags & _TABLE_TAGS) and not tags >= _MATRIX_TAGS
 
 
 def convert_to_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[NDArray[Any], FileInfo]:
@@ -41,37 +41,37 @@ def convert_to_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[ND
     Raises:
         UnsupportedPhoto: the profile is damaged, or the pixels are grey or floats.
     """
-    bands = pixels.shape[2]
-    if bands != 3 or pixels.dtype.name not in _DEPTHS:
+    channels = pixels.shape[2]
+    if channels != 3 or pixels.dtype.name not in _VIPS_FORMATS:
         raise UnsupportedPhoto(
-            f"{bands} channels of {pixels.dtype} have a LUT-based colour profile",
+            f"{channels} channels of {pixels.dtype} have a LUT-based colour profile",
             "such profiles are supported for RGB of 8 or 16 bits",
             "convert the photo to sRGB or Display P3 first",
         )
     icc = file_info.icc or b""
     try:
-        is_ignored = np.array_equal(
-            _convert(_PROBE, icc), _convert(_PROBE, pyvips.Image.profile_load("srgb"))
+        profile_is_ignored = np.array_equal(
+            _convert(_PROBE_COLOURS, icc), _convert(_PROBE_COLOURS, pyvips.Image.profile_load("srgb"))
         )
         array = _convert(pixels, icc)
     except pyvips.Error as error:
         raise _damaged_profile(icc, str(error).strip()) from error
-    if is_ignored:
+    if profile_is_ignored:
         raise _damaged_profile(icc, "libvips uses sRGB instead")
     return array, replace(file_info, icc=bytes(pyvips.Image.profile_load("p3")))
 
 
-_LEVELS = np.arange(0, 256, 51).astype(np.uint8)
-_PROBE = np.stack(np.meshgrid(_LEVELS, _LEVELS, _LEVELS), axis=-1).reshape(-1, 6, 3)
+_PROBE_LEVELS = np.arange(0, 256, 51).astype(np.uint8)
+_PROBE_COLOURS = np.stack(np.meshgrid(_PROBE_LEVELS, _PROBE_LEVELS, _PROBE_LEVELS), axis=-1).reshape(-1, 6, 3)
 """Colours that reveal an ignored profile: libvips silently uses sRGB instead of a profile that it cannot use."""
 
 
 def _convert(pixels: NDArray[Any], icc: bytes) -> NDArray[Any]:
-    height, width, bands = pixels.shape
-    kind, meaning, depth = _DEPTHS[pixels.dtype.name]
+    height, width, channels = pixels.shape
+    band_format, interpretation, depth = _VIPS_FORMATS[pixels.dtype.name]
     contiguous = np.ascontiguousarray(pixels)
-    image = pyvips.Image.new_from_memory(contiguous.data, width, height, bands, kind)
-    image = image.copy(interpretation=meaning)
+    image = pyvips.Image.new_from_memory(contiguous.data, width, height, channels, band_format)
+    image = image.copy(interpretation=interpretation)
     image.set_type(pyvips.GValue.blob_type, "icc-profile-data", icc)
     converted = image.icc_transform("p3", embedded=True, intent="relative", depth=depth)
     return np.frombuffer(converted.write_to_memory(), pixels.dtype).reshape(pixels.shape)

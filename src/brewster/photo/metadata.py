@@ -23,16 +23,16 @@ _MAX_SEGMENT_PAYLOAD = 65533  # bytes of a segment's payload
 
 def jpeg_segments(data: bytes) -> Iterator[tuple[int, int, bytes]]:
     """Yields the marker, start and payload of every segment before the pixel data."""
-    at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF:
-        marker, size = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
+    position = 2
+    while position + 4 <= len(data) and data[position] == 0xFF:
+        marker, size = data[position + 1], int.from_bytes(data[position + 2 : position + 4], "big")
         if marker == 0xFF:  # fill byte
-            at += 1
+            position += 1
             continue
-        yield marker, at, data[at + 4 : at + 2 + size]
+        yield marker, position, data[position + 4 : position + 2 + size]
         if marker == _SOS:
             return
-        at += 2 + size
+        position += 2 + size
 
 
 def jpeg_quantisation_sums(data: bytes) -> dict[int, int]:
@@ -40,9 +40,9 @@ def jpeg_quantisation_sums(data: bytes) -> dict[int, int]:
     sums = {}
     for marker, _, payload in jpeg_segments(data):
         while marker == _DQT and payload:
-            wide, number = payload[0] >> 4, payload[0] & 15
-            size = 128 if wide else 64
-            sums[number] = sum(struct.unpack(">64H" if wide else ">64B", payload[1 : 1 + size]))
+            is_16bit, number = payload[0] >> 4, payload[0] & 15
+            size = 128 if is_16bit else 64
+            sums[number] = sum(struct.unpack(">64H" if is_16bit else ">64B", payload[1 : 1 + size]))
             payload = payload[1 + size :]  # noqa: PLW2901
     return sums
 
@@ -88,29 +88,29 @@ def _segment(marker: int, payload: bytes) -> bytes:
 
 def png_chunks(data: bytes) -> dict[bytes, bytes]:
     """Returns the chunks of a PNG before its pixel data, by name."""
-    found, at = {}, 8
-    while at + 8 <= len(data) and data[at + 4 : at + 8] != b"IDAT":
-        size = int.from_bytes(data[at : at + 4], "big")
-        found[data[at + 4 : at + 8]] = data[at + 8 : at + 8 + size]
-        at += 12 + size
+    found, position = {}, 8
+    while position + 8 <= len(data) and data[position + 4 : position + 8] != b"IDAT":
+        size = int.from_bytes(data[position : position + 4], "big")
+        found[data[position + 4 : position + 8]] = data[position + 8 : position + 8 + size]
+        position += 12 + size
     return found
 
 
 def with_png_exif(data: bytes, exif: bytes) -> bytes:
     """Inserts an eXIf chunk into a PNG, directly after its header."""
-    at = 8 + 12 + 13
+    position = 8 + 12 + 13
     chunk = b"eXIf" + exif
     sized = struct.pack(">I", len(exif)) + chunk + struct.pack(">I", zlib.crc32(chunk))
-    return b"".join((data[:at], sized, data[at:]))
+    return b"".join((data[:position], sized, data[position:]))
 
 
 def webp_chunks(data: bytes) -> dict[bytes, bytes]:
     """Returns the chunks of a WebP by name."""
-    found, at = {}, 12
-    while at + 8 <= len(data):
-        size = int.from_bytes(data[at + 4 : at + 8], "little")
-        found[data[at : at + 4]] = data[at + 8 : at + 8 + size]
-        at += 8 + size + size % 2
+    found, position = {}, 12
+    while position + 8 <= len(data):
+        size = int.from_bytes(data[position + 4 : position + 8], "little")
+        found[data[position : position + 4]] = data[position + 8 : position + 8 + size]
+        position += 8 + size + size % 2
     return found
 
 
@@ -149,24 +149,24 @@ def with_avif_exif(data: bytes, exif: bytes) -> bytes:
     if row is None:
         return data
     payload = bytes(4) + exif
-    place = struct.pack(">IHII", 0, 1, len(data) + 8, len(payload))
+    location = struct.pack(">IHII", 0, 1, len(data) + 8, len(payload))
     box = struct.pack(">I", len(payload) + 8) + b"mdat" + payload
-    return b"".join((data[:row], place, data[row + len(place) :], box))
+    return b"".join((data[:row], location, data[row + len(location) :], box))
 
 
 def _item_location(data: bytes, item: bytes) -> int | None:
     """Returns the position of an item's base, count, offset and length in an iloc box as libheif writes it."""
     table = data.find(b"iloc")
-    version, sizes, more = data[table + 4], data[table + 8], data[table + 9]
-    if table < 0 or version > 1 or (sizes, more) != (0x44, 0x40):
+    version, size_fields, index_fields = data[table + 4], data[table + 8], data[table + 9]
+    if table < 0 or version > 1 or (size_fields, index_fields) != (0x44, 0x40):
         return None
-    at = table + 12
+    position = table + 12
     for _ in range(int.from_bytes(data[table + 10 : table + 12], "big")):
-        row = at + 4 + 2 * (version == 1)
+        row = position + 4 + 2 * (version == 1)
         count = int.from_bytes(data[row + 4 : row + 6], "big")
-        if data[at : at + 2] == item:
+        if data[position : position + 2] == item:
             return row if count == 1 else None
-        at = row + 6 + 8 * count
+        position = row + 6 + 8 * count
     return None
 
 
@@ -194,32 +194,32 @@ _RATIONAL_TYPES = (5, 10)  # numerator and denominator
 
 def read_tags(data: bytes) -> Tags:
     """Returns the first directory of a TIFF or EXIF block with its subdirectories; empty if there is none."""
-    order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
-    if order is None:
+    byte_order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
+    if byte_order is None:
         return {}
-    return _directory(data, order, struct.unpack_from(order + "I", data, 4)[0], _POINTER_TAGS)
+    return _directory(data, byte_order, struct.unpack_from(byte_order + "I", data, 4)[0], _POINTER_TAGS)
 
 
-def _directory(data: bytes, order: str, at: int, pointers: tuple[int, ...]) -> Tags:
-    if at + 2 > len(data):
+def _directory(data: bytes, byte_order: str, position: int, pointers: tuple[int, ...]) -> Tags:
+    if position + 2 > len(data):
         return {}
-    (count,) = struct.unpack_from(order + "H", data, at)
+    (count,) = struct.unpack_from(byte_order + "H", data, position)
     tags: Tags = {}
-    for row in range(at + 2, min(at + 2 + 12 * count, len(data) - 11), 12):
-        tag, kind, number = struct.unpack_from(order + "HHI", data, row)
+    for row in range(position + 2, min(position + 2 + 12 * count, len(data) - 11), 12):
+        tag, kind, number = struct.unpack_from(byte_order + "HHI", data, row)
         width = _TYPE_BYTES.get(kind, 0)
         size = width * number * (2 if kind in _RATIONAL_TYPES else 1)
-        (offset,) = struct.unpack_from(order + "I", data, row + 8)
+        (offset,) = struct.unpack_from(byte_order + "I", data, row + 8)
         start = row + 8 if size <= 4 else offset
         if tag in pointers:
-            tags[tag] = _directory(data, order, offset, tuple(p for p in pointers if p != tag))
+            tags[tag] = _directory(data, byte_order, offset, tuple(p for p in pointers if p != tag))
         elif width and start + size <= len(data):
-            tags[tag] = (kind, number, _to_little_endian(data[start : start + size], width, order))
+            tags[tag] = (kind, number, _to_little_endian(data[start : start + size], width, byte_order))
     return tags
 
 
-def _to_little_endian(value: bytes, width: int, order: str) -> bytes:
-    if order == "<" or width == 1:
+def _to_little_endian(value: bytes, width: int, byte_order: str) -> bytes:
+    if byte_order == "<" or width == 1:
         return value
     return b"".join(value[i : i + width][::-1] for i in range(0, len(value), width))
 
@@ -250,25 +250,25 @@ def numbers(tags: Tags, tag: int) -> list[int]:
 
 def orientation_of(exif: bytes) -> int:
     """Returns the orientation 1..8 of an EXIF block; 1 if it has none."""
-    stated = number_of(read_tags(exif.removeprefix(_EXIF_NAME)), _ORIENTATION, 1)
-    return stated if 1 <= stated <= 8 else 1
+    orientation = number_of(read_tags(exif.removeprefix(_EXIF_NAME)), _ORIENTATION, 1)
+    return orientation if 1 <= orientation <= 8 else 1
 
 
-def _serialize_directory(tags: Tags, at: int) -> tuple[bytes, int]:
+def _serialize_directory(tags: Tags, position: int) -> tuple[bytes, int]:
     """Returns a directory as bytes for offset `at` of a little-endian file, and the offset of its entries."""
     values, rows = b"", b""
     for tag, entry in sorted(tags.items(), key=lambda item: item[0]):
         if isinstance(entry, dict):
-            below, offset = _serialize_directory(entry, at + len(values))
-            values, entry = values + below, (4, 1, struct.pack("<I", offset))  # noqa: PLW2901
+            subdirectory, offset = _serialize_directory(entry, position + len(values))
+            values, entry = values + subdirectory, (4, 1, struct.pack("<I", offset))  # noqa: PLW2901
         kind, count, value = entry
         if len(value) > 4:
-            place = struct.pack("<I", at + len(values))
+            value_or_offset = struct.pack("<I", position + len(values))
             values += value + bytes(len(value) % 2)
         else:
-            place = value.ljust(4, b"\0")
-        rows += struct.pack("<HHI", tag, kind, count) + place
-    return values + struct.pack("<H", len(tags)) + rows + bytes(4), at + len(values)
+            value_or_offset = value.ljust(4, b"\0")
+        rows += struct.pack("<HHI", tag, kind, count) + value_or_offset
+    return values + struct.pack("<H", len(tags)) + rows + bytes(4), position + len(values)
 
 
 def tiff_exif(tags: Tags) -> bytes | None:
@@ -296,21 +296,21 @@ def upright_exif(exif: bytes) -> bytes:
     The thumbnail shows the input before rotation and separation; its directory is unlinked from the first one.
     """
     exif = exif.removeprefix(_EXIF_NAME)
-    order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
-    if order is None or len(exif) < 10:
+    byte_order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
+    if byte_order is None or len(exif) < 10:
         return exif
     block = bytearray(exif)
-    (at,) = struct.unpack_from(order + "I", block, 4)
-    (count,) = struct.unpack_from(order + "H", block, at) if at + 2 <= len(block) else (0,)
-    next_directory = at + 2 + 12 * count
-    for row in range(at + 2, min(next_directory, len(block) - 11), 12):
-        tag, kind = struct.unpack_from(order + "HH", block, row)
+    (position,) = struct.unpack_from(byte_order + "I", block, 4)
+    (count,) = struct.unpack_from(byte_order + "H", block, position) if position + 2 <= len(block) else (0,)
+    next_directory = position + 2 + 12 * count
+    for row in range(position + 2, min(next_directory, len(block) - 11), 12):
+        tag, kind = struct.unpack_from(byte_order + "HH", block, row)
         if tag == _ORIENTATION:
             struct.pack_into(
-                order + ("I" if kind == 4 else "HH"), block, row + 8, *((1,) if kind == 4 else (1, 0))
+                byte_order + ("I" if kind == 4 else "HH"), block, row + 8, *((1,) if kind == 4 else (1, 0))
             )
     if next_directory + 4 <= len(block):
-        struct.pack_into(order + "I", block, next_directory, 0)
+        struct.pack_into(byte_order + "I", block, next_directory, 0)
     return bytes(block)
 
 

@@ -21,7 +21,7 @@ from brewster.photo.colour import SRGB, ColourSpace, colour_space_of
 from brewster.photo.decode import Decoded, apply_orientation, decode, split_alpha
 from brewster.photo.encode import encode
 from brewster.photo.file_info import FileInfo, container_of, depth_for
-from brewster.photo.hdr_formats import too_large
+from brewster.photo.hdr_formats import too_large_error
 from brewster.photo.lut_profiles import convert_to_display_p3, has_only_tables
 
 Float32 = NDArray[np.float32]
@@ -111,7 +111,7 @@ class Photo:
         """
         encoding = _check_encoding(encoding)
         array = np.array(array)[..., None] if np.ndim(array) == 2 else np.array(array)
-        if array.ndim != 3 or array.shape[2] not in (1, 3, 4) or array.dtype.name not in _LEVELS:
+        if array.ndim != 3 or array.shape[2] not in (1, 3, 4) or array.dtype.name not in _WHITE_LEVELS:
             raise UnsupportedPhoto(
                 f"the array is {array.shape} of {array.dtype}",
                 "an image is (H, W) or (H, W, 1|3|4) of uint8, uint16 or float",
@@ -123,14 +123,17 @@ class Photo:
                 "all values must be finite",
                 "repair it first",
             )
-        colours = array.shape[2] - (array.shape[2] == 4)
-        pixels, alpha = array[..., :colours], array[..., colours] if array.shape[2] == 4 else None
+        colour_channels = array.shape[2] - (array.shape[2] == 4)
+        pixels, alpha = (
+            array[..., :colour_channels],
+            array[..., colour_channels] if array.shape[2] == 4 else None,
+        )
         if encoding == "linear" or array.dtype.kind == "f":
-            pixels = pixels / np.float32(_LEVELS[array.dtype.name])
+            pixels = pixels / np.float32(_WHITE_LEVELS[array.dtype.name])
             pixels = srgb.to_linear(pixels) if encoding == "srgb" else pixels
-            alpha = None if alpha is None else alpha / np.float32(_LEVELS[array.dtype.name])
-        floats = pixels.dtype.kind == "f"
-        dtype = np.dtype(np.float32) if floats else array.dtype
+            alpha = None if alpha is None else alpha / np.float32(_WHITE_LEVELS[array.dtype.name])
+        is_float = pixels.dtype.kind == "f"
+        dtype = np.dtype(np.float32) if is_float else array.dtype
         return cls(
             np.ascontiguousarray(pixels, dtype),
             None if alpha is None else np.ascontiguousarray(alpha, dtype),
@@ -211,10 +214,10 @@ class Photo:
         if self.colour_space() == SRGB and self.pixels.dtype.kind == "u":
             pixels = _rescaled(self.pixels, dtype) if self.pixels.dtype != dtype else self.pixels
             return np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels
-        shown = np.empty((*self.pixels.shape[:2], 3), dtype)
+        encoded = np.empty((*self.pixels.shape[:2], 3), dtype)
         for rows in self.strips():
-            shown[rows] = SRGB.to_stored(self.linear_rows(rows.start, rows.stop), shown[rows])
-        return shown
+            encoded[rows] = SRGB.to_stored(self.linear_rows(rows.start, rows.stop), encoded[rows])
+        return encoded
 
     def with_linear(self, linear: Float32) -> Photo:
         """Returns the same photo with other light, (H, W, 3); pixels with unchanged light are bit-equal."""
@@ -250,10 +253,10 @@ class Photo:
         for row in range(height):
             top, bottom = row * full_height / height, (row + 1) * full_height / height
             rows = np.arange(math.floor(top), min(math.ceil(bottom), full_height))
-            shares = np.minimum(rows + 1, bottom) - np.maximum(rows, top)
+            weights = np.minimum(rows + 1, bottom) - np.maximum(rows, top)
             strip = self.linear_rows(int(rows[0]), int(rows[-1]) + 1)
-            line = np.tensordot((shares / shares.sum()).astype(np.float32), strip, 1)
-            out[row] = _area_means(line, width)
+            mean_row = np.tensordot((weights / weights.sum()).astype(np.float32), strip, 1)
+            out[row] = _area_means(mean_row, width)
         return out
 
     def encode(self, container: str | None = None, *, depth: int | None = None) -> bytes:
@@ -303,12 +306,12 @@ class Photo:
         return Photo(pixels, alpha, replace(self.file_info, icc=None, primaries=None, header=None))
 
 
-_LEVELS = {"uint8": 255, "uint16": 65535, "float16": 1, "float32": 1, "float64": 1}
+_WHITE_LEVELS = {"uint8": 255, "uint16": 65535, "float16": 1, "float32": 1, "float64": 1}
 
 
 def _rescaled(values: Stored, dtype: np.dtype[Any]) -> Stored:
     """Converts values between dtypes so that white stays white; the encoding is unchanged."""
-    white, new_white = _LEVELS[values.dtype.name], _LEVELS[dtype.name]
+    white, new_white = _WHITE_LEVELS[values.dtype.name], _WHITE_LEVELS[dtype.name]
     if dtype.kind == "f":
         return values.astype(dtype) / np.float32(white)
     if values.dtype.kind == "f":
@@ -316,12 +319,12 @@ def _rescaled(values: Stored, dtype: np.dtype[Any]) -> Stored:
     return ((values.astype(np.uint32) * new_white + white // 2) // white).astype(dtype)
 
 
-def _area_means(line: Float32, width: int) -> Float32:
+def _area_means(row: Float32, width: int) -> Float32:
     """Averages a row (W, 3) over `width` equal parts, by differences of its cumulative sum."""
-    sums = np.vstack([np.zeros((1, 3)), np.cumsum(line, axis=0, dtype=np.float64)])
-    edges = np.linspace(0, len(line), width + 1)
-    at = np.column_stack([np.interp(edges, np.arange(len(sums)), sums[:, i]) for i in range(3)])
-    return (np.diff(at, axis=0) * (width / len(line))).astype(np.float32)
+    sums = np.vstack([np.zeros((1, 3)), np.cumsum(row, axis=0, dtype=np.float64)])
+    edges = np.linspace(0, len(row), width + 1)
+    sums_at_edges = np.column_stack([np.interp(edges, np.arange(len(sums)), sums[:, i]) for i in range(3)])
+    return (np.diff(sums_at_edges, axis=0) * (width / len(row))).astype(np.float32)
 
 
 def _check_encoding(encoding: Encoding | None) -> Encoding:
@@ -336,13 +339,13 @@ def _check_encoding(encoding: Encoding | None) -> Encoding:
 
 def _check_pixel_count(width: int, height: int, max_pixels: int) -> None:
     if width * height > max_pixels:
-        raise too_large(width, height, max_pixels)
+        raise too_large_error(width, height, max_pixels)
 
 
 def _check_arrays(pixels: Stored, alpha: Stored | None) -> None:
-    is_picture = pixels.ndim == 3 and pixels.shape[2] in (1, 3) and pixels.size > 0
-    fits = alpha is None or (alpha.shape == pixels.shape[:2] and alpha.dtype == pixels.dtype)
-    if not (is_picture and fits and pixels.dtype.name in ("uint8", "uint16", "float32")):
+    is_image = pixels.ndim == 3 and pixels.shape[2] in (1, 3) and pixels.size > 0
+    alpha_fits = alpha is None or (alpha.shape == pixels.shape[:2] and alpha.dtype == pixels.dtype)
+    if not (is_image and alpha_fits and pixels.dtype.name in ("uint8", "uint16", "float32")):
         raise UnsupportedPhoto(
             f"pixels are {pixels.shape} of {pixels.dtype}, alpha {None if alpha is None else alpha.shape}",
             "a photo has (H, W, 1|3) pixels of uint8, uint16 or float32, and optionally (H, W) alpha of the same dtype",
