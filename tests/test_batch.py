@@ -85,7 +85,7 @@ def test_a_photo_of_the_batch_is_never_overwritten(tmp_path, separator):
         (tmp_path / name).write_bytes(picture())
     sources = [tmp_path / "a.jpg", tmp_path / "a.transmission.jpg"]
     refused, separated = separate_files(sources, separator=separator, overwrite=True)
-    assert "is itself a photo" in refused.error
+    assert "is itself a photo of the batch" in refused.error
     assert separated.status == "separated"
     assert (tmp_path / "a.transmission.jpg").read_bytes() == picture()
 
@@ -97,7 +97,7 @@ def test_names_and_sources_are_checked_before_the_first_photo_is_separated(tmp_p
         (tmp_path / place / "a.jpg").write_bytes(picture())
     with pytest.raises(TargetError, match="would both be written"):
         separate_files([tmp_path / "x/a.jpg", tmp_path / "y/a.jpg"], tmp_path / "out")
-    with pytest.raises(PhotoError, match="there is no picture in"):
+    with pytest.raises(PhotoError, match="there is no photo in"):
         plan_files(tmp_path / "empty")
 
 

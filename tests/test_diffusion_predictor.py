@@ -159,7 +159,7 @@ def test_a_model_that_generates_nan_is_refused():
         def generate(self, light, count):
             return super().generate(light * float("nan"), count)
 
-    with pytest.raises(ModelError, match="contains NaN or infinity; finite values"):
+    with pytest.raises(ModelError, match="contains NaN or infinity; expected finite values"):
         Separator(DiffusionPredictor(Broken()))(smooth(60, 40))
 
 
@@ -183,7 +183,7 @@ def test_progress_rises_with_tiles_and_steps():
 
 @pytest.mark.parametrize("options", [{"steps": 0}, {"average": 0}])
 def test_zero_steps_and_zero_averages_are_refused(options):
-    with pytest.raises(ModelError, match="both must be at least 1"):
+    with pytest.raises(ModelError, match="expected both to be at least 1"):
         DiffusionPredictor(Oracle(), **options)
 
 

@@ -83,7 +83,7 @@ def test_a_partial_download_is_kept_for_the_next_call(server, remote, target):
 
 def test_a_file_with_a_wrong_digest_is_deleted(server, downloader, remote, target):
     server.bodies["/map"] = BODY[::-1]
-    with pytest.raises(DownloadError, match=r"SHA256 digest .* was expected; run again"):
+    with pytest.raises(DownloadError, match=r"SHA256 digest .* expected the digest .*; run again"):
         downloader.fetch(remote, target)
     assert list(target.parent.iterdir()) == []
 
@@ -103,7 +103,7 @@ def test_a_missing_file_is_requested_once(server, downloader, delays):
 
 @pytest.mark.parametrize("url", ["file:///etc/hosts", "ftp://127.0.0.1/map", "map", "", "http://a b/"])
 def test_only_http_urls_are_opened(downloader, url, delays):
-    with pytest.raises(DownloadError, match="https://; check the address"):
+    with pytest.raises(DownloadError, match="https://; check the URL"):
         downloader.read(url)
     assert delays == []
 

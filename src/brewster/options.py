@@ -1,6 +1,6 @@
 """The options of a separation: type, default, limits and meaning of each, written once.
 
-The command line, its help and the web form are made from `Options`; the Python API takes its defaults and its
+The command line, its help and the web form are generated from `Options`. The Python API takes its defaults and its
 documentation from it. The metadata of each field are keywords of `pydantic.Field`, so that
 `pydantic.TypeAdapter(Options)` gives an HTTP API its validation and JSON schema, while `brewster --help` needs no
 pydantic.
@@ -24,7 +24,7 @@ Quality = Literal["draft", "standard", "best"]
 Device = Literal["auto", "cuda", "rocm", "directml", "coreml", "cpu"]
 
 Quantisation = Literal["int8", "float8", "nf4"]
-"""How the weights of a large base model are stored to save memory: 8 bits by torchao, 4 bits by bitsandbytes."""
+"""The number format of the weights of a large base model: int8 and float8 by torchao, nf4 (4 bits) by bitsandbytes."""
 
 DIFFUSION_OPTIONS: Final = ("base", "quantise", "steps", "average", "plain")
 """The options of diffusion models only."""
@@ -42,7 +42,7 @@ class Options:
     """The options of a separation.
 
     Raises:
-        BrewsterError: `additive` with a format that stores no 32-bit floats.
+        BrewsterError: `additive` is set, and the format does not store 32-bit floats.
     """
 
     layers: tuple[Layer, ...] = field(
@@ -118,11 +118,11 @@ class Options:
     )
 
     def __post_init__(self) -> None:
-        """Refuses combinations of values that are not possible."""
+        """Checks combinations of values."""
         if self.additive and self.format and not FORMATS[self.format].has_float32:
             raise BrewsterError(
                 f"additive layers were requested as {self.format}",
-                "their 32-bit floats fit only into TIFF and EXR",
+                "expected tiff or exr, because only these store 32-bit floats",
                 "choose format tiff or exr, or leave additive out",
             )
 
@@ -136,7 +136,7 @@ class Options:
         return {name: getattr(self, name) for name in ("strength", "quality", "additive", "max_pixels")}
 
     def container(self, layer: str, source_format: str) -> str:
-        """Returns the format of a layer of a photo whose own format is `source_format`; confidence is always PNG."""
+        """Returns the file format of a layer. `source_format` is the format of the photo. Confidence is always PNG."""
         if layer == "confidence":
             return "png"
         if self.additive and not (source_format in FORMATS and FORMATS[source_format].has_float32):
@@ -144,7 +144,7 @@ class Options:
         return self.format or source_format
 
     def suffix(self, layer: str, source: Path) -> str | None:
-        """Returns the suffix of a layer's file; None if it is that of the source."""
+        """Returns the suffix of a layer's file, or None if it is the suffix of the source."""
         image_format = format_of(source)
         source_format = image_format.name if image_format else ""
         container = self.container(layer, source_format)
@@ -152,7 +152,7 @@ class Options:
 
 
 def document_options(function: _Function) -> _Function:
-    """Appends the parameters that are fields of `Options` to the `Args:` section of a docstring."""
+    """Adds the function parameters that are fields of `Options` to the `Args:` section of its docstring."""
     fields, docstring = Options.__dataclass_fields__, inspect.getdoc(function) or ""
     rows = [
         f"    {name}: {fields[name].metadata['description']}"
