@@ -193,11 +193,11 @@ def test_a_radiance_image_with_xyz_or_rotated_lines_is_refused() -> None:
 @pytest.mark.parametrize(("height", "width"), [(0, 8), (8, 0), (0, 0)])
 def test_a_radiance_picture_without_pixels_is_refused(height: int, width: int) -> None:
     head = f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode()
-    refused(head, UnreadablePhoto, f"{width} x {height} pixels; at least one pixel is needed; ")
+    refused(head, UnreadablePhoto, f"{width} x {height} pixels; expected at least one pixel; ")
 
 
 @pytest.mark.parametrize(
-    ("width", "word"), [("70000", "is truncated"), ("999999999", "limit"), ("9" * 5000, "RGBE")]
+    ("width", "word"), [("70000", "is truncated"), ("999999999", "at most 200 million"), ("9" * 5000, "RGBE")]
 )
 def test_a_radiance_image_with_a_wrong_size_is_refused(width: str, word: str) -> None:
     refused(f"#?RADIANCE\n\n-Y 1 +X {width}\n".encode(), PhotoError, word)

@@ -48,10 +48,10 @@ def test_input_scales_rise_and_none_is_listed_twice():
 
 
 def test_the_documentation_states_the_input_scales_of_every_quality_in_megapixels():
-    text = " ".join(EXPLANATION.read_text().split())
+    text = EXPLANATION.read_text()
     for quality, scales in QUALITIES.items():
-        (named,) = re.findall(rf"([^()]*?)(?: megapixels)? \(`{quality}`\)", text)[:1]
-        assert [float(number) for number in re.findall(r"0\.\d+", named)] == [s / 1e6 for s in scales]
+        (documented,) = re.findall(rf"^\| `{quality}` \| ([^|]*) \|$", text, re.MULTILINE)
+        assert [float(number) for number in documented.split(", ")] == [pixels / 1e6 for pixels in scales]
 
 
 def test_an_input_is_never_larger_than_the_photo_and_each_size_is_used_once():

@@ -1,7 +1,7 @@
-"""Reads and writes metadata byte by byte: JPEG tables, EXIF, PNG and WebP chunks.
+"""Reads and writes metadata as bytes: JPEG tables, EXIF, PNG and WebP chunks.
 
-libvips rewrites EXIF with libexif, which drops unknown tags, and ignores EXIF in TIFF. This module copies the EXIF
-block of the source unchanged. A block starts at its TIFF header, without the "Exif\\0\\0" of JPEG.
+libvips writes EXIF with libexif, which drops unknown tags, and ignores EXIF in TIFF. This module copies the EXIF
+block of the source unchanged. A block begins at its TIFF header, without the "Exif\\0\\0" of JPEG.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from brewster.errors import UnsupportedPhoto
 _EXIF_NAME = b"Exif\0\0"
 _APP0, _APP1, _DQT, _SOS = 0xE0, 0xE1, 0xDB, 0xDA
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_MAX_SEGMENT_PAYLOAD = 65533  # bytes of a segment's payload
+_MAX_SEGMENT_PAYLOAD = 65533  # bytes
 
 
 def jpeg_segments(data: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """Yields the marker, start and payload of every segment before the pixel data."""
+    """Yields the marker, the position and the payload of each segment before the pixel data."""
     position = 2
     while position + 4 <= len(data) and data[position] == 0xFF:
         marker, size = data[position + 1], int.from_bytes(data[position + 2 : position + 4], "big")
@@ -36,7 +36,7 @@ def jpeg_segments(data: bytes) -> Iterator[tuple[int, int, bytes]]:
 
 
 def jpeg_quantisation_sums(data: bytes) -> dict[int, int]:
-    """Returns the sum of each quantisation table by its number (0: luma, 1: chroma); a larger sum is coarser."""
+    """Returns the sum of each quantisation table by its number (0: luma, 1: chroma). A larger sum is coarser."""
     sums = {}
     for marker, _, payload in jpeg_segments(data):
         while marker == _DQT and payload:
@@ -48,7 +48,7 @@ def jpeg_quantisation_sums(data: bytes) -> dict[int, int]:
 
 
 def jpeg_subsampling(data: bytes) -> str | None:
-    """Returns the chroma subsampling, such as "4:4:4", "4:2:2" or "4:2:0"; None without chroma."""
+    """Returns the chroma subsampling, such as "4:4:4", "4:2:2" or "4:2:0", or None for a grey JPEG."""
     for marker, _, payload in jpeg_segments(data):
         if marker in _FRAMES and len(payload) >= 15:
             across, down = payload[7] >> 4, payload[7] & 15
@@ -59,10 +59,10 @@ def jpeg_subsampling(data: bytes) -> str | None:
 
 
 def with_jpeg_head(data: bytes, exif: bytes | None, dots_per_inch: tuple[float, float] | None) -> bytes:
-    """Inserts the resolution (JFIF) and EXIF into a JPEG that has neither.
+    """Inserts a JFIF segment with the resolution, and an EXIF segment, into a JPEG without these segments.
 
     Raises:
-        UnsupportedPhoto: the EXIF block is larger than the 64 KiB of a segment.
+        UnsupportedPhoto: the EXIF block is larger than a segment, 64 KiB.
     """
     head = b""
     if dots_per_inch is not None:
@@ -77,7 +77,7 @@ def _segment(marker: int, payload: bytes) -> bytes:
     if len(payload) > _MAX_SEGMENT_PAYLOAD:
         raise UnsupportedPhoto(
             f"the EXIF block has {len(payload)} bytes",
-            f"a JPEG stores at most {_MAX_SEGMENT_PAYLOAD}",
+            f"expected at most {_MAX_SEGMENT_PAYLOAD} bytes for a JPEG",
             "write PNG, TIFF or WebP instead",
         )
     return struct.pack(">BBH", 0xFF, marker, len(payload) + 2) + payload
@@ -97,8 +97,8 @@ def png_chunks(data: bytes) -> dict[bytes, bytes]:
 
 
 def with_png_exif(data: bytes, exif: bytes) -> bytes:
-    """Inserts an eXIf chunk into a PNG, directly after its header."""
-    position = 8 + 12 + 13
+    """Inserts an eXIf chunk into a PNG after its header chunk."""
+    position = 8 + 12 + 13  # signature, and the header chunk: 12 bytes and 13 bytes of data
     chunk = b"eXIf" + exif
     sized = struct.pack(">I", len(exif)) + chunk + struct.pack(">I", zlib.crc32(chunk))
     return b"".join((data[:position], sized, data[position:]))
@@ -131,7 +131,10 @@ def with_webp_exif(data: bytes, exif: bytes, size: tuple[int, int], has_alpha: b
 
 
 def cicp(data: bytes) -> tuple[int, int, int] | None:
-    """Returns the code points (CICP, ITU-T H.273) of primaries, transfer and matrix of an AVIF, HEIC or PNG; else None."""
+    """Returns the code points (CICP, ITU-T H.273) of primaries, transfer function and matrix of an AVIF, HEIC or PNG.
+
+    Returns None if the file has none.
+    """
     if data.startswith(b"\x89PNG"):
         chunk = png_chunks(data).get(b"cICP", b"")
         return (chunk[0], chunk[1], chunk[2]) if len(chunk) >= 3 else None
@@ -143,7 +146,10 @@ def cicp(data: bytes) -> tuple[int, int, int] | None:
 
 
 def with_avif_exif(data: bytes, exif: bytes) -> bytes:
-    """Replaces the Exif item of an AVIF written by libvips: appends the block and redirects the item to it."""
+    """Replaces the Exif item of an AVIF that libvips has written.
+
+    The block is appended to the file, and the location of the item is set to it.
+    """
     item = re.search(rb"infe\x02...(..)..Exif", data, re.DOTALL)
     row = _item_location(data, item[1]) if item else None
     if row is None:
@@ -155,7 +161,10 @@ def with_avif_exif(data: bytes, exif: bytes) -> bytes:
 
 
 def _item_location(data: bytes, item: bytes) -> int | None:
-    """Returns the position of an item's base, count, offset and length in an iloc box as libheif writes it."""
+    """Returns the position of the location of an item (base, count, offset, length) in an iloc box.
+
+    Returns None if the box has another layout than the one that libheif writes.
+    """
     table = data.find(b"iloc")
     version, size_fields, index_fields = data[table + 4], data[table + 8], data[table + 9]
     if table < 0 or version > 1 or (size_fields, index_fields) != (0x44, 0x40):
@@ -173,7 +182,7 @@ def _item_location(data: bytes, item: bytes) -> int | None:
 # --- EXIF and TIFF directories (TIFF 6.0 section 2, CIPA DC-008)
 
 Tags = dict[int, "tuple[int, int, bytes] | Tags"]
-"""Tag -> (type, count, value in little-endian) or, for a pointer, the directory it points to."""
+"""Tag -> (type, count, little-endian value). For a pointer: tag -> the directory at its target."""
 
 _POINTER_TAGS = (34665, 34853, 40965)  # Exif, GPS, interoperability
 _CAMERA_TAGS = (
@@ -186,14 +195,14 @@ _CAMERA_TAGS = (
     33432,
     34665,
     34853,
-)  # the tags of a TIFF directory that describe the camera and the photo
+)  # camera, date, author, copyright, and the pointers to Exif and GPS
 _ORIENTATION = 274
 _TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 4, 6: 1, 7: 1, 8: 2, 9: 4, 10: 4, 11: 4, 12: 8, 13: 4}
-_RATIONAL_TYPES = (5, 10)  # numerator and denominator
+_RATIONAL_TYPES = (5, 10)  # two numbers: numerator and denominator
 
 
 def read_tags(data: bytes) -> Tags:
-    """Returns the first directory of a TIFF or EXIF block with its subdirectories; empty if there is none."""
+    """Returns the first directory of a TIFF or EXIF block with its subdirectories, or an empty one if there is none."""
     byte_order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
     if byte_order is None:
         return {}
@@ -230,7 +239,7 @@ def number_of(tags: Tags, tag: int, default: int) -> int:
 
 
 def pixel_data_end(tags: Tags) -> int:
-    """Returns the position at which the last strip or tile of a TIFF ends; 0 if its tags do not state it."""
+    """Returns the end position of the last strip or tile of a TIFF, or 0 if its tags contain no positions."""
     ends = [0]
     for starts, sizes in ((273, 279), (324, 325)):
         ends += [
@@ -240,7 +249,7 @@ def pixel_data_end(tags: Tags) -> int:
 
 
 def numbers(tags: Tags, tag: int) -> list[int]:
-    """Returns the integers of a tag; none if it is missing."""
+    """Returns the integers of a tag, or an empty list if the tag is missing."""
     entry = tags.get(tag)
     if not isinstance(entry, tuple) or entry[0] not in (1, 3, 4):
         return []
@@ -249,13 +258,13 @@ def numbers(tags: Tags, tag: int) -> list[int]:
 
 
 def orientation_of(exif: bytes) -> int:
-    """Returns the orientation 1..8 of an EXIF block; 1 if it has none."""
+    """Returns the orientation 1..8 of an EXIF block, or 1 if it has none."""
     orientation = number_of(read_tags(exif.removeprefix(_EXIF_NAME)), _ORIENTATION, 1)
     return orientation if 1 <= orientation <= 8 else 1
 
 
 def _serialize_directory(tags: Tags, position: int) -> tuple[bytes, int]:
-    """Returns a directory as bytes for offset `at` of a little-endian file, and the offset of its entries."""
+    """Returns the bytes of a directory at `position` in a little-endian file, and the position of its entries."""
     values, rows = b"", b""
     for tag, entry in sorted(tags.items(), key=lambda item: item[0]):
         if isinstance(entry, dict):
@@ -272,7 +281,7 @@ def _serialize_directory(tags: Tags, position: int) -> tuple[bytes, int]:
 
 
 def tiff_exif(tags: Tags) -> bytes | None:
-    """Returns an EXIF block with the camera tags of a TIFF; None if it has none."""
+    """Returns an EXIF block with the camera tags of a TIFF, or None if it has none."""
     camera: Tags = {tag: entry for tag, entry in tags.items() if tag in _CAMERA_TAGS}
     if not camera:
         return None
@@ -282,7 +291,7 @@ def tiff_exif(tags: Tags) -> bytes | None:
 
 
 def with_tiff_exif(data: bytes, exif: bytes) -> bytes:
-    """Adds camera tags to a little-endian TIFF of one page, in a new directory at its end."""
+    """Adds the camera tags of an EXIF block to a little-endian TIFF of one page, in a new directory at its end."""
     tags = read_tags(data)
     tags.update((tag, entry) for tag, entry in read_tags(exif).items() if tag in _CAMERA_TAGS)
     start = len(data) + len(data) % 2
@@ -291,9 +300,10 @@ def with_tiff_exif(data: bytes, exif: bytes) -> bytes:
 
 
 def upright_exif(exif: bytes) -> bytes:
-    """Returns an EXIF block from its TIFF header on, with orientation 1 and without thumbnail, otherwise unchanged.
+    """Returns an EXIF block with orientation 1 and without the thumbnail. It begins at the TIFF header.
 
-    The thumbnail shows the input before rotation and separation; its directory is unlinked from the first one.
+    The thumbnail shows the input before rotation and separation, so the pointer to its directory is set to 0. All other
+    bytes are unchanged.
     """
     exif = exif.removeprefix(_EXIF_NAME)
     byte_order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
@@ -315,5 +325,5 @@ def upright_exif(exif: bytes) -> bytes:
 
 
 def upright_xmp(xmp: bytes) -> bytes:
-    """Returns an XMP block with tiff:Orientation set to 1, otherwise unchanged."""
+    """Returns an XMP block with tiff:Orientation set to 1. All other bytes are unchanged."""
     return re.sub(rb"""(tiff:Orientation(?:=["']|>))[1-8]""", rb"\g<1>1", xmp)
