@@ -1,4 +1,4 @@
-"""Downloads from a server on this machine, and how they fail; test_polyhaven.py has more."""
+"""Downloads from a server on this machine, and their errors. test_polyhaven.py has more tests."""
 
 import hashlib
 import subprocess
@@ -46,7 +46,7 @@ def target(tmp_path):
     return tmp_path / "new" / "map"
 
 
-def test_a_file_is_downloaded_and_nothing_else_is_left(downloader, remote, target):
+def test_a_download_leaves_only_the_file_in_the_folder(downloader, remote, target):
     downloader.fetch(remote, target)
     assert target.read_bytes() == BODY
     assert [path.name for path in target.parent.iterdir()] == ["map"]
