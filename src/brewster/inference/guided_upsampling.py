@@ -91,8 +91,10 @@ class GuidedUpsampler:
     ) -> GuidedUpsampler:
         """Fits change and reflection as local linear functions of the photo.
 
+        Arrays are (h, w, 3) in linear light, at low resolution.
+
         Args:
-            photo: the photo at low resolution, (h, w, 3) linear light, as are the next two.
+            photo: the photo.
             change: transmission - photo.
             reflection: the reflection.
             override: where a generated transmission replaces the fitted one.

@@ -53,7 +53,7 @@ _NETWORK_SHARE: Final = 0.6
 @final
 @dataclass(frozen=True)
 class Separation:
-    """The layers of a photo, each of the size of the photo, and facts of their computation."""
+    """The layers of a photo, each of the size of the photo, with the model, the device and the quality measures."""
 
     photo: Photo
     transmission: Photo
