@@ -6,7 +6,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Thread
 
 
-class _Answers(BaseHTTPRequestHandler):
+class _Handler(BaseHTTPRequestHandler):
     def do_GET(self):
         files = self.server.content
         files.requests.append((self.path, self.headers["Range"]))
@@ -29,14 +29,14 @@ class _Answers(BaseHTTPRequestHandler):
 
 
 class Files:
-    """The files of the server by path, its received requests, and its next faults: "cut" or a status code."""
+    """The bodies of a server by path, the requests it has received, and its next faults: "cut" or a status code."""
 
     def __init__(self, url):
         self.url, self.bodies, self.requests, self.faults = url, {}, [], []
 
 
 def loopback_only(monkeypatch):
-    """Replaces `_network_off` in test files with a server: only this machine may be reached."""
+    """Allows connections to this machine only. Test files with a server use it instead of `_network_off`."""
     connect = socket.socket.connect
 
     def loopback(self, address):
@@ -47,9 +47,9 @@ def loopback_only(monkeypatch):
 
 
 @contextlib.contextmanager
-def on_loopback(answers, content):
-    """Runs a server; yields `content(url)`, which its handler finds as `server.content`."""
-    with ThreadingHTTPServer(("127.0.0.1", 0), answers) as server:
+def on_loopback(handler, content):
+    """Runs a server and yields `content(url)`. The handler reads it as `server.content`."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         server.content = content(f"http://127.0.0.1:{server.server_port}")
         thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
@@ -59,12 +59,12 @@ def on_loopback(answers, content):
 
 
 def served():
-    """Runs a server of files; yields its `Files`."""
-    return on_loopback(_Answers, Files)
+    """Runs a file server and yields its `Files`."""
+    return on_loopback(_Handler, Files)
 
 
 def unused_address():
-    """A URL of this machine on which no server listens."""
+    """Returns a URL of this machine on which no server listens."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         return f"http://127.0.0.1:{listener.getsockname()[1]}"

@@ -1,4 +1,4 @@
-"""Picture files as other programs write them: PIL is the independent reader and writer of these tests."""
+"""Image files as other programs write them. PIL is the independent reader and writer of the tests."""
 
 import io
 
@@ -7,6 +7,7 @@ from PIL import Image
 
 
 def smooth(height: int = 48, width: int = 64) -> np.ndarray:
+    """Returns an image with smooth gradients, (height, width, 3) uint8."""
     down, across = np.mgrid[:height, :width]
     return np.stack([down * 3, across * 3, 255 - down - across], axis=2).astype(np.uint8)
 
@@ -22,7 +23,7 @@ def pil(data: bytes) -> Image.Image:
 
 
 def exif_block(orientation: int = 6) -> bytes:
-    """EXIF as cameras write it: big-endian, with a maker note, a date below, and GPS."""
+    """Returns an EXIF block as cameras write it: big-endian, with a maker note, a date, and GPS."""
     exif = Image.Exif()
     exif.endian = ">"
     exif[274], exif[271], exif[306] = orientation, "Sextant", "2020:01:02 03:04:05"

@@ -1,4 +1,4 @@
-"""Batches from Python: names and folders, finished and existing files, errors and bugs of single files, streams."""
+"""Batches from Python: names, folders, existing files, errors of single files, streams."""
 
 import io
 from pathlib import Path
@@ -18,24 +18,24 @@ def separator():
 
 
 @pytest.fixture
-def folder(tmp_path):
-    """A folder with a photo, one in a subfolder, and a damaged one between them."""
+def photo_folder(tmp_path):
+    """A folder with a photo, a damaged file, and a subfolder with a photo."""
     (tmp_path / "in" / "c").mkdir(parents=True)
     for name in ("a.jpg", "c/d.jpg"):
         (tmp_path / "in" / name).write_bytes(picture())
-    (tmp_path / "in" / "b.jpg").write_bytes(b"no picture")
+    (tmp_path / "in" / "b.jpg").write_bytes(b"not an image")
     return tmp_path / "in"
 
 
-def test_a_folder_is_mirrored_and_a_damaged_photo_does_not_stop_the_batch(folder, tmp_path, separator):
-    found = list(separate_files(folder, tmp_path / "out", separator=separator))
-    assert [result.status for result in found] == ["separated", "failed", "separated"]
-    assert [result.source for result in found] == [
-        str(folder / name) for name in ("a.jpg", "b.jpg", "c/d.jpg")
+def test_a_folder_is_mirrored_and_a_damaged_photo_does_not_stop_the_batch(photo_folder, tmp_path, separator):
+    batch_results = list(separate_files(photo_folder, tmp_path / "out", separator=separator))
+    assert [result.status for result in batch_results] == ["separated", "failed", "separated"]
+    assert [result.source for result in batch_results] == [
+        str(photo_folder / name) for name in ("a.jpg", "b.jpg", "c/d.jpg")
     ]
-    assert [result.error is None for result in found] == [True, False, True]
+    assert [result.error is None for result in batch_results] == [True, False, True]
     assert tree(tmp_path / "out") == sorted(results("a") + [f"c/{name}" for name in results("d")])
-    first = found[0]
+    first = batch_results[0]
     assert (first.model, first.sha256, first.device) == ("pane", "0" * 64, "cpu")
     assert first.outputs == {layer: str(tmp_path / f"out/a.{layer}.jpg") for layer in LAYERS}
     assert set(first.seconds) == {"decode", "network", "detail", "encode"}
@@ -65,16 +65,18 @@ def test_finished_photos_are_skipped_without_a_model_and_missing_layers_are_adde
     (skipped,) = separate_files(tmp_path, options=no_model)
     assert (skipped.status, set(skipped.outputs)) == ("skipped", set(LAYERS))
     (tmp_path / "a.reflection.jpg").unlink()
-    (tmp_path / "a.transmission.jpg").write_bytes(b"mine")
+    (tmp_path / "a.transmission.jpg").write_bytes(b"existing file")
     (again,) = separate_files(tmp_path, separator=separator)
     assert list(again.outputs) == ["reflection"]
-    assert (tmp_path / "a.transmission.jpg").read_bytes() == b"mine"
+    assert (tmp_path / "a.transmission.jpg").read_bytes() == b"existing file"
     list(separate_files(tmp_path, separator=separator, overwrite=True))
     assert Photo.open(tmp_path / "a.transmission.jpg").size == (60, 40)
 
 
-def test_a_dry_run_names_the_files_and_writes_nothing(folder, tmp_path):
-    planned = list(separate_files(folder, tmp_path / "out", Options(model="no-such-model"), dry_run=True))
+def test_a_dry_run_returns_the_paths_and_writes_nothing(photo_folder, tmp_path):
+    planned = list(
+        separate_files(photo_folder, tmp_path / "out", Options(model="no-such-model"), dry_run=True)
+    )
     assert [result.status for result in planned] == ["planned"] * 3
     assert planned[2].outputs["reflection"] == str(tmp_path / "out/c/d.reflection.jpg")
     assert not (tmp_path / "out").exists()
@@ -85,36 +87,36 @@ def test_a_photo_of_the_batch_is_never_overwritten(tmp_path, separator):
         (tmp_path / name).write_bytes(picture())
     sources = [tmp_path / "a.jpg", tmp_path / "a.transmission.jpg"]
     refused, separated = separate_files(sources, separator=separator, overwrite=True)
-    assert "is itself a photo" in refused.error
+    assert "is itself a photo of the batch" in refused.error
     assert separated.status == "separated"
     assert (tmp_path / "a.transmission.jpg").read_bytes() == picture()
 
 
 def test_names_and_sources_are_checked_before_the_first_photo_is_separated(tmp_path):
-    for place in ("x", "y", "empty"):
-        (tmp_path / place).mkdir()
-    for place in ("x", "y"):
-        (tmp_path / place / "a.jpg").write_bytes(picture())
+    for name in ("x", "y", "empty"):
+        (tmp_path / name).mkdir()
+    for name in ("x", "y"):
+        (tmp_path / name / "a.jpg").write_bytes(picture())
     with pytest.raises(TargetError, match="would both be written"):
         separate_files([tmp_path / "x/a.jpg", tmp_path / "y/a.jpg"], tmp_path / "out")
-    with pytest.raises(PhotoError, match="there is no picture in"):
+    with pytest.raises(PhotoError, match="there is no photo in"):
         plan_files(tmp_path / "empty")
 
 
-def test_a_photo_is_separated_when_its_result_is_requested(folder, tmp_path, separator):
-    batch = separate_files(folder, tmp_path / "out", separator=separator)
+def test_a_photo_is_separated_when_its_result_is_requested(photo_folder, tmp_path, separator):
+    batch = separate_files(photo_folder, tmp_path / "out", separator=separator)
     assert not (tmp_path / "out").exists()
     assert next(batch).status == "separated"
     assert tree(tmp_path / "out") == results("a")
 
 
-def test_a_model_that_does_not_exist_ends_the_batch(folder, tmp_path):
+def test_a_model_that_does_not_exist_ends_the_batch(photo_folder, tmp_path):
     with pytest.raises(ModelError):
-        next(separate_files(folder, tmp_path / "out", Options(model="no-such-model")))
+        next(separate_files(photo_folder, tmp_path / "out", Options(model="no-such-model")))
 
 
 def test_an_unexpected_exception_is_raised_again_after_the_last_photo(
-    folder, tmp_path, monkeypatch, separator
+    photo_folder, tmp_path, monkeypatch, separator
 ):
     call = Separator.__call__
 
@@ -125,27 +127,27 @@ def test_an_unexpected_exception_is_raised_again_after_the_last_photo(
 
     monkeypatch.setattr(Separator, "__call__", fail_on_first)
     with pytest.raises(ZeroDivisionError, match="a bug"):
-        list(separate_files(folder, tmp_path / "out", separator=separator))
+        list(separate_files(photo_folder, tmp_path / "out", separator=separator))
     assert tree(tmp_path / "out") == [f"c/{name}" for name in results("d")]
 
 
-def test_progress_names_the_file_and_grows_and_keyboard_interrupt_stops(folder, tmp_path, separator):
+def test_progress_names_the_file_and_grows_and_keyboard_interrupt_stops(photo_folder, tmp_path, separator):
     calls = []
     list(
         separate_files(
-            folder, tmp_path / "out", separator=separator, on_progress=lambda *args: calls.append(args)
+            photo_folder, tmp_path / "out", separator=separator, on_progress=lambda *args: calls.append(args)
         )
     )
-    positions = [done + share for done, _, share in calls]
+    positions = [done + fraction for done, _, fraction in calls]
     assert positions == sorted(positions)
     assert {Path(name).name for _, name, _ in calls} == {"a.jpg", "b.jpg", "d.jpg"}
 
-    def stop(done, _name, share):
-        if share == 1.0:
+    def stop(_done, _name, fraction):
+        if fraction == 1.0:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        list(separate_files(folder, tmp_path / "other", separator=separator, on_progress=stop))
+        list(separate_files(photo_folder, tmp_path / "other", separator=separator, on_progress=stop))
     assert not (tmp_path / "other").exists()
 
 

@@ -332,7 +332,7 @@ def test_a_misspelled_command_gives_a_suggestion_unless_a_photo_has_that_name(ru
         (["a.jpg", "--model", "a.jpg"], "is not a model"),
         (["a.jpg", "--device", "coreml"], "device coreml is not available"),
         (["missing.jpg"], "missing.jpg cannot be read"),
-        (["empty"], "there is no picture in empty"),
+        (["empty"], "there is no photo in empty"),
     ],
 )
 def test_an_error_is_one_line_with_exit_code_1(run, bare, tmp_path, words, reason):

@@ -1,4 +1,4 @@
-"""Diffusion models in the Separator: tiny random models for the mechanics, an oracle with known layers for values."""
+"""Diffusion models in the Separator. Tiny random models test the code, and a fake pipeline with known layers the values."""
 
 import json
 import shutil
@@ -21,11 +21,11 @@ from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion.tensors import read_tensors, write_tensors
 from brewster.srgb import to_encoded, to_linear
 
-SMALL = 3 * 48 * 32
+SMALL_BUDGET_PX = 3 * 48 * 32
 
 
-class Oracle:
-    """A pipeline with T = 0.7 I and R = 0.3 I that adds a constant, `tint`, to all panels."""
+class FakePipeline:
+    """A pipeline with T = 0.7 I and R = 0.3 I. It adds the constant `tint` to all encoded panels."""
 
     backbone = SimpleNamespace(multiple=16)
 
@@ -36,27 +36,27 @@ class Oracle:
     def __call__(self, photo, *, steps, seeds, on_progress):
         self.calls.append((tuple(photo.shape[-2:]), steps, len(seeds)))
         light = to_linear((photo + 1) / 2)
-        shares = {"I": 1.0, "T": 0.7, "R": 0.3}
+        factors = {"I": 1.0, "T": 0.7, "R": 0.3}
         for step in range(steps):
             on_progress(step + 1, steps)
-        return {name: self.generate(shares[name] * light, len(seeds)) for name in self.task.layout.panels}
+        return {name: self.generate(factors[name] * light, len(seeds)) for name in self.task.layout.panels}
 
     def generate(self, light, count):
         return (2 * (to_encoded(light) + self.tint) - 1).clamp(-1, 1).expand(count, -1, -1, -1)
 
 
-def smooth(width, height, seed=1):
-    """A photo of smooth colours, never near black or white."""
+def smooth_photo(width, height, seed=1):
+    """Returns a photo of smooth colours that are neither near black nor near white."""
     coarse = np.random.default_rng(seed).uniform(0.15, 0.6, (4, 5, 3)).astype(np.float32)
     rows, columns = np.linspace(0, 2.99, height), np.linspace(0, 3.99, width)
-    picture = coarse[rows.astype(int)][:, columns.astype(int)]
-    for axis, where in ((0, rows), (1, columns)):
-        part = (where % 1).reshape([-1 if i == axis else 1 for i in range(3)]).astype(np.float32)
+    image = coarse[rows.astype(int)][:, columns.astype(int)]
+    for axis, positions in ((0, rows), (1, columns)):
+        fraction = (positions % 1).reshape([-1 if i == axis else 1 for i in range(3)]).astype(np.float32)
         later = coarse[np.minimum(rows.astype(int) + (axis == 0), 3)][
             :, np.minimum(columns.astype(int) + (axis == 1), 4)
         ]
-        picture = picture * (1 - part) + later * part
-    return Photo.from_array(picture.astype(np.float32), encoding="linear")
+        image = image * (1 - fraction) + later * fraction
+    return Photo.from_array(image.astype(np.float32), encoding="linear")
 
 
 @pytest.fixture(scope="module")
@@ -68,27 +68,27 @@ def lora(tmp_path_factory):
     with torch.no_grad():
         for parameter in lora_parameters(backbone):
             parameter.normal_(0, 0.1, generator=torch.Generator().manual_seed(3))
-    save_lora(folder, backbone, prompt, DecompositionTask(budget_px=SMALL), base=f"{TINY}kontext")
+    save_lora(folder, backbone, prompt, DecompositionTask(budget_px=SMALL_BUDGET_PX), base=f"{TINY}kontext")
     return folder
 
 
 @pytest.mark.parametrize("tint", [-0.1, 0.0, 0.08])
 def test_a_colour_shift_of_the_model_does_not_reach_the_layers(tint):
-    photo = smooth(300, 200)
-    result = Separator(DiffusionPredictor(Oracle(tint)))(photo)
-    off = np.abs(result.transmission.linear() - 0.7 * photo.linear()).mean()
+    photo = smooth_photo(300, 200)
+    result = Separator(DiffusionPredictor(FakePipeline(tint)))(photo)
+    error = np.abs(result.transmission.linear() - 0.7 * photo.linear()).mean()
     shifted = np.abs(to_linear(to_encoded(0.7 * photo.linear()) + tint) - 0.7 * photo.linear()).mean()
-    assert off < max(0.004, shifted / 2)
+    assert error < max(0.004, shifted / 2)
     assert result.reconstruction_error == pytest.approx(abs(tint), abs=0.004)
     assert result.doubtful == (abs(tint) > RECONSTRUCTION_ERROR_LIMIT)
 
 
 def test_confidence_falls_with_the_reconstruction_error():
-    photo = smooth(120, 90)
-    sure, doubtful = (
-        Separator(DiffusionPredictor(Oracle(tint)))(photo).confidence.pixels.mean() for tint in (0, 0.1)
+    photo = smooth_photo(120, 90)
+    confident, doubtful = (
+        Separator(DiffusionPredictor(FakePipeline(tint)))(photo).confidence.pixels.mean() for tint in (0, 0.1)
     )
-    assert sure > 245
+    assert confident > 245
     assert doubtful < 100
 
 
@@ -96,9 +96,11 @@ def test_strength_zero_is_the_photo_and_half_is_halfway():
     photo = Photo.from_array(
         np.random.default_rng(2).integers(0, 256, (160, 240, 3), np.uint8), encoding="srgb"
     )
-    separator = Separator(DiffusionPredictor(Oracle()))
+    separator = Separator(DiffusionPredictor(FakePipeline()))
     assert (separator(photo, strength=0).transmission.pixels == photo.pixels).all()
-    none, half, whole = (separator(photo, strength=share).transmission.linear() for share in (0, 0.5, 1))
+    none, half, whole = (
+        separator(photo, strength=strength).transmission.linear() for strength in (0, 0.5, 1)
+    )
     np.testing.assert_allclose(half, (none + whole) / 2, atol=0.01)
 
 
@@ -106,10 +108,10 @@ def test_the_detail_of_the_photo_is_kept_unless_plain_is_set():
     rows = np.linspace(0.2, 0.5, 400, dtype=np.float32)[:, None, None]
     photo = Photo.from_array(np.broadcast_to(rows, (400, 400, 3)).copy(), encoding="linear")
     fine = photo.linear()
-    fine[::2] *= 1.1  # lines of one pixel, which no panel of 96 px can show
+    fine[::2] *= 1.1  # lines of one pixel, which a panel of 96 px cannot resolve
     photo = Photo.from_array(fine, encoding="linear")
     guided, plain = (
-        Separator(DiffusionPredictor(Oracle(), plain=plain))(photo).transmission.linear()
+        Separator(DiffusionPredictor(FakePipeline(), plain=plain))(photo).transmission.linear()
         for plain in (False, True)
     )
     contrast = [np.abs(np.diff(layer[100:-100], axis=0)).mean() / np.abs(np.diff(fine[100:-100], axis=0)).mean()
@@ -121,9 +123,9 @@ def test_the_detail_of_the_photo_is_kept_unless_plain_is_set():
 def test_drafts_take_few_steps_and_best_uses_tiles():
     calls = {}
     for quality in ("draft", "standard", "best"):
-        oracle = Oracle()
-        Separator(DiffusionPredictor(oracle, average=2))(smooth(400, 300), quality=quality)
-        calls[quality] = oracle.calls
+        pipeline = FakePipeline()
+        Separator(DiffusionPredictor(pipeline, average=2))(smooth_photo(400, 300), quality=quality)
+        calls[quality] = pipeline.calls
     assert calls["draft"] == [((80, 112), 4, 2)]
     assert calls["standard"] == [((80, 112), 20, 2)]
     assert calls["best"][0] == calls["standard"][0]
@@ -133,40 +135,40 @@ def test_drafts_take_few_steps_and_best_uses_tiles():
 
 @pytest.mark.parametrize(("width", "height"), [(16, 16), (17, 40), (30, 20), (90, 21), (171, 16), (1000, 60)])
 def test_photos_of_any_shape_keep_their_size(width, height):
-    result = Separator(DiffusionPredictor(Oracle(budget_px=3 * 128 * 128)))(smooth(width, height))
+    result = Separator(DiffusionPredictor(FakePipeline(budget_px=3 * 128 * 128)))(smooth_photo(width, height))
     assert result.transmission.size == result.reflection.size == (width, height)
     np.testing.assert_allclose(result.transmission.linear(), 0.7 * result.photo.linear(), atol=0.02)
 
 
-def test_a_photo_that_is_smaller_than_a_token_is_refused_with_the_size_it_takes():
+def test_a_photo_that_is_smaller_than_a_token_is_refused_with_the_smallest_size():
     with pytest.raises(
         PhotoError, match=r"15 x 40 pixels; at least 16 pixels a side, .* or use the compact model"
     ):
-        Separator(DiffusionPredictor(Oracle()))(smooth(15, 40))
+        Separator(DiffusionPredictor(FakePipeline()))(smooth_photo(15, 40))
 
 
 def test_without_a_reflection_panel_the_reflection_is_what_was_removed():
-    photo = smooth(100, 80)
-    result = Separator(DiffusionPredictor(Oracle(panels=("T",), budget_px=96 * 96)))(photo)
+    photo = smooth_photo(100, 80)
+    result = Separator(DiffusionPredictor(FakePipeline(panels=("T",), budget_px=96 * 96)))(photo)
     np.testing.assert_allclose(result.reflection.linear(), 0.3 * photo.linear(), atol=0.02)
     assert result.reconstruction_error is None
     assert not result.doubtful
-    assert not result.confidence.pixels.any()  # no confidence without a reconstruction or several samples
+    assert not result.confidence.pixels.any()  # a confidence needs a reconstruction or several samples
 
 
 def test_a_model_that_generates_nan_is_refused():
-    class Broken(Oracle):
+    class Broken(FakePipeline):
         def generate(self, light, count):
             return super().generate(light * float("nan"), count)
 
-    with pytest.raises(ModelError, match="contains NaN or infinity; finite values"):
-        Separator(DiffusionPredictor(Broken()))(smooth(60, 40))
+    with pytest.raises(ModelError, match="contains NaN or infinity; expected finite values"):
+        Separator(DiffusionPredictor(Broken()))(smooth_photo(60, 40))
 
 
-def test_light_beyond_the_range_of_the_photo_is_no_reconstruction_error():
+def test_a_reconstruction_above_white_is_clipped_before_its_error_is_measured():
     photo = Photo.from_array(np.full((64, 64, 3), 1.0, np.float32), encoding="linear")
 
-    class Bright(Oracle):
+    class Bright(FakePipeline):
         def generate(self, light, count):
             return super().generate(light + 0.4, count)
 
@@ -175,7 +177,9 @@ def test_light_beyond_the_range_of_the_photo_is_no_reconstruction_error():
 
 def test_progress_rises_with_tiles_and_steps():
     progress = []
-    Separator(DiffusionPredictor(Oracle()))(smooth(400, 300), quality="best", on_progress=progress.append)
+    Separator(DiffusionPredictor(FakePipeline()))(
+        smooth_photo(400, 300), quality="best", on_progress=progress.append
+    )
     assert progress == sorted(progress)
     assert progress[-1] == 1
     assert len(progress) > 7 * 20
@@ -183,32 +187,32 @@ def test_progress_rises_with_tiles_and_steps():
 
 @pytest.mark.parametrize("options", [{"steps": 0}, {"average": 0}])
 def test_zero_steps_and_zero_averages_are_refused(options):
-    with pytest.raises(ModelError, match="both must be at least 1"):
-        DiffusionPredictor(Oracle(), **options)
+    with pytest.raises(ModelError, match="expected both to be at least 1"):
+        DiffusionPredictor(FakePipeline(), **options)
 
 
 def test_a_lora_is_loaded_by_its_folder(lora):
     separator = Separator.load(str(lora), steps=2)
-    first, again = separator(smooth(90, 60)), Separator.load(str(lora), steps=2)(smooth(90, 60))
+    first, again = separator(smooth_photo(90, 60)), Separator.load(str(lora), steps=2)(smooth_photo(90, 60))
     assert (separator.name, separator.device, len(separator.sha256)) == ("lora", "cpu", 64)
     assert (first.transmission.pixels == again.transmission.pixels).all()
     assert (first.transmission.pixels != first.photo.pixels).any()
     assert first.reconstruction_error is not None
-    other = Separator.load(str(lora), steps=3)(smooth(90, 60))
+    other = Separator.load(str(lora), steps=3)(smooth_photo(90, 60))
     assert (first.transmission.pixels != other.transmission.pixels).any()
 
 
 def test_a_backbone_without_a_lora_generates_the_transmission_only():
-    decomposer = load_pipeline("tiny:klein")
-    assert decomposer.task.layout.panels == ("T",)
+    pipeline = load_pipeline("tiny:klein")
+    assert pipeline.task.layout.panels == ("T",)
     generic = load_pipeline("tiny:klein", prompt="generic")
     assert generic.prompt.text == "Remove the reflection."
-    assert generic.sha256 != decomposer.sha256
-    result = Separator(DiffusionPredictor(decomposer, steps=1))(smooth(40, 40))
+    assert generic.sha256 != pipeline.sha256
+    result = Separator(DiffusionPredictor(pipeline, steps=1))(smooth_photo(40, 40))
     assert result.transmission.size == (40, 40)
 
 
-def test_what_a_lora_is_opened_with_is_checked(lora, tmp_path):
+def test_the_base_and_the_device_of_a_lora_are_checked(lora, tmp_path):
     with pytest.raises(ModelError, match="is a LoRA of kontext; its base, not a klein"):
         load_pipeline(str(lora), base="tiny:klein")
     with pytest.raises(ModelError, match="is a backbone, and the base tiny:kontext was given"):
@@ -217,13 +221,13 @@ def test_what_a_lora_is_opened_with_is_checked(lora, tmp_path):
         load_pipeline(str(lora), device="coreml")
     with pytest.raises(ModelError, match=f"contains no model; a LoRA .{LORA_FILE}"):
         load_pipeline(str(tmp_path))
-    (tmp_path / LORA_FILE).write_bytes(b"torn")
+    (tmp_path / LORA_FILE).write_bytes(b"damaged")
     with pytest.raises(ModelError):
         load_pipeline(str(tmp_path))
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "message"),
     [
         ({"rank": "4"}, "card of the LoRA cannot be read"),
         ({"alpha": 0}, "card of the LoRA cannot be read"),
@@ -237,12 +241,12 @@ def test_what_a_lora_is_opened_with_is_checked(lora, tmp_path):
         ({"task": {"layout": {"panels": ["T", "T"], "direction": "stacked"}}}, "each once"),
     ],
 )
-def test_a_damaged_card_is_a_model_error(lora, tmp_path, change, words):
-    tensors, about = read_tensors(lora / LORA_FILE)
-    card = json.loads(about["brewster"])
+def test_a_damaged_card_is_a_model_error(lora, tmp_path, change, message):
+    tensors, metadata = read_tensors(lora / LORA_FILE)
+    card = json.loads(metadata["brewster"])
     card |= change | {"task": card["task"] | change.get("task", {})}
-    write_tensors(tmp_path / LORA_FILE, tensors, about | {"brewster": json.dumps(card)})
-    with pytest.raises(ModelError, match=words):
+    write_tensors(tmp_path / LORA_FILE, tensors, metadata | {"brewster": json.dumps(card)})
+    with pytest.raises(ModelError, match=message):
         Separator.load(str(tmp_path))
 
 
@@ -264,18 +268,24 @@ def test_local_folders_do_not_hide_models(folder, tmp_path, monkeypatch):
         Separator.load(f"{folder}/mine")
 
 
-def test_a_base_that_has_moved_can_be_named(tmp_path):
+def test_the_path_of_a_base_that_has_moved_can_be_given(tmp_path):
     backbone, prompt = tiny("kontext")
     add_lora(backbone, rank=1, alpha=1)
-    save_lora(tmp_path / "lora", backbone, prompt, DecompositionTask(budget_px=SMALL), base="/gone/kontext")
+    save_lora(
+        tmp_path / "lora",
+        backbone,
+        prompt,
+        DecompositionTask(budget_px=SMALL_BUDGET_PX),
+        base="/gone/kontext",
+    )
     with pytest.raises(ModelError, match=r"the base of .* was /gone/kontext, which does not exist.*--base"):
         Separator.load(str(tmp_path / "lora"))
     assert Separator.load(str(tmp_path / "lora"), base="tiny:kontext").name == "lora"
 
 
-def test_one_step_takes_neither_steps_nor_averages():
-    one_step = Oracle()
-    one_step.task = DecompositionTask(PanelLayout(), SMALL, "one_step", 1.0)
+def test_a_one_step_model_refuses_steps_and_averages():
+    one_step = FakePipeline()
+    one_step.task = DecompositionTask(PanelLayout(), SMALL_BUDGET_PX, "one_step", 1.0)
     with pytest.raises(ModelError, match="one-step model"):
         DiffusionPredictor(one_step, steps=4)
     with pytest.raises(ModelError, match="one-step model"):

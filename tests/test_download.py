@@ -1,4 +1,4 @@
-"""Downloads from a server on this machine, and how they fail; test_polyhaven.py has more."""
+"""Downloads from a server on this machine, and their errors. test_polyhaven.py has more tests."""
 
 import hashlib
 import subprocess
@@ -46,7 +46,7 @@ def target(tmp_path):
     return tmp_path / "new" / "map"
 
 
-def test_a_file_is_downloaded_and_nothing_else_is_left(downloader, remote, target):
+def test_a_download_leaves_only_the_file_in_the_folder(downloader, remote, target):
     downloader.fetch(remote, target)
     assert target.read_bytes() == BODY
     assert [path.name for path in target.parent.iterdir()] == ["map"]
@@ -83,7 +83,7 @@ def test_a_partial_download_is_kept_for_the_next_call(server, remote, target):
 
 def test_a_file_with_a_wrong_digest_is_deleted(server, downloader, remote, target):
     server.bodies["/map"] = BODY[::-1]
-    with pytest.raises(DownloadError, match=r"SHA256 digest .* was expected; run again"):
+    with pytest.raises(DownloadError, match=r"SHA256 digest .* expected the digest .*; run again"):
         downloader.fetch(remote, target)
     assert list(target.parent.iterdir()) == []
 
@@ -103,7 +103,7 @@ def test_a_missing_file_is_requested_once(server, downloader, delays):
 
 @pytest.mark.parametrize("url", ["file:///etc/hosts", "ftp://127.0.0.1/map", "map", "", "http://a b/"])
 def test_only_http_urls_are_opened(downloader, url, delays):
-    with pytest.raises(DownloadError, match="https://; check the address"):
+    with pytest.raises(DownloadError, match="https://; check the URL"):
         downloader.read(url)
     assert delays == []
 

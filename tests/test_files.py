@@ -26,53 +26,53 @@ def touch(folder: Path, *names: str) -> Path:
     return folder
 
 
-def names(jobs: list[SeparationPaths]) -> dict[str, str]:
-    return {job.source.name: job.name for job in jobs}
+def layer_names(found: list[SeparationPaths]) -> dict[str, str]:
+    return {paths.source.name: paths.name for paths in found}
 
 
 def test_layers_are_next_to_their_image_and_keep_its_suffix(tmp_path: Path) -> None:
-    (job,) = find([touch(tmp_path, "view.jpg") / "view.jpg"])
-    assert job.target("transmission") == tmp_path / "view.transmission.jpg"
-    assert job.target("reflection") == tmp_path / "view.reflection.jpg"
-    assert job.target("confidence") == tmp_path / "view.confidence.png"
-    assert job.target("reflection", ".tif") == tmp_path / "view.reflection.tif"
+    (paths,) = find([touch(tmp_path, "view.jpg") / "view.jpg"])
+    assert paths.target("transmission") == tmp_path / "view.transmission.jpg"
+    assert paths.target("reflection") == tmp_path / "view.reflection.jpg"
+    assert paths.target("confidence") == tmp_path / "view.confidence.png"
+    assert paths.target("reflection", ".tif") == tmp_path / "view.reflection.tif"
 
 
 @pytest.mark.parametrize("name", ["view.gif", "view.unknown", "view"])
-def test_pictures_whose_format_is_not_written_get_png_layers(tmp_path: Path, name: str) -> None:
-    (job,) = find([touch(tmp_path, name) / name])
-    assert job.target("transmission") == tmp_path / "view.transmission.png"
+def test_images_whose_format_is_not_written_get_png_layers(tmp_path: Path, name: str) -> None:
+    (paths,) = find([touch(tmp_path, name) / name])
+    assert paths.target("transmission") == tmp_path / "view.transmission.png"
 
 
 def test_a_folder_is_searched_in_order_and_its_tree_is_mirrored(tmp_path: Path) -> None:
     touch(tmp_path / "in", "b.jpg", "a.PNG", "deep/er/c.webp", "notes.txt")
-    jobs = find([tmp_path / "in"], output_folder=tmp_path / "out")
-    assert [job.source.name for job in jobs] == ["a.PNG", "b.jpg", "c.webp"]
-    assert jobs[2].target("transmission") == tmp_path / "out/deep/er/c.transmission.webp"
+    found = find([tmp_path / "in"], output_folder=tmp_path / "out")
+    assert [paths.source.name for paths in found] == ["a.PNG", "b.jpg", "c.webp"]
+    assert found[2].target("transmission") == tmp_path / "out/deep/er/c.transmission.webp"
 
 
 def test_hidden_files_and_results_are_skipped(tmp_path: Path) -> None:
-    ours = [f"a.{layer}.png" for layer in ("transmission", "reflection", "confidence")]
-    touch(tmp_path, "a.jpg", ".hidden.jpg", ".thumbnails/b.jpg", *ours)
-    assert names(find([tmp_path])) == {"a.jpg": "a"}
+    results = [f"a.{layer}.png" for layer in ("transmission", "reflection", "confidence")]
+    touch(tmp_path, "a.jpg", ".hidden.jpg", ".thumbnails/b.jpg", *results)
+    assert layer_names(find([tmp_path])) == {"a.jpg": "a"}
 
 
 def test_a_file_given_by_name_is_always_listed(tmp_path: Path) -> None:
-    wanted = ["a.transmission.jpg", ".hidden.jpg", "missing.jpg"]
-    touch(tmp_path, *wanted[:2])
-    assert list(names(find([tmp_path / name for name in wanted]))) == wanted
+    file_names = ["a.transmission.jpg", ".hidden.jpg", "missing.jpg"]
+    touch(tmp_path, *file_names[:2])
+    assert list(layer_names(find([tmp_path / name for name in file_names]))) == file_names
 
 
-def test_two_pictures_of_one_stem_keep_their_suffix(tmp_path: Path) -> None:
+def test_two_images_of_one_stem_keep_their_suffix(tmp_path: Path) -> None:
     touch(tmp_path, "a.jpg", "a.png", "b.jpg")
-    assert names(find([tmp_path])) == {"a.jpg": "a.jpg", "a.png": "a.png", "b.jpg": "b"}
+    assert layer_names(find([tmp_path])) == {"a.jpg": "a.jpg", "a.png": "a.png", "b.jpg": "b"}
 
 
 def test_names_do_not_depend_on_the_selection_or_on_existing_results(tmp_path: Path) -> None:
     touch(tmp_path, "a.jpg", "a.png")
-    before = names(find([tmp_path / "a.jpg"]))
+    before = layer_names(find([tmp_path / "a.jpg"]))
     touch(tmp_path, "a.jpg.transmission.jpg", "a.jpg.confidence.png")
-    assert before == names(find([tmp_path / "a.jpg"])) == {"a.jpg": "a.jpg"}
+    assert before == layer_names(find([tmp_path / "a.jpg"])) == {"a.jpg": "a.jpg"}
 
 
 @settings(max_examples=50, deadline=None, database=None)
@@ -85,12 +85,12 @@ def test_names_do_not_depend_on_the_selection_or_on_existing_results(tmp_path: P
         max_size=8,
     )
 )
-def test_no_two_pictures_of_a_folder_share_a_target(
+def test_no_two_images_of_a_folder_share_a_target(
     tmp_path_factory: pytest.TempPathFactory, files: set[str]
 ) -> None:
-    jobs = find([touch(tmp_path_factory.mktemp("pictures"), *files)])
-    targets = {job.target(layer) for job in jobs for layer in ("transmission", "confidence")}
-    assert len(jobs) == len(files)
+    found = find([touch(tmp_path_factory.mktemp("images"), *files)])
+    targets = {paths.target(layer) for paths in found for layer in ("transmission", "confidence")}
+    assert len(found) == len(files)
     assert len(targets) == 2 * len(files)
 
 
@@ -98,8 +98,8 @@ def test_link_loops_end_and_linked_folders_are_searched_once(tmp_path: Path) -> 
     touch(tmp_path, "deep/a.jpg")
     (tmp_path / "deep" / "loop").symlink_to(tmp_path)
     (tmp_path / "self.jpg").symlink_to(tmp_path / "self.jpg")
-    jobs = find([tmp_path])
-    assert [job.source.name for job in jobs] == ["a.jpg", "self.jpg"]
+    found = find([tmp_path])
+    assert [paths.source.name for paths in found] == ["a.jpg", "self.jpg"]
 
 
 def test_an_image_given_twice_is_listed_once(tmp_path: Path) -> None:
@@ -107,7 +107,7 @@ def test_an_image_given_twice_is_listed_once(tmp_path: Path) -> None:
     assert len(find([tmp_path, tmp_path / "a.jpg", tmp_path / "." / "a.jpg"])) == 1
 
 
-def test_pictures_of_two_folders_with_one_target_are_refused_before_any_work(tmp_path: Path) -> None:
+def test_images_of_two_folders_with_one_target_are_refused_before_any_work(tmp_path: Path) -> None:
     touch(tmp_path, "x/a.jpg", "y/a.jpg")
     with pytest.raises(TargetError, match="would both be written"):
         find([tmp_path / "x/a.jpg", tmp_path / "y/a.jpg"], output_folder=tmp_path / "out")
@@ -125,15 +125,15 @@ def test_an_unreadable_folder_is_listed_so_that_opening_it_reports_the_error(
         return listing(path)
 
     monkeypatch.setattr(Path, "iterdir", iterdir)
-    assert [job.source.name for job in find([tmp_path])] == ["locked", "z.jpg"]
+    assert [paths.source.name for paths in find([tmp_path])] == ["locked", "z.jpg"]
 
 
 @pytest.mark.parametrize("name", ["two words.jpg", "Kühlhaus été 窓.jpg", "line\nbreak.jpg", "-dash.jpg"])
 def test_names_with_spaces_accents_and_newlines_work(tmp_path: Path, name: str) -> None:
-    (job,) = find([touch(tmp_path, name)])
-    write_atomically(job.target("transmission"), b"layer")
-    assert job.target("transmission").read_bytes() == b"layer"
-    assert job.target("transmission").name == name.replace(".jpg", ".transmission.jpg")
+    (paths,) = find([touch(tmp_path, name)])
+    write_atomically(paths.target("transmission"), b"layer")
+    assert paths.target("transmission").read_bytes() == b"layer"
+    assert paths.target("transmission").name == name.replace(".jpg", ".transmission.jpg")
 
 
 def test_writing_creates_the_folder_and_leaves_only_the_file(tmp_path: Path) -> None:
@@ -152,27 +152,29 @@ def test_nothing_is_overwritten_by_default(tmp_path: Path) -> None:
     assert path.read_bytes() == b"new"
 
 
-def test_a_file_that_appears_while_we_write_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_appears_during_writing_is_not_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path, fsync = tmp_path / "a.png", os.fsync
 
-    def meanwhile(descriptor: int) -> None:
-        path.write_bytes(b"theirs")
+    def write_other_file(descriptor: int) -> None:
+        path.write_bytes(b"other")
         fsync(descriptor)
 
-    monkeypatch.setattr(os, "fsync", meanwhile)
+    monkeypatch.setattr(os, "fsync", write_other_file)
     with pytest.raises(TargetError, match="exists"):
-        write_atomically(path, b"ours")
-    assert path.read_bytes() == b"theirs"
+        write_atomically(path, b"new")
+    assert path.read_bytes() == b"other"
 
 
 def test_the_source_is_never_the_target(tmp_path: Path) -> None:
     source, link = tmp_path / "a.png", tmp_path / "link.png"
-    source.write_bytes(b"picture")
+    source.write_bytes(b"image")
     link.symlink_to(source)
     for target in (source, link):
         with pytest.raises(TargetError, match="the input image itself"):
             write_atomically(target, b"layer", overwrite=True, source=source)
-    assert source.read_bytes() == b"picture"
+    assert source.read_bytes() == b"image"
 
 
 @pytest.mark.parametrize(
@@ -222,7 +224,7 @@ def test_a_read_only_target_is_kept_even_with_overwrite(
     assert (tmp_path / "a.png").read_bytes() == b"old"
 
 
-def test_file_systems_without_links_are_written_to_as_well(
+def test_files_are_written_on_file_systems_without_hard_links(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: object) -> None:
@@ -232,7 +234,7 @@ def test_file_systems_without_links_are_written_to_as_well(
     write_atomically(tmp_path / "a.png", b"whole")
     assert [path.name for path in tmp_path.iterdir()] == ["a.png"]
     with pytest.raises(TargetError, match="overwrite"):
-        write_atomically(tmp_path / "a.png", b"another")
+        write_atomically(tmp_path / "a.png", b"new")
     assert (tmp_path / "a.png").read_bytes() == b"whole"
 
 
@@ -255,7 +257,7 @@ def test_impossible_targets_are_errors(tmp_path: Path, target: str, word: str) -
         (macos.MacOS, {"HOME": "/Users/ann"}, "/Users/ann/Library/Caches/brewster"),
     ],
 )
-def test_downloads_are_kept_where_the_system_has_its_caches(
+def test_downloads_are_in_the_cache_folder_of_the_system(
     monkeypatch: pytest.MonkeyPatch, system: type, variables: dict[str, str], folder: str
 ) -> None:
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
@@ -266,7 +268,7 @@ def test_downloads_are_kept_where_the_system_has_its_caches(
 
 
 def test_ctrl_c_just_after_the_rename_leaves_nothing_else(tmp_path, monkeypatch):
-    """The interrupt comes before the hidden file is deleted; this happened on a busy machine."""
+    """The interrupt comes before the hidden file is deleted, as on a machine with a high load."""
     discard, calls = files.discard, []
 
     def interrupted(path):

@@ -3,13 +3,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from brewster.inference.guided_upsampling import GeneratedOverride, GuidedUpsampler, enlarge_rows
+from brewster.inference.guided_upsampling import GeneratedOverride, GuidedUpsampler, upsample_rows
 from brewster.metrics import psnr
 
 
-def shrink(picture, factor):
-    height, width, channels = picture.shape
-    return picture.reshape(height // factor, factor, width // factor, factor, channels).mean((1, 3))
+def downsample(image, factor):
+    height, width, channels = image.shape
+    return image.reshape(height // factor, factor, width // factor, factor, channels).mean((1, 3))
 
 
 @pytest.fixture
@@ -31,32 +31,32 @@ def as_bytes(layer):
 def test_a_soft_reflection_is_removed_and_sharp_detail_is_kept(sharp_scene_and_soft_reflection):
     scene, reflection = sharp_scene_and_soft_reflection
     photo = scene + reflection
-    upsampler = fit(*(shrink(layer, 8) for layer in (photo, scene, reflection)))
+    upsampler = fit(*(downsample(layer, 8) for layer in (photo, scene, reflection)))
     transmission, reflected = upsampler.apply(photo, 0, 160)
-    enlarged = enlarge_rows(shrink(scene, 8), 0, 160, (160, 240))
-    assert psnr(as_bytes(transmission), as_bytes(scene)) > psnr(as_bytes(enlarged), as_bytes(scene)) + 15
+    upsampled = upsample_rows(downsample(scene, 8), 0, 160, (160, 240))
+    assert psnr(as_bytes(transmission), as_bytes(scene)) > psnr(as_bytes(upsampled), as_bytes(scene)) + 15
     assert psnr(as_bytes(reflected), as_bytes(reflection)) > 35
 
 
 @pytest.mark.parametrize("gain", [0.7, 1.25])
-def test_glass_that_only_dims_leaves_no_trace_of_the_scene_in_the_reflection(random, gain):
+def test_without_a_reflection_the_scene_does_not_appear_in_the_reflection(random, gain):
     photo = np.kron(random.random((20, 30, 3)), np.ones((8, 8, 1))).astype(np.float32) * 0.7
-    small = shrink(photo, 4)
+    small = downsample(photo, 4)
     transmission, reflected = fit(small, gain * small, np.zeros_like(small)).apply(photo, 0, 160)
     assert not reflected.any()
     assert psnr(as_bytes(transmission), as_bytes(gain * photo)) > 38
 
 
 def test_without_upsampling_the_prediction_is_unchanged(random):
-    photo, transmission, share = (random.random((33, 47, 3), np.float32) for _ in range(3))
-    reflection = share * photo
+    photo, transmission, fraction = (random.random((33, 47, 3), np.float32) for _ in range(3))
+    reflection = fraction * photo
     layers = fit(photo, transmission, reflection).apply(photo, 0, 33)
     np.testing.assert_allclose(layers, (transmission, reflection), atol=1e-5)
 
 
 def test_an_unchanged_photo_is_kept_bit_equal_even_where_its_light_is_negative(random):
     photo = random.random((64, 48, 3), np.float32) * 3 - 0.5
-    small = np.clip(shrink(photo, 4), 0, 1)
+    small = np.clip(downsample(photo, 4), 0, 1)
     transmission, reflection = fit(small, small, np.zeros_like(small)).apply(photo, 0, 64)
     assert (transmission == photo).all()
     assert (reflection == 0).all()
@@ -72,32 +72,35 @@ def test_no_reflection_is_brighter_than_the_photo(random):
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(1, 40), st.integers(1, 40))
 def test_rows_computed_one_at_a_time_equal_all_rows_at_once(small_height, small_width, height, width):
     map_ = np.random.default_rng(1).random((small_height, small_width, 2), np.float32)
-    whole = enlarge_rows(map_, 0, height, (height, width))
-    rows = [enlarge_rows(map_, top, 1, (height, width)) for top in range(height)]
+    whole = upsample_rows(map_, 0, height, (height, width))
+    rows = [upsample_rows(map_, top, 1, (height, width)) for top in range(height)]
     assert (np.concatenate(rows) == whole).all()
 
 
-def test_a_ramp_stays_a_ramp_when_enlarged():
+def test_a_ramp_stays_a_ramp_when_upsampled():
     ramp = np.arange(8, dtype=np.float32).reshape(1, 8, 1)
-    enlarged = enlarge_rows(ramp, 0, 1, (1, 32))[0, :, 0]
-    np.testing.assert_allclose(np.diff(enlarged[2:-2]), 0.25, atol=1e-6)
-    assert enlarged.mean() == pytest.approx(ramp.mean())
+    upsampled = upsample_rows(ramp, 0, 1, (1, 32))[0, :, 0]
+    np.testing.assert_allclose(np.diff(upsampled[2:-2]), 0.25, atol=1e-6)
+    assert upsampled.mean() == pytest.approx(ramp.mean())
 
 
 def test_fine_detail_of_the_reflection_is_replaced_by_the_generated_transmission():
-    """A reflection of fine lines in front of a smooth wall: at low resolution the lines are grey."""
-    large = 240
-    wall = np.broadcast_to(np.linspace(0.2, 0.4, large, dtype=np.float32)[:, None, None], (large, large, 3))
-    lines = np.zeros((large, large, 3), np.float32)
-    lines[:, ::6] = lines[:, 1::6] = 0.3  # a period of two small pixels
+    """The reflection has fine lines and the background is smooth. At low resolution the lines merge to grey."""
+    size = 240
+    wall = np.broadcast_to(np.linspace(0.2, 0.4, size, dtype=np.float32)[:, None, None], (size, size, 3))
+    lines = np.zeros((size, size, 3), np.float32)
+    lines[:, ::6] = lines[:, 1::6] = 0.3  # a period of two pixels at low resolution
     photo = wall + lines
-    generated, reflected = shrink(wall, 3), shrink(lines, 3)
+    generated, reflected = downsample(wall, 3), downsample(lines, 3)
     override = GeneratedOverride.weighted_by_detail(generated, reflected)
     errors = [
         np.abs(
-            GuidedUpsampler.fit(shrink(photo, 3), -reflected, reflected, how).apply(photo, 0, large)[0] - wall
+            GuidedUpsampler.fit(downsample(photo, 3), -reflected, reflected, candidate).apply(photo, 0, size)[
+                0
+            ]
+            - wall
         ).mean()
-        for how in (None, override)
+        for candidate in (None, override)
     ]
     assert errors[1] < errors[0] / 5
     assert override.weight[8:-8, 8:-8].min() > 0.9

@@ -12,7 +12,7 @@ from brewster.image_formats import FORMATS, SUFFIXES, WRITABLE, FormatName, form
 PAGE = Path(image_formats.__file__).parent / "web" / "page" / "index.html"
 
 
-def test_format_names_of_type_checkers_are_those_of_the_table():
+def test_the_type_of_format_names_has_the_names_of_the_table():
     assert get_args(FormatName) == tuple(WRITABLE)
 
 
@@ -21,9 +21,9 @@ def test_each_suffix_and_each_mime_type_belongs_to_one_format():
     assert len({row.mime_type for row in FORMATS.values()}) == len(FORMATS)
 
 
-@pytest.mark.parametrize(("name", "found"), [("a.JPG", "jpeg"), ("a.b.tif", "tiff"), ("a.gif", "gif")])
-def test_the_format_of_a_file_name_is_that_of_its_suffix(name, found):
-    assert format_of(Path(name)).name == found
+@pytest.mark.parametrize(("name", "expected"), [("a.JPG", "jpeg"), ("a.b.tif", "tiff"), ("a.gif", "gif")])
+def test_the_format_of_a_file_name_is_that_of_its_suffix(name, expected):
+    assert format_of(Path(name)).name == expected
 
 
 @pytest.mark.parametrize("name", ["a", "a.txt", ".png"])
@@ -38,7 +38,7 @@ def test_libvips_formats_have_a_loader_and_the_written_ones_a_saver():
         assert (row.vips_saver is not None) == (uses_libvips and row.is_writable)
 
 
-def test_the_page_offers_every_suffix_that_browsers_may_not_count_as_an_image():
-    (offered,) = re.findall(r'accept="image/\*,([^"]*)"', PAGE.read_text())
+def test_the_page_accepts_every_suffix_that_browsers_may_not_recognise_as_an_image():
+    (accepted,) = re.findall(r'accept="image/\*,([^"]*)"', PAGE.read_text())
     common = {suffix for name in ("jpeg", "png", "gif") for suffix in FORMATS[name].suffixes}
-    assert set(offered.split(",")) == set(SUFFIXES) - common
+    assert set(accepted.split(",")) == set(SUFFIXES) - common

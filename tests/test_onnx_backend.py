@@ -18,40 +18,40 @@ def network():
     torch.nn.init.normal_(network.head.weight, std=0.1)
     with torch.no_grad():
         for parameter in network.parameters():
-            parameter.copy_(parameter.half())  # the file's precision
+            parameter.copy_(parameter.half())  # the precision of the file
     return network
 
 
 @pytest.fixture(scope="module")
-def exported(network, tmp_path_factory):
+def model_file(network, tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "model.onnx"
     export_onnx(network, path, STRIDE)
     return path
 
 
 @pytest.mark.parametrize("size", [(64, 96), (160, 32), (320, 448)])
-def test_the_exported_model_equals_the_network_at_any_size(network, exported, size):
+def test_the_exported_model_equals_the_network_at_any_size(network, model_file, size):
     tile = np.random.default_rng(1).random((*size, 3), np.float32)
     with torch.no_grad():
         expected = LinearSeparator(network)(torch.from_numpy(tile).permute(2, 0, 1)[None])
-    for layer, truth in zip(OnnxBackend(exported, "cpu")(tile), expected, strict=True):
-        np.testing.assert_allclose(layer, truth[0].permute(1, 2, 0).numpy(), atol=2e-4)
+    for layer, expected_layer in zip(OnnxBackend(model_file, "cpu")(tile), expected, strict=True):
+        np.testing.assert_allclose(layer, expected_layer[0].permute(1, 2, 0).numpy(), atol=2e-4)
 
 
-def test_the_file_holds_two_bytes_a_weight(network, exported):
+def test_the_file_has_two_bytes_for_each_weight(network, model_file):
     weights = sum(parameter.numel() for parameter in network.parameters())
-    assert 2 * weights < exported.stat().st_size < 2 * weights + 5e5
+    assert 2 * weights < model_file.stat().st_size < 2 * weights + 5e5
 
 
 @pytest.mark.parametrize("size", [(1, 1), (33, 31), (5, 200)])
-def test_sides_that_are_no_multiple_of_the_stride_are_kept(exported, size):
-    for layer in OnnxBackend(exported, "cpu")(np.full((*size, 3), 0.5, np.float32)):
+def test_layers_have_the_size_of_the_tile_if_its_sides_are_no_multiples_of_the_stride(model_file, size):
+    for layer in OnnxBackend(model_file, "cpu")(np.full((*size, 3), 0.5, np.float32)):
         assert layer.shape == (*size, 3)
         assert np.isfinite(layer).all()
 
 
-def test_threads_that_share_a_backend_get_the_same_outputs(exported):
-    backend = OnnxBackend(exported, "cpu")
+def test_threads_that_share_a_backend_get_the_same_outputs(model_file):
+    backend = OnnxBackend(model_file, "cpu")
     tiles = [np.random.default_rng(seed).random((64, 64, 3), np.float32) for seed in range(4)]
     expected = [backend(tile)[0] for tile in tiles]
     outputs = [None] * 4
@@ -62,24 +62,24 @@ def test_threads_that_share_a_backend_get_the_same_outputs(exported):
         thread.start()
     for thread in threads:
         thread.join()
-    for output, truth in zip(outputs, expected, strict=True):
-        assert (output == truth).all()
+    for output, expected_output in zip(outputs, expected, strict=True):
+        assert (output == expected_output).all()
 
 
-def test_an_unavailable_device_is_an_error_with_the_command_that_installs_it(exported):
-    missing = "cuda" if "cuda" not in available_devices() else "coreml"
+def test_an_unavailable_device_is_an_error_with_the_command_that_installs_it(model_file):
+    unavailable = "cuda" if "cuda" not in available_devices() else "coreml"
     with pytest.raises(DeviceError, match="pip install onnxruntime"):
-        OnnxBackend(exported, missing)
+        OnnxBackend(model_file, unavailable)
     with pytest.raises(DeviceError, match="one of auto"):
-        OnnxBackend(exported, "toaster")
+        OnnxBackend(model_file, "unknown")
 
 
-def test_auto_finds_a_device(exported):
-    assert OnnxBackend(exported).device == available_devices()[0]
+def test_auto_finds_a_device(model_file):
+    assert OnnxBackend(model_file).device == available_devices()[0]
 
 
-def test_a_device_that_does_not_start_is_an_error_and_auto_skips_it(exported, monkeypatch):
-    """As with onnxruntime-gpu where there is no driver: the provider is listed, and its session is the CPU's."""
+def test_a_device_that_does_not_start_is_an_error_and_auto_skips_it(model_file, monkeypatch):
+    """With onnxruntime-gpu and no driver, the provider is listed, but its session runs on the CPU."""
     monkeypatch.setitem(
         onnx_backend._PROVIDERS, "cuda", ("AzureExecutionProvider", "pip install onnxruntime-gpu")
     )
@@ -92,8 +92,8 @@ def test_a_device_that_does_not_start_is_an_error_and_auto_skips_it(exported, mo
         onnx_backend.ort.InferenceSession, "get_providers", lambda self: ["CPUExecutionProvider"]
     )
     with pytest.raises(DeviceError, match="does not start"):
-        OnnxBackend(exported, "cuda")
-    assert OnnxBackend(exported, "auto").device == "cpu"
+        OnnxBackend(model_file, "cuda")
+    assert OnnxBackend(model_file, "auto").device == "cpu"
 
 
 def test_a_file_that_is_no_model_is_an_error(tmp_path):
@@ -104,6 +104,6 @@ def test_a_file_that_is_no_model_is_an_error(tmp_path):
         OnnxBackend(tmp_path / "missing.onnx")
 
 
-def test_a_model_that_fails_at_run_time_is_a_model_error(exported):
+def test_a_model_that_fails_at_run_time_is_a_model_error(model_file):
     with pytest.raises(ModelError, match="tile of 0x0"):
-        OnnxBackend(exported, "cpu")(np.zeros((0, 0, 3), np.float32))
+        OnnxBackend(model_file, "cpu")(np.zeros((0, 0, 3), np.float32))

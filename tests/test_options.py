@@ -1,4 +1,4 @@
-"""The options are written once: signatures, defaults and documentation of the Python API come from `Options`."""
+"""Defaults and documentation of the Python API are those of `Options`."""
 
 import inspect
 from dataclasses import fields

@@ -1,4 +1,4 @@
-"""Colour: sRGB by table, matrix profiles both ways, grey, chromaticities; against littleCMS or a formula."""
+"""Colour: sRGB, matrix profiles, grey, chromaticities and LUT profiles, compared with littleCMS or a formula."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from brewster.photo.lut_profiles import convert_to_display_p3
 quick = settings(max_examples=25, deadline=None, database=None)
 
 GAMMA = struct.pack(">4s4xIH", b"curv", 1, round(2.2 * 256))
-STRAIGHT = struct.pack(">4s4xI", b"curv", 0)
+LINEAR = struct.pack(">4s4xI", b"curv", 0)
 SAMPLED = (
     struct.pack(">4s4xI", b"curv", 1024) + (np.linspace(0, 1, 1024) ** 1.8 * 65535).astype(">u2").tobytes()
 )
@@ -36,7 +36,7 @@ PRO = ((0.79767, 0.28804, 0.0), (0.13519, 0.71188, 0.0), (0.03134, 0.00009, 0.82
 
 
 def profile(curve: bytes, colourants: tuple[tuple[float, ...], ...] | None) -> bytes:
-    """A small ICC profile: matrix RGB, or grey without colourants."""
+    """Returns a small ICC profile: RGB with a matrix, or grey if `colourants` is None."""
     curve += bytes(-len(curve) % 4)
     xyz = {
         name: struct.pack(">4s4x3i", b"XYZ ", *(round(65536 * value) for value in values))
@@ -59,10 +59,13 @@ def profile(curve: bytes, colourants: tuple[tuple[float, ...], ...] | None) -> b
 
 
 def table_profile(points: int = 33) -> bytes:
-    """An ICC profile without matrix: a table (lut16Type) from RGB, with a curve of 1.8 and turned primaries, to Lab."""
+    """Returns an ICC profile with a table (lut16Type) from RGB to Lab and without a matrix.
+
+    Its tone curve has the exponent 1.8, and its primaries are `TABLE_PRIMARIES`.
+    """
     grid = np.linspace(0, 1, points)
     rgb = np.stack(np.meshgrid(grid, grid, grid, indexing="ij"), axis=-1)
-    xyz = rgb**1.8 @ np.array(TURNED) / (0.9642, 1.0, 0.8249)
+    xyz = rgb**1.8 @ np.array(TABLE_PRIMARIES) / (0.9642, 1.0, 0.8249)
     root = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29)
     lightness, red, yellow = (
         116 * root[..., 1] - 16,
@@ -70,11 +73,11 @@ def table_profile(points: int = 33) -> bytes:
         200 * (root[..., 1] - root[..., 2]),
     )
     lab = np.stack([lightness * 652.8, (red + 128) * 256, (yellow + 128) * 256], axis=-1)
-    straight = struct.pack(">6H", *(0, 65535) * 3)
+    linear_curve = struct.pack(">6H", *(0, 65535) * 3)
     table = np.rint(lab).clip(0, 65535).astype(">u2").tobytes()
     matrix = struct.pack(">9i", *(65536 * (i % 4 == 0) for i in range(9)))
     lut = struct.pack(">4s4x4B", b"mft2", 3, 3, points, 0) + matrix + struct.pack(">2H", 2, 2)
-    lut += straight + table + straight
+    lut += linear_curve + table + linear_curve
     lut += bytes(-len(lut) % 4)
     white = struct.pack(">4s4x3i", b"XYZ ", 63190, 65536, 54061)
     body, rows, start = b"", b"", 132 + 2 * 12
@@ -87,95 +90,95 @@ def table_profile(points: int = 33) -> bytes:
     return head + struct.pack(">I", 2) + rows + body
 
 
-TURNED = (
+TABLE_PRIMARIES = (
     (0.35, 0.20, 0.05),
     (0.42, 0.68, 0.09),
     (0.1942, 0.12, 0.6849),
 )
-"""XYZ of red, green and blue, under D50: inside Display P3."""
+"""XYZ of red, green and blue under D50. These colours are in the gamut of Display P3."""
 
 PROFILES = {
     "Display P3": bytes(pyvips.Image.profile_load("p3")),
     "Adobe RGB": profile(GAMMA, ADOBE),
     "ProPhoto, sampled": profile(SAMPLED, PRO),
-    "linear": profile(STRAIGHT, ADOBE),
+    "linear": profile(LINEAR, ADOBE),
 }
 
 
-def stored(pixels: np.ndarray, icc: bytes | None) -> Photo:
+def photo_of(pixels: np.ndarray, icc: bytes | None) -> Photo:
     return Photo(pixels, None, FileInfo(bits=8 * pixels.dtype.itemsize, icc=icc))
 
 
-def ramp(kind: type, channels: int = 3) -> np.ndarray:
-    """Every value of the type, in each channel in another order."""
-    count = np.iinfo(kind).max + 1
+def ramp(dtype: type, channels: int = 3) -> np.ndarray:
+    """Returns every value of the dtype, in another order in each channel."""
+    count = np.iinfo(dtype).max + 1
     order = np.random.default_rng(1)
-    return np.stack([order.permutation(count) for _ in range(channels)], axis=1).astype(kind)[None]
+    return np.stack([order.permutation(count) for _ in range(channels)], axis=1).astype(dtype)[None]
 
 
-@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
-def test_srgb_light_is_the_curve_and_every_value_comes_back(kind: type) -> None:
-    photo = stored(ramp(kind), None)
-    formula = srgb.to_linear(photo.pixels / np.iinfo(kind).max)
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_srgb_is_decoded_by_its_curve_and_every_value_round_trips(dtype: type) -> None:
+    photo = photo_of(ramp(dtype), None)
+    formula = srgb.to_linear(photo.pixels / np.iinfo(dtype).max)
     np.testing.assert_allclose(photo.linear(), formula, atol=1e-7)
     assert np.array_equal(photo.with_linear(photo.linear()).pixels, photo.pixels)
 
 
-@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
-def test_new_light_is_rounded_to_the_nearest_value(kind: type) -> None:
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_new_light_is_rounded_to_the_nearest_value(dtype: type) -> None:
     linear = np.linspace(-0.1, 1.1, 30_000, dtype=np.float32).reshape(10, 1000, 3)
-    white = np.iinfo(kind).max
-    found = stored(np.zeros((10, 1000, 3), kind), None).with_linear(linear).pixels
+    white = np.iinfo(dtype).max
+    found = photo_of(np.zeros((10, 1000, 3), dtype), None).with_linear(linear).pixels
     exact = srgb.to_encoded(linear.clip(0, 1).astype(np.float64)) * white
     assert np.abs(found - exact).max() <= 0.6
 
 
 @pytest.mark.parametrize("name", PROFILES)
-@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
-def test_unchanged_light_comes_back_bit_equal_through_every_profile(name: str, kind: type) -> None:
-    photo = stored(ramp(kind), PROFILES[name])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_unchanged_light_is_bit_equal_with_every_profile(name: str, dtype: type) -> None:
+    photo = photo_of(ramp(dtype), PROFILES[name])
     assert np.array_equal(photo.with_linear(photo.linear()).pixels, photo.pixels)
 
 
 @pytest.mark.parametrize("name", PROFILES)
-def test_a_profile_agrees_with_littlecms_on_the_way_in(name: str) -> None:
+def test_a_profile_agrees_with_littlecms_when_it_is_decoded(name: str) -> None:
     pixels = np.random.default_rng(2).integers(0, 256, (32, 32, 3), np.uint8)
-    theirs = ImageCms.profileToProfile(
+    expected = ImageCms.profileToProfile(
         Image.fromarray(pixels),
         ImageCms.ImageCmsProfile(io.BytesIO(PROFILES[name])),
         ImageCms.createProfile("sRGB"),
         renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
         flags=ImageCms.Flags.NOOPTIMIZE,
     )
-    ours = srgb.to_encoded(stored(pixels, PROFILES[name]).linear().clip(0, 1)) * 255
-    assert np.abs(ours - np.asarray(theirs)).max() <= 1
+    ours = srgb.to_encoded(photo_of(pixels, PROFILES[name]).linear().clip(0, 1)) * 255
+    assert np.abs(ours - np.asarray(expected)).max() <= 1
 
 
 @pytest.mark.parametrize("name", PROFILES)
-def test_a_profile_agrees_with_littlecms_on_the_way_back(name: str) -> None:
+def test_a_profile_agrees_with_littlecms_when_it_is_encoded(name: str) -> None:
     linear = np.random.default_rng(3).random((32, 32, 3), dtype=np.float32)
     encoded = np.rint(srgb.to_encoded(linear) * 255).astype(np.uint8)
-    theirs = ImageCms.profileToProfile(
+    expected = ImageCms.profileToProfile(
         Image.fromarray(encoded),
         ImageCms.createProfile("sRGB"),
         ImageCms.ImageCmsProfile(io.BytesIO(PROFILES[name])),
         renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
         flags=ImageCms.Flags.NOOPTIMIZE,
     )
-    ours = stored(np.zeros_like(encoded), PROFILES[name]).with_linear(srgb.to_linear(encoded / 255)).pixels
-    assert np.abs(ours.astype(int) - np.asarray(theirs)).max() <= 1
+    ours = photo_of(np.zeros_like(encoded), PROFILES[name]).with_linear(srgb.to_linear(encoded / 255)).pixels
+    assert np.abs(ours.astype(int) - np.asarray(expected)).max() <= 1
 
 
 def test_wide_gamut_is_not_clipped_and_white_stays_white() -> None:
     green_and_white = np.array([[[0, 255, 0], [255, 255, 255]]], np.uint8)
-    green, white = stored(green_and_white, PROFILES["Display P3"]).linear()[0]
+    green, white = photo_of(green_and_white, PROFILES["Display P3"]).linear()[0]
     assert green[0] < -0.1
     np.testing.assert_allclose(white, 1, atol=2e-3)
 
 
 @quick
 @given(arrays.arrays(np.float32, (4, 5, 3), elements=st.floats(0, 1, width=32)))
-def test_storing_and_reading_light_is_an_inverse_within_a_sixteen_bit_step(linear: np.ndarray) -> None:
+def test_encoding_and_decoding_light_changes_it_by_less_than_a_16_bit_level(linear: np.ndarray) -> None:
     for icc in (None, *PROFILES.values()):
         space = colour_space_of(icc, None, is_float=False)
         inside = space.to_linear(space.to_stored(linear, np.zeros(linear.shape, np.uint16)))
@@ -183,9 +186,9 @@ def test_storing_and_reading_light_is_an_inverse_within_a_sixteen_bit_step(linea
         np.testing.assert_allclose(again, inside, atol=1e-4)
 
 
-def test_a_strip_means_the_same_light_wherever_it_is_cut() -> None:
+def test_the_light_of_a_row_does_not_depend_on_its_strip() -> None:
     pixels = np.random.default_rng(4).integers(0, 256, (50, 33, 3), np.uint8)
-    photo = stored(pixels, PROFILES["Adobe RGB"])
+    photo = photo_of(pixels, PROFILES["Adobe RGB"])
     whole = photo.linear()
     for top, bottom in ((0, 1), (7, 50), (13, 14)):
         assert np.array_equal(photo.linear_rows(top, bottom), whole[top:bottom])
@@ -194,7 +197,7 @@ def test_a_strip_means_the_same_light_wherever_it_is_cut() -> None:
 
 def test_only_changed_pixels_change() -> None:
     pixels = np.random.default_rng(5).integers(0, 256, (20, 20, 3), np.uint8)
-    photo = stored(pixels, PROFILES["ProPhoto, sampled"])
+    photo = photo_of(pixels, PROFILES["ProPhoto, sampled"])
     linear = photo.linear()
     linear[3, 4] = 0.5
     changed = (photo.with_linear(linear).pixels != pixels).any(axis=2)
@@ -212,17 +215,17 @@ def test_only_changed_pixels_change() -> None:
         ),
     ],
 )
-def test_a_profile_that_is_srgb_takes_the_fast_path(icc: bytes) -> None:
+def test_a_profile_that_equals_srgb_is_recognised(icc: bytes) -> None:
     assert colour_space_of(icc, None, is_float=False) == SRGB
 
 
 @pytest.mark.parametrize("icc", [PROFILES["Display P3"], PROFILES["linear"]])
-def test_a_profile_that_is_not_srgb_does_not(icc: bytes) -> None:
+def test_other_profiles_are_not_recognised_as_srgb(icc: bytes) -> None:
     assert colour_space_of(icc, None, is_float=False) != SRGB
 
 
-def test_grey_profiles_set_the_tone_of_grey_pictures() -> None:
-    photo = stored(ramp(np.uint8, channels=1), profile(GAMMA, None))
+def test_the_tone_curve_of_a_grey_profile_is_applied() -> None:
+    photo = photo_of(ramp(np.uint8, channels=1), profile(GAMMA, None))
     formula = (photo.pixels[..., 0] / 255) ** (round(2.2 * 256) / 256)
     np.testing.assert_allclose(photo.linear()[..., 1], formula, atol=1e-6)
     assert np.array_equal(photo.with_linear(photo.linear()).pixels, photo.pixels)
@@ -242,27 +245,27 @@ def test_floats_are_stored_as_they_are_beyond_white_and_below_black() -> None:
     assert np.array_equal(photo.with_linear(linear * 2).pixels, linear * 2)
 
 
-def test_floats_with_a_profile_go_through_it_and_back() -> None:
+def test_floats_with_a_profile_are_decoded_and_encoded_with_it() -> None:
     pixels = np.random.default_rng(6).random((8, 8, 3), dtype=np.float32)
-    photo = stored(pixels, PROFILES["Adobe RGB"])
+    photo = photo_of(pixels, PROFILES["Adobe RGB"])
     assert np.array_equal(photo.with_linear(photo.linear()).pixels, pixels)
     moved = photo.with_linear(photo.linear() * np.float32(0.5)).linear()
     np.testing.assert_allclose(moved, photo.linear() * 0.5, atol=1e-5)
 
 
 @pytest.mark.parametrize("channels", [1, 3])
-def test_unchanged_floats_with_the_srgb_profile_come_back_bit_equal(channels: int) -> None:
+def test_unchanged_floats_with_the_srgb_profile_are_bit_equal(channels: int) -> None:
     pixels = np.random.default_rng(7).uniform(-0.5, 2, (64, 64, channels)).astype(np.float32)
-    photo = stored(pixels, bytes(pyvips.Image.profile_load("srgb")))
+    photo = photo_of(pixels, bytes(pyvips.Image.profile_load("srgb")))
     assert photo.colour_space() == SRGB
     assert np.array_equal(photo.with_linear(photo.linear()).pixels, pixels)
 
 
-def test_chromaticities_turn_into_rec709_with_white_on_white() -> None:
+def test_chromaticities_are_converted_to_rec709_and_white_stays_white() -> None:
     aces = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
-    light_of = colour_space_of(None, aces, is_float=True).to_linear
-    np.testing.assert_allclose(light_of(np.ones((1, 1, 3), np.float32)), 1, atol=1e-4)
-    red = light_of(np.array([[[1, 0, 0]]], np.float32))[0, 0]
+    to_linear = colour_space_of(None, aces, is_float=True).to_linear
+    np.testing.assert_allclose(to_linear(np.ones((1, 1, 3), np.float32)), 1, atol=1e-4)
+    red = to_linear(np.array([[[1, 0, 0]]], np.float32))[0, 0]
     np.testing.assert_allclose(
         red, (2.5217, -0.2765, -0.0154), atol=0.01
     )  # ACES2065-1 to linear sRGB, Bradford
@@ -284,31 +287,31 @@ def test_all_parametric_functions_of_icc_agree_with_littlecms(function: int, cou
     curve += struct.pack(f">{count}i", *(round(65536 * number) for number in numbers))
     test_profile = profile(curve, ADOBE)
     pixels = np.repeat(np.arange(256, dtype=np.uint8)[None, :, None], 3, axis=2)
-    theirs = ImageCms.profileToProfile(
+    expected = ImageCms.profileToProfile(
         Image.fromarray(pixels),
         ImageCms.ImageCmsProfile(io.BytesIO(test_profile)),
         ImageCms.createProfile("sRGB"),
         renderingIntent=ImageCms.Intent.RELATIVE_COLORIMETRIC,
         flags=ImageCms.Flags.NOOPTIMIZE,
     )
-    ours = srgb.to_encoded(stored(pixels, test_profile).linear().clip(0, 1)) * 255
-    assert np.abs(ours - np.asarray(theirs)).max() <= 1.5
+    ours = srgb.to_encoded(photo_of(pixels, test_profile).linear().clip(0, 1)) * 255
+    assert np.abs(ours - np.asarray(expected)).max() <= 1.5
 
 
 def light_by_table(pixels: np.ndarray) -> np.ndarray:
-    """What the table profile means, in linear Rec.709, by its formula."""
+    """Returns the linear Rec.709 light of pixels with the table profile, by its formula."""
     rec709 = np.array(((0.43607, 0.22249, 0.01392), (0.38515, 0.71687, 0.09708), (0.14307, 0.06061, 0.71410)))
-    return (pixels / np.iinfo(pixels.dtype).max) ** 1.8 @ np.array(TURNED) @ np.linalg.inv(rec709)
+    return (pixels / np.iinfo(pixels.dtype).max) ** 1.8 @ np.array(TABLE_PRIMARIES) @ np.linalg.inv(rec709)
 
 
 @pytest.mark.parametrize(
-    ("container", "kind", "tolerance"), [("png", np.uint8, 0.01), ("tiff", np.uint16, 0.006)]
+    ("container", "dtype", "tolerance"), [("png", np.uint8, 0.01), ("tiff", np.uint16, 0.006)]
 )
-def test_a_lut_profile_gives_its_colours_and_they_survive(container, kind, tolerance) -> None:
-    random = np.random.default_rng(8).integers(0, np.iinfo(kind).max + 1, (24, 24, 3)).astype(kind)
-    data = stored(random, table_profile()).encode(container)
+def test_a_lut_profile_is_converted_and_its_colours_are_written(container, dtype, tolerance) -> None:
+    random = np.random.default_rng(8).integers(0, np.iinfo(dtype).max + 1, (24, 24, 3)).astype(dtype)
+    data = photo_of(random, table_profile()).encode(container)
     photo = Photo.open(data)
-    assert photo.pixels.dtype == kind
+    assert photo.pixels.dtype == dtype
     np.testing.assert_allclose(photo.linear(), light_by_table(random), atol=tolerance)
     assert photo.file_info.icc == PROFILES["Display P3"]
     again = Photo.open(photo.with_linear(photo.linear()).encode())
@@ -319,36 +322,36 @@ def test_a_lut_profile_gives_its_colours_and_they_survive(container, kind, toler
 
 def test_a_pil_image_with_a_lut_profile_is_read_as_its_file_is() -> None:
     random = np.random.default_rng(9).integers(0, 256, (16, 16, 3), np.uint8)
-    data = stored(random, table_profile()).encode("png")
+    data = photo_of(random, table_profile()).encode("png")
     assert np.array_equal(Photo.open(Image.open(io.BytesIO(data))).pixels, Photo.open(data).pixels)
 
 
 def test_white_in_a_lut_profile_stays_white() -> None:
-    white = Photo.open(stored(np.full((4, 4, 3), 255, np.uint8), table_profile()).encode("png"))
+    white = Photo.open(photo_of(np.full((4, 4, 3), 255, np.uint8), table_profile()).encode("png"))
     assert white.srgb_8bit().min() >= 254
 
 
 @pytest.mark.parametrize(
     "icc",
     [table_profile()[:100_000], table_profile().replace(b"mft2", b"mftX")],
-    ids=["cut short", "unknown"],
+    ids=["truncated", "unknown"],
 )
 def test_a_damaged_lut_profile_is_refused(icc: bytes) -> None:
-    """libvips would take sRGB instead, and say nothing."""
+    """libvips uses sRGB instead, without an error."""
     with pytest.raises(UnsupportedPhoto, match="LUT-based colour profile"):
-        Photo.open(stored(NOISE_8BIT, icc).encode("tiff"))
+        Photo.open(photo_of(NOISE_8BIT, icc).encode("tiff"))
 
 
-@pytest.mark.parametrize(("kind", "channels"), [(np.uint8, 1), (np.float32, 3)])
-def test_a_lut_profile_is_for_whole_numbers_in_colour(kind: type, channels: int) -> None:
+@pytest.mark.parametrize(("dtype", "channels"), [(np.uint8, 1), (np.float32, 3)])
+def test_a_lut_profile_is_refused_for_grey_and_for_floats(dtype: type, channels: int) -> None:
     with pytest.raises(UnsupportedPhoto, match="RGB of 8 or 16 bits"):
-        convert_to_display_p3(np.ones((4, 4, channels), kind), FileInfo(icc=table_profile()))
+        convert_to_display_p3(np.ones((4, 4, channels), dtype), FileInfo(icc=table_profile()))
 
 
 @pytest.mark.parametrize(
     "icc",
     [b"no profile at all" * 20, bytes(pyvips.Image.profile_load("cmyk")), profile(GAMMA, ADOBE)[:200], b""],
-    ids=["garbage", "tables", "cut short", "empty"],
+    ids=["garbage", "tables", "truncated", "empty"],
 )
 def test_profiles_without_curves_and_matrix_are_refused(icc: bytes) -> None:
     with pytest.raises(UnsupportedPhoto, match="curves and a matrix"):

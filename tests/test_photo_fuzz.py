@@ -1,4 +1,4 @@
-"""Mutated picture files: each is read, or refused by an error of ours, and nothing is printed."""
+"""Mutated image files: each is read, or raises a PhotoError, and nothing is printed."""
 
 import numpy as np
 import pytest
@@ -9,50 +9,50 @@ from brewster.photo import Photo
 from picture_files import exif_block, file_of, smooth
 
 MUTATIONS = 400
-"""Of each file: some thousands in all, about two minutes."""
+"""Number of mutations of each file. All files together take about two minutes."""
 
-PICTURE = smooth(24, 32)
-DEEP = PICTURE.astype(np.uint16) * 257
+IMAGE = smooth(24, 32)
+IMAGE_16BIT = IMAGE.astype(np.uint16) * 257
 
 
-def ours(container, array=PICTURE):
+def encoded_by_brewster(container, array=IMAGE):
     return Photo.from_array(array, encoding="srgb").encode(container)
 
 
 FILES = {
-    "jpeg": lambda: file_of(PICTURE, "JPEG", exif=exif_block()),
-    "jpeg, progressive": lambda: file_of(PICTURE, "JPEG", progressive=True),
-    "png": lambda: file_of(PICTURE, "PNG"),
-    "png, 16 bit": lambda: ours("png", DEEP),
-    "tiff": lambda: file_of(PICTURE, "TIFF"),
-    "tiff, lzw": lambda: file_of(PICTURE, "TIFF", compression="tiff_lzw"),
-    "webp": lambda: file_of(PICTURE, "WEBP"),
-    "webp, lossless": lambda: file_of(PICTURE, "WEBP", lossless=True),
-    "avif": lambda: file_of(PICTURE, "AVIF"),
-    "heic": lambda: ours("heic"),
-    "gif": lambda: file_of(PICTURE, "GIF"),
-    "exr": lambda: ours("exr"),
-    "hdr": lambda: ours("hdr"),
+    "jpeg": lambda: file_of(IMAGE, "JPEG", exif=exif_block()),
+    "jpeg, progressive": lambda: file_of(IMAGE, "JPEG", progressive=True),
+    "png": lambda: file_of(IMAGE, "PNG"),
+    "png, 16 bit": lambda: encoded_by_brewster("png", IMAGE_16BIT),
+    "tiff": lambda: file_of(IMAGE, "TIFF"),
+    "tiff, lzw": lambda: file_of(IMAGE, "TIFF", compression="tiff_lzw"),
+    "webp": lambda: file_of(IMAGE, "WEBP"),
+    "webp, lossless": lambda: file_of(IMAGE, "WEBP", lossless=True),
+    "avif": lambda: file_of(IMAGE, "AVIF"),
+    "heic": lambda: encoded_by_brewster("heic"),
+    "gif": lambda: file_of(IMAGE, "GIF"),
+    "exr": lambda: encoded_by_brewster("exr"),
+    "hdr": lambda: encoded_by_brewster("hdr"),
 }
 
 
 def mutated(data, rng):
-    """The bytes with a few of them changed, left out, doubled, or the end cut off."""
+    """Returns the bytes with one to four changes: bytes are set, flipped, deleted or doubled, or the end is cut off."""
     changed = bytearray(data)
-    header = min(len(data), 600)  # half of the changes are where a file says what it is
+    header = min(len(data), 600)  # half of the changes are in the header
     for _ in range(rng.integers(1, 5)):
-        place = int(rng.integers(0, header if rng.integers(2) else max(1, len(changed))))
-        how = rng.choice(["set", "flip", "drop", "double", "cut"], p=[0.4, 0.3, 0.1, 0.1, 0.1])
-        if how == "set":
-            changed[place : place + 1] = [rng.choice([0, 1, 127, 128, 255])]
-        elif how == "flip":
-            changed[place : place + 1] = [data[place % len(data)] ^ (1 << int(rng.integers(8)))]
-        elif how == "drop":
-            del changed[place : place + int(rng.integers(1, 9))]
-        elif how == "double":
-            changed[place:place] = changed[place : place + int(rng.integers(1, 9))]
+        position = int(rng.integers(0, header if rng.integers(2) else max(1, len(changed))))
+        change = rng.choice(["set", "flip", "drop", "double", "cut"], p=[0.4, 0.3, 0.1, 0.1, 0.1])
+        if change == "set":
+            changed[position : position + 1] = [rng.choice([0, 1, 127, 128, 255])]
+        elif change == "flip":
+            changed[position : position + 1] = [data[position % len(data)] ^ (1 << int(rng.integers(8)))]
+        elif change == "drop":
+            del changed[position : position + int(rng.integers(1, 9))]
+        elif change == "double":
+            changed[position:position] = changed[position : position + int(rng.integers(1, 9))]
         else:
-            del changed[max(place, 1) :]
+            del changed[max(position, 1) :]
     return bytes(changed)
 
 
@@ -72,5 +72,5 @@ def test_a_mutated_file_is_read_or_refused_and_nothing_is_printed(name, capfd):
             else:
                 assert np.isfinite(light).all(), number
                 outcomes["read"] += 1
-    assert min(outcomes.values()) > 0  # or the mutations were too harsh, or too mild
+    assert min(outcomes.values()) > 0  # otherwise the mutations are too strong or too weak
     assert capfd.readouterr().out == ""

@@ -1,4 +1,4 @@
-"""Several pictures in one EXR: what comes back, what the channels are called, and what is refused."""
+"""Several layers in one EXR: values, names of the channels, and errors."""
 
 import io
 import sys
@@ -16,11 +16,11 @@ NAMES = ("photo", "transmission", "background", "reflection", "mirror")
 HEADER = {"scene": 'seed = 7\nrecipe = "Fenêtre"\n', "software": "brewster 0.1.0"}
 
 
-def pictures(random, names=NAMES):
+def random_layers(random, names=NAMES):
     return {name: (random.random((6, 9, 3), np.float32) * 4).astype(np.float32) for name in names}
 
 
-def part_of(data, **options):
+def read_part(data, **options):
     exr = pytest.importorskip("OpenEXR")
     return exr.File(io.BytesIO(data), **options).parts[0]
 
@@ -33,46 +33,46 @@ def part_of(data, **options):
         elements=st.floats(-60000, 60000, width=32),
     )
 )
-def test_layers_are_kept_in_half_precision(picture):
-    again = read_layers(write_layers({"photo": picture, "mirror": picture * 2**-7}, {}))
+def test_layers_are_kept_in_half_precision(image):
+    again = read_layers(write_layers({"photo": image, "mirror": image * 2**-7}, {}))
     assert sorted(again) == ["mirror", "photo"]
-    for name, light in (("photo", picture), ("mirror", picture * 2**-7)):
+    for name, light in (("photo", image), ("mirror", image * 2**-7)):
         assert again[name].dtype == np.float32
         np.testing.assert_allclose(again[name], light, rtol=2**-11, atol=2**-25)
-    halfs = read_layers(write_layers(again, {}))
-    assert all(np.array_equal(halfs[name], again[name]) for name in again)
+    halves = read_layers(write_layers(again, {}))
+    assert all(np.array_equal(halves[name], again[name]) for name in again)
 
 
 def test_values_beyond_half_precision_are_clipped():
-    picture = np.full((2, 2, 3), 1e9, np.float32)
-    picture[0] = np.inf
-    assert (read_layers(write_layers({"photo": picture}, {}))["photo"] == 65504).all()
+    image = np.full((2, 2, 3), 1e9, np.float32)
+    image[0] = np.inf
+    assert (read_layers(write_layers({"photo": image}, {}))["photo"] == 65504).all()
 
 
 def test_layers_are_separate_in_any_order(random):
-    given_ = pictures(random)
-    again = read_layers(write_layers(given_, HEADER))
+    layers = random_layers(random)
+    again = read_layers(write_layers(layers, HEADER))
     assert list(again) == sorted(NAMES)
     for name in NAMES:
-        np.testing.assert_allclose(again[name], given_[name], rtol=1e-3)
+        np.testing.assert_allclose(again[name], layers[name], rtol=1e-3)
 
 
-def test_the_same_pictures_are_the_same_bytes_in_any_order(random):
-    given_ = pictures(random)
-    turned = {name: given_[name] for name in reversed(NAMES)}
-    assert write_layers(given_, HEADER) == write_layers(turned, dict(reversed(HEADER.items())))
+def test_the_same_layers_give_the_same_bytes_in_any_order(random):
+    layers = random_layers(random)
+    reversed_layers = {name: layers[name] for name in reversed(NAMES)}
+    assert write_layers(layers, HEADER) == write_layers(reversed_layers, dict(reversed(HEADER.items())))
 
 
 def test_other_programs_read_named_compressed_half_layers_and_the_text(random):
-    data = write_layers(pictures(random), HEADER)
+    data = write_layers(random_layers(random), HEADER)
     exr = pytest.importorskip("OpenEXR")
-    part = part_of(data, separate_channels=True)
+    part = read_part(data, separate_channels=True)
     assert sorted(part.channels) == sorted(f"{name}.{channel}" for name in NAMES for channel in "RGB")
     assert {channel.pixels.dtype for channel in part.channels.values()} == {np.dtype(np.float16)}
     assert part.header["compression"] == exr.ZIP_COMPRESSION
     assert {key: part.header[key] for key in HEADER} == HEADER
-    assert sorted(part_of(data).channels) == sorted(NAMES)  # grouped by what stands before the dot
-    assert b"mirror.B\0\1\0\0\0" in data  # as the file's channel list spells a half
+    assert sorted(read_part(data).channels) == sorted(NAMES)  # grouped by the part of the name before the dot
+    assert b"mirror.B\0\1\0\0\0" in data  # the channel list of the file: pixel type 1 is half
 
 
 def test_a_layer_name_may_have_dots_and_other_channels_are_ignored(random):
@@ -84,9 +84,9 @@ def test_a_layer_name_may_have_dots_and_other_channels_are_ignored(random):
     assert list(read_layers(file.getvalue())) == ["left.photo"]
 
 
-@pytest.mark.parametrize("damage", [b"", b"no picture", None])
+@pytest.mark.parametrize("damage", [b"", b"not an image", None])
 def test_a_damaged_file_is_refused(damage, random):
-    data = write_layers(pictures(random), HEADER)
+    data = write_layers(random_layers(random), HEADER)
     with pytest.raises(UnreadablePhoto, match="complete"):
         read_layers(data[: len(data) // 2] if damage is None else damage)
 
@@ -99,12 +99,12 @@ def test_an_exr_without_layers_is_refused(random):
 
 def test_attributes_that_exr_would_drop_are_refused(random):
     with pytest.raises(UnsupportedPhoto, match="named version"):
-        write_layers(pictures(random), {**HEADER, "version": "0.1.0"})
+        write_layers(random_layers(random), {**HEADER, "version": "0.1.0"})
 
 
 def test_without_openexr_the_error_names_the_extra(monkeypatch, random):
-    data = write_layers(pictures(random), {})
+    data = write_layers(random_layers(random), {})
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    for attempt in (lambda: read_layers(data), lambda: write_layers(pictures(random), {})):
+    for call in (lambda: read_layers(data), lambda: write_layers(random_layers(random), {})):
         with pytest.raises(MissingExtra, match="pip install"):
-            attempt()
+            call()

@@ -1,4 +1,4 @@
-"""What a file says beside its pixels: EXIF, profile, orientation, resolution, quality, compression."""
+"""Metadata of files: EXIF, profile, orientation, resolution, quality, compression."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ UPRIGHT_XMP = XMP.replace(b'"6"', b'"1"')
 
 
 @pytest.mark.parametrize("quality", [1, 30, 75, 92, 100])
-@pytest.mark.parametrize(("subsampling", "word"), [(0, "4:4:4"), (1, "4:2:2"), (2, "4:2:0")])
+@pytest.mark.parametrize(("subsampling", "name"), [(0, "4:4:4"), (1, "4:2:2"), (2, "4:2:0")])
 def test_jpeg_quality_and_chroma_are_no_worse_than_the_source(
-    quality: int, subsampling: int, word: str
+    quality: int, subsampling: int, name: str
 ) -> None:
     source = file_of(smooth(), "JPEG", quality=quality, subsampling=subsampling)
     photo = Photo.open(source)
     written = photo.encode()
-    assert (photo.file_info.jpeg_quality, photo.file_info.subsampling) == (quality, word)
-    assert metadata.jpeg_subsampling(written) == ("4:2:0" if word == "4:2:0" else "4:4:4")
-    theirs, ours = pil(source).quantization, pil(written).quantization
-    assert all(sum(ours[table]) <= sum(theirs[table]) for table in theirs)
+    assert (photo.file_info.jpeg_quality, photo.file_info.subsampling) == (quality, name)
+    assert metadata.jpeg_subsampling(written) == ("4:2:0" if name == "4:2:0" else "4:4:4")
+    source_tables, tables = pil(source).quantization, pil(written).quantization
+    assert all(sum(tables[number]) <= sum(source_tables[number]) for number in source_tables)
 
 
-def test_odd_quantisation_tables_are_matched_from_below() -> None:
+def test_unusual_quantisation_tables_get_a_quality_that_is_at_least_as_fine() -> None:
     flat = [[10] * 64, [12] * 64]
     written = Photo.open(file_of(smooth(), "JPEG", qtables=flat)).encode()
     tables = pil(written).quantization
@@ -71,7 +71,7 @@ def test_lossy_webp_and_avif_stay_lossy_and_close() -> None:
 
 
 @pytest.mark.parametrize(("container", "bits"), [("avif", 10), ("avif", 12), ("heic", 10)])
-def test_white_is_white_whatever_the_bits(container: str, bits: int) -> None:
+def test_white_is_white_at_every_bit_depth(container: str, bits: int) -> None:
     if container == "heic":
         pytest.importorskip("pillow_heif")
     white = np.full((32, 32, 3), 65535, np.uint16)
@@ -91,7 +91,7 @@ def test_avif_of_ten_and_twelve_bits_keeps_them_and_its_white(bits: int) -> None
     assert np.array_equal(Photo.open(photo.encode()).pixels, photo.pixels)
 
 
-# --- what files say beside their pixels
+# --- EXIF, profiles, XMP, resolution
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -115,7 +115,7 @@ def test_exif_profile_and_xmp_are_kept_byte_for_byte(container: str) -> None:
     photo = Photo(photo.pixels, None, FileInfo(**{**vars(photo.file_info), "xmp": UPRIGHT_XMP}))
     written = pil(photo.encode())
     found = written.info["exif"].removeprefix(b"Exif\0\0")
-    if container != "avif":  # whose orientation Pillow has taken out before
+    if container != "avif":  # Pillow has removed the orientation from it
         assert found == upright.removeprefix(b"Exif\0\0")
     assert found == photo.file_info.exif
     assert written.info["icc_profile"] == P3
@@ -123,7 +123,7 @@ def test_exif_profile_and_xmp_are_kept_byte_for_byte(container: str) -> None:
     assert (again.exif, again.icc, again.xmp) == (photo.file_info.exif, P3, UPRIGHT_XMP)
 
 
-def test_a_tiff_keeps_its_cameras_tags() -> None:
+def test_a_tiff_keeps_its_camera_tags() -> None:
     data = file_of(smooth(), "TIFF", exif=exif_block(), icc_profile=P3)
     written = pil(Photo.open(data).encode()).getexif()
     assert (written[271], written[306], written[274]) == ("Sextant", "2020:01:02 03:04:05", 1)
@@ -134,7 +134,7 @@ def test_a_tiff_keeps_its_cameras_tags() -> None:
 
 
 @pytest.mark.parametrize("container", ["jpeg", "png", "tiff", "webp", "avif"])
-def test_the_cameras_tags_survive_a_change_of_container(container: str) -> None:
+def test_the_camera_tags_survive_a_change_of_container(container: str) -> None:
     source = Photo.open(file_of(smooth(), "JPEG", exif=exif_block()))
     written = pil(source.encode(container)).getexif()
     assert written[271] == "Sextant"
@@ -160,14 +160,16 @@ def test_xmp_orientation_is_reset_with_that_of_exif() -> None:
 
 @quick
 @given(st.binary(max_size=60), st.sampled_from([b"II*\0", b"MM\0*", b""]), st.integers(0, 70))
-def test_broken_exif_never_breaks_a_picture(rubbish: bytes, order: bytes, at: int) -> None:
-    exif = order + struct.pack("<I", at) + rubbish
+def test_damaged_exif_does_not_prevent_reading_and_writing(
+    garbage: bytes, byte_order: bytes, offset: int
+) -> None:
+    exif = byte_order + struct.pack("<I", offset) + garbage
     photo = Photo.open(metadata.with_png_exif(file_of(smooth(4, 4), "PNG"), exif))
     for container in ("png", "tiff", "jpeg"):
         assert Photo.open(photo.encode(container)).size == photo.size
 
 
-def test_display_p3_stated_by_code_points_gets_its_profile() -> None:
+def test_code_points_of_display_p3_give_its_profile() -> None:
     chunk = b"cICP" + bytes((12, 13, 0, 1))
     data = file_of(smooth(), "PNG")
     sized = struct.pack(">I", 4) + chunk + struct.pack(">I", zlib.crc32(chunk))

@@ -37,9 +37,9 @@ def test_every_listed_input_scale_is_used_with_and_without_flip(quality):
 
 def test_each_quality_uses_more_pixels_than_the_one_below():
     levels = [(len(scales), sum(scales)) for scales in QUALITIES.values()]
-    for (few, little), (many, much) in itertools.pairwise(levels):
-        assert many >= few
-        assert (many, much) > (few, little)
+    for (count, pixels), (next_count, next_pixels) in itertools.pairwise(levels):
+        assert next_count >= count
+        assert (next_count, next_pixels) > (count, pixels)
 
 
 def test_input_scales_rise_and_none_is_listed_twice():
@@ -48,10 +48,10 @@ def test_input_scales_rise_and_none_is_listed_twice():
 
 
 def test_the_documentation_states_the_input_scales_of_every_quality_in_megapixels():
-    text = " ".join(EXPLANATION.read_text().split())
+    text = EXPLANATION.read_text()
     for quality, scales in QUALITIES.items():
-        (named,) = re.findall(rf"([^()]*?)(?: megapixels)? \(`{quality}`\)", text)[:1]
-        assert [float(number) for number in re.findall(r"0\.\d+", named)] == [s / 1e6 for s in scales]
+        (documented,) = re.findall(rf"^\| `{quality}` \| ([^|]*) \|$", text, re.MULTILINE)
+        assert [float(number) for number in documented.split(", ")] == [pixels / 1e6 for pixels in scales]
 
 
 def test_an_input_is_never_larger_than_the_photo_and_each_size_is_used_once():
@@ -60,7 +60,7 @@ def test_an_input_is_never_larger_than_the_photo_and_each_size_is_used_once():
 
 @pytest.mark.parametrize("size", [(12_000, 1500), (1500, 12_000), (40_000, 400)])
 def test_inputs_of_a_long_thin_photo_are_larger_so_that_the_short_side_is_at_least_160_px(size):
-    """But no side of an input is more than three times as long as for a photo of usual shape."""
+    """The sides are at most three times as long as without this rule."""
     (pixels,) = QUALITIES["draft"]
     ((width, height),) = MultiScalePredictor(lambda tile: (tile, tile)).input_sizes(size, "draft")
     assert width / height == pytest.approx(size[0] / size[1], rel=0.05)
@@ -69,7 +69,7 @@ def test_inputs_of_a_long_thin_photo_are_larger_so_that_the_short_side_is_at_lea
 
 
 def test_the_prediction_is_the_mean_over_all_inputs():
-    """The change of the transmission is proportional to the height of the input, so the mean is that of the heights."""
+    """The predicted change is proportional to the height of the input, so its mean is proportional to the mean height."""
     photo = np.full((900, 1200, 3), 0.5, np.float32)
     heights = [
         height
@@ -84,14 +84,14 @@ def test_the_prediction_is_the_mean_over_all_inputs():
     np.testing.assert_allclose(change, -1e-4 * np.mean(heights), atol=1e-3)
 
 
-def test_confidence_is_1_e_where_the_largest_spread_of_a_channel_is_a_twentieth():
+def test_the_confidence_is_1_e_where_the_largest_spread_of_the_channels_is_0_05():
     spread = np.float32([[[0.05, 0, 0], [0, 0.1, 0.05], [0.05, 0.05, 0.05], [0, 0, 0]]])
     expected = [[[math.exp(-1)], [math.exp(-2)], [math.exp(-1)], [1]]]
     np.testing.assert_allclose(confidence_from_spread(spread), expected, rtol=1e-5)
 
 
-def test_disagreement_about_one_colour_lowers_confidence_as_much_as_about_all():
-    def disagrees(channels):
+def test_a_spread_in_one_channel_lowers_the_confidence_as_much_as_in_all_channels():
+    def make_left_right_dependent_backend(channels):
         def backend(tile):
             transmission = tile.copy()
             half = tile.shape[1] // 2
@@ -101,8 +101,9 @@ def test_disagreement_about_one_colour_lowers_confidence_as_much_as_about_all():
         return backend
 
     grey = Photo.from_array(to_linear(np.full((64, 64, 3), 0.5, np.float32)), encoding="linear")
-    red, every = (
-        Separator(disagrees(channels))(grey).confidence.pixels for channels in (slice(0, 1), slice(0, 3))
+    red, all_channels = (
+        Separator(make_left_right_dependent_backend(channels))(grey).confidence.pixels
+        for channels in (slice(0, 1), slice(0, 3))
     )
-    assert every.mean() == pytest.approx(255 / math.e, rel=0.1)
-    np.testing.assert_allclose(red, every, atol=1)
+    assert all_channels.mean() == pytest.approx(255 / math.e, rel=0.1)
+    np.testing.assert_allclose(red, all_channels, atol=1)

@@ -122,7 +122,7 @@ def test_a_wrong_value_is_named_in_the_message(fields, part):
 
 
 def test_contradicting_options_raise_the_error_of_options():
-    with pytest.raises(BrewsterError, match="fit only into TIFF and EXR"):
+    with pytest.raises(BrewsterError, match="only these store 32-bit floats"):
         parse(additive="true", format="png")
 
 

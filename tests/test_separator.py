@@ -14,15 +14,16 @@ from brewster.inference import QUALITIES
 from brewster.metrics import psnr, ssim
 from brewster.photo import FileInfo
 
-PICTURES = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
+PHOTOS = sorted((Path(__file__).parent / "pictures").glob("*.jpg"))
 
 
-def glass(tile):
-    """Glass that transmits three quarters and reflects one quarter."""
+def glass_backend(tile):
+    """T = 0.75 I and R = 0.25 I."""
     return tile * 0.75, tile * 0.25
 
 
-def nothing(tile):
+def identity_backend(tile):
+    """T = I and R = 0."""
     return tile, np.zeros_like(tile)
 
 
@@ -31,9 +32,9 @@ def separator():
     return Separator.load("compact", device="cpu")
 
 
-def picture(height, width, channels=3, dtype=np.uint8, seed=1):
-    high = np.iinfo(dtype).max + 1
-    return np.random.default_rng(seed).integers(0, high, (height, width, channels), dtype)
+def random_image(height, width, channels=3, dtype=np.uint8, seed=1):
+    levels = np.iinfo(dtype).max + 1
+    return np.random.default_rng(seed).integers(0, levels, (height, width, channels), dtype)
 
 
 @settings(max_examples=25)
@@ -41,8 +42,8 @@ def picture(height, width, channels=3, dtype=np.uint8, seed=1):
     st.integers(1, 60), st.integers(1, 60), st.sampled_from([1, 3, 4]), st.sampled_from([np.uint8, np.uint16])
 )
 def test_an_unchanged_photo_is_returned_bit_equal(height, width, channels, dtype):
-    array = picture(height, width, channels, dtype)
-    result = Separator(nothing)(Photo.from_array(array, encoding="srgb"))
+    array = random_image(height, width, channels, dtype)
+    result = Separator(identity_backend)(Photo.from_array(array, encoding="srgb"))
     assert (result.transmission.pixels == result.photo.pixels).all()
     assert not result.reflection.pixels.any()
     assert result.residual == 0
@@ -51,8 +52,8 @@ def test_an_unchanged_photo_is_returned_bit_equal(height, width, channels, dtype
 @pytest.mark.parametrize("profile", ["srgb", "p3"])
 def test_strength_zero_returns_the_photo_and_no_reflection_with_any_profile(profile):
     icc = bytes(pyvips.Image.profile_load(profile))
-    photo = Photo(picture(300, 500), file_info=FileInfo(icc=icc))
-    result = Separator(glass)(photo, strength=0)
+    photo = Photo(random_image(300, 500), file_info=FileInfo(icc=icc))
+    result = Separator(glass_backend)(photo, strength=0)
     assert (result.transmission.pixels == photo.pixels).all()
     assert not result.reflection.pixels.any()
     assert result.transmission.file_info.icc == icc
@@ -60,11 +61,11 @@ def test_strength_zero_returns_the_photo_and_no_reflection_with_any_profile(prof
 
 def test_unchanged_light_above_white_and_below_black_is_kept():
     light = np.random.default_rng(3).normal(1, 4, (50, 80, 3)).astype(np.float32)
-    result = Separator(nothing)(light, encoding="linear")
+    result = Separator(identity_backend)(light, encoding="linear")
     assert (result.transmission.linear() == light).all()
 
 
-def test_a_brighter_picture_is_separated_like_the_same_picture_darker():
+def test_a_photo_above_white_is_separated_like_the_same_photo_with_less_light():
     def threshold(tile):
         return np.minimum(tile, 0.3), np.maximum(tile - 0.3, 0)
 
@@ -78,25 +79,28 @@ def test_a_brighter_picture_is_separated_like_the_same_picture_darker():
 
 def test_strength_is_linear_between_the_photo_and_the_full_separation():
     photo = Photo.from_array(np.full((40, 40, 3), 0.5, np.float32), encoding="linear")
-    light = [Separator(glass)(photo, strength=share).transmission.linear().mean() for share in (0, 0.5, 1)]
+    light = [
+        Separator(glass_backend)(photo, strength=strength).transmission.linear().mean()
+        for strength in (0, 0.5, 1)
+    ]
     np.testing.assert_allclose(light, [0.5, 0.4375, 0.375], atol=0.003)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 700), (300, 20000), (2100, 1500)])
-def test_size_in_is_size_out(size):
-    result = Separator(glass)(Photo.from_array(picture(*size), encoding="srgb"), quality="draft")
+def test_layers_and_confidence_have_the_size_of_the_photo(size):
+    result = Separator(glass_backend)(Photo.from_array(random_image(*size), encoding="srgb"), quality="draft")
     for layer in (result.transmission, result.reflection, result.confidence):
         assert layer.size == size[::-1]
 
 
 @pytest.mark.parametrize("channels", [1, 3, 4])
 def test_additive_layers_sum_to_the_photo_to_the_last_bit(channels):
-    photo = Photo.from_array(picture(200, 300, channels), encoding="srgb")
+    photo = Photo.from_array(random_image(200, 300, channels), encoding="srgb")
 
-    def brighter_in_places(tile):
+    def partly_brighter(tile):
         return np.clip(tile * 1.5 - 0.2, 0, 1), tile * 0.1
 
-    result = Separator(brighter_in_places)(photo, additive=True)
+    result = Separator(partly_brighter)(photo, additive=True)
     layers = result.transmission.pixels, result.reflection.pixels
     light = photo.linear()[..., : photo.pixels.shape[2]]
     assert (layers[0] + layers[1] == light).all()
@@ -114,53 +118,53 @@ def test_the_residual_is_reported():
 
 
 def test_positive_and_negative_differences_do_not_cancel_in_the_residual():
-    """Dark: 0.2 - 0.1 - 0.05 = 0.05 is missing. Bright: 0.6 - 0.3 - 0.45 = -0.15 is too much."""
+    """I - T - R is 0.2 - 0.1 - 0.05 = 0.05 in the dark half, and 0.6 - 0.3 - 0.45 = -0.15 in the bright half."""
     light = np.full((64, 64, 3), 0.2, np.float32)
     light[32:] = 0.6
 
-    def uneven(tile):
+    def brightness_dependent(tile):
         return tile * 0.5, np.where(tile < 0.4, tile * 0.25, tile * 0.75)
 
     photo = Photo.from_array(light, encoding="linear")
-    assert Separator(uneven)(photo).residual == pytest.approx(0.1, abs=0.01)
+    assert Separator(brightness_dependent)(photo).residual == pytest.approx(0.1, abs=0.01)
 
 
 @pytest.mark.parametrize(
     ("reconstruction_error", "doubtful"), [(None, False), (0.0, False), (0.05, False), (0.07, True)]
 )
-def test_a_separation_is_doubtful_where_the_model_redraws_the_photo(reconstruction_error, doubtful):
-    separation = Separator(nothing)(picture(8, 8), encoding="srgb")
+def test_a_separation_with_a_large_reconstruction_error_is_doubtful(reconstruction_error, doubtful):
+    separation = Separator(identity_backend)(random_image(8, 8), encoding="srgb")
     assert replace(separation, reconstruction_error=reconstruction_error).doubtful == doubtful
 
 
 def test_confidence_falls_where_the_flipped_prediction_disagrees():
-    def sees_left_from_right(tile):
+    def left_right_dependent(tile):
         half = tile.shape[1] // 2
         transmission = tile.copy()
         transmission[:, :half] *= 0.5
         return transmission, np.zeros_like(tile)
 
     grey = Photo.from_array(np.full((64, 64, 3), 128, np.uint8), encoding="srgb")
-    assert Separator(nothing)(grey).confidence.pixels.min() == 255
-    assert Separator(sees_left_from_right)(grey).confidence.pixels.max() < 50
+    assert Separator(identity_backend)(grey).confidence.pixels.min() == 255
+    assert Separator(left_right_dependent)(grey).confidence.pixels.max() < 50
 
 
 def test_the_transmission_of_a_mixture_is_closer_to_the_background(separator):
-    """The mixture is 0.92 of the coffee picture plus a rocket: see tests/pictures/make.py."""
+    """The photo is 0.92 times the image of coffee plus the image of a rocket (see tests/pictures/make.py)."""
     data = pytest.importorskip("skimage.data")
-    photo = Photo.open(next(path for path in PICTURES if "coffee" in path.name))
+    photo = Photo.open(next(path for path in PHOTOS if "coffee" in path.name))
     result = separator(photo)
     assert psnr(result.transmission.pixels, data.coffee()) > psnr(photo.pixels, data.coffee()) + 1
 
 
 def test_tiled_and_untiled_agree(separator, monkeypatch):
-    photo = Photo.open(PICTURES[0])
+    photo = Photo.open(PHOTOS[0])
     whole = separator(photo, quality="best").transmission.pixels
     monkeypatch.setattr("brewster.inference.predictor._TILE_PX", 416)
     assert psnr(separator(photo, quality="best").transmission.pixels, whole) > 40
 
 
-@pytest.mark.parametrize("path", PICTURES, ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", PHOTOS, ids=lambda path: path.stem)
 def test_every_kind_of_source_gives_the_same_transmission(separator, path):
     image = pytest.importorskip("PIL.Image")
     sources = [path, str(path), path.read_bytes(), image.open(path), Photo.open(path)]
@@ -170,36 +174,38 @@ def test_every_kind_of_source_gives_the_same_transmission(separator, path):
 
 
 def test_the_same_photo_gives_the_same_bytes_after_other_photos(separator):
-    first = separator(PICTURES[0]).transmission.encode()
-    separator(PICTURES[1])
-    assert separator(PICTURES[0]).transmission.encode() == first
+    first = separator(PHOTOS[0]).transmission.encode()
+    separator(PHOTOS[1])
+    assert separator(PHOTOS[0]).transmission.encode() == first
 
 
-def test_the_line_in_the_readme_works(tmp_path):
-    brewster.separate(PICTURES[0]).transmission.save(tmp_path / "b.jpg")
-    assert Photo.open(tmp_path / "b.jpg").size == Photo.open(PICTURES[0]).size
+def test_the_example_in_the_readme_works(tmp_path):
+    brewster.separate(PHOTOS[0]).transmission.save(tmp_path / "b.jpg")
+    assert Photo.open(tmp_path / "b.jpg").size == Photo.open(PHOTOS[0]).size
 
 
-@pytest.mark.parametrize("wrong", [{"strength": 1.5}, {"strength": -1}, {"quality": "superb"}])
-def test_options_out_of_range_are_refused(wrong):
+@pytest.mark.parametrize("options", [{"strength": 1.5}, {"strength": -1}, {"quality": "superb"}])
+def test_options_out_of_range_are_refused(options):
     with pytest.raises(BrewsterError):
-        Separator(nothing)(Photo.from_array(picture(4, 4), encoding="srgb"), **wrong)
+        Separator(identity_backend)(Photo.from_array(random_image(4, 4), encoding="srgb"), **options)
 
 
 def test_every_quality_works_and_higher_quality_uses_larger_inputs():
     assert list(QUALITIES) == ["draft", "standard", "best"]
     largest = {}
-    photo = Photo.from_array(picture(900, 1200), encoding="srgb")
+    photo = Photo.from_array(random_image(900, 1200), encoding="srgb")
     for quality in QUALITIES:
         sizes = []
-        Separator(lambda tile, sizes=sizes: sizes.append(tile.size) or nothing(tile))(photo, quality=quality)
+        Separator(lambda tile, sizes=sizes: sizes.append(tile.size) or identity_backend(tile))(
+            photo, quality=quality
+        )
         largest[quality] = max(sizes)
     assert largest["draft"] < largest["standard"] < largest["best"]
 
 
 def test_a_source_that_is_no_image_is_refused():
     with pytest.raises(PhotoError):
-        Separator(nothing)(b"hello")
+        Separator(identity_backend)(b"hello")
 
 
 @pytest.mark.slow
@@ -208,9 +214,14 @@ def test_the_shipped_model_beats_the_unprocessed_input_on_the_development_pairs(
     gains = []
     for path in sorted((data / "real/dev" / folder / "blended").iterdir()):
         (partner,) = (data / "real/dev" / folder).glob(f"transmission*/{path.stem}.*")
-        photo, truth = Photo.open(path), Photo.open(partner).pixels
+        photo, ground_truth = Photo.open(path), Photo.open(partner).pixels
         transmission = separator(photo).transmission.pixels
-        gains.append([metric(transmission, truth) - metric(photo.pixels, truth) for metric in (psnr, ssim)])
+        gains.append(
+            [
+                metric(transmission, ground_truth) - metric(photo.pixels, ground_truth)
+                for metric in (psnr, ssim)
+            ]
+        )
     assert len(gains) == 10
     assert (np.mean(gains, axis=0) > [0.4, 0]).all()
 
@@ -225,8 +236,10 @@ def test_the_shipped_model_hardly_changes_photographs_without_glass(separator, d
 @pytest.mark.parametrize("quality", QUALITIES)
 def test_progress_rises_to_one(quality):
     progress = []
-    Separator(glass)(
-        Photo.from_array(picture(600, 900), encoding="srgb"), quality=quality, on_progress=progress.append
+    Separator(glass_backend)(
+        Photo.from_array(random_image(600, 900), encoding="srgb"),
+        quality=quality,
+        on_progress=progress.append,
     )
     assert progress == sorted(progress)
     assert (progress[0], progress[-1]) == (0, 1)
@@ -237,16 +250,18 @@ def test_progress_rises_to_one(quality):
 def test_an_exception_in_on_progress_stops_the_work(calls_until_error):
     progress, tiles = [], []
 
-    def stop(share):
-        progress.append(share)
+    def stop(fraction):
+        progress.append(fraction)
         if len(progress) == calls_until_error:
             raise TimeoutError
 
-    def counting(tile):
+    def recording_backend(tile):
         tiles.append(tile)
-        return glass(tile)
+        return glass_backend(tile)
 
     with pytest.raises(TimeoutError):
-        Separator(counting)(Photo.from_array(picture(600, 900), encoding="srgb"), on_progress=stop)
+        Separator(recording_backend)(
+            Photo.from_array(random_image(600, 900), encoding="srgb"), on_progress=stop
+        )
     assert len(progress) == calls_until_error
     assert len(tiles) <= calls_until_error

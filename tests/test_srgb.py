@@ -14,12 +14,12 @@ def test_the_transfer_function_passes_through_the_published_points():
 
 
 @given(st.floats(-1, 60))
-def test_encoding_is_undone_by_decoding(value):
+def test_decoding_inverts_encoding(value):
     assert to_linear(to_encoded(np.array(value))) == pytest.approx(value, rel=1e-6, abs=1e-7)
 
 
 @given(st.lists(st.floats(-1, 60), min_size=2, max_size=20))
-def test_more_light_never_encodes_darker(values):
+def test_encoding_is_monotonic(values):
     assert (np.diff(to_encoded(np.sort(np.array(values)))) >= 0).all()
 
 

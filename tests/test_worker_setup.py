@@ -1,4 +1,4 @@
-"""Thread limits of workers; that workers exit with their parent is tested with the packages that start them."""
+"""Thread limits of workers. The exit with the parent is tested in the packages that start workers."""
 
 import contextlib
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from brewster.photo import Photo
 
     __version__: str
-else:  # hidden from type checkers: with a module-level __getattr__ they accept misspelt names
+else:  # not for type checkers, which accept misspelt names if a module has __getattr__
 
     def __getattr__(name: str) -> object:
         """Imports a public name on first use."""

@@ -2,7 +2,7 @@
 
     Downloader().fetch(RemoteFile(url, size=244408911, algorithm="sha256", digest="7be5..."), Path("alexnet.pth"))
 
-A partial download is kept next to the target as `.part`. The next call resumes it.
+A partial download is written next to the target, with the suffix `.part`. The next call resumes it.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from brewster.errors import DownloadError, TargetError
 _RETRYABLE_STATUS = (408, 425, 429, 500, 502, 503, 504)
 _MAX_RETRY_AFTER_S = 120.0
 _BLOCK_BYTES = 1 << 18
-_HTTP_URL = "http:// or https://"
+_EXPECTED_URL = "expected a URL that starts with http:// or https://"
 
 _T = TypeVar("_T")
 
 
 class RemoteFile(NamedTuple):
-    """A file to download: its address, size in bytes, and expected digest in lower-case hexadecimal."""
+    """A file to download: its URL, its size in bytes, and its expected digest in lower-case hexadecimal."""
 
     url: str
     size: int
@@ -42,7 +42,7 @@ class RemoteFile(NamedTuple):
 
 @final
 class _RetryableError(Exception):
-    """A failure that another attempt may fix: a lost connection or a busy server. `wait_s`: seconds to wait first."""
+    """A temporary failure, such as a lost connection or a busy server. `wait_s` is the wait before the next attempt."""
 
     def __init__(self, reason: object, wait_s: float = 0.0) -> None:
         super().__init__(str(reason) or type(reason).__name__)
@@ -55,9 +55,9 @@ class Downloader:
     """Downloads over http and https with retries.
 
     Attributes:
-        retry_delays_s: the seconds before each further attempt; one attempt more than delays is made.
-        timeout_s: the longest time without data, in seconds.
-        sleep: called with the seconds to wait; tests replace it.
+        retry_delays_s: the delay before each retry, in seconds. n delays give n + 1 attempts.
+        timeout_s: the longest time without received data, in seconds.
+        sleep: called with the delay in seconds; tests replace it.
     """
 
     retry_delays_s: tuple[float, ...] = (1.0, 2.0, 4.0, 8.0)
@@ -65,7 +65,7 @@ class Downloader:
     sleep: Callable[[float], object] = time.sleep
 
     def read(self, url: str) -> bytes:
-        """Returns the body of a response.
+        """Requests a URL and returns the body of the response.
 
         Raises:
             DownloadError: the URL is invalid, the server refuses it, or all attempts fail.
@@ -78,7 +78,7 @@ class Downloader:
         return self._with_retries(url, attempt)
 
     def fetch(self, remote: RemoteFile, target: Path) -> None:
-        """Downloads a file and creates its folder. The target appears only after its checksum is verified.
+        """Downloads a file and creates its folder. The target is created only after the digest is verified.
 
         Raises:
             DownloadError: all attempts fail, or the digest differs from the expected one.
@@ -90,9 +90,9 @@ class Downloader:
             self._with_retries(remote.url, lambda: self._fetch_rest(remote, part))
             if (digest := file_digest(part, remote.algorithm)) != remote.digest:
                 part.unlink()
-                happened = f"{remote.url} was downloaded with the {remote.algorithm.upper()} digest {digest}, and was deleted"
+                happened = f"the file from {remote.url} has the {remote.algorithm.upper()} digest {digest} and was deleted"
                 cure = "run again to download the whole file"
-                raise DownloadError(happened, f"the digest {remote.digest} was expected", cure)
+                raise DownloadError(happened, f"expected the digest {remote.digest}", cure)
             part.replace(target)
 
     def _with_retries(self, url: str, attempt: Callable[[], _T]) -> _T:
@@ -105,14 +105,14 @@ class Downloader:
                     happened = (
                         f"{url} could not be downloaded in {len(self.retry_delays_s) + 1} attempts ({error})"
                     )
-                    cure = "check the connection, or run again later: the partial download is kept"
+                    cure = "check the connection, or run again later to resume the download"
                     raise DownloadError(
-                        happened, "a server that responds and a stable connection", cure
+                        happened, "expected a server that responds and a stable connection", cure
                     ) from error
                 self.sleep(max(delay, error.wait_s))
 
     def _open(self, url: str, start: int = 0) -> HTTPResponse:
-        """Returns the open response, from byte `start` on where the server supports ranges."""
+        """Returns the open response. It begins at byte `start` if the server supports range requests."""
         headers = {"User-Agent": _user_agent()} | ({"Range": f"bytes={start}-"} if start else {})
         try:
             query = request.Request(url, headers=headers)  # noqa: S310  (the opener supports http and https only)
@@ -124,16 +124,20 @@ class Downloader:
                 raise _RetryableError(
                     error, min(float(retry_after), _MAX_RETRY_AFTER_S) if retry_after.isdecimal() else 0
                 ) from error
-            raise DownloadError(f"the server refused {url} ({error})", "a file", "run again later") from error
+            raise DownloadError(
+                f"the server refused the request for {url} ({error})", "expected a file", "run again later"
+            ) from error
         except (ValueError, InvalidURL) as error:
             raise DownloadError(
-                f"{url!r} is not a valid URL ({error})", _HTTP_URL, "check the address"
+                f"{url!r} is not a valid URL ({error})", _EXPECTED_URL, "check the URL"
             ) from error
         except (OSError, HTTPException) as error:
             raise _RetryableError(error) from error
         if response is None:
             raise DownloadError(
-                f"{url!r} is not, or redirects to a URL that is not, http(s)", _HTTP_URL, "check the address"
+                f"{url!r} or a URL that it redirects to has another scheme than http or https",
+                _EXPECTED_URL,
+                "check the URL",
             )
         return cast("HTTPResponse", response)
 
@@ -161,19 +165,19 @@ def file_digest(path: Path, algorithm: str) -> str:
 
 @contextmanager
 def target_errors(path: Path) -> Iterator[None]:
-    """Turns an OSError about a downloaded file into a TargetError."""
+    """Converts an OSError in the block to a TargetError about the downloaded file `path`."""
     try:
         yield
     except OSError as error:
         happened = f"{path} cannot be read or written ({error.strerror or error})"
-        cure = "free some space or name another folder, and run again: the download is resumed"
-        raise TargetError(happened, "a writable folder on a disk with free space", cure) from error
+        cure = "free some space or choose another folder, and run again to resume the download"
+        raise TargetError(happened, "expected a writable folder on a disk with free space", cure) from error
 
 
 def _read(response: HTTPResponse, max_bytes: int | None = None) -> bytes:
-    """Returns the whole body, or up to `max_bytes` of what has arrived.
+    """Returns the whole body, or at most `max_bytes` bytes of it.
 
-    `read1` returns what is there already, so that a lost connection loses none of the received bytes.
+    `read1` returns the bytes that are already received. So no received byte is lost if the connection breaks.
     """
     try:
         return response.read() if max_bytes is None else response.read1(max_bytes)
@@ -183,7 +187,7 @@ def _read(response: HTTPResponse, max_bytes: int | None = None) -> bytes:
 
 @functools.cache
 def _opener() -> request.OpenerDirector:
-    """An opener for http and https only, redirects included; for other schemes `open` returns None."""
+    """Returns an opener for http and https. It follows redirects. For other schemes, its `open` returns None."""
     opener = request.OpenerDirector()
     for handler in (
         request.ProxyHandler,
@@ -199,7 +203,7 @@ def _opener() -> request.OpenerDirector:
 
 @functools.cache
 def _user_agent() -> str:
-    """The User-Agent header; Poly Haven requires that programs identify themselves."""
+    """Returns the User-Agent header. Poly Haven requires that programs identify themselves."""
     try:
         version = metadata.version("brewster")
     except metadata.PackageNotFoundError:

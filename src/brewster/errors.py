@@ -1,15 +1,15 @@
 """All exceptions that brewster raises for expected failures.
 
-    BrewsterError              exit code 1 on the command line, one sentence without a traceback
-    |-- PhotoError             an image cannot be read, interpreted or written
-    |   |-- UnreadablePhoto    not an image, empty, truncated
-    |   |-- UnsupportedPhoto   an image of an unsupported kind (five channels, animation, NaN)
-    |   `-- PhotoTooLarge      more pixels than the limit
-    |-- TargetError            the target exists, is read-only or the source, or the disk is full
-    |-- ModelError             unknown model, damaged file, wrong inputs
+    BrewsterError              exit code 1 on the command line, a message without a traceback
+    |-- PhotoError             a photo cannot be read, interpreted or written
+    |   |-- UnreadablePhoto    the file is not an image, is empty or is truncated
+    |   |-- UnsupportedPhoto   an unsupported kind of image (five channels, animation, NaN)
+    |   `-- PhotoTooLarge      the image has more pixels than the limit
+    |-- TargetError            an output file cannot be written, for example because it exists
+    |-- ModelError             a model is unknown, damaged, or has the wrong inputs
     |-- DeviceError            the requested device is not available
     |-- RecipeError            a recipe is not TOML, or its values are invalid
-    |-- DownloadError          a server cannot be reached, or its file has the wrong digest
+    |-- DownloadError          a server cannot be reached, or its file has an unexpected digest
     `-- MissingExtra           an optional dependency is not installed
 
 Messages have three parts: what happened (with the value), what was expected, what to do.
@@ -19,7 +19,7 @@ from __future__ import annotations
 
 
 class BrewsterError(Exception):
-    """Base class of all brewster errors; the message is one sentence in three parts.
+    """Base class of all brewster errors. The message has three parts, separated by semicolons.
 
     Attributes:
         happened: what happened, with the value.
@@ -35,24 +35,24 @@ class BrewsterError(Exception):
         return f"{self.happened}; {self.expected}; {self.cure}{'' if self.cure.endswith('?') else '.'}"
 
     def sentences(self) -> list[str]:
-        """The message, a sentence for each problem; only a RecipeError has several."""
+        """Returns the message as a list with one item for each problem. Only a RecipeError has several."""
         return [str(self)]
 
     def __reduce__(self) -> tuple[type[BrewsterError], tuple[object, ...]]:
-        """Pickles the attributes, not `args`: callers may have changed them before the error crosses processes."""
+        """Pickles the attributes instead of `args`, because a caller may have changed them after the error was created."""
         return type(self), (self.happened, self.expected, self.cure)
 
 
 class PhotoError(BrewsterError):
-    """An image cannot be read, interpreted or written."""
+    """A photo cannot be read, interpreted or written."""
 
 
 class UnreadablePhoto(PhotoError):
-    """The bytes are not a complete image: empty, truncated, or another kind of file."""
+    """The file is not a complete image: it is empty, truncated, or of another kind."""
 
 
 class UnsupportedPhoto(PhotoError):
-    """An image of an unsupported kind, such as five channels, an animation, or NaN values."""
+    """The kind of image is not supported: for example five channels, an animation, or NaN values."""
 
 
 class PhotoTooLarge(PhotoError):
@@ -60,7 +60,7 @@ class PhotoTooLarge(PhotoError):
 
 
 class TargetError(BrewsterError):
-    """The target cannot be written: it exists, is read-only, is the source, or the disk is full."""
+    """An output file cannot be written: it exists, is read-only, is the source, or the disk is full."""
 
 
 class ModelError(BrewsterError):
@@ -75,7 +75,7 @@ class RecipeError(BrewsterError):
     """A recipe is not TOML, or its values are missing, unknown or impossible.
 
     Attributes:
-        others: further problems of the same recipe, each an error of its own. The message has a line for each.
+        others: one error for each further problem of the same recipe. The message has a line for each.
     """
 
     def __init__(self, happened: str, expected: str, cure: str, others: tuple[RecipeError, ...] = ()) -> None:
@@ -86,17 +86,17 @@ class RecipeError(BrewsterError):
         return "\n".join(self.sentences())
 
     def sentences(self) -> list[str]:
-        """The message, a sentence for each problem."""
+        """Returns one message for each problem of the recipe."""
         return [super().__str__(), *(sentence for other in self.others for sentence in other.sentences())]
 
     def __reduce__(self) -> tuple[type[BrewsterError], tuple[object, ...]]:
-        """Errors are sent between processes; the attributes count, as a caller may have changed them."""
+        """Pickles the attributes instead of `args`, as the base class does."""
         return type(self), (self.happened, self.expected, self.cure, self.others)
 
 
 class DownloadError(BrewsterError):
-    """A server cannot be reached, refuses a request, or sends a file with the wrong digest."""
+    """A server cannot be reached, refuses a request, or sends a file with another digest than expected."""
 
 
 class MissingExtra(BrewsterError):
-    """An optional dependency is needed and not installed."""
+    """An optional dependency is needed, but not installed."""

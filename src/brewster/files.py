@@ -1,7 +1,7 @@
 """Finds input images and writes results atomically, without overwriting other files.
 
-for job in find([Path("holiday")], output_folder=Path("clear")):
-    write_atomically(job.target("transmission"), data, source=job.source)
+for paths in find([Path("holiday")], output_folder=Path("clear")):
+    write_atomically(paths.target("transmission"), data, source=paths.source)
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from brewster.errors import TargetError
 from brewster.image_formats import format_of
 
 DEFAULT_MAX_PIXELS = 200_000_000
-"""Larger images are refused before they are decoded: a small compressed file can expand to a very large image."""
+"""The default limit. Larger images are refused before they are decoded: a small file can expand to a very large image."""
 
 TEMPORARY_PREFIX = ".brewster-"
-"""File name prefix of files that are still being written."""
+"""File name prefix of unfinished files."""
 
 LAYERS = ("transmission", "reflection", "confidence")
-_PNG_LAYERS = ("confidence",)  # a grey map, not a photo: the format of the source does not matter
+_PNG_LAYERS = ("confidence",)  # grey maps are always PNG, whatever the format of the photo
 
 
 @dataclass(frozen=True)
@@ -41,28 +41,33 @@ class SeparationPaths:
     name: str
 
     def target(self, layer: str, suffix: str | None = None) -> Path:
-        """Returns the path of a layer: with `suffix`, else that of the source, or .png if brewster does not write it."""
+        """Returns the path of a layer.
+
+        The default suffix is that of the source, or .png if brewster does not write the format of the source.
+        """
         image_format = format_of(self.source)
-        is_kept = image_format is not None and image_format.is_writable and layer not in _PNG_LAYERS
-        return self.folder / f"{self.name}.{layer}{suffix or (self.source.suffix if is_kept else '.png')}"
+        keeps_suffix = image_format is not None and image_format.is_writable and layer not in _PNG_LAYERS
+        return (
+            self.folder / f"{self.name}.{layer}{suffix or (self.source.suffix if keeps_suffix else '.png')}"
+        )
 
 
 def find(sources: Iterable[Path], output_folder: Path | None = None) -> list[SeparationPaths]:
-    """Lists the images in files and folders, each once, in a stable order.
+    """Returns the images in files and folders, each once, in a stable order.
 
     Layers are written next to their image, or below `output_folder`, which mirrors the tree of each input folder.
     Their name begins with the stem of the image, or with its full name if another image in the folder has the same
     stem: `a.jpg` gives `a`; `a.jpg` and `a.png` in one folder give `a.jpg` and `a.png`. The name depends only on the
-    images in the folder, not on which of them are selected or already separated.
+    images in the folder. It does not depend on which images are selected or already separated.
 
-    In folders, hidden files, files without an image suffix, and brewster's own results are skipped. A folder that
-    is reached through several links is visited once, so that link loops end. A file given by name is always listed:
-    opening it reports what is wrong.
+    In folders, hidden files, files without an image suffix, and layers that brewster has written are skipped. A
+    folder that is reached through several links is visited once, so that link loops end. A file given by name is
+    always included. If it is not an image, opening it raises the error.
 
     Raises:
-        TargetError: two images would be written under one name.
+        TargetError: the layers of two images would have the same path.
     """
-    jobs: dict[str, SeparationPaths] = {}
+    found: dict[str, SeparationPaths] = {}
     counts: dict[Path, Counter[str]] = {}
     for source in sources:
         for image in _image_files(source):
@@ -71,20 +76,20 @@ def find(sources: Iterable[Path], output_folder: Path | None = None) -> list[Sep
                 counts[parent] = _name_counts(parent)
             subfolder = Path() if image == source else parent.relative_to(source)
             folder = parent if output_folder is None else output_folder / subfolder
-            job = SeparationPaths(image, folder, _layer_name(image, counts[parent]))
-            jobs.setdefault(_absolute(image), job)
-    _check_unique_targets(jobs.values())
-    return list(jobs.values())
+            paths = SeparationPaths(image, folder, _layer_name(image, counts[parent]))
+            found.setdefault(_absolute(image), paths)
+    _check_unique_targets(found.values())
+    return list(found.values())
 
 
 def write_atomically(path: Path, data: bytes, *, overwrite: bool = False, source: Path | None = None) -> None:
     """Writes a file atomically and creates its folder where needed.
 
-    The bytes are written to a hidden file in the same folder and flushed to the disk; then the file is renamed. So
-    neither a full disk nor Ctrl-C leaves a partial file.
+    The bytes are written to a hidden file in the same folder and flushed to the disk. Then the file is renamed. So
+    a full disk or Ctrl-C leaves no partial file.
 
     Raises:
-        TargetError: the file exists and `overwrite` is off, is the `source`, or cannot be written.
+        TargetError: the file exists and `overwrite` is False, the file is the `source`, or it cannot be written.
     """
     _check_not_source(path, source)
     try:
@@ -99,12 +104,12 @@ def write_atomically(path: Path, data: bytes, *, overwrite: bool = False, source
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yields a hidden path for a new file or folder; it is renamed to `path` at the end of the block.
+    """Yields a hidden path for a new file or folder, and renames it to `path` at the end of the block.
 
-    It replaces an existing file. A folder that another process has created meanwhile is kept.
+    An existing file is replaced. If another process has created the folder in the meantime, that folder stays.
 
     Raises:
-        TargetError: it cannot be written, for example because the disk is full.
+        TargetError: the file or folder cannot be written, for example because the disk is full.
     """
     try:
         with _temporary(path) as part:
@@ -116,8 +121,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise TargetError(
             f"{path} was not written ({error.strerror or error})",
-            "a writable folder on a disk with free space",
-            "free some space or name another folder, and run again: finished files are kept",
+            "expected a writable folder on a disk with free space",
+            "free some space or choose another folder, and run again: finished files are kept",
         ) from error
 
 
@@ -130,18 +135,18 @@ def _temporary(path: Path) -> Iterator[Path]:
             yield part
         finally:
             discard(part)
-    except KeyboardInterrupt:  # it may have come after the rename and before the file was discarded
+    except KeyboardInterrupt:  # it may have interrupted `discard`
         discard(part)
         raise
 
 
 def temporary_path(path: Path) -> Path:
-    """Returns a new hidden path in the folder of `path`, for files being written or deleted."""
+    """Returns a new hidden path in the folder of `path`, for a file that is written or deleted."""
     return path.parent / f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}.part"
 
 
 def discard(path: Path) -> None:
-    """Deletes a file, or a folder with its content; ignores errors."""
+    """Deletes a file, or a folder with its content. Ignores errors."""
     with contextlib.suppress(OSError):
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)
@@ -178,34 +183,34 @@ def _image_files(source: Path) -> Iterator[Path]:
 
 
 def walk(folder: Path, is_included: Callable[[Path], bool]) -> Iterator[Path]:
-    """Lists the files below a folder that `is_included` accepts, in a stable order, without hidden folders.
+    """Yields the files below a folder for which `is_included` is True, in a stable order. Hidden folders are skipped.
 
-    Links are followed. Each folder is visited once, so that link loops end. A folder that cannot be read is yielded
-    itself.
+    Links are followed. Each folder is visited once, so that link loops end. If a folder cannot be read, its path is
+    yielded.
     """
     return _walk(folder, is_included, set())
 
 
-def _walk(folder: Path, is_included: Callable[[Path], bool], seen: set[tuple[int, int]]) -> Iterator[Path]:
+def _walk(folder: Path, is_included: Callable[[Path], bool], visited: set[tuple[int, int]]) -> Iterator[Path]:
     try:
         entries = sorted(folder.iterdir())
         status = folder.stat()
     except OSError:
-        yield folder  # opening it reports the reason, and the rest of the batch continues
+        yield folder  # opening it raises the error, and the rest of the batch continues
         return
-    if (status.st_dev, status.st_ino) in seen:
+    if (status.st_dev, status.st_ino) in visited:
         return
-    seen.add((status.st_dev, status.st_ino))
+    visited.add((status.st_dev, status.st_ino))
     for entry in entries:
         if _is_folder(entry):
             if not entry.name.startswith("."):
-                yield from _walk(entry, is_included, seen)
+                yield from _walk(entry, is_included, visited)
         elif is_included(entry):
             yield entry
 
 
 def _absolute(path: Path) -> str:
-    """Returns the absolute path with links unresolved: two links to one file are two images."""
+    """Returns the absolute path. Links are not resolved: two links to one file are two images."""
     return os.path.abspath(path)  # noqa: PTH100
 
 
@@ -228,21 +233,21 @@ def _layer_name(image: Path, counts: Counter[str]) -> str:
 
 
 def _is_input(path: Path) -> bool:
-    """Whether a file in a folder has an image suffix, is not hidden, and is not a result of brewster."""
+    """Returns whether a file has an image suffix, is not hidden, and is not a layer that brewster has written."""
     is_result = Path(path.stem).suffix.lstrip(".") in LAYERS
     return format_of(path) is not None and not path.name.startswith(".") and not is_result
 
 
-def _check_unique_targets(jobs: Iterable[SeparationPaths]) -> None:
-    owners: dict[str, SeparationPaths] = {}
-    for job in jobs:
-        name = job.folder / job.name
-        other = owners.setdefault(_absolute(name), job)
-        if other is not job:
+def _check_unique_targets(found: Iterable[SeparationPaths]) -> None:
+    first_with_name: dict[str, SeparationPaths] = {}
+    for paths in found:
+        name = paths.folder / paths.name
+        other = first_with_name.setdefault(_absolute(name), paths)
+        if other is not paths:
             raise TargetError(
-                f"{other.source} and {job.source} would both be written as {name}.*",
-                "each image needs its own output name",
-                "name their parent folder, whose tree is mirrored, or use different output folders",
+                f"{other.source} and {paths.source} would both be written as {name}.*",
+                "expected a separate output name for each image",
+                "pass their parent folder, whose tree is mirrored, or use different output folders",
             )
 
 
@@ -250,7 +255,9 @@ def _check_not_source(path: Path, source: Path | None) -> None:
     with contextlib.suppress(OSError):  # a file that does not exist is not the same file
         if source is not None and path.samefile(source):
             raise TargetError(
-                f"{path} is the input image itself", "input files are never changed", "choose another name"
+                f"{path} is the input image itself",
+                "expected another path, because input files are never changed",
+                "choose another name",
             )
 
 
@@ -277,27 +284,32 @@ def _publish(part: Path, path: Path, overwrite: bool) -> None:
     try:
         os.link(
             part, path
-        )  # unlike a rename, a link never replaces a file that another process wrote meanwhile
+        )  # unlike a rename, a link never replaces a file that another process has just written
     except OSError as error:
         if error.errno not in (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK):
             raise
-        part.replace(path)  # a file system without links (FAT); _check_writable has just checked
+        part.replace(
+            path
+        )  # a file system without hard links (FAT); _check_writable has found no file at this path
 
 
 _REMEDIES = {
     errno.EEXIST: (
-        "existing files are not overwritten",
+        "expected a path that does not exist, because files are not overwritten",
         "pass --overwrite (in Python overwrite=True) or choose another name or folder",
     ),
-    errno.EISDIR: ("the target must be a file", "name a file in it, or use -o for a folder"),
-    errno.ENOSPC: ("the file must fit on the disk", "free some space and run again"),
-    errno.EDQUOT: ("the file must fit in the quota", "free some space and run again"),
-    errno.EACCES: ("the folder must be writable", "choose another folder with -o, or change its permissions"),
-    errno.EPERM: ("the folder must be writable", "choose another folder with -o, or change its permissions"),
-    errno.EROFS: ("the folder must be writable", "choose another folder with -o"),
-    errno.ENAMETOOLONG: ("the name must be shorter", "rename the image"),
+    errno.EISDIR: (
+        "expected a file, not a folder",
+        "choose a file in this folder, or pass the folder with -o",
+    ),
+    errno.ENOSPC: ("expected enough free space on the disk", "free some space and run again"),
+    errno.EDQUOT: ("expected enough space in the disk quota", "free some space and run again"),
+    errno.EACCES: ("expected a writable folder", "choose another folder with -o, or change its permissions"),
+    errno.EPERM: ("expected a writable folder", "choose another folder with -o, or change its permissions"),
+    errno.EROFS: ("expected a writable folder", "choose another folder with -o"),
+    errno.ENAMETOOLONG: ("expected a shorter name", "rename the image"),
 }
-_DEFAULT_REMEDY = ("the file must be writable", "choose another folder with -o")
+_DEFAULT_REMEDY = ("expected a writable file", "choose another folder with -o")
 
 
 def _target_error(path: Path, error: OSError) -> TargetError:
@@ -306,5 +318,5 @@ def _target_error(path: Path, error: OSError) -> TargetError:
 
 
 def cache_folder() -> Path:
-    """Returns the folder for downloads, in the cache folder of the user and operating system."""
+    """Returns the folder for downloads: a folder in the cache folder of the user, as the operating system defines it."""
     return platformdirs.user_cache_path("brewster", appauthor=False)

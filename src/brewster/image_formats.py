@@ -1,4 +1,4 @@
-"""The table of image formats: one row holds everything that brewster knows about a file format.
+"""The table of image formats: one row holds all properties of a file format.
 
 To add a format, add a row here. A format with a new `library` also needs a reader and a writer in `brewster.photo`.
 """
@@ -20,7 +20,7 @@ class ImageFormat:
 
     name: str
     suffixes: tuple[str, ...]
-    """File name suffixes in lower case; new files get the first."""
+    """File name suffixes in lower case. The first one is used for new files."""
     mime_type: str
     signature: bytes
     """A regular expression for the first bytes of a file."""
@@ -28,19 +28,19 @@ class ImageFormat:
     vips_loader: str | None = None
     vips_saver: str | None = None
     extra: str | None = None
-    """The extra of brewster that installs the library; None where the core has it."""
+    """The extra of brewster that installs the library, or None if the library is installed without an extra."""
     bit_depths: tuple[int, ...] = ()
-    """Bits per channel that can be written; empty for a format that is only read."""
+    """The bit depths per channel that can be written. Empty for a format that is only read."""
     has_float32: bool = False
-    """Whether 32-bit floats are stored without loss; HDR loses precision, as its channels share an exponent."""
+    """Whether 32-bit floats are stored without loss. In HDR files the channels share an exponent, which loses precision."""
     is_linear: bool = False
     """Whether the pixels are linear light by definition, without an ICC profile."""
     has_alpha: bool = True
     """Whether an alpha channel can be written."""
     has_cicp: bool = False
-    """Whether a file may state its colour space by code points (ITU-T H.273) instead of an ICC profile."""
+    """Whether a file can have code points for its colour space (ITU-T H.273) instead of an ICC profile."""
     is_stored_rotated: bool = False
-    """Whether the library returns pixels as stored, so that the EXIF orientation must still be applied."""
+    """Whether the library returns pixels without applying the EXIF orientation."""
 
     @property
     def is_writable(self) -> bool:
@@ -153,5 +153,5 @@ SUFFIXES: Final = {suffix: row for row in _ROWS for suffix in row.suffixes}
 
 
 def format_of(path: Path) -> ImageFormat | None:
-    """Returns the format that a file name states by its suffix; None for a suffix of no known format."""
+    """Returns the format for the suffix of a file name, or None if the suffix is unknown."""
     return SUFFIXES.get(path.suffix.lower())

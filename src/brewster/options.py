@@ -1,6 +1,6 @@
 """The options of a separation: type, default, limits and meaning of each, written once.
 
-The command line, its help and the web form are made from `Options`; the Python API takes its defaults and its
+The command line, its help and the web form are generated from `Options`. The Python API takes its defaults and its
 documentation from it. The metadata of each field are keywords of `pydantic.Field`, so that
 `pydantic.TypeAdapter(Options)` gives an HTTP API its validation and JSON schema, while `brewster --help` needs no
 pydantic.
@@ -24,7 +24,7 @@ Quality = Literal["draft", "standard", "best"]
 Device = Literal["auto", "cuda", "rocm", "directml", "coreml", "cpu"]
 
 Quantisation = Literal["int8", "float8", "nf4"]
-"""How the weights of a large base model are stored to save memory: 8 bits by torchao, 4 bits by bitsandbytes."""
+"""The number format of the weights of a large base model: int8 and float8 by torchao, nf4 (4 bits) by bitsandbytes."""
 
 DIFFUSION_OPTIONS: Final = ("base", "quantise", "steps", "average", "plain")
 """The options of diffusion models only."""
@@ -32,7 +32,7 @@ DIFFUSION_OPTIONS: Final = ("base", "quantise", "steps", "average", "plain")
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
-def _about(description: str, **limits: int) -> dict[str, Any]:
+def _field_metadata(description: str, **limits: int) -> dict[str, Any]:
     return {"description": description, **limits}
 
 
@@ -42,16 +42,18 @@ class Options:
     """The options of a separation.
 
     Raises:
-        BrewsterError: `additive` with a format that stores no 32-bit floats.
+        BrewsterError: `additive` is set, and the format does not store 32-bit floats.
     """
 
     layers: tuple[Layer, ...] = field(
         default=("transmission", "reflection"),
-        metadata=_about("The layers to write, separated by commas: transmission, reflection, confidence."),
+        metadata=_field_metadata(
+            "The layers to write, separated by commas: transmission, reflection, confidence."
+        ),
     )
     strength: float = field(
         default=1.0,
-        metadata=_about(
+        metadata=_field_metadata(
             "How much of the separation to apply, from 0 (the unchanged photo) to 1 (the full separation).",
             ge=0,
             le=1,
@@ -59,68 +61,68 @@ class Options:
     )
     quality: Quality = field(
         default="standard",
-        metadata=_about("Number and size of the input scales: draft is fastest, best is slowest."),
+        metadata=_field_metadata("Number and size of the input scales: draft is fastest, best is slowest."),
     )
     additive: bool = field(
         default=False,
-        metadata=_about(
+        metadata=_field_metadata(
             "Write layers that sum to the photo exactly: 32-bit floats in linear light, TIFF or EXR."
         ),
     )
     format: FormatName | None = field(
         default=None,
-        metadata=_about("The file format of transmission and reflection, if not that of the photo."),
+        metadata=_field_metadata("The file format of transmission and reflection, if not that of the photo."),
     )
     model: str = field(
         default="compact",
-        metadata=_about(
+        metadata=_field_metadata(
             "The model to use: a name from `brewster models list`, an .onnx file, or a LoRA's folder or hub id."
         ),
     )
     device: Device = field(
         default="auto",
-        metadata=_about("The device that runs the model; auto selects the fastest one available."),
+        metadata=_field_metadata("The device that runs the model; auto selects the fastest one available."),
     )
     base: str | None = field(
         default=None,
-        metadata=_about(
+        metadata=_field_metadata(
             "For a LoRA: the folder or hub id of its base model, if it has moved since training."
         ),
     )
     quantise: Quantisation | None = field(
         default=None,
-        metadata=_about(
+        metadata=_field_metadata(
             "For diffusion models: store the weights in 8 or 4 bits, for GPUs with little memory."
         ),
     )
     steps: int | None = field(
         default=None,
-        metadata=_about(
+        metadata=_field_metadata(
             "For diffusion models: sampling steps for each prediction, by default 20, and 4 for a draft.",
             ge=1,
         ),
     )
     average: int = field(
         default=1,
-        metadata=_about("For diffusion models: the number of predictions that are averaged.", ge=1),
+        metadata=_field_metadata("For diffusion models: the number of predictions that are averaged.", ge=1),
     )
     plain: bool = field(
         default=False,
-        metadata=_about(
+        metadata=_field_metadata(
             "For diffusion models: the transmission as it is generated, enlarged, without the photo's detail."
         ),
     )
     max_pixels: int = field(
         default=DEFAULT_MAX_PIXELS,
-        metadata=_about("Refuse photos with more pixels than this, before they are decoded.", ge=1),
+        metadata=_field_metadata("Refuse photos with more pixels than this, before they are decoded.", ge=1),
     )
 
     def __post_init__(self) -> None:
-        """Refuses combinations of values that are not possible."""
+        """Checks combinations of values."""
         if self.additive and self.format and not FORMATS[self.format].has_float32:
             raise BrewsterError(
                 f"additive layers were requested as {self.format}",
-                "their 32-bit floats fit only into TIFF and EXR",
+                "expected tiff or exr, because only these store 32-bit floats",
                 "choose format tiff or exr, or leave additive out",
             )
 
@@ -133,24 +135,24 @@ class Options:
         """Returns the keywords for calling a `Separator`."""
         return {name: getattr(self, name) for name in ("strength", "quality", "additive", "max_pixels")}
 
-    def container(self, layer: str, own: str) -> str:
-        """Returns the format of a layer of a photo whose own format is `own`; confidence is always PNG."""
+    def container(self, layer: str, source_format: str) -> str:
+        """Returns the file format of a layer. `source_format` is the format of the photo. Confidence is always PNG."""
         if layer == "confidence":
             return "png"
-        if self.additive and not (own in FORMATS and FORMATS[own].has_float32):
-            own = "tiff"
-        return self.format or own
+        if self.additive and not (source_format in FORMATS and FORMATS[source_format].has_float32):
+            source_format = "tiff"
+        return self.format or source_format
 
     def suffix(self, layer: str, source: Path) -> str | None:
-        """Returns the suffix of a layer's file; None if it is that of the source."""
+        """Returns the suffix of a layer's file, or None if it is the suffix of the source."""
         image_format = format_of(source)
-        own = image_format.name if image_format else ""
-        container = self.container(layer, own)
-        return None if container == own else FORMATS[container].suffixes[0]
+        source_format = image_format.name if image_format else ""
+        container = self.container(layer, source_format)
+        return None if container == source_format else FORMATS[container].suffixes[0]
 
 
 def document_options(function: _Function) -> _Function:
-    """Appends the parameters that are fields of `Options` to the `Args:` section of a docstring."""
+    """Adds the function parameters that are fields of `Options` to the `Args:` section of its docstring."""
     fields, docstring = Options.__dataclass_fields__, inspect.getdoc(function) or ""
     rows = [
         f"    {name}: {fields[name].metadata['description']}"

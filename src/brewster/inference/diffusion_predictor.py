@@ -1,8 +1,9 @@
 """Predicts layers with a diffusion model, which generates them as panels of one image.
 
-Generated panels differ from the photo in colour and detail. If the model also generates the photo (panel I), that
-panel has the same errors. So the change is computed between generated panels, T - I, and guided_upsampling.py applies
-it to the real photo. The difference between the generated and the real photo is the reconstruction error.
+Generated panels differ from the photo in colour and detail. If the model also generates the input (panel I), that
+panel and panel T have about the same errors. So the change is the difference of the generated panels, T - I, and
+guided_upsampling.py applies it to the real photo. The reconstruction error is the difference between the generated and
+the real input.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import torch
 from numpy.typing import NDArray
 
 from brewster.errors import ModelError
-from brewster.inference.guided_upsampling import Floats, GeneratedOverride, enlarge_rows
+from brewster.inference.guided_upsampling import Floats, GeneratedOverride, upsample_rows
 from brewster.inference.predictor import Prediction, Predictor, ProgressCallback, confidence_from_spread
 from brewster.inference.tiles import run_tiled, tile_slices
 from brewster.models.diffusion.panels import PanelFit
@@ -28,24 +29,26 @@ from brewster.options import Quality
 from brewster.srgb import to_encoded, to_linear
 
 _DRAFT_STEPS: Final = 4
-_FINE_SCALE: Final = 2
-"""The scale of the second input of quality "best" relative to the first, per side; its tiles have the size of a panel."""
-_MIN_FINE_SCALE: Final = 1.25
-"""A second input with a smaller scale than this adds no detail and is left out."""
+_SECOND_INPUT_SCALE: Final = 2
+"""Side of the second input for quality "best" relative to the first. The second input is processed in tiles."""
+_MIN_SECOND_INPUT_SCALE: Final = 1.25
+"""A second input with a smaller relative side adds almost no detail, so it is not used."""
 
 
 @final
 class DiffusionPredictor(Predictor):
-    """Runs a `DecompositionPipeline` on the whole photo in one panel, and for "best" also on larger tiles.
+    """Runs a `DecompositionPipeline` on a copy of the photo that fits into one panel.
+
+    For quality "best", it also runs the pipeline on a second, larger copy in tiles of the size of a panel.
 
     Args:
         pipeline: the model.
-        steps: sampling steps for each prediction; by default 20 as in the paper, and 4 for "draft".
-        average: the number of predictions, each from its own seed, that are averaged to reduce generated detail.
-        plain: returns the transmission as it is generated, enlarged, without the detail of the photo.
+        steps: the number of sampling steps; by default 20 as in the paper, and 4 for "draft".
+        average: the number of samples with different seeds whose mean is the prediction; the mean has less invented detail.
+        plain: whether the transmission is the upsampled generated one, without the detail of the photo.
 
     Raises:
-        ModelError: `steps` or `average` is below 1, or set for a one-step model.
+        ModelError: `steps` or `average` is below 1, or one of them is set for a one-step model.
     """
 
     def __init__(
@@ -58,12 +61,14 @@ class DiffusionPredictor(Predictor):
     ) -> None:
         if (steps is not None and steps < 1) or average < 1:
             raise ModelError(
-                f"steps = {steps}, average = {average}", "both must be at least 1", "set them to 1 or more"
+                f"steps = {steps}, average = {average}",
+                "expected both to be at least 1",
+                "set them to 1 or more",
             )
         if pipeline.task.objective == "one_step" and (steps not in (None, 1) or average > 1):
             raise ModelError(
                 f"steps = {steps}, average = {average} were set for a one-step model",
-                "its prediction takes one step and is deterministic",
+                "expected neither, because it takes one step and is deterministic",
                 "leave them out",
             )
         self._pipeline, self._plain = pipeline, plain
@@ -71,40 +76,42 @@ class DiffusionPredictor(Predictor):
         self._lock = Lock()
 
     def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
-        """Returns the size of a panel, and for "best" also up to twice that size, but not more than the photo.
+        """Returns the (width, height) of the inputs: one that fits into a panel, and for "best" also a larger one.
+
+        The sides of the larger input are twice those of the first, but not larger than the photo.
 
         Raises:
-            PhotoError: the photo has fewer than 16 pixels a side, or is too long and thin.
+            PhotoError: a side of the photo has fewer than 16 pixels, or its aspect ratio is too large.
         """
         task, multiple = self._pipeline.task, self._pipeline.backbone.multiple
         coarse = task.fit(size, multiple).content
-        scale = min(_FINE_SCALE, size[0] / coarse[0])
-        if quality != "best" or scale < _MIN_FINE_SCALE:
+        scale = min(_SECOND_INPUT_SCALE, size[0] / coarse[0])
+        if quality != "best" or scale < _MIN_SECOND_INPUT_SCALE:
             return [coarse]
         return [coarse, (round(scale * coarse[0]), round(scale * coarse[1]))]
 
     def __call__(
         self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
     ) -> Prediction:
-        """Returns the mean over the inputs; the reconstruction error is that of the first input, the whole photo."""
+        """Returns the mean prediction over the inputs. The reconstruction error is that of the first input."""
         size = inputs[-1].shape[:2]
-        sides = [max(inputs[0].shape), *(self._tile_px for _ in inputs[1:])]
+        tile_sides = [max(inputs[0].shape), *(self._tile_px for _ in inputs[1:])]
         tiles = [
             len(tile_slices(scaled_input.shape[:2], **_tiling(side)))
-            for scaled_input, side in zip(inputs, sides, strict=True)
+            for scaled_input, side in zip(inputs, tile_sides, strict=True)
         ]
         steps = self._steps or (_DRAFT_STEPS if quality == "draft" else STEPS)
         progress = _ProgressCounter(on_progress, sum(tiles))
         predictions = []
-        with self._lock:  # two at once would need twice the memory of the GPU
-            for scaled_input, side in zip(inputs, sides, strict=True):
+        with self._lock:  # two predictions at the same time would need twice the GPU memory
+            for scaled_input, side in zip(inputs, tile_sides, strict=True):
                 predictions.append(
                     run_tiled(
                         lambda tile: self._predict_tile(tile, steps, progress), scaled_input, **_tiling(side)
                     )
                 )
         change, reflection, generated, spread, reconstruction_error = (
-            np.mean([enlarge_rows(map_, 0, size[0], size) for map_ in maps], axis=0)
+            np.mean([upsample_rows(map_, 0, size[0], size) for map_ in maps], axis=0)
             for maps in zip(*predictions, strict=True)
         )
         override, mean_error = None, None
@@ -129,7 +136,7 @@ class DiffusionPredictor(Predictor):
 
     @property
     def _has_confidence(self) -> bool:
-        """Whether a confidence can be computed: from a reconstruction of the photo, or from several samples."""
+        """Whether a confidence can be computed, from the reconstruction error or from the spread of several samples."""
         return self._reconstructs_input or (len(self._seeds) > 1 and self._pipeline.task.objective == "flow")
 
     @property
@@ -139,32 +146,36 @@ class DiffusionPredictor(Predictor):
         return max(1, math.isqrt(task.budget_px // len(task.layout.panels)) // multiple) * multiple
 
     def _predict_tile(self, tile: Floats, steps: int, progress: _ProgressCounter) -> tuple[Floats, ...]:
-        """Returns change, reflection and transmission (linear light), spread of the samples and reconstruction error (encoded)."""
+        """Returns five maps (h, w, 3) for a tile (h, w, 3).
+
+        In linear light, means over the samples: change, reflection and transmission. In sRGB-encoded units: the spread
+        of the transmission over the samples, and the reconstruction error.
+        """
         height, width, _ = tile.shape
-        fit = PanelFit((width, height), _round_up((width, height), self._pipeline.backbone.multiple))
+        panel_fit = PanelFit((width, height), _round_up((width, height), self._pipeline.backbone.multiple))
         panel_input = torch.from_numpy(2 * to_encoded(tile) - 1).permute(2, 0, 1)[None]
         panels = self._pipeline(
-            fit.pad(panel_input), steps=steps, seeds=self._seeds, on_progress=progress.within_tile
+            panel_fit.pad(panel_input), steps=steps, seeds=self._seeds, on_progress=progress.within_tile
         )
         progress.tile_done()
         _check_finite(panels)
-        light = {name: _to_light(fit.crop(panel)) for name, panel in panels.items()}
-        photo = light.get("I", tile)
-        change = light["T"] - photo
-        reflection = light.get("R", np.maximum(-change, 0))
-        generated = to_encoded(_reconstruction(light, tile))
+        linear_panels = {name: _to_linear_light(panel_fit.crop(panel)) for name, panel in panels.items()}
+        photo = linear_panels.get("I", tile)
+        change = linear_panels["T"] - photo
+        reflection = linear_panels.get("R", np.maximum(-change, 0))
+        generated = to_encoded(_reconstruction(linear_panels, tile))
         return (
             change.mean(axis=0),
             reflection.mean(axis=0),
-            light["T"].mean(axis=0),
-            np.ptp(to_encoded(light["T"]), axis=0),
+            linear_panels["T"].mean(axis=0),
+            np.ptp(to_encoded(linear_panels["T"]), axis=0),
             np.abs(generated - to_encoded(tile)).mean(axis=0),
         )
 
 
 @dataclass
 class _ProgressCounter:
-    """Reports progress over tiles and sampling steps."""
+    """Counts tiles and sampling steps, and reports the completed fraction."""
 
     on_progress: ProgressCallback
     tiles: int
@@ -177,11 +188,11 @@ class _ProgressCounter:
         self.done += 1
 
 
-def _reconstruction(light: Mapping[str, Floats], tile: Floats) -> Floats:
-    """Returns the photo as the model generates it: panel I, or T + R; without either, the photo itself."""
-    if "I" in light:
-        return light["I"]
-    return np.minimum(light["T"] + light["R"], 1) if "R" in light else tile[None]
+def _reconstruction(linear_panels: Mapping[str, Floats], tile: Floats) -> Floats:
+    """Returns the generated input: panel I, or T + R. If the model generates neither I nor R, returns the tile itself."""
+    if "I" in linear_panels:
+        return linear_panels["I"]
+    return np.minimum(linear_panels["T"] + linear_panels["R"], 1) if "R" in linear_panels else tile[None]
 
 
 def _check_finite(panels: Mapping[str, torch.Tensor]) -> None:
@@ -189,12 +200,12 @@ def _check_finite(panels: Mapping[str, torch.Tensor]) -> None:
         if not panel.isfinite().all():
             raise ModelError(
                 f"panel {name} of the model contains NaN or infinity",
-                "finite values",
-                "use another quantise, or train the LoRA again: its weights may be damaged",
+                "expected finite values",
+                "choose another value of quantise, or train the LoRA again: its weights may be damaged",
             )
 
 
-def _to_light(panels: torch.Tensor) -> NDArray[np.float32]:
+def _to_linear_light(panels: torch.Tensor) -> NDArray[np.float32]:
     """Converts panels (n, 3, h, w) in [-1, 1] to linear light (n, h, w, 3)."""
     light: NDArray[np.float32] = to_linear(((panels + 1) / 2).clamp(0, 1).permute(0, 2, 3, 1).numpy())
     return light

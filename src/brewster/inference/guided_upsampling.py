@@ -1,10 +1,10 @@
-"""Upsamples a separation from the resolution of the network to that of the photo, and keeps the photo's detail.
+"""Upsamples a separation from the resolution of the network to that of the photo, with the detail of the photo.
 
-Reflection adds to light, so in linear light the change from photo to transmission is about as smooth as the
-reflection itself, whatever detail is behind the glass. At low resolution the change is modelled as a local linear
-function of the photo, change = slope * photo + offset (slopes: guided filter, He et al. 2013, eq. 5; upsampling:
-fast guided filter, He & Sun 2015). The upsampled slope and offset are applied to the full photo. Without
-upsampling, the result is exactly the input.
+The transmission is the photo plus a change. In linear light the photo is the sum of its layers, so the change is about
+as smooth as the reflection, and the detail of the background cancels. At low resolution the change is modelled as a
+local linear function of the photo, change = slope * photo + offset. The slopes are those of the guided filter (He et
+al. 2013, eq. 5). Slope and offset are upsampled and applied to the full photo (fast guided filter, He & Sun 2015). The
+offset contains the error of the fit, so at low resolution the result equals the prediction.
 """
 
 from __future__ import annotations
@@ -21,9 +21,11 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float32]
 
 _RADIUS: Final = 2
-_VARIANCE_FLOOR: Final = 4e-3
-_MIN_DETAIL_ENERGY: Final = 1e-6
-"""Detail energy, in linear light squared, below which the photo's detail is kept."""
+"""Radius of the windows in pixels: windows have 5 x 5 pixels."""
+_EPSILON: Final = 4e-3
+"""The regularisation epsilon of the guided filter (He et al. 2013, eq. 5), in linear light squared."""
+_DETAIL_EPSILON: Final = 1e-6
+"""Added to the denominator of the weight of the generated transmission: without detail, the weight is 0."""
 
 
 @final
@@ -35,44 +37,49 @@ class _LocalLinearMap:
     offset: Float32[Floats, "h w 3"]
 
     def apply(self, photo: Floats, top: int, height: int) -> Floats:
-        """Returns the layer for the rows top..top+n of the full photo: `photo` and the result are (n, W, 3)."""
+        """Returns the layer for n rows of the full photo, from the row `top`. `photo` and the result are (n, W, 3)."""
         rows, width, _ = photo.shape
-        layer = enlarge_rows(self.slope, top, rows, (height, width))
+        layer = upsample_rows(self.slope, top, rows, (height, width))
         layer *= photo
-        layer += enlarge_rows(self.offset, top, rows, (height, width))
+        layer += upsample_rows(self.offset, top, rows, (height, width))
         return layer
 
 
 @final
 @dataclass(frozen=True)
 class GeneratedOverride:
-    """A generated transmission at low resolution, and where it replaces the result of the guided filter.
+    """A generated transmission at low resolution, and its weight against the result of the guided upsampling.
 
-    Where the reflection has sharp detail and the background has little, the detail of the photo belongs to the
-    reflection. The generated transmission is softer, but closer to the ground truth there.
+    Where the reflection has more fine detail than the background, the detail of the photo belongs to the reflection.
+    There, the generated transmission is softer than guided upsampling, but closer to the ground truth.
     """
 
     transmission: Float32[Floats, "h w 3"]
     weight: Float32[Floats, "h w 1"]
-    """0: guided upsampling with the photo's detail; 1: the enlarged generated transmission."""
+    """0: guided upsampling with the detail of the photo. 1: the upsampled generated transmission."""
     strength: float = 1.0
-    """The strength of the separation: 0 is the photo, 1 the generated transmission."""
+    """The strength of the separation: where the weight is 1, strength 0 gives the photo, and 1 the generated transmission."""
 
     @classmethod
     def weighted_by_detail(cls, transmission: Floats, reflection: Floats) -> GeneratedOverride:
-        """Weighs by the share of the reflection in the detail energy: the local variance of both layers."""
-        reflected, transmitted = (
+        """Returns an override with weight = var(R) / (var(R) + var(T)), for layers (h, w, 3) in linear light.
+
+        var is the local variance: the mean over channels and windows of the squared difference to the window mean.
+        """
+        reflection_variance, transmission_variance = (
             _box_mean(np.square(layer - _box_mean(layer)).mean(axis=2, keepdims=True))
             for layer in (reflection, transmission)
         )
-        weight: Floats = reflected / (reflected + transmitted + np.float32(_MIN_DETAIL_ENERGY))
+        weight: Floats = reflection_variance / (
+            reflection_variance + transmission_variance + np.float32(_DETAIL_EPSILON)
+        )
         return cls(transmission, weight)
 
 
 @final
 @dataclass(frozen=True)
 class GuidedUpsampler:
-    """A separation at low resolution that can be applied to the rows of the full photo."""
+    """A separation fitted at low resolution. It is applied to the full photo in strips of rows."""
 
     change: _LocalLinearMap
     reflection: _LocalLinearMap
@@ -82,28 +89,42 @@ class GuidedUpsampler:
     def fit(
         cls, photo: Floats, change: Floats, reflection: Floats, override: GeneratedOverride | None = None
     ) -> GuidedUpsampler:
-        """Fits to the photo, transmission - photo, and reflection at low resolution, (h, w, 3) each, linear light."""
-        mean = _box_mean(photo)
-        variance = _box_mean(photo * photo) - mean**2 + _VARIANCE_FLOOR
+        """Fits change and reflection as local linear functions of the photo.
 
-        def fit(layer: Floats) -> _LocalLinearMap:
-            """Smoothed window slopes; the offset makes the model exact at low resolution."""
+        Arrays are (h, w, 3) in linear light, at low resolution.
+
+        Args:
+            photo: the photo.
+            change: transmission - photo.
+            reflection: the reflection.
+            override: where a generated transmission replaces the fitted one.
+        """
+        mean = _box_mean(photo)
+        variance = _box_mean(photo * photo) - mean**2 + _EPSILON
+
+        def fit_layer(layer: Floats) -> _LocalLinearMap:
+            """Fits a slope to each window and averages the slopes. The offset makes the fit exact at low resolution."""
             slope = _box_mean((_box_mean(photo * layer) - mean * _box_mean(layer)) / variance)
             return _LocalLinearMap(slope, layer - slope * photo)
 
-        return cls(fit(change), fit(reflection), override)
+        return cls(fit_layer(change), fit_layer(reflection), override)
 
     def apply(self, photo: Floats, top: int, height: int) -> tuple[Floats, Floats]:
-        """Returns transmission and reflection of the rows top..top+n of a photo `height` rows high, each (n, W, 3).
+        """Returns transmission and reflection, each (n, W, 3), for n rows of the full photo.
 
-        The transmission is not negative where the photo is not (wide-gamut photos have negative values). The
-        reflection is never brighter than the photo.
+        Negative values of the photo (colours outside Rec.709) limit the transmission from below: it is at least
+        min(photo, 0). The reflection is limited to 0..max(photo, 0).
+
+        Args:
+            photo: the n rows of the photo, (n, W, 3) linear light.
+            top: the index of the first of these rows.
+            height: the number of rows of the full photo.
         """
         transmission = self.change.apply(photo, top, height)
         if self.override:
             size = height, photo.shape[1]
             generated, weight = (
-                enlarge_rows(map_, top, len(photo), size)
+                upsample_rows(map_, top, len(photo), size)
                 for map_ in (self.override.transmission, self.override.weight)
             )
             transmission += weight * (np.float32(self.override.strength) * (generated - photo) - transmission)
@@ -113,14 +134,14 @@ class GuidedUpsampler:
         return transmission, np.clip(reflection, 0, np.maximum(photo, 0), out=reflection)
 
 
-def enlarge_rows(map_: Floats, top: int, rows: int, size: tuple[int, int]) -> Floats:
-    """Returns the rows top..top+rows of `map_` (h, w, C) enlarged to `size` (H, W) by bilinear interpolation."""
+def upsample_rows(map_: Floats, top: int, rows: int, size: tuple[int, int]) -> Floats:
+    """Returns `rows` rows, from the row `top`, of `map_` (h, w, C) upsampled to `size` (H, W) by bilinear interpolation."""
     vertical = _interpolate(map_, *_positions(map_.shape[0], top, rows, size[0]), axis=0)
     return _interpolate(vertical, *_positions(map_.shape[1], 0, size[1], size[1]), axis=1)
 
 
 def _positions(small: int, first: int, count: int, large: int) -> tuple[NDArray[np.intp], Floats]:
-    """Returns, for the large pixels first..first+count, the index of the small pixel before it and the fraction past it."""
+    """Returns positions in the small map for `count` pixels of the large map, from `first`: integer and fractional part."""
     centres = (np.arange(first, first + count) + 0.5) * (small / large) - 0.5
     centres = np.clip(centres, 0, small - 1)
     lower = np.minimum(centres.astype(np.intp), max(small - 2, 0))
@@ -139,7 +160,7 @@ def _interpolate(map_: Floats, lower: NDArray[np.intp], fraction: Floats, *, axi
 
 
 def _box_mean(map_: Floats) -> Floats:
-    """Returns means over windows of 2 r + 1 pixels a side of a map (h, w, C), with repeated edges."""
+    """Returns the means of a map (h, w, C) over square windows. The edge pixels are repeated beyond the edges."""
     for axis in (0, 1):
         padding = [(0, 0)] * 3
         padding[axis] = (_RADIUS, _RADIUS)

@@ -12,7 +12,7 @@ from brewster.errors import DeviceError, ModelError
 from brewster.inference.tiles import Image
 
 _STRIDE_PX: Final = 32
-"""Networks take sides that are multiples of this; tiles are padded by reflection."""
+"""The sides of the input of a network are multiples of this. Tiles are padded by mirroring their edges."""
 
 # device name: (execution provider of ONNX Runtime, command that installs it), preferred devices first
 _PROVIDERS: Final = {
@@ -26,7 +26,7 @@ DEVICES: Final = ("auto", *_PROVIDERS)
 
 
 def available_devices() -> list[str]:
-    """Returns the names of the devices that the installed ONNX Runtime supports, the preferred one first."""
+    """Returns the names of the devices that the installed ONNX Runtime supports, in order of preference."""
     installed = ort.get_available_providers()
     return [device for device, (provider, _) in _PROVIDERS.items() if provider in installed]
 
@@ -35,11 +35,11 @@ def available_devices() -> list[str]:
 class OnnxBackend:
     """A `Backend` from an ONNX file with the input `photo` (1, 3, H, W) and the outputs `transmission` and `reflection`.
 
-    May be called from several threads at once.
+    Thread-safe.
 
     Args:
         model: the path of the .onnx file.
-        device: a name from `DEVICES`; "auto" selects the preferred device that starts.
+        device: a name from `DEVICES`; "auto" selects the first device in order of preference that starts.
 
     Raises:
         ModelError: the file cannot be read, is not an ONNX model, or has other inputs and outputs.
@@ -56,12 +56,12 @@ class OnnxBackend:
                 return
         raise DeviceError(
             f"device {device} is installed but does not start",
-            "its driver and libraries must match ONNX Runtime",
+            "expected a driver and libraries that match ONNX Runtime",
             "install them, or use --device auto or cpu",
         )
 
     def __call__(self, tile: Image) -> tuple[Image, Image]:
-        """Separates one tile (H, W, 3) of any size, linear light in 0..1.
+        """Returns the transmission and the reflection of a tile. All are (H, W, 3) of any size, linear light in 0..1.
 
         Raises:
             ModelError: the model fails on this tile.
@@ -75,8 +75,8 @@ class OnnxBackend:
         except Exception as error:
             raise ModelError(
                 f"the model failed on a tile of {width}x{height} pixels ({_first_line(error)})",
-                "a model that accepts all sizes that are multiples of 32",
-                "check it with brewster models verify, or try --device cpu",
+                "expected a model that accepts all sizes that are multiples of 32",
+                "check the model with brewster models verify, or use --device cpu",
             ) from error
         transmission, reflection = (layer[0, :, :height, :width].transpose(1, 2, 0) for layer in outputs)
         return transmission, reflection
@@ -87,7 +87,7 @@ class OnnxBackend:
         if inputs != ["photo"] or not outputs >= {"transmission", "reflection"}:
             raise ModelError(
                 f"{model} has the inputs {inputs} and the outputs {sorted(outputs)}",
-                "a model with input photo and outputs transmission and reflection",
+                "expected a model with the input photo and the outputs transmission and reflection",
                 "export it with brewster train",
             )
 
@@ -102,13 +102,13 @@ def _read_model(model: Path) -> bytes:
     except OSError as error:
         raise ModelError(
             f"{model} cannot be read ({error.strerror})",
-            "a model file",
+            "expected a model file",
             "choose one from brewster models list",
         ) from error
 
 
 def _create_session(model: Path, data: bytes, device: str) -> ort.InferenceSession:
-    """Creates a session on the device; ONNX Runtime uses the CPU where the libraries of the device do not load."""
+    """Creates a session on the device. If the libraries of the device do not load, ONNX Runtime uses the CPU."""
     options = ort.SessionOptions()
     options.log_severity_level = 3
     providers = dict.fromkeys([_PROVIDERS[device][0], "CPUExecutionProvider"])
@@ -117,24 +117,24 @@ def _create_session(model: Path, data: bytes, device: str) -> ort.InferenceSessi
     except Exception as error:
         raise ModelError(
             f"{model} is not a model that ONNX Runtime can load on {device}",
-            "an .onnx file exported by brewster train",
-            f"check the file ({_first_line(error)})",
+            f"expected an .onnx file that brewster train has exported ({_first_line(error)})",
+            "check the file",
         ) from error
 
 
 def _candidates(device: str) -> list[str]:
-    """Returns the devices to try, the preferred one first; only `device` itself unless it is "auto"."""
+    """Returns the devices to try, in order of preference: all for "auto", otherwise only `device`."""
     available = available_devices()
     if device == "auto":
         return available
     if device not in _PROVIDERS:
         raise DeviceError(
-            f"the device {device!r} is unknown", f"one of {', '.join(DEVICES)}", "use --device auto"
+            f"the device {device!r} is unknown", f"expected one of {', '.join(DEVICES)}", "use --device auto"
         )
     if device not in available:
         raise DeviceError(
             f"device {device} is not available to the installed ONNX Runtime",
-            f"one of {', '.join(available)}",
+            f"expected one of {', '.join(available)}",
             f"{_PROVIDERS[device][1]}, or use --device auto",
         )
     return [device]

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, final
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.inference.guided_upsampling import Floats, GeneratedOverride, enlarge_rows
+from brewster.inference.guided_upsampling import Floats, GeneratedOverride, upsample_rows
 from brewster.inference.tiles import Backend, run_tiled
 from brewster.options import Quality
 from brewster.srgb import to_encoded
@@ -25,52 +25,53 @@ if TYPE_CHECKING:
     from jaxtyping import Float32
 
 ProgressCallback = Callable[[float], None]
-"""Called with the completed share, 0 to 1; an exception raised in it stops the work."""
+"""Called with the completed fraction, 0 to 1. An exception raised in it stops the work."""
 
 QUALITIES: Final[dict[Quality, tuple[int, ...]]] = {
     "draft": (100_000,),
     "standard": (100_000, 200_000),
     "best": (30_000, 100_000, 200_000, 350_000),
 }
-"""The input scales of `MultiScalePredictor` in pixels, the largest last."""
+"""The input scales of `MultiScalePredictor`: width times height of each input in pixels, the largest last."""
 
 _MIN_SHORT_SIDE_PX: Final = 160
+"""Inputs are enlarged to this short side, up to the factor below."""
 _MAX_ELONGATED_SCALE: Final = 3.0
-"""The largest factor by which the sides of an input may exceed its input scale, for long thin photos."""
+"""Maximum factor by which the sides of an input are enlarged for photos with a large aspect ratio."""
 _TILE_PX: Final = 1024
 _OVERLAP_PX: Final = 192
 _SPREAD_AT_1_E: Final = 0.05
-"""The spread of outputs, in sRGB-encoded units, at which the confidence is 1/e."""
+"""The spread of outputs (maximum - minimum), in sRGB-encoded units, at which the confidence is 1/e."""
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """The output of a predictor: maps (h, w) of the size of the largest input, linear light."""
+    """The output of a predictor: maps with the size (h, w) of the largest input, in linear light."""
 
     change: Float32[NDArray[np.float32], "h w 3"]
     """Transmission minus photo."""
     reflection: Float32[NDArray[np.float32], "h w 3"]
     confidence_map: Float32[NDArray[np.float32], "h w 1"]
-    """Confidence in the transmission: 1 is certain, 0 unknown."""
+    """Confidence in the transmission: 1 is certain, 0 is unknown."""
     override: GeneratedOverride | None = None
-    """Where the generated transmission replaces the detail of the photo."""
+    """A generated transmission, and where it replaces the result of guided upsampling."""
     reconstruction_error: float | None = None
-    """Mean of |the photo as the model redraws it - photo|, sRGB-encoded; None if the model does not redraw it."""
+    """Mean of |generated input - input|, sRGB-encoded, or None if the model does not generate the input."""
 
 
 class Predictor(ABC):
-    """Predicts layers from inputs of the sizes it chooses. May be called from several threads at once."""
+    """Predicts the layers of a photo from copies of it. Thread-safe."""
 
     @abstractmethod
     def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
-        """Returns width and height of its inputs for a photo of this (width, height): smallest first, no duplicates."""
+        """Returns the (width, height) of each input for a photo of this (width, height): smallest first, no duplicates."""
 
     @abstractmethod
     def __call__(
         self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
     ) -> Prediction:
-        """Predicts from inputs of the sizes of `input_sizes`, (h, w, 3) each, linear light in 0..1."""
+        """Returns the prediction for copies of the photo with the sizes of `input_sizes`: (h, w, 3) linear light in 0..1."""
 
 
 @final
@@ -81,7 +82,10 @@ class MultiScalePredictor(Predictor):
         self._backend = backend
 
     def input_sizes(self, size: tuple[int, int], quality: Quality) -> list[tuple[int, int]]:
-        """The input scales of `QUALITIES`, never larger than the photo, and larger for long thin photos."""
+        """Returns the sizes of the inputs: those of `QUALITIES`, never larger than the photo.
+
+        Inputs for photos with a large aspect ratio are larger, so that their short side has 160 pixels if possible.
+        """
         width, height = size
         sizes = []
         for pixels in QUALITIES[quality]:
@@ -96,13 +100,13 @@ class MultiScalePredictor(Predictor):
         quality: Quality,  # noqa: ARG002
         on_progress: ProgressCallback,
     ) -> Prediction:
-        """Returns the mean over input scales and flips; the confidence is high where they agree."""
+        """Returns the mean over input scales and flips. The confidence is high where the outputs agree."""
         size = inputs[-1].shape[:2]
         changes, reflections = [], []
         for scaled_input in inputs:
             for transmission, reflection in self._predict_with_flip(scaled_input):
-                changes.append(enlarge_rows(transmission - scaled_input, 0, size[0], size))
-                reflections.append(enlarge_rows(reflection, 0, size[0], size))
+                changes.append(upsample_rows(transmission - scaled_input, 0, size[0], size))
+                reflections.append(upsample_rows(reflection, 0, size[0], size))
                 on_progress(len(changes) / (2 * len(inputs)))
         transmissions_encoded = to_encoded(np.maximum(inputs[-1] + np.stack(changes), 0))
         return Prediction(
@@ -112,7 +116,7 @@ class MultiScalePredictor(Predictor):
         )
 
     def _predict_with_flip(self, scaled_input: Floats) -> Iterator[tuple[Floats, Floats]]:
-        """Yields both layers of an input: as it is, and flipped and flipped back."""
+        """Yields both layers of an input twice: predicted directly, and predicted from the flipped input and flipped back."""
         yield self._predict(scaled_input)
         transmission, reflection = self._predict(np.ascontiguousarray(scaled_input[:, ::-1]))
         yield transmission[:, ::-1], reflection[:, ::-1]
@@ -125,6 +129,6 @@ class MultiScalePredictor(Predictor):
 
 
 def confidence_from_spread(spread: Float32[Floats, "h w 3"]) -> Float32[Floats, "h w 1"]:
-    """Returns exp(-spread / 0.05) of the channel with the largest spread (maximum - minimum), sRGB-encoded."""
+    """Returns exp(-spread / 0.05), where spread is the largest of the three channels. `spread` is sRGB-encoded."""
     confidence: Floats = np.exp(-spread.max(axis=2, keepdims=True) / np.float32(_SPREAD_AT_1_E))
     return confidence

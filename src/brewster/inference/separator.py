@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Final, final
 import numpy as np
 
 from brewster.errors import BrewsterError, MissingExtra, ModelError
-from brewster.inference.guided_upsampling import Floats, GuidedUpsampler, enlarge_rows
+from brewster.inference.guided_upsampling import Floats, GuidedUpsampler, upsample_rows
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.inference.predictor import (
     QUALITIES,
@@ -41,18 +41,19 @@ if TYPE_CHECKING:
     from brewster.models.diffusion.pipeline import DecompositionPipeline
 
 RECONSTRUCTION_ERROR_LIMIT: Final = 0.06
-"""A separation with a larger reconstruction error is doubtful; three times the error of the VAE of such a model."""
+"""A separation with a larger reconstruction error is doubtful. The value is chosen, not measured: about three times the
+error of encoding and decoding with the VAE of a diffusion model."""
 _WORKERS: Final = 2
 _WHITE_PERCENTILE: Final = 99.0
-"""In a photo with values above 1, such as an EXR, this percentile is scaled to 1 for the network."""
+"""If this percentile of the photo is above 1, as in an EXR, the input of the network is divided by it."""
 _NETWORK_SHARE: Final = 0.6
-"""The progress at which the network has finished: an estimate of its share of the total time."""
+"""Estimated fraction of the total time that the network takes, for the progress."""
 
 
 @final
 @dataclass(frozen=True)
 class Separation:
-    """The layers of a photo, each of the photo's size, and how they were computed."""
+    """The layers of a photo, each of the size of the photo, with the model, the device and the quality measures."""
 
     photo: Photo
     transmission: Photo
@@ -60,9 +61,9 @@ class Separation:
     confidence_map: Floats = field(repr=False, compare=False)
     """Confidence in 0..1, (h, w, 1), at the size of the largest input of the network."""
     residual: float
-    """Mean of |photo - transmission - reflection| in linear light: what the layers do not explain."""
+    """Mean of |photo - transmission - reflection| in linear light."""
     reconstruction_error: float | None
-    """Mean of |the photo as the model redraws it - photo|, sRGB-encoded; None if the model does not redraw it."""
+    """Mean of |generated input - input|, sRGB-encoded, or None if the model does not generate the input."""
     model: str
     sha256: str | None
     device: str
@@ -71,14 +72,14 @@ class Separation:
 
     @property
     def doubtful(self) -> bool:
-        """Whether the model redraws the photo so freely that the layers may show another scene: check them."""
+        """Whether the generated input differs so much from the photo that the layers may show another scene."""
         return (
             self.reconstruction_error is not None and self.reconstruction_error > RECONSTRUCTION_ERROR_LIMIT
         )
 
     @cached_property
     def confidence(self) -> Photo:
-        """The confidence as a grey 8-bit image of the photo's size: 255 is certain. Computed on first use."""
+        """The confidence as a grey 8-bit image of the size of the photo: 255 is certain. Computed on first use."""
         return _upsampled_confidence(self.confidence_map, self.photo)
 
 
@@ -87,10 +88,10 @@ class Separator:
     """Separates photos with one model. Reusable and thread-safe.
 
     Args:
-        model: a `Backend`, which runs at several input scales, or a `Predictor`.
+        model: a `Predictor`, or a `Backend`, which a `MultiScalePredictor` runs at several input scales.
         name: the name of the model, for `Separation.model`.
-        sha256: the digest of its file, for `Separation.sha256`.
-        device: the device it runs on, for `Separation.device`.
+        sha256: the digest of the model file, for `Separation.sha256`.
+        device: the device that runs the model, for `Separation.device`.
     """
 
     def __init__(
@@ -134,8 +135,8 @@ class Separator:
         if changed := [name for name, value in chosen.items() if value != getattr(Options, name)]:
             raise ModelError(
                 f"{', '.join(changed)} was set for the model {model}",
-                "only diffusion models and LoRAs have this option",
-                "leave it out, or choose such a model",
+                "expected a diffusion model or a LoRA for this option",
+                "leave the option out, or choose such a model",
             )
         model_file = find_model(model)
         digest = model_file.verify()
@@ -162,14 +163,14 @@ class Separator:
         additive: bool = Options.additive,
         encoding: Encoding | None = None,
         max_pixels: int = Options.max_pixels,
-        on_progress: ProgressCallback = lambda _share: None,
+        on_progress: ProgressCallback = lambda _fraction: None,
     ) -> Separation:
-        """Separates a photo. May be called from several threads at once.
+        """Separates a photo. Thread-safe.
 
         Args:
             source: a path, the bytes of a file, a PIL image, a `Photo`, or an array (see `Photo.from_array`).
-            encoding: what the numbers of an array mean, "srgb" or "linear"; for arrays only.
-            on_progress: called with the completed share, 0 to 1; an exception raised in it stops the work.
+            encoding: the encoding of an array, "srgb" or "linear"; for arrays only.
+            on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the work.
 
         Raises:
             PhotoError: the source cannot be read, or is too large.
@@ -225,10 +226,10 @@ def separate(
 
     Args:
         source: a path, the bytes of a file, a PIL image, a `Photo`, or an array (see `Photo.from_array`).
-        encoding: what the numbers of an array mean, "srgb" or "linear"; for arrays only.
+        encoding: the encoding of an array, "srgb" or "linear"; for arrays only.
 
     Raises:
-        BrewsterError: as `Separator.load` and calling a `Separator`.
+        BrewsterError: an error of `Separator.load` or of a call of the `Separator`.
     """
     separator = Separator.load(
         model, device=device, base=base, quantise=quantise, steps=steps, average=average, plain=plain
@@ -250,7 +251,9 @@ def _open_pipeline(
         from brewster.models.diffusion.pipeline import load_pipeline  # noqa: PLC0415  (imports torch)
     except ImportError as error:
         raise MissingExtra(
-            f"{error.name} is not installed", f"{model} needs it", "pip install 'brewster[large]'"
+            f"{error.name} is not installed",
+            f"expected it to be installed, because {model} needs it",
+            "run: pip install 'brewster[large]'",
         ) from error
     return load_pipeline(model, device=device, base=base, quantise=quantise)
 
@@ -258,16 +261,18 @@ def _open_pipeline(
 def _check_options(strength: float, quality: str) -> None:
     if not 0 <= strength <= 1:
         raise BrewsterError(
-            f"strength is {strength}", "a number from 0 to 1", "choose a number in this range"
+            f"strength is {strength}", "expected a number from 0 to 1", "choose a number in this range"
         )
     if quality not in QUALITIES:
-        raise BrewsterError(f"quality is {quality!r}", f"one of {', '.join(QUALITIES)}", "choose one of them")
+        raise BrewsterError(
+            f"quality is {quality!r}", f"expected one of {', '.join(QUALITIES)}", "choose one of them"
+        )
 
 
 def _fit_upsampler(
     largest_input: Floats, prediction: Prediction, strength: float, white: np.float32
 ) -> GuidedUpsampler:
-    """Fits the upsampler to a prediction that is scaled by the strength and by the white of the photo."""
+    """Fits the upsampler to a prediction, scaled by the strength and by the white level `white` of the photo."""
     scale, override = np.float32(strength) * white, prediction.override
     if override:
         override = replace(override, transmission=white * override.transmission, strength=strength)
@@ -279,7 +284,7 @@ def _fit_upsampler(
 def _upsample(
     photo: Photo, upsampler: GuidedUpsampler, *, additive: bool, on_progress: ProgressCallback
 ) -> tuple[Photo, Photo, float]:
-    """Returns both layers, encoded like the photo or as exact floats, and the mean residual."""
+    """Returns transmission, reflection and the mean residual. The layers are encoded like the photo, or as exact floats."""
     template = _float_template(photo) if additive else photo
     canvases = [np.empty(template.pixels.shape, template.pixels.dtype) for _ in range(2)]
 
@@ -303,7 +308,7 @@ def _upsample(
 
 
 def _float_template(photo: Photo) -> Photo:
-    """Returns a black photo of the same size in 32-bit floats of linear light, with the alpha and EXIF of the photo."""
+    """Returns a black photo of the same size, 32-bit floats in linear light, with the alpha and EXIF of the photo."""
     file_info = replace(
         photo.file_info, container="tiff", bits=32, compression=None, icc=None, primaries=None, header=None
     )
@@ -315,7 +320,9 @@ def _float_template(photo: Photo) -> Photo:
 
 
 def _exact_sum_layers(photo: Floats, transmission: Floats) -> list[Floats]:
-    """Returns two layers whose float sum is bit-equal to the photo, and not negative where the photo is not.
+    """Returns transmission and reflection whose float sum is bit-equal to the photo.
+
+    They are not negative where the photo is not negative.
 
     At least one of the two differences is exact (Sterbenz 1974), which makes the sum exact.
     """
@@ -324,11 +331,11 @@ def _exact_sum_layers(photo: Floats, transmission: Floats) -> list[Floats]:
 
 
 def _upsampled_confidence(map_: Floats, photo: Photo) -> Photo:
-    """Enlarges a map (h, w, 1) in 0..1 to a grey 8-bit image of the photo's size."""
+    """Upsamples a map (h, w, 1) in 0..1 to a grey 8-bit image of the size of the photo."""
     width, height = photo.size
     canvas = np.empty((height, width, 1), np.uint8)
     for rows in photo.strips():
-        canvas[rows] = np.rint(255 * enlarge_rows(map_, rows.start, rows.stop - rows.start, (height, width)))
+        canvas[rows] = np.rint(255 * upsample_rows(map_, rows.start, rows.stop - rows.start, (height, width)))
     return Photo(canvas)
 
 

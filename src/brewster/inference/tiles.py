@@ -1,4 +1,4 @@
-"""Runs a backend over an image in overlapping, blended tiles, to limit the memory that it needs."""
+"""Runs a backend on overlapping tiles of an image and blends the outputs, to limit the memory use."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def run_tiled(
 ) -> tuple[Image, ...]:
     """Returns the outputs of the backend, (H, W, 3) each, for an image of any size.
 
-    Neighbouring tiles overlap by at least `overlap_px` pixels, over which their outputs are blended linearly. An
-    image that is no larger than a tile is passed to the backend directly.
+    Tiles are squares of `tile_px` pixels. Neighbouring tiles overlap by at least `overlap_px` pixels. In the overlap
+    their outputs are blended linearly. If the image is not larger than a tile, it is passed to the backend directly.
     """
     height, width, _ = image.shape
     tiles = tile_slices((height, width), tile_px=tile_px, overlap_px=overlap_px)
@@ -49,13 +49,13 @@ def run_tiled(
 
 
 def tile_slices(size: tuple[int, int], *, tile_px: int, overlap_px: int) -> list[tuple[slice, slice]]:
-    """Returns the rows and columns of each tile of an image of this (height, width)."""
+    """Returns the rows and the columns of each tile for an image of this (height, width)."""
     rows, columns = (_tile_spans(side, tile_px, overlap_px) for side in size)
     return list(product(rows, columns))
 
 
 def _tile_spans(side: int, tile: int, overlap: int) -> list[slice]:
-    """Returns spans of length `tile` that cover 0..side with equal overlaps of at least `overlap`."""
+    """Returns spans of length `tile` that cover 0..side, with equal overlaps of at least `overlap` pixels."""
     if side <= tile:
         return [slice(0, side)]
     count = -(-(side - overlap) // (tile - overlap))
@@ -64,7 +64,7 @@ def _tile_spans(side: int, tile: int, overlap: int) -> list[slice]:
 
 
 def _blend_weights(span: slice, side: int, overlap: int) -> NDArray[np.float32]:
-    """Returns weights along a span: 1 inside, falling linearly towards edges inside the image."""
+    """Returns weights along a span: 1 in the middle, with a linear ramp at each end that is not an edge of the image."""
     length = span.stop - span.start
     ramp = (np.arange(length, dtype=np.float32) + 1) / (overlap + 1)
     ones = np.ones(length, np.float32)

@@ -1,9 +1,9 @@
-"""Reads and writes photos. A `Photo` holds the stored pixels, their colour space and the facts of their file.
+"""Reads and writes photos. A `Photo` has the stored pixels, their colour space and the metadata of their file.
 
     photo = Photo.open("window.jpg")
     photo.with_linear(photo.linear() * 0.5).save("darker.jpg")
 
-Only this package imports pyvips. OpenEXR and pillow-heif are imported when a file needs them.
+Only this package imports pyvips. It imports OpenEXR and pillow-heif when a file needs them.
 """
 
 from brewster.files import DEFAULT_MAX_PIXELS

@@ -1,8 +1,8 @@
 """Converts stored pixels to linear Rec.709 light and back.
 
-A `ColourSpace` is the tone curve of each channel and the matrix from its linear light to linear Rec.709. It comes from
-an ICC matrix profile (ICC.1:2022) or from the chromaticities of an EXR, and is sRGB otherwise. Light outside the
-Rec.709 gamut has values below 0 or above 1; reading clips nothing.
+A `ColourSpace` has a tone curve for each channel, and a matrix from linear RGB to linear Rec.709. It is read from an ICC
+matrix profile (ICC.1:2022) or from the chromaticities of an EXR. Without these it is sRGB for integers and linear
+Rec.709 for floats. Colours outside the Rec.709 gamut have values below 0 or above 1, which are not clipped.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0
 class ToneCurve:
     """A tone curve from stored values 0..1 to linear light (ICC.1:2022 10.6 and 10.18).
 
-    Given by `samples`, or by the parameters g, a, b, c, d, e, f: (a x + b)^g + e for x >= d, else c x + f.
+    If `samples` is not empty, the curve interpolates them linearly over 0..1. Otherwise it is parametric, with the
+    parameters g, a, b, c, d, e, f: (a x + b)^g + e for x >= d, and c x + f for x < d.
     """
 
     samples: tuple[float, ...] = ()
@@ -76,16 +77,17 @@ class ColourSpace:
     matrix: Matrix | None = None
 
     def to_linear(self, stored: Stored) -> Float32:
-        """Converts stored pixels (H, W, 1|3), uint8, uint16 or float32, to linear Rec.709, (H, W, 3) float32."""
+        """Converts stored pixels (H, W, 1|3) of uint8, uint16 or float32 to linear Rec.709, (H, W, 3) float32."""
         channels = [_decoded(stored[..., i], curve) for i, curve in enumerate(self._curves(stored))]
         if len(channels) == 1:
             return np.repeat(channels[0][..., None], 3, axis=2)
         return np.stack(_apply_matrix(self.matrix, channels) if self.matrix else channels, axis=2)
 
     def to_stored(self, linear: Float32, original: Stored) -> Stored:
-        """Converts linear Rec.709 (H, W, 3) to the dtype and channels of `original`, the pixels before a change.
+        """Converts linear Rec.709 (H, W, 3) to stored pixels with the dtype and the channels of `original`.
 
-        Pixels whose light equals that of `original` are returned bit-equal to it. NaN becomes black.
+        `original` is the stored pixels before a change. Where the light is unchanged, its values are returned
+        bit-equal. NaN becomes black.
         """
         stored = np.empty_like(original)
         curves = self._curves(original)
@@ -97,13 +99,17 @@ class ColourSpace:
         for i, curve in enumerate(curves):
             stored[..., i] = _encoded(channels[i], curve, original.dtype)
         is_exact = self == LINEAR_REC709 or (self == SRGB and original.dtype.kind == "u")
-        if not is_exact:  # exact spaces round-trip without this; the tests prove it
+        if not is_exact:  # in the exact spaces, decoding and encoding is the identity; tested
             same = np.all(linear == self.to_linear(original), axis=2)
             stored[same] = original[same]
         return stored
 
     def _curves(self, stored: Stored) -> tuple[ToneCurve, ...]:
-        """Grey uses the green curve: grey profiles have one curve, and in RGB profiles neutral values are equal."""
+        """Returns the curve of each stored channel.
+
+        Grey uses the green curve: grey profiles have the same curve three times, and in RGB profiles red, green and
+        blue of a neutral colour are equal.
+        """
         return self.curves if stored.shape[-1] == 3 else (self.curves[1],)
 
 
@@ -115,10 +121,10 @@ LINEAR_REC709 = ColourSpace((ToneCurve(),) * 3)
 def colour_space_of(icc: bytes | None, primaries: tuple[float, ...] | None, is_float: bool) -> ColourSpace:
     """Returns the colour space of stored pixels from their ICC profile or chromaticities.
 
-    Without either, integers are sRGB and floats are linear Rec.709.
+    Without a profile and chromaticities, integers are sRGB and floats are linear Rec.709.
 
     Raises:
-        UnsupportedPhoto: the profile is neither grey nor RGB with curves and a matrix.
+        UnsupportedPhoto: the profile is not a grey profile with a curve, nor an RGB profile with curves and a matrix.
     """
     if icc is not None:
         return _profile_space(icc)
@@ -150,9 +156,9 @@ def _decode_table(curve: ToneCurve, white: int) -> Float32:
 
 @lru_cache(maxsize=16)
 def _encode_table(curve: ToneCurve, white: int) -> NDArray[Any]:
-    """A lookup table from the square root of linear light to stored integers.
+    """Returns a lookup table from the square root of linear light to stored integers.
 
-    Like tone curves, the square root gives dark values more of the table. With 2**16 entries the rounding error is
+    The square root gives dark values more entries, as tone curves do. With 2**16 entries the rounding error is
     below 0.01 levels of 8 bits, with 2**20 entries below 0.1 levels of 16 bits.
     """
     sqrt_light = np.linspace(0, 1, 2**16 if white < 256 else 2**20)
@@ -161,14 +167,17 @@ def _encode_table(curve: ToneCurve, white: int) -> NDArray[Any]:
 
 
 def _apply_matrix(matrix: Matrix, channels: list[Float32]) -> list[Float32]:
-    """Multiplies channels by a matrix. Without BLAS, whose rounding depends on the position of a pixel in the strip."""
+    """Multiplies the channels of each pixel by a matrix.
+
+    This does not use BLAS, because its rounding depends on the position of a pixel in the strip.
+    """
     red, green, blue = channels
     rows = np.array(matrix, np.float32)
     return [row[0] * red + row[1] * green + row[2] * blue for row in rows]
 
 
 def _grey(linear: Float32) -> Float32:
-    """Returns the luminance; exactly the common value where all channels are equal."""
+    """Returns the luminance (H, W). Where all channels are equal, it is exactly their value."""
     red, green, blue = (linear[..., i] for i in range(3))
     weights = np.array(srgb.REC709_LUMINANCE, np.float32)
     neutral = (red == green) & (green == blue)
@@ -213,14 +222,14 @@ def _profile_space(icc: bytes) -> ColourSpace:
     except (KeyError, ValueError, struct.error, np.linalg.LinAlgError) as error:
         raise UnsupportedPhoto(
             f"the embedded colour profile ({len(icc)} bytes) does not consist of curves and a matrix",
-            "brewster reads RGB and grey profiles such as sRGB, Display P3, Adobe RGB and ProPhoto",
+            "expected an RGB or grey profile such as sRGB, Display P3, Adobe RGB or ProPhoto",
             "convert the photo to one of these first",
         ) from error
     return space
 
 
 def _snap_to_srgb(space: ColourSpace) -> ColourSpace:
-    """Returns SRGB for a profile that equals sRGB within its rounding, a small fraction of an 8-bit level."""
+    """Returns SRGB for a profile that equals sRGB within its rounding errors; otherwise returns `space`."""
     levels = np.arange(256) / 255
     curve_errors = [np.abs(curve.decode(levels) - srgb.to_linear(levels)).max() for curve in space.curves]
     matrix_error = np.abs(np.array(space.matrix) - np.eye(3)).max() if space.matrix else 0.0
@@ -228,7 +237,7 @@ def _snap_to_srgb(space: ColourSpace) -> ColourSpace:
 
 
 def icc_tags(icc: bytes) -> dict[bytes, bytes]:
-    """Returns the tags of an ICC profile by signature.
+    """Returns the data of each tag of an ICC profile, by the signature of the tag.
 
     Raises:
         struct.error: the profile is truncated.
@@ -243,17 +252,11 @@ def _parse_xyz(tag: bytes) -> tuple[float, float, float]:
     return x / 65536, y / 65536, z / 65536
 
 
-_PARAMETRIC_NAMES = (
-    "g",
-    "gab",
-    "gabc",
-    "gabcd",
-    "gabcdef",
-)  # the parameters that each of ICC's function types gives
+_PARAMETRIC_NAMES = ("g", "gab", "gabc", "gabcd", "gabcdef")  # parameters of ICC function types 0 to 4
 
 
 def _parse_curve(tag: bytes) -> ToneCurve:
-    """Parses a curveType or parametricCurveType tag (ICC.1:2022 10.6 and 10.18)."""
+    """Parses a tag of curveType or parametricCurveType (ICC.1:2022 10.6 and 10.18)."""
     kind, count = struct.unpack_from(">4s4xI", tag)
     if kind == b"para":
         return _parse_parametric(count >> 16, tag)
@@ -269,9 +272,9 @@ def _parse_curve(tag: bytes) -> ToneCurve:
 
 def _parse_parametric(function: int, tag: bytes) -> ToneCurve:
     names = _PARAMETRIC_NAMES[function] if function < len(_PARAMETRIC_NAMES) else ""
-    given = dict(zip(names, struct.unpack_from(f">{len(names)}i", tag, 12), strict=True))
-    g, a, b, c, d, e, f = (given.get(name, 65536 * (name == "a")) / 65536 for name in "gabcdef")
-    if function in (1, 2):  # types 1 and 2 are constant below -b/a
+    values = dict(zip(names, struct.unpack_from(f">{len(names)}i", tag, 12), strict=True))
+    g, a, b, c, d, e, f = (values.get(name, 65536 * (name == "a")) / 65536 for name in "gabcdef")
+    if function in (1, 2):  # types 1 and 2 are constant for x < -b/a
         c, d, e, f = 0.0, -b / a, c, c
     if g <= 0 or a <= 0:
         raise ValueError(names)

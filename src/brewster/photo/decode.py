@@ -1,7 +1,6 @@
-"""Decodes the bytes of an image file to stored pixels and file facts.
+"""Decodes the bytes of an image file to stored pixels and file metadata.
 
-The format is recognised by the first bytes, never by the file name. Unsupported files are refused by their header,
-before any pixel is decoded.
+The first bytes determine the format; the file name is not used. The header is checked before any pixel is decoded.
 """
 
 from __future__ import annotations
@@ -22,18 +21,18 @@ from brewster.image_formats import FORMATS
 from brewster.photo import metadata
 from brewster.photo.colour import colour_space_of
 from brewster.photo.file_info import FileInfo
-from brewster.photo.hdr_formats import read_exr, read_hdr, too_large
+from brewster.photo.hdr_formats import read_exr, read_hdr, too_large_error
 from brewster.photo.lut_profiles import has_only_tables
 
-pyvips.cache_set_max(0)  # each image is read once: libvips' operation cache would only hold memory
-logging.getLogger("pyvips").addHandler(logging.NullHandler())  # its warnings are raised as brewster errors
+pyvips.cache_set_max(0)  # each image is read once, so the operation cache of libvips would only use memory
+logging.getLogger("pyvips").addHandler(logging.NullHandler())  # its warnings become brewster errors
 
 Stored = NDArray[Any]
 
 
 @dataclass(frozen=True)
 class Decoded:
-    """Pixels (H, W, 1|3) and alpha (H, W) or None, as stored (uint8, uint16 or float32), EXIF orientation applied."""
+    """Stored pixels (H, W, 1|3) and alpha (H, W) or None: uint8, uint16 or float32, with the EXIF orientation applied."""
 
     pixels: Stored
     alpha: Stored | None
@@ -41,13 +40,13 @@ class Decoded:
 
 
 def decode(data: bytes, max_pixels: int) -> Decoded:
-    """Decodes the image in these bytes.
+    """Decodes the bytes of an image file.
 
     Raises:
-        PhotoError: the image cannot be read, is unsupported or too large; see `Photo.open`.
+        PhotoError: the image cannot be read, is not supported, or is too large (see `Photo.open`).
         MissingExtra: the reader of EXR or HEIC is not installed.
     """
-    container = _container(data)
+    container = _detect_container(data)
     if container in _FLOAT_READERS:
         floats = _FLOAT_READERS[container](data, max_pixels)
         decoded = Decoded(floats.pixels, floats.alpha, floats.file_info)
@@ -58,21 +57,22 @@ def decode(data: bytes, max_pixels: int) -> Decoded:
     if decoded.pixels.dtype.kind == "f" and not np.isfinite(decoded.pixels).all():
         count = int((~np.isfinite(decoded.pixels)).any(axis=2).sum())
         raise UnsupportedPhoto(
-            f"{count} pixels are infinite or NaN", "all values must be finite", "repair them in the renderer"
+            f"{count} pixels are infinite or NaN",
+            "expected finite values",
+            "render the image again without such pixels",
         )
     return decoded
 
 
 def read_size(data: bytes) -> tuple[int, int]:
-    """Returns width and height as `Photo.open(data).size` does, but reads only the header.
+    """Returns (width, height), equal to `Photo.open(data).size`, from the header only.
 
-    Refuses what `Photo.open` refuses by the header; does not notice damaged pixel data. EXR and HDR files are read
-    completely.
+    Checks the header as `Photo.open` does. Does not find damaged pixel data. EXR and HDR files are read completely.
 
     Raises:
-        PhotoError: as `Photo.open`.
+        PhotoError: an error of `Photo.open`.
     """
-    container = _container(data)
+    container = _detect_container(data)
     if container in _FLOAT_READERS:
         height, width = decode(data, DEFAULT_MAX_PIXELS).pixels.shape[:2]
         return width, height
@@ -95,95 +95,95 @@ def _check_profile(icc: bytes | None, *, is_float: bool) -> None:
 _FLOAT_READERS = {"exr": read_exr, "hdr": read_hdr}
 
 
-def _container(data: bytes) -> str:
+def _detect_container(data: bytes) -> str:
     if not data:
-        raise UnreadablePhoto("the file is empty", "an image file has at least a header", "copy it again")
+        raise UnreadablePhoto("the file is empty", "expected an image file", "copy it again")
     if re.match(
         rb"....ftypmi[fa]", data, re.DOTALL
-    ):  # a brand of both: only HEVC files have a decoder configuration hvcC
+    ):  # both formats use these brands; only HEIC files have a decoder configuration hvcC
         return "heic" if b"hvcC" in data[: 1 << 16] else "avif"
     for image_format in FORMATS.values():
         if re.match(image_format.signature, data, re.DOTALL):
             return image_format.name
     raise UnreadablePhoto(
         f"the file starts with {data[:12]!r}, which is no known image format",
-        f"brewster reads {', '.join(FORMATS)}",
-        "convert it, or check that its content fits its name",
+        f"expected one of {', '.join(FORMATS)}",
+        "convert it, or check that its content matches its name",
     )
 
 
 # --- libvips
 
-_STRICT = {"tiff": "error"}  # libvips reports missing strips as errors, not as truncation
+_FAIL_ON = {"tiff": "error"}  # libvips reports missing strips as errors, not as truncation
 _GREY = ("b-w", "grey16")
 _RGB = ("srgb", "rgb", "rgb16", "scrgb")
-_TYPES = {"uchar": np.uint8, "ushort": np.uint16, "float": np.float32}
+_DTYPES = {"uchar": np.uint8, "ushort": np.uint16, "float": np.float32}
 
 
 def _decode_vips(data: bytes, container: str, max_pixels: int) -> Decoded:
     image = _open_vips(data, container, max_pixels)
     try:
         file_info = _file_info(image, data, container)
-        array = np.frombuffer(image.write_to_memory(), _TYPES[image.format])
+        array = np.frombuffer(image.write_to_memory(), _DTYPES[image.format])
     except pyvips.Error as error:
-        raise _unreadable(container, error) from error
+        raise _unreadable_error(container, error) from error
     array = _full_scale(array.reshape(image.height, image.width, image.bands), file_info.bits)
     return split_alpha(apply_orientation(array, _orientation(image, container)), file_info)
 
 
 def _open_vips(data: bytes, container: str, max_pixels: int) -> pyvips.Image:
-    """Opens an image and checks its header; pixels are decoded on demand."""
+    """Opens an image and checks its header. libvips decodes the pixels later."""
     load = getattr(pyvips.Image, FORMATS[container].vips_loader or "")
     try:
-        image = load(data, access="sequential", fail_on=_STRICT.get(container, "truncated"))
+        image = load(data, access="sequential", fail_on=_FAIL_ON.get(container, "truncated"))
         _check_supported(image, data, container, max_pixels)
     except pyvips.Error as error:
-        raise _unreadable(container, error) from error
+        raise _unreadable_error(container, error) from error
     return image
 
 
 def _orientation(image: pyvips.Image, container: str) -> int:
-    """The EXIF orientation that is still to be applied; 1 where libvips has applied it."""
-    is_unapplied = FORMATS[container].is_stored_rotated and image.get_typeof("orientation")
-    return int(image.get("orientation")) if is_unapplied else 1
+    """Returns the EXIF orientation that must still be applied; 1 if libvips has applied it."""
+    must_be_applied = FORMATS[container].is_stored_rotated and image.get_typeof("orientation")
+    return int(image.get("orientation")) if must_be_applied else 1
 
 
-def _unreadable(container: str, error: Exception | str) -> PhotoError:
+def _unreadable_error(container: str, error: Exception | str) -> PhotoError:
     lines = [line.strip() for line in str(error).splitlines()]
     message = " ".join(line for line in lines if line and not line.startswith(("unable to", "source:")))
     return UnreadablePhoto(
         f"the {container} cannot be read completely ({message[:200] or error})",
-        "a complete file in a common variant of the format is needed",
+        "expected a complete file in a common variant of the format",
         "copy it again from its source, or convert it",
     )
 
 
 def _check_supported(image: pyvips.Image, data: bytes, container: str, max_pixels: int) -> None:
-    """Refuses unsupported images by their header.
+    """Checks the header of an image.
 
     Raises:
-        PhotoTooLarge: more pixels than `max_pixels`.
-        UnsupportedPhoto: an animation, several pages, CMYK, or an unsupported number or type of channels.
+        PhotoTooLarge: the image has more pixels than `max_pixels`.
+        UnsupportedPhoto: the image is an animation, has several pages, CMYK colours, or unsupported channels.
     """
     if image.width * image.height > max_pixels:
-        raise too_large(image.width, image.height, max_pixels)
+        raise too_large_error(image.width, image.height, max_pixels)
     if _has_frames(image, data, container):
         raise UnsupportedPhoto(
             f"the {container} is an animation or has several pages",
-            "brewster reads single images",
+            "expected a single image",
             "extract the frames first, for example with ffmpeg or vips",
         )
     if image.interpretation == "cmyk":
         raise UnsupportedPhoto(
             f"the {container} has CMYK colours",
-            "brewster reads RGB and grey images",
+            "expected an RGB or grey image",
             "convert it to sRGB first",
         )
-    meanings = {1: _GREY, 2: _GREY, 3: _RGB, 4: _RGB}.get(image.bands, ())
-    if image.interpretation not in meanings or image.format not in _TYPES:
+    interpretations = {1: _GREY, 2: _GREY, 3: _RGB, 4: _RGB}.get(image.bands, ())
+    if image.interpretation not in interpretations or image.format not in _DTYPES:
         raise UnsupportedPhoto(
             f"the {container} has {image.bands} channels of {image.format} ({image.interpretation})",
-            "brewster reads grey or RGB, with or without alpha, of 8 or 16 bits or 32-bit floats",
+            "expected grey or RGB, with or without alpha, of 8 or 16 bits or 32-bit floats",
             "convert it to one of these",
         )
     if container == "tiff":
@@ -192,23 +192,26 @@ def _check_supported(image: pyvips.Image, data: bytes, container: str, max_pixel
 
 def _check_tiff(tags: metadata.Tags, size: int) -> None:
     if metadata.pixel_data_end(tags) > size:  # libvips reads missing tiles as black
-        raise _unreadable("tiff", "pixels are missing")
+        raise _unreadable_error("tiff", "pixels are missing")
     if _is_raw(tags):
         raise UnsupportedPhoto(
-            "the file is a camera's raw image", "a developed image is needed", "develop it first"
+            "the file is the raw image of a camera", "expected a developed image", "develop it first"
         )
 
 
 def _has_frames(image: pyvips.Image, data: bytes, container: str) -> bool:
     if container == "png":
-        return b"acTL" in metadata.png_chunks(data)  # libvips would read the first frame without an error
+        return b"acTL" in metadata.png_chunks(data)  # libvips reads the first frame without an error
     if container == "avif":
         return data[8:12] == b"avis"  # libvips counts thumbnails as pages
     return bool(image.get_typeof("n-pages")) and image.get("n-pages") > 1
 
 
 def _is_raw(tags: metadata.Tags) -> bool:
-    """Whether a TIFF is a raw file: a DNG has a version tag (50706); others store a reduced image first (NewSubfileType)."""
+    """Returns whether a TIFF is a raw file.
+
+    A DNG has the tag DNGVersion (50706). Other raw files begin with a reduced image (NewSubfileType, bit 0).
+    """
     return 50706 in tags or metadata.number_of(tags, 254, 0) & 1 == 1
 
 
@@ -230,17 +233,17 @@ def _file_info(image: pyvips.Image, data: bytes, container: str) -> FileInfo:
 
 
 def _profile_of(data: bytes, container: str) -> bytes | None:
-    """Returns an ICC profile for colours stated by code points (ITU-T H.273): None for sRGB, else Display P3.
+    """Returns the ICC profile for the code points (ITU-T H.273) of a file: None for sRGB, or Display P3.
 
     Raises:
-        UnsupportedPhoto: other primaries, or the transfer functions PQ (16) or HLG (18) of HDR video.
+        UnsupportedPhoto: the file has other primaries, or the transfer functions PQ (16) or HLG (18) of HDR video.
     """
     codes = metadata.cicp(data) if FORMATS[container].has_cicp else None
     primaries, transfer = codes[:2] if codes else (1, 13)
     if transfer in (16, 18) or primaries not in (1, 2, 5, 6, 12):
         raise UnsupportedPhoto(
             f"the {container} has the colours of HDR video (primaries {primaries}, transfer {transfer})",
-            "brewster reads sRGB, Display P3, or colours with an ICC profile",
+            "expected sRGB, Display P3, or an ICC profile",
             "export it with one of these",
         )
     return bytes(pyvips.Image.profile_load("p3")) if primaries == 12 else None
@@ -252,7 +255,7 @@ def _jpeg_info(data: bytes) -> dict[str, Any]:
 
 
 def _jpeg_quality(data: bytes, bands: int) -> int:
-    """Returns the lowest quality at which libvips quantises luma and chroma at least as finely as the file."""
+    """Returns the lowest libvips quality whose quantisation is at least as fine as that of the file, for luma and chroma."""
     source = metadata.jpeg_quantisation_sums(data)
     square = pyvips.Image.black(8, 8, bands=bands)
 
@@ -285,7 +288,7 @@ def _webp_info(data: bytes) -> dict[str, Any]:
 
 
 def _avif_info(data: bytes) -> dict[str, Any]:
-    """Only a lossless AVIF stores RGB directly: matrix code 0, the identity."""
+    """Returns whether the AVIF is lossless: only then it stores RGB (matrix code 0, the identity)."""
     codes = metadata.cicp(data)
     return {"lossless": codes is not None and codes[2] == 0}
 
@@ -299,21 +302,23 @@ _HEIC_ERRORS = (ValueError, RuntimeError, OSError, SyntaxError, EOFError)
 
 
 def _open_heic(data: bytes, max_pixels: int) -> Any:  # noqa: ANN401  (pillow-heif has no types)
-    """Opens a HEIC file and checks its header; pixels are decoded on demand."""
+    """Opens a HEIC file and checks its header. pillow-heif decodes the pixels later."""
     try:
         import pillow_heif  # noqa: PLC0415  (an extra, because of the patents on HEVC)
     except ImportError as error:
         raise MissingExtra(
-            "HEIC needs the pillow-heif package", "it is not installed", "run: pip install 'brewster[heic]'"
+            "the pillow-heif package is not installed",
+            "expected it to be installed, because HEIC files need it",
+            "run: pip install 'brewster[heic]'",
         ) from error
     try:
         heif = pillow_heif.open_heif(data, convert_hdr_to_8bit=False)
         if not len(heif):
             raise ValueError("no image in the file can be decoded")
         if heif.size[0] * heif.size[1] > max_pixels:
-            raise too_large(heif.size[0], heif.size[1], max_pixels)
+            raise too_large_error(heif.size[0], heif.size[1], max_pixels)
     except _HEIC_ERRORS as error:
-        raise _unreadable("heic", error) from error
+        raise _unreadable_error("heic", error) from error
     return heif
 
 
@@ -326,7 +331,7 @@ def _decode_heic(data: bytes, max_pixels: int) -> Decoded:
     try:
         array = np.array(heif)
     except _HEIC_ERRORS as error:
-        raise _unreadable("heic", error) from error
+        raise _unreadable_error("heic", error) from error
     exif, xmp = heif.info.get("exif"), heif.info.get("xmp")
     file_info = FileInfo(
         container="heic",
@@ -344,12 +349,15 @@ _TRANSPOSED = (5, 6, 7, 8)
 
 
 def _full_scale(array: Stored, bits: int) -> Stored:
-    """Fills 10- and 12-bit values, which arrive in the upper bits of 16, with their own upper bits: white is 65535."""
+    """Scales 10- and 12-bit values to 16 bits, so that white is 65535.
+
+    The libraries return such values in the upper bits of 16. The lower bits are filled with a copy of the upper bits.
+    """
     return array | array >> bits if bits in (10, 12) else array
 
 
 def apply_orientation(array: Stored, orientation: int) -> Stored:
-    """Rotates and flips an array (H, W, C) by an EXIF orientation 1..8 (CIPA DC-008, tag 274)."""
+    """Rotates and flips an array (H, W, C) as the EXIF orientation 1..8 requires (CIPA DC-008, tag 274)."""
     if orientation in _TRANSPOSED:
         array = array.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
@@ -360,8 +368,8 @@ def apply_orientation(array: Stored, orientation: int) -> Stored:
 
 
 def split_alpha(array: Stored, file_info: FileInfo) -> Decoded:
-    """Splits an array (H, W, 1..4) into contiguous colour (H, W, 1|3) and alpha (H, W) or None."""
+    """Splits an array (H, W, 1..4) into contiguous colour channels (H, W, 1|3), and alpha (H, W) or None."""
     has_alpha = array.shape[2] in (2, 4)
-    colours = array.shape[2] - has_alpha
-    alpha = np.ascontiguousarray(array[..., colours]) if has_alpha else None
-    return Decoded(np.ascontiguousarray(array[..., :colours]), alpha, file_info)
+    colour_channels = array.shape[2] - has_alpha
+    alpha = np.ascontiguousarray(array[..., colour_channels]) if has_alpha else None
+    return Decoded(np.ascontiguousarray(array[..., :colour_channels]), alpha, file_info)

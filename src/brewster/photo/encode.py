@@ -1,4 +1,4 @@
-"""Encodes stored pixels to the bytes of a file, in the format and bit depth that a `FileInfo` states."""
+"""Encodes stored pixels to the bytes of a file, in the format and bit depth of a `FileInfo`."""
 
 from __future__ import annotations
 
@@ -17,15 +17,17 @@ from brewster.photo.hdr_formats import HdrPixels, write_exr, write_hdr
 
 Stored = NDArray[Any]
 
-_KEEP = 2 | 4 | 8  # libvips' flags for XMP, IPTC and ICC; EXIF is inserted byte for byte afterwards
-_KEEP_AVIF = _KEEP | 1  # and EXIF: libvips must create the item whose content is replaced afterwards
-_DEFAULT_QUALITY = 95  # of lossy files whose source states no quality
-_DEFAULT_AVIF_QUALITY = 90  # the quality scale of AV1 differs
+_KEPT_METADATA = 2 | 4 | 8  # libvips flags for XMP, IPTC and ICC; EXIF is inserted unchanged afterwards
+_KEPT_AVIF_METADATA = (
+    _KEPT_METADATA | 1
+)  # also EXIF: libvips must create the item, whose content is replaced afterwards
+_DEFAULT_QUALITY = 95  # for lossy files, if the quality of the source is unknown
+_DEFAULT_AVIF_QUALITY = 90  # AV1 has another quality scale
 _DEFAULT_RESOLUTION = (72 / 25.4, 72 / 25.4)
 
 
 def encode(pixels: Stored, alpha: Stored | None, file_info: FileInfo) -> bytes:
-    """Returns the bytes of a file. `pixels` (H, W, 1|3) and `alpha` (H, W) have the dtype that `file_info.bits` needs.
+    """Returns the bytes of a file. `pixels` (H, W, 1|3) and `alpha` (H, W) have the dtype for `file_info.bits`.
 
     Raises:
         UnsupportedPhoto: the format cannot store the image.
@@ -33,8 +35,8 @@ def encode(pixels: Stored, alpha: Stored | None, file_info: FileInfo) -> bytes:
     """
     if alpha is not None and not FORMATS[file_info.container].has_alpha:
         raise UnsupportedPhoto(
-            f"the photo has an alpha channel, and {file_info.container} stores none",
-            "no channel is dropped silently",
+            f"the photo has an alpha channel, which {file_info.container} cannot store",
+            "expected a format with alpha, because no channel is dropped silently",
             f"write {', '.join(name for name, row in WRITABLE.items() if row.has_alpha)}",
         )
     if file_info.container == "exr":
@@ -48,11 +50,11 @@ def encode(pixels: Stored, alpha: Stored | None, file_info: FileInfo) -> bytes:
 
 
 def _encode_vips(array: Stored, file_info: FileInfo) -> bytes:
-    height, width, bands = array.shape
+    height, width, channels = array.shape
     across, down = file_info.resolution or _DEFAULT_RESOLUTION
     contiguous = np.ascontiguousarray(array)
-    kind = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}[array.dtype.name]
-    image = pyvips.Image.new_from_memory(contiguous.data, width, height, bands, kind)
+    band_format = {"uint8": "uchar", "uint16": "ushort", "float32": "float"}[array.dtype.name]
+    image = pyvips.Image.new_from_memory(contiguous.data, width, height, channels, band_format)
     image = image.copy(interpretation=_interpretation(array), xres=across, yres=down)
     image.set_type(pyvips.GValue.gstr_type, "resolution-unit", "in")
     blobs = {"icc-profile-data": file_info.icc, "xmp-data": file_info.xmp, "iptc-data": file_info.iptc}
@@ -61,7 +63,7 @@ def _encode_vips(array: Stored, file_info: FileInfo) -> bytes:
     for name, blob in blobs.items():
         if blob is not None:
             image.set_type(pyvips.GValue.blob_type, name, blob)
-    keep = _KEEP_AVIF if file_info.container == "avif" else _KEEP
+    keep = _KEPT_AVIF_METADATA if file_info.container == "avif" else _KEPT_METADATA
     save = getattr(image, FORMATS[file_info.container].vips_saver or "")
     try:
         return bytes(save(keep=keep, **_save_options(file_info, array.dtype)))
@@ -69,22 +71,22 @@ def _encode_vips(array: Stored, file_info: FileInfo) -> bytes:
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         raise UnsupportedPhoto(
             f"{width} x {height} pixels cannot be written as {file_info.container} ({lines[-1]})",
-            "the format must be able to store them",
+            "expected a size that the format can store",
             "write PNG or TIFF",
         ) from error
 
 
 def _interpretation(array: Stored) -> str:
-    is_grey, is_wide = array.shape[2] < 3, array.dtype == np.uint16
+    is_grey, is_16bit = array.shape[2] < 3, array.dtype == np.uint16
     if array.dtype.kind == "f":
         return "b-w" if is_grey else "scrgb"
     return {(True, True): "grey16", (True, False): "b-w", (False, True): "rgb16"}.get(
-        (is_grey, is_wide), "srgb"
+        (is_grey, is_16bit), "srgb"
     )
 
 
 def _save_options(file_info: FileInfo, dtype: np.dtype[Any]) -> dict[str, Any]:
-    """Returns the options of libvips' saver for a format. Chroma is subsampled only if it was in the source."""
+    """Returns the options of the libvips saver for a format. Chroma is subsampled only if the source is subsampled."""
     match file_info.container:
         case "jpeg":
             mode = "on" if file_info.subsampling == "4:2:0" else "off"
@@ -95,13 +97,17 @@ def _save_options(file_info: FileInfo, dtype: np.dtype[Any]) -> dict[str, Any]:
         case "webp":
             return {"Q": _DEFAULT_QUALITY, "lossless": file_info.lossless, "exact": True}
         case "avif":
-            fidelity = {"Q": _DEFAULT_AVIF_QUALITY, "lossless": file_info.lossless, "subsample_mode": "off"}
-            # effort 1 takes 1/7 of the default's time; files are 1/8 larger
+            quality_options = {
+                "Q": _DEFAULT_AVIF_QUALITY,
+                "lossless": file_info.lossless,
+                "subsample_mode": "off",
+            }
+            # effort 1 takes 1/7 of the time of the default; files are 1/8 larger
             return {
                 "compression": "av1",
                 "bitdepth": file_info.bits,
                 "effort": 1,
-                **fidelity,
+                **quality_options,
             }
     compression = file_info.compression or "deflate"
     if compression == "jpeg" and dtype != np.uint8:
@@ -132,10 +138,12 @@ def _encode_heic(array: Stored, file_info: FileInfo) -> bytes:
         import pillow_heif  # noqa: PLC0415  (an extra, because of the patents on HEVC)
     except ImportError as error:
         raise MissingExtra(
-            "HEIC needs the pillow-heif package", "it is not installed", "run: pip install 'brewster[heic]'"
+            "the pillow-heif package is not installed",
+            "expected it to be installed, because HEIC files need it",
+            "run: pip install 'brewster[heic]'",
         ) from error
-    height, width, bands = array.shape
-    mode = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}[bands] + (";16" if file_info.bits > 8 else "")
+    height, width, channels = array.shape
+    mode = {1: "L", 2: "LA", 3: "RGB", 4: "RGBA"}[channels] + (";16" if file_info.bits > 8 else "")
     heif = pillow_heif.from_bytes(mode, (width, height), np.ascontiguousarray(array).tobytes())
     metadata_items = {
         "icc_profile": file_info.icc,

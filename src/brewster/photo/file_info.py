@@ -1,4 +1,4 @@
-"""Facts of an image file that pixels do not hold, and the choice of a format and bit depth for writing."""
+"""The metadata of an image file, and the choice of a format and bit depth for writing."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from brewster.image_formats import WRITABLE, format_of
 
 @dataclass(frozen=True)
 class FileInfo:
-    """Facts of the file of a photo. `exif` starts at its TIFF header; its orientation is already reset to 1."""
+    """The metadata of the file of a photo. `exif` begins at its TIFF header, and its orientation is reset to 1."""
 
     container: str = "png"
     """The name of the file format, a key of `brewster.image_formats.FORMATS`."""
@@ -24,23 +24,23 @@ class FileInfo:
     xmp: bytes | None = None
     iptc: bytes | None = None
     resolution: tuple[float, float] | None = None
-    """Pixels per millimetre, across and down."""
+    """Pixels per millimetre, horizontal and vertical."""
     jpeg_quality: int | None = None
-    """The lowest libvips quality, 1..100, at which no quantisation table has a larger sum than in the file."""
+    """The lowest libvips quality, 1..100, whose quantisation tables have no larger sums than those of the file."""
     subsampling: str | None = None
     """Chroma subsampling of a JPEG, such as "4:2:0"."""
     compression: str | None = None
-    """Compression of a TIFF, as libvips names it."""
+    """Compression of a TIFF, by its libvips name."""
     lossless: bool = False
     """Whether a WebP or AVIF is compressed without loss."""
     primaries: tuple[float, ...] | None = None
-    """Chromaticities of an EXR or HDR: x and y of red, green, blue and white; None where the file has none."""
+    """Chromaticities of an EXR or HDR: x and y of red, green, blue and white. None if the file has none."""
     header: Mapping[str, Any] | None = None
     """The other attributes of an EXR or HDR."""
 
 
 def container_of(path: Path) -> str:
-    """Returns the name of the format that a file name states by its suffix.
+    """Returns the name of the format for the suffix of a file name.
 
     Raises:
         UnsupportedPhoto: brewster does not write files with this suffix.
@@ -49,24 +49,27 @@ def container_of(path: Path) -> str:
     if image_format is None or not image_format.is_writable:
         raise UnsupportedPhoto(
             f"the file name {path.name!r} has the suffix {path.suffix!r}",
-            f"brewster writes {', '.join(WRITABLE)}",
-            "use the suffix of one of these formats",
+            f"expected the suffix of one of the formats {', '.join(WRITABLE)}",
+            "choose one of these suffixes",
         )
     return image_format.name
 
 
 def depth_for(file_info: FileInfo, container: str, bit_depth: int | None) -> int:
-    """Returns the bits per channel to write: `bit_depth` if given, else those of the file or the next fewer.
+    """Returns the bits per channel to write.
+
+    This is `bit_depth` if it is not None. Otherwise it is the largest depth of the format that is not larger than the
+    depth of the file, or the smallest depth of the format if all are larger.
 
     Raises:
-        UnsupportedPhoto: the format cannot be written, or not at this bit depth.
+        UnsupportedPhoto: brewster does not write this format, or not at this bit depth.
     """
     depths = WRITABLE[container].bit_depths if container in WRITABLE else ()
     if not depths or (bit_depth is not None and bit_depth not in depths):
         raise UnsupportedPhoto(
             f"{container} with {bit_depth or 'any'} bits per channel was requested",
-            f"brewster writes {', '.join(f'{name} {row.bit_depths}' for name, row in WRITABLE.items())}",
-            "choose one of these",
+            f"expected one of {', '.join(f'{name} {row.bit_depths}' for name, row in WRITABLE.items())}",
+            "choose one of these formats and depths",
         )
     fitting = [bits for bits in depths if bits <= file_info.bits]
     return bit_depth or max(fitting, default=depths[0])

@@ -1,6 +1,6 @@
 """Reads and writes floating-point images: OpenEXR with its own package, Radiance HDR with built-in code.
 
-Both store linear light. Other header attributes are kept and written back.
+Both formats store linear light. The other header attributes of a file are read, and written again.
 """
 
 from __future__ import annotations
@@ -23,32 +23,35 @@ Float32 = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class HdrPixels:
-    """Pixels (H, W, 1|3) in float32 linear light, alpha (H, W) or None, and the facts of their file."""
+    """Pixels (H, W, 1|3) in linear light, alpha (H, W) or None, both float32, and the metadata of their file."""
 
     pixels: Float32
     alpha: Float32 | None
     file_info: FileInfo
 
 
-def too_large(width: int, height: int, max_pixels: int) -> PhotoTooLarge:
+def too_large_error(width: int, height: int, max_pixels: int) -> PhotoTooLarge:
     """Returns the error for an image with more pixels than the limit."""
     return PhotoTooLarge(
         f"the image has {width} x {height} pixels ({width * height / 1e6:.3g} million)",
-        f"the limit is {max_pixels / 1e6:g} million",
+        f"expected at most {max_pixels / 1e6:g} million",
         "raise --max-pixels (in Python max_pixels) if you trust the file",
     )
 
 
 def _valid_chromaticities(chromaticities: Sequence[float | str]) -> tuple[float, ...] | None:
-    """Returns chromaticities if they span a gamut; None if they are missing or all zero, as some programs write."""
+    """Returns chromaticities if red, green and blue form a triangle, otherwise None.
+
+    They may be missing, or all zero, as some programs write them.
+    """
     try:
         points = np.array(chromaticities, np.float64).reshape(4, 2)
     except ValueError:
         return None
     red, green, blue, _ = points
     area = np.linalg.det([green - red, blue - red])
-    spans = np.isfinite(points).all() and points[:, 1].all() and abs(area) > 1e-6
-    return tuple(points.ravel().tolist()) if spans else None
+    is_gamut = np.isfinite(points).all() and points[:, 1].all() and abs(area) > 1e-6
+    return tuple(points.ravel().tolist()) if is_gamut else None
 
 
 # --- OpenEXR
@@ -59,25 +62,27 @@ def _openexr() -> types.ModuleType:
         import OpenEXR  # noqa: PLC0415  (an extra: only EXR files need it)
     except ImportError as error:
         raise MissingExtra(
-            "EXR needs the OpenEXR package", "it is not installed", "run: pip install 'brewster[exr]'"
+            "the OpenEXR package is not installed",
+            "expected it to be installed, because EXR files need it",
+            "run: pip install 'brewster[exr]'",
         ) from error
     return OpenEXR  # type: ignore[no-any-return]
 
 
 def read_exr(data: bytes, max_pixels: int) -> HdrPixels:
-    """Reads the first part of an EXR: R, G, B or Y, and A. Other channels, such as depth, are ignored.
+    """Reads the channels R, G and B or Y, and A, of the first part of an EXR. Other channels, such as Z, are ignored.
 
     Raises:
         MissingExtra: OpenEXR is not installed.
-        PhotoTooLarge: more pixels than `max_pixels`.
+        PhotoTooLarge: the image has more pixels than `max_pixels`.
         UnreadablePhoto: the file is damaged or truncated.
-        UnsupportedPhoto: it has neither R, G and B nor Y.
+        UnsupportedPhoto: the file has neither the channels R, G and B nor the channel Y.
     """
     header = _exr_part(data, header_only=True).header
     low, high = header["dataWindow"]
     width, height = (int(side) for side in np.array(high) - np.array(low) + 1)
     if width * height > max_pixels:
-        raise too_large(width, height, max_pixels)
+        raise too_large_error(width, height, max_pixels)
     part = _exr_part(data, header_only=False)
     return _exr_pixels({name: channel.pixels for name, channel in part.channels.items()}, dict(part.header))
 
@@ -88,7 +93,7 @@ def _exr_part(data: bytes, *, header_only: bool) -> Any:  # noqa: ANN401  (OpenE
         return exr.File(io.BytesIO(data), separate_channels=True, header_only=header_only).parts[0]
     except (RuntimeError, ValueError, TypeError, IndexError) as error:
         raise UnreadablePhoto(
-            f"the exr cannot be read completely ({error})", "a complete file is needed", "export it again"
+            f"the EXR cannot be read completely ({error})", "expected a complete file", "export it again"
         ) from error
 
 
@@ -97,7 +102,7 @@ def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> Hd
     if not set(names) <= channels.keys() or "RY" in channels:
         raise UnsupportedPhoto(
             f"the EXR has the channels {', '.join(sorted(channels))}",
-            "the channels R, G, B or Y, and optionally A",
+            "expected the channels R, G, B or Y, and optionally A",
             "export it with these names",
         )
     is_half = all(channels[name].dtype == np.float16 for name in names)
@@ -115,15 +120,15 @@ def _exr_pixels(channels: dict[str, NDArray[Any]], header: dict[str, Any]) -> Hd
 
 
 def write_exr(image: HdrPixels) -> bytes:
-    """Encodes an EXR in half or single precision, by `file_info.bits`, with the attributes of the source."""
+    """Encodes an EXR in half (16 `bits`) or single precision (32 `bits`), with the attributes of the source."""
     exr = _openexr()
     names = "RGB" if image.pixels.shape[2] == 3 else "Y"
     planes = {name: image.pixels[..., i] for i, name in enumerate(names)}
     if image.alpha is not None:
         planes["A"] = image.alpha
-    kind: type[np.floating[Any]] = np.float16 if image.file_info.bits == 16 else np.float32
-    max_value = float(np.finfo(kind).max)
-    channels = {name: plane.clip(-max_value, max_value).astype(kind) for name, plane in planes.items()}
+    dtype: type[np.floating[Any]] = np.float16 if image.file_info.bits == 16 else np.float32
+    max_value = float(np.finfo(dtype).max)
+    channels = {name: plane.clip(-max_value, max_value).astype(dtype) for name, plane in planes.items()}
     header = {
         "compression": exr.ZIP_COMPRESSION,
         **(image.file_info.header or {}),
@@ -137,26 +142,35 @@ def write_exr(image: HdrPixels) -> bytes:
 # --- OpenEXR with several layers
 
 _LAYER_CHANNELS = ("R", "G", "B")
-_RESERVED = {"channels", "chunkCount", "compression", "dataWindow", "lineOrder", "tiles", "type", "version"}
-"""Attributes that OpenEXR defines itself: it silently drops text under some of these names."""
+_RESERVED_ATTRIBUTES = {
+    "channels",
+    "chunkCount",
+    "compression",
+    "dataWindow",
+    "lineOrder",
+    "tiles",
+    "type",
+    "version",
+}
+"""Attributes that OpenEXR defines itself. It silently drops text attributes with some of these names."""
 
 
 def write_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -> bytes:
     """Encodes images (H, W, 3) of equal size as the layers of one EXR, in half precision, with text attributes.
 
-    The red channel of the layer "photo" is named "photo.R", as compositing programs expect ("Technical Introduction
-    to OpenEXR", layers). Values are clipped to the range of half precision, 65504.
+    The red channel of the layer "photo" has the name "photo.R", as compositing programs expect ("Technical
+    Introduction to OpenEXR", layers). Values are clipped to the range of half precision, -65504..65504.
 
     Raises:
         MissingExtra: OpenEXR is not installed.
-        UnsupportedPhoto: an attribute has a name that OpenEXR reserves.
+        UnsupportedPhoto: the name of an attribute is reserved by OpenEXR.
     """
     exr = _openexr()
-    if reserved := _RESERVED & header.keys():
+    if reserved := _RESERVED_ATTRIBUTES & header.keys():
         raise UnsupportedPhoto(
             f"attributes are named {', '.join(sorted(reserved))}",
-            "OpenEXR reserves these names",
-            "choose others",
+            "expected other names, because OpenEXR reserves these",
+            "choose other names",
         )
     max_value = float(np.finfo(np.float16).max)
     half_layers = {
@@ -174,7 +188,7 @@ def write_layers(layers: Mapping[str, Float32], header: Mapping[str, str]) -> by
 
 
 def read_layers(data: bytes) -> dict[str, Float32]:
-    """Returns the layers of an EXR by name, (H, W, 3) float32 each, sorted by name; other channels are ignored.
+    """Returns the layers of an EXR by name, (H, W, 3) float32 each, sorted by name. Other channels are ignored.
 
     Raises:
         MissingExtra: OpenEXR is not installed.
@@ -184,14 +198,14 @@ def read_layers(data: bytes) -> dict[str, Float32]:
     stems = sorted(name.removesuffix(".R") for name in channels if name.endswith(".R"))
     names = {stem: [f"{stem}.{channel}" for channel in _LAYER_CHANNELS] for stem in stems}
     layers = {
-        stem: np.stack([channels[name].pixels.astype(np.float32) for name in three], axis=2)
-        for stem, three in names.items()
-        if channels.keys() >= set(three)
+        stem: np.stack([channels[name].pixels.astype(np.float32) for name in channel_names], axis=2)
+        for stem, channel_names in names.items()
+        if channels.keys() >= set(channel_names)
     }
     if not layers:
         raise UnreadablePhoto(
             f"the EXR has the channels {', '.join(sorted(channels))}",
-            'layers have the channels "name.R", "name.G" and "name.B"',
+            'expected channels with names such as "name.R", "name.G" and "name.B"',
             "open it with Photo.open, or write it again",
         )
     return layers
@@ -204,27 +218,27 @@ def read_hdr(data: bytes, max_pixels: int) -> HdrPixels:
     """Reads a Radiance HDR image: red, green and blue with a shared exponent (RGBE).
 
     Raises:
-        PhotoTooLarge: more pixels than `max_pixels`.
+        PhotoTooLarge: the image has more pixels than `max_pixels`.
         UnreadablePhoto: the image is empty or truncated.
-        UnsupportedPhoto: XYZ colours, or scan lines that do not run from top to bottom.
+        UnsupportedPhoto: the image has XYZ colours, or its scan lines are not ordered from top to bottom.
     """
-    head, blank, rest = data.partition(b"\n\n")
-    size, _, body = rest.partition(b"\n")
-    size_match = re.fullmatch(rb"-Y (\d{1,9}) \+X (\d{1,9})\s*", size)
-    lines = head.decode("latin-1").splitlines()[1:]
-    if not blank or size_match is None or any("xyze" in line for line in lines):
+    header_text, separator, rest = data.partition(b"\n\n")
+    resolution, _, body = rest.partition(b"\n")
+    resolution_match = re.fullmatch(rb"-Y (\d{1,9}) \+X (\d{1,9})\s*", resolution)
+    lines = header_text.decode("latin-1").splitlines()[1:]
+    if not separator or resolution_match is None or any("xyze" in line for line in lines):
         raise UnsupportedPhoto(
-            f"the header of the HDR image ends in {size[:40]!r}",
-            "brewster reads RGBE images with lines from top to bottom, '-Y height +X width'",
+            f"the header of the HDR image ends in {resolution[:40]!r}",
+            "expected an RGBE image with lines from top to bottom, '-Y height +X width'",
             "export it in this form",
         )
-    height, width = int(size_match[1]), int(size_match[2])
+    height, width = int(resolution_match[1]), int(resolution_match[2])
     if width * height == 0:
         raise UnreadablePhoto(
-            f"the HDR image has {width} x {height} pixels", "at least one pixel is needed", "export it again"
+            f"the HDR image has {width} x {height} pixels", "expected at least one pixel", "export it again"
         )
     if width * height > max_pixels:
-        raise too_large(width, height, max_pixels)
+        raise too_large_error(width, height, max_pixels)
     return HdrPixels(_from_rgbe(_scan_lines(body, width, height)), None, _hdr_file_info(lines))
 
 
@@ -239,23 +253,26 @@ def _hdr_file_info(lines: list[str]) -> FileInfo:
 
 
 def _scan_lines(body: bytes, width: int, height: int) -> NDArray[np.uint8]:
-    """Reads bytes (H, W, 4) from run-length encoded or flat scan lines; lines of 2**15 pixels or more are flat."""
-    is_coded = width < 1 << 15 and body.startswith(b"\2\2" + width.to_bytes(2, "big"))
+    """Reads RGBE bytes (H, W, 4) from run-length encoded or flat scan lines. Lines of 2**15 or more pixels are flat."""
+    is_run_length_encoded = width < 1 << 15 and body.startswith(b"\2\2" + width.to_bytes(2, "big"))
     try:
-        if is_coded:
+        if is_run_length_encoded:
             planes = np.frombuffer(_decode_runs(body, width, height), np.uint8)
             return planes.reshape(height, 4, width).swapaxes(1, 2)
         return np.frombuffer(body, np.uint8, height * width * 4).reshape(height, width, 4)
     except (IndexError, ValueError) as error:
         raise UnreadablePhoto(
-            "the hdr cannot be read completely (it is truncated)",
-            f"its header states {height} lines",
+            "the HDR image cannot be read completely (it is truncated)",
+            f"expected {height} lines, as its header states",
             "copy it again from its source",
         ) from error
 
 
 def _decode_runs(body: bytes, width: int, height: int) -> bytes:
-    """Decodes run-length encoded lines: a header of 4 bytes, then runs (128 + length, value) or (length, values...)."""
+    """Decodes run-length encoded lines.
+
+    Each line has a header of 4 bytes, followed by runs (128 + length, value) and literals (length, values...).
+    """
     planes, position = bytearray(), 0
     for line in range(height):
         position += 4
@@ -279,7 +296,7 @@ def _from_rgbe(rgbe: NDArray[np.uint8]) -> Float32:
 
 
 def _to_rgbe(pixels: Float32) -> NDArray[np.uint8]:
-    """The inverse of `_from_rgbe`, exact for its outputs; negative light becomes black."""
+    """Inverts `_from_rgbe`, exactly for its outputs. Negative light becomes black."""
     light = np.fmax(pixels, 0)
     _, exponent = np.frexp(light.max(axis=2))
     exponent = np.clip(exponent, -127, 127)
@@ -290,7 +307,7 @@ def _to_rgbe(pixels: Float32) -> NDArray[np.uint8]:
 
 
 def write_hdr(image: HdrPixels) -> bytes:
-    """Encodes a Radiance HDR image with flat lines, which all readers support; grey becomes three equal channels."""
+    """Encodes a Radiance HDR image with flat lines, which all readers support. Grey becomes three equal channels."""
     height, width = image.pixels.shape[:2]
     attributes = [f"{key}={value}" for key, value in (image.file_info.header or {}).items()]
     lines = ["#?RADIANCE", "FORMAT=32-bit_rle_rgbe", *attributes]

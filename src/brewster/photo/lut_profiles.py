@@ -1,8 +1,8 @@
 """Converts photos with LUT-based ICC profiles, which scanners and some cameras write, to Display P3.
 
-colour.py supports profiles of curves and a matrix, in both directions. Photos with other RGB profiles are converted
-once, by littleCMS in libvips, to Display P3, the largest colour space whose profile libvips includes. Colours outside
-it are clipped.
+colour.py converts with profiles of curves and a matrix, in both directions. A photo with another RGB profile is
+converted to Display P3 when it is opened, by littleCMS in libvips. Display P3 is the largest colour space whose profile
+libvips includes. Colours outside Display P3 are clipped.
 """
 
 from __future__ import annotations
@@ -19,59 +19,59 @@ from brewster.errors import UnsupportedPhoto
 from brewster.photo.colour import icc_tags
 from brewster.photo.file_info import FileInfo
 
-_MATRIX = {b"rXYZ", b"gXYZ", b"bXYZ", b"rTRC", b"gTRC", b"bTRC"}
-_TABLES = {b"A2B0", b"A2B1"}
-_DEPTHS = {"uint8": ("uchar", "rgb", 8), "uint16": ("ushort", "rgb16", 16)}
+_MATRIX_TAGS = {b"rXYZ", b"gXYZ", b"bXYZ", b"rTRC", b"gTRC", b"bTRC"}
+_TABLE_TAGS = {b"A2B0", b"A2B1"}
+_VIPS_FORMATS = {"uint8": ("uchar", "rgb", 8), "uint16": ("ushort", "rgb16", 16)}
 
 
 def has_only_tables(icc: bytes | None) -> bool:
-    """Whether an ICC profile is an RGB profile with lookup tables and without curves and a matrix."""
+    """Returns whether an ICC profile is an RGB profile with lookup tables, but without curves and a matrix."""
     if icc is None or icc[16:20] != b"RGB ":
         return False
     try:
         tags = icc_tags(icc).keys()
     except struct.error:
         return False
-    return bool(tags & _TABLES) and not tags >= _MATRIX
+    return bool(tags & _TABLE_TAGS) and not tags >= _MATRIX_TAGS
 
 
 def convert_to_display_p3(pixels: NDArray[Any], file_info: FileInfo) -> tuple[NDArray[Any], FileInfo]:
-    """Converts pixels (H, W, 3) of 8 or 16 bits to Display P3 (relative colorimetric); returns them and their file facts.
+    """Returns pixels (H, W, 3) of 8 or 16 bits in Display P3 (relative colorimetric), and `file_info` with its profile.
 
     Raises:
         UnsupportedPhoto: the profile is damaged, or the pixels are grey or floats.
     """
-    bands = pixels.shape[2]
-    if bands != 3 or pixels.dtype.name not in _DEPTHS:
+    channels = pixels.shape[2]
+    if channels != 3 or pixels.dtype.name not in _VIPS_FORMATS:
         raise UnsupportedPhoto(
-            f"{bands} channels of {pixels.dtype} have a LUT-based colour profile",
-            "such profiles are supported for RGB of 8 or 16 bits",
+            f"{channels} channels of {pixels.dtype} have a LUT-based colour profile",
+            "expected RGB of 8 or 16 bits for such a profile",
             "convert the photo to sRGB or Display P3 first",
         )
     icc = file_info.icc or b""
     try:
-        is_ignored = np.array_equal(
-            _convert(_PROBE, icc), _convert(_PROBE, pyvips.Image.profile_load("srgb"))
+        profile_is_ignored = np.array_equal(
+            _convert(_PROBE_COLOURS, icc), _convert(_PROBE_COLOURS, pyvips.Image.profile_load("srgb"))
         )
         array = _convert(pixels, icc)
     except pyvips.Error as error:
         raise _damaged_profile(icc, str(error).strip()) from error
-    if is_ignored:
-        raise _damaged_profile(icc, "libvips uses sRGB instead")
+    if profile_is_ignored:
+        raise _damaged_profile(icc, "libvips ignores it")
     return array, replace(file_info, icc=bytes(pyvips.Image.profile_load("p3")))
 
 
-_LEVELS = np.arange(0, 256, 51).astype(np.uint8)
-_PROBE = np.stack(np.meshgrid(_LEVELS, _LEVELS, _LEVELS), axis=-1).reshape(-1, 6, 3)
-"""Colours that reveal an ignored profile: libvips silently uses sRGB instead of a profile that it cannot use."""
+_PROBE_LEVELS = np.arange(0, 256, 51).astype(np.uint8)
+_PROBE_COLOURS = np.stack(np.meshgrid(_PROBE_LEVELS, _PROBE_LEVELS, _PROBE_LEVELS), axis=-1).reshape(-1, 6, 3)
+"""Test colours. If they convert exactly as with sRGB, libvips cannot use the profile and silently uses sRGB instead."""
 
 
 def _convert(pixels: NDArray[Any], icc: bytes) -> NDArray[Any]:
-    height, width, bands = pixels.shape
-    kind, meaning, depth = _DEPTHS[pixels.dtype.name]
+    height, width, channels = pixels.shape
+    band_format, interpretation, depth = _VIPS_FORMATS[pixels.dtype.name]
     contiguous = np.ascontiguousarray(pixels)
-    image = pyvips.Image.new_from_memory(contiguous.data, width, height, bands, kind)
-    image = image.copy(interpretation=meaning)
+    image = pyvips.Image.new_from_memory(contiguous.data, width, height, channels, band_format)
+    image = image.copy(interpretation=interpretation)
     image.set_type(pyvips.GValue.blob_type, "icc-profile-data", icc)
     converted = image.icc_transform("p3", embedded=True, intent="relative", depth=depth)
     return np.frombuffer(converted.write_to_memory(), pixels.dtype).reshape(pixels.shape)
@@ -80,6 +80,6 @@ def _convert(pixels: NDArray[Any], icc: bytes) -> NDArray[Any]:
 def _damaged_profile(icc: bytes, reason: str) -> UnsupportedPhoto:
     return UnsupportedPhoto(
         f"the LUT-based colour profile ({len(icc)} bytes) cannot be used ({reason})",
-        "a complete ICC profile is needed",
+        "expected a complete ICC profile",
         "convert the photo to sRGB or Display P3 first",
     )

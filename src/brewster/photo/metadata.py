@@ -1,7 +1,7 @@
-"""Reads and writes metadata byte by byte: JPEG tables, EXIF, PNG and WebP chunks.
+"""Reads and writes metadata as bytes: JPEG tables, EXIF, PNG and WebP chunks.
 
-libvips rewrites EXIF with libexif, which drops unknown tags, and ignores EXIF in TIFF. This module copies the EXIF
-block of the source unchanged. A block starts at its TIFF header, without the "Exif\\0\\0" of JPEG.
+libvips writes EXIF with libexif, which drops unknown tags, and ignores EXIF in TIFF. This module copies the EXIF
+block of the source unchanged. A block begins at its TIFF header, without the "Exif\\0\\0" of JPEG.
 """
 
 from __future__ import annotations
@@ -18,37 +18,37 @@ from brewster.errors import UnsupportedPhoto
 _EXIF_NAME = b"Exif\0\0"
 _APP0, _APP1, _DQT, _SOS = 0xE0, 0xE1, 0xDB, 0xDA
 _FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_MAX_SEGMENT_PAYLOAD = 65533  # bytes of a segment's payload
+_MAX_SEGMENT_PAYLOAD = 65533  # bytes
 
 
 def jpeg_segments(data: bytes) -> Iterator[tuple[int, int, bytes]]:
-    """Yields the marker, start and payload of every segment before the pixel data."""
-    at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF:
-        marker, size = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
+    """Yields the marker, the position and the payload of each segment before the pixel data."""
+    position = 2
+    while position + 4 <= len(data) and data[position] == 0xFF:
+        marker, size = data[position + 1], int.from_bytes(data[position + 2 : position + 4], "big")
         if marker == 0xFF:  # fill byte
-            at += 1
+            position += 1
             continue
-        yield marker, at, data[at + 4 : at + 2 + size]
+        yield marker, position, data[position + 4 : position + 2 + size]
         if marker == _SOS:
             return
-        at += 2 + size
+        position += 2 + size
 
 
 def jpeg_quantisation_sums(data: bytes) -> dict[int, int]:
-    """Returns the sum of each quantisation table by its number (0: luma, 1: chroma); a larger sum is coarser."""
+    """Returns the sum of each quantisation table by its number (0: luma, 1: chroma). A larger sum is coarser."""
     sums = {}
     for marker, _, payload in jpeg_segments(data):
         while marker == _DQT and payload:
-            wide, number = payload[0] >> 4, payload[0] & 15
-            size = 128 if wide else 64
-            sums[number] = sum(struct.unpack(">64H" if wide else ">64B", payload[1 : 1 + size]))
+            is_16bit, number = payload[0] >> 4, payload[0] & 15
+            size = 128 if is_16bit else 64
+            sums[number] = sum(struct.unpack(">64H" if is_16bit else ">64B", payload[1 : 1 + size]))
             payload = payload[1 + size :]  # noqa: PLW2901
     return sums
 
 
 def jpeg_subsampling(data: bytes) -> str | None:
-    """Returns the chroma subsampling, such as "4:4:4", "4:2:2" or "4:2:0"; None without chroma."""
+    """Returns the chroma subsampling, such as "4:4:4", "4:2:2" or "4:2:0", or None for a grey JPEG."""
     for marker, _, payload in jpeg_segments(data):
         if marker in _FRAMES and len(payload) >= 15:
             across, down = payload[7] >> 4, payload[7] & 15
@@ -59,10 +59,10 @@ def jpeg_subsampling(data: bytes) -> str | None:
 
 
 def with_jpeg_head(data: bytes, exif: bytes | None, dots_per_inch: tuple[float, float] | None) -> bytes:
-    """Inserts the resolution (JFIF) and EXIF into a JPEG that has neither.
+    """Inserts a JFIF segment with the resolution, and an EXIF segment, into a JPEG without these segments.
 
     Raises:
-        UnsupportedPhoto: the EXIF block is larger than the 64 KiB of a segment.
+        UnsupportedPhoto: the EXIF block is larger than a segment, 64 KiB.
     """
     head = b""
     if dots_per_inch is not None:
@@ -77,7 +77,7 @@ def _segment(marker: int, payload: bytes) -> bytes:
     if len(payload) > _MAX_SEGMENT_PAYLOAD:
         raise UnsupportedPhoto(
             f"the EXIF block has {len(payload)} bytes",
-            f"a JPEG stores at most {_MAX_SEGMENT_PAYLOAD}",
+            f"expected at most {_MAX_SEGMENT_PAYLOAD} bytes for a JPEG",
             "write PNG, TIFF or WebP instead",
         )
     return struct.pack(">BBH", 0xFF, marker, len(payload) + 2) + payload
@@ -88,29 +88,29 @@ def _segment(marker: int, payload: bytes) -> bytes:
 
 def png_chunks(data: bytes) -> dict[bytes, bytes]:
     """Returns the chunks of a PNG before its pixel data, by name."""
-    found, at = {}, 8
-    while at + 8 <= len(data) and data[at + 4 : at + 8] != b"IDAT":
-        size = int.from_bytes(data[at : at + 4], "big")
-        found[data[at + 4 : at + 8]] = data[at + 8 : at + 8 + size]
-        at += 12 + size
+    found, position = {}, 8
+    while position + 8 <= len(data) and data[position + 4 : position + 8] != b"IDAT":
+        size = int.from_bytes(data[position : position + 4], "big")
+        found[data[position + 4 : position + 8]] = data[position + 8 : position + 8 + size]
+        position += 12 + size
     return found
 
 
 def with_png_exif(data: bytes, exif: bytes) -> bytes:
-    """Inserts an eXIf chunk into a PNG, directly after its header."""
-    at = 8 + 12 + 13
+    """Inserts an eXIf chunk into a PNG after its header chunk."""
+    position = 8 + 12 + 13  # signature, and the header chunk: 12 bytes and 13 bytes of data
     chunk = b"eXIf" + exif
     sized = struct.pack(">I", len(exif)) + chunk + struct.pack(">I", zlib.crc32(chunk))
-    return b"".join((data[:at], sized, data[at:]))
+    return b"".join((data[:position], sized, data[position:]))
 
 
 def webp_chunks(data: bytes) -> dict[bytes, bytes]:
     """Returns the chunks of a WebP by name."""
-    found, at = {}, 12
-    while at + 8 <= len(data):
-        size = int.from_bytes(data[at + 4 : at + 8], "little")
-        found[data[at : at + 4]] = data[at + 8 : at + 8 + size]
-        at += 8 + size + size % 2
+    found, position = {}, 12
+    while position + 8 <= len(data):
+        size = int.from_bytes(data[position + 4 : position + 8], "little")
+        found[data[position : position + 4]] = data[position + 8 : position + 8 + size]
+        position += 8 + size + size % 2
     return found
 
 
@@ -131,7 +131,10 @@ def with_webp_exif(data: bytes, exif: bytes, size: tuple[int, int], has_alpha: b
 
 
 def cicp(data: bytes) -> tuple[int, int, int] | None:
-    """Returns the code points (CICP, ITU-T H.273) of primaries, transfer and matrix of an AVIF, HEIC or PNG; else None."""
+    """Returns the code points (CICP, ITU-T H.273) of primaries, transfer function and matrix of an AVIF, HEIC or PNG.
+
+    Returns None if the file has none.
+    """
     if data.startswith(b"\x89PNG"):
         chunk = png_chunks(data).get(b"cICP", b"")
         return (chunk[0], chunk[1], chunk[2]) if len(chunk) >= 3 else None
@@ -143,37 +146,43 @@ def cicp(data: bytes) -> tuple[int, int, int] | None:
 
 
 def with_avif_exif(data: bytes, exif: bytes) -> bytes:
-    """Replaces the Exif item of an AVIF written by libvips: appends the block and redirects the item to it."""
+    """Replaces the Exif item of an AVIF that libvips has written.
+
+    The block is appended to the file, and the location of the item is set to it.
+    """
     item = re.search(rb"infe\x02...(..)..Exif", data, re.DOTALL)
     row = _item_location(data, item[1]) if item else None
     if row is None:
         return data
     payload = bytes(4) + exif
-    place = struct.pack(">IHII", 0, 1, len(data) + 8, len(payload))
+    location = struct.pack(">IHII", 0, 1, len(data) + 8, len(payload))
     box = struct.pack(">I", len(payload) + 8) + b"mdat" + payload
-    return b"".join((data[:row], place, data[row + len(place) :], box))
+    return b"".join((data[:row], location, data[row + len(location) :], box))
 
 
 def _item_location(data: bytes, item: bytes) -> int | None:
-    """Returns the position of an item's base, count, offset and length in an iloc box as libheif writes it."""
+    """Returns the position of the location of an item (base, count, offset, length) in an iloc box.
+
+    Returns None if the box has another layout than the one that libheif writes.
+    """
     table = data.find(b"iloc")
-    version, sizes, more = data[table + 4], data[table + 8], data[table + 9]
-    if table < 0 or version > 1 or (sizes, more) != (0x44, 0x40):
+    version, size_fields, index_fields = data[table + 4], data[table + 8], data[table + 9]
+    if table < 0 or version > 1 or (size_fields, index_fields) != (0x44, 0x40):
         return None
-    at = table + 12
+    position = table + 12
     for _ in range(int.from_bytes(data[table + 10 : table + 12], "big")):
-        row = at + 4 + 2 * (version == 1)
+        row = position + 4 + 2 * (version == 1)
         count = int.from_bytes(data[row + 4 : row + 6], "big")
-        if data[at : at + 2] == item:
+        if data[position : position + 2] == item:
             return row if count == 1 else None
-        at = row + 6 + 8 * count
+        position = row + 6 + 8 * count
     return None
 
 
 # --- EXIF and TIFF directories (TIFF 6.0 section 2, CIPA DC-008)
 
 Tags = dict[int, "tuple[int, int, bytes] | Tags"]
-"""Tag -> (type, count, value in little-endian) or, for a pointer, the directory it points to."""
+"""Tag -> (type, count, little-endian value). For a pointer: tag -> the directory at its target."""
 
 _POINTER_TAGS = (34665, 34853, 40965)  # Exif, GPS, interoperability
 _CAMERA_TAGS = (
@@ -186,40 +195,40 @@ _CAMERA_TAGS = (
     33432,
     34665,
     34853,
-)  # the tags of a TIFF directory that describe the camera and the photo
+)  # camera, date, author, copyright, and the pointers to Exif and GPS
 _ORIENTATION = 274
 _TYPE_BYTES = {1: 1, 2: 1, 3: 2, 4: 4, 5: 4, 6: 1, 7: 1, 8: 2, 9: 4, 10: 4, 11: 4, 12: 8, 13: 4}
-_RATIONAL_TYPES = (5, 10)  # numerator and denominator
+_RATIONAL_TYPES = (5, 10)  # two numbers: numerator and denominator
 
 
 def read_tags(data: bytes) -> Tags:
-    """Returns the first directory of a TIFF or EXIF block with its subdirectories; empty if there is none."""
-    order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
-    if order is None:
+    """Returns the first directory of a TIFF or EXIF block with its subdirectories, or an empty one if there is none."""
+    byte_order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
+    if byte_order is None:
         return {}
-    return _directory(data, order, struct.unpack_from(order + "I", data, 4)[0], _POINTER_TAGS)
+    return _directory(data, byte_order, struct.unpack_from(byte_order + "I", data, 4)[0], _POINTER_TAGS)
 
 
-def _directory(data: bytes, order: str, at: int, pointers: tuple[int, ...]) -> Tags:
-    if at + 2 > len(data):
+def _directory(data: bytes, byte_order: str, position: int, pointers: tuple[int, ...]) -> Tags:
+    if position + 2 > len(data):
         return {}
-    (count,) = struct.unpack_from(order + "H", data, at)
+    (count,) = struct.unpack_from(byte_order + "H", data, position)
     tags: Tags = {}
-    for row in range(at + 2, min(at + 2 + 12 * count, len(data) - 11), 12):
-        tag, kind, number = struct.unpack_from(order + "HHI", data, row)
+    for row in range(position + 2, min(position + 2 + 12 * count, len(data) - 11), 12):
+        tag, kind, number = struct.unpack_from(byte_order + "HHI", data, row)
         width = _TYPE_BYTES.get(kind, 0)
         size = width * number * (2 if kind in _RATIONAL_TYPES else 1)
-        (offset,) = struct.unpack_from(order + "I", data, row + 8)
+        (offset,) = struct.unpack_from(byte_order + "I", data, row + 8)
         start = row + 8 if size <= 4 else offset
         if tag in pointers:
-            tags[tag] = _directory(data, order, offset, tuple(p for p in pointers if p != tag))
+            tags[tag] = _directory(data, byte_order, offset, tuple(p for p in pointers if p != tag))
         elif width and start + size <= len(data):
-            tags[tag] = (kind, number, _to_little_endian(data[start : start + size], width, order))
+            tags[tag] = (kind, number, _to_little_endian(data[start : start + size], width, byte_order))
     return tags
 
 
-def _to_little_endian(value: bytes, width: int, order: str) -> bytes:
-    if order == "<" or width == 1:
+def _to_little_endian(value: bytes, width: int, byte_order: str) -> bytes:
+    if byte_order == "<" or width == 1:
         return value
     return b"".join(value[i : i + width][::-1] for i in range(0, len(value), width))
 
@@ -230,7 +239,7 @@ def number_of(tags: Tags, tag: int, default: int) -> int:
 
 
 def pixel_data_end(tags: Tags) -> int:
-    """Returns the position at which the last strip or tile of a TIFF ends; 0 if its tags do not state it."""
+    """Returns the end position of the last strip or tile of a TIFF, or 0 if its tags contain no positions."""
     ends = [0]
     for starts, sizes in ((273, 279), (324, 325)):
         ends += [
@@ -240,7 +249,7 @@ def pixel_data_end(tags: Tags) -> int:
 
 
 def numbers(tags: Tags, tag: int) -> list[int]:
-    """Returns the integers of a tag; none if it is missing."""
+    """Returns the integers of a tag, or an empty list if the tag is missing."""
     entry = tags.get(tag)
     if not isinstance(entry, tuple) or entry[0] not in (1, 3, 4):
         return []
@@ -249,30 +258,30 @@ def numbers(tags: Tags, tag: int) -> list[int]:
 
 
 def orientation_of(exif: bytes) -> int:
-    """Returns the orientation 1..8 of an EXIF block; 1 if it has none."""
-    stated = number_of(read_tags(exif.removeprefix(_EXIF_NAME)), _ORIENTATION, 1)
-    return stated if 1 <= stated <= 8 else 1
+    """Returns the orientation 1..8 of an EXIF block, or 1 if it has none."""
+    orientation = number_of(read_tags(exif.removeprefix(_EXIF_NAME)), _ORIENTATION, 1)
+    return orientation if 1 <= orientation <= 8 else 1
 
 
-def _serialize_directory(tags: Tags, at: int) -> tuple[bytes, int]:
-    """Returns a directory as bytes for offset `at` of a little-endian file, and the offset of its entries."""
+def _serialize_directory(tags: Tags, position: int) -> tuple[bytes, int]:
+    """Returns the bytes of a directory at `position` in a little-endian file, and the position of its entries."""
     values, rows = b"", b""
     for tag, entry in sorted(tags.items(), key=lambda item: item[0]):
         if isinstance(entry, dict):
-            below, offset = _serialize_directory(entry, at + len(values))
-            values, entry = values + below, (4, 1, struct.pack("<I", offset))  # noqa: PLW2901
+            subdirectory, offset = _serialize_directory(entry, position + len(values))
+            values, entry = values + subdirectory, (4, 1, struct.pack("<I", offset))  # noqa: PLW2901
         kind, count, value = entry
         if len(value) > 4:
-            place = struct.pack("<I", at + len(values))
+            value_or_offset = struct.pack("<I", position + len(values))
             values += value + bytes(len(value) % 2)
         else:
-            place = value.ljust(4, b"\0")
-        rows += struct.pack("<HHI", tag, kind, count) + place
-    return values + struct.pack("<H", len(tags)) + rows + bytes(4), at + len(values)
+            value_or_offset = value.ljust(4, b"\0")
+        rows += struct.pack("<HHI", tag, kind, count) + value_or_offset
+    return values + struct.pack("<H", len(tags)) + rows + bytes(4), position + len(values)
 
 
 def tiff_exif(tags: Tags) -> bytes | None:
-    """Returns an EXIF block with the camera tags of a TIFF; None if it has none."""
+    """Returns an EXIF block with the camera tags of a TIFF, or None if it has none."""
     camera: Tags = {tag: entry for tag, entry in tags.items() if tag in _CAMERA_TAGS}
     if not camera:
         return None
@@ -282,7 +291,7 @@ def tiff_exif(tags: Tags) -> bytes | None:
 
 
 def with_tiff_exif(data: bytes, exif: bytes) -> bytes:
-    """Adds camera tags to a little-endian TIFF of one page, in a new directory at its end."""
+    """Adds the camera tags of an EXIF block to a little-endian TIFF of one page, in a new directory at its end."""
     tags = read_tags(data)
     tags.update((tag, entry) for tag, entry in read_tags(exif).items() if tag in _CAMERA_TAGS)
     start = len(data) + len(data) % 2
@@ -291,29 +300,30 @@ def with_tiff_exif(data: bytes, exif: bytes) -> bytes:
 
 
 def upright_exif(exif: bytes) -> bytes:
-    """Returns an EXIF block from its TIFF header on, with orientation 1 and without thumbnail, otherwise unchanged.
+    """Returns an EXIF block with orientation 1 and without the thumbnail. It begins at the TIFF header.
 
-    The thumbnail shows the input before rotation and separation; its directory is unlinked from the first one.
+    The thumbnail shows the input before rotation and separation, so the pointer to its directory is set to 0. All other
+    bytes are unchanged.
     """
     exif = exif.removeprefix(_EXIF_NAME)
-    order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
-    if order is None or len(exif) < 10:
+    byte_order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
+    if byte_order is None or len(exif) < 10:
         return exif
     block = bytearray(exif)
-    (at,) = struct.unpack_from(order + "I", block, 4)
-    (count,) = struct.unpack_from(order + "H", block, at) if at + 2 <= len(block) else (0,)
-    next_directory = at + 2 + 12 * count
-    for row in range(at + 2, min(next_directory, len(block) - 11), 12):
-        tag, kind = struct.unpack_from(order + "HH", block, row)
+    (position,) = struct.unpack_from(byte_order + "I", block, 4)
+    (count,) = struct.unpack_from(byte_order + "H", block, position) if position + 2 <= len(block) else (0,)
+    next_directory = position + 2 + 12 * count
+    for row in range(position + 2, min(next_directory, len(block) - 11), 12):
+        tag, kind = struct.unpack_from(byte_order + "HH", block, row)
         if tag == _ORIENTATION:
             struct.pack_into(
-                order + ("I" if kind == 4 else "HH"), block, row + 8, *((1,) if kind == 4 else (1, 0))
+                byte_order + ("I" if kind == 4 else "HH"), block, row + 8, *((1,) if kind == 4 else (1, 0))
             )
     if next_directory + 4 <= len(block):
-        struct.pack_into(order + "I", block, next_directory, 0)
+        struct.pack_into(byte_order + "I", block, next_directory, 0)
     return bytes(block)
 
 
 def upright_xmp(xmp: bytes) -> bytes:
-    """Returns an XMP block with tiff:Orientation set to 1, otherwise unchanged."""
+    """Returns an XMP block with tiff:Orientation set to 1. All other bytes are unchanged."""
     return re.sub(rb"""(tiff:Orientation(?:=["']|>))[1-8]""", rb"\g<1>1", xmp)

@@ -1,4 +1,4 @@
-"""`Photo`: stored pixels with their colour space and the facts of their file."""
+"""`Photo`: stored pixels with their colour space and the metadata of their file."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from brewster.photo.colour import SRGB, ColourSpace, colour_space_of
 from brewster.photo.decode import Decoded, apply_orientation, decode, split_alpha
 from brewster.photo.encode import encode
 from brewster.photo.file_info import FileInfo, container_of, depth_for
-from brewster.photo.hdr_formats import too_large
+from brewster.photo.hdr_formats import too_large_error
 from brewster.photo.lut_profiles import convert_to_display_p3, has_only_tables
 
 Float32 = NDArray[np.float32]
 Stored = NDArray[Any]
 Encoding = Literal["srgb", "linear"]
 Source = Any
-"""A path, the bytes of a file, a numpy array (with its encoding), a PIL image, or a Photo."""
+"""A path, the bytes of a file, a numpy array, a PIL image, or a `Photo`."""
 
-_STRIP_PIXELS = 1 << 18  # processed at once: a few MB as floats; a whole photo may not fit into memory
+_STRIP_PIXELS = 1 << 18  # one strip has a few MB as floats; a whole photo may not fit into memory
 
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """A photo: stored pixels, alpha and file facts, with the EXIF orientation applied. Immutable and thread-safe.
+    """A photo: stored pixels, alpha and file metadata, with the EXIF orientation applied. Immutable and thread-safe.
 
-    `pixels` is (H, W, 1|3) and `alpha` (H, W) or None; both are uint8, uint16 or float32. Integers are encoded by
-    the ICC profile in `file_info` (sRGB if it has none); floats without a profile are linear Rec.709 light.
+    `pixels` is (H, W, 1|3) and `alpha` (H, W) or None; both are uint8, uint16 or float32. The ICC profile in
+    `file_info` defines their encoding. Without a profile, integers are sRGB and floats are linear Rec.709 light.
     """
 
     pixels: Stored = field(repr=False)
@@ -56,19 +56,19 @@ class Photo:
     def open(
         cls, source: Source, *, encoding: Encoding | None = None, max_pixels: int = DEFAULT_MAX_PIXELS
     ) -> Photo:
-        """Opens a photo from a path, the bytes of a file, an array, a PIL image, or a photo.
+        """Opens a photo.
 
         Args:
-            source: what to open.
-            encoding: what the numbers of an array mean, "srgb" or "linear"; for arrays only.
-            max_pixels: larger photos are refused before they are decoded.
+            source: a path, the bytes of a file, a numpy array, a PIL image, or a `Photo`.
+            encoding: the encoding of an array, "srgb" or "linear"; for arrays only.
+            max_pixels: photos with more pixels are refused before they are decoded.
 
         Raises:
             UnreadablePhoto: the file is missing, empty, truncated, or not an image.
-            UnsupportedPhoto: CMYK, an animation, five channels, NaN values, or a damaged profile.
-            PhotoTooLarge: more pixels than `max_pixels`.
+            UnsupportedPhoto: the image has CMYK colours, several frames, five channels, NaN values, or a damaged profile.
+            PhotoTooLarge: the image has more pixels than `max_pixels`.
             MissingExtra: the reader of EXR or HEIC is not installed.
-            PhotoError: the encoding is missing, unknown, or given for a source that is not an array.
+            PhotoError: the encoding is missing or unknown, or the source is not an array and has an encoding.
         """
         if isinstance(source, np.ndarray):
             height, width = (*source.shape, 1, 1)[:2]
@@ -76,8 +76,8 @@ class Photo:
             return cls.from_array(source, encoding=_check_encoding(encoding))
         if encoding is not None:
             raise PhotoError(
-                f"encoding={encoding!r} came with a {type(source).__name__}",
-                "only arrays need one: files, PIL images and photos state their own",
+                f"encoding={encoding!r} was passed with a {type(source).__name__}",
+                "expected no encoding, because only arrays need one",
                 "leave it out",
             )
         if isinstance(source, Photo):
@@ -96,41 +96,44 @@ class Photo:
         if has_only_tables(file_info.icc):
             pixels, file_info = convert_to_display_p3(pixels, file_info)
         photo = cls(pixels, decoded.alpha, file_info)
-        photo.colour_space()  # raises the error of an unusable profile now, not in the middle of a separation
+        photo.colour_space()  # raises the error of an invalid profile now, not during a separation
         return photo
 
     @classmethod
     def from_array(cls, array: Stored, *, encoding: Encoding) -> Photo:
-        """Makes a photo from an array (H, W) or (H, W, 1|3|4) of uint8, uint16, or floats where 1.0 is white.
+        """Creates a photo from an array (H, W) or (H, W, 1|3|4) of uint8, uint16 or floats; for floats, 1.0 is white.
 
-        sRGB-encoded integers are stored unchanged, all others as linear float32.
+        sRGB-encoded integers are stored unchanged. All other values are stored as linear float32.
 
         Raises:
-            UnsupportedPhoto: another shape or dtype, or values that are not finite.
+            UnsupportedPhoto: the array has another shape or dtype, or values that are not finite.
             PhotoError: the encoding is neither "srgb" nor "linear".
         """
         encoding = _check_encoding(encoding)
         array = np.array(array)[..., None] if np.ndim(array) == 2 else np.array(array)
-        if array.ndim != 3 or array.shape[2] not in (1, 3, 4) or array.dtype.name not in _LEVELS:
+        if array.ndim != 3 or array.shape[2] not in (1, 3, 4) or array.dtype.name not in _WHITE_LEVELS:
             raise UnsupportedPhoto(
-                f"the array is {array.shape} of {array.dtype}",
-                "an image is (H, W) or (H, W, 1|3|4) of uint8, uint16 or float",
+                f"the array has the shape {array.shape} and the dtype {array.dtype}",
+                "expected (H, W) or (H, W, 1|3|4) of uint8, uint16 or float",
                 "reshape or convert it",
             )
         if not np.isfinite(array).all():
             raise UnsupportedPhoto(
-                "the array has values that are infinite or NaN",
-                "all values must be finite",
-                "repair it first",
+                "the array contains infinity or NaN",
+                "expected finite values",
+                "replace them first",
             )
-        colours = array.shape[2] - (array.shape[2] == 4)
-        pixels, alpha = array[..., :colours], array[..., colours] if array.shape[2] == 4 else None
+        colour_channels = array.shape[2] - (array.shape[2] == 4)
+        pixels, alpha = (
+            array[..., :colour_channels],
+            array[..., colour_channels] if array.shape[2] == 4 else None,
+        )
         if encoding == "linear" or array.dtype.kind == "f":
-            pixels = pixels / np.float32(_LEVELS[array.dtype.name])
+            pixels = pixels / np.float32(_WHITE_LEVELS[array.dtype.name])
             pixels = srgb.to_linear(pixels) if encoding == "srgb" else pixels
-            alpha = None if alpha is None else alpha / np.float32(_LEVELS[array.dtype.name])
-        floats = pixels.dtype.kind == "f"
-        dtype = np.dtype(np.float32) if floats else array.dtype
+            alpha = None if alpha is None else alpha / np.float32(_WHITE_LEVELS[array.dtype.name])
+        is_float = pixels.dtype.kind == "f"
+        dtype = np.dtype(np.float32) if is_float else array.dtype
         return cls(
             np.ascontiguousarray(pixels, dtype),
             None if alpha is None else np.ascontiguousarray(alpha, dtype),
@@ -139,16 +142,18 @@ class Photo:
 
     @classmethod
     def from_pil(cls, image: Source) -> Photo:
-        """Makes a photo from a PIL image with its profile and EXIF; palettes become RGB.
+        """Creates a photo from a PIL image with its profile and EXIF. A palette image becomes RGB.
 
         Raises:
-            UnsupportedPhoto: an animation, CMYK, LAB, floats, or another mode without a defined colour space.
+            UnsupportedPhoto: the image has several frames, or another mode than RGB or grey, such as CMYK, LAB or floats.
         """
-        if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":  # MPO: a JPEG followed by previews
+        if (
+            getattr(image, "n_frames", 1) > 1 and image.format != "MPO"
+        ):  # an MPO is a JPEG followed by previews
             raise UnsupportedPhoto(
                 f"the PIL image has {image.n_frames} frames",
-                "brewster reads single images",
-                "seek the frame and pass its image.copy()",
+                "expected a single image",
+                "seek the frame and pass image.copy()",
             )
         if image.mode in ("P", "PA", "1"):
             has_alpha = image.mode == "PA" or "transparency" in image.info
@@ -156,7 +161,7 @@ class Photo:
         if image.mode not in ("L", "LA", "RGB", "RGBA", "I;16"):
             raise UnsupportedPhoto(
                 f"the PIL image has mode {image.mode}",
-                "RGB and grey are supported, with or without alpha",
+                "expected RGB or grey, with or without alpha",
                 'use image.convert("RGB")',
             )
         exif, icc = image.info.get("exif"), image.info.get("icc_profile")
@@ -182,7 +187,7 @@ class Photo:
         return colour_space_of(self.file_info.icc, self.file_info.primaries, self.pixels.dtype.kind == "f")
 
     def linear(self) -> Float32:
-        """Returns linear Rec.709 light, (H, W, 3) float32; below 0 or above 1 where the gamut or range is wider."""
+        """Returns linear Rec.709 light, (H, W, 3) float32. Colours outside Rec.709 have values below 0 or above 1."""
         linear = np.empty((*self.pixels.shape[:2], 3), np.float32)
         for rows in self.strips():
             linear[rows] = self.linear_rows(rows.start, rows.stop)
@@ -193,77 +198,78 @@ class Photo:
         return self.colour_space().to_linear(self.pixels[top:bottom])
 
     def stored_rows(self, linear: Float32, top: int) -> Stored:
-        """Encodes new linear light (rows, W, 3) for the rows from `top` on, in the colour space and dtype of this photo.
+        """Converts new linear light (n, W, 3) for n rows to stored pixels in the colour space and dtype of this photo.
 
-        The inverse of `linear_rows`. Pixels with unchanged light are bit-equal; others are clipped to the range of
-        the dtype. To process a photo in strips, collect the strips in an array like `pixels` and call `with_pixels`.
+        `top` is the first of these rows. This is the inverse of `linear_rows`: pixels with unchanged light are
+        bit-equal. The others are clipped to the range of the dtype. To process a photo in strips, write the strips to
+        an array like `pixels`, and call `with_pixels`.
         """
         return self.colour_space().to_stored(
             np.asarray(linear, np.float32), self.pixels[top : top + len(linear)]
         )
 
     def srgb_8bit(self) -> NDArray[np.uint8]:
-        """Returns 8-bit sRGB values (H, W, 3), clipped to the sRGB gamut, without alpha; benchmarks compare these.
+        """Returns 8-bit sRGB values (H, W, 3), clipped to the sRGB gamut, without alpha. Benchmarks compare these values.
 
-        For an 8-bit sRGB photo these are the stored values. Grey is repeated in all three channels.
+        For an 8-bit sRGB photo they are the stored values. Grey is repeated in all three channels.
         """
         dtype = np.dtype(np.uint8)
         if self.colour_space() == SRGB and self.pixels.dtype.kind == "u":
             pixels = _rescaled(self.pixels, dtype) if self.pixels.dtype != dtype else self.pixels
             return np.repeat(pixels, 3, axis=2) if pixels.shape[2] == 1 else pixels
-        shown = np.empty((*self.pixels.shape[:2], 3), dtype)
+        encoded = np.empty((*self.pixels.shape[:2], 3), dtype)
         for rows in self.strips():
-            shown[rows] = SRGB.to_stored(self.linear_rows(rows.start, rows.stop), shown[rows])
-        return shown
+            encoded[rows] = SRGB.to_stored(self.linear_rows(rows.start, rows.stop), encoded[rows])
+        return encoded
 
     def with_linear(self, linear: Float32) -> Photo:
-        """Returns the same photo with other light, (H, W, 3); pixels with unchanged light are bit-equal."""
+        """Returns a copy of the photo with other linear light (H, W, 3). Pixels with unchanged light are bit-equal."""
         pixels = np.empty_like(self.pixels)
         for rows in self.strips():
             pixels[rows] = self.stored_rows(linear[rows], rows.start)
         return self.with_pixels(pixels)
 
     def with_pixels(self, pixels: Stored) -> Photo:
-        """Returns the same photo with other stored pixels of the same shape and dtype; the array becomes read-only.
+        """Returns a copy of the photo with other stored pixels of the same shape and dtype. Makes the array read-only.
 
         Raises:
-            PhotoError: another shape or dtype.
+            PhotoError: the pixels have another shape or dtype.
         """
         if pixels.shape != self.pixels.shape or pixels.dtype != self.pixels.dtype:
             raise PhotoError(
-                f"new pixels are {pixels.shape} of {pixels.dtype}",
-                f"the photo's are {self.pixels.shape} of {self.pixels.dtype}",
-                "use with_linear to convert",
+                f"the new pixels have the shape {pixels.shape} and the dtype {pixels.dtype}",
+                f"expected {self.pixels.shape} and {self.pixels.dtype}, as in the photo",
+                "use with_linear to convert them",
             )
         return replace(self, pixels=pixels)
 
     def strips(self) -> Iterator[slice]:
-        """Returns slices of rows from top to bottom, each small enough to convert to floats."""
+        """Returns slices of rows that cover the photo from top to bottom. Each has about 2**18 pixels."""
         height, width = self.pixels.shape[:2]
         step = max(1, _STRIP_PIXELS // width)
         return (slice(top, min(top + step, height)) for top in range(0, height, step))
 
     def resized(self, width: int, height: int) -> Float32:
-        """Returns the photo at another size, (height, width, 3) linear light, by area averaging."""
+        """Returns the photo resized by area averaging: linear light, (height, width, 3) float32."""
         out = np.empty((height, width, 3), np.float32)
         full_height = self.size[1]
         for row in range(height):
             top, bottom = row * full_height / height, (row + 1) * full_height / height
             rows = np.arange(math.floor(top), min(math.ceil(bottom), full_height))
-            shares = np.minimum(rows + 1, bottom) - np.maximum(rows, top)
+            weights = np.minimum(rows + 1, bottom) - np.maximum(rows, top)
             strip = self.linear_rows(int(rows[0]), int(rows[-1]) + 1)
-            line = np.tensordot((shares / shares.sum()).astype(np.float32), strip, 1)
-            out[row] = _area_means(line, width)
+            mean_row = np.tensordot((weights / weights.sum()).astype(np.float32), strip, 1)
+            out[row] = _area_means(mean_row, width)
         return out
 
     def encode(self, container: str | None = None, *, depth: int | None = None) -> bytes:
         """Returns the bytes of a file.
 
-        JPEG keeps the quality and chroma subsampling of the source.
+        A JPEG has the quality and the chroma subsampling of the source.
 
         Args:
-            container: the format, such as "png"; by default that of the photo's own file.
-            depth: bits per channel (see `image_formats.FORMATS`); by default those of the photo, or the next fewer.
+            container: the format, such as "png"; by default that of the source.
+            depth: bits per channel (see `image_formats.FORMATS`); by default those of the photo, or the next smaller depth.
 
         Raises:
             UnsupportedPhoto: the format cannot store this photo, or not at this bit depth.
@@ -277,17 +283,17 @@ class Photo:
     def save(
         self, path: str | os.PathLike[str], *, depth: int | None = None, overwrite: bool = False
     ) -> None:
-        """Writes a file atomically, in the format that its suffix states.
+        """Writes a file atomically, in the format for its suffix.
 
         Raises:
-            TargetError: the file exists (without `overwrite`) or cannot be written.
-            UnsupportedPhoto: as `encode`.
+            TargetError: the file exists and `overwrite` is False, or the file cannot be written.
+            UnsupportedPhoto: the format cannot store this photo, or not at this bit depth.
         """
         data = self.encode(container_of(Path(path)), depth=depth)
         write_atomically(Path(path), data, overwrite=overwrite)
 
     def _stored_as(self, container: str, bits: int) -> Photo:
-        """Converts the pixels to the dtype that a format and bit depth need; the light stays the same."""
+        """Returns the photo with the dtype for a format and bit depth. The light is unchanged."""
         was_linear, is_linear = (FORMATS[name].is_linear for name in (self.file_info.container, container))
         dtype = np.dtype(np.float32 if is_linear or bits == 32 else np.uint8 if bits == 8 else np.uint16)
         changes_light = container != self.file_info.container and (was_linear or is_linear)
@@ -303,12 +309,12 @@ class Photo:
         return Photo(pixels, alpha, replace(self.file_info, icc=None, primaries=None, header=None))
 
 
-_LEVELS = {"uint8": 255, "uint16": 65535, "float16": 1, "float32": 1, "float64": 1}
+_WHITE_LEVELS = {"uint8": 255, "uint16": 65535, "float16": 1, "float32": 1, "float64": 1}
 
 
 def _rescaled(values: Stored, dtype: np.dtype[Any]) -> Stored:
-    """Converts values between dtypes so that white stays white; the encoding is unchanged."""
-    white, new_white = _LEVELS[values.dtype.name], _LEVELS[dtype.name]
+    """Converts values to another dtype, scaled so that white stays white. The encoding is unchanged."""
+    white, new_white = _WHITE_LEVELS[values.dtype.name], _WHITE_LEVELS[dtype.name]
     if dtype.kind == "f":
         return values.astype(dtype) / np.float32(white)
     if values.dtype.kind == "f":
@@ -316,19 +322,19 @@ def _rescaled(values: Stored, dtype: np.dtype[Any]) -> Stored:
     return ((values.astype(np.uint32) * new_white + white // 2) // white).astype(dtype)
 
 
-def _area_means(line: Float32, width: int) -> Float32:
-    """Averages a row (W, 3) over `width` equal parts, by differences of its cumulative sum."""
-    sums = np.vstack([np.zeros((1, 3)), np.cumsum(line, axis=0, dtype=np.float64)])
-    edges = np.linspace(0, len(line), width + 1)
-    at = np.column_stack([np.interp(edges, np.arange(len(sums)), sums[:, i]) for i in range(3)])
-    return (np.diff(at, axis=0) * (width / len(line))).astype(np.float32)
+def _area_means(row: Float32, width: int) -> Float32:
+    """Returns the means of a row (W, 3) over `width` equal parts, as differences of its cumulative sum."""
+    sums = np.vstack([np.zeros((1, 3)), np.cumsum(row, axis=0, dtype=np.float64)])
+    edges = np.linspace(0, len(row), width + 1)
+    sums_at_edges = np.column_stack([np.interp(edges, np.arange(len(sums)), sums[:, i]) for i in range(3)])
+    return (np.diff(sums_at_edges, axis=0) * (width / len(row))).astype(np.float32)
 
 
 def _check_encoding(encoding: Encoding | None) -> Encoding:
     if encoding not in ("srgb", "linear"):
         raise PhotoError(
-            f"the array's encoding is {encoding!r}",
-            "an array does not state its encoding",
+            f"the encoding of the array is {encoding!r}",
+            'expected "srgb" or "linear", because an array has no metadata',
             'pass encoding="srgb" or encoding="linear"',
         )
     return encoding
@@ -336,16 +342,16 @@ def _check_encoding(encoding: Encoding | None) -> Encoding:
 
 def _check_pixel_count(width: int, height: int, max_pixels: int) -> None:
     if width * height > max_pixels:
-        raise too_large(width, height, max_pixels)
+        raise too_large_error(width, height, max_pixels)
 
 
 def _check_arrays(pixels: Stored, alpha: Stored | None) -> None:
-    is_picture = pixels.ndim == 3 and pixels.shape[2] in (1, 3) and pixels.size > 0
-    fits = alpha is None or (alpha.shape == pixels.shape[:2] and alpha.dtype == pixels.dtype)
-    if not (is_picture and fits and pixels.dtype.name in ("uint8", "uint16", "float32")):
+    is_image = pixels.ndim == 3 and pixels.shape[2] in (1, 3) and pixels.size > 0
+    alpha_fits = alpha is None or (alpha.shape == pixels.shape[:2] and alpha.dtype == pixels.dtype)
+    if not (is_image and alpha_fits and pixels.dtype.name in ("uint8", "uint16", "float32")):
         raise UnsupportedPhoto(
-            f"pixels are {pixels.shape} of {pixels.dtype}, alpha {None if alpha is None else alpha.shape}",
-            "a photo has (H, W, 1|3) pixels of uint8, uint16 or float32, and optionally (H, W) alpha of the same dtype",
+            f"pixels are {pixels.shape} of {pixels.dtype}, and alpha is {None if alpha is None else alpha.shape}",
+            "expected (H, W, 1|3) pixels of uint8, uint16 or float32, and alpha (H, W) of the same dtype or None",
             "use Photo.from_array",
         )
 
@@ -356,5 +362,5 @@ def _read_file(path: Path) -> bytes:
     except OSError as error:
         reason = "it is a folder" if path.is_dir() else error.strerror or str(error)
         raise UnreadablePhoto(
-            f"{path} cannot be read ({reason})", "an image file is needed", "check its name and permissions"
+            f"{path} cannot be read ({reason})", "expected an image file", "check its name and permissions"
         ) from error
