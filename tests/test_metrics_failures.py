@@ -16,15 +16,15 @@ TRANSMITTANCE = 0.8
 WHITE = (slice(4, 20), slice(4, 20))  # a white sheet behind the left half, which has no reflection
 SCORES = (removed_content, removed_white, kept_reflection)
 
-pictures = arrays(np.uint8, (16, 16, 3))
+images = arrays(np.uint8, (16, 16, 3))
 
 
 def encode(light):
     return (to_encoded(light.clip(0, 1)) * 255).round().astype(np.uint8)
 
 
-def brighten(picture, gain):
-    return encode(to_linear(picture / 255) * gain)
+def brighten(image, gain):
+    return encode(to_linear(image / 255) * gain)
 
 
 @pytest.fixture
@@ -59,7 +59,7 @@ def test_the_photo_itself_keeps_all_of_the_reflection_and_removes_nothing(scene)
 
 def test_half_of_the_reflection_counts_half(scene):
     background, photo, reflection = scene
-    light = [to_linear(picture / 255) for picture in (background, reflection)]
+    light = [to_linear(image / 255) for image in (background, reflection)]
     prediction = encode(light[0] + light[1] / 2)
     assert kept_reflection(prediction, background, photo, reflection) == pytest.approx(0.5, abs=0.01)
 
@@ -180,17 +180,17 @@ def test_sixty_four_pixels_are_enough():
     white, none = np.full((8, 8, 3), 220, np.uint8), np.zeros((8, 8, 3), np.uint8)
     assert removed_white(white, white, white, none) == 0
     with pytest.raises(ValueError, match="63 pixels"):
-        removed_white(*(picture.reshape(1, 64, 3)[:, 1:] for picture in (white, white, white, none)))
+        removed_white(*(image.reshape(1, 64, 3)[:, 1:] for image in (white, white, white, none)))
 
 
 @pytest.mark.parametrize("score", SCORES)
-def test_pictures_of_different_shapes_are_refused(scene, score):
+def test_images_of_different_shapes_are_refused(scene, score):
     background, photo, reflection = scene
     with pytest.raises(ValueError, match="shape"):
         score(background[1:], background, photo, reflection)
 
 
-@given(pictures, pictures, pictures, pictures, st.integers(0, 16), st.sampled_from(SCORES))
+@given(images, images, images, images, st.integers(0, 16), st.sampled_from(SCORES))
 def test_scores_are_shares_whatever_the_pictures(
     prediction, background, photo, reflection, unreflected, score
 ):

@@ -63,7 +63,7 @@ def published(data, monkeypatch):
 
 
 def pair(height, width):
-    """Photo, truth and region: a picture of ramps and squares, and the same with a haze over the region."""
+    """Photo, truth and region: an image of ramps and squares, and the same with a haze over the region."""
     y, x = np.mgrid[:height, :width]
     squares = (x // 8 + y // 8) % 2 * 160 + 40
     truth = np.stack([x * 255 // (width - 1), y * 255 // (height - 1), squares], 2).astype(np.uint8)
@@ -129,7 +129,7 @@ def test_distances_follow_the_definition(metric, size):
 
 @settings(max_examples=10)
 @given(arrays(np.uint8, (2, 31, 34, 3)))
-def test_the_distance_of_equal_pictures_is_zero_and_distances_are_symmetric(metric, two):
+def test_the_distance_of_equal_images_is_zero_and_distances_are_symmetric(metric, two):
     one, other = map(metric.features, two)
     assert metric.distance(one, one) == 0
     assert metric.distance(one, metric.features(two[0].copy())) == 0
@@ -152,7 +152,7 @@ def test_features_are_of_unit_length(metric):
 
 
 def test_a_uniform_difference_of_a_single_layer_is_its_head_in_every_region(metric):
-    """Upsampling does not change uniform maps, so any region has the mean of the picture."""
+    """Upsampling does not change uniform maps, so any region has the mean of the image."""
     one = metric.features(np.full((40, 40, 3), 10, np.uint8))
     maps = [torch.zeros_like(activations) for activations in one.maps]
     other = perceptual.Features(
@@ -178,7 +178,7 @@ def test_the_number_of_threads_does_not_change_the_distance(metric):
     assert distances[0] == pytest.approx(distances[1], abs=1e-7)
 
 
-def test_pictures_may_have_any_memory_layout(metric):
+def test_images_may_have_any_memory_layout(metric):
     photo = pair(64, 96)[0]
     photo.flags.writeable = False
     turned = photo[::-1, ::-1]
@@ -197,7 +197,7 @@ def test_the_heads_are_the_published_ones():
 
 
 @pytest.mark.parametrize("size", [(30, 90), (90, 30)])
-def test_a_picture_that_is_too_small_for_alexnet_is_refused(metric, size):
+def test_an_image_that_is_too_small_for_alexnet_is_refused(metric, size):
     with pytest.raises(ValueError, match=f"at least 31x31 pixels, not {size[0]}x{size[1]}"):
         metric.features(np.zeros((*size, 3), np.uint8))
 
@@ -325,7 +325,7 @@ def test_other_weights_in_the_downloaded_file_are_deleted(server, state, cache):
     "damage",
     [
         lambda body: b"",
-        lambda body: b"not a picture either",
+        lambda body: b"not an image either",
         lambda body: body[: len(body) // 2],
         lambda body: body[:-30],
         lambda body: body.replace(b"features.0.weight", b"features.9.weight"),

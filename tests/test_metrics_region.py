@@ -10,7 +10,7 @@ def pair(side=20):
     return np.full((2, side, side, 3), 100, np.uint8)
 
 
-def test_equal_pictures_have_no_reflection():
+def test_equal_images_have_no_reflection():
     photo, truth = pair()
     assert not reflection_region(photo, truth).any()
     assert not reflection_region(photo, truth, threshold=0).any()
@@ -50,7 +50,7 @@ def test_a_higher_threshold_marks_less(random):
     assert (shares[0], shares[-1]) == (1, 0)
 
 
-def test_a_picture_may_be_smaller_than_the_window():
+def test_an_image_may_be_smaller_than_the_window():
     assert reflection_region(np.full((1, 2, 3), 255, np.uint8), np.zeros((1, 2, 3), np.uint8)).all()
 
 
@@ -60,6 +60,6 @@ def test_a_threshold_outside_0_to_1_is_refused(threshold):
         reflection_region(*pair(), threshold=threshold)
 
 
-def test_pictures_of_different_shapes_are_refused():
+def test_images_of_different_shapes_are_refused():
     with pytest.raises(ValueError, match="shape"):
         reflection_region(np.zeros((8, 8, 3), np.uint8), np.zeros((8, 9, 3), np.uint8))

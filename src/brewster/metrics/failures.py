@@ -5,7 +5,7 @@ luminance in linear light, with I = T + R, where the transmission T is the part 
 
 Some methods restore the light that the glass absorbs, and others do not. To score both alike, the prediction is first
 multiplied by one gain: the median of B / prediction over the pixels without reflection that are neither black nor
-clipped in either picture. If B has too few such pixels, the scores are undefined (ValueError). If only the prediction
+clipped in either image. If B has too few such pixels, the scores are undefined (ValueError). If only the prediction
 has too few, the gain is 1.
 
 Each score is a share of light in 0..1; lower is better.
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final, final
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.metrics.windows import Picture, Region, check_pictures
+from brewster.metrics.windows import Image, Region, check_images
 from brewster.srgb import REC709_LUMINANCE, to_linear
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ MIN_PIXELS: Final = 64
 _LINEAR: Final = to_linear(np.arange(256) / 255)
 
 
-def removed_content(prediction: Picture, background: Picture, photo: Picture, reflection: Picture) -> float:
+def removed_content(prediction: Image, background: Image, photo: Image, reflection: Image) -> float:
     """The share of the background's light that the prediction lacks where there is no reflection.
 
     sum max(B - g prediction, 0) / sum B over the pixels with R < 2 % of I and B > 0, where g is the gain of the module.
@@ -61,14 +61,14 @@ def removed_content(prediction: Picture, background: Picture, photo: Picture, re
         A share in 0..1; lower is better.
 
     Raises:
-        ValueError: the pictures are not uint8 (H, W, 3) or differ in shape, or fewer than 64 pixels are left for the
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or fewer than 64 pixels are left for the
             score or in B for the gain.
     """
     luminance = _Luminances.of(prediction, background, photo, reflection)
     return luminance.removed_share(luminance.unreflected, f"R < {NEGLIGIBLE_SHARE:.0%} of I")
 
 
-def removed_white(prediction: Picture, background: Picture, photo: Picture, reflection: Picture) -> float:
+def removed_white(prediction: Image, background: Image, photo: Image, reflection: Image) -> float:
     """The share of the background's light that the prediction lacks in white areas without reflection.
 
     As `removed_content`, over the pixels that are also white in B: every encoded channel is above 0.75, and the
@@ -86,7 +86,7 @@ def removed_white(prediction: Picture, background: Picture, photo: Picture, refl
     )
 
 
-def kept_reflection(prediction: Picture, background: Picture, photo: Picture, reflection: Picture) -> float:
+def kept_reflection(prediction: Image, background: Image, photo: Image, reflection: Image) -> float:
     """The share of the reflection's light that the prediction still contains.
 
     sum min(max(g prediction - B, 0), R) / sum R over the pixels with R >= 10 % of I where I is not clipped, where g is
@@ -113,7 +113,7 @@ def kept_reflection(prediction: Picture, background: Picture, photo: Picture, re
 @final
 @dataclass(frozen=True, eq=False)
 class _Luminances:
-    """The linear luminances of the four pictures, (H, W); that of the prediction is multiplied by the gain."""
+    """The linear luminances of the four images, (H, W); that of the prediction is multiplied by the gain."""
 
     prediction: Light
     background: Light
@@ -123,8 +123,8 @@ class _Luminances:
     """Pixels without reflection."""
 
     @classmethod
-    def of(cls, prediction: Picture, background: Picture, photo: Picture, reflection: Picture) -> _Luminances:
-        check_pictures(prediction, background, photo, reflection)
+    def of(cls, prediction: Image, background: Image, photo: Image, reflection: Image) -> _Luminances:
+        check_images(prediction, background, photo, reflection)
         t, b, i, r = map(_luminance, (prediction, background, photo, reflection))
         unreflected = r < NEGLIGIBLE_SHARE * i
         comparable_background = unreflected & (b >= BLACK_LUMINANCE) & ~_is_clipped(background)
@@ -154,18 +154,18 @@ def _require_pixels(mask: Region, condition: str) -> None:
         raise ValueError(f"{count} pixels have {condition}; a score needs at least {MIN_PIXELS}")
 
 
-def _luminance(picture: Picture) -> Light:
-    luminance: Light = _LINEAR[picture] @ np.array(REC709_LUMINANCE)
+def _luminance(image: Image) -> Light:
+    luminance: Light = _LINEAR[image] @ np.array(REC709_LUMINANCE)
     return luminance
 
 
-def _is_clipped(picture: Picture) -> Region:
-    clipped: Region = picture.max(axis=2) >= CLIPPED_MIN
+def _is_clipped(image: Image) -> Region:
+    clipped: Region = image.max(axis=2) >= CLIPPED_MIN
     return clipped
 
 
-def _is_white(picture: Picture) -> Region:
-    darkest, brightest = picture.min(axis=2), picture.max(axis=2)
+def _is_white(image: Image) -> Region:
+    darkest, brightest = image.min(axis=2), image.max(axis=2)
     bright: Region = darkest > WHITE_MIN * 255
     grey: Region = brightest - darkest < WHITE_MAX_DIFFERENCE * 255
     return bright & grey

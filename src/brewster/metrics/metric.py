@@ -6,21 +6,21 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar, cast, final
 
-from brewster.metrics.windows import Picture, Region
+from brewster.metrics.windows import Image, Region
 
 _Features = TypeVar("_Features")
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class CachedPicture:
-    """A picture, uint8 sRGB (H, W, 3), with the features that metrics have computed from it."""
+class CachedImage:
+    """An image, uint8 sRGB (H, W, 3), with the features that metrics have computed from it."""
 
-    pixels: Picture
-    _features: dict[Callable[[Picture], Any], Any] = field(default_factory=dict, repr=False)
+    pixels: Image
+    _features: dict[Callable[[Image], Any], Any] = field(default_factory=dict, repr=False)
 
-    def features(self, compute: Callable[[Picture], _Features]) -> _Features:
-        """The result of `compute` for this picture. Metrics share it: it is computed once."""
+    def features(self, compute: Callable[[Image], _Features]) -> _Features:
+        """The result of `compute` for this image. Metrics share it: it is computed once."""
         if compute not in self._features:
             self._features[compute] = compute(self.pixels)
         return cast("_Features", self._features[compute])
@@ -35,10 +35,10 @@ class Comparison:
     `reflection` is never None.
     """
 
-    prediction: CachedPicture
-    truth: CachedPicture
-    photo: Picture
-    reflection: Picture | None = None
+    prediction: CachedImage
+    truth: CachedImage
+    photo: Image
+    reflection: Image | None = None
     """The ground truth of the reflection; None if the case has none."""
     region: Region | None = None
     """The pixels to score, for a metric whose `where` is "region"; otherwise None."""
@@ -61,9 +61,9 @@ class Metric:
     of: Literal["transmission", "reflection", "rendered"]
     """The ground truth that it needs: the transmission, the reflection, or all layers of a rendered sample."""
     score: Callable[[Comparison], float]
-    """Computes the value. Raises ValueError where it is undefined: an empty region, a picture that is too small."""
+    """Computes the value. Raises ValueError where it is undefined: an empty region, an image that is too small."""
     where: Literal["picture", "region"] = "picture"
-    """Whether it averages over the whole picture or over the reflection region."""
+    """Whether it averages over the whole image or over the reflection region."""
     prepare: Callable[[], object] | None = None
     """Loads what it needs, such as weights. Called before the first score, so that missing weights fail early."""
 
