@@ -15,12 +15,12 @@ from brewster.errors import BrewsterError
 from brewster.metrics import METRICS, Metric, find_metric, psnr, ssim
 
 GAUSSIAN = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 255}
-PEERS = {"uniform": {"channel_axis": 2}, "gaussian": {"channel_axis": 2, **GAUSSIAN}}
+SCIKIT_ARGUMENTS = {"uniform": {"channel_axis": 2}, "gaussian": {"channel_axis": 2, **GAUSSIAN}}
 BORDERS = {"uniform": 3, "gaussian": 5}
 
 images = arrays(np.uint8, (13, 17, 3))
 masks = arrays(np.bool_, (13, 17))
-windows = st.sampled_from(sorted(PEERS))
+windows = st.sampled_from(sorted(SCIKIT_ARGUMENTS))
 
 
 @given(images, images)
@@ -31,16 +31,16 @@ def test_psnr_equals_scikit_image(one, other):
 
 @given(images, images, windows)
 def test_ssim_equals_scikit_image_with_either_window(one, other, window):
-    peer = structural_similarity(other, one, **PEERS[window])
-    assert ssim(one, other, window=window) == pytest.approx(peer, abs=1e-9)
+    expected = structural_similarity(other, one, **SCIKIT_ARGUMENTS[window])
+    assert ssim(one, other, window=window) == pytest.approx(expected, abs=1e-9)
 
 
-@pytest.mark.parametrize("window", PEERS)
+@pytest.mark.parametrize("window", SCIKIT_ARGUMENTS)
 @pytest.mark.parametrize("size", [(11, 11), (11, 40), (40, 12), (33, 47)])
 def test_ssim_equals_scikit_image_at_any_size_and_near_white(random, size, window):
     one, other = random.integers(230, 256, (2, *size, 3), np.uint8)
-    peer = structural_similarity(other, one, **PEERS[window])
-    assert ssim(one, other, window=window) == pytest.approx(peer, abs=1e-9)
+    expected = structural_similarity(other, one, **SCIKIT_ARGUMENTS[window])
+    assert ssim(one, other, window=window) == pytest.approx(expected, abs=1e-9)
 
 
 def test_equal_images_have_infinite_psnr_and_an_ssim_of_one(random):
@@ -59,7 +59,7 @@ def test_a_constant_offset_has_a_known_psnr(offset, decibels):
 def test_two_uniform_images_have_the_ssim_of_their_means():
     black, white = np.zeros((11, 11, 3), np.uint8), np.full((11, 11, 3), 255, np.uint8)
     constant = (0.01 * 255) ** 2
-    for window in PEERS:
+    for window in SCIKIT_ARGUMENTS:
         assert ssim(black, white, window=window) == pytest.approx(constant / (255**2 + constant))
 
 
@@ -83,7 +83,7 @@ def test_a_region_that_is_the_whole_image_changes_nothing(one, other, window):
 @given(images, images, masks, windows)
 def test_ssim_in_a_region_is_the_mean_of_the_map_of_scikit_image(one, other, mask, window):
     border = BORDERS[window]
-    _, ssim_map = structural_similarity(other, one, full=True, **PEERS[window])
+    _, ssim_map = structural_similarity(other, one, full=True, **SCIKIT_ARGUMENTS[window])
     inner = (slice(border, -border),) * 2
     if mask[inner].any():
         expected = ssim_map[inner][mask[inner]].mean()
@@ -151,7 +151,7 @@ def test_an_image_smaller_than_the_window_is_refused(window, side):
 # --- the table
 
 
-def test_the_table_names_each_metric_once_and_defines_it():
+def test_the_table_has_each_metric_once_with_a_definition():
     assert [metric.name for metric in METRICS.values()] == list(METRICS)
     assert len({metric.title for metric in METRICS.values()}) == len(METRICS)
     for metric in METRICS.values():
@@ -167,8 +167,8 @@ def test_a_metric_is_found_by_name_and_a_typing_error_gets_a_suggestion():
     assert isinstance(find_metric("lpips"), Metric)
     with pytest.raises(BrewsterError, match=r"no metric 'lpisp'.*did you mean lpips\?"):
         find_metric("lpisp")
-    with pytest.raises(BrewsterError, match=r"metrics are psnr, ssim, .* choose one"):
-        find_metric("beauty")
+    with pytest.raises(BrewsterError, match=r"expected one of psnr, ssim, .* choose one"):
+        find_metric("sharpness")
 
 
 def test_exports_are_in_order():

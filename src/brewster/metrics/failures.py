@@ -36,15 +36,15 @@ NEGLIGIBLE_SHARE: Final = 0.02
 NOTICEABLE_SHARE: Final = 0.1
 """A pixel with R of at least this share of I counts as a pixel with reflection."""
 
-WHITE_MIN: Final = 0.75
-WHITE_MAX_DIFFERENCE: Final = 0.12
-"""A pixel is white if its encoded channels, in 0..1, are above WHITE_MIN and less than WHITE_MAX_DIFFERENCE apart."""
+MIN_WHITE: Final = 0.75
+MAX_WHITE_DIFFERENCE: Final = 0.12
+"""A pixel is white if its encoded channels, in 0..1, are above MIN_WHITE and differ by less than MAX_WHITE_DIFFERENCE."""
 
 BLACK_LUMINANCE: Final = 0.01
-"""Pixels below this luminance are left out of the gain: 8-bit steps are too coarse there for a ratio."""
+"""The gain excludes pixels below this luminance: 8-bit steps are too coarse there for a ratio."""
 
-CLIPPED_MIN: Final = 254
-"""From this 8-bit value on, a channel may be clipped: its true value is unknown."""
+MIN_CLIPPED: Final = 254
+"""A channel with at least this 8-bit value may be clipped: its true value is unknown."""
 
 MIN_PIXELS: Final = 64
 """A score or gain over fewer pixels is too noisy to report."""
@@ -55,7 +55,8 @@ _LINEAR: Final = to_linear(np.arange(256) / 255)
 def removed_content(prediction: Image, background: Image, photo: Image, reflection: Image) -> float:
     """The share of the background's light that the prediction lacks where there is no reflection.
 
-    sum max(B - g prediction, 0) / sum B over the pixels with R < 2 % of I and B > 0, where g is the gain of the module.
+    sum max(B - g prediction, 0) / sum B over the pixels with R < 2 % of I and B > 0. The module docstring defines the
+    gain g.
 
     Returns:
         A share in 0..1; lower is better.
@@ -71,14 +72,15 @@ def removed_content(prediction: Image, background: Image, photo: Image, reflecti
 def removed_white(prediction: Image, background: Image, photo: Image, reflection: Image) -> float:
     """The share of the background's light that the prediction lacks in white areas without reflection.
 
-    As `removed_content`, over the pixels that are also white in B: every encoded channel is above 0.75, and the
-    largest is less than 0.12 above the smallest. It is high where a method takes white objects for highlights.
+    The formula is that of `removed_content`, over the pixels that are also white in B: every encoded channel is above
+    0.75, and the largest is less than 0.12 above the smallest. The score is high if a method removes white objects as
+    if they were highlights.
 
     Returns:
         A share in 0..1; lower is better.
 
     Raises:
-        ValueError: as `removed_content`.
+        ValueError: see `removed_content`.
     """
     luminance = _Luminances.of(prediction, background, photo, reflection)
     return luminance.removed_share(
@@ -89,14 +91,14 @@ def removed_white(prediction: Image, background: Image, photo: Image, reflection
 def kept_reflection(prediction: Image, background: Image, photo: Image, reflection: Image) -> float:
     """The share of the reflection's light that the prediction still contains.
 
-    sum min(max(g prediction - B, 0), R) / sum R over the pixels with R >= 10 % of I where I is not clipped, where g is
-    the gain of the module.
+    sum min(max(g prediction - B, 0), R) / sum R over the pixels with R >= 10 % of I and I not clipped. The module
+    docstring defines the gain g.
 
     Returns:
         A share in 0..1; lower is better.
 
     Raises:
-        ValueError: as `removed_content`.
+        ValueError: see `removed_content`.
     """
     luminance = _Luminances.of(prediction, background, photo, reflection)
     reflective = (
@@ -160,12 +162,12 @@ def _luminance(image: Image) -> Light:
 
 
 def _is_clipped(image: Image) -> Region:
-    clipped: Region = image.max(axis=2) >= CLIPPED_MIN
+    clipped: Region = image.max(axis=2) >= MIN_CLIPPED
     return clipped
 
 
 def _is_white(image: Image) -> Region:
     darkest, brightest = image.min(axis=2), image.max(axis=2)
-    bright: Region = darkest > WHITE_MIN * 255
-    grey: Region = brightest - darkest < WHITE_MAX_DIFFERENCE * 255
+    bright: Region = darkest > MIN_WHITE * 255
+    grey: Region = brightest - darkest < MAX_WHITE_DIFFERENCE * 255
     return bright & grey

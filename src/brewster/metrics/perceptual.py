@@ -1,11 +1,11 @@
-"""LPIPS 0.1 with AlexNet: the perceptual distance of two images.
+"""LPIPS 0.1 with AlexNet: the perceptual distance between two images.
 
     metric = Lpips.load()
     truth = metric.features(image)  # once for many predictions
     print([metric.distance(metric.features(prediction), truth) for prediction in predictions])
 
-R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018; the same
-definition as the `lpips` package with version 0.1 of its weights. Only `Lpips.load` imports torch.
+R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018. The
+definition and the weights are those of version 0.1 of the `lpips` package. Only `Lpips.load` imports torch.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     """The maps of one image differ in all three sizes; the underscores tell jaxtyping not to compare them."""
 
 MIN_SIDE: Final = 31
-"""With fewer pixels on a side, AlexNet's strides and poolings leave an empty map."""
+"""The minimum height and width in pixels: with fewer, AlexNet's strides and poolings leave an empty map."""
 
 _SHIFT: Final = np.array([-0.030, -0.088, -0.188])
 _SCALE: Final = np.array([0.458, 0.448, 0.450])
@@ -68,7 +68,7 @@ class Features:
 @final
 @dataclass(frozen=True, eq=False)
 class Lpips:
-    """LPIPS with its weights. It runs on the CPU; several threads may share one object."""
+    """LPIPS with its weights. It runs on the CPU. Several threads may use one object."""
 
     convolutions: tuple[tuple[Tensor, Tensor], ...]
     """Weights (out, in, k, k) and biases (out,) of AlexNet's five convolutions."""
@@ -77,7 +77,7 @@ class Lpips:
 
     @classmethod
     def load(cls) -> Lpips:
-        """LPIPS with its published weights; later calls return the same object.
+        """Returns LPIPS with its published weights. All calls return the same object.
 
         Raises:
             MissingExtra: torch is not installed.
@@ -113,7 +113,7 @@ class Lpips:
         return Features(tuple(maps), size)
 
     def distance(self, one: Features, other: Features, *, region: Region | None = None) -> float:
-        """The LPIPS distance of two images.
+        """The LPIPS distance between two images, given by their features.
 
         The squared differences of the features are weighted by channel, averaged over each map, and summed over the
         five maps. With a `region`, bool (H, W), each map of differences is first upsampled to the size of the image
@@ -122,7 +122,7 @@ class Lpips:
         weight of the pixels at the border of a map.
 
         Returns:
-            0 for equal images; lower is better.
+            The distance, 0 for equal images; lower is better.
 
         Raises:
             ValueError: the images differ in size, or the region is empty or of another shape.
@@ -143,10 +143,10 @@ class Lpips:
 
 
 def lpips(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
-    """LPIPS 0.1 (AlexNet) of two images, with weights from `Lpips.load`; see `Lpips.distance`.
+    """The LPIPS 0.1 (AlexNet) distance between two images, with weights from `Lpips.load`; see `Lpips.distance`.
 
     Returns:
-        0 for equal images; lower is better.
+        The distance, 0 for equal images; lower is better.
 
     Raises:
         ValueError: the images are not uint8 (H, W, 3), differ in shape, or are smaller than 31x31 pixels; the
@@ -164,7 +164,9 @@ def _load() -> Lpips:
         import torch  # noqa: PLC0415 - an extra
     except ImportError as error:
         raise MissingExtra(
-            "torch is not installed", "the library that computes LPIPS", "pip install 'brewster[evaluate]'"
+            "torch is not installed",
+            "expected torch, which computes LPIPS",
+            "run: pip install 'brewster[evaluate]'",
         ) from error
     tensors = [*load_alexnet().values()]
     weights = [weight.to(memory_format=torch.channels_last) for weight in tensors[::2]]  # faster on the CPU
@@ -175,7 +177,7 @@ def _load() -> Lpips:
 def _normalised(image: Image) -> NDArray[np.float32]:
     """(value / 127.5 - 1 - shift) / scale, (H, W, 3).
 
-    The channels stay last in memory, in which layout the convolutions are fastest on a CPU. The arithmetic runs on
+    The channels stay last in memory, because the convolutions are fastest on a CPU in this layout. The arithmetic runs on
     whole rows, because numpy is slow along an axis of length 3.
     """
     height, width, _ = image.shape
@@ -186,7 +188,7 @@ def _normalised(image: Image) -> NDArray[np.float32]:
 
 
 def _mean(values: NDArray[np.float32]) -> float:
-    """The mean by numpy in float64: unlike torch, the order of its sums does not depend on the number of threads."""
+    """The mean, computed by numpy in float64, because the order of torch's sums depends on the number of threads."""
     return float(values.mean(dtype=np.float64))
 
 

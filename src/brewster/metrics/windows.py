@@ -1,4 +1,4 @@
-"""Shared by the metrics: checks of images and regions, and sums over sliding windows."""
+"""Checks of images and regions, and sums over sliding windows, for all metrics."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ else:
 
 _Values = TypeVar("_Values", bound=NDArray[Any])
 
-BOX: Final = 7
+BOX_SIDE: Final = 7
 """The side of the uniform window, in pixels."""
 
 GAUSSIAN_RADIUS: Final = 5
 GAUSSIAN_SIGMA: Final = 1.5
 """The Gaussian window of Wang et al. 2004: 11x11 pixels, as scikit-image's truncation at 3.5 sigma gives."""
 
-_TAPS: Final = np.exp(-0.5 * (np.arange(-GAUSSIAN_RADIUS, 1) / GAUSSIAN_SIGMA) ** 2)
-# The first half of the symmetric window, up to its centre.
-_GAUSSIAN: Final = _TAPS / (2 * _TAPS.sum() - _TAPS[-1])
+# The first half of the symmetric window, up to its centre; the sum of the whole window is 1.
+_HALF_TAPS: Final = np.exp(-0.5 * (np.arange(-GAUSSIAN_RADIUS, 1) / GAUSSIAN_SIGMA) ** 2)
+_GAUSSIAN: Final = _HALF_TAPS / (2 * _HALF_TAPS.sum() - _HALF_TAPS[-1])
 
 
 def check_images(*images: Image) -> None:
