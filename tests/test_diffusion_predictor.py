@@ -14,7 +14,7 @@ from brewster.errors import DeviceError, DownloadError, ModelError, PhotoError
 from brewster.inference.diffusion_predictor import DiffusionPredictor
 from brewster.inference.separator import RECONSTRUCTION_ERROR_LIMIT
 from brewster.models.diffusion.adapter.lora import LORA_FILE, add_lora, lora_parameters, save_lora
-from brewster.models.diffusion.backbones import TINY, tiny
+from brewster.models.diffusion.backbones import TINY_PREFIX, tiny
 from brewster.models.diffusion.panels import PanelLayout
 from brewster.models.diffusion.pipeline import fingerprint, load_pipeline
 from brewster.models.diffusion.task import DecompositionTask
@@ -68,7 +68,7 @@ def lora(tmp_path_factory):
     with torch.no_grad():
         for parameter in lora_parameters(backbone):
             parameter.normal_(0, 0.1, generator=torch.Generator().manual_seed(3))
-    save_lora(folder, backbone, prompt, DecompositionTask(budget_px=SMALL), base=f"{TINY}kontext")
+    save_lora(folder, backbone, prompt, DecompositionTask(budget_px=SMALL), base=f"{TINY_PREFIX}kontext")
     return folder
 
 

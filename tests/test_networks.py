@@ -8,7 +8,7 @@ from torch import nn
 
 from brewster.errors import ModelError, RecipeError
 from brewster.inference.onnx_backend import OnnxBackend
-from brewster.models.networks import DEFAULT_NETWORK, LARGEST_STRIDE, NETWORKS, NetworkEntry
+from brewster.models.networks import DEFAULT_NETWORK, MAX_STRIDE, NETWORKS, NetworkEntry
 from brewster.training.checkpoint import Checkpoint
 from brewster.training.compact.trainer import CompactTrainer, train
 from brewster.training.recipe import with_value
@@ -39,7 +39,7 @@ def silent(step, steps, metrics, logged):
 @pytest.mark.parametrize("name", list(NETWORKS))
 def test_every_network_fulfils_the_contract_of_its_row(name):
     entry = NETWORKS[name]
-    assert LARGEST_STRIDE % entry.stride == 0
+    assert MAX_STRIDE % entry.stride == 0
     fresh, started = entry.build(), entry.pretrained()
     assert fresh.state_dict().keys() == started.state_dict().keys()
     assert list(started.get_submodule("encoder").parameters())

@@ -30,10 +30,10 @@ class NetworkEntry:
     pretrained: Callable[[], nn.Module]
     """Returns the network with which training starts: its encoder has pretrained weights. May raise MissingExtra."""
     stride: int
-    """Height and width of the input must be multiples of this; it must divide LARGEST_STRIDE."""
+    """Height and width of the input must be multiples of this; it must divide MAX_STRIDE."""
 
 
-LARGEST_STRIDE: Final = 32
+MAX_STRIDE: Final = 32
 """Inference pads the sides of every tile to multiples of this; the sides of training pictures are multiples of it."""
 
 DEFAULT_NETWORK: Final = "lite2-unet"

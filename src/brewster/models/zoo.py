@@ -72,7 +72,7 @@ MODELS: Final = {
 }
 
 
-LARGE: Final = {
+LARGE_MODELS: Final = {
     "kontext": "brewster.models.diffusion.families.kontext:Kontext",
     "klein": "brewster.models.diffusion.families.klein:Klein",
     "qwen": "brewster.models.diffusion.families.qwen:Qwen",
@@ -80,7 +80,7 @@ LARGE: Final = {
 """Large models: name -> import path of the `Backbone` class. The path is text, because the import needs torch."""
 
 
-TINY: Final = "tiny:"
+TINY_PREFIX: Final = "tiny:"
 """Prefix of a backbone's name for its tiny version: the same classes with few, random weights, for tests and demos."""
 
 
@@ -88,7 +88,7 @@ def is_large(name: str) -> bool:
     """Whether this is a large model or a LoRA, given by name, tiny version ("tiny:kontext"), folder or hub id."""
     if name in MODELS or Path(name).is_file():
         return False
-    return name in LARGE or name.startswith(TINY) or Path(name).is_dir() or _is_hub_id(name)
+    return name in LARGE_MODELS or name.startswith(TINY_PREFIX) or Path(name).is_dir() or _is_hub_id(name)
 
 
 def model_name(model: str) -> str:
@@ -125,9 +125,9 @@ def find_model(name: str) -> ModelFile:
     path = Path(name)
     if path.is_file():
         return ModelFile(path.stem, path, None, "unknown")
-    close = difflib.get_close_matches(name, (*MODELS, *LARGE), n=1) if path.name == name else []
+    close = difflib.get_close_matches(name, (*MODELS, *LARGE_MODELS), n=1) if path.name == name else []
     raise ModelError(
         f"there is no model {name!r}",
-        f"one of {', '.join((*MODELS, *LARGE))}, an .onnx file, or the folder or hub id of a LoRA",
+        f"one of {', '.join((*MODELS, *LARGE_MODELS))}, an .onnx file, or the folder or hub id of a LoRA",
         f"did you mean {close[0]}?" if close else "check the path; brewster models list prints all models",
     )

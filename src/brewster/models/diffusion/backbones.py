@@ -32,13 +32,13 @@ from brewster.models.diffusion.lazy_imports import (
     import_library,
 )
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
-from brewster.models.zoo import LARGE, TINY
+from brewster.models.zoo import LARGE_MODELS, TINY_PREFIX
 from brewster.options import Quantisation
 
 BACKBONES: Final[dict[str, type[Backbone]]] = {
-    name: pkgutil.resolve_name(adapter) for name, adapter in LARGE.items()
+    name: pkgutil.resolve_name(adapter) for name, adapter in LARGE_MODELS.items()
 }
-"""name -> Backbone class, with hub id, licence, diffusers classes and architecture. `zoo.LARGE` lists the rows."""
+"""name -> Backbone class, with hub id, licence, diffusers classes and architecture. `zoo.LARGE_MODELS` lists the rows."""
 
 _INDEX: Final = "model_index.json"
 _CONFIGS: Final = {"transformer": "config.json", "vae": "config.json", "scheduler": "scheduler_config.json"}
@@ -69,7 +69,7 @@ def load_backbone(
         MissingExtra: diffusers, torchao or bitsandbytes is not installed.
     """
     _check_device(device)
-    if source.startswith(TINY):
+    if source.startswith(TINY_PREFIX):
         return _load_tiny(source, device, quantise)
     options = _quantisation_options(quantise, device) if quantise else {}
     dtype = dtype or (torch.float32 if device == "cpu" else torch.bfloat16)
@@ -99,9 +99,9 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
         DownloadError, ModelError, DeviceError, MissingExtra: as `load_backbone`.
     """
     _check_device(device)
-    if source.startswith(TINY):
+    if source.startswith(TINY_PREFIX):
         seed = 0 if text == PROMPT else zlib.crc32(text.encode())
-        return replace(tiny(source.removeprefix(TINY), seed)[1], text=text)
+        return replace(tiny(source.removeprefix(TINY_PREFIX), seed)[1], text=text)
     for name in family_of(source).text_encoder_requirements:  # before the download, which may take an hour
         if importlib.util.find_spec(name) is None:
             raise MissingExtra(
@@ -185,8 +185,8 @@ def family_of(source: str) -> type[Backbone]:
     Raises:
         DownloadError, ModelError, MissingExtra: as `load_backbone`.
     """
-    if source in BACKBONES or source.startswith(TINY):
-        return find_family(source.removeprefix(TINY))
+    if source in BACKBONES or source.startswith(TINY_PREFIX):
+        return find_family(source.removeprefix(TINY_PREFIX))
     return _family_in(fetch(source, [_INDEX]))[0]
 
 
@@ -197,7 +197,7 @@ def _load_tiny(source: str, device: str, quantise: str | None) -> Backbone:
             "a tiny version without quantisation",
             "leave quantise out",
         )
-    backbone, _ = tiny(source.removeprefix(TINY))
+    backbone, _ = tiny(source.removeprefix(TINY_PREFIX))
     backbone.transformer.to(device)
     backbone.vae.to(device)
     return backbone

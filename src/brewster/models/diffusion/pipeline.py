@@ -27,7 +27,7 @@ from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_
 from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding
 from brewster.models.diffusion.sampling import STEPS, euler, sample
 from brewster.models.diffusion.task import DecompositionTask
-from brewster.models.zoo import TINY, model_name
+from brewster.models.zoo import TINY_PREFIX, model_name
 from brewster.options import Quantisation
 
 if TYPE_CHECKING:
@@ -216,7 +216,7 @@ def torch_device(device: str) -> str:
 
 def _lora_folder(model: str) -> Path | None:
     """The folder of a LoRA, downloaded if it is on the hub; None for a backbone."""
-    if model in BACKBONES or model.startswith(TINY) or (Path(model) / "model_index.json").is_file():
+    if model in BACKBONES or model.startswith(TINY_PREFIX) or (Path(model) / "model_index.json").is_file():
         return None
     folder = fetch(model, [LORA_FILE, PROMPT_FILE])
     if (folder / LORA_FILE).is_file():

@@ -26,7 +26,7 @@ from brewster.models.diffusion.backbones import BACKBONES, find_family
 from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion.prompt import PROMPT_FILE
 from brewster.models.diffusion.tensors import read_metadata, with_metadata
-from brewster.models.zoo import TINY
+from brewster.models.zoo import TINY_PREFIX
 
 CARD_FILE: Final = "README.md"
 RECIPE_FILE: Final = "recipe.json"
@@ -253,7 +253,7 @@ def _refuse_home_folders(path: Path, data: bytes) -> None:
 
 
 def _is_tiny(card: LoraCard) -> bool:
-    return card.base.startswith(TINY)
+    return card.base.startswith(TINY_PREFIX)
 
 
 def _remarks(folder: Path, card: LoraCard, renamed: Mapping[str, str]) -> Iterator[str]:
