@@ -9,14 +9,14 @@ from torch import nn
 from brewster.errors import ModelError
 from brewster.models.diffusion.adapter.lora import (
     LORA_FILE,
-    LoraCard,
+    LoraMetadata,
     add_lora,
     has_lora,
     load_lora,
     load_lora_state,
     lora_parameters,
     lora_state,
-    read_card,
+    read_lora_metadata,
     remove_lora,
     save_lora,
 )
@@ -115,11 +115,11 @@ def test_a_saved_lora_gives_the_same_prediction_reloaded_and_in_diffusers(tiny_m
     untouched = velocity(backbone, prompt)
     with_lora = velocity(trained(backbone, alpha=alpha), prompt)
     assert (with_lora - untouched).abs().max() > 1e-3
-    card = save_lora(tmp_path, backbone, prompt, DecompositionTask())
+    metadata = save_lora(tmp_path, backbone, prompt, DecompositionTask())
 
     backbone.transformer = copy.deepcopy(plain)
-    assert load_lora(tmp_path, backbone)[0] == card == read_card(tmp_path)
-    assert (card.rank, card.alpha, card.prompt_sha256) == (4, alpha, prompt.sha256)
+    assert load_lora(tmp_path, backbone)[0] == metadata == read_lora_metadata(tmp_path)
+    assert (metadata.rank, metadata.alpha, metadata.prompt_sha256) == (4, alpha, prompt.sha256)
     torch.testing.assert_close(velocity(backbone, prompt), with_lora, atol=1e-6, rtol=0)
 
     backbone.transformer = plain
@@ -162,16 +162,16 @@ def test_a_lora_of_another_backbone_is_refused(kontext, tmp_path):
         load_lora(tmp_path, tiny("klein")[0])
 
 
-def changed_card(folder, **changes):
-    tensors, about = read_tensors(folder / LORA_FILE)
-    card = vars(LoraCard.from_json(about["brewster"])) | changes
-    write_tensors(folder / LORA_FILE, tensors, about | {"brewster": LoraCard(**card).to_json()})
+def change_metadata(folder, **changes):
+    tensors, entries = read_tensors(folder / LORA_FILE)
+    metadata = vars(LoraMetadata.from_json(entries["brewster"])) | changes
+    write_tensors(folder / LORA_FILE, tensors, entries | {"brewster": LoraMetadata(**metadata).to_json()})
 
 
-def test_a_card_that_does_not_match_its_weights_is_refused_without_side_effects(kontext, tmp_path):
+def test_metadata_that_does_not_match_the_weights_is_refused_without_side_effects(kontext, tmp_path):
     backbone, prompt = kontext
     save_lora(tmp_path, trained(backbone), prompt, DecompositionTask())
-    changed_card(tmp_path, rank=8)
+    change_metadata(tmp_path, rank=8)
     fresh, _ = tiny("kontext", seed=1)
     with pytest.raises(ModelError, match=r"has the shape \(4, 32\); \(8, 32\); use the rank"):
         load_lora(tmp_path, fresh)
@@ -190,7 +190,7 @@ def test_a_smaller_backbone_of_the_same_family_is_refused(kontext, tmp_path):
 def test_another_prompt_in_the_folder_is_refused(kontext, tmp_path):
     backbone, prompt = kontext
     save_lora(tmp_path, trained(backbone), prompt, DecompositionTask())
-    changed_card(tmp_path, prompt_sha256="0" * 64)
+    change_metadata(tmp_path, prompt_sha256="0" * 64)
     with pytest.raises(ModelError, match="is not the prompt that the LoRA was trained with"):
         load_lora(tmp_path, tiny("kontext")[0])
 
@@ -207,10 +207,10 @@ def test_a_corrupt_or_foreign_or_missing_file_is_refused(kontext, tmp_path):
         load_lora(tmp_path, backbone)
     write_tensors(path, tensors, {})
     with pytest.raises(ModelError, match="was not written by brewster"):
-        read_card(tmp_path)
+        read_lora_metadata(tmp_path)
     write_tensors(path, tensors, {"brewster": '{"rank": 4}'})
-    with pytest.raises(ModelError, match="the card of the LoRA cannot be read"):
-        read_card(tmp_path)
+    with pytest.raises(ModelError, match="the metadata of the LoRA cannot be read"):
+        read_lora_metadata(tmp_path)
 
 
 def test_a_second_lora_and_saving_without_a_lora_are_refused(kontext, tmp_path):
@@ -226,7 +226,7 @@ def test_a_second_lora_and_saving_without_a_lora_are_refused(kontext, tmp_path):
         save_lora(tmp_path, backbone, tiny("klein")[1], DecompositionTask())
 
 
-def test_a_card_survives_a_round_trip_through_json():
+def test_metadata_survives_a_round_trip_through_json():
     task = DecompositionTask(PanelLayout(("T", "R"), "stacked"), 4096, "one_step", 1.0)
-    card = LoraCard("qwen", "Qwen/Qwen-Image-Edit", "int8", 16, 8, task, "abc")
-    assert LoraCard.from_json(card.to_json()) == card
+    metadata = LoraMetadata("qwen", "Qwen/Qwen-Image-Edit", "int8", 16, 8, task, "abc")
+    assert LoraMetadata.from_json(metadata.to_json()) == metadata

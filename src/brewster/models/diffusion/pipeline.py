@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from brewster.errors import DeviceError, ModelError
-from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraCard, load_lora, read_card
+from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata, load_lora, read_lora_metadata
 from brewster.models.diffusion.backbones import BACKBONES, encode_prompt, family_of, load_backbone
 from brewster.models.diffusion.families.family import Backbone
 from brewster.models.diffusion.lazy_imports import explain_out_of_memory, fetch
@@ -175,10 +175,10 @@ def fingerprint(
     if folder is None:
         parts = [_source_id(model), str(quantise), PROMPTS.get(prompt, prompt)]
     else:
-        card = read_card(folder)
+        metadata = read_lora_metadata(folder)
         weights = hashlib.sha256((folder / LORA_FILE).read_bytes()).hexdigest()
-        stored_as = _base_quantisation(card, torch_device(device), quantise)
-        parts = [weights, card.prompt_sha256, _source_id(base or card.base), str(stored_as)]
+        stored_as = _base_quantisation(metadata, torch_device(device), quantise)
+        parts = [weights, metadata.prompt_sha256, _source_id(base or metadata.base), str(stored_as)]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
@@ -196,9 +196,11 @@ def _source_id(source: str) -> str:
     return digest.hexdigest()
 
 
-def _base_quantisation(card: LoraCard, device: str, quantise: Quantisation | None) -> Quantisation | None:
+def _base_quantisation(
+    metadata: LoraMetadata, device: str, quantise: Quantisation | None
+) -> Quantisation | None:
     """The requested quantisation; by default that of the LoRA's training, and none on the CPU, where it saves nothing."""
-    return quantise or (card.quantise if device != "cpu" else None)
+    return quantise or (metadata.quantise if device != "cpu" else None)
 
 
 def torch_device(device: str) -> str:
@@ -233,24 +235,24 @@ def _lora_folder(model: str) -> Path | None:
 def _load_with_lora(
     model: str, folder: Path, device: str, base: str | None, quantise: Quantisation | None
 ) -> DecompositionPipeline:
-    card = read_card(folder)
-    source = base or card.base
+    metadata = read_lora_metadata(folder)
+    source = base or metadata.base
     if base is None and _is_local(source) and not Path(source).is_dir():
         raise ModelError(
             f"the base of {model} was {source}, which does not exist",
-            f"a {card.backbone} in diffusers' layout",
+            f"a {metadata.backbone} in diffusers' layout",
             "give its folder or hub id with --base",
         )
     family = family_of(source)  # before it is loaded, which may take an hour
-    if family.name != card.backbone:
+    if family.name != metadata.backbone:
         raise ModelError(
-            f"{model} is a LoRA of {card.backbone}", f"its base, not a {family.name}", "give another base"
+            f"{model} is a LoRA of {metadata.backbone}", f"its base, not a {family.name}", "give another base"
         )
-    backbone = load_backbone(source, device=device, quantise=_base_quantisation(card, device, quantise))
-    card, prompt = load_lora(folder, backbone)
+    backbone = load_backbone(source, device=device, quantise=_base_quantisation(metadata, device, quantise))
+    metadata, prompt = load_lora(folder, backbone)
     torch_name = "cpu" if device == "cpu" else "cuda"
     digest = fingerprint(model, device=torch_name, base=base, quantise=quantise)
-    return DecompositionPipeline(backbone, prompt, card.task, model_name(model), digest)
+    return DecompositionPipeline(backbone, prompt, metadata.task, model_name(model), digest)
 
 
 def _is_local(source: str) -> bool:

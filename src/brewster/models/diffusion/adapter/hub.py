@@ -21,7 +21,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, Final, final
 
 from brewster.errors import DownloadError, ModelError
-from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraCard, read_card, read_prompt
+from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata, read_lora_metadata, read_prompt
 from brewster.models.diffusion.backbones import BACKBONES, find_family
 from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion.prompt import PROMPT_FILE
@@ -91,21 +91,21 @@ def plan_push(folder: Path, repo_id: str, *, message: str = "", public: bool = F
     """
     _check_repo_id(repo_id)
     data = {name: _bytes(folder / name) for name in FILES}
-    card, recipe = read_card(folder), _recipe(folder, data[RECIPE_FILE])
-    read_prompt(folder, card)
-    _check_front_matter(folder, data[CARD_FILE], is_tiny=_is_tiny(card))
-    renamed = {path: PureWindowsPath(path).name for path in _local_paths(recipe)} | _public_base(card)
+    metadata, recipe = read_lora_metadata(folder), _recipe(folder, data[RECIPE_FILE])
+    read_prompt(folder, metadata)
+    _check_front_matter(folder, data[CARD_FILE], is_tiny=_is_tiny(metadata))
+    renamed = {path: PureWindowsPath(path).name for path in _local_paths(recipe)} | _public_base(metadata)
     if renamed:
         data[RECIPE_FILE] = f"{json.dumps(_with_renamed(recipe, renamed), indent=2)}\n".encode()
-        data[LORA_FILE] = _with_public_base(data[LORA_FILE], card, renamed)
+        data[LORA_FILE] = _with_public_base(data[LORA_FILE], metadata, renamed)
     for name, sent in [*data.items(), ("the message", message.encode())]:
         _refuse_home_folders(folder / name, sent)
     return UploadPlan(
         repo_id,
         tuple(UploadFile(name, sent) for name, sent in data.items()),
-        message or f"LoRA of {renamed.get(card.base, card.base)}, rank {card.rank}",
+        message or f"LoRA of {renamed.get(metadata.base, metadata.base)}, rank {metadata.rank}",
         not public,
-        tuple(_remarks(folder, card, renamed)),
+        tuple(_remarks(folder, metadata, renamed)),
     )
 
 
@@ -225,17 +225,20 @@ def _with_renamed(value: Any, renamed: Mapping[str, str]) -> Any:  # noqa: ANN40
     return renamed.get(value, value) if isinstance(value, str) else value
 
 
-def _public_base(card: LoraCard) -> dict[str, str]:
+def _public_base(metadata: LoraMetadata) -> dict[str, str]:
     """If the base is a local folder: a mapping from it to the hub id that replaces it; otherwise empty."""
-    is_local = card.base not in BACKBONES and (_is_local_path(card.base) or Path(card.base).is_dir())
-    return {card.base: find_family(card.backbone).hub_id} if is_local else {}
+    is_local = metadata.base not in BACKBONES and (
+        _is_local_path(metadata.base) or Path(metadata.base).is_dir()
+    )
+    return {metadata.base: find_family(metadata.backbone).hub_id} if is_local else {}
 
 
-def _with_public_base(data: bytes, card: LoraCard, renamed: Mapping[str, str]) -> bytes:
-    """The bytes of the LoRA file with the base in its card replaced as in `renamed`."""
-    public = dataclasses.replace(card, base=renamed.get(card.base, card.base)).to_json()
+def _with_public_base(data: bytes, metadata: LoraMetadata, renamed: Mapping[str, str]) -> bytes:
+    """The bytes of the LoRA file with the base in its metadata replaced as in `renamed`."""
+    public = dataclasses.replace(metadata, base=renamed.get(metadata.base, metadata.base)).to_json()
     return with_metadata(
-        data, {name: public if text == card.to_json() else text for name, text in read_metadata(data).items()}
+        data,
+        {name: public if text == metadata.to_json() else text for name, text in read_metadata(data).items()},
     )
 
 
@@ -252,14 +255,14 @@ def _refuse_home_folders(path: Path, data: bytes) -> None:
         )
 
 
-def _is_tiny(card: LoraCard) -> bool:
-    return card.base.startswith(TINY_PREFIX)
+def _is_tiny(metadata: LoraMetadata) -> bool:
+    return metadata.base.startswith(TINY_PREFIX)
 
 
-def _remarks(folder: Path, card: LoraCard, renamed: Mapping[str, str]) -> Iterator[str]:
-    licence = find_family(card.backbone).licence
-    if _is_tiny(card):
-        yield f"its base is {card.base}, a tiny test model: it cannot separate photos"
+def _remarks(folder: Path, metadata: LoraMetadata, renamed: Mapping[str, str]) -> Iterator[str]:
+    licence = find_family(metadata.backbone).licence
+    if _is_tiny(metadata):
+        yield f"its base is {metadata.base}, a tiny test model: it cannot separate photos"
     elif not licence.is_commercial:
         yield f"its base has the licence {licence.title}, which also applies to the LoRA: not for commercial use"
     yield from (f"{place} is replaced by {name} in the uploaded files" for place, name in renamed.items())

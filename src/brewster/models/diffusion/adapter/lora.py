@@ -2,7 +2,7 @@
 
     add_lora(backbone, rank=16, alpha=16, seed=0)
     save_lora(folder, backbone, prompt, task)     # in diffusers: pipe.load_lora_weights(folder)
-    card, prompt = load_lora(folder, backbone)
+    metadata, prompt = load_lora(folder, backbone)
 
 The paper gives the rank, 16 (Experimental Setup). Alpha 16 and adapters on all linear layers of the blocks are the
 usual settings with it. The LoRA is float32 on a base of any precision, because most of Adam's updates are smaller than the
@@ -33,14 +33,14 @@ from brewster.options import Quantisation
 LORA_FILE: Final = "pytorch_lora_weights.safetensors"
 """The file name that diffusers expects."""
 _PREFIX: Final = "transformer."
-_CARD_KEY: Final = "brewster"
+_METADATA_KEY: Final = "brewster"
 _PEFT_KEY: Final = "lora_adapter_metadata"
 _ADAPTER_NAME: Final = "default"
 
 
 @final
 @dataclass(frozen=True)
-class LoraCard:
+class LoraMetadata:
     """The metadata of a LoRA: its backbone, the base's quantisation, rank and alpha, task, and the prompt's digest.
 
     `base` is a hub id, a folder, or a name in the table of backbones.
@@ -55,29 +55,29 @@ class LoraCard:
     prompt_sha256: str
 
     def to_json(self) -> str:
-        """The card as one line of JSON."""
+        """The metadata as one line of JSON."""
         return json.dumps(asdict(self), sort_keys=True)
 
     @classmethod
-    def from_json(cls, text: str) -> LoraCard:
+    def from_json(cls, text: str) -> LoraMetadata:
         """Parses the result of `to_json`.
 
         Raises:
-            ModelError: the text is not a valid card.
+            ModelError: the text is not valid metadata.
         """
         try:
-            return _card_validator().validate_json(text, strict=True, extra="forbid")
+            return _metadata_validator().validate_json(text, strict=True, extra="forbid")
         except (ValueError, RecipeError) as error:
             raise ModelError(
-                f"the card of the LoRA cannot be read: {error}",
-                "a card that brewster wrote",
+                f"the metadata of the LoRA cannot be read: {error}",
+                "expected metadata that brewster wrote",
                 "save the LoRA again",
             ) from error
 
 
 @cache
-def _card_validator() -> TypeAdapter[LoraCard]:
-    return TypeAdapter(LoraCard)
+def _metadata_validator() -> TypeAdapter[LoraMetadata]:
+    return TypeAdapter(LoraMetadata)
 
 
 def add_lora(backbone: Backbone, *, rank: int = 16, alpha: int = 16, seed: int = 0) -> list[nn.Parameter]:
@@ -150,13 +150,13 @@ def save_lora(
     *,
     base: str = "",
     quantise: Quantisation | None = None,
-) -> LoraCard:
+) -> LoraMetadata:
     """Writes a folder with the LoRA, in a file that diffusers can load, and the prompt. Deterministic to the byte.
 
     `base` is by default the backbone's hub id.
 
     Returns:
-        The card that is stored in the metadata of the file.
+        The metadata that is stored in the file.
 
     Raises:
         ModelError: the backbone has no LoRA, or the prompt belongs to another backbone.
@@ -169,7 +169,7 @@ def save_lora(
             f"the prompt was encoded for {prompt.backbone}", f"{backbone.name}", "encode it for this backbone"
         )
     config = backbone.transformer.peft_config[_ADAPTER_NAME]
-    card = LoraCard(
+    metadata = LoraMetadata(
         backbone.name,
         base or backbone.hub_id,
         quantise,
@@ -180,12 +180,14 @@ def save_lora(
     )
     tensors = {_PREFIX + name: tensor for name, tensor in lora_state(backbone).items()}
     prompt.save(folder / PROMPT_FILE)
-    write_tensors(folder / LORA_FILE, tensors, {_CARD_KEY: card.to_json(), _PEFT_KEY: _peft_settings(config)})
-    return card
+    write_tensors(
+        folder / LORA_FILE, tensors, {_METADATA_KEY: metadata.to_json(), _PEFT_KEY: _peft_settings(config)}
+    )
+    return metadata
 
 
-def read_card(folder: Path) -> LoraCard:
-    """The card of the LoRA in this folder; it says which backbone to load.
+def read_lora_metadata(folder: Path) -> LoraMetadata:
+    """The metadata of the LoRA in this folder. It names the backbone to load.
 
     Raises:
         ModelError: the LoRA is missing or damaged, or was not written by brewster.
@@ -193,59 +195,59 @@ def read_card(folder: Path) -> LoraCard:
     return _read(folder)[1]
 
 
-def read_prompt(folder: Path, card: LoraCard) -> PromptEmbedding:
+def read_prompt(folder: Path, metadata: LoraMetadata) -> PromptEmbedding:
     """The prompt of the LoRA in this folder.
 
     Raises:
         ModelError: the prompt is missing or damaged, or is not the one with which the LoRA was trained.
     """
-    prompt = load_prompt(folder / PROMPT_FILE, card.backbone)
-    if prompt.sha256 != card.prompt_sha256:
+    prompt = load_prompt(folder / PROMPT_FILE, metadata.backbone)
+    if prompt.sha256 != metadata.prompt_sha256:
         raise ModelError(
             f"{folder / PROMPT_FILE} is not the prompt that the LoRA was trained with",
-            f"SHA-256 {card.prompt_sha256[:12]}...",
+            f"SHA-256 {metadata.prompt_sha256[:12]}...",
             "copy the whole folder again",
         )
     return prompt
 
 
-def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraCard, PromptEmbedding]:
+def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmbedding]:
     """Adds the LoRA of a folder to its backbone.
 
     Returns:
-        The LoRA's card and its prompt.
+        The metadata of the LoRA, and its prompt.
 
     Raises:
-        ModelError: the LoRA belongs to another backbone, its weights do not have the rank of its card, a file is
+        ModelError: the LoRA belongs to another backbone, its weights do not have the rank in its metadata, a file is
             damaged, the prompt does not belong to it, or the backbone already has a LoRA.
     """
-    state, card = _read(folder)
-    if card.backbone != backbone.name:
+    state, metadata = _read(folder)
+    if metadata.backbone != backbone.name:
         raise ModelError(
-            f"{folder} is a LoRA of {card.backbone}",
+            f"{folder} is a LoRA of {metadata.backbone}",
             f"a LoRA of {backbone.name}",
-            f"load the backbone {card.backbone} for it",
+            f"load the backbone {metadata.backbone} for it",
         )
-    prompt = read_prompt(folder, card)
-    add_lora(backbone, rank=card.rank, alpha=card.alpha)
+    prompt = read_prompt(folder, metadata)
+    add_lora(backbone, rank=metadata.rank, alpha=metadata.alpha)
     try:
         load_lora_state(backbone, state)
     except ModelError:
         remove_lora(backbone)
         raise
-    return card, prompt
+    return metadata, prompt
 
 
-def _read(folder: Path) -> tuple[dict[str, Tensor], LoraCard]:
-    tensors, metadata = read_tensors(folder / LORA_FILE)
-    if _CARD_KEY not in metadata:
+def _read(folder: Path) -> tuple[dict[str, Tensor], LoraMetadata]:
+    tensors, entries = read_tensors(folder / LORA_FILE)
+    if _METADATA_KEY not in entries:
         raise ModelError(
             f"{folder / LORA_FILE} was not written by brewster",
-            "a LoRA with a card in its metadata",
+            f"expected a LoRA with the entry {_METADATA_KEY} in its metadata",
             "use a LoRA that brewster train wrote",
         )
-    card = LoraCard.from_json(metadata[_CARD_KEY])
-    return {name.removeprefix(_PREFIX): tensor for name, tensor in tensors.items()}, card
+    metadata = LoraMetadata.from_json(entries[_METADATA_KEY])
+    return {name.removeprefix(_PREFIX): tensor for name, tensor in tensors.items()}, metadata
 
 
 def _refuse_other_weights(expected: Mapping[str, Tensor], found: Mapping[str, Tensor]) -> None:
