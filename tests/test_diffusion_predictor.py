@@ -140,7 +140,7 @@ def test_photos_of_any_shape_keep_their_size(width, height):
 
 def test_a_photo_that_is_smaller_than_a_token_is_refused_with_the_size_it_takes():
     with pytest.raises(
-        PhotoError, match=r"15 x 40 pixels; at least 16 pixels a side, .* or use the compact model"
+        PhotoError, match=r"15 x 40 pixels; expected at least 16 pixels a side, .* or use the compact model"
     ):
         Separator(DiffusionPredictor(Oracle()))(smooth(15, 40))
 
@@ -209,13 +209,13 @@ def test_a_backbone_without_a_lora_generates_the_transmission_only():
 
 
 def test_what_a_lora_is_opened_with_is_checked(lora, tmp_path):
-    with pytest.raises(ModelError, match="is a LoRA of kontext; its base, not a klein"):
+    with pytest.raises(ModelError, match="is a LoRA of kontext; expected a base of kontext, not of klein"):
         load_pipeline(str(lora), base="tiny:klein")
     with pytest.raises(ModelError, match="is a backbone, and the base tiny:kontext was given"):
         load_pipeline("tiny:klein", base="tiny:kontext")
-    with pytest.raises(DeviceError, match="do not run on coreml; one of auto, cuda, rocm, cpu"):
+    with pytest.raises(DeviceError, match="do not run on coreml; expected one of auto, cuda, rocm, cpu"):
         load_pipeline(str(lora), device="coreml")
-    with pytest.raises(ModelError, match=f"contains no model; a LoRA .{LORA_FILE}"):
+    with pytest.raises(ModelError, match=f"contains no model; expected a LoRA .{LORA_FILE}"):
         load_pipeline(str(tmp_path))
     (tmp_path / LORA_FILE).write_bytes(b"torn")
     with pytest.raises(ModelError):
@@ -233,7 +233,7 @@ def test_what_a_lora_is_opened_with_is_checked(lora, tmp_path):
         ({"more": 1}, "metadata of the LoRA cannot be read"),
         ({"task": {"objective": "two"}}, "metadata of the LoRA cannot be read"),
         ({"task": {"budget_px": "18432"}}, "metadata of the LoRA cannot be read"),
-        ({"task": {"layout": {"panels": ["I", "R"], "direction": "stacked"}}}, "a list with T"),
+        ({"task": {"layout": {"panels": ["I", "R"], "direction": "stacked"}}}, "expected a list with T"),
         ({"task": {"layout": {"panels": ["T", "T"], "direction": "stacked"}}}, "each once"),
     ],
 )
