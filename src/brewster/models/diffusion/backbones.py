@@ -49,7 +49,7 @@ _CONFIG_FILES: Final = {
 _BACKBONE_PATTERNS: Final = [_INDEX_FILE, *(f"{part}/*" for part in _CONFIG_FILES)]
 _TEXT_ENCODER_PATTERNS: Final = [_INDEX_FILE, "scheduler/*", "text_encoder*/*", "tokenizer*/*", "processor/*"]
 _STATISTICS_SPREAD: Final = 0.2
-"""The spread of a tiny version's latent means around 0 and variances around 1: tests then detect code that ignores them."""
+"""The spread of a tiny version's latent statistics around 0 and 1, so that tests detect code without normalisation."""
 
 
 def load_backbone(
@@ -269,7 +269,7 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _translate_load_errors(folder: Path) -> Iterator[None]:
-    """Converts the exceptions that diffusers raises for a folder, except out of memory (see `explain_out_of_memory`)."""
+    """Converts the exceptions of diffusers; `explain_out_of_memory` converts those about memory."""
     safetensors_error = import_library("safetensors").SafetensorError
     try:
         yield

@@ -85,8 +85,8 @@ def plan_push(folder: Path, repo_id: str, *, message: str = "", public: bool = F
     """Checks a LoRA's folder and prepares its upload; needs no network connection.
 
     Raises:
-        ModelError: a file is missing or damaged, the prompt does not belong to the LoRA, the model card has no front matter, a
-            file contains the path of a home folder, or `repo_id` is not OWNER/NAME.
+        ModelError: a file is missing or damaged, the prompt does not belong to the LoRA, the model card has no front
+            matter, a file contains the path of a home folder, or `repo_id` is not OWNER/NAME.
         MissingExtra: huggingface_hub is not installed.
     """
     _check_repo_id(repo_id)
@@ -94,9 +94,8 @@ def plan_push(folder: Path, repo_id: str, *, message: str = "", public: bool = F
     metadata, recipe = read_lora_metadata(folder), _parse_recipe(folder, data[RECIPE_FILE])
     read_prompt(folder, metadata)
     _check_front_matter(folder, data[CARD_FILE], is_tiny=_is_tiny(metadata))
-    replacements = {path: PureWindowsPath(path).name for path in _local_paths(recipe)} | _base_replacement(
-        metadata
-    )
+    replacements = {path: PureWindowsPath(path).name for path in _local_paths(recipe)}
+    replacements |= _base_replacement(metadata)
     if replacements:
         data[RECIPE_FILE] = f"{json.dumps(_replace_strings(recipe, replacements), indent=2)}\n".encode()
         data[LORA_FILE] = _replace_base(data[LORA_FILE], metadata, replacements)
@@ -183,7 +182,7 @@ def _parse_recipe(folder: Path, data: bytes) -> Any:  # noqa: ANN401 - JSON
 
 
 def _check_front_matter(folder: Path, card: bytes, *, is_tiny: bool) -> None:
-    """Checks that the front matter of the model card has the fields from which the hub reads licence, base and library."""
+    """Checks the front matter of the model card: the hub reads licence, base and library from it."""
     yaml_errors = (ValueError, TypeError, import_library("yaml").YAMLError)
     required = {"license", "library_name"} | (set() if is_tiny else {"base_model"})
     try:

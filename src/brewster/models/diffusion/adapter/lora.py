@@ -4,8 +4,8 @@
     save_lora(folder, backbone, prompt, task)     # in diffusers: pipe.load_lora_weights(folder)
     metadata, prompt = load_lora(folder, backbone)
 
-The paper uses rank 16 (Experimental Setup). It does not give alpha and the adapted layers; alpha 16 and all linear layers
-of the blocks are usual settings. The LoRA is float32 for a base of any precision, because most of Adam's updates are
+The paper uses rank 16 (Experimental Setup). It does not state alpha or the adapted layers; alpha 16 and all linear
+layers of the blocks are usual settings. The LoRA is float32 for a base of any precision, because most of Adam's updates are
 smaller than the rounding error of bf16.
 """
 
@@ -270,7 +270,7 @@ def _check_weights(expected: Mapping[str, Tensor], actual: Mapping[str, Tensor])
 
 
 def _peft_settings(config: Any) -> str:  # noqa: ANN401 - peft's configuration
-    """The LoRA settings that diffusers reads from the metadata. Without them, diffusers assumes that alpha equals the rank."""
+    """The LoRA settings that diffusers reads. Without them, diffusers assumes that alpha equals the rank."""
     settings = {
         "r": config.r,
         "lora_alpha": config.lora_alpha,

@@ -71,7 +71,7 @@ class Backbone(ABC):
     hub_id: ClassVar[str]
     licence: ClassVar[Licence]
     diffusers_usage: ClassVar[DiffusersUsage | str]
-    """For model cards: how to call the pipeline of diffusers, or a clause "but ..." with the reason why its image differs."""
+    """For model cards: how to call the pipeline of diffusers, or a clause "but ..." on why its image differs."""
     classes: ClassVar[Mapping[str, str]]
     """Class names in diffusers of the "pipeline", "transformer", "vae" and "scheduler"."""
     full_size: ClassVar[Architecture]
@@ -208,7 +208,7 @@ class Backbone(ABC):
         return sigmas
 
     def lora_targets(self) -> list[str]:
-        """The full names of all linear layers in the blocks. A suffix such as proj_out would also match layers outside."""
+        """The full names of all linear layers in the blocks. The suffix proj_out would match layers outside."""
         return [
             name.removesuffix(".base_layer")
             for name, module in self.transformer.named_modules()
