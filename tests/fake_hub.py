@@ -8,7 +8,7 @@ from file_server import on_loopback
 
 
 class Hub:
-    """The state of the hub: repositories, the valid token, and the errors to return (`refusals`: path -> status)."""
+    """The state of the hub: repositories, the valid token, and the errors to return (`refusals`: part of a path -> status)."""
 
     def __init__(self, url):
         self.url, self.token, self.refusals, self.requests = url, "hf_right", {}, []
@@ -32,10 +32,10 @@ class Hub:
         return 200, {"commitUrl": f"{self.url}/{name}/commit/1", "commitOid": "1" * 40}
 
     def respond(self, path, body):
-        """Status and JSON value of the response."""
+        """Returns the status and the JSON value of the response to a request."""
         statuses = [status for part, status in self.refusals.items() if part in path]
         if statuses:
-            return statuses[0], {"error": "no"}
+            return statuses[0], {"error": "refused"}
         if path == "/api/repos/create":
             return self.create(json.loads(body))
         if path == "/api/validate-yaml":
@@ -45,11 +45,11 @@ class Hub:
             return self.commit(name, [json.loads(line) for line in body.splitlines()])
         if verb == "preupload":
             files = [file["path"] for file in json.loads(body)["files"]]
-            how = {"uploadMode": "regular", "shouldIgnore": False}
-            return 200, {"files": [{"path": path, **how} for path in files]}
+            options = {"uploadMode": "regular", "shouldIgnore": False}
+            return 200, {"files": [{"path": path, **options} for path in files]}
         name = f"{name}/{verb}"
-        found = name in self.repos
-        return (200, {"id": name, "private": self.private[name], "tags": []}) if found else (404, {})
+        exists = name in self.repos
+        return (200, {"id": name, "private": self.private[name], "tags": []}) if exists else (404, {})
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -73,5 +73,5 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def served():
-    """Context manager: a running hub."""
+    """Returns a context manager that runs the hub in a thread."""
     return on_loopback(_Handler, Hub)

@@ -1,4 +1,4 @@
-"""The table of large backbones: the real loading code on tiny folders, and all errors of damaged or wrong folders."""
+"""The table of large backbones: loading of tiny versions from folders, and all errors for damaged or wrong folders."""
 
 import json
 import shutil
@@ -17,7 +17,7 @@ from brewster.models.diffusion.prompt import PROMPT
 
 
 @pytest.fixture(scope="module")
-def saved(tmp_path_factory):
+def tiny_folders(tmp_path_factory):
     """Folders of tiny versions; tests must not change them."""
     folder = tmp_path_factory.mktemp("tiny")
     for name in BACKBONES:
@@ -26,9 +26,9 @@ def saved(tmp_path_factory):
 
 
 @pytest.fixture
-def folder(saved, tmp_path):
+def folder(tiny_folders, tmp_path):
     """A folder of a tiny Kontext that a test may change."""
-    return shutil.copytree(saved / "kontext", tmp_path / "kontext")
+    return shutil.copytree(tiny_folders / "kontext", tmp_path / "kontext")
 
 
 def velocity(backbone, prompt):
@@ -38,9 +38,9 @@ def velocity(backbone, prompt):
 
 
 @pytest.mark.parametrize("name", list(BACKBONES))
-def test_a_tiny_version_survives_saving_and_loading(saved, name):
+def test_a_tiny_version_survives_saving_and_loading(tiny_folders, name):
     original, prompt = tiny(name, seed=1)
-    loaded = load_backbone(str(saved / name))
+    loaded = load_backbone(str(tiny_folders / name))
     assert type(loaded) is BACKBONES[name]
     weights = loaded.transformer.state_dict()
     assert all(torch.equal(weights[key], value) for key, value in original.transformer.state_dict().items())
@@ -73,7 +73,7 @@ def test_full_size_architectures_need_no_memory_on_the_meta_device(name, billion
 
 
 @pytest.mark.parametrize("name", list(BACKBONES))
-def test_a_picture_becomes_one_token_for_16_by_16_pixels(name):
+def test_a_latent_grid_has_one_token_for_16_by_16_pixels(name):
     backbone, _ = tiny(name, seed=1)
     latents = backbone.encode(torch.rand(2, 3, 32, 96) * 2 - 1)
     assert latents.shape == (2, backbone.channels, 2, 6)
@@ -88,11 +88,11 @@ def test_latent_statistics_are_applied_and_inverted(name, monkeypatch):
     assert mean.abs().max() > 0.05
     assert (deviation - 1).abs().max() > 0.05
     grid = torch.randn(1, backbone.channels // 4, 4, 4)
-    monkeypatch.setattr(backbone, "_vae_encode", lambda picture: grid)
-    black, shown = torch.zeros(1, 3, 32, 32), []
-    monkeypatch.setattr(backbone, "_vae_decode", lambda latent: shown.append(latent) or black)
+    monkeypatch.setattr(backbone, "_vae_encode", lambda image: grid)
+    black, decoded = torch.zeros(1, 3, 32, 32), []
+    monkeypatch.setattr(backbone, "_vae_decode", lambda latent: decoded.append(latent) or black)
     backbone.decode(backbone.encode(black))
-    torch.testing.assert_close(shown, [grid])
+    torch.testing.assert_close(decoded, [grid])
 
 
 def test_a_panel_encoded_separately_differs_from_that_panel_of_the_composite():
@@ -104,45 +104,49 @@ def test_a_panel_encoded_separately_differs_from_that_panel_of_the_composite():
 
 
 @pytest.mark.parametrize("quantise", ["int8", "float8"])
-def test_a_quantised_base_predicts_nearly_the_same_and_trains_a_lora(saved, quantise):
+def test_a_quantised_base_predicts_nearly_the_same_and_trains_a_lora(tiny_folders, quantise):
     plain, prompt = tiny("kontext", seed=1)
-    small = load_backbone(str(saved / "kontext"), quantise=quantise, dtype=torch.bfloat16)
-    weight = small.transformer.transformer_blocks[0].attn.to_q.weight
+    quantised = load_backbone(str(tiny_folders / "kontext"), quantise=quantise, dtype=torch.bfloat16)
+    weight = quantised.transformer.transformer_blocks[0].attn.to_q.weight
     assert type(weight) not in {torch.Tensor, torch.nn.Parameter}
     expected = velocity(plain, prompt)
-    assert (velocity(small, prompt) - expected).std() < 0.2 * expected.std()
-    parameters = add_lora(small, rank=2)
-    velocity(small, prompt).square().mean().backward()
+    assert (velocity(quantised, prompt) - expected).std() < 0.2 * expected.std()
+    parameters = add_lora(quantised, rank=2)
+    velocity(quantised, prompt).square().mean().backward()
     assert any(parameter.grad.abs().max() > 0 for parameter in parameters)
     assert {parameter.dtype for parameter in parameters} == {torch.float32}
 
 
-def test_a_base_that_was_silently_left_unquantised_is_refused(saved, monkeypatch):
+def test_a_base_that_was_silently_left_unquantised_is_refused(tiny_folders, monkeypatch):
     monkeypatch.setattr(backbones, "_device_map", lambda device: {"device_map": {"": device}})
-    with pytest.raises(ModelError, match=r"loaded as torch\.bfloat16; weights stored as int8"):
-        load_backbone(str(saved / "kontext"), quantise="int8", dtype=torch.bfloat16)
+    with pytest.raises(ModelError, match=r"loaded as torch\.bfloat16; expected weights stored as int8"):
+        load_backbone(str(tiny_folders / "kontext"), quantise="int8", dtype=torch.bfloat16)
 
 
 def test_nf4_needs_an_nvidia_gpu():
-    with pytest.raises(DeviceError, match='nf4 does not run on cpu; an NVIDIA GPU; use quantise="int8"'):
+    with pytest.raises(
+        DeviceError, match='nf4 does not run on cpu; expected an NVIDIA GPU; use quantise="int8"'
+    ):
         load_backbone("kontext", quantise="nf4")
 
 
 def test_unknown_names_get_suggestions():
     with pytest.raises(ModelError, match="did you mean kontext"):
         tiny("kontxt")
-    with pytest.raises(ModelError, match="there is no quantisation 'int2'; one of int8, float8, nf4"):
+    with pytest.raises(
+        ModelError, match="there is no quantisation 'int2'; expected one of int8, float8, nf4"
+    ):
         load_backbone("kontext", quantise="int2")
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
 def test_a_missing_gpu_is_reported_before_anything_is_loaded():
     with pytest.raises(DeviceError, match="there is no CUDA device"):
-        load_backbone("/nowhere", device="cuda")
+        load_backbone("/absent", device="cuda")
 
 
 @pytest.fixture(scope="module")
-def with_text_encoders(tmp_path_factory):
+def text_encoder_folders(tmp_path_factory):
     """Folders of tiny versions with text encoders, and tokenizers whose tokens are single bytes."""
     folder = tmp_path_factory.mktemp("words")
     letters = sorted(ByteLevel.alphabet())
@@ -189,12 +193,12 @@ def with_text_encoders(tmp_path_factory):
         ("klein", {"embeds": (1, 512, 48), "negative": (1, 512, 48)}),
     ],
 )
-def test_a_prompt_is_encoded_by_the_text_encoders_of_the_folder(with_text_encoders, name, shapes):
-    prompt = encode_prompt(str(with_text_encoders / name))
+def test_a_prompt_is_encoded_by_the_text_encoders_of_the_folder(text_encoder_folders, name, shapes):
+    prompt = encode_prompt(str(text_encoder_folders / name))
     assert (prompt.backbone, prompt.text) == (name, PROMPT)
     assert {key: tuple(tensor.shape) for key, tensor in prompt.tensors.items()} == shapes
-    assert encode_prompt(str(with_text_encoders / name)).sha256 == prompt.sha256
-    assert not torch.equal(encode_prompt(str(with_text_encoders / name), "a cat").embeds, prompt.embeds)
+    assert encode_prompt(str(text_encoder_folders / name)).sha256 == prompt.sha256
+    assert not torch.equal(encode_prompt(str(text_encoder_folders / name), "a cat").embeds, prompt.embeds)
 
 
 def test_the_offline_error_of_huggingface_hub_is_explained(tmp_path, monkeypatch):
@@ -204,12 +208,12 @@ def test_the_offline_error_of_huggingface_hub_is_explained(tmp_path, monkeypatch
         load_backbone("klein")
 
 
-def test_text_encoders_are_not_downloaded(saved, monkeypatch):
+def test_text_encoders_are_not_downloaded(tiny_folders, monkeypatch):
     requests = []
 
     def snapshot_download(source, *, allow_patterns):
         requests.append((source, allow_patterns))
-        return str(saved / "klein")
+        return str(tiny_folders / "klein")
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot_download)
     load_backbone("klein")
@@ -247,28 +251,32 @@ def test_truncated_weights_are_refused(folder, size):
         load_backbone(str(folder))
 
 
-def change(path, **values):
+def change_json(path, **values):
     path.write_text(json.dumps(json.loads(path.read_text()) | values))
 
 
 def test_a_folder_of_another_pipeline_is_refused(folder):
-    change(folder / "model_index.json", _class_name="StableDiffusionPipeline")
-    with pytest.raises(ModelError, match="contains a StableDiffusionPipeline; one of FluxKontextPipeline"):
+    change_json(folder / "model_index.json", _class_name="StableDiffusionPipeline")
+    with pytest.raises(
+        ModelError, match="contains a StableDiffusionPipeline; expected one of FluxKontextPipeline"
+    ):
         load_backbone(str(folder))
 
 
-def test_a_transformer_of_another_architecture_is_refused(folder, saved):
+def test_a_transformer_of_another_architecture_is_refused(folder, tiny_folders):
     shutil.rmtree(folder / "transformer")
-    shutil.copytree(saved / "qwen" / "transformer", folder / "transformer")
-    with pytest.raises(ModelError, match="contains a QwenImageTransformer2DModel; a FluxTransformer2DModel"):
+    shutil.copytree(tiny_folders / "qwen" / "transformer", folder / "transformer")
+    with pytest.raises(
+        ModelError, match="contains a QwenImageTransformer2DModel; expected a FluxTransformer2DModel"
+    ):
         load_backbone(str(folder))
 
 
 def test_settings_that_do_not_match_the_weights_are_refused(folder):
-    change(folder / "transformer" / "config.json", num_layers=3)
+    change_json(folder / "transformer" / "config.json", num_layers=3)
     with pytest.raises(ModelError, match="transformer"):
         load_backbone(str(folder))
-    change(folder / "transformer" / "config.json", num_layers=2, num_attention_heads=3)
+    change_json(folder / "transformer" / "config.json", num_layers=2, num_attention_heads=3)
     with pytest.raises(ModelError, match="transformer cannot be loaded"):
         load_backbone(str(folder))
 
@@ -283,9 +291,9 @@ def test_a_damaged_index_is_refused(folder):
 
 
 def test_out_of_memory_while_loading_says_what_to_reduce(folder, monkeypatch):
-    def full(*_, **__):
+    def raise_error(*_, **__):
         raise torch.OutOfMemoryError("CUDA out of memory.")
 
-    monkeypatch.setattr(backbones, "_load_part", full)
+    monkeypatch.setattr(backbones, "_load_part", raise_error)
     with pytest.raises(DeviceError, match='use quantise="int8", a smaller backbone'):
         load_backbone(str(folder))

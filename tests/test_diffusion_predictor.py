@@ -14,7 +14,7 @@ from brewster.errors import DeviceError, DownloadError, ModelError, PhotoError
 from brewster.inference.diffusion_predictor import DiffusionPredictor
 from brewster.inference.separator import RECONSTRUCTION_ERROR_LIMIT
 from brewster.models.diffusion.adapter.lora import LORA_FILE, add_lora, lora_parameters, save_lora
-from brewster.models.diffusion.backbones import TINY, tiny
+from brewster.models.diffusion.backbones import TINY_PREFIX, tiny
 from brewster.models.diffusion.panels import PanelLayout
 from brewster.models.diffusion.pipeline import fingerprint, load_pipeline
 from brewster.models.diffusion.task import DecompositionTask
@@ -68,7 +68,7 @@ def lora(tmp_path_factory):
     with torch.no_grad():
         for parameter in lora_parameters(backbone):
             parameter.normal_(0, 0.1, generator=torch.Generator().manual_seed(3))
-    save_lora(folder, backbone, prompt, DecompositionTask(budget_px=SMALL_BUDGET_PX), base=f"{TINY}kontext")
+    save_lora(folder, backbone, prompt, DecompositionTask(budget_px=SMALL_BUDGET_PX), base=f"{TINY_PREFIX}kontext")
     return folder
 
 
@@ -142,7 +142,7 @@ def test_photos_of_any_shape_keep_their_size(width, height):
 
 def test_a_photo_that_is_smaller_than_a_token_is_refused_with_the_smallest_size():
     with pytest.raises(
-        PhotoError, match=r"15 x 40 pixels; at least 16 pixels a side, .* or use the compact model"
+        PhotoError, match=r"15 x 40 pixels; expected at least 16 pixels a side, .* or use the compact model"
     ):
         Separator(DiffusionPredictor(FakePipeline()))(smooth_photo(15, 40))
 
@@ -213,13 +213,13 @@ def test_a_backbone_without_a_lora_generates_the_transmission_only():
 
 
 def test_the_base_and_the_device_of_a_lora_are_checked(lora, tmp_path):
-    with pytest.raises(ModelError, match="is a LoRA of kontext; its base, not a klein"):
+    with pytest.raises(ModelError, match="is a LoRA of kontext; expected a base of kontext, not of klein"):
         load_pipeline(str(lora), base="tiny:klein")
     with pytest.raises(ModelError, match="is a backbone, and the base tiny:kontext was given"):
         load_pipeline("tiny:klein", base="tiny:kontext")
-    with pytest.raises(DeviceError, match="do not run on coreml; one of auto, cuda, rocm, cpu"):
+    with pytest.raises(DeviceError, match="do not run on coreml; expected one of auto, cuda, rocm, cpu"):
         load_pipeline(str(lora), device="coreml")
-    with pytest.raises(ModelError, match=f"contains no model; a LoRA .{LORA_FILE}"):
+    with pytest.raises(ModelError, match=f"contains no model; expected a LoRA .{LORA_FILE}"):
         load_pipeline(str(tmp_path))
     (tmp_path / LORA_FILE).write_bytes(b"damaged")
     with pytest.raises(ModelError):
@@ -229,15 +229,15 @@ def test_the_base_and_the_device_of_a_lora_are_checked(lora, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"rank": "4"}, "card of the LoRA cannot be read"),
-        ({"alpha": 0}, "card of the LoRA cannot be read"),
-        ({"base": None}, "card of the LoRA cannot be read"),
-        ({"quantise": "int3"}, "card of the LoRA cannot be read"),
-        ({"prompt_sha256": None}, "card of the LoRA cannot be read"),
-        ({"more": 1}, "card of the LoRA cannot be read"),
-        ({"task": {"objective": "two"}}, "card of the LoRA cannot be read"),
-        ({"task": {"budget_px": "18432"}}, "card of the LoRA cannot be read"),
-        ({"task": {"layout": {"panels": ["I", "R"], "direction": "stacked"}}}, "a list with T"),
+        ({"rank": "4"}, "metadata of the LoRA cannot be read"),
+        ({"alpha": 0}, "metadata of the LoRA cannot be read"),
+        ({"base": None}, "metadata of the LoRA cannot be read"),
+        ({"quantise": "int3"}, "metadata of the LoRA cannot be read"),
+        ({"prompt_sha256": None}, "metadata of the LoRA cannot be read"),
+        ({"more": 1}, "metadata of the LoRA cannot be read"),
+        ({"task": {"objective": "two"}}, "metadata of the LoRA cannot be read"),
+        ({"task": {"budget_px": "18432"}}, "metadata of the LoRA cannot be read"),
+        ({"task": {"layout": {"panels": ["I", "R"], "direction": "stacked"}}}, "expected a list with T"),
         ({"task": {"layout": {"panels": ["T", "T"], "direction": "stacked"}}}, "each once"),
     ],
 )

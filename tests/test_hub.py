@@ -19,7 +19,7 @@ from brewster.training.lora.model_card import write_card
 from brewster.training.recipe import LoraRecipe
 from file_server import loopback_only, unused_address
 
-REPO = "somebody/sees-through-glass"
+REPO = "somebody/some-lora"
 VALUES = {
     "seed": 1, "steps": 6, "batch": 2, "learning_rate": 1e-2, "warmup_steps": 2, "weight_decay": 1e-4,
     "report_every": 6, "checkpoint_every": 2,
@@ -39,10 +39,10 @@ def tiny_model():
 
 
 @pytest.fixture
-def write(tiny_model, tmp_path):
+def write_lora(tiny_model, tmp_path):
     """A function that writes a LoRA's folder as training does."""
 
-    def write(base="kontext", sets="sets/window"):
+    def write_lora(base="kontext", sets="sets/window"):
         folder = tmp_path / "lora"
         hub_id = BACKBONES["kontext"].hub_id if base == "kontext" else base
         save_lora(folder, *tiny_model, DecompositionTask(), base=hub_id)
@@ -53,14 +53,14 @@ def write(tiny_model, tmp_path):
         write_card(folder, recipe, {"loss": 1.0}, BACKBONES["kontext"])
         return folder
 
-    return write
+    return write_lora
 
 
 @pytest.fixture
 def hub(monkeypatch, tmp_path):
     with fake_hub.served() as hub:
         monkeypatch.setattr(huggingface_hub.constants, "ENDPOINT", hub.url)
-        monkeypatch.setattr(huggingface_hub.constants, "HF_TOKEN_PATH", str(tmp_path / "nobody-logged-in"))
+        monkeypatch.setattr(huggingface_hub.constants, "HF_TOKEN_PATH", str(tmp_path / "no-token"))
         monkeypatch.setenv("HF_TOKEN", hub.token)
         yield hub
 
@@ -69,8 +69,8 @@ def contents(plan):
     return {file.name: file.data for file in plan.files}
 
 
-def test_four_files_would_be_sent_as_they_are(write):
-    folder = write()
+def test_the_plan_has_the_four_files_unchanged(write_lora):
+    folder = write_lora()
     (folder / "notes.txt").write_text("mine")
     plan = plan_push(folder, REPO)
     assert [file.name for file in plan.files] == sorted(FILES, key=FILES.index)
@@ -83,14 +83,16 @@ def test_four_files_would_be_sent_as_they_are(write):
     assert all(name in plan.table() for name in FILES)
 
 
-def test_remarks_name_a_non_commercial_base_and_a_tiny_one(write):
-    assert "not for commercial use" in plan_push(write(), REPO).remarks[0]
-    assert "a tiny test model: it cannot separate" in plan_push(write("tiny:kontext"), REPO).remarks[0]
+def test_remarks_name_a_non_commercial_base_and_a_tiny_one(write_lora):
+    assert "not for commercial use" in plan_push(write_lora(), REPO).remarks[0]
+    assert "a tiny test model: it cannot separate" in plan_push(write_lora("tiny:kontext"), REPO).remarks[0]
 
 
-def test_local_paths_are_replaced_in_uploaded_files_and_the_lora_still_loads(write, tmp_path, tiny_model):
+def test_local_paths_are_replaced_in_uploaded_files_and_the_lora_still_loads(
+    write_lora, tmp_path, tiny_model
+):
     base, sets = tmp_path / "models" / "flux", tmp_path / "secret" / "window"
-    folder = write(str(base), str(sets))
+    folder = write_lora(str(base), str(sets))
     before = {name: (folder / name).read_bytes() for name in FILES}
     plan = plan_push(folder, REPO)
     sent = contents(plan)
@@ -111,24 +113,26 @@ def test_local_paths_are_replaced_in_uploaded_files_and_the_lora_still_loads(wri
 
 
 @pytest.mark.parametrize("home", ["/home/ann/photos", "/Users/ann/x.jpg", r"C:\Users\ann\x.jpg"])
-def test_a_card_with_the_path_of_a_home_folder_is_refused(write, home):
-    folder = write()
+def test_a_card_with_the_path_of_a_home_folder_is_refused(write_lora, home):
+    folder = write_lora()
     with (folder / "README.md").open("a") as card:
         card.write(f"Trained on {home}, at night.\n")
-    with pytest.raises(ModelError, match=r"README\.md contains the path .*ann.*; no path of a home folder"):
+    with pytest.raises(
+        ModelError, match=r"README\.md contains the path .*ann.*; expected no path of a home folder"
+    ):
         plan_push(folder, REPO)
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_missing_file_is_named(write, name):
-    folder = write()
+def test_a_missing_file_is_named(write_lora, name):
+    folder = write_lora()
     (folder / name).unlink()
-    with pytest.raises(ModelError, match=f"{name} cannot be read .*; a LoRA's folder, with"):
+    with pytest.raises(ModelError, match=f"{name} cannot be read .*; expected a LoRA's folder, with"):
         plan_push(folder, REPO)
 
 
 @pytest.mark.parametrize(
-    ("card", "words"),
+    ("card", "message"),
     [
         ("# No front matter\n", "has no base_model, library_name, license"),
         ("---\nlicense: mit\nlibrary_name: diffusers\n---\n", "has no base_model"),
@@ -136,21 +140,21 @@ def test_a_missing_file_is_named(write, name):
         ("---\n- mit\n---\n", "is not YAML"),
     ],
 )
-def test_a_card_with_invalid_front_matter_is_refused(write, card, words):
-    folder = write()
+def test_a_card_with_invalid_front_matter_is_refused(write_lora, card, message):
+    folder = write_lora()
     (folder / "README.md").write_text(card)
-    with pytest.raises(ModelError, match=words):
+    with pytest.raises(ModelError, match=message):
         plan_push(folder, REPO)
 
 
-def test_damaged_files_and_another_prompt_are_refused(write):
-    folder = write()
+def test_damaged_files_and_another_prompt_are_refused(write_lora):
+    folder = write_lora()
     (folder / "recipe.json").write_text("{")
     with pytest.raises(ModelError, match="is not JSON"):
         plan_push(folder, REPO)
-    folder = write()
+    folder = write_lora()
     tiny("kontext", seed=8)[1].save(folder / "prompt.safetensors")
-    with pytest.raises(ModelError, match="not the prompt that the LoRA was trained with"):
+    with pytest.raises(ModelError, match="not the prompt with which the LoRA was trained"):
         plan_push(folder, REPO)
     whole = (folder / LORA_FILE).read_bytes()
     (folder / LORA_FILE).write_bytes(whole[:1000])
@@ -159,42 +163,42 @@ def test_damaged_files_and_another_prompt_are_refused(write):
 
 
 @pytest.mark.parametrize("name", ["name", "a/b/c", "a b/c", "", "-a/b"])
-def test_an_invalid_hub_id_is_refused(write, name):
-    with pytest.raises(ModelError, match=r"is not a valid hub id .*; OWNER/NAME"):
-        plan_push(write(), name)
+def test_an_invalid_hub_id_is_refused(write_lora, name):
+    with pytest.raises(ModelError, match=r"is not a valid hub id .*; expected OWNER/NAME"):
+        plan_push(write_lora(), name)
 
 
 # --- sending
 
 
-def test_a_push_makes_a_private_repository_with_the_four_files_in_one_commit(write, hub):
-    plan = plan_push(write(), REPO, message="First try")
+def test_a_push_makes_a_private_repository_with_the_four_files_in_one_commit(write_lora, hub):
+    plan = plan_push(write_lora(), REPO, message="First try")
     assert push(plan) == f"{hub.url}/{REPO}/commit/1"
     assert hub.repos == {REPO: contents(plan)}
     assert hub.private == {REPO: True}
     assert hub.messages == ["First try"]
     assert ModelCard(hub.repos[REPO]["README.md"].decode()).data.license == "other"
-    push(plan_push(write(), REPO, message="Again"))
+    push(plan_push(write_lora(), REPO, message="Again"))
     assert hub.messages == ["First try", "Again"]
 
 
-def test_a_private_upload_to_a_public_repository_is_refused(write, hub):
-    push(plan_push(write(), REPO, public=True))
+def test_a_private_upload_to_a_public_repository_is_refused(write_lora, hub):
+    push(plan_push(write_lora(), REPO, public=True))
     assert hub.private == {REPO: False}
     with pytest.raises(DownloadError, match=r"exists already and is public; .*; pass --public"):
-        push(plan_push(write(), REPO))
+        push(plan_push(write_lora(), REPO))
     assert len(hub.messages) == 1
 
 
-def test_without_a_token_no_request_is_made(write, hub, monkeypatch):
+def test_without_a_token_no_request_is_made(write_lora, hub, monkeypatch):
     monkeypatch.delenv("HF_TOKEN")
-    with pytest.raises(DownloadError, match=r"there is no token to write to .*; .*; make one at https"):
-        push(plan_push(write(), REPO))
+    with pytest.raises(DownloadError, match=r"there is no token to write to .*; .*; create one at https"):
+        push(plan_push(write_lora(), REPO))
     assert hub.requests == []
 
 
 @pytest.mark.parametrize(
-    ("path", "status", "words"),
+    ("path", "status", "message"),
     [
         ("repos/create", 403, "the token may not write to somebody/.* repositories of somebody"),
         ("/commit/", 403, "the token may not write"),
@@ -203,38 +207,38 @@ def test_without_a_token_no_request_is_made(write, hub, monkeypatch):
         ("validate-yaml", 400, r"the hub refused README\.md"),
     ],
 )
-def test_refusals_of_the_hub_are_explained(write, hub, path, status, words):
+def test_refusals_of_the_hub_are_explained(write_lora, hub, path, status, message):
     hub.refusals[path] = status
-    with pytest.raises(DownloadError, match=words):
-        push(plan_push(write(), REPO))
+    with pytest.raises(DownloadError, match=message):
+        push(plan_push(write_lora(), REPO))
     assert hub.messages == []
 
 
-def test_an_invalid_token_is_explained(write, hub):
+def test_an_invalid_token_is_explained(write_lora, hub):
     with pytest.raises(DownloadError, match="the hub refused the token"):
-        push(plan_push(write(), REPO), token="hf_wrong")
+        push(plan_push(write_lora(), REPO), token="hf_wrong")
 
 
-def test_a_server_that_is_not_a_hub_is_explained(write, hub):
+def test_a_server_that_is_not_a_hub_is_explained(write_lora, hub):
     hub.returns_html = True
     with pytest.raises(DownloadError, match=r"the server's response is not JSON .*; check HF_ENDPOINT"):
-        push(plan_push(write(), REPO))
+        push(plan_push(write_lora(), REPO))
 
 
-def test_a_missing_network_connection_is_explained(write, monkeypatch):
+def test_a_missing_network_connection_is_explained(write_lora, monkeypatch):
     monkeypatch.setattr(huggingface_hub.constants, "ENDPOINT", unused_address())
-    with pytest.raises(DownloadError, match=r"the hub cannot be reached .*; a network"):
-        push(plan_push(write(), REPO), token="hf_right")
+    with pytest.raises(DownloadError, match=r"the hub cannot be reached .*; expected a network connection"):
+        push(plan_push(write_lora(), REPO), token="hf_right")
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
     with pytest.raises(DownloadError, match="the hub cannot be reached"):
-        push(plan_push(write(), REPO), token="hf_right")
+        push(plan_push(write_lora(), REPO), token="hf_right")
 
 
 # --- the command
 
 
-def test_a_dry_run_of_the_command_prints_the_plan_and_sends_nothing(bare, write, hub):
-    folder = write()
+def test_a_dry_run_of_the_command_prints_the_plan_and_sends_nothing(bare, write_lora, hub):
+    folder = write_lora()
     code, out, err = bare("models", "push", folder, REPO, "--dry-run")
     assert (code, hub.requests) == (0, [])
     assert out.decode().splitlines()[-1] == "nothing was sent"
@@ -247,19 +251,19 @@ def test_a_dry_run_of_the_command_prints_the_plan_and_sends_nothing(bare, write,
     assert [file["name"] for file in plan["files"]] == list(FILES)
 
 
-def test_the_command_sends_and_prints_the_address(bare, write, hub):
-    code, out, _ = bare("models", "push", write(), REPO)
+def test_the_command_sends_and_prints_the_address(bare, write_lora, hub):
+    code, out, _ = bare("models", "push", write_lora(), REPO)
     assert code == 0
     assert out.decode().splitlines()[-1] == f"sent: {hub.url}/{REPO}/commit/1"
     assert set(hub.repos[REPO]) == set(FILES)
     hub.token = "hf_changed"
-    code, _, err = bare("models", "push", write(), REPO)
+    code, _, err = bare("models", "push", write_lora(), REPO)
     assert code == 1
     assert "error: the hub refused the token" in err
 
 
-def test_the_card_of_a_folder_is_printed_and_scores_are_added(bare, write, tmp_path):
-    folder = write()
+def test_the_card_of_a_folder_is_printed_and_scores_are_added(bare, write_lora, tmp_path):
+    folder = write_lora()
     code, out, _ = bare("models", "card", folder)
     assert (code, out.decode()) == (0, (folder / "README.md").read_text() + "\n")
     (tmp_path / "half.json").write_text('{"metrics": {}}')

@@ -37,7 +37,7 @@ def backbone():
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    """A data folder with a set, pairs, and pairs with reflections."""
+    """A data folder with a rendered set, pairs without reflection, and pairs with reflection."""
     root = tmp_path_factory.mktemp("data")
     make(root / "set", count=3)
     for folder, roles in (
@@ -64,64 +64,68 @@ def recipe(root, monkeypatch):
 
 
 RENDERED = {"rendered": {"sets": ["set"], "target": "transmission"}}
-LARGE = {"pairs": ["large"], "pairs_share": 1.0}
-"""Three samples with twice the side of a panel."""
+LARGE_PAIRS = {"pairs": ["large"], "pairs_share": 1.0}
+"""Data with three pairs whose sides are twice those of a panel."""
 
 
-def test_panels_are_the_whole_sample_in_its_own_aspect_ratio(recipe, root, backbone):
-    wanted = recipe(RENDERED)
-    samples = open_samples(wanted)
+def test_panels_show_the_whole_sample_in_its_aspect_ratio(recipe, root, backbone):
+    lora_recipe = recipe(RENDERED)
+    samples = open_samples(lora_recipe)
     assert len(samples) == 3
     for number, entry in enumerate(read_set(root / "set")):
-        fit = fit_sample(samples[number].layers, backbone, wanted)
+        fit = fit_sample(samples[number].layers, backbone, lora_recipe)
         panels = make_panels(samples[number].layers, fit)
         assert (fit.content, fit.panel) == ((24, 16), (32, 16))
         for letter, name in zip("ITR", ("photo", "transmission", "reflection"), strict=True):
-            picture = torch.from_numpy(Photo.open(entry.read(f"{name}.jpg")).pixels.copy())
+            image = torch.from_numpy(Photo.open(entry.read(f"{name}.jpg")).pixels.copy())
             whole = (fit.crop(panels[letter])[0].permute(1, 2, 0) + 1) * 127.5
-            torch.testing.assert_close(whole, picture.float(), atol=0.01, rtol=0)
+            torch.testing.assert_close(whole, image.float(), atol=0.01, rtol=0)
 
 
 def test_an_encoded_sample_depends_on_the_rng_alone_and_is_encoded_once(recipe, backbone, monkeypatch):
-    wanted = recipe(RENDERED)
-    one, other = (LatentEncoder(open_samples(wanted), backbone, wanted) for _ in range(2))
+    lora_recipe = recipe(RENDERED)
+    one, other = (LatentEncoder(open_samples(lora_recipe), backbone, lora_recipe) for _ in range(2))
     for slot in range(4):
         other(SampleRng(1, 0, slot))
     assert torch.equal(one(SampleRng(1, 7, 0)).composite, other(SampleRng(1, 7, 0)).composite)
     assert one(SampleRng(1, 7, 0)) is one(SampleRng(1, 7, 0))
     grid = one(SampleRng(1, 7, 0)).composite
     assert grid.shape[2:] == (1, 6)
-    assert {tuple(panel.shape[2:]) for panel in split(grid, wanted.layout).values()} == {(1, 2)}
+    assert {tuple(panel.shape[2:]) for panel in split(grid, lora_recipe.layout).values()} == {(1, 2)}
 
 
 def test_samples_are_mirrored_at_random_unless_the_recipe_disables_it(recipe, backbone):
     counts = []
     for flip in (True, False):
-        wanted = recipe(RENDERED, flip=flip)
-        latents = LatentEncoder(open_samples(wanted), backbone, wanted)
+        lora_recipe = recipe(RENDERED, flip=flip)
+        latents = LatentEncoder(open_samples(lora_recipe), backbone, lora_recipe)
         counts.append(len({id(latents(SampleRng(1, step, 0))) for step in range(60)}))
     assert counts == [6, 3]
 
 
-def test_each_sample_has_the_whole_and_as_many_crops_as_the_recipe_states(recipe, backbone):
-    for crops, seen in ((0, 6), (2, 18)):
-        wanted = recipe(LARGE, crops=crops)
-        latents = LatentEncoder(open_samples(wanted), backbone, wanted)
+def test_each_sample_is_used_whole_and_in_the_number_of_crops_of_the_recipe(recipe, backbone):
+    for crops, count in ((0, 6), (2, 18)):
+        lora_recipe = recipe(LARGE_PAIRS, crops=crops)
+        latents = LatentEncoder(open_samples(lora_recipe), backbone, lora_recipe)
         encoded = {id(each): each for each in (latents(SampleRng(1, step, 0)) for step in range(200))}
-        assert len(encoded) == seen
+        assert len(encoded) == count
         different = {each.composite.numpy().tobytes() for each in encoded.values()}
-        assert len(different) == seen
+        assert len(different) == count
         assert {each.composite.shape for each in encoded.values()} == {(1, 64, 1, 6)}
 
 
 def test_a_crop_depends_on_seed_sample_and_crop_number_alone(recipe, backbone):
-    def encoded(number, crop, **changes):
-        wanted = recipe(LARGE, crops=3, **changes)
-        return LatentEncoder(open_samples(wanted), backbone, wanted)._encode(number, False, crop).composite
+    def encode(number, crop, **changes):
+        lora_recipe = recipe(LARGE_PAIRS, crops=3, **changes)
+        return (
+            LatentEncoder(open_samples(lora_recipe), backbone, lora_recipe)
+            ._encode(number, False, crop)
+            .composite
+        )
 
-    assert torch.equal(encoded(1, 2), encoded(1, 2, steps=9, flip=False))
-    for other in (encoded(1, 1), encoded(0, 2), encoded(1, 2, seed=2), encoded(1, 0)):
-        assert not torch.equal(encoded(1, 2), other)
+    assert torch.equal(encode(1, 2), encode(1, 2, steps=9, flip=False))
+    for other in (encode(1, 1), encode(0, 2), encode(1, 2, seed=2), encode(1, 0)):
+        assert not torch.equal(encode(1, 2), other)
 
 
 @given(st.integers(16, 300), st.integers(16, 300), st.integers(1, 99), st.integers(0, 99))
@@ -154,10 +158,10 @@ def test_real_pairs_are_drawn_with_the_probability_pairs_share(recipe, root):
     assert 30 < chosen.count(3) < 70
 
 
-def test_data_without_a_share_is_not_read(recipe):
-    gone = {"sets": ["gone"]}
-    assert len(open_samples(recipe({**RENDERED, "pairs": ["gone"], "pairs_share": 0.0}))) == 3
-    assert len(open_samples(recipe({"rendered": gone, "pairs": ["trios"], "pairs_share": 1.0}))) == 1
+def test_data_with_probability_0_is_not_read(recipe):
+    absent = {"sets": ["absent"]}
+    assert len(open_samples(recipe({**RENDERED, "pairs": ["absent"], "pairs_share": 0.0}))) == 3
+    assert len(open_samples(recipe({"rendered": absent, "pairs": ["trios"], "pairs_share": 1.0}))) == 1
 
 
 def test_pairs_without_reflections_are_refused_where_r_is_a_panel(recipe):
@@ -176,14 +180,14 @@ def test_a_given_reflection_has_weight_one_and_a_missing_one_is_the_difference_i
     assert given.reflection_weight == 1
     assert [given.layers[0, 0, channel].item() for channel in (0, 3, 6)] == [200, 130, 60]
     both = (torch.full((2, 2, 3), value, dtype=torch.uint8) for value in (188, 137))
-    left = layers_from_pair(*both)[0, 0, 6].item()
-    assert left == 138  # in linear light: 188 is a half, 137 a quarter, and so is the difference
+    difference = layers_from_pair(*both)[0, 0, 6].item()
+    assert difference == 138  # 188 is 1/2 in linear light and 137 is 1/4, so the difference is 1/4
 
 
 def test_a_sample_that_is_smaller_than_a_panel_is_refused_with_the_budget_that_fits(recipe, backbone):
-    wanted = recipe(RENDERED, budget_px=10**6)
+    lora_recipe = recipe(RENDERED, budget_px=10**6)
     with pytest.raises(PhotoError, match="lower budget_px to 768"):
-        LatentEncoder(open_samples(wanted), backbone, wanted)
+        LatentEncoder(open_samples(lora_recipe), backbone, lora_recipe)
     pair = recipe({"pairs": ["trios"], "pairs_share": 1.0}, budget_px=10**6)
     with pytest.raises(PhotoError, match="lower budget_px to"):
         LatentEncoder(open_samples(pair), backbone, pair)
@@ -194,7 +198,7 @@ def test_too_few_rendered_samples_are_refused(recipe):
         open_samples(recipe({"rendered": {"sets": ["set"], "count": 9}}))
 
 
-def test_crops_have_half_to_all_of_the_samples_sides():
+def test_the_sides_of_crops_are_0_5_to_1_times_those_of_the_sample():
     fit = fit_panel((300, 200), PanelLayout(), budget_px=3 * 48 * 32, multiple=16)
     whole = torch.zeros(200, 300, 9, dtype=torch.uint8)
     shares = [crop_sample(SampleRng(seed, -1, 1), whole, fit).shape[0] / 200 for seed in range(200)]

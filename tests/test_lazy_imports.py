@@ -1,4 +1,4 @@
-"""Third-party libraries are imported late and without output, and their errors are translated."""
+"""Third-party libraries are imported at their first use and without output, and their errors are converted."""
 
 import subprocess
 import sys
@@ -12,22 +12,24 @@ from brewster.models.diffusion.backbones import encode_prompt, load_backbone
 from brewster.models.diffusion.lazy_imports import import_library
 
 
-def hub_error(kind, status, **headers):
+def hub_error(error_class, status, **headers):
     """An error as huggingface_hub raises it for this status."""
     httpx = sys.modules[hub_errors.Response.__module__.split(".")[0]]
     request = httpx.Request("GET", "https://huggingface.co/api/models/owner/name")
-    return kind(f"{status} Client Error.", response=httpx.Response(status, request=request, headers=headers))
+    return error_class(
+        f"{status} Client Error.", response=httpx.Response(status, request=request, headers=headers)
+    )
 
 
-def caused_by(http_error):
-    """The error that snapshot_download raises if the cache is empty as well."""
+def missing_entry_error(http_error):
+    """The error that snapshot_download raises if the request fails and the cache is empty."""
     error = hub_errors.LocalEntryNotFoundError("Got: HfHubHTTPError")
     error.__cause__ = http_error
     return error
 
 
 @pytest.mark.parametrize(
-    ("error", "words"),
+    ("error", "message"),
     [
         (
             hub_error(hub_errors.GatedRepoError, 401),
@@ -40,19 +42,22 @@ def caused_by(http_error):
         (hub_error(hub_errors.RepositoryNotFoundError, 401), "the hub has no model .*hf auth login"),
         (hub_error(hub_errors.HfHubHTTPError, 401), "refused the token.*settings/tokens"),
         (hub_error(hub_errors.HfHubHTTPError, 503), "returned HTTP 503.*try again later"),
-        (caused_by(hub_error(hub_errors.HfHubHTTPError, 503)), "returned HTTP 503.*try again later"),
+        (
+            missing_entry_error(hub_error(hub_errors.HfHubHTTPError, 503)),
+            "returned HTTP 503.*try again later",
+        ),
         (OSError(28, "No space left on device"), "No space left on device.*HF_HOME"),
         (hub_errors.LocalEntryNotFoundError("no network"), "not in the cache and the hub cannot be reached"),
-        (hub_errors.OfflineModeIsEnabled("HF_HUB_OFFLINE"), "the hub cannot be reached.*give the folder"),
+        (hub_errors.OfflineModeIsEnabled("HF_HUB_OFFLINE"), "the hub cannot be reached.*pass its folder"),
     ],
 )
 @pytest.mark.parametrize("load", [load_backbone, encode_prompt])
-def test_errors_of_the_hub_are_explained(monkeypatch, error, words, load):
+def test_errors_of_the_hub_are_explained(monkeypatch, error, message, load):
     def refuse(*_, **__):
         raise error
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", refuse)
-    with pytest.raises(DownloadError, match=words) as raised:
+    with pytest.raises(DownloadError, match=message) as raised:
         load("kontext")
     assert "black-forest-labs/FLUX.1-Kontext-dev" in str(raised.value)
 

@@ -9,14 +9,14 @@ from torch import nn
 from brewster.errors import ModelError
 from brewster.models.diffusion.adapter.lora import (
     LORA_FILE,
-    LoraCard,
+    LoraMetadata,
     add_lora,
     has_lora,
     load_lora,
     load_lora_state,
     lora_parameters,
     lora_state,
-    read_card,
+    read_lora_metadata,
     remove_lora,
     save_lora,
 )
@@ -42,7 +42,7 @@ def velocity(backbone, prompt):
     return backbone.predict(latents, condition, torch.tensor([0.7]), prompt, 4.0)
 
 
-def trained(backbone, *, alpha=16, rank=4):
+def add_trained_lora(backbone, *, alpha=16, rank=4):
     """Adds a LoRA with nonzero B matrices, as after training."""
     add_lora(backbone, rank=rank, alpha=alpha, seed=2)
     generator = torch.Generator().manual_seed(4)
@@ -52,7 +52,7 @@ def trained(backbone, *, alpha=16, rank=4):
     return backbone
 
 
-def test_every_linear_layer_of_the_blocks_is_changed_and_nothing_else(tiny_model):
+def test_all_linear_layers_of_the_blocks_and_no_others_are_adapted(tiny_model):
     backbone, _ = tiny_model
     targets = backbone.lora_targets()
     linear = {name for name, module in backbone.transformer.named_modules() if isinstance(module, nn.Linear)}
@@ -67,7 +67,7 @@ def test_every_linear_layer_of_the_blocks_is_changed_and_nothing_else(tiny_model
     assert backbone.lora_targets() == targets
 
 
-def test_a_fresh_lora_changes_nothing_and_is_all_that_is_trained(tiny_model):
+def test_a_new_lora_changes_no_prediction_and_only_its_parameters_are_trained(tiny_model):
     backbone, prompt = tiny_model
     before = velocity(backbone, prompt)
     parameters = add_lora(backbone, rank=4)
@@ -113,13 +113,13 @@ def test_a_saved_lora_gives_the_same_prediction_reloaded_and_in_diffusers(tiny_m
     backbone, prompt = tiny_model
     plain = copy.deepcopy(backbone.transformer)
     untouched = velocity(backbone, prompt)
-    with_lora = velocity(trained(backbone, alpha=alpha), prompt)
+    with_lora = velocity(add_trained_lora(backbone, alpha=alpha), prompt)
     assert (with_lora - untouched).abs().max() > 1e-3
-    card = save_lora(tmp_path, backbone, prompt, DecompositionTask())
+    metadata = save_lora(tmp_path, backbone, prompt, DecompositionTask())
 
     backbone.transformer = copy.deepcopy(plain)
-    assert load_lora(tmp_path, backbone)[0] == card == read_card(tmp_path)
-    assert (card.rank, card.alpha, card.prompt_sha256) == (4, alpha, prompt.sha256)
+    assert load_lora(tmp_path, backbone)[0] == metadata == read_lora_metadata(tmp_path)
+    assert (metadata.rank, metadata.alpha, metadata.prompt_sha256) == (4, alpha, prompt.sha256)
     torch.testing.assert_close(velocity(backbone, prompt), with_lora, atol=1e-6, rtol=0)
 
     backbone.transformer = plain
@@ -129,7 +129,7 @@ def test_a_saved_lora_gives_the_same_prediction_reloaded_and_in_diffusers(tiny_m
 
 def test_the_same_lora_gives_the_same_bytes(kontext, tmp_path):
     backbone, prompt = kontext
-    trained(backbone)
+    add_trained_lora(backbone)
     for name in "ab":
         save_lora(tmp_path / name, backbone, prompt, DecompositionTask())
     assert (tmp_path / "a" / LORA_FILE).read_bytes() == (tmp_path / "b" / LORA_FILE).read_bytes()
@@ -137,7 +137,7 @@ def test_the_same_lora_gives_the_same_bytes(kontext, tmp_path):
 
 def test_a_state_of_the_weights_alone_can_be_loaded(kontext):
     backbone, prompt = kontext
-    state = {name: tensor.clone() for name, tensor in lora_state(trained(backbone)).items()}
+    state = {name: tensor.clone() for name, tensor in lora_state(add_trained_lora(backbone)).items()}
     expected = velocity(backbone, prompt)
     with torch.no_grad():
         for parameter in lora_parameters(backbone):
@@ -149,7 +149,7 @@ def test_a_state_of_the_weights_alone_can_be_loaded(kontext):
 def test_removing_a_lora_restores_the_backbone(tiny_model):
     backbone, prompt = tiny_model
     before = velocity(backbone, prompt)
-    remove_lora(trained(backbone))
+    remove_lora(add_trained_lora(backbone))
     assert not has_lora(backbone)
     assert lora_state(backbone) == {}
     assert torch.equal(velocity(backbone, prompt), before)
@@ -157,30 +157,32 @@ def test_removing_a_lora_restores_the_backbone(tiny_model):
 
 def test_a_lora_of_another_backbone_is_refused(kontext, tmp_path):
     backbone, prompt = kontext
-    save_lora(tmp_path, trained(backbone), prompt, DecompositionTask())
-    with pytest.raises(ModelError, match="is a LoRA of kontext; a LoRA of klein; load the backbone kontext"):
+    save_lora(tmp_path, add_trained_lora(backbone), prompt, DecompositionTask())
+    with pytest.raises(
+        ModelError, match="is a LoRA of kontext; expected a LoRA of klein; load the backbone kontext"
+    ):
         load_lora(tmp_path, tiny("klein")[0])
 
 
-def changed_card(folder, **changes):
-    tensors, about = read_tensors(folder / LORA_FILE)
-    card = vars(LoraCard.from_json(about["brewster"])) | changes
-    write_tensors(folder / LORA_FILE, tensors, about | {"brewster": LoraCard(**card).to_json()})
+def change_metadata(folder, **changes):
+    tensors, entries = read_tensors(folder / LORA_FILE)
+    metadata = vars(LoraMetadata.from_json(entries["brewster"])) | changes
+    write_tensors(folder / LORA_FILE, tensors, entries | {"brewster": LoraMetadata(**metadata).to_json()})
 
 
-def test_a_card_that_does_not_match_its_weights_is_refused_without_side_effects(kontext, tmp_path):
+def test_metadata_that_does_not_match_the_weights_is_refused_without_side_effects(kontext, tmp_path):
     backbone, prompt = kontext
-    save_lora(tmp_path, trained(backbone), prompt, DecompositionTask())
-    changed_card(tmp_path, rank=8)
+    save_lora(tmp_path, add_trained_lora(backbone), prompt, DecompositionTask())
+    change_metadata(tmp_path, rank=8)
     fresh, _ = tiny("kontext", seed=1)
-    with pytest.raises(ModelError, match=r"has the shape \(4, 32\); \(8, 32\); use the rank"):
+    with pytest.raises(ModelError, match=r"has the shape \(4, 32\); expected \(8, 32\); use the rank"):
         load_lora(tmp_path, fresh)
     assert not has_lora(fresh)
 
 
 def test_a_smaller_backbone_of_the_same_family_is_refused(kontext, tmp_path):
     backbone, prompt = kontext
-    save_lora(tmp_path, trained(backbone), prompt, DecompositionTask())
+    save_lora(tmp_path, add_trained_lora(backbone), prompt, DecompositionTask())
     fresh, _ = tiny("kontext", seed=1)
     fresh.transformer.single_transformer_blocks = fresh.transformer.single_transformer_blocks[:1]
     with pytest.raises(ModelError, match=r"missing or unexpected, for example single_transformer_blocks\.1"):
@@ -189,17 +191,17 @@ def test_a_smaller_backbone_of_the_same_family_is_refused(kontext, tmp_path):
 
 def test_another_prompt_in_the_folder_is_refused(kontext, tmp_path):
     backbone, prompt = kontext
-    save_lora(tmp_path, trained(backbone), prompt, DecompositionTask())
-    changed_card(tmp_path, prompt_sha256="0" * 64)
-    with pytest.raises(ModelError, match="is not the prompt that the LoRA was trained with"):
+    save_lora(tmp_path, add_trained_lora(backbone), prompt, DecompositionTask())
+    change_metadata(tmp_path, prompt_sha256="0" * 64)
+    with pytest.raises(ModelError, match="is not the prompt with which the LoRA was trained"):
         load_lora(tmp_path, tiny("kontext")[0])
 
 
-def test_a_corrupt_or_foreign_or_missing_file_is_refused(kontext, tmp_path):
+def test_a_damaged_missing_or_other_file_is_refused(kontext, tmp_path):
     backbone, prompt = kontext
     with pytest.raises(ModelError, match="is missing"):
         load_lora(tmp_path, backbone)
-    save_lora(tmp_path, trained(backbone), prompt, DecompositionTask())
+    save_lora(tmp_path, add_trained_lora(backbone), prompt, DecompositionTask())
     path = tmp_path / LORA_FILE
     tensors, _ = read_tensors(path)
     path.write_bytes(path.read_bytes()[:1000])
@@ -207,10 +209,10 @@ def test_a_corrupt_or_foreign_or_missing_file_is_refused(kontext, tmp_path):
         load_lora(tmp_path, backbone)
     write_tensors(path, tensors, {})
     with pytest.raises(ModelError, match="was not written by brewster"):
-        read_card(tmp_path)
+        read_lora_metadata(tmp_path)
     write_tensors(path, tensors, {"brewster": '{"rank": 4}'})
-    with pytest.raises(ModelError, match="the card of the LoRA cannot be read"):
-        read_card(tmp_path)
+    with pytest.raises(ModelError, match="the metadata of the LoRA cannot be read"):
+        read_lora_metadata(tmp_path)
 
 
 def test_a_second_lora_and_saving_without_a_lora_are_refused(kontext, tmp_path):
@@ -226,7 +228,7 @@ def test_a_second_lora_and_saving_without_a_lora_are_refused(kontext, tmp_path):
         save_lora(tmp_path, backbone, tiny("klein")[1], DecompositionTask())
 
 
-def test_a_card_survives_a_round_trip_through_json():
+def test_metadata_survives_a_round_trip_through_json():
     task = DecompositionTask(PanelLayout(("T", "R"), "stacked"), 4096, "one_step", 1.0)
-    card = LoraCard("qwen", "Qwen/Qwen-Image-Edit", "int8", 16, 8, task, "abc")
-    assert LoraCard.from_json(card.to_json()) == card
+    metadata = LoraMetadata("qwen", "Qwen/Qwen-Image-Edit", "int8", 16, 8, task, "abc")
+    assert LoraMetadata.from_json(metadata.to_json()) == metadata

@@ -266,7 +266,7 @@ def test_an_encoded_prompt_is_used_if_it_was_encoded_for_this_backbone(recipe, t
     trainer = LoraTrainer(recipe(prompt=str(tmp_path / "kontext.safetensors")))
     trainer.initialize()
     assert trainer.prompt.sha256 == tiny("kontext", seed=5)[1].sha256
-    with pytest.raises(ModelError, match="encoded for klein; a prompt for kontext"):
+    with pytest.raises(ModelError, match="encoded for klein; expected a prompt for kontext"):
         LoraTrainer(recipe(prompt=str(tmp_path / "klein.safetensors"))).initialize()
 
 

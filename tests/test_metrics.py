@@ -15,55 +15,55 @@ from brewster.errors import BrewsterError
 from brewster.metrics import METRICS, Metric, find_metric, psnr, ssim
 
 GAUSSIAN = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 255}
-PEERS = {"uniform": {"channel_axis": 2}, "gaussian": {"channel_axis": 2, **GAUSSIAN}}
+SCIKIT_ARGUMENTS = {"uniform": {"channel_axis": 2}, "gaussian": {"channel_axis": 2, **GAUSSIAN}}
 BORDERS = {"uniform": 3, "gaussian": 5}
 
-pictures = arrays(np.uint8, (13, 17, 3))
+images = arrays(np.uint8, (13, 17, 3))
 masks = arrays(np.bool_, (13, 17))
-windows = st.sampled_from(sorted(PEERS))
+windows = st.sampled_from(sorted(SCIKIT_ARGUMENTS))
 
 
-@given(pictures, pictures)
+@given(images, images)
 def test_psnr_equals_scikit_image(one, other):
     if (one != other).any():
         assert psnr(one, other) == pytest.approx(peak_signal_noise_ratio(other, one), abs=1e-9)
 
 
-@given(pictures, pictures, windows)
+@given(images, images, windows)
 def test_ssim_equals_scikit_image_with_either_window(one, other, window):
-    peer = structural_similarity(other, one, **PEERS[window])
-    assert ssim(one, other, window=window) == pytest.approx(peer, abs=1e-9)
+    expected = structural_similarity(other, one, **SCIKIT_ARGUMENTS[window])
+    assert ssim(one, other, window=window) == pytest.approx(expected, abs=1e-9)
 
 
-@pytest.mark.parametrize("window", PEERS)
+@pytest.mark.parametrize("window", SCIKIT_ARGUMENTS)
 @pytest.mark.parametrize("size", [(11, 11), (11, 40), (40, 12), (33, 47)])
 def test_ssim_equals_scikit_image_at_any_size_and_near_white(random, size, window):
     one, other = random.integers(230, 256, (2, *size, 3), np.uint8)
-    peer = structural_similarity(other, one, **PEERS[window])
-    assert ssim(one, other, window=window) == pytest.approx(peer, abs=1e-9)
+    expected = structural_similarity(other, one, **SCIKIT_ARGUMENTS[window])
+    assert ssim(one, other, window=window) == pytest.approx(expected, abs=1e-9)
 
 
-def test_equal_pictures_have_infinite_psnr_and_an_ssim_of_one(random):
-    picture = random.integers(0, 256, (12, 12, 3), np.uint8)
-    assert psnr(picture, picture) == float("inf")
-    assert ssim(picture, picture) == ssim(picture, picture, window="gaussian") == pytest.approx(1)
+def test_equal_images_have_infinite_psnr_and_an_ssim_of_one(random):
+    image = random.integers(0, 256, (12, 12, 3), np.uint8)
+    assert psnr(image, image) == float("inf")
+    assert ssim(image, image) == ssim(image, image, window="gaussian") == pytest.approx(1)
 
 
 @pytest.mark.parametrize(("offset", "decibels"), [(1, 48.1308), (10, 28.1308), (100, 8.1308)])
 def test_a_constant_offset_has_a_known_psnr(offset, decibels):
-    picture = np.full((8, 8, 3), 100, np.uint8)
-    assert psnr(picture + np.uint8(offset), picture) == pytest.approx(decibels, abs=1e-4)
-    assert psnr(picture, picture + np.uint8(offset)) == pytest.approx(decibels, abs=1e-4)
+    image = np.full((8, 8, 3), 100, np.uint8)
+    assert psnr(image + np.uint8(offset), image) == pytest.approx(decibels, abs=1e-4)
+    assert psnr(image, image + np.uint8(offset)) == pytest.approx(decibels, abs=1e-4)
 
 
-def test_two_uniform_pictures_have_the_ssim_of_their_means():
+def test_two_uniform_images_have_the_ssim_of_their_means():
     black, white = np.zeros((11, 11, 3), np.uint8), np.full((11, 11, 3), 255, np.uint8)
     constant = (0.01 * 255) ** 2
-    for window in PEERS:
+    for window in SCIKIT_ARGUMENTS:
         assert ssim(black, white, window=window) == pytest.approx(constant / (255**2 + constant))
 
 
-def test_pictures_may_have_any_memory_layout(random):
+def test_images_may_have_any_memory_layout(random):
     one, other = random.integers(0, 256, (2, 20, 26, 3), np.uint8)
     for a, b in ((one[::-1, ::2], other[::-1, ::2]), (one.transpose(1, 0, 2), other.transpose(1, 0, 2))):
         assert psnr(a, b) == psnr(a.copy(), b.copy())
@@ -73,17 +73,17 @@ def test_pictures_may_have_any_memory_layout(random):
 # --- in a region
 
 
-@given(pictures, pictures, windows)
-def test_a_region_that_is_the_whole_picture_changes_nothing(one, other, window):
+@given(images, images, windows)
+def test_a_region_that_is_the_whole_image_changes_nothing(one, other, window):
     whole = np.ones(one.shape[:2], bool)
     assert psnr(one, other, region=whole) == psnr(one, other)
     assert ssim(one, other, window=window, region=whole) == pytest.approx(ssim(one, other, window=window))
 
 
-@given(pictures, pictures, masks, windows)
+@given(images, images, masks, windows)
 def test_ssim_in_a_region_is_the_mean_of_the_map_of_scikit_image(one, other, mask, window):
     border = BORDERS[window]
-    _, ssim_map = structural_similarity(other, one, full=True, **PEERS[window])
+    _, ssim_map = structural_similarity(other, one, full=True, **SCIKIT_ARGUMENTS[window])
     inner = (slice(border, -border),) * 2
     if mask[inner].any():
         expected = ssim_map[inner][mask[inner]].mean()
@@ -95,28 +95,28 @@ def test_ssim_in_a_region_is_the_mean_of_the_map_of_scikit_image(one, other, mas
 
 def test_psnr_in_a_region_ignores_all_other_pixels(random):
     truth = random.integers(0, 200, (9, 9, 3), np.uint8)
-    picture, region = truth.copy(), np.zeros((9, 9), bool)
-    picture[:3] += np.uint8(10)
+    image, region = truth.copy(), np.zeros((9, 9), bool)
+    image[:3] += np.uint8(10)
     region[:3, 2:5] = True
-    assert psnr(picture, truth, region=region) == pytest.approx(28.1308, abs=1e-4)
-    assert psnr(picture, truth, region=~region & (picture == truth).all(2)) == float("inf")
+    assert psnr(image, truth, region=region) == pytest.approx(28.1308, abs=1e-4)
+    assert psnr(image, truth, region=~region & (image == truth).all(2)) == float("inf")
 
 
 @pytest.mark.parametrize("metric", [psnr, ssim])
 def test_an_empty_region_and_one_of_another_shape_are_refused(metric):
-    picture = np.zeros((9, 9, 3), np.uint8)
+    image = np.zeros((9, 9, 3), np.uint8)
     with pytest.raises(ValueError, match="empty"):
-        metric(picture, picture, region=np.zeros((9, 9), bool))
+        metric(image, image, region=np.zeros((9, 9), bool))
     for wrong in (np.ones((9, 8), bool), np.ones((9, 9), np.uint8), np.ones((9, 9, 1), bool)):
         with pytest.raises(ValueError, match=r"must be bool \(9, 9\)"):
-            metric(picture, picture, region=wrong)
+            metric(image, image, region=wrong)
 
 
 def test_a_region_at_the_border_has_no_ssim():
-    picture, region = np.zeros((9, 9, 3), np.uint8), np.zeros((9, 9), bool)
+    image, region = np.zeros((9, 9, 3), np.uint8), np.zeros((9, 9), bool)
     region[:3] = True
     with pytest.raises(ValueError, match="within 3 pixels of the border"):
-        ssim(picture, picture, region=region)
+        ssim(image, image, region=region)
 
 
 # --- invalid input
@@ -124,7 +124,7 @@ def test_a_region_at_the_border_has_no_ssim():
 
 @pytest.mark.parametrize("metric", [psnr, ssim])
 @pytest.mark.parametrize(
-    ("picture", "why"),
+    ("image", "why"),
     [
         (np.zeros((8, 9, 3), np.uint8), "shape"),
         (np.zeros((8, 8, 4), np.uint8), r"must be uint8 \(H, W, 3\), not uint8 \(8, 8, 4\)"),
@@ -134,15 +134,15 @@ def test_a_region_at_the_border_has_no_ssim():
         (np.zeros((0, 8, 3), np.uint8), "must be"),
     ],
 )
-def test_pictures_of_another_type_or_shape_are_refused(metric, picture, why):
+def test_images_of_another_type_or_shape_are_refused(metric, image, why):
     truth = np.zeros((8, 8, 3), np.uint8)
-    for pair in ((picture, truth), (truth, picture)):
+    for pair in ((image, truth), (truth, image)):
         with pytest.raises(ValueError, match=why):
             metric(*pair)
 
 
 @pytest.mark.parametrize(("window", "side"), [("uniform", 7), ("gaussian", 11)])
-def test_a_picture_smaller_than_the_window_is_refused(window, side):
+def test_an_image_smaller_than_the_window_is_refused(window, side):
     with pytest.raises(ValueError, match=f"at least {side}x{side} pixels, not {side - 1}x20"):
         ssim(*np.zeros((2, side - 1, 20, 3), np.uint8), window=window)
     assert ssim(*np.zeros((2, side, side, 3), np.uint8), window=window) == 1
@@ -151,7 +151,7 @@ def test_a_picture_smaller_than_the_window_is_refused(window, side):
 # --- the table
 
 
-def test_the_table_names_each_metric_once_and_defines_it():
+def test_the_table_has_each_metric_once_with_a_definition():
     assert [metric.name for metric in METRICS.values()] == list(METRICS)
     assert len({metric.title for metric in METRICS.values()}) == len(METRICS)
     for metric in METRICS.values():
@@ -167,8 +167,8 @@ def test_a_metric_is_found_by_name_and_a_typing_error_gets_a_suggestion():
     assert isinstance(find_metric("lpips"), Metric)
     with pytest.raises(BrewsterError, match=r"no metric 'lpisp'.*did you mean lpips\?"):
         find_metric("lpisp")
-    with pytest.raises(BrewsterError, match=r"metrics are psnr, ssim, .* choose one"):
-        find_metric("beauty")
+    with pytest.raises(BrewsterError, match=r"expected one of psnr, ssim, .* choose one"):
+        find_metric("sharpness")
 
 
 def test_exports_are_in_order():

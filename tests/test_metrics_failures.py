@@ -1,4 +1,4 @@
-"""The failure metrics (removed content, remaining reflection) on panes that are computed here in linear light."""
+"""The failure metrics (removed content, remaining reflection) on scenes that these tests compute in linear light."""
 
 import contextlib
 
@@ -16,26 +16,30 @@ TRANSMITTANCE = 0.8
 WHITE = (slice(4, 20), slice(4, 20))  # a white sheet behind the left half, which has no reflection
 SCORES = (removed_content, removed_white, kept_reflection)
 
-pictures = arrays(np.uint8, (16, 16, 3))
+images = arrays(np.uint8, (16, 16, 3))
 
 
 def encode(light):
     return (to_encoded(light.clip(0, 1)) * 255).round().astype(np.uint8)
 
 
-def brighten(picture, gain):
-    return encode(to_linear(picture / 255) * gain)
+def brighten(image, gain):
+    return encode(to_linear(image / 255) * gain)
 
 
 @pytest.fixture
 def scene():
     """Background, photo and reflection; only the right half of the pane has a reflection."""
     random = np.random.default_rng(7)
-    behind = random.uniform(0.05, 0.4, (SIDE, SIDE, 3))
-    behind[WHITE] = 0.8
-    mirrored = np.zeros_like(behind)
-    mirrored[:, SIDE // 2 :] = random.uniform(0.1, 0.3, (SIDE, SIDE // 2, 3))
-    return encode(behind), encode(TRANSMITTANCE * behind + mirrored), encode(mirrored)
+    background_light = random.uniform(0.05, 0.4, (SIDE, SIDE, 3))
+    background_light[WHITE] = 0.8
+    reflection_light = np.zeros_like(background_light)
+    reflection_light[:, SIDE // 2 :] = random.uniform(0.1, 0.3, (SIDE, SIDE // 2, 3))
+    return (
+        encode(background_light),
+        encode(TRANSMITTANCE * background_light + reflection_light),
+        encode(reflection_light),
+    )
 
 
 def test_the_background_itself_scores_zero(scene):
@@ -50,21 +54,21 @@ def test_a_prediction_that_does_not_restore_absorbed_light_scores_zero(scene, ga
     assert scores == pytest.approx([0, 0, 0], abs=0.01)
 
 
-def test_the_photo_itself_keeps_all_of_the_reflection_and_removes_nothing(scene):
+def test_the_unprocessed_photo_contains_all_of_the_reflection_and_all_content(scene):
     background, photo, reflection = scene
     content, white, remaining = (score(photo, background, photo, reflection) for score in SCORES)
     assert (content, white) == pytest.approx((0, 0), abs=0.01)
     assert remaining == pytest.approx(1, abs=0.01)
 
 
-def test_half_of_the_reflection_counts_half(scene):
+def test_a_prediction_with_half_of_the_reflection_scores_one_half(scene):
     background, photo, reflection = scene
-    light = [to_linear(picture / 255) for picture in (background, reflection)]
+    light = [to_linear(image / 255) for image in (background, reflection)]
     prediction = encode(light[0] + light[1] / 2)
     assert kept_reflection(prediction, background, photo, reflection) == pytest.approx(0.5, abs=0.01)
 
 
-def test_a_white_sheet_taken_for_a_highlight_is_removed_white(scene):
+def test_a_removed_white_sheet_counts_as_removed_white(scene):
     background, photo, reflection = scene
     prediction = background.copy()
     prediction[WHITE] = 0
@@ -75,7 +79,7 @@ def test_a_white_sheet_taken_for_a_highlight_is_removed_white(scene):
     assert kept_reflection(prediction, background, photo, reflection) == 0
 
 
-def test_a_black_prediction_removes_everything_and_keeps_nothing(scene):
+def test_a_black_prediction_removes_all_content_and_all_reflection(scene):
     background, photo, reflection = scene
     assert [score(np.zeros_like(photo), background, photo, reflection) for score in SCORES] == [1, 1, 0]
 
@@ -92,32 +96,32 @@ def test_a_third_of_the_pixels_at_half_their_light_does_not_change_the_gain(scen
     assert removed_content(encode(prediction), background, photo, reflection) == pytest.approx(lost, abs=0.01)
 
 
-def halves(share):
+def scene_with_share(share):
     """Background, photo and reflection; in the right half, this share of the photo's light is reflection."""
-    behind = np.full((SIDE, SIDE, 3), 0.3)
-    mirrored = np.zeros_like(behind)
-    mirrored[:, SIDE // 2 :] = 0.3 * share / (1 - share)
-    return encode(behind), encode(behind + mirrored), encode(mirrored)
+    background_light = np.full((SIDE, SIDE, 3), 0.3)
+    reflection_light = np.zeros_like(background_light)
+    reflection_light[:, SIDE // 2 :] = 0.3 * share / (1 - share)
+    return encode(background_light), encode(background_light + reflection_light), encode(reflection_light)
 
 
 @pytest.mark.parametrize(("share", "lost"), [(0.01, 0.5), (0.05, 0), (0.15, 0)])
 def test_content_counts_where_the_reflection_is_less_than_two_percent(share, lost):
-    background, photo, reflection = halves(share)
+    background, photo, reflection = scene_with_share(share)
     prediction = background.copy()
     prediction[:, SIDE // 2 :] = 0
     assert removed_content(prediction, background, photo, reflection) == pytest.approx(lost, abs=0.01)
 
 
-def test_a_reflection_counts_from_a_tenth_of_the_photo_on():
-    assert kept_reflection(halves(0.12)[1], *halves(0.12)) == pytest.approx(1, abs=0.05)
+def test_a_reflection_counts_if_it_is_at_least_a_tenth_of_the_photo():
+    assert kept_reflection(scene_with_share(0.12)[1], *scene_with_share(0.12)) == pytest.approx(1, abs=0.05)
     with pytest.raises(ValueError, match="0 pixels have R >= 10%"):
-        kept_reflection(halves(0.08)[1], *halves(0.08))
+        kept_reflection(scene_with_share(0.08)[1], *scene_with_share(0.08))
 
 
 def test_pixels_where_the_photo_is_clipped_do_not_count_for_the_reflection():
-    background, mirrored = np.full((SIDE, SIDE, 3), 0.5), np.zeros((SIDE, SIDE, 3))
-    mirrored[:, SIDE // 2 :] = 0.6
-    layers = [encode(layer) for layer in (background, background + mirrored, mirrored)]
+    background, reflection_light = np.full((SIDE, SIDE, 3), 0.5), np.zeros((SIDE, SIDE, 3))
+    reflection_light[:, SIDE // 2 :] = 0.6
+    layers = [encode(layer) for layer in (background, background + reflection_light, reflection_light)]
     with pytest.raises(ValueError, match=r"0 pixels have .* not clipped"):
         kept_reflection(layers[1], *layers)
 
@@ -127,7 +131,7 @@ def test_pixels_where_the_photo_is_clipped_do_not_count_for_the_reflection():
     [((200, 200, 200), True), ((185, 185, 185), False), ((250, 250, 225), True), ((250, 250, 200), False)],
 )
 def test_white_is_bright_in_all_channels_and_without_colour(scene, sheet, is_white):
-    """Encoded above 0.75 of 255 = 191, and no two channels 0.12 of it = 31 apart."""
+    """Encoded channels above 0.75 x 255 = 191 that differ by less than 0.12 x 255 = 31."""
     background, photo, reflection = scene
     background = background.copy()
     background[30:46, 4:20] = sheet
@@ -151,9 +155,7 @@ def test_scores_hardly_depend_on_the_brightness_of_a_prediction(scene, gain):
 def test_clipped_values_do_not_change_the_gain(scene):
     background, photo, reflection = scene
     background = background.copy()
-    background[:, :20] = (
-        255  # most of where nothing is mirrored; the prediction is darker there than the glass explains
-    )
+    background[:, :20] = 255  # most of the pixels without reflection, where the prediction is too dark
     prediction = brighten(background, 0.5)
     prediction[:, :20] = 255
     assert kept_reflection(prediction, background, photo, reflection) == pytest.approx(0, abs=0.01)
@@ -161,7 +163,7 @@ def test_clipped_values_do_not_change_the_gain(scene):
 
 @pytest.mark.parametrize("score", SCORES)
 def test_too_few_pixels_for_the_gain_are_refused(scene, score):
-    """The reflection covers all but 63 pixels, so the right brightness of a prediction is unknown."""
+    """The reflection covers all but 63 pixels, too few for the gain."""
     background, photo, reflection = scene
     reflection = np.maximum(reflection, 60)
     reflection.reshape(-1, 3)[:63] = 0
@@ -180,17 +182,17 @@ def test_sixty_four_pixels_are_enough():
     white, none = np.full((8, 8, 3), 220, np.uint8), np.zeros((8, 8, 3), np.uint8)
     assert removed_white(white, white, white, none) == 0
     with pytest.raises(ValueError, match="63 pixels"):
-        removed_white(*(picture.reshape(1, 64, 3)[:, 1:] for picture in (white, white, white, none)))
+        removed_white(*(image.reshape(1, 64, 3)[:, 1:] for image in (white, white, white, none)))
 
 
 @pytest.mark.parametrize("score", SCORES)
-def test_pictures_of_different_shapes_are_refused(scene, score):
+def test_images_of_different_shapes_are_refused(scene, score):
     background, photo, reflection = scene
     with pytest.raises(ValueError, match="shape"):
         score(background[1:], background, photo, reflection)
 
 
-@given(pictures, pictures, pictures, pictures, st.integers(0, 16), st.sampled_from(SCORES))
+@given(images, images, images, images, st.integers(0, 16), st.sampled_from(SCORES))
 def test_scores_are_shares_whatever_the_pictures(
     prediction, background, photo, reflection, unreflected, score
 ):
@@ -198,5 +200,5 @@ def test_scores_are_shares_whatever_the_pictures(
     reflection[:unreflected] = 0
     if score is removed_white:
         background = background // 16 + np.uint8(220)
-    with contextlib.suppress(ValueError):  # too few such pixels
+    with contextlib.suppress(ValueError):  # too few pixels for a score
         assert 0 <= score(prediction, background, photo, reflection) <= 1

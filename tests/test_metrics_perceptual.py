@@ -1,4 +1,4 @@
-"""LPIPS, compared with its definition and with the lpips package, and the ways to get its weights."""
+"""LPIPS compared with its definition and with the lpips package, and the search and download of its weights."""
 
 import hashlib
 import io
@@ -27,7 +27,7 @@ from brewster.metrics.weights import (
 from file_server import loopback_only, served, unused_address
 
 SHAPES = ((64, 3, 11), (192, 64, 5), (384, 192, 3), (256, 384, 3), (256, 256, 3))
-STEPS = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))  # stride and padding; the second and third pool before
+STRIDES_AND_PADDINGS = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))  # the second and third follow a pooling
 
 
 @pytest.fixture(autouse=True)
@@ -37,7 +37,7 @@ def _network_off(monkeypatch):
 
 @pytest.fixture(autouse=True)
 def cache(monkeypatch, tmp_path):
-    """An empty cache folder; no BREWSTER_DATA; no weights in memory."""
+    """An empty folder for cached weights. BREWSTER_DATA is not set, and no weights are in memory."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv("BREWSTER_DATA", raising=False)
     perceptual._load.cache_clear()
@@ -57,13 +57,13 @@ def metric():
 
 
 @pytest.fixture
-def published(data, monkeypatch):
+def published_metric(data, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     return Lpips.load()
 
 
-def pair(height, width):
-    """Photo, truth and region: a picture of ramps and squares, and the same with a haze over the region."""
+def make_pair(height, width):
+    """Photo, ground truth and region. The ground truth has ramps and squares; the photo also has haze in the region."""
     y, x = np.mgrid[:height, :width]
     squares = (x // 8 + y // 8) % 2 * 160 + 40
     truth = np.stack([x * 255 // (width - 1), y * 255 // (height - 1), squares], 2).astype(np.uint8)
@@ -73,14 +73,16 @@ def pair(height, width):
     return photo, truth, region
 
 
-def by_definition(metric, one, other):
+def reference_maps(metric, one, other):
     """The five maps of weighted squared differences, in double precision and without torch's convolutions."""
     shift, scale = (np.array(v)[:, None, None] for v in ((-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)))
     activations = [
         torch.from_numpy((p.transpose(2, 0, 1) / 127.5 - 1 - shift) / scale)[None] for p in (one, other)
     ]
     maps = []
-    for layer, ((stride, padding), (weight, bias)) in enumerate(zip(STEPS, metric.convolutions, strict=True)):
+    for layer, ((stride, padding), (weight, bias)) in enumerate(
+        zip(STRIDES_AND_PADDINGS, metric.convolutions, strict=True)
+    ):
         for i in (0, 1):
             if layer in (1, 2):
                 columns = functional.unfold(activations[i], 3, stride=2).unflatten(1, (-1, 9)).amax(2)
@@ -98,7 +100,7 @@ def by_definition(metric, one, other):
     return maps
 
 
-# --- the number
+# --- values
 
 
 @pytest.mark.parametrize(
@@ -109,17 +111,17 @@ def by_definition(metric, one, other):
         ((97, 130), 0.093210354, 0.254545959),
     ],
 )
-def test_distances_equal_those_of_the_lpips_package(published, size, whole, inside):
-    """Figures of lpips 0.1.4, net "alex", without and with spatial=True."""
-    photo, truth, region = pair(*size)
+def test_distances_equal_those_of_the_lpips_package(published_metric, size, whole, inside):
+    """The expected values are those of lpips 0.1.4, net "alex", without and with spatial=True."""
+    photo, truth, region = make_pair(*size)
     assert lpips(photo, truth) == pytest.approx(whole, abs=1e-6)
     assert lpips(photo, truth, region=region) == pytest.approx(inside, abs=1e-6)
 
 
 @pytest.mark.parametrize("size", [(31, 31), (64, 96), (75, 58)])
 def test_distances_follow_the_definition(metric, size):
-    photo, truth, region = pair(*size)
-    maps = by_definition(metric, photo, truth)
+    photo, truth, region = make_pair(*size)
+    maps = reference_maps(metric, photo, truth)
     one, other = metric.features(photo), metric.features(truth)
     assert metric.distance(one, other) == pytest.approx(sum(m.mean().item() for m in maps), rel=1e-5)
     full = sum(functional.interpolate(m, size, mode="bilinear", align_corners=False) for m in maps)[0, 0]
@@ -129,7 +131,7 @@ def test_distances_follow_the_definition(metric, size):
 
 @settings(max_examples=10)
 @given(arrays(np.uint8, (2, 31, 34, 3)))
-def test_the_distance_of_equal_pictures_is_zero_and_distances_are_symmetric(metric, two):
+def test_the_distance_of_equal_images_is_zero_and_distances_are_symmetric(metric, two):
     one, other = map(metric.features, two)
     assert metric.distance(one, one) == 0
     assert metric.distance(one, metric.features(two[0].copy())) == 0
@@ -137,7 +139,7 @@ def test_the_distance_of_equal_pictures_is_zero_and_distances_are_symmetric(metr
 
 
 def test_features_are_of_unit_length(metric):
-    found = metric.features(pair(64, 96)[0])
+    found = metric.features(make_pair(64, 96)[0])
     assert [tuple(activations.shape) for activations in found.maps] == [
         (64, 15, 23),
         (192, 7, 11),
@@ -152,7 +154,7 @@ def test_features_are_of_unit_length(metric):
 
 
 def test_a_uniform_difference_of_a_single_layer_is_its_head_in_every_region(metric):
-    """Upsampling does not change uniform maps, so any region has the mean of the picture."""
+    """Upsampling does not change uniform maps, so any region has the mean of the image."""
     one = metric.features(np.full((40, 40, 3), 10, np.uint8))
     maps = [torch.zeros_like(activations) for activations in one.maps]
     other = perceptual.Features(
@@ -167,7 +169,7 @@ def test_a_uniform_difference_of_a_single_layer_is_its_head_in_every_region(metr
 
 
 def test_the_number_of_threads_does_not_change_the_distance(metric):
-    photo, truth, _ = pair(97, 130)
+    photo, truth, _ = make_pair(97, 130)
     threads, distances = torch.get_num_threads(), []
     try:
         for count in (1, 2):
@@ -178,8 +180,8 @@ def test_the_number_of_threads_does_not_change_the_distance(metric):
     assert distances[0] == pytest.approx(distances[1], abs=1e-7)
 
 
-def test_pictures_may_have_any_memory_layout(metric):
-    photo = pair(64, 96)[0]
+def test_images_may_have_any_memory_layout(metric):
+    photo = make_pair(64, 96)[0]
     photo.flags.writeable = False
     turned = photo[::-1, ::-1]
     assert metric.distance(metric.features(turned), metric.features(turned.copy())) == 0
@@ -197,7 +199,7 @@ def test_the_heads_are_the_published_ones():
 
 
 @pytest.mark.parametrize("size", [(30, 90), (90, 30)])
-def test_a_picture_that_is_too_small_for_alexnet_is_refused(metric, size):
+def test_an_image_that_is_too_small_for_alexnet_is_refused(metric, size):
     with pytest.raises(ValueError, match=f"at least 31x31 pixels, not {size[0]}x{size[1]}"):
         metric.features(np.zeros((*size, 3), np.uint8))
 
@@ -225,7 +227,7 @@ def test_without_torch_the_extra_is_named(monkeypatch):
         Lpips.load()
 
 
-# --- where the weights come from; small tensors with the right names replace those of AlexNet
+# --- search and download of the weights, with small tensors in place of those of AlexNet
 
 
 @pytest.fixture
@@ -240,7 +242,7 @@ def state():
     return {name: torch.randn(3, 2, generator=noise) for name in (*TENSOR_NAMES, "classifier.6.bias")}
 
 
-def saved(state, path=None):
+def serialise(state, path=None):
     buffer = io.BytesIO()
     torch.save(state, buffer)
     if path:
@@ -250,8 +252,8 @@ def saved(state, path=None):
 
 
 def remote_file(server, body):
-    server.bodies["/whole.pth"] = body
-    return RemoteFile(f"{server.url}/whole.pth", len(body), "sha256", hashlib.sha256(body).hexdigest())
+    server.bodies["/alexnet.pth"] = body
+    return RemoteFile(f"{server.url}/alexnet.pth", len(body), "sha256", hashlib.sha256(body).hexdigest())
 
 
 def test_the_file_in_the_shared_data_has_the_pinned_digest(data):
@@ -262,21 +264,21 @@ def test_the_file_in_the_shared_data_has_the_pinned_digest(data):
 def test_the_cache_is_searched_first_then_the_data_folder_then_the_server(
     server, state, cache, monkeypatch, tmp_path
 ):
-    remote, digest = remote_file(server, saved(state)), digest_of(state)
+    remote, digest = remote_file(server, serialise(state)), digest_of(state)
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "data"))
-    saved(state, tmp_path / "data" / "weights" / WEIGHTS_FILE)
+    serialise(state, tmp_path / "data" / "weights" / WEIGHTS_FILE)
     load_alexnet(remote, digest)
     assert server.requests == []
     assert not cache.exists()
-    saved({name: values + 1 for name, values in state.items()}, cache / WEIGHTS_FILE)
+    serialise({name: values + 1 for name, values in state.items()}, cache / WEIGHTS_FILE)
     with pytest.raises(ModelError, match=str(cache)):
         load_alexnet(remote, digest)
 
 
 def test_a_download_is_stored_without_the_rest_of_the_network(server, state, cache):
-    remote, digest = remote_file(server, saved(state)), digest_of(state)
+    remote, digest = remote_file(server, serialise(state)), digest_of(state)
     first, second = (load_alexnet(remote, digest) for _ in range(2))
-    assert [path for path, _ in server.requests] == ["/whole.pth"]
+    assert [path for path, _ in server.requests] == ["/alexnet.pth"]
     assert [path.name for path in cache.iterdir()] == [WEIGHTS_FILE]
     assert (
         list(first)
@@ -288,34 +290,34 @@ def test_a_download_is_stored_without_the_rest_of_the_network(server, state, cac
 
 
 def test_an_interrupted_download_is_resumed_and_not_used_before(server, state, cache):
-    body = saved(state)
+    body = serialise(state)
     remote, digest = remote_file(server, body), digest_of(state)
     server.faults = ["cut"]
     with pytest.raises(DownloadError, match="ended after"):
         load_alexnet(remote, digest, downloader=Downloader(retry_delays_s=()))
-    assert [path.name for path in cache.iterdir()] == ["whole.pth.part"]
+    assert [path.name for path in cache.iterdir()] == ["alexnet.pth.part"]
     load_alexnet(remote, digest, downloader=Downloader(retry_delays_s=()))
-    assert server.requests[-1] == ("/whole.pth", f"bytes={len(body) // 2}-")
+    assert server.requests[-1] == ("/alexnet.pth", f"bytes={len(body) // 2}-")
 
 
 def test_an_unreachable_server_is_explained():
-    remote = RemoteFile(f"{unused_address()}/whole.pth", 9, "sha256", "0")
+    remote = RemoteFile(f"{unused_address()}/alexnet.pth", 9, "sha256", "0")
     with pytest.raises(DownloadError, match="check the connection"):
         load_alexnet(remote, downloader=Downloader(retry_delays_s=()))
 
 
 def test_a_wrong_file_from_the_server_is_deleted(server, state, cache):
-    remote = remote_file(server, saved(state))
-    server.bodies["/whole.pth"] = bytes(remote.size)
+    remote = remote_file(server, serialise(state))
+    server.bodies["/alexnet.pth"] = bytes(remote.size)
     with pytest.raises(DownloadError, match="was deleted"):
         load_alexnet(remote, digest_of(state))
     assert list(cache.iterdir()) == []
 
 
 def test_other_weights_in_the_downloaded_file_are_deleted(server, state, cache):
-    remote = remote_file(server, saved(state))
+    remote = remote_file(server, serialise(state))
     with pytest.raises(
-        ModelError, match=r"whole\.pth does not hold the AlexNet weights of LPIPS \(its digest"
+        ModelError, match=r"alexnet\.pth does not contain the AlexNet weights of LPIPS \(its digest"
     ):
         load_alexnet(remote, "0" * 64)
     assert list(cache.iterdir()) == []
@@ -325,21 +327,21 @@ def test_other_weights_in_the_downloaded_file_are_deleted(server, state, cache):
     "damage",
     [
         lambda body: b"",
-        lambda body: b"not a picture either",
+        lambda body: b"not a weights file",
         lambda body: body[: len(body) // 2],
         lambda body: body[:-30],
         lambda body: body.replace(b"features.0.weight", b"features.9.weight"),
-        lambda body: saved([1, 2]),
-        lambda body: saved(torch.zeros(3)),
-        lambda body: saved(dict.fromkeys(TENSOR_NAMES, "words")),
-        lambda body: saved({"model": Path("code")}),
+        lambda body: serialise([1, 2]),
+        lambda body: serialise(torch.zeros(3)),
+        lambda body: serialise(dict.fromkeys(TENSOR_NAMES, "text")),
+        lambda body: serialise({"model": Path("code")}),
     ],
 )
 def test_a_damaged_file_is_named_and_never_executed(state, cache, damage):
     cache.mkdir(parents=True)
-    (cache / WEIGHTS_FILE).write_bytes(damage(saved(state)))
+    (cache / WEIGHTS_FILE).write_bytes(damage(serialise(state)))
     with pytest.raises(
-        ModelError, match=rf"{cache / WEIGHTS_FILE} does not hold the AlexNet .* delete the file"
+        ModelError, match=rf"{cache / WEIGHTS_FILE} does not contain the AlexNet .* delete the file"
     ):
         load_alexnet(digest=digest_of(state))
 
@@ -349,9 +351,9 @@ def test_a_damaged_file_is_named_and_never_executed(state, cache, damage):
 @given(st.data())
 def test_every_changed_byte_is_detected_or_harmless(tmp_path_factory, data):
     state = {name: torch.arange(6.0).view(3, 2) for name in TENSOR_NAMES}
-    body = bytearray(saved(state))
-    place = data.draw(st.integers(0, len(body) - 1))
-    body[place] ^= data.draw(st.integers(1, 255))
+    body = bytearray(serialise(state))
+    position = data.draw(st.integers(0, len(body) - 1))
+    body[position] ^= data.draw(st.integers(1, 255))
     path = tmp_path_factory.mktemp("weights") / WEIGHTS_FILE
     path.write_bytes(body)
     try:

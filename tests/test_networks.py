@@ -1,4 +1,4 @@
-"""The table of compact networks: the contract of a row with the trainer and the exported file."""
+"""The table of compact networks: what the trainer and the exported file require of a row."""
 
 from dataclasses import replace
 
@@ -8,13 +8,13 @@ from torch import nn
 
 from brewster.errors import ModelError, RecipeError
 from brewster.inference.onnx_backend import OnnxBackend
-from brewster.models.networks import DEFAULT_NETWORK, LARGEST_STRIDE, NETWORKS, NetworkEntry
+from brewster.models.networks import DEFAULT_NETWORK, MAX_STRIDE, NETWORKS, NetworkEntry
 from brewster.training.checkpoint import Checkpoint
 from brewster.training.compact.trainer import CompactTrainer, train
 from brewster.training.recipe import with_value
 
 
-class Small(nn.Module):
+class SmallNetwork(nn.Module):
     """A network of two convolutions at a stride of 4."""
 
     def __init__(self):
@@ -27,23 +27,23 @@ class Small(nn.Module):
 
 
 @pytest.fixture
-def small(monkeypatch):
-    monkeypatch.setitem(NETWORKS, "small", NetworkEntry(Small, Small, stride=4))
+def small_network(monkeypatch):
+    monkeypatch.setitem(NETWORKS, "small", NetworkEntry(SmallNetwork, SmallNetwork, stride=4))
     return "small"
 
 
-def silent(step, steps, metrics, logged):
+def ignore_progress(step, steps, metrics, logged):
     pass
 
 
 @pytest.mark.parametrize("name", list(NETWORKS))
-def test_every_network_fulfils_the_contract_of_its_row(name):
+def test_every_network_has_the_stride_and_channels_of_its_row(name):
     entry = NETWORKS[name]
-    assert LARGEST_STRIDE % entry.stride == 0
-    fresh, started = entry.build(), entry.pretrained()
-    assert fresh.state_dict().keys() == started.state_dict().keys()
-    assert list(started.get_submodule("encoder").parameters())
-    assert fresh(torch.rand(2, 3, entry.stride, 2 * entry.stride)).shape == (
+    assert MAX_STRIDE % entry.stride == 0
+    random, pretrained = entry.build(), entry.pretrained()
+    assert random.state_dict().keys() == pretrained.state_dict().keys()
+    assert list(pretrained.get_submodule("encoder").parameters())
+    assert random(torch.rand(2, 3, entry.stride, 2 * entry.stride)).shape == (
         2,
         6,
         entry.stride,
@@ -56,9 +56,9 @@ def test_a_recipe_without_a_network_trains_the_default_one(recipe):
     assert type(CompactTrainer(recipe).network) is NETWORKS[DEFAULT_NETWORK].build
 
 
-def test_a_recipe_trains_and_exports_the_network_that_it_names(recipe, small, tmp_path):
-    recipe = with_value(recipe, "network", small)
-    assert isinstance(train(recipe, tmp_path, silent), Small)
+def test_a_recipe_trains_and_exports_the_network_that_it_names(recipe, small_network, tmp_path):
+    recipe = with_value(recipe, "network", small_network)
+    assert isinstance(train(recipe, tmp_path, ignore_progress), SmallNetwork)
     trainer = CompactTrainer(recipe)
     trainer.load_state_dict(Checkpoint.read(tmp_path / "checkpoint.pt").state)
     backend = OnnxBackend(trainer.export(tmp_path), "cpu")
@@ -67,10 +67,12 @@ def test_a_recipe_trains_and_exports_the_network_that_it_names(recipe, small, tm
     assert transmission.shape == reflection.shape == photo.shape
 
 
-def test_a_run_of_one_network_does_not_start_from_a_checkpoint_of_another(recipe, small, tmp_path):
+def test_a_run_of_one_network_does_not_start_from_a_checkpoint_of_another(recipe, small_network, tmp_path):
     trainer = CompactTrainer(recipe)
     Checkpoint(0, recipe.model_dump_json(), trainer.state_dict()).write(tmp_path / "start.pt")
-    other = with_value(recipe, "network", small).model_copy(update={"start_from": (tmp_path / "start.pt",)})
+    other = with_value(recipe, "network", small_network).model_copy(
+        update={"start_from": (tmp_path / "start.pt",)}
+    )
     with pytest.raises(
         ModelError,
         match=r"start.pt contains the network lite2-unet; a checkpoint of small, .*; train the recipe",
@@ -78,21 +80,22 @@ def test_a_run_of_one_network_does_not_start_from_a_checkpoint_of_another(recipe
         CompactTrainer(other).initialize()
 
 
-def test_a_run_of_one_network_is_not_resumed_with_another(recipe, small, tmp_path):
-    train(recipe, tmp_path, silent)
+def test_a_run_of_one_network_is_not_resumed_with_another(recipe, small_network, tmp_path):
+    train(recipe, tmp_path, ignore_progress)
     with pytest.raises(
         RecipeError, match=r"belongs to a run of another recipe \(different values: network\)"
     ):
-        train(with_value(recipe, "network", small), tmp_path, silent)
+        train(with_value(recipe, "network", small_network), tmp_path, ignore_progress)
 
 
-def test_checkpoints_older_than_the_choice_of_network_hold_the_default_one(recipe, tmp_path):
+def test_a_checkpoint_without_the_key_network_has_the_default_network(recipe, tmp_path):
     trainer = CompactTrainer(recipe)
-    older = recipe.model_dump_json(exclude={"network"})
-    assert "network" not in older
+    recipe_without_network = recipe.model_dump_json(exclude={"network"})
+    assert "network" not in recipe_without_network
     average = {name: torch.full_like(value, 2.0) for name, value in trainer.average.items()}
     checkpoint = replace(
-        Checkpoint(0, older, trainer.state_dict()), state=trainer.state_dict() | {"average": average}
+        Checkpoint(0, recipe_without_network, trainer.state_dict()),
+        state=trainer.state_dict() | {"average": average},
     )
     checkpoint.write(tmp_path / "start.pt")
     started = CompactTrainer(recipe.model_copy(update={"start_from": (tmp_path / "start.pt",)}))

@@ -23,18 +23,18 @@ def test_splitting_is_the_exact_inverse_of_composing(layout, height, width, seed
     panels = {name: torch.randn(2, 3, height, width, generator=generator) for name in layout.panels}
     composite = compose(panels, layout)
     assert tuple(composite.shape[:-3:-1]) == layout.composite_size((width, height))
-    back = split(composite, layout)
-    assert list(back) == list(layout.panels)
-    assert all(torch.equal(back[name], panels[name]) for name in panels)
-    assert torch.equal(compose(back, layout), composite)
+    panels_again = split(composite, layout)
+    assert list(panels_again) == list(layout.panels)
+    assert all(torch.equal(panels_again[name], panels[name]) for name in panels)
+    assert torch.equal(compose(panels_again, layout), composite)
 
 
 def test_the_conditioning_image_is_the_photo_and_white_space():
     photo = torch.rand(1, 3, 4, 5) - 1
-    shown = split(conditioning_image(photo, PanelLayout()), PanelLayout())
-    assert torch.equal(shown["I"], photo)
-    assert shown["T"].eq(1).all()
-    assert shown["R"].eq(1).all()
+    panels = split(conditioning_image(photo, PanelLayout()), PanelLayout())
+    assert torch.equal(panels["I"], photo)
+    assert panels["T"].eq(1).all()
+    assert panels["R"].eq(1).all()
 
 
 def test_without_a_generated_photo_the_conditioning_image_is_the_photo():
@@ -64,16 +64,19 @@ def test_any_photo_fits_without_distortion_or_is_refused(width, height, layout, 
     assert min(padding) == 0
     assert 0 <= max(padding) <= multiple / 2 + 0.5
     assert all(side % multiple == 0 for side in fit.panel)
-    scales = [content / own for content, own in zip(fit.content, (width, height), strict=True)]
+    scales = [content / side for content, side in zip(fit.content, (width, height), strict=True)]
     assert max(scales) <= 1
     # One side determines the scale; the other is rounded to the nearest pixel.
     assert any(
-        all(abs(got - scale * own) <= 0.501 for got, own in zip(fit.content, (width, height), strict=True))
+        all(
+            abs(content - scale * side) <= 0.501
+            for content, side in zip(fit.content, (width, height), strict=True)
+        )
         for scale in scales
     )
-    picture = torch.rand(1, 1, fit.content[1], 1).expand(1, 1, fit.content[1], fit.content[0])
+    image = torch.rand(1, 1, fit.content[1], 1).expand(1, 1, fit.content[1], fit.content[0])
     if fit.panel[0] * fit.panel[1] < 200_000:
-        assert torch.equal(fit.crop(fit.pad(picture)), picture)
+        assert torch.equal(fit.crop(fit.pad(image)), image)
 
 
 @given(st.integers(16, 4000), st.integers(16, 4000), layouts, st.integers(10_000, 2_000_000))
@@ -89,9 +92,9 @@ def test_the_next_larger_panel_would_exceed_the_budget(width, height, layout, bu
 
 @given(st.integers(16, 500), st.integers(16, 500), layouts)
 def test_the_error_for_a_photo_smaller_than_its_panel_names_a_budget_that_works(width, height, layout):
-    with pytest.raises(PhotoError, match="lower budget_px to") as refused:
+    with pytest.raises(PhotoError, match="lower budget_px to") as raised:
         fit_panel((width, height), layout, budget_px=10**7, multiple=16)
-    budget_px = int(str(refused.value).rstrip(".").rsplit(maxsplit=1)[1])
+    budget_px = int(str(raised.value).rstrip(".").rsplit(maxsplit=1)[1])
     with contextlib.suppress(PhotoError):  # the aspect ratio may be too extreme for this budget
         fit = fit_panel((width, height), layout, budget_px=budget_px, multiple=16)
         assert max(fit.content) <= max(width, height)
@@ -105,13 +108,13 @@ def test_an_extreme_aspect_ratio_is_refused():
 def test_padding_is_a_mirrored_copy_of_the_border():
     fit = fit_panel((100, 61), PanelLayout(("T",)), budget_px=48 * 80, multiple=16)
     assert (fit.content, fit.panel) == ((79, 48), (80, 48))
-    picture = torch.rand(1, 3, 48, 79)
-    assert torch.equal(fit.pad(picture)[..., 79], picture[..., 77])
+    image = torch.rand(1, 3, 48, 79)
+    assert torch.equal(fit.pad(image)[..., 79], image[..., 77])
 
 
 @pytest.mark.parametrize("panels", [(), ("I", "I"), ("I", "B")])
 def test_unknown_repeated_and_missing_panels_are_refused(panels):
-    with pytest.raises(RecipeError, match="some of I, T and R, each once"):
+    with pytest.raises(RecipeError, match="expected one or more of I, T and R, each once"):
         PanelLayout(panels)
 
 
@@ -121,12 +124,12 @@ def test_an_unknown_direction_is_refused():
 
 
 def test_missing_panels_and_wrong_sizes_are_refused():
-    one = torch.zeros(1, 3, 4, 4)
+    panel = torch.zeros(1, 3, 4, 4)
     with pytest.raises(PhotoError, match="there is no panel R"):
-        compose({"I": one, "T": one}, PanelLayout())
+        compose({"I": panel, "T": panel}, PanelLayout())
     with pytest.raises(PhotoError, match="equal shapes"):
-        compose({"T": one, "R": one[..., :2]}, PanelLayout(("T", "R")))
+        compose({"T": panel, "R": panel[..., :2]}, PanelLayout(("T", "R")))
     with pytest.raises(PhotoError, match="is not divisible by 3"):
-        split(one, PanelLayout())
+        split(panel, PanelLayout())
     with pytest.raises(PhotoError, match="resize it first"):
-        fit_panel((64, 64), PanelLayout(("T",)), budget_px=64 * 64, multiple=16).pad(one)
+        fit_panel((64, 64), PanelLayout(("T",)), budget_px=64 * 64, multiple=16).pad(panel)

@@ -29,11 +29,11 @@ def test_the_prompt_names_three_images():
 
 def test_a_saved_prompt_is_read_back_exactly(prompt, tmp_path):
     prompt.save(tmp_path / "prompt.safetensors")
-    back = load_prompt(tmp_path / "prompt.safetensors", "kontext")
-    assert (back.text, back.sha256, back.negative) == (PROMPT, prompt.sha256, None)
-    assert torch.equal(back.embeds, prompt.embeds)
-    assert back.embeds.dtype == torch.bfloat16
-    assert torch.equal(back.pooled, prompt.pooled)
+    loaded = load_prompt(tmp_path / "prompt.safetensors", "kontext")
+    assert (loaded.text, loaded.sha256, loaded.negative) == (PROMPT, prompt.sha256, None)
+    assert torch.equal(loaded.embeds, prompt.embeds)
+    assert loaded.embeds.dtype == torch.bfloat16
+    assert torch.equal(loaded.pooled, prompt.pooled)
 
 
 def test_the_same_prompt_gives_the_same_bytes(prompt, tmp_path):
@@ -63,7 +63,7 @@ def test_moving_a_prompt_preserves_its_text(prompt):
 
 def test_a_prompt_of_another_backbone_is_refused(prompt, tmp_path):
     prompt.save(tmp_path / "p")
-    with pytest.raises(ModelError, match="was encoded for kontext; a prompt for klein"):
+    with pytest.raises(ModelError, match="was encoded for kontext; expected a prompt for klein"):
         load_prompt(tmp_path / "p", "klein")
 
 

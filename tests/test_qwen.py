@@ -14,13 +14,13 @@ from brewster.models.diffusion.backbones import encode_prompt, tiny
 from brewster.models.diffusion.families.qwen import Qwen
 from brewster.models.diffusion.prompt import PROMPT
 
-MARKS = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>"]
-MARKS += ["<|image_pad|>", "<|video_pad|>"]
-PICTURE_TOKENS = 16
+SPECIAL_TOKENS = ["<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|vision_start|>", "<|vision_end|>"]
+SPECIAL_TOKENS += ["<|image_pad|>", "<|video_pad|>"]
+IMAGE_TOKENS = 16
 
 
 class WithoutVideo(transformers.Qwen2VLProcessor):
-    """The processor of transformers requires a video processor, which needs torchvision."""
+    """The processor without the check for a video processor, which needs torchvision."""
 
     def check_argument_for_proper_class(self, name, argument):
         if name != "video_processor":
@@ -29,10 +29,12 @@ class WithoutVideo(transformers.Qwen2VLProcessor):
 
 @pytest.fixture(scope="module")
 def pipeline():
-    """The diffusers pipeline with a tokenizer of single bytes, and an image of 16 tokens."""
-    words = {word: number for number, word in enumerate([*sorted(ByteLevel.alphabet()), *MARKS])}
-    tokenizer = transformers.Qwen2TokenizerFast(vocab=words, merges=[], additional_special_tokens=MARKS)
-    image_processor = Qwen2VLImageProcessorPil(min_pixels=28 * 28, max_pixels=28 * 28 * PICTURE_TOKENS)
+    """The diffusers pipeline with a tokenizer of single bytes. It encodes an image as 16 tokens."""
+    words = {word: number for number, word in enumerate([*sorted(ByteLevel.alphabet()), *SPECIAL_TOKENS])}
+    tokenizer = transformers.Qwen2TokenizerFast(
+        vocab=words, merges=[], additional_special_tokens=SPECIAL_TOKENS
+    )
+    image_processor = Qwen2VLImageProcessorPil(min_pixels=28 * 28, max_pixels=28 * 28 * IMAGE_TOKENS)
     text = {
         "vocab_size": len(words), "hidden_size": 32, "intermediate_size": 16, "num_hidden_layers": 2,
         "num_attention_heads": 2, "num_key_value_heads": 1, "bos_token_id": 0, "eos_token_id": 0,
@@ -48,13 +50,13 @@ def pipeline():
         vision_end_token_id=words["<|vision_end|>"],
     )
     torch.manual_seed(0)
-    pipe = tiny("qwen")[0].pipeline()
-    pipe.register_modules(
+    pipeline = tiny("qwen")[0].pipeline()
+    pipeline.register_modules(
         tokenizer=tokenizer,
         processor=WithoutVideo(image_processor=image_processor, tokenizer=tokenizer),
         text_encoder=transformers.Qwen2_5_VLForConditionalGeneration(config).eval(),
     )
-    return pipe
+    return pipeline
 
 
 def test_a_prompt_is_encoded_with_a_uniform_grey_image(pipeline):
@@ -67,7 +69,7 @@ def test_a_prompt_is_encoded_with_a_uniform_grey_image(pipeline):
     hook.remove()
     for words, kwargs, embeds in zip((PROMPT, " "), calls, (prompt.embeds, prompt.negative), strict=True):
         token_ids = pipeline.tokenizer(pipeline.prompt_template_encode.format(words)).input_ids
-        count = len(token_ids) - 1 + PICTURE_TOKENS - pipeline.prompt_template_encode_start_idx
+        count = len(token_ids) - 1 + IMAGE_TOKENS - pipeline.prompt_template_encode_start_idx
         assert embeds.shape == (1, count, 32)
         image_processor = pipeline.processor.image_processor
         grey = torch.tensor(
@@ -76,8 +78,8 @@ def test_a_prompt_is_encoded_with_a_uniform_grey_image(pipeline):
                 for mean, std in zip(image_processor.image_mean, image_processor.image_std, strict=True)
             ]
         )
-        seen = kwargs["pixel_values"].unflatten(1, (3, -1))
-        torch.testing.assert_close(seen, grey[:, None].expand_as(seen).to(seen), atol=1e-5, rtol=0)
+        pixels = kwargs["pixel_values"].unflatten(1, (3, -1))
+        torch.testing.assert_close(pixels, grey[:, None].expand_as(pixels).to(pixels), atol=1e-5, rtol=0)
     assert (prompt.backbone, prompt.text, prompt.pooled) == ("qwen", PROMPT, None)
 
 
@@ -89,7 +91,7 @@ def test_other_prompts_have_other_embeddings_and_the_same_empty_prompt(pipeline)
     assert torch.equal(one.negative, other.negative)
 
 
-def test_its_embedding_guides_the_tiny_version(pipeline):
+def test_the_embedding_guides_the_tiny_version(pipeline):
     backbone, _ = tiny("qwen")
     with torch.no_grad():
         prompt = Qwen.embed(pipeline, "a cat")

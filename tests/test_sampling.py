@@ -1,4 +1,4 @@
-"""Our sampling loop, compared with the pipelines of diffusers on tiny versions of the same classes."""
+"""The sampling loop, compared with the pipelines of diffusers on tiny versions of the same classes."""
 
 import pytest
 import torch
@@ -19,18 +19,18 @@ def tiny_model(request):
     return tiny(request.param, seed=1)
 
 
-def eight_bit_picture(width, height):
-    """A picture with 8-bit values, so that pipelines that only accept PIL images get the same numbers."""
+def image_8bit(width, height):
+    """An image with 8-bit values, so that pipelines that only accept PIL images get the same numbers."""
     generator = torch.Generator().manual_seed(5)
     return torch.randint(0, 256, (1, 3, height, width), generator=generator) / 127.5 - 1
 
 
-def as_pil(picture):
-    return Image.fromarray(((picture[0] + 1) * 127.5).round().byte().permute(1, 2, 0).numpy())
+def to_pil(image):
+    return Image.fromarray(((image[0] + 1) * 127.5).round().byte().permute(1, 2, 0).numpy())
 
 
-def diffusers_picture(tiny_model, condition, monkeypatch, *, guidance=4.0, seed=3):
-    """The picture of the diffusers pipeline in [0, 1], without its rescaling, with its own noise for the seed."""
+def sample_with_diffusers(tiny_model, condition, monkeypatch, *, guidance=4.0, seed=3):
+    """The image of the diffusers pipeline in [0, 1], without its rescaling, with the noise that it draws for the seed."""
     backbone, prompt = tiny_model
     width, height = SIZE
     options = {"prompt_embeds": prompt.embeds, "height": height, "width": width, "output_type": "pt"}
@@ -39,31 +39,31 @@ def diffusers_picture(tiny_model, condition, monkeypatch, *, guidance=4.0, seed=
         options |= {"image": (condition + 1) / 2, "pooled_prompt_embeds": prompt.pooled}
         options |= {"max_area": width * height, "_auto_resize": False, "guidance_scale": guidance}
     elif backbone.name == "klein":
-        options |= {"image": as_pil(condition), "negative_prompt_embeds": prompt.negative}
+        options |= {"image": to_pil(condition), "negative_prompt_embeds": prompt.negative}
         options |= {"guidance_scale": guidance}
     else:
-        as_it_is = (condition.shape[3], condition.shape[2], None)
-        monkeypatch.setattr(pipeline_qwenimage_edit, "calculate_dimensions", lambda area, ratio: as_it_is)
-        options |= {"image": as_pil(condition), "negative_prompt_embeds": prompt.negative}
+        unchanged = (condition.shape[3], condition.shape[2], None)
+        monkeypatch.setattr(pipeline_qwenimage_edit, "calculate_dimensions", lambda area, ratio: unchanged)
+        options |= {"image": to_pil(condition), "negative_prompt_embeds": prompt.negative}
         options |= {"true_cfg_scale": guidance}
     pipe = backbone.pipeline()
     pipe.set_progress_bar_config(disable=True)
     return pipe(**options).images
 
 
-def ours(tiny_model, condition, **options):
+def sample_with_brewster(tiny_model, condition, **options):
     backbone, prompt = tiny_model
     return sample(backbone, condition, prompt, **({"size": SIZE, "steps": STEPS, "seeds": [3]} | options))
 
 
 @pytest.mark.parametrize("condition_size", [SIZE, (64, 96)])
 @pytest.mark.parametrize("guidance", [1.0, 4.0])
-def test_our_loop_gives_the_picture_of_the_diffusers_pipeline(
+def test_the_loop_gives_the_image_of_the_diffusers_pipeline(
     tiny_model, monkeypatch, guidance, condition_size
 ):
-    condition = eight_bit_picture(*condition_size)
-    expected = diffusers_picture(tiny_model, condition, monkeypatch, guidance=guidance)
-    actual = (ours(tiny_model, condition, guidance=guidance) + 1) / 2
+    condition = image_8bit(*condition_size)
+    expected = sample_with_diffusers(tiny_model, condition, monkeypatch, guidance=guidance)
+    actual = (sample_with_brewster(tiny_model, condition, guidance=guidance) + 1) / 2
     torch.testing.assert_close(actual, expected, atol=1e-5, rtol=0)
     assert expected.std() > 0.01
 
@@ -75,9 +75,9 @@ def test_the_transformer_gets_the_same_input_as_in_the_diffusers_pipeline(tiny_m
     hook = backbone.transformer.register_forward_pre_hook(
         lambda module, args, kwargs: calls.append(kwargs), with_kwargs=True
     )
-    condition = eight_bit_picture(64, 96)
-    diffusers_picture(tiny_model, condition, monkeypatch)
-    ours(tiny_model, condition)
+    condition = image_8bit(64, 96)
+    sample_with_diffusers(tiny_model, condition, monkeypatch)
+    sample_with_brewster(tiny_model, condition)
     hook.remove()
     half = len(calls) // 2
     assert half == STEPS * (1 if backbone.guided_by_embedding else 2)
@@ -92,52 +92,56 @@ def test_the_transformer_gets_the_same_input_as_in_the_diffusers_pipeline(tiny_m
         assert actual_call.get("img_shapes") == expected_call.get("img_shapes")
 
 
-def test_every_argument_changes_the_picture(tiny_model):
+def test_every_argument_changes_the_image(tiny_model):
     backbone, _ = tiny_model
-    condition = eight_bit_picture(*SIZE)
-    reference = ours(tiny_model, condition)
+    condition = image_8bit(*SIZE)
+    reference = sample_with_brewster(tiny_model, condition)
     others = {
-        "condition": ours(tiny_model, -condition),
-        "guidance": ours(tiny_model, condition, guidance=2.0),
-        "seed": ours(tiny_model, condition, seeds=[4]),
-        "prompt": ours((backbone, backbone.random_prompt(backbone.transformer, 9)), condition),
+        "condition": sample_with_brewster(tiny_model, -condition),
+        "guidance": sample_with_brewster(tiny_model, condition, guidance=2.0),
+        "seed": sample_with_brewster(tiny_model, condition, seeds=[4]),
+        "prompt": sample_with_brewster(
+            (backbone, backbone.random_prompt(backbone.transformer, 9)), condition
+        ),
     }
     assert not [name for name, other in others.items() if (other - reference).abs().max() < 1e-4]
 
 
-def test_a_seed_gives_the_same_picture_alone_and_in_a_batch(tiny_model):
-    condition = eight_bit_picture(*SIZE)
-    alone = ours(tiny_model, condition, seeds=[3, 4, 5])
-    together = ours(tiny_model, condition, seeds=[3, 4, 5], batch=2)
-    torch.testing.assert_close(alone, together, atol=5e-5, rtol=0)
-    assert torch.equal(ours(tiny_model, condition, seeds=[4]), alone[1:2])
+def test_a_seed_gives_the_same_image_alone_and_in_a_batch(tiny_model):
+    condition = image_8bit(*SIZE)
+    alone = sample_with_brewster(tiny_model, condition, seeds=[3, 4, 5])
+    batched = sample_with_brewster(tiny_model, condition, seeds=[3, 4, 5], batch=2)
+    torch.testing.assert_close(alone, batched, atol=5e-5, rtol=0)
+    assert torch.equal(sample_with_brewster(tiny_model, condition, seeds=[4]), alone[1:2])
     assert (alone[0] - alone[1]).abs().max() > 0.01
 
 
-def test_the_schedule_counts_generated_tokens_and_ends_at_the_picture(tiny_model):
+def test_the_schedule_counts_generated_tokens_and_ends_at_sigma_0(tiny_model):
     backbone, _ = tiny_model
     few, many = backbone.schedule(256, 20), backbone.schedule(3072, 20)
     assert len(few) == 21
     assert (few[0], few[-1]) == (1, 0)
     assert (few.diff() < 0).all()
-    assert (many[1:-2] > few[1:-2]).all()  # larger pictures get more steps at high noise
+    assert (many[1:-2] > few[1:-2]).all()  # larger images get more steps at high noise
 
 
 def test_training_times_are_shifted_like_those_of_the_schedule(tiny_model):
     backbone, _ = tiny_model
-    moved = backbone.shifted(torch.linspace(1, 1 / 8, 8), 3072, steps=8)
-    if backbone.scheduler.config.shift_terminal:  # the scheduler stretches the end afterwards
-        stretch = (1 - moved[-1]) / (1 - backbone.scheduler.config.shift_terminal)
-        moved = 1 - (1 - moved) / stretch
-    torch.testing.assert_close(moved, backbone.schedule(3072, 8)[:-1], atol=1e-6, rtol=0)
+    times = backbone.shifted(torch.linspace(1, 1 / 8, 8), 3072, steps=8)
+    if (
+        backbone.scheduler.config.shift_terminal
+    ):  # the scheduler stretches shifted times so that the last one is shift_terminal
+        stretch = (1 - times[-1]) / (1 - backbone.scheduler.config.shift_terminal)
+        times = 1 - (1 - times) / stretch
+    torch.testing.assert_close(times, backbone.schedule(3072, 8)[:-1], atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("steps", [1, 2])
 def test_few_steps_are_allowed_and_every_step_is_reported(tiny_model, steps):
     reported = []
-    ours(
+    sample_with_brewster(
         tiny_model,
-        eight_bit_picture(*SIZE),
+        image_8bit(*SIZE),
         steps=steps,
         seeds=[1, 2],
         on_progress=lambda *step: reported.append(step),
@@ -148,32 +152,34 @@ def test_few_steps_are_allowed_and_every_step_is_reported(tiny_model, steps):
 def test_guidance_without_an_empty_prompt_is_refused_with_a_hint(tiny_model):
     backbone, prompt = tiny_model
     if backbone.guided_by_embedding:
-        pytest.skip("guidance is distilled into this one")
-    bare = PromptEmbedding(prompt.backbone, prompt.text, prompt.embeds)
+        pytest.skip("this backbone has distilled guidance")
+    without_negative = PromptEmbedding(prompt.backbone, prompt.text, prompt.embeds)
     with pytest.raises(ModelError, match=r"no embedding of the empty prompt.*set the guidance to 1"):
-        ours((backbone, bare), eight_bit_picture(*SIZE))
-    assert ours((backbone, bare), eight_bit_picture(*SIZE), guidance=1.0).isfinite().all()
+        sample_with_brewster((backbone, without_negative), image_8bit(*SIZE))
+    assert (
+        sample_with_brewster((backbone, without_negative), image_8bit(*SIZE), guidance=1.0).isfinite().all()
+    )
 
 
-def test_a_picture_off_the_grid_is_refused(tiny_model):
-    with pytest.raises(ModelError, match="has 100 x 64 pixels; sides that are multiples of 16"):
-        ours(tiny_model, torch.zeros(1, 3, 64, 100))
+def test_an_image_with_sides_that_are_not_multiples_of_16_is_refused(tiny_model):
+    with pytest.raises(ModelError, match="has 100 x 64 pixels; expected sides that are multiples of 16"):
+        sample_with_brewster(tiny_model, torch.zeros(1, 3, 64, 100))
     with pytest.raises(ModelError, match="has 100 x 64 pixels"):
-        ours(tiny_model, torch.zeros(1, 3, 64, 64), size=(100, 64))
+        sample_with_brewster(tiny_model, torch.zeros(1, 3, 64, 64), size=(100, 64))
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "message"),
     [
-        ({"steps": 0}, "0 steps; at least 1; the usual value is 20"),
-        ({"steps": -3}, "-3 steps; at least 1; the usual value is 20"),
-        ({"seeds": []}, "0 seeds; at least 1; the usual value is 1"),
-        ({"batch": 0}, "a batch of 0; at least 1; the usual value is 1"),
+        ({"steps": 0}, "0 steps; expected at least 1; use 20"),
+        ({"steps": -3}, "-3 steps; expected at least 1; use 20"),
+        ({"seeds": []}, "0 seeds; expected at least 1; use 1,"),
+        ({"batch": 0}, "a batch of 0; expected at least 1; use 1,"),
     ],
 )
-def test_counts_less_than_one_are_refused(tiny_model, options, words):
-    with pytest.raises(ModelError, match=words):
-        ours(tiny_model, eight_bit_picture(*SIZE), **options)
+def test_counts_less_than_one_are_refused(tiny_model, options, message):
+    with pytest.raises(ModelError, match=message):
+        sample_with_brewster(tiny_model, image_8bit(*SIZE), **options)
 
 
 @pytest.mark.parametrize(
@@ -185,18 +191,18 @@ def test_counts_less_than_one_are_refused(tiny_model, options, words):
     ],
 )
 def test_out_of_memory_errors_say_what_to_reduce(tiny_model, monkeypatch, error):
-    def full(*_, **__):
+    def raise_error(*_, **__):
         raise error
 
-    monkeypatch.setattr(tiny_model[0], "predict", full)
+    monkeypatch.setattr(tiny_model[0], "predict", raise_error)
     with pytest.raises(DeviceError, match="fewer bits"):
-        ours(tiny_model, eight_bit_picture(*SIZE))
+        sample_with_brewster(tiny_model, image_8bit(*SIZE))
 
 
 def test_other_errors_are_not_converted_to_memory_errors(tiny_model, monkeypatch):
-    def broken(*_, **__):
+    def raise_bug(*_, **__):
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr(tiny_model[0], "predict", broken)
+    monkeypatch.setattr(tiny_model[0], "predict", raise_bug)
     with pytest.raises(RuntimeError, match="a bug"):
-        ours(tiny_model, eight_bit_picture(*SIZE))
+        sample_with_brewster(tiny_model, image_8bit(*SIZE))

@@ -6,16 +6,16 @@ from brewster.models.diffusion.tensors import read_tensors, write_tensors
 
 
 def test_tensors_and_metadata_survive_a_round_trip(tmp_path):
-    tensors = {"b": torch.randn(2, 3).T, "a": torch.arange(3, dtype=torch.bfloat16), "none": torch.zeros(0)}
+    tensors = {"b": torch.randn(2, 3).T, "a": torch.arange(3, dtype=torch.bfloat16), "empty": torch.zeros(0)}
     write_tensors(tmp_path / "t", tensors, {"name": "größer", "a": "1"})
-    back, metadata = read_tensors(tmp_path / "t")
+    loaded, metadata = read_tensors(tmp_path / "t")
     assert metadata == {"format": "pt", "name": "größer", "a": "1"}
-    assert all(torch.equal(back[name], tensor) for name, tensor in tensors.items())
+    assert all(torch.equal(loaded[name], tensor) for name, tensor in tensors.items())
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(ModelError, match="nothing is missing; a safetensors file"):
-        read_tensors(tmp_path / "nothing")
+    with pytest.raises(ModelError, match="absent is missing; expected a safetensors file"):
+        read_tensors(tmp_path / "absent")
 
 
 @pytest.mark.parametrize("size", [0, 4, 40, -1])

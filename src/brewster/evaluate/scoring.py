@@ -13,7 +13,7 @@ from brewster.benchmarks.registry import Case
 from brewster.errors import PhotoError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import MethodOutput
-from brewster.metrics import CachedPicture, Comparison, Metric, Picture, Region
+from brewster.metrics import CachedImage, Comparison, Image, Metric, Region
 from brewster.photo import Photo
 
 _DIGITS: Final = 6
@@ -50,7 +50,7 @@ class GroundTruth:
 
     case: Case
     photo: Photo
-    pictures: Mapping[str, Picture]
+    pictures: Mapping[str, Image]
 
     @classmethod
     def open(cls, case: Case, config: EvaluationConfig) -> GroundTruth:
@@ -110,7 +110,7 @@ class Scorer:
 
     def __init__(self, truth: GroundTruth, config: EvaluationConfig) -> None:
         self._truth, self._protocol = truth, config
-        self._pictures = {role: CachedPicture(picture) for role, picture in truth.pictures.items()}
+        self._pictures = {role: CachedImage(picture) for role, picture in truth.pictures.items()}
         self._regions: dict[float, Region] = {}
 
     @cached_property
@@ -123,21 +123,21 @@ class Scorer:
 
         Columns are left out if the prediction or the ground truth has no such layer.
         """
-        layers = {"transmission": CachedPicture(prediction.transmission.srgb_8bit())}
+        layers = {"transmission": CachedImage(prediction.transmission.srgb_8bit())}
         if prediction.reflection:
-            layers["reflection"] = CachedPicture(prediction.reflection.srgb_8bit())
+            layers["reflection"] = CachedImage(prediction.reflection.srgb_8bit())
         return {
             column: _or_none(lambda column=column, metric=metric: self._measure(column, metric, layers))  # type: ignore[misc]
             for column, metric in self._protocol.columns().items()
             if self._applies(metric, layers)
         }
 
-    def _applies(self, metric: Metric, layers: Mapping[str, CachedPicture]) -> bool:
+    def _applies(self, metric: Metric, layers: Mapping[str, CachedImage]) -> bool:
         if metric.of == "rendered":
             return self._truth.case.rendered
         return metric.of in layers and metric.of in self._pictures
 
-    def _measure(self, column: str, metric: Metric, layers: Mapping[str, CachedPicture]) -> float:
+    def _measure(self, column: str, metric: Metric, layers: Mapping[str, CachedImage]) -> float:
         layer = "transmission" if metric.of == "rendered" else metric.of
         truths = self._truth.pictures
         region = self._region(self._protocol.threshold(column)) if metric.where == "region" else None

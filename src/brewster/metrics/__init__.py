@@ -1,4 +1,4 @@
-"""Metrics that compare a prediction with its ground truth. All pictures are uint8 sRGB, (H, W, 3).
+"""Metrics that compare a prediction with its ground truth. All images are uint8 sRGB, (H, W, 3).
 
     from brewster.metrics import METRICS, psnr, reflection_region
     psnr(prediction, truth, region=reflection_region(photo, truth))
@@ -20,21 +20,21 @@ from typing import Final
 from brewster.errors import BrewsterError
 from brewster.metrics.failures import kept_reflection, removed_content, removed_white
 from brewster.metrics.fidelity import Window, psnr, ssim
-from brewster.metrics.metric import CachedPicture, Comparison, Metric
+from brewster.metrics.metric import CachedImage, Comparison, Metric
 from brewster.metrics.perceptual import Features, Lpips, lpips
 from brewster.metrics.region import DEFAULT_THRESHOLD, reflection_region
-from brewster.metrics.windows import Picture, Region
+from brewster.metrics.windows import Image, Region
 
 __all__ = [
     "DEFAULT_THRESHOLD",
     "IDENTICAL_DB",
     "METRICS",
-    "CachedPicture",
+    "CachedImage",
     "Comparison",
     "Features",
+    "Image",
     "Lpips",
     "Metric",
-    "Picture",
     "Region",
     "Window",
     "find_metric",
@@ -61,18 +61,18 @@ def _ssim_gaussian(case: Comparison) -> float:
 
 
 def _lpips(case: Comparison) -> float:
-    prediction, truth = (picture.features(_lpips_features) for picture in (case.prediction, case.truth))
+    prediction, truth = (image.features(_lpips_features) for image in (case.prediction, case.truth))
     return Lpips.load().distance(prediction, truth, region=case.region)
 
 
-def _lpips_features(picture: Picture) -> Features:
-    return Lpips.load().features(picture)
+def _lpips_features(image: Image) -> Features:
+    return Lpips.load().features(image)
 
 
 def _rendered_score(
-    score: Callable[[Picture, Picture, Picture, Picture], float],
+    score: Callable[[Image, Image, Image, Image], float],
 ) -> Callable[[Comparison], float]:
-    """Adapts a function of prediction, background, photo and reflection to the `score` of a metric."""
+    """Converts a function of prediction, background, photo and reflection to the `score` function of a metric."""
 
     def score_case(case: Comparison) -> float:
         assert case.reflection is not None
@@ -82,12 +82,12 @@ def _rendered_score(
 
 
 IDENTICAL_DB: Final = 100.0
-"""The PSNR that METRICS reports for identical pictures, whose PSNR is infinite, so that means stay finite."""
+"""The PSNR that METRICS reports for identical images. Their PSNR is infinite, and so would be the mean over a benchmark."""
 
 _PSNR: Final = "10 log10(255^2 / MSE) over the three channels of 8-bit sRGB"
 _SSIM: Final = "per RGB channel of 8-bit sRGB, K1 0.01, K2 0.03, range 255"
 _UNIFORM: Final = f"uniform 7x7 window, sample covariance, {_SSIM}, outermost 3 pixels left out"
-_LPIPS: Final = "LPIPS 0.1 of AlexNet, 8-bit sRGB scaled to -1..1 at the truth's size"
+_LPIPS: Final = "LPIPS 0.1 of AlexNet, 8-bit sRGB scaled to -1..1, at the size of the ground truth"
 _REGION: Final = (
     "the reflection region, where |photo - truth| / 255 in its largest channel, averaged over 7x7 pixels,"
     f" is above {DEFAULT_THRESHOLD} unless the report states another threshold"
@@ -147,7 +147,7 @@ _ROWS: Final = (
         "",
         False,
         3,
-        f"{_LPIPS}, each layer's map enlarged to the picture (bilinear), averaged over {_REGION}.",
+        f"{_LPIPS}, each layer's map enlarged to the image (bilinear), averaged over {_REGION}.",
         "transmission",
         _lpips,
         "region",
@@ -203,7 +203,7 @@ _ROWS: Final = (
 )
 
 METRICS: Final = {metric.name: metric for metric in _ROWS}
-"""All metrics by name, in the order of reports."""
+"""All metrics by name, in the order in which reports list them."""
 
 
 def find_metric(name: str) -> Metric:
@@ -215,5 +215,5 @@ def find_metric(name: str) -> Metric:
     if name in METRICS:
         return METRICS[name]
     close = difflib.get_close_matches(name.lower(), METRICS, n=1)
-    hint = f"did you mean {close[0]}?" if close else "choose one of them"
-    raise BrewsterError(f"there is no metric {name!r}", f"metrics are {', '.join(METRICS)}", hint)
+    cure = f"did you mean {close[0]}?" if close else "choose one of them"
+    raise BrewsterError(f"there is no metric {name!r}", f"expected one of {', '.join(METRICS)}", cure)

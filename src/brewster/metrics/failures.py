@@ -5,7 +5,7 @@ luminance in linear light, with I = T + R, where the transmission T is the part 
 
 Some methods restore the light that the glass absorbs, and others do not. To score both alike, the prediction is first
 multiplied by one gain: the median of B / prediction over the pixels without reflection that are neither black nor
-clipped in either picture. If B has too few such pixels, the scores are undefined (ValueError). If only the prediction
+clipped in either image. If B has too few such pixels, the scores are undefined (ValueError). If only the prediction
 has too few, the gain is 1.
 
 Each score is a share of light in 0..1; lower is better.
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final, final
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster.metrics.windows import Picture, Region, check_pictures
+from brewster.metrics.windows import Image, Region, check_images
 from brewster.srgb import REC709_LUMINANCE, to_linear
 
 if TYPE_CHECKING:
@@ -36,15 +36,15 @@ NEGLIGIBLE_SHARE: Final = 0.02
 NOTICEABLE_SHARE: Final = 0.1
 """A pixel with R of at least this share of I counts as a pixel with reflection."""
 
-WHITE_MIN: Final = 0.75
-WHITE_MAX_DIFFERENCE: Final = 0.12
-"""A pixel is white if its encoded channels, in 0..1, are above WHITE_MIN and less than WHITE_MAX_DIFFERENCE apart."""
+MIN_WHITE: Final = 0.75
+MAX_WHITE_DIFFERENCE: Final = 0.12
+"""A pixel is white if its encoded channels, in 0..1, are above MIN_WHITE and differ by less than MAX_WHITE_DIFFERENCE."""
 
 BLACK_LUMINANCE: Final = 0.01
-"""Pixels below this luminance are left out of the gain: 8-bit steps are too coarse there for a ratio."""
+"""The gain excludes pixels below this luminance: 8-bit steps are too coarse there for a ratio."""
 
-CLIPPED_MIN: Final = 254
-"""From this 8-bit value on, a channel may be clipped: its true value is unknown."""
+MIN_CLIPPED: Final = 254
+"""A channel with at least this 8-bit value may be clipped: its true value is unknown."""
 
 MIN_PIXELS: Final = 64
 """A score or gain over fewer pixels is too noisy to report."""
@@ -52,33 +52,35 @@ MIN_PIXELS: Final = 64
 _LINEAR: Final = to_linear(np.arange(256) / 255)
 
 
-def removed_content(prediction: Picture, background: Picture, photo: Picture, reflection: Picture) -> float:
+def removed_content(prediction: Image, background: Image, photo: Image, reflection: Image) -> float:
     """The share of the background's light that the prediction lacks where there is no reflection.
 
-    sum max(B - g prediction, 0) / sum B over the pixels with R < 2 % of I and B > 0, where g is the gain of the module.
+    sum max(B - g prediction, 0) / sum B over the pixels with R < 2 % of I and B > 0. The module docstring defines the
+    gain g.
 
     Returns:
         A share in 0..1; lower is better.
 
     Raises:
-        ValueError: the pictures are not uint8 (H, W, 3) or differ in shape, or fewer than 64 pixels are left for the
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape, or fewer than 64 pixels are left for the
             score or in B for the gain.
     """
     luminance = _Luminances.of(prediction, background, photo, reflection)
     return luminance.removed_share(luminance.unreflected, f"R < {NEGLIGIBLE_SHARE:.0%} of I")
 
 
-def removed_white(prediction: Picture, background: Picture, photo: Picture, reflection: Picture) -> float:
+def removed_white(prediction: Image, background: Image, photo: Image, reflection: Image) -> float:
     """The share of the background's light that the prediction lacks in white areas without reflection.
 
-    As `removed_content`, over the pixels that are also white in B: every encoded channel is above 0.75, and the
-    largest is less than 0.12 above the smallest. It is high where a method takes white objects for highlights.
+    The formula is that of `removed_content`, over the pixels that are also white in B: every encoded channel is above
+    0.75, and the largest is less than 0.12 above the smallest. The score is high if a method removes white objects as
+    if they were highlights.
 
     Returns:
         A share in 0..1; lower is better.
 
     Raises:
-        ValueError: as `removed_content`.
+        ValueError: see `removed_content`.
     """
     luminance = _Luminances.of(prediction, background, photo, reflection)
     return luminance.removed_share(
@@ -86,17 +88,17 @@ def removed_white(prediction: Picture, background: Picture, photo: Picture, refl
     )
 
 
-def kept_reflection(prediction: Picture, background: Picture, photo: Picture, reflection: Picture) -> float:
+def kept_reflection(prediction: Image, background: Image, photo: Image, reflection: Image) -> float:
     """The share of the reflection's light that the prediction still contains.
 
-    sum min(max(g prediction - B, 0), R) / sum R over the pixels with R >= 10 % of I where I is not clipped, where g is
-    the gain of the module.
+    sum min(max(g prediction - B, 0), R) / sum R over the pixels with R >= 10 % of I and I not clipped. The module
+    docstring defines the gain g.
 
     Returns:
         A share in 0..1; lower is better.
 
     Raises:
-        ValueError: as `removed_content`.
+        ValueError: see `removed_content`.
     """
     luminance = _Luminances.of(prediction, background, photo, reflection)
     reflective = (
@@ -113,7 +115,7 @@ def kept_reflection(prediction: Picture, background: Picture, photo: Picture, re
 @final
 @dataclass(frozen=True, eq=False)
 class _Luminances:
-    """The linear luminances of the four pictures, (H, W); that of the prediction is multiplied by the gain."""
+    """The linear luminances of the four images, (H, W); that of the prediction is multiplied by the gain."""
 
     prediction: Light
     background: Light
@@ -123,8 +125,8 @@ class _Luminances:
     """Pixels without reflection."""
 
     @classmethod
-    def of(cls, prediction: Picture, background: Picture, photo: Picture, reflection: Picture) -> _Luminances:
-        check_pictures(prediction, background, photo, reflection)
+    def of(cls, prediction: Image, background: Image, photo: Image, reflection: Image) -> _Luminances:
+        check_images(prediction, background, photo, reflection)
         t, b, i, r = map(_luminance, (prediction, background, photo, reflection))
         unreflected = r < NEGLIGIBLE_SHARE * i
         comparable_background = unreflected & (b >= BLACK_LUMINANCE) & ~_is_clipped(background)
@@ -154,18 +156,18 @@ def _require_pixels(mask: Region, condition: str) -> None:
         raise ValueError(f"{count} pixels have {condition}; a score needs at least {MIN_PIXELS}")
 
 
-def _luminance(picture: Picture) -> Light:
-    luminance: Light = _LINEAR[picture] @ np.array(REC709_LUMINANCE)
+def _luminance(image: Image) -> Light:
+    luminance: Light = _LINEAR[image] @ np.array(REC709_LUMINANCE)
     return luminance
 
 
-def _is_clipped(picture: Picture) -> Region:
-    clipped: Region = picture.max(axis=2) >= CLIPPED_MIN
+def _is_clipped(image: Image) -> Region:
+    clipped: Region = image.max(axis=2) >= MIN_CLIPPED
     return clipped
 
 
-def _is_white(picture: Picture) -> Region:
-    darkest, brightest = picture.min(axis=2), picture.max(axis=2)
-    bright: Region = darkest > WHITE_MIN * 255
-    grey: Region = brightest - darkest < WHITE_MAX_DIFFERENCE * 255
+def _is_white(image: Image) -> Region:
+    darkest, brightest = image.min(axis=2), image.max(axis=2)
+    bright: Region = darkest > MIN_WHITE * 255
+    grey: Region = brightest - darkest < MAX_WHITE_DIFFERENCE * 255
     return bright & grey

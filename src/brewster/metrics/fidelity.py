@@ -1,7 +1,7 @@
-"""PSNR and SSIM of 8-bit sRGB pictures, as papers on reflection removal define them.
+"""PSNR and SSIM of 8-bit sRGB images, as papers on reflection removal define them.
 
 SSIM (Z. Wang et al., IEEE Trans. Image Proc. 13, 2004; K1 0.01, K2 0.03, range 255) is computed per RGB channel, and
-its map is averaged over the positions where the whole window is inside the picture. Two windows are in use:
+its map is averaged over the positions where the whole window is inside the image. Two windows are in use:
 
     uniform    7x7, sample covariance, as ERRNet, RAGNet and their successors report it. Equal to scikit-image's
                structural_similarity(a, b, channel_axis=2)
@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brewster.metrics.windows import (
-    BOX,
+    BOX_SIDE,
     GAUSSIAN_RADIUS,
-    Picture,
+    Image,
     Region,
     box_sums,
-    check_pictures,
+    check_images,
     check_region,
     gaussian_means,
 )
@@ -33,21 +33,21 @@ Window = Literal["uniform", "gaussian"]
 _LUMINANCE_CONSTANT: Final = (0.01 * 255) ** 2
 _CONTRAST_CONSTANT: Final = (0.03 * 255) ** 2
 _STRIP_ROWS: Final = 32
-_WINDOW_SIDES: Final[dict[Window, int]] = {"uniform": BOX, "gaussian": 2 * GAUSSIAN_RADIUS + 1}
+_WINDOW_SIDES: Final[dict[Window, int]] = {"uniform": BOX_SIDE, "gaussian": 2 * GAUSSIAN_RADIUS + 1}
 
 
-def psnr(prediction: Picture, truth: Picture, *, region: Region | None = None) -> float:
+def psnr(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
     """Peak signal-to-noise ratio, 10 log10(255^2 / MSE).
 
     The mean squared error is over the three channels of all pixels, or of the pixels in `region`, bool (H, W).
 
     Returns:
-        dB; higher is better. Infinity for equal pictures.
+        The PSNR in dB; infinity for equal images. Higher is better.
 
     Raises:
-        ValueError: the pictures are not uint8 (H, W, 3) or differ in shape, or the region is empty or of another shape.
+        ValueError: the images are not uint8 (H, W, 3) or differ in shape; the region is empty or of another shape.
     """
-    check_pictures(prediction, truth)
+    check_images(prediction, truth)
     difference = prediction.astype(np.int32) - truth
     if region is not None:
         check_region(region, prediction.shape[:2])
@@ -57,21 +57,21 @@ def psnr(prediction: Picture, truth: Picture, *, region: Region | None = None) -
 
 
 def ssim(
-    prediction: Picture, truth: Picture, *, window: Window = "uniform", region: Region | None = None
+    prediction: Image, truth: Image, *, window: Window = "uniform", region: Region | None = None
 ) -> float:
-    """Structural similarity (Wang et al. 2004), with one of the two windows of this module.
+    """Mean structural similarity (Wang et al. 2004), with one of the two windows of this module.
 
-    With a `region`, bool (H, W), the mean of the SSIM map over its pixels. The map has no values within 3 pixels of the
-    picture's border (Gaussian window: 5 pixels).
+    The SSIM map is averaged over all its pixels, or over those in `region`, bool (H, W). The map has no values within
+    3 pixels of the image's border (Gaussian window: 5 pixels).
 
     Returns:
-        At most 1; higher is better.
+        The mean, at most 1; 1 for equal images. Higher is better.
 
     Raises:
-        ValueError: the pictures are not uint8 (H, W, 3), differ in shape, or are smaller than the window; the
+        ValueError: the images are not uint8 (H, W, 3), differ in shape, or are smaller than the window; the
             region is empty, of another shape, or has only pixels without a value.
     """
-    check_pictures(prediction, truth)
+    check_images(prediction, truth)
     side = _WINDOW_SIDES[window]
     height, width = prediction.shape[:2]
     if min(height, width) < side:
@@ -88,7 +88,7 @@ def ssim(
     return float(np.mean(values))
 
 
-def _ssim_map(prediction: Picture, truth: Picture, window: Window) -> NDArray[np.float64]:
+def _ssim_map(prediction: Image, truth: Image, window: Window) -> NDArray[np.float64]:
     """The SSIM map, (H - side + 1, W - side + 1, 3), computed in strips that fit the processor's cache."""
     windowed_ssim, strip_height = _WINDOWED_SSIM[window], _STRIP_ROWS + _WINDOW_SIDES[window] - 1
     tops = range(0, len(prediction) - _WINDOW_SIDES[window] + 1, _STRIP_ROWS)
@@ -97,14 +97,14 @@ def _ssim_map(prediction: Picture, truth: Picture, window: Window) -> NDArray[np
     )
 
 
-def _ssim_uniform(prediction: Picture, truth: Picture) -> NDArray[np.float64]:
-    """In int32, which holds the sums of 8-bit values and products over the window exactly."""
+def _ssim_uniform(prediction: Image, truth: Image) -> NDArray[np.float64]:
+    """The SSIM map with the uniform window. int32 holds the sums of 8-bit values and of their products exactly."""
     return _ssim_formula(
-        prediction.astype(np.int32), truth.astype(np.int32), box_sums, BOX**2, sample_covariance=True
+        prediction.astype(np.int32), truth.astype(np.int32), box_sums, BOX_SIDE**2, sample_covariance=True
     )
 
 
-def _ssim_gaussian(prediction: Picture, truth: Picture) -> NDArray[np.float64]:
+def _ssim_gaussian(prediction: Image, truth: Image) -> NDArray[np.float64]:
     return _ssim_formula(
         prediction.astype(np.float64), truth.astype(np.float64), gaussian_means, 1, sample_covariance=False
     )
@@ -114,15 +114,15 @@ def _ssim_formula(
     x: NDArray[Any],
     y: NDArray[Any],
     window_sum: Callable[[Any], Any],
-    weight: int,
+    pixel_count: int,
     *,
     sample_covariance: bool,
 ) -> NDArray[np.float64]:
     """SSIM = (2 mx my + C1) (2 cov + C2) / ((mx^2 + my^2 + C1) (vx + vy + C2)), computed from window sums.
 
-    Numerator and denominator are multiplied by powers of `weight`, the number of pixels that a window sum counts
-    (1 if `window_sum` returns means). So there is one division, and integer sums stay integers until then. The formula
-    only needs the sum of both variances, so x^2 + y^2 is summed at once.
+    Here m is a mean, v a variance and cov the covariance in the window. Numerator and denominator are multiplied by
+    powers of `pixel_count`, the number of pixels in a window sum (1 if `window_sum` returns means). So there is only one
+    division, and integer sums stay integers until then. The formula needs only vx + vy, so x^2 + y^2 is summed once.
     """
     mean_x, mean_y, squares, products = (
         window_sum(x),
@@ -131,15 +131,15 @@ def _ssim_formula(
         window_sum(x * y),
     )
     mean_product, mean_squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
-    luminance = _LUMINANCE_CONSTANT * weight**2
-    contrast = _CONTRAST_CONSTANT * weight * (weight - sample_covariance)
-    numerator = (2 * mean_product + luminance) * (2 * (weight * products - mean_product) + contrast)
-    denominator = (mean_squares + luminance) * (weight * squares - mean_squares + contrast)
+    luminance = _LUMINANCE_CONSTANT * pixel_count**2
+    contrast = _CONTRAST_CONSTANT * pixel_count * (pixel_count - sample_covariance)
+    numerator = (2 * mean_product + luminance) * (2 * (pixel_count * products - mean_product) + contrast)
+    denominator = (mean_squares + luminance) * (pixel_count * squares - mean_squares + contrast)
     ssim_map: NDArray[np.float64] = numerator / denominator
     return ssim_map
 
 
-_WINDOWED_SSIM: Final[dict[Window, Callable[[Picture, Picture], NDArray[np.float64]]]] = {
+_WINDOWED_SSIM: Final[dict[Window, Callable[[Image, Image], NDArray[np.float64]]]] = {
     "uniform": _ssim_uniform,
     "gaussian": _ssim_gaussian,
 }

@@ -1,4 +1,4 @@
-"""The row type of METRICS, and the input of its functions: one prediction and the ground truth of one case."""
+"""`Metric`, the row type of METRICS, and `Comparison`, the argument of its `score` function."""
 
 from __future__ import annotations
 
@@ -6,21 +6,21 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar, cast, final
 
-from brewster.metrics.windows import Picture, Region
+from brewster.metrics.windows import Image, Region
 
 _Features = TypeVar("_Features")
 
 
 @final
 @dataclass(frozen=True, eq=False)
-class CachedPicture:
-    """A picture, uint8 sRGB (H, W, 3), with the features that metrics have computed from it."""
+class CachedImage:
+    """An image, uint8 sRGB (H, W, 3), with the features that metrics have computed from it."""
 
-    pixels: Picture
-    _features: dict[Callable[[Picture], Any], Any] = field(default_factory=dict, repr=False)
+    pixels: Image
+    _features: dict[Callable[[Image], Any], Any] = field(default_factory=dict, repr=False)
 
-    def features(self, compute: Callable[[Picture], _Features]) -> _Features:
-        """The result of `compute` for this picture. Metrics share it: it is computed once."""
+    def features(self, compute: Callable[[Image], _Features]) -> _Features:
+        """The result of `compute` for this image. It is computed once, and all metrics share it."""
         if compute not in self._features:
             self._features[compute] = compute(self.pixels)
         return cast("_Features", self._features[compute])
@@ -35,10 +35,10 @@ class Comparison:
     `reflection` is never None.
     """
 
-    prediction: CachedPicture
-    truth: CachedPicture
-    photo: Picture
-    reflection: Picture | None = None
+    prediction: CachedImage
+    truth: CachedImage
+    photo: Image
+    reflection: Image | None = None
     """The ground truth of the reflection; None if the case has none."""
     region: Region | None = None
     """The pixels to score, for a metric whose `where` is "region"; otherwise None."""
@@ -47,7 +47,7 @@ class Comparison:
 @final
 @dataclass(frozen=True)
 class Metric:
-    """A metric: its function, how its values are printed, and what they mean."""
+    """A metric: its definition, its function, and the format of its values."""
 
     name: str
     title: str
@@ -55,17 +55,17 @@ class Metric:
     """"dB", or "" for a number without unit."""
     higher_is_better: bool
     digits: int
-    """Decimal places in tables."""
+    """The number of decimal places in tables."""
     about: str
     """The definition with all parameters, in one sentence."""
     of: Literal["transmission", "reflection", "rendered"]
-    """The ground truth that it needs: the transmission, the reflection, or all layers of a rendered sample."""
+    """The ground truth that the metric needs: the transmission, the reflection, or all layers of a rendered sample."""
     score: Callable[[Comparison], float]
-    """Computes the value. Raises ValueError where it is undefined: an empty region, a picture that is too small."""
+    """Computes the value. Raises ValueError if it is undefined: the region is empty, or the image is too small."""
     where: Literal["picture", "region"] = "picture"
-    """Whether it averages over the whole picture or over the reflection region."""
+    """The pixels to average over: the whole image, or the reflection region."""
     prepare: Callable[[], object] | None = None
-    """Loads what it needs, such as weights. Called before the first score, so that missing weights fail early."""
+    """Loads the weights of the metric. It is called before the first score, so that missing weights are reported early."""
 
     def to_dict(self) -> dict[str, Any]:
         """All fields except the name and the functions, for results.json."""

@@ -1,11 +1,11 @@
-"""LPIPS 0.1 with AlexNet: the perceptual distance of two pictures.
+"""LPIPS 0.1 with AlexNet: the perceptual distance between two images.
 
     metric = Lpips.load()
-    truth = metric.features(picture)  # once for many predictions
+    truth = metric.features(image)  # once for many predictions
     print([metric.distance(metric.features(prediction), truth) for prediction in predictions])
 
-R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018; the same
-definition as the `lpips` package with version 0.1 of its weights. Only `Lpips.load` imports torch.
+R. Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual Metric", CVPR 2018. The
+definition and the weights are those of version 0.1 of the `lpips` package. Only `Lpips.load` imports torch.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from numpy.typing import NDArray
 
 from brewster.errors import MissingExtra
 from brewster.metrics.weights import load_alexnet, read_heads
-from brewster.metrics.windows import Picture, Region, check_pictures, check_region
+from brewster.metrics.windows import Image, Region, check_images, check_region
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from torch import Tensor
 
     Map = Float[Tensor, "_c _h _w"]
-    """The maps of one picture differ in all three sizes; the underscores tell jaxtyping not to compare them."""
+    """The maps of one image differ in all three sizes; the underscores tell jaxtyping not to compare them."""
 
 MIN_SIDE: Final = 31
-"""With fewer pixels on a side, AlexNet's strides and poolings leave an empty map."""
+"""The minimum height and width in pixels: with fewer, AlexNet's strides and poolings leave an empty map."""
 
 _SHIFT: Final = np.array([-0.030, -0.088, -0.188])
 _SCALE: Final = np.array([0.458, 0.448, 0.450])
@@ -56,9 +56,9 @@ _LAYERS: Final = (
 @final
 @dataclass(frozen=True, eq=False)
 class Features:
-    """AlexNet's features of a picture: five float32 maps (C, h, w), normalised to unit length over C.
+    """AlexNet's features of an image: five float32 maps (C, h, w), normalised to unit length over C.
 
-    `size` is the (height, width) of the picture.
+    `size` is the (height, width) of the image.
     """
 
     maps: tuple[Map, ...]
@@ -68,7 +68,7 @@ class Features:
 @final
 @dataclass(frozen=True, eq=False)
 class Lpips:
-    """LPIPS with its weights. It runs on the CPU; several threads may share one object."""
+    """LPIPS with its weights. It runs on the CPU. Several threads may use one object."""
 
     convolutions: tuple[tuple[Tensor, Tensor], ...]
     """Weights (out, in, k, k) and biases (out,) of AlexNet's five convolutions."""
@@ -77,7 +77,7 @@ class Lpips:
 
     @classmethod
     def load(cls) -> Lpips:
-        """LPIPS with its published weights; later calls return the same object.
+        """Returns LPIPS with its published weights. All calls return the same object.
 
         Raises:
             MissingExtra: torch is not installed.
@@ -87,22 +87,22 @@ class Lpips:
         """
         return _load()
 
-    def features(self, picture: Picture) -> Features:
-        """The features of a picture, uint8 (H, W, 3).
+    def features(self, image: Image) -> Features:
+        """The features of an image, uint8 (H, W, 3).
 
         Raises:
-            ValueError: the picture is not uint8 (H, W, 3), or has fewer than 31 pixels on a side.
+            ValueError: the image is not uint8 (H, W, 3), or has fewer than 31 pixels on a side.
         """
         import torch  # noqa: PLC0415 - an extra
         from torch.nn import functional  # noqa: PLC0415
 
-        check_pictures(picture)
-        size = picture.shape[:2]
+        check_images(image)
+        size = image.shape[:2]
         if min(size) < MIN_SIDE:
             raise ValueError(f"LPIPS needs at least {MIN_SIDE}x{MIN_SIDE} pixels, not {size[0]}x{size[1]}")
         maps = []
         with torch.inference_mode():
-            activations = torch.from_numpy(_normalised(picture)).permute(2, 0, 1)[None]
+            activations = torch.from_numpy(_normalised(image)).permute(2, 0, 1)[None]
             for (weight, bias), layer in zip(self.convolutions, _LAYERS, strict=True):
                 if layer.pooled_before:
                     activations = functional.max_pool2d(activations, 3, 2)
@@ -113,24 +113,24 @@ class Lpips:
         return Features(tuple(maps), size)
 
     def distance(self, one: Features, other: Features, *, region: Region | None = None) -> float:
-        """The LPIPS distance of two pictures.
+        """The LPIPS distance between two images, given by their features.
 
         The squared differences of the features are weighted by channel, averaged over each map, and summed over the
-        five maps. With a `region`, bool (H, W), each map of differences is first upsampled to the size of the picture
+        five maps. With a `region`, bool (H, W), each map of differences is first upsampled to the size of the image
         (bilinear, align_corners=False; `spatial=True` in `lpips`), and their sum is averaged over the region. A region
-        that is the whole picture gives a slightly different value than no region, because upsampling changes the
+        that is the whole image gives a slightly different value than no region, because upsampling changes the
         weight of the pixels at the border of a map.
 
         Returns:
-            0 for equal pictures; lower is better.
+            The distance, 0 for equal images; lower is better.
 
         Raises:
-            ValueError: the pictures differ in size, or the region is empty or of another shape.
+            ValueError: the images differ in size, or the region is empty or of another shape.
         """
         import torch  # noqa: PLC0415 - an extra
 
         if one.size != other.size:
-            raise ValueError(f"the pictures differ in size: {one.size} and {other.size}")
+            raise ValueError(f"the images differ in size: {one.size} and {other.size}")
         with torch.inference_mode():
             maps = [
                 torch.einsum("c,chw->hw", head, (a - b).square_())
@@ -142,18 +142,18 @@ class Lpips:
             return _mean(_upsampled(maps, one.size).numpy()[region])
 
 
-def lpips(prediction: Picture, truth: Picture, *, region: Region | None = None) -> float:
-    """LPIPS 0.1 (AlexNet) of two pictures, with weights from `Lpips.load`; see `Lpips.distance`.
+def lpips(prediction: Image, truth: Image, *, region: Region | None = None) -> float:
+    """The LPIPS 0.1 (AlexNet) distance between two images, with weights from `Lpips.load`; see `Lpips.distance`.
 
     Returns:
-        0 for equal pictures; lower is better.
+        The distance, 0 for equal images; lower is better.
 
     Raises:
-        ValueError: the pictures are not uint8 (H, W, 3), differ in shape, or are smaller than 31x31 pixels; the
+        ValueError: the images are not uint8 (H, W, 3), differ in shape, or are smaller than 31x31 pixels; the
             region is empty or of another shape.
         BrewsterError: the weights cannot be loaded; see `Lpips.load`.
     """
-    check_pictures(prediction, truth)
+    check_images(prediction, truth)
     metric = Lpips.load()
     return metric.distance(metric.features(prediction), metric.features(truth), region=region)
 
@@ -164,7 +164,9 @@ def _load() -> Lpips:
         import torch  # noqa: PLC0415 - an extra
     except ImportError as error:
         raise MissingExtra(
-            "torch is not installed", "the library that computes LPIPS", "pip install 'brewster[evaluate]'"
+            "torch is not installed",
+            "expected torch, which computes LPIPS",
+            "run: pip install 'brewster[evaluate]'",
         ) from error
     tensors = [*load_alexnet().values()]
     weights = [weight.to(memory_format=torch.channels_last) for weight in tensors[::2]]  # faster on the CPU
@@ -172,21 +174,21 @@ def _load() -> Lpips:
     return Lpips(tuple(zip(weights, tensors[1::2], strict=True)), heads)
 
 
-def _normalised(picture: Picture) -> NDArray[np.float32]:
+def _normalised(image: Image) -> NDArray[np.float32]:
     """(value / 127.5 - 1 - shift) / scale, (H, W, 3).
 
-    The channels stay last in memory, in which layout the convolutions are fastest on a CPU. The arithmetic runs on
+    The channels stay last in memory, because the convolutions are fastest on a CPU in this layout. The arithmetic runs on
     whole rows, because numpy is slow along an axis of length 3.
     """
-    height, width, _ = picture.shape
-    values = picture.reshape(height, -1).astype(np.float32, order="C")
+    height, width, _ = image.shape
+    values = image.reshape(height, -1).astype(np.float32, order="C")
     values *= np.tile(1 / (127.5 * _SCALE), width).astype(np.float32)
     values -= np.tile((1 + _SHIFT) / _SCALE, width).astype(np.float32)
-    return values.reshape(picture.shape)
+    return values.reshape(image.shape)
 
 
 def _mean(values: NDArray[np.float32]) -> float:
-    """The mean by numpy in float64: unlike torch, the order of its sums does not depend on the number of threads."""
+    """The mean, computed by numpy in float64, because the order of torch's sums depends on the number of threads."""
     return float(values.mean(dtype=np.float64))
 
 

@@ -2,8 +2,8 @@
 
 The convolutions are those of torchvision's AlexNet (`features.0`, 3, 6, 8 and 10 of alexnet-owt-7be5be79.pth,
 BSD-3-Clause). Their ten tensors are stored as a state dict, `lpips_alexnet_features.pth`. It is searched for in
-brewster/weights of the user's cache folder, then in `weights` of the folder that `BREWSTER_DATA` names. A digest of
-the values is always checked, because distances from other weights are not LPIPS.
+the folder `brewster/weights` of the user's cache folder, then in the folder `weights` of BREWSTER_DATA. The digest of
+the values is always checked, because distances with other weights are not LPIPS.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TENSOR_NAMES: Final = tuple(f"features.{i}.{kind}" for i in (0, 3, 6, 8, 10) for
 WEIGHTS_FILE: Final = "lpips_alexnet_features.pth"
 
 DIGEST: Final = "b58cb12516261361a1ed14f3b70c0abad70c1ca4c1c75e1aa576654d3759aa06"
-"""See `digest_of`."""
+"""The expected result of `digest_of`."""
 
 TORCHVISION_ALEXNET: Final = RemoteFile(
     "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth",
@@ -56,7 +56,7 @@ _LOAD_ERRORS: Final = (
     MemoryError,
     OSError,
 )
-"""The exceptions that torch.load and the lookup of tensors raise for a file that is damaged or not a state dict."""
+"""The exceptions of torch.load and of the lookup of tensors if the file is damaged or is not a state dict."""
 
 
 def load_alexnet(
@@ -65,7 +65,7 @@ def load_alexnet(
     """AlexNet's ten tensors by name, float32: from the cache, from BREWSTER_DATA, or downloaded into the cache.
 
     Raises:
-        ModelError: the file is damaged, or holds other weights.
+        ModelError: the file is damaged, or contains other weights.
         DownloadError: there is no file, and the download fails.
         TargetError: the cache folder cannot be written.
     """
@@ -78,10 +78,10 @@ def load_alexnet(
 
 
 def read_alexnet(path: Path, digest: str = DIGEST) -> dict[str, Tensor]:
-    """The ten tensors of a state dict, whose digest is checked. Other tensors in the file are ignored.
+    """Reads the ten tensors of a state dict and checks their digest. Other tensors in the file are ignored.
 
     Raises:
-        ModelError: the file is damaged, or holds other weights.
+        ModelError: the file is damaged, or contains other weights.
     """
     import torch  # noqa: PLC0415 - an extra
 
@@ -96,7 +96,7 @@ def read_alexnet(path: Path, digest: str = DIGEST) -> dict[str, Tensor]:
 
 
 def read_heads() -> list[NDArray[np.float32]]:
-    """The channel weights of the five layers, (64,), (192,), (384,), (256,), (256,); none is negative."""
+    """The channel weights of the five layers: (64,), (192,), (384,), (256,), (256,), all >= 0."""
     with np.load(Path(__file__).with_name("lpips_alex_v0.1.npz")) as file:
         return [file[f"layer{i}"] for i in range(5)]
 
@@ -111,31 +111,31 @@ def digest_of(tensors: dict[str, Tensor]) -> str:
 
 
 def _fetch(remote: RemoteFile, digest: str, cached: Path, downloader: Downloader) -> dict[str, Tensor]:
-    """Downloads the whole network, stores its ten tensors in `cached`, and deletes the rest (96 % of the file)."""
+    """Downloads the whole network, stores its ten tensors in `cached`, and deletes the download (the rest is 96 %)."""
     import torch  # noqa: PLC0415 - an extra
 
-    full_file = cached.with_name(remote.url.rsplit("/", 1)[-1])
+    download = cached.with_name(remote.url.rsplit("/", 1)[-1])
     try:
-        downloader.fetch(remote, full_file)
+        downloader.fetch(remote, download)
     except DownloadError as error:
         raise DownloadError(
             f"AlexNet's weights for LPIPS (233 MiB) could not be downloaded: {str(error).rstrip('.')}",
-            f"a network connection, or {WEIGHTS_FILE} in the folder weights of BREWSTER_DATA",
+            f"expected a network connection, or {WEIGHTS_FILE} in the folder weights of BREWSTER_DATA",
             "connect and try again, or leave LPIPS out with --metrics psnr,ssim",
         ) from error
     try:
-        tensors = read_alexnet(full_file, digest)
+        tensors = read_alexnet(download, digest)
         buffer = io.BytesIO()
         torch.save(tensors, buffer)
         write_atomically(cached, buffer.getvalue(), overwrite=True)
     finally:
-        full_file.unlink(missing_ok=True)
+        download.unlink(missing_ok=True)
     return tensors
 
 
-def _not_alexnet(path: Path, why: str) -> ModelError:
+def _not_alexnet(path: Path, reason: str) -> ModelError:
     return ModelError(
-        f"{path} does not hold the AlexNet weights of LPIPS ({why})",
-        "the first convolutions of torchvision's alexnet-owt-7be5be79.pth",
-        "delete the file, and brewster downloads it again (233 MiB); or replace it by the right one",
+        f"{path} does not contain the AlexNet weights of LPIPS ({reason})",
+        "expected the convolutions of torchvision's alexnet-owt-7be5be79.pth",
+        "delete the file, so that brewster downloads it again (233 MiB), or replace it with the correct one",
     )

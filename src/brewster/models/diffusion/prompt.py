@@ -1,7 +1,7 @@
-"""The paper's prompt, and its embedding: encoded once and stored with the LoRA, so inference needs no text encoder.
+"""The paper's prompt and its embedding. It is encoded once and stored with the LoRA, so inference needs no text encoder.
 
-"We embed the prompt into the model as a feature specific to the task" (paper, Text-to-image Model Fine-tuning). This
-saves 4.8 billion parameters of text encoder in training and inference.
+"We embed the prompt into the model as a feature specific to the task" (paper, Text-to-image Model Fine-tuning).
+Therefore training and inference do not load the text encoders (4.8 billion parameters for kontext).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PROMPT: Final = (
     "[IMAGE3] shows only the reflection of glass without transmission; "
     "[IMAGE1] could be decomposed to [IMAGE2] and [IMAGE3]."
 )
-"""The paper's prompt, word for word (Experimental Setup, box PROMPT); its paragraphs are joined by a space."""
+"""The paper's prompt, word for word (Experimental Setup, box PROMPT); its paragraphs are joined by spaces."""
 
 PROMPTS: Final[dict[str, str]] = {
     "paper": PROMPT,
@@ -41,7 +41,7 @@ PROMPTS: Final[dict[str, str]] = {
     ),
 }
 """Prompts by name. "generic" and "detailed" are for a backbone without a LoRA (paper, Comparing to original Flux
-model). The paper shows results of such prompts, but not their text, so these texts are by brewster."""
+model). The paper shows results of such prompts without their texts, so brewster defines these texts."""
 
 PROMPT_FILE: Final = "prompt.safetensors"
 _FORMAT: Final = "brewster prompt 1"
@@ -53,7 +53,7 @@ class PromptEmbedding:
     """The embedding of a prompt by the text encoders of one backbone.
 
     `embeds` is (1, tokens, width). `pooled`, (1, width), is for backbones that take a pooled vector as well.
-    `negative`, (1, tokens, width), is the embedding of the empty prompt, for classifier-free guidance.
+    `negative`, (1, tokens, width), is the embedding of the empty prompt, which classifier-free guidance needs.
     """
 
     backbone: str
@@ -74,12 +74,12 @@ class PromptEmbedding:
         return _digest(self.backbone, self.text, self.tensors)
 
     def to(self, device: torch.device | str, dtype: torch.dtype) -> PromptEmbedding:
-        """The same embedding on this device and in this dtype."""
+        """Copies the embedding to this device and dtype."""
         moved = {name: tensor.to(device, dtype) for name, tensor in self.tensors.items()}
         return PromptEmbedding(self.backbone, self.text, **moved)
 
     def save(self, path: Path) -> None:
-        """Writes a safetensors file. The same embedding gives the same bytes.
+        """Writes a safetensors file. The same embedding always gives the same bytes.
 
         Raises:
             TargetError: the file cannot be written.
@@ -97,17 +97,19 @@ def load_prompt(path: Path, backbone: str) -> PromptEmbedding:
     tensors, metadata = read_tensors(path)
     is_prompt = metadata.get("kind") == _FORMAT and {"backbone", "text", "sha256"} <= metadata.keys()
     if not (is_prompt and {"embeds"} <= set(tensors) <= {"embeds", "pooled", "negative"}):
-        raise ModelError(f"{path} is not an encoded prompt", f"a file of kind {_FORMAT!r}", "encode it again")
+        raise ModelError(
+            f"{path} is not an encoded prompt", f"expected a file of kind {_FORMAT!r}", "encode it again"
+        )
     if metadata["backbone"] != backbone:
         raise ModelError(
             f"{path} was encoded for {metadata['backbone']}",
-            f"a prompt for {backbone}",
+            f"expected a prompt for {backbone}",
             f"encode it with {backbone}'s text encoder",
         )
     if _digest(metadata["backbone"], metadata["text"], tensors) != metadata["sha256"]:
         raise ModelError(
             f"{path} does not have the digest in its metadata",
-            f"{metadata['sha256'][:12]}...",
+            f"expected {metadata['sha256'][:12]}...",
             "copy it again",
         )
     return PromptEmbedding(metadata["backbone"], metadata["text"], **tensors)

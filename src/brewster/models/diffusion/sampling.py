@@ -1,9 +1,9 @@
 """Generates panels from noise with the Euler steps of the pipelines in diffusers, but without their rescaling.
 
-    pictures = sample(backbone, condition, prompt, size=(1536, 512), seeds=[0, 1])
+    images = sample(backbone, condition, prompt, size=(1536, 512), seeds=[0, 1])
 
 The paper uses 20 steps and guidance 4 (Experimental Setup). Fewer steps are faster and less accurate. Averaging the
-pictures of several seeds reduces details that the model invents, because they differ between seeds.
+images of several seeds reduces details that the model invents, because they differ between seeds.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 STEPS: Final = 20
 GUIDANCE: Final = 4.0
 _MEMORY_HINT: Final = (
-    "store the base in fewer bits (quantise), or take a smaller base or a card with more memory"
+    "store the base in fewer bits (quantise), or use a smaller base or a GPU with more memory"
 )
 
 
@@ -43,35 +43,35 @@ def sample(
     batch: int = 1,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Float[Tensor, "seeds 3 h w"]:
-    """Generates one composite of this (width, height) for each seed.
+    """Generates one composite per seed, of this (width, height) in pixels.
 
     The noise is drawn on the CPU, so a seed gives the same noise on every device. `batch` is the number of seeds that
-    are computed at once; it does not change the result beyond rounding. `on_progress(done, total)` is called after
+    are computed at once; the result depends on it only by rounding. `on_progress(done, total)` is called after
     each step.
 
     Returns:
         The composites in [-1, 1], float32, on the CPU. `.mean(0, keepdim=True)` averages them.
 
     Raises:
-        ModelError: a side is not a multiple of 16, the prompt lacks the embedding that guidance needs, or `steps`,
-            `batch` or the number of seeds is less than one.
+        ModelError: a side is not a multiple of 16; the prompt lacks the embedding that guidance needs; `steps`, `batch`
+            or the number of seeds is less than one.
         DeviceError: out of memory; the message says what to reduce.
     """
-    _check_positive(f"{steps} steps", steps, usual=STEPS)
-    _check_positive(f"{len(seeds)} seeds", len(seeds), usual=1)
-    _check_positive(f"a batch of {batch}", batch, usual=1)
-    groups = [seeds[start : start + batch] for start in range(0, len(seeds), batch)]
+    _check_positive(f"{steps} steps", steps, default=STEPS)
+    _check_positive(f"{len(seeds)} seeds", len(seeds), default=1)
+    _check_positive(f"a batch of {batch}", batch, default=1)
+    chunks = [seeds[start : start + batch] for start in range(0, len(seeds), batch)]
     done = itertools.count(1)
 
     def report_step() -> None:
         if on_progress:
-            on_progress(next(done), steps * len(groups))
+            on_progress(next(done), steps * len(chunks))
 
-    pictures = []
+    images = []
     with explain_out_of_memory(_MEMORY_HINT):
         condition_latents = backbone.encode(condition)
-        for group in groups:
-            noise = torch.cat([backbone.noise(size, seed) for seed in group])
+        for chunk in chunks:
+            noise = torch.cat([backbone.noise(size, seed) for seed in chunk])
             latents = euler(
                 backbone,
                 noise,
@@ -81,8 +81,8 @@ def sample(
                 guidance=guidance,
                 on_progress=report_step,
             )
-            pictures.append(backbone.decode(latents).clamp(-1, 1).cpu())
-    return torch.cat(pictures)
+            images.append(backbone.decode(latents).clamp(-1, 1).cpu())
+    return torch.cat(images)
 
 
 def euler(
@@ -112,8 +112,8 @@ def euler(
     return latents
 
 
-def _check_positive(request: str, count: int, *, usual: int) -> None:
+def _check_positive(request: str, count: int, *, default: int) -> None:
     if count < 1:
         raise ModelError(
-            f"sampling was requested with {request}", "at least 1", f"the usual value is {usual}"
+            f"sampling was requested with {request}", "expected at least 1", f"use {default}, the default"
         )

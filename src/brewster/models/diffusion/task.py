@@ -20,7 +20,7 @@ PAPER_PX: Final = 1536 * 512
 @final
 @dataclass(frozen=True)
 class DecompositionTask:
-    """Which panels to generate, with at most `budget_px` pixels in all panels together.
+    """Which panels to generate, and how. All panels together have at most `budget_px` pixels.
 
     `objective` is "flow" (from noise, in many steps) or "one_step" (from the photo, in one step). `guidance` is used
     for separation; training may use another value.
@@ -35,7 +35,7 @@ class DecompositionTask:
         """Raises RecipeError for a task without T, because every separation needs a transmission."""
         if "T" not in self.layout.panels:
             raise RecipeError(
-                f"the panels are {list(self.layout.panels)}", "a list with T", "add T to the panels"
+                f"the panels are {list(self.layout.panels)}", "expected a list with T", "add T to the panels"
             )
 
     def fit(self, size: tuple[int, int], multiple: int) -> PanelFit:
@@ -52,6 +52,6 @@ class DecompositionTask:
                 return fit_panel(size, self.layout, budget_px=budget, multiple=multiple)
         raise PhotoError(
             f"the photo has {size[0]} x {size[1]} pixels",
-            f"at least {multiple} pixels a side, and an aspect ratio that is less extreme",
+            f"expected at least {multiple} pixels a side, and a less extreme aspect ratio",
             "crop it, or use the compact model",
         )

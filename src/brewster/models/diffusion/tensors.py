@@ -1,4 +1,4 @@
-"""Reads and writes safetensors files. The same tensors and metadata always give the same bytes."""
+"""Reading and writing of safetensors files. The same tensors and metadata always give the same bytes."""
 
 from __future__ import annotations
 
@@ -38,15 +38,19 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     """
     safetensors = import_library("safetensors")
     try:
-        # Read, not memory-mapped: if another process rewrites the file, mapped tensors would change.
+        # Not memory-mapped: mapped tensors would change if another process rewrote the file.
         data = path.read_bytes()
         tensors = import_library("safetensors.torch").load(data)
         return dict(sorted(tensors.items())), read_metadata(data)
     except FileNotFoundError as error:
-        raise ModelError(f"{path} is missing", "a safetensors file", "copy the whole folder") from error
+        raise ModelError(
+            f"{path} is missing", "expected a safetensors file", "copy the whole folder"
+        ) from error
     except (OSError, ValueError, safetensors.SafetensorError) as error:
         raise ModelError(
-            f"{path} cannot be read: {error}", "a complete safetensors file", "copy or write it again"
+            f"{path} cannot be read: {error}",
+            "expected a complete safetensors file",
+            "copy or write it again",
         ) from error
 
 
@@ -60,13 +64,13 @@ def _header_end(data: bytes) -> int:
 
 
 def read_metadata(data: bytes) -> dict[str, str]:
-    """The metadata in the bytes of a complete file."""
+    """The metadata in the bytes of a safetensors file."""
     metadata: dict[str, str] = _header(data).get("__metadata__", {})
     return metadata
 
 
 def with_metadata(data: bytes, metadata: Mapping[str, str]) -> bytes:
-    """The bytes of a file with the same tensors and other metadata."""
+    """Replaces the metadata in the bytes of a safetensors file, and returns the new bytes."""
     header = _header(data)
     header["__metadata__"] = dict(sorted(metadata.items()))
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()

@@ -23,7 +23,7 @@ from brewster.models.diffusion.families.family import APACHE_2, Backbone, Diffus
 from brewster.models.diffusion.panels import fit_panel
 from brewster.models.diffusion.prompt import PROMPT, PROMPT_FILE, load_prompt
 from brewster.models.diffusion.sampling import GUIDANCE, STEPS
-from brewster.models.zoo import TINY
+from brewster.models.zoo import TINY_PREFIX
 from brewster.rendered.generation.job import RECORD
 from brewster.rendered.store import read_set
 from brewster.training.recipe import LoraRecipe
@@ -283,7 +283,7 @@ def _table(head: tuple[str, str], rows: Mapping[str, object]) -> str:
 
 
 def _is_toy(recipe: LoraRecipe) -> bool:
-    return recipe.backbone.startswith(TINY)
+    return recipe.backbone.startswith(TINY_PREFIX)
 
 
 def _base_id(recipe: LoraRecipe, base: type[Backbone]) -> str:

@@ -21,7 +21,7 @@ from brewster.models.diffusion.backbones import build, find_family
 from brewster.models.diffusion.families.family import Backbone
 from brewster.models.diffusion.panels import fit_panel
 from brewster.models.diffusion.prompt import PromptEmbedding
-from brewster.models.zoo import TINY
+from brewster.models.zoo import TINY_PREFIX
 from brewster.training.recipe import LoraRecipe
 
 _GIB: Final = 1 << 30
@@ -203,9 +203,9 @@ def _local_gpu() -> GraphicsCard:
 
 
 def _meta_backbone(recipe: LoraRecipe) -> Backbone:
-    name = recipe.backbone.removeprefix(TINY)
+    name = recipe.backbone.removeprefix(TINY_PREFIX)
     family = find_family(name)
-    size = family.tiny if recipe.backbone.startswith(TINY) else family.full_size
+    size = family.tiny if recipe.backbone.startswith(TINY_PREFIX) else family.full_size
     return build(name, size, device="meta", dtype=torch.bfloat16)
 
 

@@ -1,10 +1,10 @@
-"""Uploads a LoRA's folder to the Hugging Face hub: checks it first, then sends it in one commit.
+"""Checks a LoRA's folder and uploads it to the Hugging Face hub in one commit.
 
-    plan = plan_push(Path("out/kontext/lora"), "somebody/sees-through-glass")
+    plan = plan_push(Path("out/kontext/lora"), "my-name/my-lora")
     print(plan.table())                     # nothing has been sent yet
-    address = push(plan)
+    commit_url = push(plan)
 
-It sends exactly four files. Local paths in the recipe and in the LoRA's metadata are replaced in the uploaded copies.
+Exactly four files are sent. Local paths in the recipe and in the LoRA's metadata are replaced in the uploaded copies.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, Final, final
 
 from brewster.errors import DownloadError, ModelError
-from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraCard, read_card, read_prompt
+from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata, read_lora_metadata, read_prompt
 from brewster.models.diffusion.backbones import BACKBONES, find_family
 from brewster.models.diffusion.lazy_imports import import_library
 from brewster.models.diffusion.prompt import PROMPT_FILE
 from brewster.models.diffusion.tensors import read_metadata, with_metadata
-from brewster.models.zoo import TINY
+from brewster.models.zoo import TINY_PREFIX
 
 CARD_FILE: Final = "README.md"
 RECIPE_FILE: Final = "recipe.json"
 FILES: Final = (CARD_FILE, LORA_FILE, PROMPT_FILE, RECIPE_FILE)
-"""The files on the hub. diffusers and the hub find the LoRA and the model card by these names."""
+"""The files to upload. diffusers and the hub find the LoRA and the model card by these names."""
 
 _HOME_FOLDERS: Final = re.compile(r"(?:(?<![\w.])/home/|/Users/|/root/|[A-Za-z]:\\+Users\\+)[^\s\"'`,;)\]]*")
 _LOGIN_HINT: Final = (
-    "make one at https://huggingface.co/settings/tokens, then `hf auth login` or set HF_TOKEN"
+    "create one at https://huggingface.co/settings/tokens, then run `hf auth login` or set HF_TOKEN"
 )
-_RETRAIN_HINT: Final = "correct the card, or train again to write a new one"
+_RETRAIN_HINT: Final = "correct the model card, or train again to write a new one"
 
 
 @final
@@ -85,27 +85,28 @@ def plan_push(folder: Path, repo_id: str, *, message: str = "", public: bool = F
     """Checks a LoRA's folder and prepares its upload; needs no network connection.
 
     Raises:
-        ModelError: a file is missing or damaged, the prompt is not the LoRA's, the card has no front matter, a
-            file contains the path of a home folder, or `repo_id` is not OWNER/NAME.
+        ModelError: a file is missing or damaged, the prompt does not belong to the LoRA, the model card has no front
+            matter, a file contains the path of a home folder, or `repo_id` is not OWNER/NAME.
         MissingExtra: huggingface_hub is not installed.
     """
     _check_repo_id(repo_id)
-    data = {name: _bytes(folder / name) for name in FILES}
-    card, recipe = read_card(folder), _recipe(folder, data[RECIPE_FILE])
-    read_prompt(folder, card)
-    _check_front_matter(folder, data[CARD_FILE], is_tiny=_is_tiny(card))
-    renamed = {path: PureWindowsPath(path).name for path in _local_paths(recipe)} | _public_base(card)
-    if renamed:
-        data[RECIPE_FILE] = f"{json.dumps(_with_renamed(recipe, renamed), indent=2)}\n".encode()
-        data[LORA_FILE] = _with_public_base(data[LORA_FILE], card, renamed)
-    for name, sent in [*data.items(), ("the message", message.encode())]:
-        _refuse_home_folders(folder / name, sent)
+    data = {name: _read_bytes(folder / name) for name in FILES}
+    metadata, recipe = read_lora_metadata(folder), _parse_recipe(folder, data[RECIPE_FILE])
+    read_prompt(folder, metadata)
+    _check_front_matter(folder, data[CARD_FILE], is_tiny=_is_tiny(metadata))
+    replacements = {path: PureWindowsPath(path).name for path in _local_paths(recipe)}
+    replacements |= _base_replacement(metadata)
+    if replacements:
+        data[RECIPE_FILE] = f"{json.dumps(_replace_strings(recipe, replacements), indent=2)}\n".encode()
+        data[LORA_FILE] = _replace_base(data[LORA_FILE], metadata, replacements)
+    for name, content in [*data.items(), ("the message", message.encode())]:
+        _refuse_home_folders(folder / name, content)
     return UploadPlan(
         repo_id,
-        tuple(UploadFile(name, sent) for name, sent in data.items()),
-        message or f"LoRA of {renamed.get(card.base, card.base)}, rank {card.rank}",
+        tuple(UploadFile(name, content) for name, content in data.items()),
+        message or f"LoRA of {replacements.get(metadata.base, metadata.base)}, rank {metadata.rank}",
         not public,
-        tuple(_remarks(folder, card, renamed)),
+        tuple(_remarks(folder, metadata, replacements)),
     )
 
 
@@ -125,7 +126,7 @@ def push(plan: UploadPlan, token: str | None = None) -> str:
     hub = import_library("huggingface_hub")
     if not (token or hub.get_token()):
         raise DownloadError(
-            f"there is no token to write to {plan.repo_id} with", "a token with write access", _LOGIN_HINT
+            f"there is no token to write to {plan.repo_id}", "expected a token with write access", _LOGIN_HINT
         )
     if not sys.stderr.isatty():
         import_library("huggingface_hub.utils").disable_progress_bars()
@@ -137,8 +138,8 @@ def push(plan: UploadPlan, token: str | None = None) -> str:
         if plan.is_private != is_private:
             raise DownloadError(
                 f"{plan.repo_id} exists already and is {'private' if is_private else 'public'}",
-                "a private repository without --public, or a public one with it",
-                f"{'leave out' if is_private else 'pass'} --public, choose another name, or change its settings",
+                f"expected a {'private' if plan.is_private else 'public'} repository",
+                f"{'leave out' if is_private else 'pass'} --public, or choose another name, or change its settings",
             )
         commit = api.create_commit(plan.repo_id, added, commit_message=plan.message)
     return str(commit.commit_url)
@@ -153,35 +154,35 @@ def _check_repo_id(repo_id: str) -> None:
     if reason:
         raise ModelError(
             f"{repo_id!r} is not a valid hub id ({reason})",
-            "OWNER/NAME",
-            "give your user name and a repository name",
+            "expected OWNER/NAME",
+            "pass your user name and a repository name",
         )
 
 
-def _bytes(path: Path) -> bytes:
+def _read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
         raise ModelError(
             f"{path} cannot be read ({error.strerror})",
-            f"a LoRA's folder, with {', '.join(FILES)}",
-            "give the folder lora that brewster train wrote, or train again to write it",
+            f"expected a LoRA's folder, with {', '.join(FILES)}",
+            "pass the folder lora that brewster train wrote, or train again to write it",
         ) from error
 
 
-def _recipe(folder: Path, data: bytes) -> Any:  # noqa: ANN401 - JSON
+def _parse_recipe(folder: Path, data: bytes) -> Any:  # noqa: ANN401 - JSON
     try:
         return json.loads(data)
     except ValueError as error:
         raise ModelError(
             f"{folder / RECIPE_FILE} is not JSON: {error}",
-            "the recipe of the LoRA",
+            "expected the recipe of the LoRA",
             "train again to write it",
         ) from error
 
 
 def _check_front_matter(folder: Path, card: bytes, *, is_tiny: bool) -> None:
-    """Checks that the card's front matter has the fields by which the hub shows licence, base and library."""
+    """Checks the front matter of the model card: the hub reads licence, base and library from it."""
     yaml_errors = (ValueError, TypeError, import_library("yaml").YAMLError)
     required = {"license", "library_name"} | (set() if is_tiny else {"base_model"})
     try:
@@ -192,14 +193,14 @@ def _check_front_matter(folder: Path, card: bytes, *, is_tiny: bool) -> None:
     except yaml_errors as error:
         raise ModelError(
             f"the front matter of {folder / CARD_FILE} is not YAML: {error}",
-            "YAML that the hub can read",
+            "expected YAML that the hub can read",
             _RETRAIN_HINT,
         ) from error
     missing = sorted(required - {name for name, value in fields.items() if value})
     if missing:
         raise ModelError(
             f"the front matter of {folder / CARD_FILE} has no {', '.join(missing)}",
-            "these fields as YAML between two lines ---",
+            "expected these fields as YAML between two lines ---",
             _RETRAIN_HINT,
         )
 
@@ -216,56 +217,62 @@ def _is_local_path(text: str) -> bool:
     return PurePosixPath(text).is_absolute() or PureWindowsPath(text).is_absolute() or text.startswith("~")
 
 
-def _with_renamed(value: Any, renamed: Mapping[str, str]) -> Any:  # noqa: ANN401 - JSON
-    """The same JSON value with these strings replaced."""
+def _replace_strings(value: Any, replacements: Mapping[str, str]) -> Any:  # noqa: ANN401 - JSON
+    """Replaces strings in a JSON value, and returns the new value."""
     if isinstance(value, dict):
-        return {name: _with_renamed(item, renamed) for name, item in value.items()}
+        return {name: _replace_strings(item, replacements) for name, item in value.items()}
     if isinstance(value, list):
-        return [_with_renamed(item, renamed) for item in value]
-    return renamed.get(value, value) if isinstance(value, str) else value
+        return [_replace_strings(item, replacements) for item in value]
+    return replacements.get(value, value) if isinstance(value, str) else value
 
 
-def _public_base(card: LoraCard) -> dict[str, str]:
-    """If the base is a local folder: a mapping from it to the hub id that replaces it; otherwise empty."""
-    is_local = card.base not in BACKBONES and (_is_local_path(card.base) or Path(card.base).is_dir())
-    return {card.base: find_family(card.backbone).hub_id} if is_local else {}
+def _base_replacement(metadata: LoraMetadata) -> dict[str, str]:
+    """{local folder: hub id} if the base is a local folder; otherwise empty."""
+    is_local = metadata.base not in BACKBONES and (
+        _is_local_path(metadata.base) or Path(metadata.base).is_dir()
+    )
+    return {metadata.base: find_family(metadata.backbone).hub_id} if is_local else {}
 
 
-def _with_public_base(data: bytes, card: LoraCard, renamed: Mapping[str, str]) -> bytes:
-    """The bytes of the LoRA file with the base in its card replaced as in `renamed`."""
-    public = dataclasses.replace(card, base=renamed.get(card.base, card.base)).to_json()
+def _replace_base(data: bytes, metadata: LoraMetadata, replacements: Mapping[str, str]) -> bytes:
+    """Replaces the base in the metadata of the LoRA file, and returns the new bytes."""
+    new_text = dataclasses.replace(metadata, base=replacements.get(metadata.base, metadata.base)).to_json()
     return with_metadata(
-        data, {name: public if text == card.to_json() else text for name, text in read_metadata(data).items()}
+        data,
+        {
+            name: new_text if text == metadata.to_json() else text
+            for name, text in read_metadata(data).items()
+        },
     )
 
 
 def _refuse_home_folders(path: Path, data: bytes) -> None:
-    """Refuses text and metadata that contain a home folder, because its path can contain the user's name."""
+    """Refuses text and metadata with the path of a home folder, because the path can contain the user's name."""
     text = json.dumps(read_metadata(data)) if path.suffix == ".safetensors" else data.decode(errors="replace")
     home = str(Path.home())
-    found = _HOME_FOLDERS.search(text)
-    if found or (len(home) > 1 and home in text):
+    match = _HOME_FOLDERS.search(text)
+    if match or (len(home) > 1 and home in text):
         raise ModelError(
-            f"{path} contains the path {found[0] if found else home}",
-            "no path of a home folder in uploaded files",
+            f"{path} contains the path {match[0] if match else home}",
+            "expected no path of a home folder in uploaded files",
             "remove it from the file",
         )
 
 
-def _is_tiny(card: LoraCard) -> bool:
-    return card.base.startswith(TINY)
+def _is_tiny(metadata: LoraMetadata) -> bool:
+    return metadata.base.startswith(TINY_PREFIX)
 
 
-def _remarks(folder: Path, card: LoraCard, renamed: Mapping[str, str]) -> Iterator[str]:
-    licence = find_family(card.backbone).licence
-    if _is_tiny(card):
-        yield f"its base is {card.base}, a tiny test model: it cannot separate photos"
+def _remarks(folder: Path, metadata: LoraMetadata, replacements: Mapping[str, str]) -> Iterator[str]:
+    licence = find_family(metadata.backbone).licence
+    if _is_tiny(metadata):
+        yield f"its base is {metadata.base}, a tiny test model: it cannot separate photos"
     elif not licence.is_commercial:
         yield f"its base has the licence {licence.title}, which also applies to the LoRA: not for commercial use"
-    yield from (f"{place} is replaced by {name} in the uploaded files" for place, name in renamed.items())
-    others = sorted(path.name for path in folder.iterdir() if path.name not in FILES)
-    if others:
-        yield f"not sent: {', '.join(others)}"
+    yield from (f"{path} is replaced by {name} in the uploaded files" for path, name in replacements.items())
+    other_files = sorted(path.name for path in folder.iterdir() if path.name not in FILES)
+    if other_files:
+        yield f"not sent: {', '.join(other_files)}"
 
 
 @contextlib.contextmanager
@@ -279,18 +286,18 @@ def _translate_hub_errors(repo_id: str) -> Iterator[None]:
     except (errors.HTTPError, errors.OfflineModeIsEnabled) as error:
         raise DownloadError(
             f"the hub cannot be reached ({error})",
-            "a network connection",
-            "connect and push again: nothing was sent",
+            "expected a network connection",
+            "connect and push again (nothing was sent)",
         ) from error
     except json.JSONDecodeError as error:
         raise DownloadError(
             f"the server's response is not JSON ({error})",
-            "a Hugging Face hub",
+            "expected a Hugging Face hub",
             "check HF_ENDPOINT and your proxy settings",
         ) from error
     except ValueError as error:  # huggingface_hub raises it if the hub rejects the front matter
         raise DownloadError(
-            f"the hub refused {CARD_FILE}: {error}", "valid front matter", _RETRAIN_HINT
+            f"the hub refused {CARD_FILE}: {error}", "expected valid front matter", _RETRAIN_HINT
         ) from error
 
 
@@ -298,14 +305,16 @@ def _http_error(status: int, repo_id: str) -> DownloadError:
     if status == 401:
         return DownloadError(
             f"the hub refused the token for {repo_id} (HTTP 401)",
-            "a valid token with write access",
+            "expected a valid token with write access",
             _LOGIN_HINT,
         )
     if status == 403:
         owner = repo_id.partition("/")[0]
         return DownloadError(
             f"the token may not write to {repo_id} (HTTP 403)",
-            f"a token with write access to the repositories of {owner}",
+            f"expected a token with write access to the repositories of {owner}",
             _LOGIN_HINT,
         )
-    return DownloadError(f"the hub returned HTTP {status} for {repo_id}", "a commit", "try again later")
+    return DownloadError(
+        f"the hub returned HTTP {status} for {repo_id}", "expected a commit", "try again later"
+    )

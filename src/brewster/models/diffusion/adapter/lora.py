@@ -2,11 +2,11 @@
 
     add_lora(backbone, rank=16, alpha=16, seed=0)
     save_lora(folder, backbone, prompt, task)     # in diffusers: pipe.load_lora_weights(folder)
-    card, prompt = load_lora(folder, backbone)
+    metadata, prompt = load_lora(folder, backbone)
 
-The paper gives the rank, 16 (Experimental Setup). Alpha 16 and adapters on all linear layers of the blocks are the
-usual settings with it. The LoRA is float32 on a base of any precision, because most of Adam's updates are smaller than the
-rounding of bf16.
+The paper uses rank 16 (Experimental Setup). It does not state alpha or the adapted layers; alpha 16 and all linear
+layers of the blocks are usual settings. The LoRA is float32 for a base of any precision, because most of Adam's updates are
+smaller than the rounding error of bf16.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from brewster.options import Quantisation
 LORA_FILE: Final = "pytorch_lora_weights.safetensors"
 """The file name that diffusers expects."""
 _PREFIX: Final = "transformer."
-_CARD_KEY: Final = "brewster"
+_METADATA_KEY: Final = "brewster"
 _PEFT_KEY: Final = "lora_adapter_metadata"
 _ADAPTER_NAME: Final = "default"
 
 
 @final
 @dataclass(frozen=True)
-class LoraCard:
-    """The metadata of a LoRA: its backbone, the base's quantisation, rank and alpha, task, and the prompt's digest.
+class LoraMetadata:
+    """The metadata of a LoRA: backbone, base and its quantisation, rank, alpha, task, and the digest of the prompt.
 
     `base` is a hub id, a folder, or a name in the table of backbones.
     """
@@ -55,29 +55,29 @@ class LoraCard:
     prompt_sha256: str
 
     def to_json(self) -> str:
-        """The card as one line of JSON."""
+        """The metadata as one line of JSON."""
         return json.dumps(asdict(self), sort_keys=True)
 
     @classmethod
-    def from_json(cls, text: str) -> LoraCard:
+    def from_json(cls, text: str) -> LoraMetadata:
         """Parses the result of `to_json`.
 
         Raises:
-            ModelError: the text is not a valid card.
+            ModelError: the text is not valid metadata.
         """
         try:
-            return _card_validator().validate_json(text, strict=True, extra="forbid")
+            return _metadata_validator().validate_json(text, strict=True, extra="forbid")
         except (ValueError, RecipeError) as error:
             raise ModelError(
-                f"the card of the LoRA cannot be read: {error}",
-                "a card that brewster wrote",
-                "save the LoRA again",
+                f"the metadata of the LoRA cannot be read: {error}",
+                "expected metadata that brewster wrote",
+                "copy the folder again, or save the LoRA again",
             ) from error
 
 
 @cache
-def _card_validator() -> TypeAdapter[LoraCard]:
-    return TypeAdapter(LoraCard)
+def _metadata_validator() -> TypeAdapter[LoraMetadata]:
+    return TypeAdapter(LoraMetadata)
 
 
 def add_lora(backbone: Backbone, *, rank: int = 16, alpha: int = 16, seed: int = 0) -> list[nn.Parameter]:
@@ -91,10 +91,10 @@ def add_lora(backbone: Backbone, *, rank: int = 16, alpha: int = 16, seed: int =
         MissingExtra: peft is not installed.
     """
     if rank < 1:
-        raise ModelError(f"the rank is {rank}", "at least 1", "use 16 as in the paper")
+        raise ModelError(f"the rank is {rank}", "expected at least 1", "use 16 as in the paper")
     if has_lora(backbone):
         raise ModelError(
-            "the backbone already has a LoRA", "a backbone without one", "call remove_lora first"
+            "the backbone already has a LoRA", "expected a backbone without a LoRA", "call remove_lora first"
         )
     peft = import_library("peft")
     config = peft.LoraConfig(r=rank, lora_alpha=alpha, target_modules=backbone.lora_targets())
@@ -107,7 +107,7 @@ def add_lora(backbone: Backbone, *, rank: int = 16, alpha: int = 16, seed: int =
 
 
 def remove_lora(backbone: Backbone) -> None:
-    """Removes the LoRA, which restores the base's predictions; without a LoRA it does nothing."""
+    """Removes the LoRA and so restores the base's predictions. Does nothing if there is no LoRA."""
     if has_lora(backbone):
         backbone.transformer.unload_lora()
 
@@ -136,7 +136,7 @@ def load_lora_state(backbone: Backbone, state: Mapping[str, Tensor]) -> None:
     Raises:
         ModelError: the backbone has no LoRA, or the weights are those of another backbone or rank.
     """
-    _refuse_other_weights(lora_state(backbone), state)
+    _check_weights(lora_state(backbone), state)
     import_library("peft").set_peft_model_state_dict(
         backbone.transformer, dict(state), adapter_name=_ADAPTER_NAME
     )
@@ -150,26 +150,28 @@ def save_lora(
     *,
     base: str = "",
     quantise: Quantisation | None = None,
-) -> LoraCard:
-    """Writes a folder with the LoRA, in a file that diffusers can load, and the prompt. Deterministic to the byte.
+) -> LoraMetadata:
+    """Writes a folder with the LoRA, in a file that diffusers can load, and the prompt. The bytes are reproducible.
 
-    `base` is by default the backbone's hub id.
+    By default `base` is the backbone's hub id.
 
     Returns:
-        The card that is stored in the metadata of the file.
+        The metadata that is stored in the file.
 
     Raises:
         ModelError: the backbone has no LoRA, or the prompt belongs to another backbone.
         TargetError: the folder cannot be written.
     """
     if not has_lora(backbone):
-        raise ModelError("the backbone has no LoRA", "a backbone with one", "call add_lora first")
+        raise ModelError("the backbone has no LoRA", "expected a backbone with a LoRA", "call add_lora first")
     if prompt.backbone != backbone.name:
         raise ModelError(
-            f"the prompt was encoded for {prompt.backbone}", f"{backbone.name}", "encode it for this backbone"
+            f"the prompt was encoded for {prompt.backbone}",
+            f"expected a prompt for {backbone.name}",
+            "encode it for this backbone",
         )
     config = backbone.transformer.peft_config[_ADAPTER_NAME]
-    card = LoraCard(
+    metadata = LoraMetadata(
         backbone.name,
         base or backbone.hub_id,
         quantise,
@@ -180,93 +182,95 @@ def save_lora(
     )
     tensors = {_PREFIX + name: tensor for name, tensor in lora_state(backbone).items()}
     prompt.save(folder / PROMPT_FILE)
-    write_tensors(folder / LORA_FILE, tensors, {_CARD_KEY: card.to_json(), _PEFT_KEY: _peft_settings(config)})
-    return card
+    write_tensors(
+        folder / LORA_FILE, tensors, {_METADATA_KEY: metadata.to_json(), _PEFT_KEY: _peft_settings(config)}
+    )
+    return metadata
 
 
-def read_card(folder: Path) -> LoraCard:
-    """The card of the LoRA in this folder; it says which backbone to load.
+def read_lora_metadata(folder: Path) -> LoraMetadata:
+    """The metadata of the LoRA in this folder. It names the backbone to load.
 
     Raises:
         ModelError: the LoRA is missing or damaged, or was not written by brewster.
     """
-    return _read(folder)[1]
+    return _read_lora(folder)[1]
 
 
-def read_prompt(folder: Path, card: LoraCard) -> PromptEmbedding:
+def read_prompt(folder: Path, metadata: LoraMetadata) -> PromptEmbedding:
     """The prompt of the LoRA in this folder.
 
     Raises:
         ModelError: the prompt is missing or damaged, or is not the one with which the LoRA was trained.
     """
-    prompt = load_prompt(folder / PROMPT_FILE, card.backbone)
-    if prompt.sha256 != card.prompt_sha256:
+    prompt = load_prompt(folder / PROMPT_FILE, metadata.backbone)
+    if prompt.sha256 != metadata.prompt_sha256:
         raise ModelError(
-            f"{folder / PROMPT_FILE} is not the prompt that the LoRA was trained with",
-            f"SHA-256 {card.prompt_sha256[:12]}...",
+            f"{folder / PROMPT_FILE} is not the prompt with which the LoRA was trained",
+            f"expected SHA-256 {metadata.prompt_sha256[:12]}...",
             "copy the whole folder again",
         )
     return prompt
 
 
-def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraCard, PromptEmbedding]:
+def load_lora(folder: Path, backbone: Backbone) -> tuple[LoraMetadata, PromptEmbedding]:
     """Adds the LoRA of a folder to its backbone.
 
     Returns:
-        The LoRA's card and its prompt.
+        The metadata of the LoRA, and its prompt.
 
     Raises:
-        ModelError: the LoRA belongs to another backbone, its weights do not have the rank of its card, a file is
+        ModelError: the LoRA belongs to another backbone, its weights do not match the rank in its metadata, a file is
             damaged, the prompt does not belong to it, or the backbone already has a LoRA.
     """
-    state, card = _read(folder)
-    if card.backbone != backbone.name:
+    state, metadata = _read_lora(folder)
+    if metadata.backbone != backbone.name:
         raise ModelError(
-            f"{folder} is a LoRA of {card.backbone}",
-            f"a LoRA of {backbone.name}",
-            f"load the backbone {card.backbone} for it",
+            f"{folder} is a LoRA of {metadata.backbone}",
+            f"expected a LoRA of {backbone.name}",
+            f"load the backbone {metadata.backbone} for it",
         )
-    prompt = read_prompt(folder, card)
-    add_lora(backbone, rank=card.rank, alpha=card.alpha)
+    prompt = read_prompt(folder, metadata)
+    add_lora(backbone, rank=metadata.rank, alpha=metadata.alpha)
     try:
         load_lora_state(backbone, state)
     except ModelError:
         remove_lora(backbone)
         raise
-    return card, prompt
+    return metadata, prompt
 
 
-def _read(folder: Path) -> tuple[dict[str, Tensor], LoraCard]:
-    tensors, metadata = read_tensors(folder / LORA_FILE)
-    if _CARD_KEY not in metadata:
+def _read_lora(folder: Path) -> tuple[dict[str, Tensor], LoraMetadata]:
+    tensors, entries = read_tensors(folder / LORA_FILE)
+    if _METADATA_KEY not in entries:
         raise ModelError(
             f"{folder / LORA_FILE} was not written by brewster",
-            "a LoRA with a card in its metadata",
+            f"expected a LoRA with the entry {_METADATA_KEY} in its metadata",
             "use a LoRA that brewster train wrote",
         )
-    card = LoraCard.from_json(metadata[_CARD_KEY])
-    return {name.removeprefix(_PREFIX): tensor for name, tensor in tensors.items()}, card
+    metadata = LoraMetadata.from_json(entries[_METADATA_KEY])
+    return {name.removeprefix(_PREFIX): tensor for name, tensor in tensors.items()}, metadata
 
 
-def _refuse_other_weights(expected: Mapping[str, Tensor], found: Mapping[str, Tensor]) -> None:
-    mismatched = sorted(set(expected) ^ set(found))
+def _check_weights(expected: Mapping[str, Tensor], actual: Mapping[str, Tensor]) -> None:
+    mismatched = sorted(set(expected) ^ set(actual))
     if mismatched:
         raise ModelError(
             f"{len(mismatched)} weights of the LoRA are missing or unexpected, for example {mismatched[0]}",
-            "one pair of matrices for each linear layer of the blocks",
-            "use the backbone that it was trained on",
+            "expected one pair of matrices for each linear layer of the blocks",
+            "use the backbone with which it was trained",
         )
-    for name, tensor in sorted(found.items()):
+    for name, tensor in sorted(actual.items()):
         if tensor.shape != expected[name].shape:
             raise ModelError(
                 f"{name} has the shape {tuple(tensor.shape)}",
-                f"{tuple(expected[name].shape)}",
+                f"expected {tuple(expected[name].shape)}",
                 "use the rank and the backbone with which it was trained",
             )
 
 
 def _peft_settings(config: Any) -> str:  # noqa: ANN401 - peft's configuration
-    """The LoRA settings that diffusers reads from the metadata. Without them, it assumes that alpha equals the rank."""
+    """The LoRA settings that diffusers reads. Without them, diffusers assumes that alpha equals the rank."""
     settings = {
         "r": config.r,
         "lora_alpha": config.lora_alpha,

@@ -1,7 +1,7 @@
 """Base classes of the large backbones: encode, decode, predict the velocity, and list the layers for a LoRA.
 
 Latents are grids (N, C, H/16, W/16): the VAE's latents with each 2 x 2 patch packed into the channels. One grid cell is
-one token of the transformer and 16 x 16 pixels of the picture, and a panel is a block of whole cells.
+one token of the transformer and 16 x 16 pixels of the image, and a panel is a block of whole cells.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 PATCH: Final = 2
-"""The side of a token in VAE cells; every family packs 2 x 2."""
+"""The side of a token in VAE cells: all families pack 2 x 2 cells."""
 _BLOCKS: Final = ("transformer_blocks", "single_transformer_blocks")
 _LORA_PARTS: Final = ("lora_A", "lora_B")
 
@@ -41,7 +41,7 @@ class Licence:
 
     title: str
     hub: Mapping[str, str]
-    """Its fields in the front matter of a model card on the hub."""
+    """The fields of the licence in the front matter of a model card on the hub."""
     is_commercial: bool = True
 
 
@@ -56,22 +56,22 @@ class DiffusersUsage:
     parts: str
     """Arguments of `from_pretrained` that leave out the text encoders."""
     options: str
-    """Arguments of the call. {area} is replaced by the pixels of the composite; `words` is the encoded prompt."""
+    """Arguments of the call. {area} is replaced by the number of pixels of the composite; `words` is the encoded prompt."""
     caution: str
-    """What the pipeline does without these options, in one sentence."""
+    """One sentence on what the pipeline does without these options."""
 
 
 class Backbone(ABC):
-    """A flow-matching transformer that generates a picture from a conditioning image, with its VAE and scheduler.
+    """A flow-matching transformer that generates an image from a conditioning image, with its VAE and scheduler.
 
-    Time is sigma: 1 is noise, 0 is the picture. The transformer predicts velocity = noise - picture.
+    Time is sigma: 1 is noise, 0 is the image. The transformer predicts velocity = noise - latents of the image.
     """
 
     name: ClassVar[str]
     hub_id: ClassVar[str]
     licence: ClassVar[Licence]
     diffusers_usage: ClassVar[DiffusersUsage | str]
-    """For model cards: how to call the pipeline of diffusers, or a clause "but ..." why it gives another picture."""
+    """For model cards: how to call the pipeline of diffusers, or a clause "but ..." on why its image differs."""
     classes: ClassVar[Mapping[str, str]]
     """Class names in diffusers of the "pipeline", "transformer", "vae" and "scheduler"."""
     full_size: ClassVar[Architecture]
@@ -79,7 +79,7 @@ class Backbone(ABC):
     guided_by_embedding: ClassVar[bool]
     """True if the guidance scale is an input of the transformer; False for classifier-free guidance."""
     text_encoder_requirements: ClassVar[tuple[str, ...]] = ()
-    """Libraries that its text encoders need in addition to the extra `large`."""
+    """Libraries that the text encoders need in addition to the extra `large`."""
     multiple: ClassVar[int] = 16
     """The sides of a panel must be multiples of this, in pixels."""
 
@@ -109,8 +109,8 @@ class Backbone(ABC):
         return int(self.transformer.config.in_channels)
 
     @torch.no_grad()
-    def encode(self, picture: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c h/16 w/16"]:
-        """Encodes pictures in [-1, 1] to normalised latent grids, float32: the mode of the VAE's distribution.
+    def encode(self, image: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n c h/16 w/16"]:
+        """Encodes images in [-1, 1] to normalised latent grids, float32: the mode of the VAE's distribution.
 
         Encode the whole composite at once. Panels that are encoded separately differ at the seams and, because of
         GroupNorm, everywhere.
@@ -118,14 +118,14 @@ class Backbone(ABC):
         Raises:
             ModelError: a side is not a multiple of 16.
         """
-        self._check_grid(picture.shape[-1], picture.shape[-2])
+        self._check_grid(image.shape[-1], image.shape[-2])
         mean, deviation = self.statistics()
-        cells = self._vae_encode(picture.to(self.vae.device, self.vae.dtype))
+        cells = self._vae_encode(image.to(self.vae.device, self.vae.dtype))
         return (functional.pixel_unshuffle(cells, PATCH).float() - mean) / deviation
 
     @torch.no_grad()
     def decode(self, latents: Float[Tensor, "n c h w"]) -> Float[Tensor, "n 3 16*h 16*w"]:
-        """Decodes latent grids to pictures, float32, about [-1, 1], not clamped."""
+        """Decodes latent grids to images, float32, about [-1, 1], not clamped."""
         mean, deviation = self.statistics()
         grid = latents.to(self.vae.device).float() * deviation + mean
         return self._vae_decode(functional.pixel_shuffle(grid, PATCH).to(self.vae.dtype)).float()
@@ -143,7 +143,7 @@ class Backbone(ABC):
         prompt: PromptEmbedding,
         guidance: float,
     ) -> Float[Tensor, "n c h w"]:
-        """The velocity (noise - picture) of the latents at time sigma, float32; differentiable.
+        """The velocity (noise - latents of the image) at time sigma, float32; differentiable.
 
         Raises:
             ModelError: the prompt lacks an embedding that this guidance needs.
@@ -176,7 +176,7 @@ class Backbone(ABC):
         shape = (1, self.channels // PATCH**2, height, width)
         return functional.pixel_unshuffle(_seeded_noise(shape, seed), PATCH)
 
-    def shift(self, tokens: int, steps: int) -> float:  # noqa: ARG002 - one family's shift counts the steps
+    def shift(self, tokens: int, steps: int) -> float:  # noqa: ARG002 - the shift of klein depends on the steps
         """The schedule's shift mu for a composite of this many generated tokens, without those of the condition.
 
         A linear function of the number of tokens through the scheduler's two anchors (Esser et al. 2024; FLUX).
@@ -187,7 +187,7 @@ class Backbone(ABC):
         return float(config.base_shift + slope * (tokens - low))
 
     def shifted(self, sigma: Tensor, tokens: int, steps: int = 20) -> Tensor:
-        """Times in (0, 1], shifted towards noise as in the sampling schedule; for training."""
+        """Shifts times in (0, 1] towards noise, as the sampling schedule does. Used in training."""
         scheduler = self.scheduler
         if scheduler.config.use_dynamic_shifting:
             shifted = scheduler.time_shift(self.shift(tokens, steps), 1.0, sigma)
@@ -196,10 +196,9 @@ class Backbone(ABC):
         return scheduler.shift * sigma / (1 + (scheduler.shift - 1) * sigma)  # type: ignore[no-any-return]
 
     def schedule(self, tokens: int, steps: int) -> Float[Tensor, " sigmas"]:
-        """The sigmas from 1 to 0 by the scheduler of diffusers: steps + 1 decreasing values."""
-        if (
-            steps == 1
-        ):  # a shift does not change sigma 1, but stretching to `shift_terminal` would divide 0 by 0
+        """The sigmas of the scheduler of diffusers: steps + 1 decreasing values from 1 to 0."""
+        # A shift does not change sigma 1, but stretching to `shift_terminal` would divide 0 by 0.
+        if steps == 1:
             return torch.tensor([1.0, 0.0])
         scheduler = type(self.scheduler).from_config(self.scheduler.config)
         dynamic = {"mu": self.shift(tokens, steps)} if scheduler.config.use_dynamic_shifting else {}
@@ -209,7 +208,7 @@ class Backbone(ABC):
         return sigmas
 
     def lora_targets(self) -> list[str]:
-        """The full names of all linear layers in the blocks. Suffixes would also match the top-level proj_out."""
+        """The full names of all linear layers in the blocks. The suffix proj_out would match layers outside."""
         return [
             name.removesuffix(".base_layer")
             for name, module in self.transformer.named_modules()
@@ -224,33 +223,33 @@ class Backbone(ABC):
         Raises:
             MissingExtra: diffusers is not installed.
         """
-        kind = diffusers_class(self.classes["pipeline"])
+        pipeline_class = diffusers_class(self.classes["pipeline"])
         parts = {"transformer": self.transformer, "vae": self.vae, "scheduler": self.scheduler}
-        parameters = inspect.signature(kind.__init__).parameters
+        parameters = inspect.signature(pipeline_class.__init__).parameters
         omitted = {
             name: None
             for name, parameter in parameters.items()
             if name not in {"self", *parts} and parameter.default is parameter.empty
         }
         distilled = {"is_distilled": self.distilled} if "is_distilled" in parameters else {}
-        return kind(**parts, **omitted, **distilled)
+        return pipeline_class(**parts, **omitted, **distilled)
 
     def save(self, folder: Path) -> None:
-        """Writes a folder that `load_backbone` and diffusers can read."""
+        """Writes a folder that `load_backbone` and diffusers can load."""
         pipeline = self.pipeline()
-        with suppress_warnings():  # diffusers warns about each missing text encoder
+        with suppress_warnings():  # diffusers warns about missing text encoders
             pipeline.save_pretrained(folder)
 
     def _check_grid(self, width: int, height: int) -> None:
         if width % self.multiple or height % self.multiple:
             raise ModelError(
-                f"the picture has {width} x {height} pixels",
-                f"sides that are multiples of {self.multiple}",
-                "pad it with panels.fit_panel",
+                f"the image has {width} x {height} pixels",
+                f"expected sides that are multiples of {self.multiple}",
+                "pad it with PanelFit.pad",
             )
 
-    def _vae_encode(self, picture: Tensor) -> Tensor:
-        return self.vae.encode(picture).latent_dist.mode()  # type: ignore[no-any-return]
+    def _vae_encode(self, image: Tensor) -> Tensor:
+        return self.vae.encode(image).latent_dist.mode()  # type: ignore[no-any-return]
 
     def _vae_decode(self, latent: Tensor) -> Tensor:
         return self.vae.decode(latent, return_dict=False)[0]  # type: ignore[no-any-return]
@@ -309,7 +308,7 @@ def _negative_embeds(prompt: PromptEmbedding) -> Tensor:
     if prompt.negative is None:
         raise ModelError(
             f"the prompt for {prompt.backbone} has no embedding of the empty prompt",
-            "one, for a guidance above 1",
+            "expected this embedding for a guidance above 1",
             "encode the prompt again or set the guidance to 1",
         )
     return prompt.negative

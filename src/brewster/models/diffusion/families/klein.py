@@ -1,4 +1,4 @@
-"""FLUX.2 klein base-4B: 3.9 billion parameters, small enough for bf16 training on a 24 GB card."""
+"""FLUX.2 klein base-4B: 3.9 billion parameters, small enough for bf16 training on a 24 GB GPU."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SCHEDULER: Final = {
     "base_image_seq_len": 256, "max_image_seq_len": 4096,
 }  # fmt: skip
 _CONDITION_TIME: Final = 10
-"""The time coordinate of conditioning tokens. Generated tokens have 0; FLUX.2's first reference picture has 10."""
+"""The time coordinate of conditioning tokens. Generated tokens have 0; FLUX.2's first reference image has 10."""
 
 
 @final
@@ -62,13 +62,13 @@ class Klein(ClassifierFreeBackbone):
     }  # fmt: skip
 
     def statistics(self) -> tuple[Tensor, Tensor]:
-        """The running statistics of the VAE's batch norm, one value per packed channel."""
+        """See `Backbone.statistics`: the running statistics of the VAE's batch norm, one value per packed channel."""
         norm = self.vae.bn
         deviation = (norm.running_var.float() + self.vae.config.batch_norm_eps).sqrt()
         return norm.running_mean.float().view(1, -1, 1, 1), deviation.view(1, -1, 1, 1)
 
     def noise(self, size: tuple[int, int], seed: int) -> Tensor:
-        """See `Backbone.noise`. Unlike in the other families, the noise is drawn on the packed grid.
+        """See `Backbone.noise`. For this family, diffusers draws the noise on the packed grid.
 
         Raises:
             ModelError: a side is not a multiple of 16.
@@ -78,7 +78,7 @@ class Klein(ClassifierFreeBackbone):
         return torch.randn(1, self.channels, height, width, generator=torch.Generator().manual_seed(seed))
 
     def shift(self, tokens: int, steps: int) -> float:
-        """Black Forest Labs' empirical fit of mu: linear in the steps between its values at 10 and at 200 steps."""
+        """mu by the empirical formula of Black Forest Labs: linear in the steps through its values at 10 and 200 steps."""
         at_200 = 0.00016927 * tokens + 0.45666666
         if tokens > 4300:
             return at_200
@@ -86,7 +86,7 @@ class Klein(ClassifierFreeBackbone):
         return at_200 + (at_200 - at_10) / 190 * (steps - 200)
 
     def positions(self, latents: Tensor, condition: Tensor) -> Tensor:
-        """Position ids, (tokens, 4): time (0 generated, 10 conditioning), row, column, index in the text (0)."""
+        """Position ids, (tokens, 4): time (0: generated, 10: conditioning), row, column, index in the text (0)."""
         return torch.cat([_position_ids(latents, 0), _position_ids(condition, _CONDITION_TIME)]).to(
             self.device
         )

@@ -46,7 +46,7 @@ class Kontext(Backbone):
     diffusers_usage = DiffusersUsage(
         "text_encoder=None, text_encoder_2=None, tokenizer=None, tokenizer_2=None",
         'pooled_prompt_embeds=prompt["pooled"], max_area={area}, _auto_resize=False,',
-        "Without `max_area` and `_auto_resize=False` the pipeline silently rescales both pictures.",
+        "Without `max_area` and `_auto_resize=False` the pipeline silently rescales both images.",
     )
     classes: ClassVar = {
         "pipeline": "FluxKontextPipeline", "transformer": "FluxTransformer2DModel",
@@ -69,14 +69,14 @@ class Kontext(Backbone):
     guided_by_embedding = True
 
     def statistics(self) -> tuple[Tensor, Tensor]:
-        """One value each, (1, 1, 1, 1): FLUX.1's VAE has one shift and scale for all channels."""
+        """See `Backbone.statistics`: (1, 1, 1, 1), because FLUX.1's VAE has one shift and one scale for all channels."""
         config = self.vae.config
         mean = torch.tensor(config.shift_factor, device=self.vae.device)
         deviation = 1 / torch.tensor(config.scaling_factor, device=self.vae.device)
         return mean.view(1, 1, 1, 1), deviation.view(1, 1, 1, 1)
 
     def positions(self, latents: Tensor, condition: Tensor) -> Tensor:
-        """Position ids, (tokens, 3): picture (0 generated, 1 conditioning), row, column."""
+        """Position ids, (tokens, 3): image (0: generated, 1: conditioning), row, column."""
         return torch.cat([_position_ids(latents, 0), _position_ids(condition, 1)]).to(self.device)
 
     def predict(
@@ -88,7 +88,11 @@ class Kontext(Backbone):
             ModelError: the prompt has no pooled vector.
         """
         if prompt.pooled is None:
-            raise ModelError("the prompt has no pooled vector", "one by CLIP", "encode the prompt again")
+            raise ModelError(
+                "the prompt has no pooled vector",
+                "expected the pooled vector of CLIP",
+                "encode the prompt again",
+            )
         count, embedding = len(latents), prompt.to(self.device, self.dtype)
         assert embedding.pooled is not None
         takes_guidance = self.transformer.config.guidance_embeds
@@ -106,7 +110,7 @@ class Kontext(Backbone):
 
     @classmethod
     def embed(cls, pipeline: Any, text: str) -> PromptEmbedding:  # noqa: ANN401 - a pipeline of diffusers
-        """The prompt's token embeddings by T5, and its pooled vector by CLIP."""
+        """The token embeddings of T5 and the pooled vector of CLIP."""
         embeds, pooled, _ = pipeline.encode_prompt(prompt=text, prompt_2=text)
         return PromptEmbedding(cls.name, text, embeds.detach(), pooled.detach())
 
@@ -118,6 +122,6 @@ class Kontext(Backbone):
         return random_prompt(cls.name, seed, **shapes)
 
 
-def _position_ids(grid: Tensor, picture: int) -> Tensor:
+def _position_ids(grid: Tensor, image: int) -> Tensor:
     rows, columns = (torch.arange(side) for side in grid.shape[2:])
-    return torch.cartesian_prod(torch.tensor([picture]), rows, columns)
+    return torch.cartesian_prod(torch.tensor([image]), rows, columns)

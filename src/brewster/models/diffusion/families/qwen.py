@@ -1,4 +1,4 @@
-"""Qwen-Image-Edit: 20 billion parameters, Apache-2.0; the backbone of WindowSeat, the best published method."""
+"""Qwen-Image-Edit: 20 billion parameters, Apache-2.0. The method WindowSeat uses it."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ _GREY_SIDE_PX: Final = 448
 class Qwen(ClassifierFreeBackbone):
     """Qwen-Image-Edit (Qwen team 2025), with classifier-free guidance that preserves the norm of each token.
 
-    The pipeline of diffusers resizes the conditioning image to one megapixel; this class does not. Its text encoder
-    also reads the conditioning image; this class encodes the prompt once, with a uniform grey image.
+    The pipeline of diffusers resizes the conditioning image to one megapixel; this class does not. The text encoder
+    also takes the conditioning image. This class encodes the prompt once, with a uniform grey image instead.
     """
 
     name = "qwen"
@@ -51,16 +51,16 @@ class Qwen(ClassifierFreeBackbone):
     }  # fmt: skip
 
     def statistics(self) -> tuple[Tensor, Tensor]:
-        """One value per channel of the VAE, repeated for the four cells of a patch."""
+        """See `Backbone.statistics`: one value per channel of the VAE, repeated for the four cells of a patch."""
         config, device = self.vae.config, self.vae.device
         mean = torch.tensor(config.latents_mean, device=device).repeat_interleave(PATCH**2)
         deviation = torch.tensor(config.latents_std, device=device).repeat_interleave(PATCH**2)
         return mean.view(1, -1, 1, 1), deviation.view(1, -1, 1, 1)
 
     def positions(self, latents: Tensor, condition: Tensor) -> list[list[tuple[int, int, int]]]:
-        """For each sample, (frames, rows, columns) of the generated picture and of the conditioning image.
+        """For each sample, (frames, rows, columns) of the generated image and of the conditioning image.
 
-        The transformer computes the rotary position embedding from them, centred on each picture.
+        The transformer computes the rotary position embedding from them, centred on each image.
         """
         shapes = [(1, int(grid.shape[2]), int(grid.shape[3])) for grid in (latents, condition)]
         return [shapes] * len(latents)
@@ -92,15 +92,15 @@ class Qwen(ClassifierFreeBackbone):
     def _guided(self, conditional: Tensor, unconditional: Tensor, guidance: float) -> Tensor:
         """The guided prediction, rescaled per token to the norm of the conditional one."""
         combined = super()._guided(conditional, unconditional, guidance)
-        return combined * (_length(conditional) / _length(combined))
+        return combined * (_token_norm(conditional) / _token_norm(combined))
 
-    def _vae_encode(self, picture: Tensor) -> Tensor:
-        return self.vae.encode(picture[:, :, None]).latent_dist.mode()[:, :, 0]  # type: ignore[no-any-return]
+    def _vae_encode(self, image: Tensor) -> Tensor:
+        return self.vae.encode(image[:, :, None]).latent_dist.mode()[:, :, 0]  # type: ignore[no-any-return]
 
     def _vae_decode(self, latent: Tensor) -> Tensor:
         return self.vae.decode(latent[:, :, None], return_dict=False)[0][:, :, 0]  # type: ignore[no-any-return]
 
 
-def _length(grid: Tensor) -> Tensor:
-    length: Tensor = torch.linalg.vector_norm(grid, dim=1, keepdim=True)
-    return length
+def _token_norm(grid: Tensor) -> Tensor:
+    norm: Tensor = torch.linalg.vector_norm(grid, dim=1, keepdim=True)
+    return norm
