@@ -56,7 +56,7 @@ def test_two_runs_and_two_workers_write_the_same_bytes(real20, methods, tmp_path
 
 
 def test_the_page_shows_the_worst_of_the_first_model(real20, methods, tmp_path):
-    results = evaluate(real20, methods, QUICK, tmp_path / "out", shown=1)
+    results = evaluate(real20, methods, QUICK, tmp_path / "out", max_report_cases=1)
     scores = {picture["name"]: picture["scores"]["pane"]["psnr"] for picture in results["pictures"]}
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("<article") == 1
@@ -65,7 +65,7 @@ def test_the_page_shows_the_worst_of_the_first_model(real20, methods, tmp_path):
 
 def test_the_page_shows_first_what_the_first_model_failed_on(real20, methods, tmp_path):
     (tmp_path / "theirs" / "2.png").unlink()
-    evaluate(real20, [IdentityBaseline(), methods[2]], QUICK, tmp_path / "out", shown=1)
+    evaluate(real20, [IdentityBaseline(), methods[2]], QUICK, tmp_path / "out", max_report_cases=1)
     page = (tmp_path / "out" / "report.html").read_text()
     assert 'data-name="2"' in page
     assert page.count("<article") == 1
@@ -74,7 +74,7 @@ def test_the_page_shows_first_what_the_first_model_failed_on(real20, methods, tm
 def test_a_case_with_an_unreadable_ground_truth_is_not_on_the_page(real20, methods, tmp_path):
     path = tmp_path / "real20" / "transmission_layer" / "2.png"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    evaluate(real20, [IdentityBaseline(), methods[2]], QUICK, tmp_path / "out", shown=1)
+    evaluate(real20, [IdentityBaseline(), methods[2]], QUICK, tmp_path / "out", max_report_cases=1)
     assert 'data-name="1"' in (tmp_path / "out" / "report.html").read_text()
 
 
@@ -89,7 +89,7 @@ def test_an_unchanged_photo_that_equals_the_ground_truth_gives_no_remark(tmp_pat
 
 
 def test_without_a_model_the_page_shows_the_worst_photos(real20, tmp_path):
-    results = evaluate(real20, [IdentityBaseline()], QUICK, tmp_path / "out", shown=1)
+    results = evaluate(real20, [IdentityBaseline()], QUICK, tmp_path / "out", max_report_cases=1)
     scores = {
         picture["name"]: picture["scores"]["input (unprocessed)"]["psnr"] for picture in results["pictures"]
     }
@@ -135,7 +135,7 @@ def test_downscaled_photos_are_written_for_methods_that_run_elsewhere(real20, tm
 def test_benchmarks_that_share_a_name_or_hold_no_pair_are_refused(real20, methods, tmp_path):
     with pytest.raises(BrewsterError, match="2 benchmarks have the name 'real20'"):
         evaluate([*real20, *real20], methods, QUICK, tmp_path / "out")
-    empty = Benchmark("real20", "Real20", (), refused=("a.png has no partner",))
+    empty = Benchmark("real20", "Real20", (), excluded=("a.png has no partner",))
     with pytest.raises(PhotoError, match=r"no pair in real20.*a\.png has no partner"):
         evaluate([empty], methods, QUICK, tmp_path / "out")
 
@@ -184,7 +184,7 @@ def test_a_resumed_run_decodes_only_what_the_page_shows(tmp_path, methods, real2
     evaluate(real20, methods, QUICK, tmp_path / "out")
     page = (tmp_path / "out" / "report.html").read_bytes()
     monkeypatch.setattr(Photo, "open", lambda *_: pytest.fail("a picture was decoded"))
-    evaluate(real20, methods, QUICK, tmp_path / "out", shown=0)
+    evaluate(real20, methods, QUICK, tmp_path / "out", max_report_cases=0)
     monkeypatch.undo()
     evaluate(real20, methods, QUICK, tmp_path / "out")
     assert (tmp_path / "out" / "report.html").read_bytes() == page
@@ -193,7 +193,7 @@ def test_a_resumed_run_decodes_only_what_the_page_shows(tmp_path, methods, real2
 def test_the_page_is_the_same_whether_pictures_are_cached_or_read_again(tmp_path, methods, real20):
     """The page shows the whole benchmark from the pictures in memory, and a part of it from the files."""
     evaluate(real20, methods, QUICK, tmp_path / "whole")
-    evaluate(real20, methods, QUICK, tmp_path / "part", shown=1)
+    evaluate(real20, methods, QUICK, tmp_path / "part", max_report_cases=1)
     pages = [(tmp_path / name / "report.html").read_text() for name in ("whole", "part")]
     _, article = pages[1].split("<article")
     assert article.partition("</article>")[0] in pages[0]

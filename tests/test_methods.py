@@ -102,7 +102,7 @@ def test_a_folder_in_which_no_name_fits_is_refused_at_once(cases, tmp_path):
 
 
 def test_pictures_without_a_case_are_counted(cases, tmp_path):
-    assert method(tmp_path, "1.png", "other.png", "another.png").unused(cases) == 2
+    assert method(tmp_path, "1.png", "other.png", "another.png").count_unmatched(cases) == 2
 
 
 def test_the_baseline_is_the_photo_and_black(case):
@@ -176,5 +176,5 @@ def test_folders_and_broken_links_with_names_of_pictures_are_ignored(cases, tmp_
     theirs = method(tmp_path, "2.png")
     (tmp_path / "theirs" / "1.png").mkdir()
     (tmp_path / "theirs" / "3.png").symlink_to("nowhere")
-    assert theirs.unused(cases) == 0
+    assert theirs.count_unmatched(cases) == 0
     assert "no picture" in theirs.key(cases[0])

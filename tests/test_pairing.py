@@ -76,8 +76,8 @@ def test_only_equal_names_make_a_pair_and_all_others_are_refused(photos, truths,
             assert group.photo.stem == group.transmission.stem == group.name
             assert (group.reflection is not None) == (group.name in mirrored)
         for stem in (photos | truths | mirrored) - (photos & truths):
-            assert any(f"/{stem}.png" in line and "no partner" in line for line in found.refused)
-        assert len(found.refused) == len((photos | truths | mirrored) - (photos & truths))
+            assert any(f"/{stem}.png" in line and "no partner" in line for line in found.excluded)
+        assert len(found.excluded) == len((photos | truths | mirrored) - (photos & truths))
 
 
 def test_suffixes_may_differ(tmp_path):
@@ -91,8 +91,8 @@ def test_two_pictures_of_one_name_and_role_are_refused_both(tmp_path, role):
     write(tmp_path, f"{role}/a.jpg")
     found = read_folders(tmp_path)
     assert names(found) == ["b"]
-    assert len(found.refused) == 1
-    assert found.refused[0].startswith(f"{role}/a.jpg and {role}/a.png are ambiguous")
+    assert len(found.excluded) == 1
+    assert found.excluded[0].startswith(f"{role}/a.jpg and {role}/a.png are ambiguous")
 
 
 def test_a_name_is_the_same_in_both_spellings_of_unicode(tmp_path):
@@ -198,8 +198,8 @@ def test_a_triplet_without_ground_truth_is_refused_and_one_without_reflection_is
     write(tmp_path, "1/m.jpg", "1/r.jpg", "2/m.jpg", "2/g.jpg", "3/g.jpg", "3/r.jpg")
     found = read_tree(tmp_path, "wildscene")
     assert names(found) == ["2"]
-    assert [line.split(" ")[0] for line in found.refused] == ["1/m.jpg", "3/g.jpg"]
-    assert all("no partner" in line for line in found.refused)
+    assert [line.split(" ")[0] for line in found.excluded] == ["1/m.jpg", "3/g.jpg"]
+    assert all("no partner" in line for line in found.excluded)
 
 
 def test_the_letter_of_a_role_is_a_separate_word_in_either_case(tmp_path):
@@ -217,7 +217,7 @@ def test_the_letter_of_a_role_is_a_separate_word_in_either_case(tmp_path):
     found = read_tree(tmp_path, "wildscene")
     assert names(found) == ["1", "2"]
     assert found.remarks == ("ignored 2/big.png", "ignored 3/grm.png and 3/m-g.png")
-    assert len(found.refused) == 1
+    assert len(found.excluded) == 1
 
 
 def test_shots_of_one_name_in_two_folders_are_refused_both(tmp_path):
@@ -228,8 +228,8 @@ def test_shots_of_one_name_in_two_folders_are_refused_both(tmp_path):
         pytest.skip("this file system is not case-sensitive")
     found = read_tree(tmp_path, "postcard")
     assert found.groups == ()
-    assert len(found.refused) == 2
-    assert all("ambiguous" in line for line in found.refused)
+    assert len(found.excluded) == 2
+    assert all("ambiguous" in line for line in found.excluded)
 
 
 def test_other_files_in_a_tree_are_ignored_with_a_remark(tmp_path):

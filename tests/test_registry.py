@@ -57,16 +57,16 @@ def names(cases):
 @pytest.mark.parametrize("name", ["real20", "nature20"])
 def test_twenty_pairs_are_read_under_the_name_of_their_benchmark(tmp_path, name):
     read = only(name, repacked(tmp_path, map(str, range(20, 0, -1))))
-    assert (read.name, read.title.lower(), read.expected) == (name, name, (20,))
+    assert (read.name, read.title.lower(), read.expected_counts) == (name, name, (20,))
     assert names(read.cases) == [str(number) for number in range(1, 21)]
-    assert read.remarks == read.refused == ()
+    assert read.remarks == read.excluded == ()
     assert read.cases[1] == Case(
         benchmark=name,
         name="2",
         scene="2",
         relative_path="blended/2",
         photo=PictureFile(tmp_path / "blended" / "2.png"),
-        transmission=PictureFile(tmp_path / "transmission_layer" / "2.png"),
+        ground_truth=PictureFile(tmp_path / "transmission_layer" / "2.png"),
     )
 
 
@@ -77,7 +77,7 @@ def test_the_original_sir2_has_199_and_200_and_101_triplets(whole):
         "wildscene": 101,
     }
     for name, read in whole.items():
-        assert read.remarks == read.refused == ()
+        assert read.remarks == read.excluded == ()
         assert all(case.reflection for case in read.cases)
         assert {case.benchmark for case in read.cases} == {name}
         assert (
@@ -126,7 +126,7 @@ def test_sir2_may_be_repacked_in_part_and_what_is_missing_is_said(tmp_path):
 def test_one_split_below_an_openrr_folder_is_taken(tmp_path):
     repacked(tmp_path / "val_100", ["1", "2"], ("Input", "GT"))
     read = only("openrr", tmp_path)
-    assert (read.name, read.expected, read.remarks) == ("openrr", (), ())
+    assert (read.name, read.expected_counts, read.remarks) == ("openrr", (), ())
     assert read.cases[0].relative_path == "val_100/Input/1"
     assert names(only("openrr", tmp_path / "val_100").cases) == ["1", "2"]
 
@@ -158,7 +158,7 @@ def test_a_folder_has_its_name_also_as_the_current_folder(tmp_path, monkeypatch)
 def test_a_rendered_set_gives_its_background_and_its_reflection(tmp_path, shards):
     make(tmp_path / "set", count=3, shards=shards)
     read = only("rendered", tmp_path / "set")
-    assert (read.name, read.title, read.remarks, read.refused) == ("set", "set", (), ())
+    assert (read.name, read.title, read.remarks, read.excluded) == ("set", "set", (), ())
     assert names(read.cases) == ["000000", "000001", "000002"]
     for case in read.cases:
         assert case.rendered
@@ -166,7 +166,7 @@ def test_a_rendered_set_gives_its_background_and_its_reflection(tmp_path, shards
         assert Photo.open(case.photo.read()).size == (24, 16)
     make(tmp_path / "again", count=3)
     for case, file in ((read.cases[1], "background"), (read.cases[2], "background")):
-        assert case.transmission.read() == (tmp_path / "again" / case.name / f"{file}.jpg").read_bytes()
+        assert case.ground_truth.read() == (tmp_path / "again" / case.name / f"{file}.jpg").read_bytes()
         assert case.reflection.read() == (tmp_path / "again" / case.name / "reflection.jpg").read_bytes()
 
 
@@ -175,13 +175,13 @@ def test_an_incomplete_rendered_sample_is_refused(tmp_path):
     (tmp_path / "000001" / "background.jpg").unlink()
     read = only("rendered", tmp_path)
     assert names(read.cases) == ["000000"]
-    assert read.refused == ("000001 is incomplete: photo.jpg, background.jpg, reflection.jpg are needed",)
+    assert read.excluded == ("000001 is incomplete: photo.jpg, background.jpg, reflection.jpg are needed",)
 
 
 def test_the_dev_pairs_are_ten_each(data):
     for name in ("nature", "real"):
         read = only("pairs", data / "real" / "dev" / name)
-        assert (read.name, len(read.cases), read.remarks, read.refused) == (name, 10, (), ())
+        assert (read.name, len(read.cases), read.remarks, read.excluded) == (name, 10, (), ())
     assert only("nature20", data / "real" / "dev" / "nature").remarks == (
         "10 pictures, where Nature20 has 20",
     )
@@ -218,7 +218,7 @@ def test_pictures_without_a_unique_partner_are_refused_and_the_others_are_read(t
     read = only("pairs", tmp_path)
     assert names(read.cases) == ["a", "d"]
     for line, (named, why) in zip(
-        read.refused,
+        read.excluded,
         [
             ("transmission_layer/b.jpg and transmission_layer/b.png", "ambiguous"),
             ("blended/c.jpg and blended/c.png", "ambiguous"),
@@ -249,13 +249,13 @@ def test_a_truth_of_another_size_is_refused_and_its_scale_is_reported(tmp_path, 
     write(tmp_path, "gt/a.png", size=size)
     read = only("pairs", tmp_path)
     assert read.cases == ()
-    assert read.refused == (f"blended/a: {message}",)
+    assert read.excluded == (f"blended/a: {message}",)
 
 
 def test_a_reflection_of_another_size_is_refused_too(tmp_path):
     repacked(tmp_path, ["a"])
     write(tmp_path, "reflection/a.png", size=(4, 3))
-    (line,) = only("pairs", tmp_path).refused
+    (line,) = only("pairs", tmp_path).excluded
     assert line == "blended/a: photo 8x6, reflection 4x3: the reflection is at half the scale"
 
 
@@ -275,8 +275,8 @@ def test_an_unreadable_picture_is_refused_by_name(tmp_path, role, label, bad, wh
     (tmp_path / role / "a.png").write_bytes(bad)
     read = only("pairs", tmp_path)
     assert names(read.cases) == ["b"]
-    assert read.refused[0].startswith(f"blended/a: the {label} cannot be used: ")
-    assert why in read.refused[0]
+    assert read.excluded[0].startswith(f"blended/a: the {label} cannot be used: ")
+    assert why in read.excluded[0]
 
 
 def test_a_dangling_link_is_refused_by_name(tmp_path):
@@ -285,7 +285,7 @@ def test_a_dangling_link_is_refused_by_name(tmp_path):
     (tmp_path / "blended" / "a.png").symlink_to(tmp_path / "nowhere.png")
     read = only("pairs", tmp_path)
     assert names(read.cases) == ["b"]
-    assert "the photo cannot be used" in read.refused[0]
+    assert "the photo cannot be used" in read.excluded[0]
 
 
 # --- remarks

@@ -12,13 +12,13 @@ AVERAGED = [row for row in ROWS if "average181" in row.scores]
 def test_the_papers_tables_are_all_there():
     tables = {}
     for row in ROWS:
-        tables.setdefault(row.read_in, []).append(row.method)
+        tables.setdefault(row.copied_from, []).append(row.method)
     assert [len(tables[f"Table {number} of that paper"]) for number in (1, 2, 4)] == [7, 3, 2]
-    elsewhere = {row.method for row in ROWS if "the notes" in row.read_in}
+    elsewhere = {row.method for row in ROWS if "the notes" in row.copied_from}
     assert elsewhere == {"WindowSeat", "GenSIRR", "RDNet", "DSRNet", "ERRNet", "IBCLN", "input (unprocessed)"}
 
 
-@pytest.mark.parametrize("row", AVERAGED, ids=lambda row: f"{row.read_in[:7]} {row.method}")
+@pytest.mark.parametrize("row", AVERAGED, ids=lambda row: f"{row.copied_from[:7]} {row.method}")
 def test_an_average_that_a_paper_prints_is_the_mean_weighted_by_pictures(row):
     for metric, average in row.scores["average181"].items():
         mean = sum(count * row.scores[name][metric] for name, count in PICTURES.items()) / 181
@@ -28,7 +28,7 @@ def test_an_average_that_a_paper_prints_is_the_mean_weighted_by_pictures(row):
 
 def test_every_row_names_its_source_its_place_and_its_protocol():
     for row in ROWS:
-        assert all((row.method, row.source, row.read_in, row.protocol))
+        assert all((row.method, row.source, row.copied_from, row.protocol))
         assert row.scores
         assert all(row.scores.values())
 

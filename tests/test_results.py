@@ -15,10 +15,10 @@ from brewster.evaluate.runner import ScoreRow
 PSNR = EvaluationConfig(metrics=("psnr",))
 
 
-def benchmark(name, count, refused=()):
+def benchmark(name, count, excluded=()):
     file = PictureFile("nowhere")
     cases = tuple(Case(name, str(i), str(i), str(i), file, file) for i in range(count))
-    return Benchmark(name, name.title(), cases, refused=refused)
+    return Benchmark(name, name.title(), cases, excluded=excluded)
 
 
 def rows(benchmarks, methods, score):
@@ -70,7 +70,7 @@ def test_differences_are_to_every_method_named_before(methods):
 
 
 def test_a_failed_picture_is_counted_out_and_named(methods):
-    parts = [benchmark("a", 3, refused=("x.png has no partner",))]
+    parts = [benchmark("a", 3, excluded=("x.png has no partner",))]
     score_rows = rows(parts, methods, lambda case, method: float(case.name))
     score_rows[1] = ScoreRow("a", "0", "theirs", "", "", error="theirs failed")
     results = summarise(parts, methods, PSNR, score_rows)
@@ -93,7 +93,7 @@ def test_metrics_without_any_score_are_left_out(methods):
 
 
 def test_a_benchmark_without_pairs_is_listed_and_has_no_table(methods):
-    parts = [benchmark("a", 2), benchmark("b", 0, refused=("all of it",))]
+    parts = [benchmark("a", 2), benchmark("b", 0, excluded=("all of it",))]
     results = summarise(parts, methods, PSNR, rows(parts, methods, lambda *_: 1.0))
     assert list(results["tables"]) == ["a"]
     assert results["benchmarks"]["b"]["pictures"] == 0

@@ -18,7 +18,7 @@ from brewster.benchmarks.registry import read_benchmark
 from brewster.errors import BrewsterError, PhotoError, TargetError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import IdentityBaseline, MethodOutput, ModelMethod, PredictionFolder
-from brewster.evaluate.runner import SCORES, score
+from brewster.evaluate.runner import SCORES_FILE, score
 from other_processes import children, is_alive, wait_for
 
 QUICK = EvaluationConfig(metrics=("psnr", "ssim"))
@@ -69,7 +69,7 @@ def test_every_method_is_scored_on_every_case_in_order(real20, tmp_path):
     ]
     assert rows[0].scores == rows[1].scores
     assert (rows[0].width, rows[0].height) == (24, 16)
-    assert len((tmp_path / "out" / SCORES).read_text().splitlines()) == 6
+    assert len((tmp_path / "out" / SCORES_FILE).read_text().splitlines()) == 6
 
 
 def test_logged_scores_are_reused(real20, tmp_path):
@@ -81,9 +81,9 @@ def test_logged_scores_are_reused(real20, tmp_path):
 
 def test_a_run_that_was_killed_in_the_middle_of_a_line_is_resumed(real20, tmp_path):
     whole = score(real20, [Fake()], QUICK, tmp_path / "whole")
-    log = tmp_path / "out" / SCORES
+    log = tmp_path / "out" / SCORES_FILE
     log.parent.mkdir()
-    lines = (tmp_path / "whole" / SCORES).read_text().splitlines()
+    lines = (tmp_path / "whole" / SCORES_FILE).read_text().splitlines()
     log.write_text(lines[0] + "\n" + lines[1][:40])
     fake = Fake()
     assert numbers(score(real20, [fake], QUICK, tmp_path / "out")) == numbers(whole)
@@ -123,7 +123,7 @@ def test_a_stored_prediction_that_was_changed_is_made_again(real20, model, tmp_p
 
 @pytest.mark.parametrize(
     ("changed", "requested"),
-    [("brewster.__version__", []), ("brewster.evaluate.runner.SCORE_FORMAT", NAMES)],
+    [("brewster.__version__", []), ("brewster.evaluate.runner.SCORE_FORMAT_VERSION", NAMES)],
 )
 def test_scores_are_made_again_with_another_score_format_and_not_with_a_new_version(
     real20, tmp_path, monkeypatch, changed, requested
@@ -137,7 +137,7 @@ def test_scores_are_made_again_with_another_score_format_and_not_with_a_new_vers
 
 @pytest.mark.parametrize(
     ("changed", "requested"),
-    [("brewster.__version__", 0), ("brewster.evaluate.methods.PREDICTION_FORMAT", 3)],
+    [("brewster.__version__", 0), ("brewster.evaluate.methods.PREDICTION_FORMAT_VERSION", 3)],
 )
 def test_predictions_are_made_again_with_another_prediction_format_and_not_with_a_new_version(
     real20, model, tmp_path, monkeypatch, changed, requested
@@ -320,7 +320,7 @@ def test_progress_is_reported_after_every_prediction(real20, tmp_path):
 
 def test_lines_of_another_version_are_ignored(real20, tmp_path):
     (tmp_path / "out").mkdir()
-    (tmp_path / "out" / SCORES).write_text(json.dumps({"benchmark": "real20", "odd": 1}) + "\n[]\n7\n")
+    (tmp_path / "out" / SCORES_FILE).write_text(json.dumps({"benchmark": "real20", "odd": 1}) + "\n[]\n7\n")
     assert len(score(real20, [Fake()], QUICK, tmp_path / "out")) == 3
 
 
@@ -335,7 +335,7 @@ def test_an_interrupt_keeps_the_logged_scores(real20, tmp_path, monkeypatch):
     monkeypatch.setattr(fake, "predict", predict)
     with pytest.raises(KeyboardInterrupt):
         score(real20, [fake], QUICK, tmp_path / "out")
-    assert len((tmp_path / "out" / SCORES).read_text().splitlines()) == 2
+    assert len((tmp_path / "out" / SCORES_FILE).read_text().splitlines()) == 2
 
 
 class Large(Fake):

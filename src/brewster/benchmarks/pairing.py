@@ -60,12 +60,12 @@ class PictureGroup:
 class FolderListing:
     """The content of a folder: groups in natural order of their names.
 
-    `remarks` are lines about ignored files, `refused` lines about files without a unique partner.
+    `remarks` are lines about ignored files, `excluded` lines about files without a unique partner.
     """
 
     groups: tuple[PictureGroup, ...] = ()
     remarks: tuple[str, ...] = ()
-    refused: tuple[str, ...] = ()
+    excluded: tuple[str, ...] = ()
 
 
 def natural_key(name: str) -> tuple[list[str | int], str]:
@@ -181,7 +181,7 @@ def read_tree(folder: Path, subset: str) -> FolderListing:
         PhotoError: a folder cannot be read, or the tree contains no shot.
     """
     found = _refuse_duplicates(folder, _merge(_read_branches(folder, folder, SIR2_TREES[subset], {})))
-    if not found.groups and not found.refused:
+    if not found.groups and not found.excluded:
         raise PhotoError(
             f"{folder} is not a {subset} set",
             f"expected photos in {'/'.join(f'<{level}>' for level in SIR2_TREES[subset])}/*m*.*, or in {ROLES['photo'][0]}/",
@@ -237,7 +237,7 @@ def _refuse_duplicates(root: Path, found: FolderListing) -> FolderListing:
         if counts[group.name] > 1
     )
     unique = tuple(group for group in found.groups if counts[group.name] == 1)
-    return FolderListing(unique, found.remarks, (*found.refused, *duplicates))
+    return FolderListing(unique, found.remarks, (*found.excluded, *duplicates))
 
 
 # --- both layouts
@@ -247,7 +247,7 @@ def _make_group(root: Path, name: str, scene: str, parts: _FilesByRole) -> Folde
     """A listing with one group, or with the reason why there is none."""
     problem = _problem(root, parts)
     if problem:
-        return FolderListing(refused=(problem,))
+        return FolderListing(excluded=(problem,))
     reflection = parts["reflection"][0] if parts.get("reflection") else None
     return FolderListing(
         (PictureGroup(name, scene, parts["photo"][0], parts["transmission"][0], reflection),)
@@ -301,7 +301,7 @@ def _merge(pieces: Iterable[FolderListing]) -> FolderListing:
             )
         ),
         tuple(line for piece in listings for line in piece.remarks),
-        tuple(line for piece in listings for line in piece.refused),
+        tuple(line for piece in listings for line in piece.excluded),
     )
 
 

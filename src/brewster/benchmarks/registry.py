@@ -1,10 +1,10 @@
 """Reads public benchmarks from the user's own copies: every photo with its ground truth, paired by name.
 
 for benchmark in read_benchmark("sir2", Path("SIR2")):
-    print(benchmark.title, len(benchmark.cases), *benchmark.remarks, *benchmark.refused)
+    print(benchmark.title, len(benchmark.cases), *benchmark.remarks, *benchmark.excluded)
 
 `pairing` finds the pictures that belong together. This module names the cases, compares the sizes in the file headers,
-checks the number of pictures and draws the subset of the paper. A case that does not fit is listed in `refused`.
+checks the number of pictures and draws the subset of the paper. A case that does not fit is listed in `excluded`.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ from brewster.photo import read_size
 PAPER_SEED: Final = 181
 """Seed of `paper_draw`. The value is arbitrary: the number of pictures in the paper's average."""
 
-_RENDERED: Final = ("photo.jpg", "background.jpg", "reflection.jpg")
-_SCENES: Final = 20
+_RENDERED_FILES: Final = ("photo.jpg", "background.jpg", "reflection.jpg")
+_MAX_SCENES: Final = 20
 _SCALES: Final = {"0.25": "a quarter of the scale", "0.5": "half the scale", "2": "twice the scale"}
 
 
@@ -95,7 +95,7 @@ class Case:
     scene: str
     relative_path: str
     photo: PictureFile
-    transmission: PictureFile
+    ground_truth: PictureFile
     reflection: PictureFile | None = None
     rendered: bool = False
 
@@ -105,16 +105,16 @@ class Case:
 class Benchmark:
     """Cases in natural order of their names (2 before 10); the order of the folder listing does not matter.
 
-    `expected` are the numbers of pictures that papers report. `remarks` are notes that are not failures. `refused` has
+    `expected_counts` are the numbers of pictures that papers report. `remarks` are notes that are not failures. `excluded` has
     one line for each picture that was left out, with the reason.
     """
 
     name: str
     title: str
     cases: tuple[Case, ...]
-    expected: tuple[int, ...] = ()
+    expected_counts: tuple[int, ...] = ()
     remarks: tuple[str, ...] = ()
-    refused: tuple[str, ...] = ()
+    excluded: tuple[str, ...] = ()
 
 
 @final
@@ -122,14 +122,14 @@ class Benchmark:
 class BenchmarkLayout:
     """A row of BENCHMARKS: its title ("" means the folder's name), the counts that papers report, and its reader.
 
-    `scene` is set where the paper draws one case of each scene: it matches the part of a repacked file name that
+    `scene_pattern` is set where the paper draws one case of each scene: it matches the part of a repacked file name that
     identifies the scene.
     """
 
     title: str
-    expected: tuple[int, ...]
+    expected_counts: tuple[int, ...]
     read: Callable[[str, Path], list[Benchmark]]
-    scene: str = ""
+    scene_pattern: str = ""
 
 
 def read_benchmark(name: str, folder: Path) -> list[Benchmark]:
@@ -137,7 +137,7 @@ def read_benchmark(name: str, folder: Path) -> list[Benchmark]:
 
     Returns:
         One benchmark; for "sir2", one for each of its three subsets that the folder contains. An incomplete copy is
-        read as far as possible: see `remarks` and `refused`.
+        read as far as possible: see `remarks` and `excluded`.
 
     Raises:
         PhotoError: the name is not in BENCHMARKS, or the folder is missing, empty or has another layout.
@@ -162,7 +162,7 @@ def paper_draw(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ...]
     Raises:
         PhotoError: the names do not identify the scenes.
     """
-    if benchmark.name not in BENCHMARKS or not BENCHMARKS[benchmark.name].scene:
+    if benchmark.name not in BENCHMARKS or not BENCHMARKS[benchmark.name].scene_pattern:
         return benchmark.cases
     scenes: dict[str, list[Case]] = defaultdict(list)
     for case in benchmark.cases:
@@ -209,16 +209,16 @@ def _read_sir2(_: str, folder: Path) -> list[Benchmark]:
 
 
 def _read_rendered(name: str, folder: Path) -> list[Benchmark]:
-    benchmark_name, cases, refused = _benchmark_name(name, folder), [], []
+    benchmark_name, cases, excluded = _benchmark_name(name, folder), [], []
     for key, files in _rendered_samples(folder):
-        if len(files) < len(_RENDERED):
-            refused.append(f"{key} is incomplete: {', '.join(_RENDERED)} are needed")
+        if len(files) < len(_RENDERED_FILES):
+            excluded.append(f"{key} is incomplete: {', '.join(_RENDERED_FILES)} are needed")
             continue
         photo, background, reflection = files
         cases.append(
             Case(benchmark_name, key, key, f"{key}/photo", photo, background, reflection, rendered=True)
         )
-    return [_benchmark(name, folder, cases, FolderListing(refused=tuple(refused)))]
+    return [_benchmark(name, folder, cases, FolderListing(excluded=tuple(excluded)))]
 
 
 def _rendered_samples(folder: Path) -> list[tuple[str, list[PictureFile]]]:
@@ -238,12 +238,12 @@ def _rendered_samples(folder: Path) -> list[tuple[str, list[PictureFile]]]:
     return [
         (
             key(entry.index),
-            [PictureFile(entry.place, entry.spans[name]) for name in _RENDERED if name in entry.spans],
+            [PictureFile(entry.place, entry.spans[name]) for name in _RENDERED_FILES if name in entry.spans],
         )
         if entry.spans
         else (
             key(entry.index),
-            [PictureFile(entry.place / name) for name in _RENDERED if (entry.place / name).exists()],
+            [PictureFile(entry.place / name) for name in _RENDERED_FILES if (entry.place / name).exists()],
         )
         for entry in entries
     ]
@@ -284,10 +284,10 @@ def _to_case(benchmark_name: str, scene: str, group: PictureGroup, root: Path) -
 
 def _scenes(row: BenchmarkLayout, groups: Sequence[PictureGroup]) -> tuple[list[str], list[str]]:
     """The scene of each group, and remarks. If one name does not identify its scene, every group is its own scene."""
-    if not row.scene or any(group.scene for group in groups):
+    if not row.scene_pattern or any(group.scene for group in groups):
         return [group.scene or group.name for group in groups], []
-    matched = [match[0] for group in groups if (match := re.match(row.scene, group.name))]
-    if len(matched) == len(groups) and len(set(matched)) <= _SCENES:
+    matched = [match[0] for group in groups if (match := re.match(row.scene_pattern, group.name))]
+    if len(matched) == len(groups) and len(set(matched)) <= _MAX_SCENES:
         return matched, []
     return [group.name for group in groups], [
         "the names do not identify the scenes, so the paper's draw is not possible"
@@ -305,9 +305,13 @@ def _benchmark(name: str, folder: Path, cases: Sequence[Case], found: FolderList
         _benchmark_name(name, folder),
         title,
         valid,
-        row.expected,
-        (*_count_remark(len(valid), title, row.expected), *_missing_reflections(valid), *found.remarks),
-        (*found.refused, *mismatches.values()),
+        row.expected_counts,
+        (
+            *_count_remark(len(valid), title, row.expected_counts),
+            *_missing_reflections(valid),
+            *found.remarks,
+        ),
+        (*found.excluded, *mismatches.values()),
     )
 
 
@@ -340,7 +344,7 @@ def _folder_name(folder: Path) -> str:
 
 def _mismatch(case: Case) -> str:
     """Why a case cannot be scored according to the headers of its files, or ""."""
-    files = {"photo": case.photo, "truth": case.transmission, "reflection": case.reflection}
+    files = {"photo": case.photo, "truth": case.ground_truth, "reflection": case.reflection}
     sizes: dict[str, tuple[int, int]] = {}
     for role, file in files.items():
         try:

@@ -31,7 +31,7 @@ Choice = str | int | float | bool
 AblationCallback = Callable[[str, int, int, Mapping[str, float], bool], None]
 """Called with (choice, step, steps, losses, is_logged) after each training step."""
 
-PLOT: Final = "plot.png"
+PLOT_FILE: Final = "plot.png"
 
 
 def _all_different(choices: list[Choice]) -> list[Choice]:
@@ -132,7 +132,7 @@ def ablate(
         choice for choice in study.choices if isinstance(choice, int | float) and not isinstance(choice, bool)
     ]
     if len(numbers) == len(study.choices):
-        write_atomically(out / PLOT, _plot(study, numbers, results), overwrite=True)
+        write_atomically(out / PLOT_FILE, _plot(study, numbers, results), overwrite=True)
     return results
 
 

@@ -34,8 +34,8 @@ from brewster.files import write_atomically
 from brewster.metrics import IDENTICAL_DB
 from brewster.photo import Photo
 
-RESULTS, PAGE, INPUTS = "results.json", "report.html", "inputs"
-PICTURES_SHOWN: Final = 50
+RESULTS_FILE, REPORT_FILE, INPUTS_FOLDER = "results.json", "report.html", "inputs"
+MAX_REPORT_CASES: Final = 50
 
 
 def evaluate(
@@ -45,14 +45,14 @@ def evaluate(
     out: Path,
     *,
     workers: int = 1,
-    shown: int = PICTURES_SHOWN,
+    max_report_cases: int = MAX_REPORT_CASES,
     on_progress: ScoreCallback = lambda _done, _total, _row: None,
 ) -> Results:
     """Scores and writes results.json, tables.md, table.tex, table.csv and report.html into `out`.
 
     With `config.size`, the reduced photos are written into `out`/inputs. Each picture is read and decoded once. There are
     two exceptions: exclusive methods, which read the cases again, and the pictures that the report shows of a benchmark
-    with more than `shown` cases or of an earlier run.
+    with more than `max_report_cases` cases or of an earlier run.
 
     Args:
         benchmarks: as `read_benchmark` returns them.
@@ -60,7 +60,7 @@ def evaluate(
         config: the settings of the evaluation.
         out: a folder for this evaluation only. A stopped run is resumed from its files.
         workers: number of processes that score in parallel.
-        shown: number of cases of each benchmark in the report: the worst of the first method that is not the baseline.
+        max_report_cases: number of cases of each benchmark in the report: the worst of the first method that is not the baseline.
         on_progress: called after each new row.
 
     Returns:
@@ -74,19 +74,19 @@ def evaluate(
     check(benchmarks, methods, config)
     cases = [case for part in benchmarks for case in part.cases]
     with TemporaryDirectory(prefix="brewster-report-") as folder:
-        complete = frozenset(part.name for part in benchmarks if len(part.cases) <= shown)
-        tiles = _TileCache(Path(folder), complete, config, out / INPUTS)
+        complete = frozenset(part.name for part in benchmarks if len(part.cases) <= max_report_cases)
+        tiles = _TileCache(Path(folder), complete, config, out / INPUTS_FOLDER)
         rows = score(
-            benchmarks, methods, config, out, workers=workers, on_progress=on_progress, on_decoded=tiles
+            benchmarks, methods, config, out, workers=workers, on_progress=on_progress, on_case_scored=tiles
         )
         if config.size:
-            _write_missing_inputs(cases, config.size, out / INPUTS)
+            _write_missing_inputs(cases, config.size, out / INPUTS_FOLDER)
         results = summarise(benchmarks, methods, config, rows)
         for method in methods:
             if remarks := list(_method_remarks(method, cases, rows)):
                 results["methods"][method.name]["remark"] = "; ".join(remarks)
         _write(results, out)
-        write_report(results, _page_cases(cases, methods, rows, shown, tiles), out / PAGE)
+        write_report(results, _page_cases(cases, methods, rows, max_report_cases, tiles), out / REPORT_FILE)
     return results
 
 
@@ -106,7 +106,7 @@ def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: Ev
                 "rename one of the folders",
             )
     if not any(part.cases for part in benchmarks):
-        refused = [reason for part in benchmarks for reason in part.refused]
+        refused = [reason for part in benchmarks for reason in part.excluded]
         raise PhotoError(
             f"there is no pair in {', '.join(names) or 'no benchmark'}",
             "expected photos with their ground truth",
@@ -129,7 +129,7 @@ def _method_remarks(method: Method, cases: Sequence[Case], rows: Sequence[ScoreR
     copied = [row for row in perfect if row.method == method.name and row.id[:2] not in trivial]
     if copied:
         yield f"its prediction equals the ground truth on {_pictures(len(copied))}: check the folder"
-    if unused := method.unused(cases):
+    if unused := method.count_unmatched(cases):
         yield f"{_pictures(unused)} of its folder {'fits' if unused == 1 else 'fit'} no case"
 
 
@@ -152,7 +152,7 @@ def _input_path(folder: Path, case: Case) -> Path:
 
 def _write(results: Results, out: Path) -> None:
     tables = {
-        RESULTS: json.dumps(results, indent=1, allow_nan=False) + "\n",
+        RESULTS_FILE: json.dumps(results, indent=1, allow_nan=False) + "\n",
         "tables.md": f"{to_markdown(results)}\n{published_to_markdown(read_published())}",
         "table.tex": to_latex(results),
         "table.csv": to_csv(results),

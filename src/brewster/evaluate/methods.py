@@ -29,7 +29,7 @@ from brewster.options import Device, Quality
 from brewster.photo import Photo
 
 BASELINE: Final = "input (unprocessed)"
-PREDICTION_FORMAT: Final = 1
+PREDICTION_FORMAT_VERSION: Final = 1
 """Increase it when the same model predicts other layers, so that stored predictions are made again; see test_house_formats."""
 
 _STEM_SUFFIXES: Final = {"transmission": ("_t", "_l"), "reflection": ("_r",)}
@@ -103,7 +103,7 @@ class IdentityBaseline:
 
     def key(self, case: Case) -> str:  # noqa: ARG002  (the same for all cases)
         """A constant."""
-        return "nothing"
+        return "identity"
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002
         """The photo and a black reflection."""
@@ -139,7 +139,7 @@ class ModelMethod:
 
     def key(self, case: Case) -> str:  # noqa: ARG002  (the same for all cases)
         """The model's digest, the quality, and the format of predictions."""
-        return f"{self._sha256} {self.quality} {PREDICTION_FORMAT}"
+        return f"{self._sha256} {self.quality} {PREDICTION_FORMAT_VERSION}"
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:
         """Separates the photo and stores both layers.
@@ -270,7 +270,7 @@ class PredictionFolder:
             )
         return {layer: path for layer, paths in found.items() for path in paths}
 
-    def unused(self, cases: Iterable[Case]) -> int:
+    def count_unmatched(self, cases: Iterable[Case]) -> int:
         """The number of pictures in the folder that belong to none of the cases: a hint that names differ."""
         layers = ("transmission", "reflection")
         used = {path for case in cases for layer in layers for path in self._candidates(case, layer)}

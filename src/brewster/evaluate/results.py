@@ -16,7 +16,7 @@ from brewster.evaluate.runner import ScoreRow
 from brewster.evaluate.statistics import Stratum, differences, estimate
 
 AVERAGE: Final = "average"
-PAPER: Final = {"real20": 20, "nature20": 20, "postcard": 20, "solidobject": 20, "wildscene": 101}
+PAPER_COUNTS: Final = {"real20": 20, "nature20": 20, "postcard": 20, "solidobject": 20, "wildscene": 101}
 """The sets in the paper's average, with the number of pictures of each."""
 _DIGITS: Final = 6
 _AVERAGED: Final = "The average is over pictures, not over sets: each picture has the same weight."
@@ -53,7 +53,7 @@ def summarise(
     full = [Selection(part.name, part.title, part.cases) for part in benchmarks if part.cases]
     drawn = paper_draws(benchmarks) if config.paper else []
     tables = [[selection] for selection in (*full, *drawn)]
-    together = _averaged([part for part in full if part.key in PAPER] if config.paper else full, drawn)
+    together = _averaged([part for part in full if part.key in PAPER_COUNTS] if config.paper else full, drawn)
     selections = {group[0].key: group for group in tables} | ({AVERAGE: together} if together else {})
     series = [(method, column) for method in method_names for column in columns]
     directions = {name: metric.higher_is_better for name, metric in columns.items()}
@@ -115,12 +115,12 @@ def _choices(config: EvaluationConfig, together: Sequence[Selection]) -> list[st
     """The settings as sentences, how the average is computed, and how it differs from the paper's."""
     choices = [*config.choices(), *([_AVERAGED] if together else [])]
     there = {part.key.partition(":")[0]: len(part.cases) for part in together}
-    if not config.paper or there == PAPER:
+    if not config.paper or there == PAPER_COUNTS:
         return choices
     found = ", ".join(f"{count} of {name}" for name, count in there.items()) or "too few sets"
     return [
         *choices,
-        f"The paper's average is over {sum(PAPER.values())} pictures; this one is over {found}.",
+        f"The paper's average is over {sum(PAPER_COUNTS.values())} pictures; this one is over {found}.",
     ]
 
 
@@ -162,9 +162,9 @@ def _describe(part: Benchmark) -> dict[str, Any]:
     return {
         "title": part.title,
         "pictures": len(part.cases),
-        "expected": list(part.expected),
+        "expected": list(part.expected_counts),
         "remarks": list(part.remarks),
-        "refused": list(part.refused),
+        "refused": list(part.excluded),
     }
 
 

@@ -26,14 +26,14 @@ from brewster.evaluate.methods import Method, MethodOutput, check_names
 from brewster.evaluate.scoring import CaseFiles, GroundTruth, Scorer
 from brewster.worker_setup import exit_with_parent, single_torch_thread
 
-SCORES: Final = "scores.jsonl"
-SCORE_FORMAT: Final = 2
+SCORES_FILE: Final = "scores.jsonl"
+SCORE_FORMAT_VERSION: Final = 3
 """Increase it when the same prediction gets other scores, so that logged rows are scored again; see test_house_formats."""
 
 ScoreCallback = Callable[[int, int, "ScoreRow"], None]
 """Called with (done, total, row) after each prediction that was scored."""
 
-DecodedCallback = Callable[[GroundTruth, Mapping[str, MethodOutput]], None]
+CaseCallback = Callable[[GroundTruth, Mapping[str, MethodOutput]], None]
 """Called with a decoded case and its new predictions, by method, in the process that scored them."""
 
 RowId = tuple[str, str, str]
@@ -44,15 +44,15 @@ RowId = tuple[str, str, str]
 class ScoreRow:
     """The scores of one method on one case, or the error. A line of scores.jsonl has these fields.
 
-    `key` is a digest of everything that the scores depend on, `answer_key` of everything that the prediction depends
-    on. Equal digests mean that the work need not be repeated. `digest` is that of the prediction's files, if it has any.
+    `score_key` is a digest of all inputs of the scores, `prediction_key` of all inputs of the prediction. A score or a
+    prediction is reused if its key is unchanged. `digest` is the SHA-256 of the files of the prediction, if it has any.
     """
 
     benchmark: str
     case: str
     method: str
-    answer_key: str
-    key: str
+    prediction_key: str
+    score_key: str
     scores: dict[str, float | None] = field(default_factory=dict)
     error: str | None = None
     seconds: float | None = None
@@ -85,7 +85,7 @@ def score(
     *,
     workers: int = 1,
     on_progress: ScoreCallback = lambda _done, _total, _row: None,
-    on_decoded: DecodedCallback | None = None,
+    on_case_scored: CaseCallback | None = None,
 ) -> list[ScoreRow]:
     """Runs every method on every case and scores the predictions; unchanged rows of an earlier run are reused.
 
@@ -98,7 +98,7 @@ def score(
         out: the folder of scores.jsonl.
         workers: number of processes that score in parallel.
         on_progress: called after each new row.
-        on_decoded: called once for each case with new rows. With several workers it must be picklable.
+        on_case_scored: called once for each case with new rows. With several workers it must be picklable.
 
     Returns:
         One row for each case and method, in the order of benchmarks, cases and methods, for any number of workers. A
@@ -109,11 +109,11 @@ def score(
         TargetError: `out` cannot be written.
     """
     check_names(methods)
-    logged = _read_log(out / SCORES)
+    logged = _read_log(out / SCORES_FILE)
     cases = {(case.benchmark, case.name): case for part in benchmarks for case in part.cases}
     ids = [(*case, method.name) for case in cases for method in methods]
     _prepare_metrics(config, ids, logged)
-    log, rows = _ScoreLog(out / SCORES), dict[RowId, ScoreRow]()
+    log, rows = _ScoreLog(out / SCORES_FILE), dict[RowId, ScoreRow]()
 
     def on_rows(case_rows: Sequence[ScoreRow]) -> None:
         for row in case_rows:
@@ -122,7 +122,7 @@ def score(
                 log.write(row)
                 on_progress(len(rows), len(ids), row)
 
-    state = _WorkerState({method.name: method for method in methods}, config, on_decoded)
+    state = _WorkerState({method.name: method for method in methods}, config, on_case_scored)
     shared = [method.name for method in methods if not method.exclusive]
     _run_tasks(_tasks(cases.values(), shared, logged), state, on_rows, workers)
     for method in methods:
@@ -167,7 +167,7 @@ class _WorkerState:
 
     methods: Mapping[str, Method]
     config: EvaluationConfig
-    on_decoded: DecodedCallback | None
+    on_case_scored: CaseCallback | None
 
 
 def _score_case(task: _ScoringTask, state: _WorkerState) -> list[ScoreRow]:
@@ -210,8 +210,8 @@ def _score_rows(
         else:
             predictions[row.method] = prediction
             done.append(_scored_row(row, truth, scorer, prediction))
-    if state.on_decoded:
-        state.on_decoded(truth, predictions)
+    if state.on_case_scored:
+        state.on_case_scored(truth, predictions)
     return done
 
 
@@ -222,15 +222,15 @@ def _empty_row(
     case = files.case
     photo, *truths = files.digests()
     settings = asdict(config) | {"paper": None, "quality": None}
-    answer_key = _digest(photo, config.size, method.key(case))
-    key = _digest(answer_key, truths, settings, case.rendered, SCORE_FORMAT)
-    row = ScoreRow(case.benchmark, case.name, method.name, answer_key, key)
+    prediction_key = _digest(photo, config.size, method.key(case))
+    score_key = _digest(prediction_key, truths, settings, case.rendered, SCORE_FORMAT_VERSION)
+    row = ScoreRow(case.benchmark, case.name, method.name, prediction_key, score_key)
     before = logged.get(method.name)
-    return replace(row, digest=before.digest) if before and before.answer_key == answer_key else row
+    return replace(row, digest=before.digest) if before and before.prediction_key == prediction_key else row
 
 
 def _is_scored(row: ScoreRow, logged: Mapping[str, ScoreRow]) -> bool:
-    return row.method in logged and logged[row.method].key == row.key
+    return row.method in logged and logged[row.method].score_key == row.score_key
 
 
 def _scored_row(row: ScoreRow, truth: GroundTruth, scorer: Scorer, prediction: MethodOutput) -> ScoreRow:

@@ -34,7 +34,7 @@ class CaseFiles:
         Raises:
             PhotoError: a file cannot be read.
         """
-        files = {"photo": case.photo, "transmission": case.transmission, "reflection": case.reflection}
+        files = {"photo": case.photo, "transmission": case.ground_truth, "reflection": case.reflection}
         return cls(case, {role: file.read() for role, file in files.items() if file})
 
     def digests(self) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final
 
-from brewster.evaluate.report.tables import MAIN, is_complete, ranking
+from brewster.evaluate.report.tables import MAIN_METRICS, is_complete, ranking
 from brewster.evaluate.results import AVERAGE, Results
 
 _SIR2: Final = ("postcard", "solidobject", "wildscene")
@@ -24,7 +24,7 @@ def to_latex(results: Results) -> str:
     The best three values of a column are marked as in the paper, but never the last one. A dagger marks means over fewer
     pictures than those of other methods. The table needs the packages multirow and ulem.
     """
-    metrics = [name for name in MAIN if name in results["metrics"]]
+    metrics = [name for name in MAIN_METRICS if name in results["metrics"]]
     keys = _of_the_paper(results)
     if not metrics or not keys:
         return "% PSNR, SSIM and LPIPS were not measured\n"

@@ -31,7 +31,7 @@ class PublishedScores:
 
     method: str
     source: str
-    read_in: str
+    copied_from: str
     protocol: str
     scores: dict[str, dict[str, float]]
 
@@ -54,7 +54,7 @@ def read_published() -> list[PublishedScores]:
     """The rows of published.toml, in file order."""
     tables = tomllib.loads(_FILE.read_text("utf-8"), parse_float=_PrintedNumber)["table"]
     return [
-        PublishedScores(method, table["source"], table["read_in"], table["protocol"].strip(), scores)
+        PublishedScores(method, table["source"], table["copied_from"], table["protocol"].strip(), scores)
         for table in tables
         for method, scores in table["rows"].items()
     ]
@@ -87,8 +87,10 @@ def _table(protocol: str, rows: list[PublishedScores]) -> str:
 
 
 def _sources(rows: list[PublishedScores]) -> list[str]:
-    places = _names((row.source, row.read_in) for row in rows)
-    methods = {place: [row.method for row in rows if (row.source, row.read_in) == place] for place in places}
+    places = _names((row.source, row.copied_from) for row in rows)
+    methods = {
+        place: [row.method for row in rows if (row.source, row.copied_from) == place] for place in places
+    }
     return [f"- {', '.join(methods[place])}: {place[0]}; read in {place[1]}" for place in places]
 
 

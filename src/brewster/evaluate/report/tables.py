@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from brewster.evaluate.results import Results
 
-MAIN: Final = ("psnr", "ssim", "lpips")
+MAIN_METRICS: Final = ("psnr", "ssim", "lpips")
 """The metrics of the overview table."""
 
 _ARROWS: Final = {True: "↑", False: "↓"}
@@ -42,7 +42,7 @@ def overview(results: Results) -> str:
 
 def _overview(results: Results) -> str:
     """One row per method, one column per selection, the main metrics in each cell."""
-    metrics = [name for name in MAIN if name in results["metrics"]]
+    metrics = [name for name in MAIN_METRICS if name in results["metrics"]]
     if not metrics:
         return ""
     titles = " / ".join(_heading(results, name) for name in metrics)

@@ -100,9 +100,9 @@ def _picture_groups(folder: Path) -> list[PictureGroup]:
             "a folder that contains blended/ and transmission_layer/",
             _FOLDER_CURE,
         ) from error
-    if found.refused:
+    if found.excluded:
         raise RecipeError(
-            f"{folder}: {found.refused[0]} (pictures without a partner: {len(found.refused)})",
+            f"{folder}: {found.excluded[0]} (pictures without a partner: {len(found.excluded)})",
             "one transmission with the name of each photo, and no other files",
             "add or remove files until the names match",
         )
