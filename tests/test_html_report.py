@@ -90,7 +90,7 @@ def results(names=("a", "b"), method="compact", errors=None):
         "metrics": {"psnr": metric(), "psnr_region": metric("PSNR in the region")},
         "benchmarks": {
             "nature20": {"title": "Nature20", "pictures": len(names), "expected": [20]}
-            | {"remarks": ["2 pictures, where Nature20 has 20"], "refused": ["c.png has no partner"]}
+            | {"remarks": ["found 2 images, expected 20"], "refused": ["c.png has no partner"]}
         },
         "unmeasured": [],
         "selections": {
@@ -275,7 +275,7 @@ def test_settings_metrics_remarks_and_refused_files_are_listed(page):
     for said in (
         "Nothing is resized.",
         "PSNR of it all. (higher is better)",
-        "2 pictures, where Nature20 has 20",
+        "found 2 images, expected 20",
     ):
         assert said in text
     assert "1 file refused" in text

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from benchmark_folders import repacked, sir2
-from brewster.benchmarks.registry import Benchmark, Case, PictureFile, read_benchmark
+from brewster.benchmarks.registry import Benchmark, Case, ImageFile, read_benchmark
 from brewster.errors import BrewsterError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import IdentityBaseline, PredictionFolder
@@ -16,7 +16,7 @@ PSNR = EvaluationConfig(metrics=("psnr",))
 
 
 def benchmark(name, count, excluded=()):
-    file = PictureFile("nowhere")
+    file = ImageFile("nowhere")
     cases = tuple(Case(name, str(i), str(i), str(i), file, file) for i in range(count))
     return Benchmark(name, name.title(), cases, excluded=excluded)
 
