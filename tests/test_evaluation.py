@@ -143,9 +143,9 @@ def test_benchmarks_that_share_a_name_or_hold_no_pair_are_refused(real20, method
 def test_a_failed_prediction_is_missing_on_the_page_and_named_in_the_tables(real20, methods, tmp_path):
     (tmp_path / "theirs" / "2.png").unlink()
     results = evaluate(real20, methods, QUICK, tmp_path / "out")
-    assert "no picture for real20/2" in results["pictures"][1]["errors"]["theirs"]
-    assert "no picture for real20/2" in (tmp_path / "out" / "tables.md").read_text()
-    assert "no picture for real20/2" in (tmp_path / "out" / "report.html").read_text()
+    assert "no prediction for real20/2" in results["pictures"][1]["errors"]["theirs"]
+    assert "no prediction for real20/2" in (tmp_path / "out" / "tables.md").read_text()
+    assert "no prediction for real20/2" in (tmp_path / "out" / "report.html").read_text()
 
 
 @pytest.fixture

@@ -142,7 +142,7 @@ def read_benchmark(name: str, folder: Path) -> list[Benchmark]:
 
     Raises:
         PhotoError: the name is not in BENCHMARKS, or the folder is missing or empty, or its layout is not supported.
-        MissingExtra: the benchmark is a rendered set, and torch is not installed.
+        MissingExtra: the extra for rendered sets or for the image format is not installed.
     """
     if name not in BENCHMARKS:
         close = difflib.get_close_matches(name.lower(), BENCHMARKS, 1)
