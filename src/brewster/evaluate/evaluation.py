@@ -243,14 +243,14 @@ def _case_images(
     return CaseImages(
         benchmark=truth.case.benchmark,
         name=truth.case.name,
-        photo=truth.pictures["photo"],
-        truth=truth.pictures["transmission"],
+        photo=truth.images["photo"],
+        truth=truth.images["transmission"],
         region=truth.region(config.thresholds[0]),
         predictions={name: output.transmission.srgb_8bit() for name, output in others.items()},
         reflections={
             name: output.reflection.srgb_8bit() for name, output in others.items() if output.reflection
         },
-        reflection_truth=truth.pictures.get("reflection"),
+        reflection_truth=truth.images.get("reflection"),
     )
 
 
