@@ -203,7 +203,7 @@ _exclusive_separators: dict[tuple[str, Device], Separator] = {}
 
 
 def _load_exclusive_separator(model: str, device: Device) -> Separator:
-    """Loads a diffusion model, or returns it if it is already loaded. Frees the previous model first, to save memory."""
+    """Loads a diffusion model if it is not loaded. Frees the previous model first, because memory is limited."""
     if (model, device) not in _exclusive_separators:
         _exclusive_separators.clear()
         gc.collect()

@@ -115,8 +115,8 @@ def _average_selections(full: Sequence[Selection], drawn: Sequence[Selection]) -
 
 
 def _describe_selection(key: str, group: Sequence[Selection]) -> dict[str, Any]:
-    pictures = sum(len(part.cases) for part in group)
-    return {"title": "Average" if key == AVERAGE else group[0].title, "pictures": pictures}
+    image_count = sum(len(part.cases) for part in group)
+    return {"title": "Average" if key == AVERAGE else group[0].title, "pictures": image_count}
 
 
 def _choices(config: EvaluationConfig, averaged: Sequence[Selection]) -> list[str]:
