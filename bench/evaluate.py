@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from brewster import Photo
-from brewster.evaluate.runner import SCORES
+from brewster.evaluate.runner import SCORES_FILE
 from brewster.srgb import to_encoded
 
 OUT = Path("out/bench/evaluate")
@@ -80,7 +80,7 @@ def measure(out: Path, workers: int) -> tuple[float, list[float]]:
 def watch(process: subprocess.Popen, out: Path, memory: list[float]) -> None:
     """Appends the resident memory in KiB every second, from the first score until the process ends."""
     while process.poll() is None:
-        if (out / SCORES).exists() and (out / SCORES).stat().st_size:
+        if (out / SCORES_FILE).exists() and (out / SCORES_FILE).stat().st_size:
             memory.append(sum(resident_kib(pid) for pid in process_tree(process.pid)))
         time.sleep(1)
 

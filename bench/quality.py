@@ -20,7 +20,7 @@ from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.evaluation import evaluate
 from brewster.evaluate.methods import IdentityBaseline, ModelMethod, PredictionFolder
 from brewster.evaluate.report.tables import overview
-from brewster.evaluate.runner import SCORES
+from brewster.evaluate.runner import SCORES_FILE
 from brewster.models.zoo import MODELS
 
 OUT = Path("out/bench/quality")
@@ -35,7 +35,7 @@ def main(data: Path) -> None:
     cases = [case for part in parts for case in part.cases]
     frr_seconds = run_frr(cases)
     models = [ModelMethod(name, name, OUT / "predictions" / name, device="cpu") for name in MODELS]
-    (OUT / SCORES).unlink(missing_ok=True)  # stored scores would have no new times
+    (OUT / SCORES_FILE).unlink(missing_ok=True)  # stored scores would have no new times
     timed = {}
     results = evaluate(
         parts,

@@ -1,8 +1,20 @@
 """Evaluation results in the format of results.json, with known numbers."""
 
 METRICS = {
-    "psnr": {"title": "PSNR", "unit": "dB", "higher_is_better": True, "digits": 2, "about": "PSNR is so."},
-    "lpips": {"title": "LPIPS", "unit": "", "higher_is_better": False, "digits": 3, "about": "LPIPS is so."},
+    "psnr": {
+        "title": "PSNR",
+        "unit": "dB",
+        "higher_is_better": True,
+        "digits": 2,
+        "about": "Definition of PSNR.",
+    },
+    "lpips": {
+        "title": "LPIPS",
+        "unit": "",
+        "higher_is_better": False,
+        "digits": 3,
+        "about": "Definition of LPIPS.",
+    },
 }
 SETS = ["real20", "nature20", "postcard", "solidobject", "wildscene"]
 
@@ -18,19 +30,23 @@ def known_results():
         "input (unprocessed)": {"psnr": entry(20.0, low=18.5, high=21.25), "lpips": entry(0.2)},
         "A_b|c": {"psnr": entry(21.5), "lpips": entry(0.1234)},
     }
-    apart = {"method": "A_b|c", "than": "input (unprocessed)"}
+    pair = {"method": "A_b|c", "than": "input (unprocessed)"}
     rows = [
-        apart | {"metric": "psnr", "mean": 1.5, "low": -0.25, "high": 3.0, "better": 15, "count": 20},
-        apart | {"metric": "lpips", "mean": -0.0766, "low": None, "high": None, "better": 20, "count": 20},
+        pair | {"metric": "psnr", "mean": 1.5, "low": -0.25, "high": 3.0, "better": 15, "count": 20},
+        pair | {"metric": "lpips", "mean": -0.0766, "low": None, "high": None, "better": 20, "count": 20},
     ]
     return {
-        "protocol": {"choices": ["Everything is stated."]},
+        "protocol": {"choices": ["Nothing is resized."]},
         "metrics": dict(METRICS),
         "selections": selections,
         "benchmarks": {
-            "real20": {"title": "Real20", "remarks": ["20 of 20"], "refused": ["x.png has no partner"]}
+            "real20": {
+                "title": "Real20",
+                "remarks": ["found 19 images, expected 20"],
+                "refused": ["x.png has no partner"],
+            }
         },
-        "methods": {"input (unprocessed)": {}, "A_b|c": {"remark": "2 pictures fit no case"}},
+        "methods": {"input (unprocessed)": {}, "A_b|c": {"remark": "2 images in the folder match no case"}},
         "unmeasured": ["removed_white"],
         "pictures": [{"errors": {"A_b|c": "A_b|c failed on real20/3"}}],
         "tables": dict.fromkeys(selections, table),

@@ -1,4 +1,4 @@
-"""Studies: one value, several choices, trained and measured alike."""
+"""Ablation studies: one model for each choice of a value, all trained and scored in the same way."""
 
 import io
 import os
@@ -27,10 +27,10 @@ def names(paths):
 
 
 TINY = {"prompt": "backbone-tiny.toml"}
-"""Another tiny base than tiny.toml, by study."""
+"""study -> tiny base recipe, if it is not tiny.toml."""
 
 
-def test_every_ablation_of_the_paper_is_ready():
+def test_every_ablation_of_the_paper_has_a_study():
     assert names(STUDIES) == ["mixing", "orders", "pairs", "prompt", "size"]
 
 
@@ -43,12 +43,12 @@ def test_a_study_changes_one_value_of_both_the_full_and_the_tiny_recipe(path):
         assert len({recipe.model_dump_json() for recipe in recipes}) == len(study.choices)
 
 
-def test_the_training_sizes_are_the_papers():
+def test_the_training_sizes_are_those_of_the_paper():
     assert read_study(RECIPES / "size.toml").choices == [0, 10, 50, 100, 300, 1000]
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("value = 'seed'\nchoices = [1, 2]\nbenchmarks = { real20 = 'x' }", "base"),
         ("base = 'b'\nvalue = 'seed'\nchoices = [1]\nbenchmarks = { real20 = 'x' }", "choices"),
@@ -57,15 +57,15 @@ def test_the_training_sizes_are_the_papers():
         ("base =", "TOML"),
     ],
 )
-def test_a_study_that_does_not_say_what_it_must_is_refused(text, said, tmp_path):
+def test_a_study_with_missing_or_invalid_keys_is_an_error(text, message, tmp_path):
     (tmp_path / "study.toml").write_text(text)
-    with pytest.raises(RecipeError, match=said):
+    with pytest.raises(RecipeError, match=message):
         read_study(tmp_path / "study.toml")
 
 
 @pytest.fixture
-def quick(monkeypatch, model):
-    """Training that takes no time: every network is a pane."""
+def without_training(monkeypatch, model):
+    """Replaces training: every trained model is a copy of the model of the fixture."""
 
     def train(recipe, folder, on_step):
         on_step(1, 1, {"loss": 0.5}, True)
@@ -83,18 +83,20 @@ def pairs(tmp_path):
     return read_benchmark("real20", tmp_path / "real20")
 
 
-def test_choices_are_compared_with_the_first_and_numbers_are_drawn(quick, pairs, data, tmp_path, monkeypatch):
+def test_choices_are_compared_with_the_first_and_numbers_are_plotted(
+    without_training, pairs, data, tmp_path, monkeypatch
+):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     calls = []
     results = ablate(
         read_study(RECIPES / "size.toml"),
         pairs,
         tmp_path / "out",
-        on_progress=lambda *now: calls.append(now),
+        on_progress=lambda *values: calls.append(values),
     )
     labels = [f"count {count}" for count in (0, 10, 50, 100, 300, 1000)]
     assert list(results["methods"]) == ["input (unprocessed)", *labels]
-    assert [now[0] for now in calls] == labels
+    assert [values[0] for values in calls] == labels
     compared = {(row["method"], row["than"]) for row in results["differences"]["real20"]}
     assert ("count 300", "count 0") in compared
     plot = np.asarray(Image.open(io.BytesIO((tmp_path / "out" / "plot.png").read_bytes())).convert("L"))
@@ -102,14 +104,14 @@ def test_choices_are_compared_with_the_first_and_numbers_are_drawn(quick, pairs,
     assert 0.005 < (plot < 128).mean() < 0.5
 
 
-def test_words_are_not_drawn(quick, pairs, data, tmp_path, monkeypatch):
+def test_choices_that_are_not_numbers_are_not_plotted(without_training, pairs, data, tmp_path, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     ablate(read_study(RECIPES / "mixing.toml"), pairs, tmp_path / "out")
     assert not (tmp_path / "out" / "plot.png").exists()
     assert (tmp_path / "out" / "mixing-8-bit" / "model.onnx").is_file()
 
 
-def test_prompts_are_compared_on_a_backbone_that_nobody_has_trained(pairs, data, tmp_path, monkeypatch):
+def test_prompts_are_compared_on_a_backbone_without_training(pairs, data, tmp_path, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     study = read_study(RECIPES / "prompt.toml").model_copy(update={"base": RECIPES / "backbone-tiny.toml"})
     results = ablate(study, pairs, tmp_path / "out")
@@ -120,8 +122,8 @@ def test_prompts_are_compared_on_a_backbone_that_nobody_has_trained(pairs, data,
 
 
 @pytest.fixture
-def little_data(data, tmp_path):
-    """A few of the pairs that studies learn from and are measured on."""
+def few_pairs(data, tmp_path):
+    """A data folder with four training pairs and two pairs of each benchmark."""
     for place, count in (("real/train", 4), ("real/dev/nature", 2), ("real/dev/real", 2)):
         for photo in sorted((data / place / "blended").iterdir())[:count]:
             for role in ("blended", "transmission"):
@@ -134,13 +136,13 @@ def little_data(data, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", STUDIES, ids=names(STUDIES))
-def test_every_study_runs_end_to_end_at_tiny_size(path, little_data, tmp_path):
-    """Real rendering, real training, real measuring, on four real pairs."""
-    environment = {**os.environ, "BREWSTER_DATA": str(little_data)}
+def test_every_study_runs_end_to_end_at_tiny_size(path, few_pairs, tmp_path):
+    """Nothing is replaced: the study renders, trains on four real pairs, and evaluates."""
+    environment = {**os.environ, "BREWSTER_DATA": str(few_pairs)}
     base = RECIPES / TINY.get(path.stem, "tiny.toml")
-    done = as_user("ablate", path, "--base", base, "-o", tmp_path / "out", env=environment)
-    assert done.returncode == 0, done.stderr.decode()
-    text = done.stdout.decode()
+    result = as_user("ablate", path, "--base", base, "-o", tmp_path / "out", env=environment)
+    assert result.returncode == 0, result.stderr.decode()
+    text = result.stdout.decode()
     for choice in read_study(path).choices:
         assert f" {choice} " in text
     assert (tmp_path / "out" / "report.html").is_file()

@@ -35,7 +35,7 @@ def test_tables_go_to_standard_output_and_all_results_into_a_folder(bare, pairs,
     text = out.decode()
     assert text.count("| input (unprocessed)") == 2
     assert "theirs \N{MINUS SIGN} input (unprocessed)" in text
-    assert "3 pictures, where Real20 has 20" in err
+    assert "found 3 images, expected 20" in err
     assert (tmp_path / "out" / "report.html").is_file()
     assert (tmp_path / "out" / "predictions" / "pane" / "real20" / "3.reflection.png").is_file()
 
@@ -66,7 +66,7 @@ def test_pictures_without_partner_are_named_and_the_others_are_scored(bare, pair
     assert len(json.loads(out)["pictures"]) == 3
     messages = errors(err)
     assert any("4.png" in line for line in messages)
-    assert any("blended/5:" in line and "half the scale" in line for line in messages)
+    assert any("blended/5:" in line and "resized by the factor 0.5" in line for line in messages)
 
 
 def test_a_method_that_fails_on_a_picture_is_named_and_the_exit_code_is_one(bare, pairs, tmp_path):

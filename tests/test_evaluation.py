@@ -1,4 +1,4 @@
-"""A complete evaluation, from folders to files."""
+"""A complete evaluation: reads folders and writes the output files."""
 
 import io
 import json
@@ -31,7 +31,7 @@ def real20(tmp_path):
 def methods(model, tmp_path):
     return [
         IdentityBaseline(),
-        ModelMethod("pane", str(model), tmp_path / "kept"),
+        ModelMethod("pane", str(model), tmp_path / "stored"),
         PredictionFolder("theirs", tmp_path / "theirs"),
     ]
 
@@ -49,38 +49,38 @@ def test_an_evaluation_writes_results_tables_and_a_report(real20, methods, tmp_p
 
 
 def test_two_runs_and_two_workers_write_the_same_bytes(real20, methods, tmp_path):
-    for place, workers in (("a", 1), ("b", 2)):
-        evaluate(real20, methods, QUICK, tmp_path / place, workers=workers)
+    for name, workers in (("a", 1), ("b", 2)):
+        evaluate(real20, methods, QUICK, tmp_path / name, workers=workers)
     for name in ("results.json", "tables.md", "table.tex", "table.csv", "report.html"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
 
 
-def test_the_page_shows_the_worst_of_the_first_model(real20, methods, tmp_path):
-    results = evaluate(real20, methods, QUICK, tmp_path / "out", shown=1)
+def test_the_report_shows_the_cases_with_the_worst_scores_of_the_first_model(real20, methods, tmp_path):
+    results = evaluate(real20, methods, QUICK, tmp_path / "out", max_report_cases=1)
     scores = {picture["name"]: picture["scores"]["pane"]["psnr"] for picture in results["pictures"]}
     page = (tmp_path / "out" / "report.html").read_text()
     assert page.count("<article") == 1
     assert f'data-name="{min(scores, key=scores.get)}"' in page
 
 
-def test_the_page_shows_first_what_the_first_model_failed_on(real20, methods, tmp_path):
+def test_the_report_first_shows_the_cases_on_which_the_first_model_failed(real20, methods, tmp_path):
     (tmp_path / "theirs" / "2.png").unlink()
-    evaluate(real20, [IdentityBaseline(), methods[2]], QUICK, tmp_path / "out", shown=1)
+    evaluate(real20, [IdentityBaseline(), methods[2]], QUICK, tmp_path / "out", max_report_cases=1)
     page = (tmp_path / "out" / "report.html").read_text()
     assert 'data-name="2"' in page
     assert page.count("<article") == 1
 
 
-def test_a_case_with_an_unreadable_ground_truth_is_not_on_the_page(real20, methods, tmp_path):
+def test_a_case_with_an_unreadable_ground_truth_is_not_in_the_report(real20, methods, tmp_path):
     path = tmp_path / "real20" / "transmission_layer" / "2.png"
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    evaluate(real20, [IdentityBaseline(), methods[2]], QUICK, tmp_path / "out", shown=1)
+    evaluate(real20, [IdentityBaseline(), methods[2]], QUICK, tmp_path / "out", max_report_cases=1)
     assert 'data-name="1"' in (tmp_path / "out" / "report.html").read_text()
 
 
-def test_an_unchanged_photo_that_equals_the_ground_truth_gives_no_remark(tmp_path):
-    for place in ("real20/blended/1.png", "real20/transmission_layer/1.png", "theirs/1.png"):
-        paint(tmp_path / place, 1)
+def test_a_photo_without_reflection_gives_no_remark_about_copied_ground_truth(tmp_path):
+    for path in ("real20/blended/1.png", "real20/transmission_layer/1.png", "theirs/1.png"):
+        paint(tmp_path / path, 1)
     parts = read_benchmark("real20", tmp_path / "real20")
     results = evaluate(
         parts, [IdentityBaseline(), PredictionFolder("theirs", tmp_path / "theirs")], QUICK, tmp_path / "out"
@@ -88,8 +88,8 @@ def test_an_unchanged_photo_that_equals_the_ground_truth_gives_no_remark(tmp_pat
     assert not any("remark" in about for about in results["methods"].values())
 
 
-def test_without_a_model_the_page_shows_the_worst_photos(real20, tmp_path):
-    results = evaluate(real20, [IdentityBaseline()], QUICK, tmp_path / "out", shown=1)
+def test_without_a_model_the_report_shows_the_worst_scores_of_the_baseline(real20, tmp_path):
+    results = evaluate(real20, [IdentityBaseline()], QUICK, tmp_path / "out", max_report_cases=1)
     scores = {
         picture["name"]: picture["scores"]["input (unprocessed)"]["psnr"] for picture in results["pictures"]
     }
@@ -97,26 +97,26 @@ def test_without_a_model_the_page_shows_the_worst_photos(real20, tmp_path):
     assert f'data-name="{min(scores, key=scores.get)}"' in page
 
 
-def test_a_lost_prediction_is_made_again_for_the_page(real20, methods, tmp_path):
+def test_a_deleted_prediction_is_computed_again_for_the_report(real20, methods, tmp_path):
     first = evaluate(real20, methods, QUICK, tmp_path / "out")
     page = (tmp_path / "out" / "report.html").read_bytes()
-    for stored in (tmp_path / "kept").rglob("1.*.png"):
+    for stored in (tmp_path / "stored").rglob("1.*.png"):
         stored.unlink()
     assert evaluate(real20, methods, QUICK, tmp_path / "out") == first
     assert (tmp_path / "out" / "report.html").read_bytes() == page
 
 
-def test_pictures_without_a_case_are_a_remark(real20, methods, tmp_path):
+def test_images_without_a_case_give_a_remark(real20, methods, tmp_path):
     paint(tmp_path / "theirs" / "other.png", 3)
     results = evaluate(real20, methods, QUICK, tmp_path / "out")
-    assert results["methods"]["theirs"]["remark"] == "1 picture of its folder fits no case"
+    assert results["methods"]["theirs"]["remark"] == "1 image in the folder matches no case"
 
 
-def test_a_folder_with_the_ground_truth_is_a_remark(real20, tmp_path):
+def test_a_folder_with_the_ground_truth_gives_a_remark(real20, tmp_path):
     results = evaluate(
         real20, [IdentityBaseline(), PredictionFolder("self", tmp_path / "real20")], QUICK, tmp_path / "out"
     )
-    assert "equals the ground truth on 2 pictures" in results["methods"]["self"]["remark"]
+    assert "equal the ground truth for 2 images" in results["methods"]["self"]["remark"]
     assert "remark" not in results["methods"]["input (unprocessed)"]
 
 
@@ -132,38 +132,38 @@ def test_downscaled_photos_are_written_for_methods_that_run_elsewhere(real20, tm
     assert Photo.open(inputs / "real20" / "1.png").size == (12, 8)
 
 
-def test_benchmarks_that_share_a_name_or_hold_no_pair_are_refused(real20, methods, tmp_path):
+def test_equal_benchmark_names_and_benchmarks_without_cases_are_an_error(real20, methods, tmp_path):
     with pytest.raises(BrewsterError, match="2 benchmarks have the name 'real20'"):
         evaluate([*real20, *real20], methods, QUICK, tmp_path / "out")
-    empty = Benchmark("real20", "Real20", (), refused=("a.png has no partner",))
-    with pytest.raises(PhotoError, match=r"no pair in real20.*a\.png has no partner"):
+    empty = Benchmark("real20", "Real20", (), excluded=("a.png has no partner",))
+    with pytest.raises(PhotoError, match=r"no case in real20.*a\.png has no partner"):
         evaluate([empty], methods, QUICK, tmp_path / "out")
 
 
-def test_a_failed_prediction_is_missing_on_the_page_and_named_in_the_tables(real20, methods, tmp_path):
+def test_a_missing_prediction_is_reported_in_results_tables_and_report(real20, methods, tmp_path):
     (tmp_path / "theirs" / "2.png").unlink()
     results = evaluate(real20, methods, QUICK, tmp_path / "out")
-    assert "no picture for real20/2" in results["pictures"][1]["errors"]["theirs"]
-    assert "no picture for real20/2" in (tmp_path / "out" / "tables.md").read_text()
-    assert "no picture for real20/2" in (tmp_path / "out" / "report.html").read_text()
+    assert "no prediction for real20/2" in results["pictures"][1]["errors"]["theirs"]
+    assert "no prediction for real20/2" in (tmp_path / "out" / "tables.md").read_text()
+    assert "no prediction for real20/2" in (tmp_path / "out" / "report.html").read_text()
 
 
 @pytest.fixture
 def opened(monkeypatch, tmp_path):
-    """Counts how often each picture below tmp_path is opened for reading."""
+    """Counts how often each image file below tmp_path is opened for reading."""
     counts, io_open = Counter(), io.open
 
-    def counting(file, mode="r", *args, **kwargs):
+    def open_and_count(file, mode="r", *args, **kwargs):
         path = Path(file) if not isinstance(file, int) else Path()
         if mode == "rb" and path.suffix == ".png":
             counts[path.relative_to(tmp_path).as_posix()] += 1
         return io_open(file, mode, *args, **kwargs)
 
-    monkeypatch.setattr(io, "open", counting)
+    monkeypatch.setattr(io, "open", open_and_count)
     return counts
 
 
-def test_each_picture_is_opened_once_and_decoded_once(tmp_path, methods, real20, opened, monkeypatch):
+def test_each_image_is_opened_once_and_decoded_once(tmp_path, methods, real20, opened, monkeypatch):
     decoded, open_photo = [], Photo.open
     monkeypatch.setattr(
         Photo, "open", lambda source, **more: decoded.append(source) or open_photo(source, **more)
@@ -171,7 +171,7 @@ def test_each_picture_is_opened_once_and_decoded_once(tmp_path, methods, real20,
     evaluate(real20, methods, QUICK, tmp_path / "out")
     folders = ("real20/blended", "real20/transmission_layer", "theirs")
     assert opened == {f"{folder}/{name}.png": 1 for folder in folders for name in ("1", "2")}
-    layers = 2 * len(("transmission", "reflection"))  # of the model, decoded from the bytes that it stores
+    layers = 2 * len(("transmission", "reflection"))  # the layers of the model, decoded from the stored bytes
     assert sum(isinstance(source, bytes) for source in decoded) == len(opened) + layers
 
 
@@ -180,20 +180,22 @@ def test_a_benchmark_is_opened_once_to_compare_sizes(tmp_path, real20, opened):
     assert set(opened.values()) == {1}
 
 
-def test_a_resumed_run_decodes_only_what_the_page_shows(tmp_path, methods, real20, monkeypatch):
+def test_a_resumed_run_decodes_only_the_images_of_the_report(tmp_path, methods, real20, monkeypatch):
     evaluate(real20, methods, QUICK, tmp_path / "out")
     page = (tmp_path / "out" / "report.html").read_bytes()
-    monkeypatch.setattr(Photo, "open", lambda *_: pytest.fail("a picture was decoded"))
-    evaluate(real20, methods, QUICK, tmp_path / "out", shown=0)
+    monkeypatch.setattr(Photo, "open", lambda *_: pytest.fail("an image was decoded"))
+    evaluate(real20, methods, QUICK, tmp_path / "out", max_report_cases=0)
     monkeypatch.undo()
     evaluate(real20, methods, QUICK, tmp_path / "out")
     assert (tmp_path / "out" / "report.html").read_bytes() == page
 
 
-def test_the_page_is_the_same_whether_pictures_are_cached_or_read_again(tmp_path, methods, real20):
-    """The page shows the whole benchmark from the pictures in memory, and a part of it from the files."""
+def test_the_report_is_the_same_for_stored_tiles_and_for_images_that_are_read_again(
+    tmp_path, methods, real20
+):
+    """The whole benchmark is shown from stored tiles, and a part of it from files that are read again."""
     evaluate(real20, methods, QUICK, tmp_path / "whole")
-    evaluate(real20, methods, QUICK, tmp_path / "part", shown=1)
+    evaluate(real20, methods, QUICK, tmp_path / "part", max_report_cases=1)
     pages = [(tmp_path / name / "report.html").read_text() for name in ("whole", "part")]
     _, article = pages[1].split("<article")
     assert article.partition("</article>")[0] in pages[0]

@@ -1,4 +1,4 @@
-"""Every setting is printed, and invalid settings are refused."""
+"""Every setting is described in the reports. Invalid settings are errors."""
 
 import pytest
 
@@ -7,13 +7,13 @@ from brewster.evaluate.config import EvaluationConfig
 from brewster.metrics import METRICS
 
 
-def test_an_unknown_metric_is_refused_with_the_name_that_was_meant():
+def test_an_unknown_metric_is_an_error_that_suggests_the_nearest():
     with pytest.raises(BrewsterError, match="did you mean psnr"):
         EvaluationConfig(metrics=("pnsr",))
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "settings",
     [
         {"metrics": ()},
         {"metrics": ("psnr", "psnr")},
@@ -22,21 +22,23 @@ def test_an_unknown_metric_is_refused_with_the_name_that_was_meant():
         {"size": 0},
     ],
 )
-def test_impossible_choices_are_refused(wrong):
+def test_invalid_settings_are_an_error(settings):
     with pytest.raises(BrewsterError):
-        EvaluationConfig(**wrong)
+        EvaluationConfig(**settings)
 
 
 def test_several_thresholds_give_a_column_each():
-    swept = EvaluationConfig(metrics=("psnr", "psnr_region"), thresholds=(0.05, 0.1))
-    assert list(swept.columns()) == ["psnr", "psnr_region@0.05", "psnr_region@0.1"]
-    assert swept.columns()["psnr_region@0.05"].title.endswith("> 0.05")
-    assert [swept.threshold(column) for column in swept.columns()] == [0.05, 0.05, 0.1]
+    config = EvaluationConfig(metrics=("psnr", "psnr_region"), thresholds=(0.05, 0.1))
+    assert list(config.columns()) == ["psnr", "psnr_region@0.05", "psnr_region@0.1"]
+    assert config.columns()["psnr_region@0.05"].title.endswith("> 0.05")
+    assert [config.threshold(column) for column in config.columns()] == [0.05, 0.05, 0.1]
     assert list(EvaluationConfig(metrics=("psnr_region",)).columns()) == ["psnr_region"]
 
 
-def test_every_choice_is_printed():
-    said = " ".join(EvaluationConfig(size=420, quality="best", thresholds=(0.05, 0.2), paper=True).choices())
+def test_every_setting_is_described():
+    description = " ".join(
+        EvaluationConfig(size=420, quality="best", thresholds=(0.05, 0.2), paper=True).describe()
+    )
     for word in (
         "420 px",
         '"best"',
@@ -47,8 +49,8 @@ def test_every_choice_is_printed():
         "100 dB",
         "8-bit sRGB",
     ):
-        assert word in said
-    assert "nothing is resized" in EvaluationConfig().choices()[0]
+        assert word in description
+    assert "nothing is resized" in EvaluationConfig().describe()[0]
 
 
 def test_by_default_every_metric_but_the_second_ssim_is_measured():

@@ -18,8 +18,8 @@ from brewster.benchmarks.registry import Case
 from brewster.environments.catalog import BUILTIN_CATALOG
 from brewster.environments.procedural.rooms import ENVIRONMENTS
 from brewster.evaluate.config import EvaluationConfig
-from brewster.evaluate.methods import PREDICTION_FORMAT, MethodOutput, ModelMethod
-from brewster.evaluate.runner import SCORE_FORMAT
+from brewster.evaluate.methods import PREDICTION_FORMAT_VERSION, MethodOutput, ModelMethod
+from brewster.evaluate.runner import SCORE_FORMAT_VERSION
 from brewster.evaluate.scoring import GroundTruth, Scorer
 from brewster.inference import QUALITIES
 from brewster.metrics import METRICS
@@ -114,7 +114,7 @@ ANSWERS = {
     },
 }
 SCORES = {
-    2: {
+    3: {
         "psnr": 20.003941,
         "ssim": 0.862947,
         "ssim_gaussian": 0.876058,
@@ -128,7 +128,7 @@ SCORES = {
     },
 }
 LPIPS = {
-    2: {"lpips": 0.033937, "lpips_region": 0.035948, "lpips_reflection": 0.283549},
+    3: {"lpips": 0.033937, "lpips_region": 0.035948, "lpips_reflection": 0.283549},
 }
 SCENES = {
     1: {"tiny": "3110c6324c047d3d", "window": "e2d8b2c9af23a561"},
@@ -219,7 +219,7 @@ def test_a_changed_prediction_needs_a_new_prediction_format(asymmetric, tmp_path
             [layer.pixels[7::240, 9::240, 1] for layer in (answer.transmission, answer.reflection)]
         )
         made[quality] = layers.ravel().tolist()
-    same("evaluate.methods.PREDICTION_FORMAT", PREDICTION_FORMAT, ANSWERS, made, 1)
+    same("evaluate.methods.PREDICTION_FORMAT_VERSION", PREDICTION_FORMAT_VERSION, ANSWERS, made, 1)
 
 
 def scores(names):
@@ -238,13 +238,13 @@ def test_a_changed_score_needs_a_new_score_format():
     names = tuple(name for name in METRICS if not name.startswith("lpips"))
     made = scores(names)
     assert None not in made.values()
-    same("evaluate.runner.SCORE_FORMAT", SCORE_FORMAT, SCORES, made, 2e-6)
+    same("evaluate.runner.SCORE_FORMAT_VERSION", SCORE_FORMAT_VERSION, SCORES, made, 2e-6)
 
 
 def test_a_changed_lpips_needs_a_new_score_format(data, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     names = tuple(name for name in METRICS if name.startswith("lpips"))
-    same("evaluate.runner.SCORE_FORMAT", SCORE_FORMAT, LPIPS, scores(names), 1e-4)
+    same("evaluate.runner.SCORE_FORMAT_VERSION", SCORE_FORMAT_VERSION, LPIPS, scores(names), 1e-4)
 
 
 def test_a_changed_scene_needs_a_new_sample_format():

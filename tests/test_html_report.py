@@ -56,7 +56,7 @@ class Page(HTMLParser):
 
 
 def metric(title="PSNR", *, unit="dB", higher=True, digits=2):
-    about = f"{title} of it all."
+    about = f"Definition of {title}."
     return {"title": title, "unit": unit, "higher_is_better": higher, "digits": digits, "about": about}
 
 
@@ -90,7 +90,7 @@ def results(names=("a", "b"), method="compact", errors=None):
         "metrics": {"psnr": metric(), "psnr_region": metric("PSNR in the region")},
         "benchmarks": {
             "nature20": {"title": "Nature20", "pictures": len(names), "expected": [20]}
-            | {"remarks": ["2 pictures, where Nature20 has 20"], "refused": ["c.png has no partner"]}
+            | {"remarks": ["found 2 images, expected 20"], "refused": ["c.png has no partner"]}
         },
         "unmeasured": [],
         "selections": {
@@ -104,12 +104,12 @@ def results(names=("a", "b"), method="compact", errors=None):
     }
 
 
-def shown(name="a", method="compact", size=(40, 60), **changes):
+def make_tiles(name="a", method="compact", size=(40, 60), **changes):
     photo = np.full((*size, 3), 90, np.uint8)
-    photo[: size[0] // 2] = 200  # bright above, dark below: an upright picture
+    photo[: size[0] // 2] = 200  # bright at the top, dark at the bottom, so that the orientation is visible
     region = np.zeros(size, bool)
     region[: size[0] // 2] = True
-    given = {"photo": photo, "truth": photo // 2, "region": region, "predictions": {method: photo}}
+    given = {"photo": photo, "ground_truth": photo // 2, "region": region, "predictions": {method: photo}}
     images = CaseImages("nature20", name, **(given | {"reflections": {method: photo // 4}} | changes))
     return to_tiles(images)
 
@@ -120,14 +120,14 @@ def page(tmp_path):
 
     def page(given=None, cases=None):
         path = tmp_path / "report.html"
-        write_report(given or results(), cases or [shown("a"), shown("b")], path)
+        write_report(given or results(), cases or [make_tiles("a"), make_tiles("b")], path)
         return Page(path.read_text("utf-8"))
 
     return page
 
 
 def pictures(page):
-    """The alternative text and the photo of each embedded picture."""
+    """Returns alternative text -> decoded image, for each embedded image."""
     prefix = "data:image/webp;base64,"
     images = page.all("img")
     assert all(image["src"].startswith(prefix) for image in images)
@@ -137,7 +137,7 @@ def pictures(page):
 # --- the page
 
 
-def test_the_page_needs_no_other_file(page, tmp_path):
+def test_the_page_does_not_load_other_files(page, tmp_path):
     made, source = page(), (tmp_path / "report.html").read_text()
     assert "http" not in re.sub(r"http-equiv", "", source)
     assert not made.all("link")
@@ -148,39 +148,39 @@ def test_the_page_needs_no_other_file(page, tmp_path):
     assert "img-src data:" in policy
 
 
-def test_every_case_and_method_appears_with_its_scores_and_their_change(page):
+def test_every_case_and_method_appears_with_scores_and_differences(page):
     made = page()
     assert [has["data-name"] for has in made.all("article")] == ["a", "b"]
-    for said in (
+    for text in (
         "photo, input (unprocessed)",
         "compact",
         "21.50",
         "+1.50 ▲",
-        "region 25%",
+        "reflection region 25%",
         "60 \N{MULTIPLICATION SIGN} 40 px",
         "Nature20",
     ):
-        assert said in made.text
+        assert text in made.text
     assert made.data()["scores"][1]["compact"] == {"psnr": 21.5, "psnr_region": None}
 
 
-def test_every_picture_can_be_opened_and_says_what_it_is(page):
-    made = page(cases=[shown("a", reflection_truth=np.zeros((40, 60, 3), np.uint8))])
+def test_every_image_has_a_button_and_an_alternative_text(page):
+    made = page(cases=[make_tiles("a", reflection_ground_truth=np.zeros((40, 60, 3), np.uint8))])
     kinds = [has["data-kind"] for has in made.all("button", type="button") if "data-kind" in has]
     assert len(kinds) == len(made.all("img")) == 8
     assert [has["alt"] for has in made.all("img")] == [
         "photo, a",
         "error of the photo, a",
-        "truth, a",
+        "ground truth, a",
         "reflection region, a",
-        "true reflection, a",
+        "ground truth of the reflection, a",
         "compact, a",
         "error of compact, a",
         "reflection by compact, a",
     ]
 
 
-def test_controls_have_labels_and_what_scrolls_can_be_reached_by_keyboard(page):
+def test_controls_have_labels_and_scrolling_areas_can_have_the_keyboard_focus(page):
     made = page()
     assert len(made.all("label")) == len(made.all("select")) + len(made.all("input"))
     scrolling = [has for has in made.all("div") if has.get("class") == "scroll"]
@@ -189,7 +189,7 @@ def test_controls_have_labels_and_what_scrolls_can_be_reached_by_keyboard(page):
 
 def test_the_same_input_gives_the_same_bytes(tmp_path):
     for name in ("one", "two"):
-        write_report(results(), iter([shown("a"), shown("b")]), tmp_path / name)
+        write_report(results(), iter([make_tiles("a"), make_tiles("b")]), tmp_path / name)
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
 
 
@@ -197,13 +197,13 @@ def test_the_same_input_gives_the_same_bytes(tmp_path):
     "name",
     ["<script>alert(1)</script>", "\"&' onerror=alert(1) ", "<!--data-->", "</article>", "\udcff", "ä/日本"],
 )
-def test_hostile_names_are_harmless(page, name):
+def test_names_with_markup_are_escaped(page, name):
     given = results([name], method=name, errors={name: name})
     given["benchmarks"]["nature20"] |= {"title": name, "remarks": [name], "refused": [name]}
     given["metrics"]["psnr"] |= {"title": name, "about": name}
     made, plain = (
-        page(given, [shown(name, name)]),
-        page(results(["a"], errors={"compact": "a"}), [shown("a")]),
+        page(given, [make_tiles(name, name)]),
+        page(results(["a"], errors={"compact": "a"}), [make_tiles("a")]),
     )
     assert [tag for tag, _ in made.elements] == [tag for tag, _ in plain.elements]
     assert [set(has) for _, has in made.elements] == [set(has) for _, has in plain.elements]
@@ -214,18 +214,18 @@ def test_hostile_names_are_harmless(page, name):
 # --- numbers
 
 
-def test_the_best_of_a_column_is_marked_by_more_than_colour(page):
+def test_the_best_mean_of_a_column_has_a_star(page):
     assert re.search(r"input \(unprocessed\)\s*20.00", page().text)
     assert re.search(r"★ best 21.50\s*20.00 to 23.00", page().text)
 
 
-def test_equal_means_are_all_the_best(page):
+def test_equal_best_means_all_have_a_star(page):
     given = results()
     given["tables"]["nature20"]["compact"]["psnr"]["mean"] = 20.001
     assert page(given).text.count("★ best 20.00") == 2
 
 
-def test_for_a_metric_that_should_be_low_the_lowest_is_the_best_and_a_fall_is_better(page):
+def test_if_lower_is_better_the_lowest_mean_is_the_best_and_an_increase_is_worse(page):
     given = results()
     given["metrics"]["psnr"]["higher_is_better"] = False
     text = page(given).text
@@ -248,14 +248,14 @@ def test_differences_between_methods_are_separate_from_those_to_the_baseline(pag
         row | {"method": "RDNet", "than": "compact", "low": -3, "high": -1, "mean": -2}
     )
     text = page(given).text
-    assert "RDNet against compact▼ worse: \N{MINUS SIGN}2.00" in text
-    assert "Between methods" in text
-    assert "Between methods" not in page().text
+    assert "RDNet minus compact▼ worse: \N{MINUS SIGN}2.00" in text
+    assert "Differences between methods" in text
+    assert "Differences between methods" not in page().text
 
 
 def test_a_missing_score_is_a_dash_and_a_metric_without_scores_has_no_column(page):
     given = results()
-    assert "PSNR in the region" in page(given).text  # its definition is listed nevertheless
+    assert "PSNR in the region" in page(given).text  # its definition is still listed
     assert "PSNR in the region dB" not in page(given).text
     given["pictures"][0]["scores"]["compact"] = {"psnr": None, "psnr_region": None}
     given["tables"]["nature20"]["compact"]["psnr"] = None
@@ -270,43 +270,43 @@ def test_an_estimate_over_fewer_pictures_shows_their_number_and_may_have_no_inte
     assert "★ best 21.501 of 2" not in text
 
 
-def test_settings_metrics_remarks_and_refused_files_are_listed(page):
+def test_settings_metrics_remarks_and_excluded_files_are_listed(page):
     text = page().text
-    for said in (
+    for expected in (
         "Nothing is resized.",
-        "PSNR of it all. (higher is better)",
-        "2 pictures, where Nature20 has 20",
+        "Definition of PSNR. (higher is better)",
+        "found 2 images, expected 20",
     ):
-        assert said in text
-    assert "1 file refused" in text
+        assert expected in text
+    assert "1 file excluded" in text
     assert "c.png has no partner" in text
     assert "sha256 7adb" in text
-    assert "No method failed on any picture." in text
+    assert "No method failed on any image." in text
     given = results()
-    given["methods"]["compact"]["remark"] = "its prediction equals the ground truth on 2 pictures"
-    assert "compact: its prediction equals the ground truth" in page(given).text
+    given["methods"]["compact"]["remark"] = "the predictions equal the ground truth for 2 images"
+    assert "compact: the predictions equal the ground truth" in page(given).text
 
 
-def test_failures_are_listed_at_the_top_and_at_their_picture(page):
+def test_errors_are_listed_at_the_top_and_at_their_case(page):
     given = results()
     given["pictures"][0] |= {
         "scores": {"input (unprocessed)": {"psnr": 20.0}},
         "errors": {"compact": "no prediction"},
     }
-    made = page(given, [shown("a", predictions={}, reflections={}), shown("b")])
-    assert "Failed: compact on 1 of 2 pictures" in made.text
+    made = page(given, [make_tiles("a", predictions={}, reflections={}), make_tiles("b")])
+    assert "Failed: compact on 1 of 2 images" in made.text
     assert "nature20/a, compact: no prediction" in made.text
     assert "Failed: no prediction" in made.text
     assert "compact, a" not in [has["alt"] for has in made.all("img")]
 
 
-def test_many_failures_are_collapsed_behind_their_number(page):
+def test_a_long_list_of_errors_is_collapsed(page):
     given = results([f"{number}" for number in range(9)], errors={"compact": "no prediction"})
-    made = page(given, [shown("0")])
-    assert "Failed: compact on 9 of 9 pictures" in made.text
+    made = page(given, [make_tiles("0")])
+    assert "Failed: compact on 9 of 9 images" in made.text
     assert [has for has in made.all("details") if has.get("class") == "note" and "open" not in has]
     assert (
-        "1 of 9 pictures are on this page: of each benchmark those that the first method after the baseline failed on"
+        "This page shows 1 of 9 images: for each benchmark, first the images on which the first method after the baseline failed"
         in made.text
     )
 
@@ -318,29 +318,31 @@ def test_many_failures_are_collapsed_behind_their_number(page):
     ("size", "embedded"),
     [((40, 60), (60, 40)), ((600, 1200), (480, 240)), ((960, 320), (160, 480)), ((1, 2000), (480, 1))],
 )
-def test_pictures_are_reduced_together_to_480_px_and_never_enlarged(page, size, embedded):
-    made = page(cases=[shown("a", size=size)])
+def test_images_are_downscaled_to_480_px_and_never_enlarged(page, size, embedded):
+    made = page(cases=[make_tiles("a", size=size)])
     assert {photo.size for photo in pictures(made).values()} == {embedded}
     assert {(has["width"], has["height"]) for has in made.all("img")} == {tuple(map(str, embedded))}
     assert max(embedded) <= MAX_SIDE_PX
 
 
-def test_pictures_stay_upright_and_keep_their_values(page):
-    photo = pictures(page(cases=[shown("a", size=(700, 500))]))["photo, a"].pixels
+def test_images_keep_their_orientation_and_their_values(page):
+    photo = pictures(page(cases=[make_tiles("a", size=(700, 500))]))["photo, a"].pixels
     assert abs(photo[:200].astype(int) - 200).max() <= 6
     assert abs(photo[-200:].astype(int) - 90).max() <= 6
 
 
-def test_pictures_are_reduced_as_a_photo_reduces_itself(page, random):
+def test_images_are_downscaled_like_photo_resized(page, random):
     photo = random.integers(0, 255, (501, 733, 3)).astype(np.uint8)
     expected = Photo.from_array(Photo.from_array(photo, encoding="srgb").resized(480, 328), encoding="linear")
-    made = pictures(page(cases=[shown("a", size=(501, 733), photo=photo)]))["photo, a"]
-    apart = abs(made.pixels.astype(int) - Photo.open(expected.encode("webp")).pixels)
-    assert apart.mean() < 1  # roundings apart, then WebP; averages of encoded values would be some 10 apart
+    made = pictures(page(cases=[make_tiles("a", size=(501, 733), photo=photo)]))["photo, a"]
+    difference = abs(made.pixels.astype(int) - Photo.open(expected.encode("webp")).pixels)
+    assert (
+        difference.mean() < 1
+    )  # from rounding and WebP; averages of encoded values would differ by about 10
 
 
-def test_the_region_is_a_tint_over_its_pixels_and_clear_elsewhere(page):
-    tint = pictures(page(cases=[shown("a", size=(800, 600))]))["reflection region, a"]
+def test_the_overlay_is_coloured_inside_the_region_and_transparent_outside(page):
+    tint = pictures(page(cases=[make_tiles("a", size=(800, 600))]))["reflection region, a"]
     assert tint.alpha[:239].min() > 50
     assert tint.alpha[241:].max() == 0
 
@@ -357,16 +359,16 @@ def test_an_error_map_has_the_colour_of_the_largest_channels_difference():
     assert (error_map(truth, prediction) == colours).all()
 
 
-def test_an_error_map_averages_errors_when_it_is_reduced():
+def test_a_downscaled_error_map_averages_the_errors():
     truth = np.zeros((960, 960, 3), np.uint8)
     prediction = truth.copy()
-    prediction[::2] = 48  # every other row: the mean halves it
+    prediction[::2] = 48  # every other row, so the mean error is 24
     assert (error_map(prediction, truth) == COLOUR_MAP[24 * len(COLOUR_MAP) // MAX_ERROR]).all()
 
 
-def test_error_maps_are_embedded_without_loss(page, random):
+def test_error_maps_are_embedded_losslessly(page, random):
     truth, photo = random.integers(0, 255, (2, 40, 60, 3)).astype(np.uint8)
-    made = pictures(page(cases=[shown("a", photo=photo, truth=truth)]))
+    made = pictures(page(cases=[make_tiles("a", photo=photo, ground_truth=truth)]))
     assert (made["error of the photo, a"].pixels == error_map(photo, truth)).all()
 
 
@@ -378,13 +380,13 @@ def test_the_lightness_of_the_colour_map_increases():
 # --- the file
 
 
-def test_cases_are_consumed_and_freed_one_at_a_time(tmp_path):
+def test_cases_are_read_and_freed_one_at_a_time(tmp_path):
     alive = []
 
     def cases():
         for number in range(6):
-            assert sum(case() is not None for case in alive) <= 1  # the one that was just written
-            case = shown(f"{number}")
+            assert sum(case() is not None for case in alive) <= 1  # the case that was just written
+            case = make_tiles(f"{number}")
             alive.append(weakref.ref(case))
             yield case
             del case
@@ -395,26 +397,26 @@ def test_cases_are_consumed_and_freed_one_at_a_time(tmp_path):
 
 def test_a_report_replaces_an_older_one_atomically(tmp_path):
     def broken():
-        yield shown("a")
+        yield make_tiles("a")
         raise ValueError
 
     path = tmp_path / "new" / "report.html"
-    write_report(results(), [shown("a")], path)
+    write_report(results(), [make_tiles("a")], path)
     before = path.read_bytes()
     with pytest.raises(ValueError):  # noqa: PT011
         write_report(results(), broken(), path)
     assert path.read_bytes() == before
-    write_report(results(), [shown("b")], path)
+    write_report(results(), [make_tiles("b")], path)
     assert path.read_bytes() != before
     assert [file.name for file in path.parent.iterdir()] == ["report.html"]
 
 
-def test_a_place_that_cannot_be_written_is_named(tmp_path):
+def test_a_path_that_cannot_be_written_is_an_error_that_names_it(tmp_path):
     (tmp_path / "report.html").mkdir()
     with pytest.raises(TargetError, match=r"report\.html was not written \(.*\); .* run again"):
-        write_report(results(), [shown("a")], tmp_path / "report.html")
+        write_report(results(), [make_tiles("a")], tmp_path / "report.html")
     assert not list(tmp_path.glob(".brewster-*"))
 
 
-def test_a_case_that_the_results_do_not_know_is_shown_without_scores(page):
-    assert page(cases=[shown("stranger")]).data()["scores"] == [{}]
+def test_a_case_that_is_not_in_the_results_is_shown_without_scores(page):
+    assert page(cases=[make_tiles("unknown")]).data()["scores"] == [{}]

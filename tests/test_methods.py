@@ -1,4 +1,4 @@
-"""Predictions are paired with cases by name, uniquely."""
+"""Each prediction is paired with exactly one case, by name."""
 
 import pickle
 import unicodedata
@@ -27,12 +27,13 @@ def case(cases):
     return cases[0]
 
 
-def method(tmp_path, *places):
-    write(tmp_path / "theirs", *places)
+def write_predictions(tmp_path, *paths):
+    """Writes images into a folder; returns the folder as a method."""
+    write(tmp_path / "theirs", *paths)
     return PredictionFolder("theirs", tmp_path / "theirs")
 
 
-NAMES = [
+PREDICTION_PATHS = [
     "1.png",
     "1.jpg",
     "1.transmission.png",
@@ -46,74 +47,74 @@ NAMES = [
 ]
 
 
-@pytest.mark.parametrize("place", NAMES)
-def test_a_prediction_is_found_under_every_name_that_is_documented(place, case, tmp_path):
-    (found,) = method(tmp_path, place).files(case).values()
-    assert found == tmp_path / "theirs" / place
+@pytest.mark.parametrize("path", PREDICTION_PATHS)
+def test_a_prediction_is_found_under_every_name_that_is_documented(path, case, tmp_path):
+    (found,) = write_predictions(tmp_path, path).files(case).values()
+    assert found == tmp_path / "theirs" / path
 
 
-def test_a_reflection_is_found_beside_it(case, tmp_path):
-    both = method(tmp_path, "1/x_t.png", "1/x_r.png", "1/m_input.png", "1/t_label.png").files(case)
+def test_a_reflection_is_found_in_addition(case, tmp_path):
+    both = write_predictions(tmp_path, "1/x_t.png", "1/x_r.png", "1/m_input.png", "1/t_label.png").files(case)
     assert {layer: path.name for layer, path in both.items()} == {
         "transmission": "x_t.png",
         "reflection": "x_r.png",
     }
-    both = method(tmp_path / "more", "1.transmission.png", "1.reflection.png").files(case)
+    both = write_predictions(tmp_path / "more", "1.transmission.png", "1.reflection.png").files(case)
     assert both["reflection"].name == "1.reflection.png"
 
 
-@pytest.mark.parametrize("place", ["10.png", "01.png", "1_.png", "1.txt", ".1.png", "x1.png"])
-def test_a_similar_name_is_not_a_prediction(place, case, tmp_path):
-    with pytest.raises(PhotoError, match="no picture for real20/1"):
-        method(tmp_path, place).files(case)
+@pytest.mark.parametrize("path", ["10.png", "01.png", "1_.png", "1.txt", ".1.png", "x1.png"])
+def test_a_similar_name_is_not_a_prediction(path, case, tmp_path):
+    with pytest.raises(PhotoError, match="no prediction for real20/1"):
+        write_predictions(tmp_path, path).files(case)
 
 
 def test_a_copy_of_the_photos_is_not_a_prediction(case, tmp_path):
-    with pytest.raises(PhotoError, match="no picture"):
-        method(tmp_path, "blended/1.png").files(case)
+    with pytest.raises(PhotoError, match="no prediction"):
+        write_predictions(tmp_path, "blended/1.png").files(case)
 
 
-def test_two_pictures_for_one_case_are_refused_and_named(case, tmp_path):
-    with pytest.raises(PhotoError, match=r"2 pictures for the transmission.*1\.jpg, 1\.png"):
-        method(tmp_path, "1.png", "1.jpg").files(case)
+def test_two_files_for_one_case_are_an_error_that_names_both(case, tmp_path):
+    with pytest.raises(PhotoError, match=r"2 files for the transmission.*1\.jpg, 1\.png"):
+        write_predictions(tmp_path, "1.png", "1.jpg").files(case)
 
 
-def test_an_accent_written_as_two_characters_is_the_same_name(cases, tmp_path):
-    apart = unicodedata.normalize("NFD", "ä")
-    assert method(tmp_path, f"{apart}.png").files(cases[2])
+def test_names_in_both_unicode_forms_are_equal(cases, tmp_path):
+    decomposed = unicodedata.normalize("NFD", "ä")
+    assert write_predictions(tmp_path, f"{decomposed}.png").files(cases[2])
 
 
-def test_one_picture_cannot_be_the_prediction_for_two_cases(cases, tmp_path):
+def test_one_image_cannot_be_the_prediction_for_two_cases(cases, tmp_path):
     repacked(tmp_path / "nature20", ["1"])
     (other,) = read_benchmark("nature20", tmp_path / "nature20")
-    theirs = method(tmp_path, "1.png", "2.png")
+    theirs = write_predictions(tmp_path, "1.png", "2.png")
     theirs.check_pairing(cases)
-    with pytest.raises(PhotoError, match="fits two cases of theirs, real20/1 and nature20/1"):
+    with pytest.raises(PhotoError, match="matches two cases, real20/1 and nature20/1"):
         theirs.check_pairing([*cases, *other.cases])
-    sorted_out = method(tmp_path / "sorted", "real20/1.png", "nature20/1.png")
-    sorted_out.check_pairing([*cases, *other.cases])
+    unambiguous = write_predictions(tmp_path / "sorted", "real20/1.png", "nature20/1.png")
+    unambiguous.check_pairing([*cases, *other.cases])
 
 
-def test_a_folder_in_which_no_name_fits_is_refused_at_once(cases, tmp_path):
+def test_a_folder_without_a_matching_name_is_an_error_before_scoring(cases, tmp_path):
     with pytest.raises(PhotoError, match="has the name of a case"):
-        method(tmp_path, "a.png", "b.png").check_pairing(cases)
+        write_predictions(tmp_path, "a.png", "b.png").check_pairing(cases)
     with pytest.raises(PhotoError, match="is not a folder"):
         PredictionFolder("theirs", tmp_path / "nowhere").check_pairing(cases)
 
 
-def test_pictures_without_a_case_are_counted(cases, tmp_path):
-    assert method(tmp_path, "1.png", "other.png", "another.png").unused(cases) == 2
+def test_images_without_a_case_are_counted(cases, tmp_path):
+    assert write_predictions(tmp_path, "1.png", "other.png", "another.png").count_unmatched(cases) == 2
 
 
-def test_the_baseline_is_the_photo_and_black(case):
+def test_the_baseline_predicts_the_photo_and_a_black_reflection(case):
     photo = Photo.open(case.photo.read())
     prediction = IdentityBaseline().predict(case, photo)
     assert prediction.transmission is photo
     assert not prediction.reflection.pixels.any()
 
 
-def test_a_model_predicts_as_the_separator_and_stores_its_prediction(case, model, tmp_path):
-    ours = ModelMethod("pane", str(model), tmp_path / "kept")
+def test_a_model_stores_its_prediction(case, model, tmp_path):
+    ours = ModelMethod("pane", str(model), tmp_path / "predictions")
     assert ours.cached(case) is None
     photo = Photo.open(case.photo.read())
     prediction = ours.predict(case, photo)
@@ -121,44 +122,51 @@ def test_a_model_predicts_as_the_separator_and_stores_its_prediction(case, model
     stored = ours.cached(case)
     assert np.array_equal(stored.transmission.srgb_8bit(), prediction.transmission.srgb_8bit())
     assert np.array_equal(stored.reflection.srgb_8bit(), prediction.reflection.srgb_8bit())
-    assert PredictionFolder("again", tmp_path / "kept").files(case).keys() == {"transmission", "reflection"}
+    assert PredictionFolder("again", tmp_path / "predictions").files(case).keys() == {
+        "transmission",
+        "reflection",
+    }
 
 
-def test_the_stored_layers_of_a_16_bit_wide_gamut_photo_are_what_is_scored(case, model, tmp_path):
+def test_the_stored_layers_of_a_16_bit_wide_gamut_photo_are_scored(case, model, tmp_path):
     pixels = np.random.default_rng(1).integers(0, 1 << 16, (6, 8, 3), np.uint16)
     photo = Photo(pixels, None, FileInfo(bits=16, icc=bytes(pyvips.Image.profile_load("p3"))))
-    ours = ModelMethod("pane", str(model), tmp_path / "kept")
+    ours = ModelMethod("pane", str(model), tmp_path / "predictions")
     prediction, stored = ours.predict(case, photo), ours.cached(case)
     assert np.array_equal(stored.transmission.srgb_8bit(), prediction.transmission.srgb_8bit())
 
 
-def test_a_key_changes_with_everything_that_the_prediction_depends_on(case, model, tmp_path):
+def test_a_key_changes_with_the_quality_and_with_the_files(case, model, tmp_path):
     draft = ModelMethod("pane", str(model), tmp_path, quality="draft")
     assert draft.key(case) != ModelMethod("pane", str(model), tmp_path).key(case)
-    theirs = method(tmp_path, "1.png")
+    theirs = write_predictions(tmp_path, "1.png")
     before = theirs.key(case)
     write(tmp_path / "theirs", "1.png", data=picture((8, 7), "png"))
     assert PredictionFolder("theirs", tmp_path / "theirs").key(case) != before
 
 
 def test_methods_can_be_pickled(model, tmp_path):
-    for one in (IdentityBaseline(), ModelMethod("pane", str(model), tmp_path), method(tmp_path, "1.png")):
-        assert pickle.loads(pickle.dumps(one)) == one
+    for method in (
+        IdentityBaseline(),
+        ModelMethod("pane", str(model), tmp_path),
+        write_predictions(tmp_path, "1.png"),
+    ):
+        assert pickle.loads(pickle.dumps(method)) == method
 
 
-def test_no_method_at_all_is_refused():
+def test_an_empty_list_of_methods_is_an_error():
     with pytest.raises(BrewsterError, match="there is no method"):
         check_names([])
 
 
-def test_two_methods_of_one_name_are_refused(tmp_path):
+def test_two_methods_with_the_same_name_are_an_error(tmp_path):
     with pytest.raises(BrewsterError, match=r"2 methods have the name 'input \(unprocessed\)'"):
         check_names([IdentityBaseline(), PredictionFolder("input (unprocessed)", tmp_path)])
 
 
 @pytest.mark.parametrize("name", ["../out", "a/b", "a\\b", "..", ".", "", "two\nlines", "\udcff"])
-def test_names_that_are_not_valid_for_folders_are_refused(name, tmp_path):
-    with pytest.raises(BrewsterError, match="names are used for folders"):
+def test_names_that_are_not_valid_for_folders_are_an_error(name, tmp_path):
+    with pytest.raises(BrewsterError, match="expected a valid folder name"):
         check_names([PredictionFolder(name, tmp_path)])
 
 
@@ -172,9 +180,9 @@ def test_linked_folders_are_searched_and_loops_end(case, tmp_path):
     assert found == theirs / "real20" / "1.png"
 
 
-def test_folders_and_broken_links_with_names_of_pictures_are_ignored(cases, tmp_path):
-    theirs = method(tmp_path, "2.png")
+def test_folders_and_broken_links_with_names_of_images_are_ignored(cases, tmp_path):
+    theirs = write_predictions(tmp_path, "2.png")
     (tmp_path / "theirs" / "1.png").mkdir()
     (tmp_path / "theirs" / "3.png").symlink_to("nowhere")
-    assert theirs.unused(cases) == 0
-    assert "no picture" in theirs.key(cases[0])
+    assert theirs.count_unmatched(cases) == 0
+    assert "no prediction" in theirs.key(cases[0])

@@ -1,4 +1,4 @@
-"""Pictures are grouped by their names alone; all other files are reported."""
+"""Images are grouped by file name only. All other files are reported."""
 
 import random
 import tempfile
@@ -13,11 +13,11 @@ from benchmark_folders import postcard, repacked, solidobject, wildscene, write
 from brewster.benchmarks.pairing import (
     ROLES,
     FolderListing,
-    entries,
     find_roles,
     find_split,
     find_subsets,
     join_names,
+    list_folder,
     natural_key,
     read_folders,
     read_tree,
@@ -55,29 +55,29 @@ def test_roles_are_recognised_by_the_names_of_their_folders(tmp_path, roles):
 
 
 def test_no_folder_name_belongs_to_two_roles():
-    every = [name for names in ROLES.values() for name in names]
-    assert len(every) == len(set(every))
-    assert every == [name.lower() for name in every]
+    folder_names = [name for names in ROLES.values() for name in names]
+    assert len(folder_names) == len(set(folder_names))
+    assert folder_names == [name.lower() for name in folder_names]
 
 
 @settings(max_examples=40)
-@given(photos=STEMS, truths=STEMS, mirrored=STEMS, order=st.randoms())
-def test_only_equal_names_make_a_pair_and_all_others_are_refused(photos, truths, mirrored, order):
+@given(photos=STEMS, ground_truths=STEMS, reflections=STEMS, order=st.randoms())
+def test_only_equal_names_make_a_pair_and_all_others_are_excluded(photos, ground_truths, reflections, order):
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
-        wanted = {"blended": photos, "gt": truths, "reflection": mirrored}
-        places = [f"{role}/{stem}.png" for role, stems in wanted.items() for stem in stems]
-        order.shuffle(places)
-        write(root, *places)
+        stems_by_role = {"blended": photos, "gt": ground_truths, "reflection": reflections}
+        paths = [f"{role}/{stem}.png" for role, stems in stems_by_role.items() for stem in stems]
+        order.shuffle(paths)
+        write(root, *paths)
         found = read_folders(root)
-        assert set(names(found)) == photos & truths
-        assert names(found) == sorted(photos & truths, key=natural_key)
+        assert set(names(found)) == photos & ground_truths
+        assert names(found) == sorted(photos & ground_truths, key=natural_key)
         for group in found.groups:
             assert group.photo.stem == group.transmission.stem == group.name
-            assert (group.reflection is not None) == (group.name in mirrored)
-        for stem in (photos | truths | mirrored) - (photos & truths):
-            assert any(f"/{stem}.png" in line and "no partner" in line for line in found.refused)
-        assert len(found.refused) == len((photos | truths | mirrored) - (photos & truths))
+            assert (group.reflection is not None) == (group.name in reflections)
+        for stem in (photos | ground_truths | reflections) - (photos & ground_truths):
+            assert any(f"/{stem}.png" in line and "no partner" in line for line in found.excluded)
+        assert len(found.excluded) == len((photos | ground_truths | reflections) - (photos & ground_truths))
 
 
 def test_suffixes_may_differ(tmp_path):
@@ -86,16 +86,16 @@ def test_suffixes_may_differ(tmp_path):
 
 
 @pytest.mark.parametrize("role", ["blended", "gt", "reflection"])
-def test_two_pictures_of_one_name_and_role_are_refused_both(tmp_path, role):
+def test_two_images_with_the_same_name_and_role_are_both_excluded(tmp_path, role):
     repacked(tmp_path, ["a", "b"], ("blended", "gt", "reflection"))
     write(tmp_path, f"{role}/a.jpg")
     found = read_folders(tmp_path)
     assert names(found) == ["b"]
-    assert len(found.refused) == 1
-    assert found.refused[0].startswith(f"{role}/a.jpg and {role}/a.png are ambiguous")
+    assert len(found.excluded) == 1
+    assert found.excluded[0].startswith(f"{role}/a.jpg and {role}/a.png are ambiguous")
 
 
-def test_a_name_is_the_same_in_both_spellings_of_unicode(tmp_path):
+def test_names_in_both_unicode_forms_are_equal(tmp_path):
     write(tmp_path, f"blended/{unicodedata.normalize('NFC', 'café')}.png")
     write(tmp_path, f"gt/{unicodedata.normalize('NFD', 'café')}.png")
     assert len(read_folders(tmp_path).groups) == 1
@@ -103,7 +103,7 @@ def test_a_name_is_the_same_in_both_spellings_of_unicode(tmp_path):
 
 def test_system_files_are_ignored_silently_and_other_files_with_a_remark(tmp_path):
     repacked(tmp_path, ["a"])
-    quiet = (
+    system_files = (
         "blended/._a.png",
         "blended/.DS_Store",
         "gt/Thumbs.db",
@@ -111,7 +111,7 @@ def test_system_files_are_ignored_silently_and_other_files_with_a_remark(tmp_pat
         ".hidden/x.png",
         "__MACOSX/a.png",
     )
-    write(tmp_path, *quiet[:2], *quiet[3:])
+    write(tmp_path, *system_files[:2], *system_files[3:])
     assert read_folders(tmp_path).remarks == ()
     write(tmp_path, "blended/README.txt", "transmission_layer/old/a.png", "licence.md")
     (remark,) = read_folders(tmp_path).remarks
@@ -121,18 +121,20 @@ def test_system_files_are_ignored_silently_and_other_files_with_a_remark(tmp_pat
 
 def test_two_folders_for_one_role_are_an_error_that_names_both(tmp_path):
     repacked(tmp_path, ["a"], ("blended", "gt", "transmission_layer"))
-    with pytest.raises(PhotoError, match=r"two folders for transmission, gt and transmission_layer; .*; .*"):
+    with pytest.raises(
+        PhotoError, match=r"two subfolders for transmission, gt and transmission_layer; .*; .*"
+    ):
         read_folders(tmp_path)
 
 
 def test_a_missing_or_empty_folder_of_a_role_is_an_error(tmp_path):
-    with pytest.raises(PhotoError, match=r"no folder for the photo; .*blended.*; "):
+    with pytest.raises(PhotoError, match=r"no subfolder for the photo; .*blended.*; "):
         read_folders(tmp_path)
     write(tmp_path, "blended/notes.txt")
-    with pytest.raises(PhotoError, match=r"no pictures in .*blended; .*\.png.*; "):
+    with pytest.raises(PhotoError, match=r"blended contains no images; .*\.png.*; "):
         read_folders(tmp_path)
     write(tmp_path, "blended/a.png")
-    with pytest.raises(PhotoError, match=r"no folder for the transmission; "):
+    with pytest.raises(PhotoError, match=r"no subfolder for the transmission; "):
         read_folders(tmp_path)
 
 
@@ -145,11 +147,11 @@ def test_a_folder_that_cannot_be_listed_is_an_error(tmp_path):
 
 
 def test_links_are_followed(tmp_path):
-    repacked(tmp_path / "there", ["a"])
+    repacked(tmp_path / "elsewhere", ["a"])
     here = tmp_path / "here"
     here.mkdir()
     for role in ("blended", "transmission_layer"):
-        (here / role).symlink_to(tmp_path / "there" / role)
+        (here / role).symlink_to(tmp_path / "elsewhere" / role)
     assert names(read_folders(here)) == ["a"]
 
 
@@ -159,22 +161,23 @@ def test_a_split_is_the_folder_itself_or_the_only_one_in_it(tmp_path):
     assert find_split(tmp_path) == find_split(tmp_path / "val") == tmp_path / "val"
     repacked(tmp_path / "test", ["a"])
     with pytest.raises(
-        PhotoError, match=r"has pairs in test and val; .*; give the path of one, for example .*test"
+        PhotoError,
+        match=r"has pairs in the subfolders test and val; .*; give the path of one, for example .*test",
     ):
         find_split(tmp_path)
 
 
-# --- trees
+# --- the original folders of SIR2
 
 
-def test_the_original_trees_are_grouped_shot_by_shot(tmp_path):
+def test_the_original_folders_of_sir2_give_one_group_per_shot(tmp_path):
     found = read_tree(postcard(tmp_path / "p", ["ab", "ba"]), "postcard")
     assert names(found)[:4] == ["ab-Focus-11", "ab-Focus-13", "ab-Focus-16", "ab-Focus-19"]
     assert names(found)[7:10] == ["ab-Thick-3", "ab-Thick-5", "ab-Thick-10"]
     assert {group.scene for group in found.groups} == {"ab", "ba"}
     thick = next(group for group in found.groups if group.name == "ab-Thick-10")
-    there = tmp_path / "p" / "Thick" / "ab" / "10"
-    assert (thick.photo, thick.transmission) == (there / "ab-10-m-3.png", there / "ab-10-g-3.png")
+    shot_folder = tmp_path / "p" / "Thick" / "ab" / "10"
+    assert (thick.photo, thick.transmission) == (shot_folder / "ab-10-m-3.png", shot_folder / "ab-10-g-3.png")
     found = read_tree(solidobject(tmp_path / "s", [2, 10]), "solidobject")
     assert names(found)[::10] == ["2-Focus-11", "10-Focus-11"]
     found = read_tree(wildscene(tmp_path / "w", 8), "wildscene")
@@ -194,12 +197,12 @@ def test_two_triplets_in_a_folder_are_distinguished_by_their_names(tmp_path):
     )
 
 
-def test_a_triplet_without_ground_truth_is_refused_and_one_without_reflection_is_not(tmp_path):
+def test_a_triplet_without_ground_truth_is_excluded_and_one_without_reflection_is_not(tmp_path):
     write(tmp_path, "1/m.jpg", "1/r.jpg", "2/m.jpg", "2/g.jpg", "3/g.jpg", "3/r.jpg")
     found = read_tree(tmp_path, "wildscene")
     assert names(found) == ["2"]
-    assert [line.split(" ")[0] for line in found.refused] == ["1/m.jpg", "3/g.jpg"]
-    assert all("no partner" in line for line in found.refused)
+    assert [line.split(" ")[0] for line in found.excluded] == ["1/m.jpg", "3/g.jpg"]
+    assert all("no partner" in line for line in found.excluded)
 
 
 def test_the_letter_of_a_role_is_a_separate_word_in_either_case(tmp_path):
@@ -217,19 +220,19 @@ def test_the_letter_of_a_role_is_a_separate_word_in_either_case(tmp_path):
     found = read_tree(tmp_path, "wildscene")
     assert names(found) == ["1", "2"]
     assert found.remarks == ("ignored 2/big.png", "ignored 3/grm.png and 3/m-g.png")
-    assert len(found.refused) == 1
+    assert len(found.excluded) == 1
 
 
-def test_shots_of_one_name_in_two_folders_are_refused_both(tmp_path):
+def test_shots_with_the_same_name_in_two_folders_are_both_excluded(tmp_path):
     write(
         tmp_path, *(f"{kind}/ab/11/ab-3-{letter}-11.png" for kind in ("Focus", "focus") for letter in "mgr")
     )
-    if len(entries(tmp_path)[0]) < 2:
+    if len(list_folder(tmp_path)[0]) < 2:
         pytest.skip("this file system is not case-sensitive")
     found = read_tree(tmp_path, "postcard")
     assert found.groups == ()
-    assert len(found.refused) == 2
-    assert all("ambiguous" in line for line in found.refused)
+    assert len(found.excluded) == 2
+    assert all("ambiguous" in line for line in found.excluded)
 
 
 def test_other_files_in_a_tree_are_ignored_with_a_remark(tmp_path):
@@ -241,11 +244,11 @@ def test_other_files_in_a_tree_are_ignored_with_a_remark(tmp_path):
 @pytest.mark.parametrize("subset", ["postcard", "solidobject", "wildscene"])
 def test_a_folder_without_a_tree_is_an_error_that_shows_the_expected_tree(tmp_path, subset):
     write(tmp_path, "a.png")
-    with pytest.raises(PhotoError, match=rf"is not a {subset} set; .*<scene>.*; "):
+    with pytest.raises(PhotoError, match=rf"contains no shot of SIR2 {subset}; .*<scene>.*; "):
         read_tree(tmp_path, subset)
 
 
-def test_subsets_are_recognised_by_their_first_letters(tmp_path):
+def test_subsets_are_recognised_by_the_start_of_their_names(tmp_path):
     for name in ("Postcard Dataset", "Solid_Object-2", "WildSceneDataset", "others"):
         (tmp_path / name).mkdir()
     assert {subset: path.name for subset, path in find_subsets(tmp_path).items()} == {
@@ -254,7 +257,7 @@ def test_subsets_are_recognised_by_their_first_letters(tmp_path):
         "wildscene": "WildSceneDataset",
     }
     (tmp_path / "postcard").mkdir()
-    with pytest.raises(PhotoError, match=r"two folders for postcard, Postcard Dataset and postcard"):
+    with pytest.raises(PhotoError, match=r"two subfolders for postcard, Postcard Dataset and postcard"):
         find_subsets(tmp_path)
 
 
@@ -263,7 +266,7 @@ def test_subsets_are_recognised_by_their_first_letters(tmp_path):
 
 @settings(max_examples=15)
 @given(order=st.randoms())
-def test_a_permuted_listing_gives_the_same(order):
+def test_the_order_of_a_listing_does_not_matter(order):
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         pairs = repacked(Path(folder) / "pairs", ["1", "2", "02", "10"])
         write(pairs, "blended/x.png", "gt.txt", "blended/2.jpg")
@@ -281,8 +284,8 @@ def shuffled(items, order: random.Random):
 
 
 @given(st.sets(st.text(min_size=1)), st.randoms())
-def test_natural_order_is_total_and_puts_2_before_10(some, order):
-    assert sorted(shuffled(some, order), key=natural_key) == sorted(some, key=natural_key)
+def test_natural_order_is_total_and_puts_2_before_10(texts, order):
+    assert sorted(shuffled(texts, order), key=natural_key) == sorted(texts, key=natural_key)
     assert sorted(["a10", "a2", "10", "2", "a"], key=natural_key) == ["2", "10", "a", "a2", "a10"]
 
 
@@ -295,7 +298,7 @@ def test_long_lists_are_shortened():
 # --- training
 
 
-def test_training_pairs_are_grouped_by_the_same_rule(tmp_path):
+def test_training_pairs_are_grouped_in_the_same_way(tmp_path):
     for size, name in (((8, 6), "2"), ((6, 8), "10")):
         repacked(tmp_path, [name], ("blended", "transmission"), size=size)
     assert [tuple(photo.shape) for photo, _ in read_pairs([tmp_path])] == [(8, 6, 3), (6, 8, 3)]
@@ -313,7 +316,7 @@ def test_a_training_pair_of_two_sizes_is_an_error_that_names_both(tmp_path):
         read_pairs([tmp_path])
 
 
-def test_training_pairs_that_are_missing_are_an_error_of_the_recipe(tmp_path):
+def test_a_missing_folder_of_training_pairs_is_a_recipe_error(tmp_path):
     with pytest.raises(
         RecipeError, match=r"gone cannot be read \(No such file or directory\); .*BREWSTER_DATA"
     ):

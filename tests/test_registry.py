@@ -1,4 +1,4 @@
-"""Benchmarks are read completely, in either layout, and cases that do not fit are refused."""
+"""Benchmarks are read completely, in either layout. Cases that do not fit are excluded."""
 
 import pickle
 import random
@@ -22,7 +22,7 @@ from brewster.benchmarks.registry import (
     PAPER_SEED,
     Benchmark,
     Case,
-    PictureFile,
+    ImageFile,
     paper_draw,
     read_benchmark,
 )
@@ -38,7 +38,7 @@ def original(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def whole(original):
+def subsets(original):
     return {benchmark.name: benchmark for benchmark in read_benchmark("sir2", original)}
 
 
@@ -57,59 +57,59 @@ def names(cases):
 @pytest.mark.parametrize("name", ["real20", "nature20"])
 def test_twenty_pairs_are_read_under_the_name_of_their_benchmark(tmp_path, name):
     read = only(name, repacked(tmp_path, map(str, range(20, 0, -1))))
-    assert (read.name, read.title.lower(), read.expected) == (name, name, (20,))
+    assert (read.name, read.title.lower(), read.expected_counts) == (name, name, (20,))
     assert names(read.cases) == [str(number) for number in range(1, 21)]
-    assert read.remarks == read.refused == ()
+    assert read.remarks == read.excluded == ()
     assert read.cases[1] == Case(
         benchmark=name,
         name="2",
         scene="2",
         relative_path="blended/2",
-        photo=PictureFile(tmp_path / "blended" / "2.png"),
-        transmission=PictureFile(tmp_path / "transmission_layer" / "2.png"),
+        photo=ImageFile(tmp_path / "blended" / "2.png"),
+        ground_truth=ImageFile(tmp_path / "transmission_layer" / "2.png"),
     )
 
 
-def test_the_original_sir2_has_199_and_200_and_101_triplets(whole):
-    assert {name: len(read.cases) for name, read in whole.items()} == {
+def test_the_original_sir2_has_199_and_200_and_101_triplets(subsets):
+    assert {name: len(read.cases) for name, read in subsets.items()} == {
         "postcard": 199,
         "solidobject": 200,
         "wildscene": 101,
     }
-    for name, read in whole.items():
-        assert read.remarks == read.refused == ()
+    for name, read in subsets.items():
+        assert read.remarks == read.excluded == ()
         assert all(case.reflection for case in read.cases)
         assert {case.benchmark for case in read.cases} == {name}
         assert (
             len({case.relative_path for case in read.cases}) == len(set(names(read.cases))) == len(read.cases)
         )
-    assert len({case.scene for case in whole["postcard"].cases}) == 20
-    assert len({case.scene for case in whole["solidobject"].cases}) == 20
-    assert len({case.scene for case in whole["wildscene"].cases}) == 101
+    assert len({case.scene for case in subsets["postcard"].cases}) == 20
+    assert len({case.scene for case in subsets["solidobject"].cases}) == 20
+    assert len({case.scene for case in subsets["wildscene"].cases}) == 101
 
 
-def test_a_place_is_where_the_photo_lies_below_the_folder_given(whole, original):
-    places = {case.name: case.relative_path for read in whole.values() for case in read.cases}
-    assert places["ab-Thick-10"] == "Postcard Dataset/Thick/ab/10/ab-10-m-3"
-    assert places["1-Focus-11"] == "SolidObjectDataset/1/Focus/11/m"
-    assert places["7s"] == "Wildscene/7s/m"
+def test_a_relative_path_is_that_of_the_photo_below_the_benchmark_folder(subsets, original):
+    paths = {case.name: case.relative_path for read in subsets.values() for case in read.cases}
+    assert paths["ab-Thick-10"] == "Postcard Dataset/Thick/ab/10/ab-10-m-3"
+    assert paths["1-Focus-11"] == "SolidObjectDataset/1/Focus/11/m"
+    assert paths["7s"] == "Wildscene/7s/m"
     alone = only("solidobject", original / "SolidObjectDataset")
     assert alone.cases[0].relative_path == "1/Focus/11/m"
 
 
 @pytest.mark.parametrize("subset", ["postcard", "solidobject", "wildscene"])
-def test_a_set_of_sir2_is_read_from_its_own_folder_and_from_the_one_above(whole, original, subset):
+def test_a_subset_of_sir2_is_read_from_its_own_folder_and_from_the_parent_folder(subsets, original, subset):
     above = only(subset, original)
     alone = only(
-        subset, whole[subset].cases[0].photo.path.parents[{"postcard": 3, "solidobject": 3}.get(subset, 1)]
+        subset, subsets[subset].cases[0].photo.path.parents[{"postcard": 3, "solidobject": 3}.get(subset, 1)]
     )
-    assert above == whole[subset]
+    assert above == subsets[subset]
     assert [(case.name, case.scene, case.photo) for case in alone.cases] == [
         (case.name, case.scene, case.photo) for case in above.cases
     ]
 
 
-def test_sir2_may_be_repacked_in_part_and_what_is_missing_is_said(tmp_path):
+def test_a_part_of_sir2_can_be_repacked_and_missing_subsets_are_reported(tmp_path):
     repacked(tmp_path / "postcard", ["ab-3-32", "ab-5-32", "ba-1-2"])
     wildscene(tmp_path / "WildSceneDataset", 55)
     cards, wild = read_benchmark("sir2", tmp_path)
@@ -118,15 +118,15 @@ def test_sir2_may_be_repacked_in_part_and_what_is_missing_is_said(tmp_path):
     assert cards.cases[0].relative_path == "postcard/blended/ab-3-32"
     assert cards.remarks == (
         f"SIR2 SolidObject is not in {tmp_path}",
-        "3 pictures, where SIR2 Postcard has 199",
+        "found 3 images, expected 199",
     )
     assert (len(wild.cases), wild.remarks) == (55, ())
 
 
-def test_one_split_below_an_openrr_folder_is_taken(tmp_path):
+def test_the_only_split_below_an_openrr_folder_is_read(tmp_path):
     repacked(tmp_path / "val_100", ["1", "2"], ("Input", "GT"))
     read = only("openrr", tmp_path)
-    assert (read.name, read.expected, read.remarks) == ("openrr", (), ())
+    assert (read.name, read.expected_counts, read.remarks) == ("openrr", (), ())
     assert read.cases[0].relative_path == "val_100/Input/1"
     assert names(only("openrr", tmp_path / "val_100").cases) == ["1", "2"]
 
@@ -143,7 +143,9 @@ def test_one_split_below_an_openrr_folder_is_taken(tmp_path):
         ("pairs", "pairs"),
     ],
 )
-def test_a_folder_of_pairs_has_the_name_of_its_folder_but_never_that_of_a_known_set(tmp_path, folder, name):
+def test_a_folder_of_pairs_has_the_name_of_its_folder_but_never_that_of_a_known_benchmark(
+    tmp_path, folder, name
+):
     read = only("pairs", repacked(tmp_path / folder, ["a"]))
     assert (read.name, read.title) == (name, folder.rstrip("/"))
     assert read.cases[0].benchmark == name
@@ -158,7 +160,7 @@ def test_a_folder_has_its_name_also_as_the_current_folder(tmp_path, monkeypatch)
 def test_a_rendered_set_gives_its_background_and_its_reflection(tmp_path, shards):
     make(tmp_path / "set", count=3, shards=shards)
     read = only("rendered", tmp_path / "set")
-    assert (read.name, read.title, read.remarks, read.refused) == ("set", "set", (), ())
+    assert (read.name, read.title, read.remarks, read.excluded) == ("set", "set", (), ())
     assert names(read.cases) == ["000000", "000001", "000002"]
     for case in read.cases:
         assert case.rendered
@@ -166,25 +168,23 @@ def test_a_rendered_set_gives_its_background_and_its_reflection(tmp_path, shards
         assert Photo.open(case.photo.read()).size == (24, 16)
     make(tmp_path / "again", count=3)
     for case, file in ((read.cases[1], "background"), (read.cases[2], "background")):
-        assert case.transmission.read() == (tmp_path / "again" / case.name / f"{file}.jpg").read_bytes()
+        assert case.ground_truth.read() == (tmp_path / "again" / case.name / f"{file}.jpg").read_bytes()
         assert case.reflection.read() == (tmp_path / "again" / case.name / "reflection.jpg").read_bytes()
 
 
-def test_an_incomplete_rendered_sample_is_refused(tmp_path):
+def test_an_incomplete_rendered_sample_is_excluded(tmp_path):
     make(tmp_path, count=2)
     (tmp_path / "000001" / "background.jpg").unlink()
     read = only("rendered", tmp_path)
     assert names(read.cases) == ["000000"]
-    assert read.refused == ("000001 is incomplete: photo.jpg, background.jpg, reflection.jpg are needed",)
+    assert read.excluded == ("000001 is incomplete: expected photo.jpg, background.jpg, reflection.jpg",)
 
 
 def test_the_dev_pairs_are_ten_each(data):
     for name in ("nature", "real"):
         read = only("pairs", data / "real" / "dev" / name)
-        assert (read.name, len(read.cases), read.remarks, read.refused) == (name, 10, (), ())
-    assert only("nature20", data / "real" / "dev" / "nature").remarks == (
-        "10 pictures, where Nature20 has 20",
-    )
+        assert (read.name, len(read.cases), read.remarks, read.excluded) == (name, 10, (), ())
+    assert only("nature20", data / "real" / "dev" / "nature").remarks == ("found 10 images, expected 20",)
 
 
 # --- the order of the listing does not matter
@@ -203,14 +203,14 @@ def test_neither_the_order_of_writing_nor_that_of_listing_matters(tmp_path, monk
     assert names(before.cases) == sorted(stems, key=natural_key)
 
 
-# --- refused cases
+# --- excluded cases
 
 
-def test_pictures_without_a_unique_partner_are_refused_and_the_others_are_read(tmp_path):
+def test_images_without_a_unique_partner_are_excluded_and_the_others_are_read(tmp_path):
     repacked(tmp_path, ["a", "b", "c", "d"])
     write(
         tmp_path,
-        "blended/lonely.png",
+        "blended/e.png",
         "transmission_layer/b.jpg",
         "blended/c.jpg",
         "transmission_layer/x.png",
@@ -218,11 +218,11 @@ def test_pictures_without_a_unique_partner_are_refused_and_the_others_are_read(t
     read = only("pairs", tmp_path)
     assert names(read.cases) == ["a", "d"]
     for line, (named, why) in zip(
-        read.refused,
+        read.excluded,
         [
             ("transmission_layer/b.jpg and transmission_layer/b.png", "ambiguous"),
             ("blended/c.jpg and blended/c.png", "ambiguous"),
-            ("blended/lonely.png", "no partner"),
+            ("blended/e.png", "no partner"),
             ("transmission_layer/x.png", "no partner"),
         ],
         strict=True,
@@ -234,32 +234,49 @@ def test_pictures_without_a_unique_partner_are_refused_and_the_others_are_read(t
 @pytest.mark.parametrize(
     ("size", "message"),
     [
-        ((600, 400), "photo 1200x800, truth 600x400: the truth is at half the scale"),
-        ((300, 200), "photo 1200x800, truth 300x200: the truth is at a quarter of the scale"),
-        ((2400, 1600), "photo 1200x800, truth 2400x1600: the truth is at twice the scale"),
-        ((420, 280), "photo 1200x800, truth 420x280: the truth is at 0.35 times the scale"),
-        ((420, 279), "photo 1200x800, truth 420x279: the truth is at 0.35 times the scale"),
-        ((800, 1200), "photo 1200x800, truth 800x1200: one of them is rotated"),
-        ((1199, 800), "photo 1200x800, truth 1199x800: their sizes must be equal"),
-        ((600, 800), "photo 1200x800, truth 600x800: their sizes must be equal"),
+        (
+            (600, 400),
+            "the photo is 1200x800, the ground truth is 600x400: the ground truth is resized by the factor 0.5",
+        ),
+        (
+            (300, 200),
+            "the photo is 1200x800, the ground truth is 300x200: the ground truth is resized by the factor 0.25",
+        ),
+        (
+            (2400, 1600),
+            "the photo is 1200x800, the ground truth is 2400x1600: the ground truth is resized by the factor 2",
+        ),
+        (
+            (420, 280),
+            "the photo is 1200x800, the ground truth is 420x280: the ground truth is resized by the factor 0.35",
+        ),
+        (
+            (420, 279),
+            "the photo is 1200x800, the ground truth is 420x279: the ground truth is resized by the factor 0.35",
+        ),
+        ((800, 1200), "the photo is 1200x800, the ground truth is 800x1200: one of them is rotated"),
+        ((1199, 800), "the photo is 1200x800, the ground truth is 1199x800: expected equal sizes"),
+        ((600, 800), "the photo is 1200x800, the ground truth is 600x800: expected equal sizes"),
     ],
 )
-def test_a_truth_of_another_size_is_refused_and_its_scale_is_reported(tmp_path, size, message):
+def test_a_ground_truth_of_another_size_is_excluded_and_its_scale_is_reported(tmp_path, size, message):
     write(tmp_path, "blended/a.png", size=(1200, 800))
     write(tmp_path, "gt/a.png", size=size)
     read = only("pairs", tmp_path)
     assert read.cases == ()
-    assert read.refused == (f"blended/a: {message}",)
+    assert read.excluded == (f"blended/a: {message}",)
 
 
-def test_a_reflection_of_another_size_is_refused_too(tmp_path):
+def test_a_reflection_of_another_size_is_excluded_too(tmp_path):
     repacked(tmp_path, ["a"])
     write(tmp_path, "reflection/a.png", size=(4, 3))
-    (line,) = only("pairs", tmp_path).refused
-    assert line == "blended/a: photo 8x6, reflection 4x3: the reflection is at half the scale"
+    (line,) = only("pairs", tmp_path).excluded
+    assert line == (
+        "blended/a: the photo is 8x6, the reflection is 4x3: the reflection is resized by the factor 0.5"
+    )
 
 
-def test_sizes_are_those_of_upright_pictures(tmp_path):
+def test_sizes_are_compared_after_the_exif_orientation(tmp_path):
     write(tmp_path, "blended/a.jpg", data=file_of(smooth(6, 8), "JPEG", exif=exif_block(orientation=6)))
     write(tmp_path, "gt/a.png", size=(6, 8))
     assert names(only("pairs", tmp_path).cases) == ["a"]
@@ -267,54 +284,54 @@ def test_sizes_are_those_of_upright_pictures(tmp_path):
 
 @pytest.mark.parametrize(
     ("role", "label"),
-    [("blended", "photo"), ("transmission_layer", "truth"), ("reflection_layer", "reflection")],
+    [("blended", "photo"), ("transmission_layer", "ground truth"), ("reflection_layer", "reflection")],
 )
 @pytest.mark.parametrize(("bad", "why"), [(b"", "is empty"), (b"no picture", "no known image format")])
-def test_an_unreadable_picture_is_refused_by_name(tmp_path, role, label, bad, why):
+def test_an_unreadable_image_is_excluded_and_named(tmp_path, role, label, bad, why):
     repacked(tmp_path, ["a", "b"], ("blended", "transmission_layer", "reflection_layer"))
     (tmp_path / role / "a.png").write_bytes(bad)
     read = only("pairs", tmp_path)
     assert names(read.cases) == ["b"]
-    assert read.refused[0].startswith(f"blended/a: the {label} cannot be used: ")
-    assert why in read.refused[0]
+    assert read.excluded[0].startswith(f"blended/a: the {label} cannot be read: ")
+    assert why in read.excluded[0]
 
 
-def test_a_dangling_link_is_refused_by_name(tmp_path):
+def test_a_dangling_link_is_excluded_and_named(tmp_path):
     repacked(tmp_path, ["a", "b"])
     (tmp_path / "blended" / "a.png").unlink()
     (tmp_path / "blended" / "a.png").symlink_to(tmp_path / "nowhere.png")
     read = only("pairs", tmp_path)
     assert names(read.cases) == ["b"]
-    assert "the photo cannot be used" in read.refused[0]
+    assert "the photo cannot be read" in read.excluded[0]
 
 
 # --- remarks
 
 
 def test_an_unexpected_number_of_pictures_is_a_remark(tmp_path):
-    assert only("real20", repacked(tmp_path / "r", ["a"])).remarks == ("1 picture, where Real20 has 20",)
+    assert only("real20", repacked(tmp_path / "r", ["a"])).remarks == ("found 1 image, expected 20",)
     wild = only("wildscene", wildscene(tmp_path / "w", 56))
-    assert wild.remarks == ("56 pictures, where SIR2 Wildscene has 101 or 55",)
+    assert wild.remarks == ("found 56 images, expected 101 or 55",)
     assert only("wildscene", wildscene(tmp_path / "x", 55)).remarks == ()
 
 
-def test_pictures_without_a_reflection_are_named_where_others_have_one(tmp_path):
+def test_cases_without_a_reflection_are_named_if_others_have_one(tmp_path):
     repacked(tmp_path, ["a", "b", "c"])
     assert only("pairs", tmp_path).remarks == ()
     write(tmp_path, "reflection/b.png")
-    assert only("pairs", tmp_path).remarks == ("no reflection ground truth for a and c",)
+    assert only("pairs", tmp_path).remarks == ("there is no ground truth of the reflection for a and c",)
 
 
-# --- refused folders
+# --- invalid folders
 
 
 @pytest.mark.parametrize("name", BENCHMARKS)
 def test_an_empty_or_missing_folder_or_a_file_is_an_error_in_three_parts(tmp_path, name):
     (tmp_path / "empty").mkdir()
     write(tmp_path, "a.png")
-    for place in ("empty", "gone", "a.png"):
-        with pytest.raises(PhotoError, match=rf"{place}.*; .*; .*\.$"):
-            read_benchmark(name, tmp_path / place)
+    for path in ("empty", "gone", "a.png"):
+        with pytest.raises(PhotoError, match=rf"{path}.*; .*; .*\.$"):
+            read_benchmark(name, tmp_path / path)
 
 
 def test_a_damaged_shard_is_an_error(tmp_path):
@@ -324,14 +341,14 @@ def test_a_damaged_shard_is_an_error(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "cure"),
+    ("name", "suggestion"),
     [("nature", "did you mean nature20?"), ("SIR2", "did you mean sir2?"), ("xyz", "use pairs=FOLDER")],
 )
-def test_an_unknown_benchmark_is_an_error_that_suggests_the_nearest(tmp_path, name, cure):
+def test_an_unknown_benchmark_is_an_error_that_suggests_the_nearest(tmp_path, name, suggestion):
     with pytest.raises(PhotoError) as error:
         read_benchmark(name, tmp_path)
-    assert str(error.value).startswith(f"there is no benchmark {name!r}; brewster reads real20, ")
-    assert cure in str(error.value)
+    assert str(error.value).startswith(f"there is no benchmark {name!r}; expected one of real20, ")
+    assert suggestion in str(error.value)
 
 
 # --- files
@@ -339,7 +356,7 @@ def test_an_unknown_benchmark_is_an_error_that_suggests_the_nearest(tmp_path, na
 
 def test_a_file_or_a_span_of_it_is_read_and_can_be_pickled(tmp_path):
     write(tmp_path, "a.png")
-    whole, span = PictureFile(tmp_path / "a.png"), PictureFile(tmp_path / "a.png", (1, 3))
+    whole, span = ImageFile(tmp_path / "a.png"), ImageFile(tmp_path / "a.png", (1, 3))
     assert whole.read() == picture()
     assert span.read() == b"PNG"
     assert pickle.loads(pickle.dumps(span)) == span
@@ -350,9 +367,9 @@ def test_a_file_or_a_span_of_it_is_read_and_can_be_pickled(tmp_path):
 def test_a_file_that_is_missing_or_too_short_is_an_error_in_three_parts(tmp_path):
     write(tmp_path, "a.png")
     for file, why in (
-        (PictureFile(tmp_path / "b.png"), "b.png cannot be read .No such file"),
-        (PictureFile(tmp_path), "cannot be read .Is a directory"),
-        (PictureFile(tmp_path / "a.png", (len(picture()) - 2, 5)), "cannot be read .it has 2 of 5 bytes"),
+        (ImageFile(tmp_path / "b.png"), "b.png cannot be read .No such file"),
+        (ImageFile(tmp_path), "cannot be read .Is a directory"),
+        (ImageFile(tmp_path / "a.png", (len(picture()) - 2, 5)), "cannot be read .2 of 5 bytes are left"),
     ):
         with pytest.raises(UnreadablePhoto, match=f"{why}.*; .*; .*"):
             file.read()
@@ -361,33 +378,33 @@ def test_a_file_that_is_missing_or_too_short_is_an_error_in_three_parts(tmp_path
 # --- the paper's draw
 
 
-def test_the_draw_takes_one_shot_of_each_scene(whole):
+def test_the_draw_takes_one_shot_of_each_scene(subsets):
     for name in ("postcard", "solidobject"):
-        drawn = paper_draw(whole[name])
+        drawn = paper_draw(subsets[name])
         assert len(drawn) == len({case.scene for case in drawn}) == 20
-        assert set(drawn) <= set(whole[name].cases)
+        assert set(drawn) <= set(subsets[name].cases)
         assert [case.scene for case in drawn] == sorted((case.scene for case in drawn), key=natural_key)
-        assert drawn != paper_draw(whole[name], seed=PAPER_SEED + 1)
-    assert paper_draw(whole["wildscene"]) == whole["wildscene"].cases
+        assert drawn != paper_draw(subsets[name], seed=PAPER_SEED + 1)
+    assert paper_draw(subsets["wildscene"]) == subsets["wildscene"].cases
 
 
-def test_the_published_draw_never_changes(whole):
-    solid = {case.scene: case.name for case in paper_draw(whole["solidobject"])}
+def test_the_published_draw_never_changes(subsets):
+    solid = {case.scene: case.name for case in paper_draw(subsets["solidobject"])}
     assert " ".join(solid[str(scene)].split("-", 1)[1] for scene in range(1, 11)) == (
         "Focus-16 Focus-19 Focus-11 Focus-11 Thick-10 Thick-10 Focus-22 Focus-11 Focus-32 Thick-3"
     )
 
 
-def test_the_draw_of_a_scene_depends_on_no_other_scene(whole, tmp_path):
-    full = {case.scene: case.name for case in paper_draw(whole["postcard"])}
+def test_the_draw_of_a_scene_depends_on_no_other_scene(subsets, tmp_path):
+    full = {case.scene: case.name for case in paper_draw(subsets["postcard"])}
     few = paper_draw(only("postcard", postcard(tmp_path, POSTCARD_SCENES[3:6])))
     assert {case.scene: case.name for case in few} == {scene: full[scene] for scene in POSTCARD_SCENES[3:6]}
 
 
-def test_the_draw_does_not_depend_on_the_order_of_cases(whole, original, monkeypatch):
+def test_the_draw_does_not_depend_on_the_order_of_cases(subsets, original, monkeypatch):
     listing = registry.Path.iterdir
     monkeypatch.setattr(registry.Path, "iterdir", lambda path: iter(sorted(listing(path), reverse=True)))
-    assert paper_draw(only("solidobject", original)) == paper_draw(whole["solidobject"])
+    assert paper_draw(only("solidobject", original)) == paper_draw(subsets["solidobject"])
 
 
 def test_a_repacked_set_whose_names_identify_the_scenes_can_be_drawn(tmp_path):
@@ -401,7 +418,7 @@ def test_a_repacked_set_whose_names_identify_the_scenes_can_be_drawn(tmp_path):
 def test_a_repacked_set_whose_names_do_not_identify_the_scenes_cannot_be_drawn(tmp_path, name, stems):
     read = only(name, repacked(tmp_path, stems))
     assert [case.scene for case in read.cases] == names(read.cases)
-    assert "the names do not identify the scenes, so the paper's draw is not possible" in read.remarks
+    assert "the file names do not identify the scenes, so the paper's draw is not possible" in read.remarks
     with pytest.raises(PhotoError, match=r"do not identify the scenes of SIR2 .*; .*; .*"):
         paper_draw(read)
 

@@ -1,4 +1,4 @@
-"""The LaTeX table, from results whose numbers are known."""
+"""The LaTeX table of results with known numbers."""
 
 import re
 
@@ -13,7 +13,7 @@ def results():
     return known_results()
 
 
-def test_it_has_the_papers_layout(results):
+def test_the_table_has_the_papers_layout(results):
     text = to_latex(results)
     assert r"\begin{tabular}{l|cc|cc|cc|cc|cc|cc}" in text
     assert r"\multicolumn{6}{c|}{SIR$^2$ (60)}" in text
@@ -26,13 +26,13 @@ def test_it_has_the_papers_layout(results):
     assert widths == [12] * 5
 
 
-def test_the_average_has_one_digit_more(results):
+def test_the_average_has_one_more_digit(results):
     row = next(line for line in to_latex(results).splitlines() if line.startswith("A"))
     assert row.endswith(r"& \textbf{21.500} & \textbf{0.1234} \\")
 
 
-def test_the_best_three_are_marked_but_never_the_last(results):
-    means = {"A_b|c": 21.5, "input (unprocessed)": 20.0, "third": 19.0, "fourth": 18.0, "as bad": 18.0}
+def test_the_best_three_are_marked_but_not_the_worst(results):
+    means = {"A_b|c": 21.5, "input (unprocessed)": 20.0, "third": 19.0, "fourth": 18.0, "equal": 18.0}
     results["methods"] = {key: {} for key in means}
     results["tables"] = {
         key: {name: {"psnr": entry(mean)} for name, mean in means.items()} for key in results["tables"]
@@ -42,10 +42,10 @@ def test_the_best_three_are_marked_but_never_the_last(results):
     assert r"input (unprocessed) & \underline{20.00}" in text
     assert r"third & \uuline{19.00}" in text
     assert "fourth & 18.00" in text
-    assert "as bad & 18.00" in text
+    assert "equal & 18.00" in text
 
 
-def test_means_over_fewer_pictures_have_a_dagger_that_is_explained_and_no_mark(results):
+def test_a_mean_over_fewer_images_has_a_dagger_and_no_mark(results):
     assert "dagger" not in to_latex(results)
     results["tables"]["real20"] = {
         "input (unprocessed)": {"psnr": entry(20.0), "lpips": entry(0.2)},
@@ -53,10 +53,10 @@ def test_means_over_fewer_pictures_have_a_dagger_that_is_explained_and_no_mark(r
     }
     text = to_latex(results)
     assert r"A\_b|c & 21.50$^\dagger$" in text
-    assert r"\multicolumn{13}{l}{$^\dagger$ over fewer pictures" in text
+    assert r"\multicolumn{13}{l}{$^\dagger$ mean over fewer images" in text
 
 
-def test_it_takes_the_papers_draw_where_there_is_one(results):
+def test_the_papers_draw_replaces_the_whole_benchmark(results):
     for part in ("selections", "tables", "differences"):
         results[part]["postcard:paper"] = results[part]["postcard"]
     results["selections"]["postcard:paper"] = {"title": "Postcard, the paper's draw", "pictures": 7}
@@ -65,7 +65,7 @@ def test_it_takes_the_papers_draw_where_there_is_one(results):
     assert "Postcard (20)" not in text
 
 
-def test_without_sir2_it_has_one_line_of_heads(results):
+def test_without_sir2_the_header_has_one_row(results):
     for part in ("selections", "tables", "differences"):
         results[part] = {key: results[part][key] for key in ("real20", "average")}
     assert "SIR" not in to_latex(results)

@@ -1,4 +1,4 @@
-"""Tables from results whose numbers are known."""
+"""Tables of results with known numbers."""
 
 import csv
 import io
@@ -24,24 +24,24 @@ def test_markdown_shows_means_intervals_and_paired_differences(results):
     assert "21.50 / 0.123" in text
 
 
-def test_markdown_lists_refused_files_failures_and_every_setting(results):
+def test_markdown_lists_excluded_files_errors_and_every_setting(results):
     text = to_markdown(results)
-    for said in (
-        "left out: x.png has no partner",
+    for line in (
+        "excluded: x.png has no partner",
         "- A_b|c failed on real20/3",
-        "2 pictures fit no case",
-        "Everything is stated.",
-        "LPIPS is so.",
+        "2 images in the folder match no case",
+        "Nothing is resized.",
+        "Definition of LPIPS.",
     ):
-        assert said in text
+        assert line in text
 
 
-def test_a_table_has_as_many_cells_in_every_line_whatever_names_hold(results):
+def test_all_lines_of_a_table_have_the_same_number_of_cells_with_any_names(results):
     for block in re.findall(r"(?:^\|.*\n)+", overview(results), re.M):
         assert len({len(re.findall(r"(?<!\\)\|", line)) for line in block.splitlines()}) == 1
 
 
-def test_a_method_that_failed_somewhere_shows_how_many_pictures_it_is_scored_on(results):
+def test_a_method_with_errors_shows_the_number_of_scored_images(results):
     results["tables"]["real20"] = {
         "input (unprocessed)": {"psnr": entry(20.0)},
         "A_b|c": {"psnr": entry(21.5, count=19)},
@@ -63,7 +63,7 @@ def test_csv_has_a_line_for_every_mean_and_every_difference(results):
     assert [row["than"] for row in rows if row["set"] == "average"].count("input (unprocessed)") == 2
 
 
-def test_a_method_that_failed_somewhere_is_never_the_best(results):
+def test_a_method_with_errors_is_not_in_the_ranking(results):
     table = {
         "input (unprocessed)": {"psnr": entry(20.0), "lpips": entry(0.2)},
         "A_b|c": {"psnr": entry(21.5, count=10), "lpips": entry(0.1, count=10)},
@@ -73,8 +73,8 @@ def test_a_method_that_failed_somewhere_is_never_the_best(results):
     assert ranking(table, "psnr", METRICS["psnr"]) == ["20.00", "19.00"]
 
 
-def test_a_note_warns_of_means_over_fewer_pictures(results):
-    note = "Do not compare a mean over fewer pictures"
+def test_a_note_warns_of_means_over_fewer_images(results):
+    note = "Do not compare a mean over fewer images"
     assert note not in overview(results)
     results["tables"]["real20"] = {
         "input (unprocessed)": {"psnr": entry(20.0)},

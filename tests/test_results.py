@@ -5,7 +5,7 @@ import json
 import pytest
 
 from benchmark_folders import repacked, sir2
-from brewster.benchmarks.registry import Benchmark, Case, PictureFile, read_benchmark
+from brewster.benchmarks.registry import Benchmark, Case, ImageFile, read_benchmark
 from brewster.errors import BrewsterError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import IdentityBaseline, PredictionFolder
@@ -15,13 +15,13 @@ from brewster.evaluate.runner import ScoreRow
 PSNR = EvaluationConfig(metrics=("psnr",))
 
 
-def benchmark(name, count, refused=()):
-    file = PictureFile("nowhere")
+def make_benchmark(name, count, excluded=()):
+    file = ImageFile("nowhere")
     cases = tuple(Case(name, str(i), str(i), str(i), file, file) for i in range(count))
-    return Benchmark(name, name.title(), cases, refused=refused)
+    return Benchmark(name, name.title(), cases, excluded=excluded)
 
 
-def rows(benchmarks, methods, score):
+def make_rows(benchmarks, methods, score):
     return [
         ScoreRow(case.benchmark, case.name, method.name, "", "", {"psnr": score(case, method)})
         for part in benchmarks
@@ -35,30 +35,37 @@ def methods(tmp_path):
     return [IdentityBaseline(), PredictionFolder("theirs", tmp_path)]
 
 
-def test_the_average_is_over_all_pictures(methods):
-    parts = [benchmark("a", 20), benchmark("b", 80)]
+def test_the_average_is_over_all_images(methods):
+    parts = [make_benchmark("a", 20), make_benchmark("b", 80)]
     results = summarise(
-        parts, methods, PSNR, rows(parts, methods, lambda case, _: 20.0 if case.benchmark == "a" else 30.0)
+        parts,
+        methods,
+        PSNR,
+        make_rows(parts, methods, lambda case, _: 20.0 if case.benchmark == "a" else 30.0),
     )
     assert results["tables"]["a"]["theirs"]["psnr"]["mean"] == 20
     assert results["tables"]["average"]["theirs"]["psnr"]["mean"] == 28
     assert results["selections"]["average"] == {"title": "Average", "pictures": 100}
 
 
-def test_one_benchmark_alone_has_no_average(methods):
-    parts = [benchmark("a", 3)]
-    assert list(summarise(parts, methods, PSNR, rows(parts, methods, lambda *_: 1.0))["tables"]) == ["a"]
+def test_a_single_benchmark_has_no_average(methods):
+    parts = [make_benchmark("a", 3)]
+    assert list(summarise(parts, methods, PSNR, make_rows(parts, methods, lambda *_: 1.0))["tables"]) == ["a"]
 
 
 def test_the_order_of_rows_does_not_matter(methods):
-    parts = [benchmark("a", 9)]
-    score_rows = rows(parts, methods, lambda case, method: int(case.name) ** 2 + (method.name == "theirs"))
+    parts = [make_benchmark("a", 9)]
+    score_rows = make_rows(
+        parts, methods, lambda case, method: int(case.name) ** 2 + (method.name == "theirs")
+    )
     assert summarise(parts, methods, PSNR, score_rows) == summarise(parts, methods, PSNR, score_rows[::-1])
 
 
-def test_differences_are_to_every_method_named_before(methods):
-    parts = [benchmark("a", 4)]
-    score_rows = rows(parts, methods, lambda case, method: int(case.name) + 0.5 * (method.name == "theirs"))
+def test_each_method_is_compared_with_the_methods_before_it(methods):
+    parts = [make_benchmark("a", 4)]
+    score_rows = make_rows(
+        parts, methods, lambda case, method: int(case.name) + 0.5 * (method.name == "theirs")
+    )
     (row,) = summarise(parts, methods, PSNR, score_rows)["differences"]["a"]
     assert (row["method"], row["than"], row["mean"], row["better"]) == (
         "theirs",
@@ -69,9 +76,9 @@ def test_differences_are_to_every_method_named_before(methods):
     assert (row["low"], row["high"]) == (0.5, 0.5)
 
 
-def test_a_failed_picture_is_counted_out_and_named(methods):
-    parts = [benchmark("a", 3, refused=("x.png has no partner",))]
-    score_rows = rows(parts, methods, lambda case, method: float(case.name))
+def test_a_failed_case_is_not_counted_and_is_named(methods):
+    parts = [make_benchmark("a", 3, excluded=("x.png has no partner",))]
+    score_rows = make_rows(parts, methods, lambda case, method: float(case.name))
     score_rows[1] = ScoreRow("a", "0", "theirs", "", "", error="theirs failed")
     results = summarise(parts, methods, PSNR, score_rows)
     assert results["tables"]["a"]["theirs"]["psnr"] | {"low": 0, "high": 0} == {
@@ -85,21 +92,21 @@ def test_a_failed_picture_is_counted_out_and_named(methods):
 
 
 def test_metrics_without_any_score_are_left_out(methods):
-    parts = [benchmark("a", 2)]
+    parts = [make_benchmark("a", 2)]
     config = EvaluationConfig(metrics=("psnr", "kept_reflection"))
-    results = summarise(parts, methods, config, rows(parts, methods, lambda *_: 1.0))
+    results = summarise(parts, methods, config, make_rows(parts, methods, lambda *_: 1.0))
     assert list(results["metrics"]) == ["psnr"]
     assert results["metrics"]["psnr"]["unit"] == "dB"
 
 
 def test_a_benchmark_without_pairs_is_listed_and_has_no_table(methods):
-    parts = [benchmark("a", 2), benchmark("b", 0, refused=("all of it",))]
-    results = summarise(parts, methods, PSNR, rows(parts, methods, lambda *_: 1.0))
+    parts = [make_benchmark("a", 2), make_benchmark("b", 0, excluded=("b.png has no partner",))]
+    results = summarise(parts, methods, PSNR, make_rows(parts, methods, lambda *_: 1.0))
     assert list(results["tables"]) == ["a"]
     assert results["benchmarks"]["b"]["pictures"] == 0
 
 
-def test_the_papers_protocol_averages_over_181_pictures_and_reports_all_too(tmp_path, methods):
+def test_the_papers_protocol_averages_over_181_images_and_also_reports_whole_benchmarks(tmp_path, methods):
     for name in ("real20", "nature20"):
         repacked(tmp_path / name, map(str, range(20)))
     sir2(tmp_path / "sir2")
@@ -107,7 +114,7 @@ def test_the_papers_protocol_averages_over_181_pictures_and_reports_all_too(tmp_
         part for name in ("real20", "nature20", "sir2") for part in read_benchmark(name, tmp_path / name)
     ]
     config = EvaluationConfig(metrics=("psnr",), paper=True)
-    results = summarise(parts, methods, config, rows(parts, methods, lambda *_: 1.0))
+    results = summarise(parts, methods, config, make_rows(parts, methods, lambda *_: 1.0))
     pictures = {key: selection["pictures"] for key, selection in results["selections"].items()}
     assert pictures == {
         "real20": 20,
@@ -123,25 +130,24 @@ def test_the_papers_protocol_averages_over_181_pictures_and_reports_all_too(tmp_
     json.dumps(results, allow_nan=False)
 
 
-def test_the_papers_average_is_over_the_papers_sets_only_and_states_what_is_missing(tmp_path, methods):
-    parts = [benchmark("real20", 20), benchmark("nature20", 10), benchmark("mine", 7)]
+def test_the_papers_average_uses_only_the_papers_benchmarks_and_reports_missing_images(tmp_path, methods):
+    parts = [make_benchmark("real20", 20), make_benchmark("nature20", 10), make_benchmark("mine", 7)]
     config = EvaluationConfig(metrics=("psnr",), paper=True)
-    results = summarise(parts, methods, config, rows(parts, methods, lambda *_: 1.0))
+    results = summarise(parts, methods, config, make_rows(parts, methods, lambda *_: 1.0))
     assert results["selections"]["average"]["pictures"] == 30
     assert (
-        "over 181 pictures; this one is over 20 of real20, 10 of nature20"
-        in results["protocol"]["choices"][-1]
+        "over 181 images; this one is over 20 of real20, 10 of nature20" in results["protocol"]["choices"][-1]
     )
 
 
 def test_a_requested_metric_without_a_score_is_listed(methods):
-    parts = [benchmark("a", 2)]
+    parts = [make_benchmark("a", 2)]
     config = EvaluationConfig(metrics=("psnr", "kept_reflection"))
-    results = summarise(parts, methods, config, rows(parts, methods, lambda *_: 1.0))
+    results = summarise(parts, methods, config, make_rows(parts, methods, lambda *_: 1.0))
     assert results["unmeasured"] == ["kept_reflection"]
 
 
-def test_the_papers_draw_is_refused_if_names_do_not_identify_the_scenes(tmp_path, methods):
+def test_the_papers_draw_is_an_error_if_names_do_not_identify_the_scenes(tmp_path, methods):
     repacked(tmp_path / "postcard", ["001", "002"])
     parts = read_benchmark("postcard", tmp_path / "postcard")
     with pytest.raises(BrewsterError, match="scene"):
@@ -149,5 +155,5 @@ def test_the_papers_draw_is_refused_if_names_do_not_identify_the_scenes(tmp_path
             parts,
             methods,
             EvaluationConfig(metrics=("psnr",), paper=True),
-            rows(parts, methods, lambda *_: 1.0),
+            make_rows(parts, methods, lambda *_: 1.0),
         )

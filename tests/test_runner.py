@@ -1,4 +1,4 @@
-"""Resuming, workers and failures do not change the scores."""
+"""A resumed run, several workers and failures of other methods do not change the scores."""
 
 import json
 import os
@@ -18,14 +18,14 @@ from brewster.benchmarks.registry import read_benchmark
 from brewster.errors import BrewsterError, PhotoError, TargetError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import IdentityBaseline, MethodOutput, ModelMethod, PredictionFolder
-from brewster.evaluate.runner import SCORES, score
+from brewster.evaluate.runner import SCORES_FILE, score
 from other_processes import children, is_alive, wait_for
 
 QUICK = EvaluationConfig(metrics=("psnr", "ssim"))
 NAMES = ["1", "2", "3"]
 
 
-class Fake:
+class FakeMethod:
     """A method with given predictions or failures, which records the cases that it was run on."""
 
     exclusive = False
@@ -58,108 +58,108 @@ def real20(tmp_path):
     return read_benchmark("real20", tmp_path / "real20")
 
 
-def numbers(rows):
+def comparable(rows):
     return [(row.id, row.scores, row.error) for row in rows]
 
 
 def test_every_method_is_scored_on_every_case_in_order(real20, tmp_path):
-    rows = score(real20, [IdentityBaseline(), Fake()], QUICK, tmp_path / "out")
+    rows = score(real20, [IdentityBaseline(), FakeMethod()], QUICK, tmp_path / "out")
     assert [row.id[1:] for row in rows] == [
         (case, method) for case in NAMES for method in ("input (unprocessed)", "fake")
     ]
     assert rows[0].scores == rows[1].scores
     assert (rows[0].width, rows[0].height) == (24, 16)
-    assert len((tmp_path / "out" / SCORES).read_text().splitlines()) == 6
+    assert len((tmp_path / "out" / SCORES_FILE).read_text().splitlines()) == 6
 
 
 def test_logged_scores_are_reused(real20, tmp_path):
-    first = score(real20, [Fake()], QUICK, tmp_path / "out")
-    again = Fake()
-    assert numbers(score(real20, [again], QUICK, tmp_path / "out")) == numbers(first)
+    first = score(real20, [FakeMethod()], QUICK, tmp_path / "out")
+    again = FakeMethod()
+    assert comparable(score(real20, [again], QUICK, tmp_path / "out")) == comparable(first)
     assert again.requested == []
 
 
 def test_a_run_that_was_killed_in_the_middle_of_a_line_is_resumed(real20, tmp_path):
-    whole = score(real20, [Fake()], QUICK, tmp_path / "whole")
-    log = tmp_path / "out" / SCORES
+    complete = score(real20, [FakeMethod()], QUICK, tmp_path / "complete")
+    log = tmp_path / "out" / SCORES_FILE
     log.parent.mkdir()
-    lines = (tmp_path / "whole" / SCORES).read_text().splitlines()
+    lines = (tmp_path / "complete" / SCORES_FILE).read_text().splitlines()
     log.write_text(lines[0] + "\n" + lines[1][:40])
-    fake = Fake()
-    assert numbers(score(real20, [fake], QUICK, tmp_path / "out")) == numbers(whole)
+    fake = FakeMethod()
+    assert comparable(score(real20, [fake], QUICK, tmp_path / "out")) == comparable(complete)
     assert fake.requested == ["2", "3"]
-    fake = Fake()
+    fake = FakeMethod()
     score(real20, [fake], QUICK, tmp_path / "out")
     assert fake.requested == []
 
 
 def test_a_changed_photo_ground_truth_or_setting_is_scored_again(real20, tmp_path):
-    score(real20, [Fake()], QUICK, tmp_path / "out")
+    score(real20, [FakeMethod()], QUICK, tmp_path / "out")
     paint(tmp_path / "real20" / "transmission_layer" / "2.png", 77)
-    fake = Fake()
+    fake = FakeMethod()
     score(real20, [fake], QUICK, tmp_path / "out")
     assert fake.requested == ["2"]
-    fake = Fake()
+    fake = FakeMethod()
     score(real20, [fake], replace(QUICK, metrics=("psnr",)), tmp_path / "out")
     assert fake.requested == NAMES
 
 
 def test_other_metrics_do_not_run_the_model_again(real20, model, tmp_path, monkeypatch):
-    ours = ModelMethod("pane", str(model), tmp_path / "out" / "predictions" / "pane")
-    first = score(real20, [ours], QUICK, tmp_path / "out")
-    monkeypatch.setattr(ModelMethod, "predict", lambda *_: pytest.fail("it was run again"))
-    more = score(real20, [ours], EvaluationConfig(metrics=("psnr", "psnr_region")), tmp_path / "out")
+    method = ModelMethod("pane", str(model), tmp_path / "out" / "predictions" / "pane")
+    first = score(real20, [method], QUICK, tmp_path / "out")
+    monkeypatch.setattr(ModelMethod, "predict", lambda *_: pytest.fail("the model ran again"))
+    more = score(real20, [method], EvaluationConfig(metrics=("psnr", "psnr_region")), tmp_path / "out")
     assert [row.scores["psnr"] for row in more] == [row.scores["psnr"] for row in first]
 
 
-def test_a_stored_prediction_that_was_changed_is_made_again(real20, model, tmp_path):
-    ours = ModelMethod("pane", str(model), tmp_path / "kept")
-    first = score(real20, [ours], QUICK, tmp_path / "out")
-    stored = tmp_path / "kept" / "real20" / "2.transmission.png"
+def test_a_stored_prediction_that_was_changed_is_computed_again(real20, model, tmp_path):
+    method = ModelMethod("pane", str(model), tmp_path / "predictions")
+    first = score(real20, [method], QUICK, tmp_path / "out")
+    stored = tmp_path / "predictions" / "real20" / "2.transmission.png"
     stored.write_bytes((tmp_path / "real20" / "blended" / "2.png").read_bytes())
-    again = score(real20, [ours], EvaluationConfig(metrics=("psnr",)), tmp_path / "out")
+    again = score(real20, [method], EvaluationConfig(metrics=("psnr",)), tmp_path / "out")
     assert [row.scores["psnr"] for row in again] == [row.scores["psnr"] for row in first]
 
 
 @pytest.mark.parametrize(
     ("changed", "requested"),
-    [("brewster.__version__", []), ("brewster.evaluate.runner.SCORE_FORMAT", NAMES)],
+    [("brewster.__version__", []), ("brewster.evaluate.runner.SCORE_FORMAT_VERSION", NAMES)],
 )
-def test_scores_are_made_again_with_another_score_format_and_not_with_a_new_version(
+def test_scores_are_computed_again_if_the_score_format_changes_but_not_for_a_new_release(
     real20, tmp_path, monkeypatch, changed, requested
 ):
-    score(real20, [Fake()], QUICK, tmp_path / "out")
+    score(real20, [FakeMethod()], QUICK, tmp_path / "out")
     monkeypatch.setattr(changed, 99)
-    fake = Fake()
+    fake = FakeMethod()
     score(real20, [fake], QUICK, tmp_path / "out")
     assert fake.requested == requested
 
 
 @pytest.mark.parametrize(
     ("changed", "requested"),
-    [("brewster.__version__", 0), ("brewster.evaluate.methods.PREDICTION_FORMAT", 3)],
+    [("brewster.__version__", 0), ("brewster.evaluate.methods.PREDICTION_FORMAT_VERSION", 3)],
 )
-def test_predictions_are_made_again_with_another_prediction_format_and_not_with_a_new_version(
+def test_predictions_are_computed_again_if_their_format_changes_but_not_for_a_new_release(
     real20, model, tmp_path, monkeypatch, changed, requested
 ):
-    ours = ModelMethod("pane", str(model), tmp_path / "kept")
-    score(real20, [ours], QUICK, tmp_path / "out")
+    method = ModelMethod("pane", str(model), tmp_path / "predictions")
+    score(real20, [method], QUICK, tmp_path / "out")
     monkeypatch.setattr(changed, 99)
-    made, predict = [], ModelMethod.predict
-    monkeypatch.setattr(ModelMethod, "predict", lambda self, *case: made.append(1) or predict(self, *case))
-    score(real20, [ours], QUICK, tmp_path / "out")
-    assert len(made) == requested
+    calls, predict = [], ModelMethod.predict
+    monkeypatch.setattr(ModelMethod, "predict", lambda self, *case: calls.append(1) or predict(self, *case))
+    score(real20, [method], QUICK, tmp_path / "out")
+    assert len(calls) == requested
 
 
 def test_a_worker_that_dies_is_an_error(real20, model, tmp_path):
     with pytest.raises(BrewsterError, match="a worker process died"):
-        score(real20, [IdentityBaseline(), Deadly()], QUICK, tmp_path / "out", workers=2)
+        score(real20, [IdentityBaseline(), MethodThatKillsItsProcess()], QUICK, tmp_path / "out", workers=2)
 
 
 @final
 @dataclass(frozen=True)
-class Deadly:
-    """A method that kills its process."""
+class MethodThatKillsItsProcess:
+    """A method whose prediction ends the process."""
 
     name: str = "deadly"
     exclusive: bool = False
@@ -176,10 +176,10 @@ class Deadly:
 
 @final
 @dataclass(frozen=True)
-class Endless:
+class EndlessMethod:
     """A method that creates a file when it starts and never returns."""
 
-    begun: Path
+    started: Path
     name: str = "endless"
     exclusive: bool = False
 
@@ -187,7 +187,7 @@ class Endless:
         return self.name
 
     def predict(self, case, photo):
-        (self.begun / case.name).touch()
+        (self.started / case.name).touch()
         time.sleep(1000)
 
     def cached(self, case):
@@ -195,21 +195,21 @@ class Endless:
 
 
 def test_killing_a_run_ends_its_workers(real20, tmp_path):
-    (tmp_path / "begun").mkdir()
+    (tmp_path / "started").mkdir()
     code = f"""
 from pathlib import Path
-from test_runner import QUICK, Endless, read_benchmark, score
+from test_runner import QUICK, EndlessMethod, read_benchmark, score
 folder = Path({str(tmp_path)!r})
 if __name__ == "__main__":
     parts = read_benchmark("real20", folder / "real20")
-    score(parts, [Endless(folder / "begun")], QUICK, folder / "out", workers=2)
+    score(parts, [EndlessMethod(folder / "started")], QUICK, folder / "out", workers=2)
 """
     (tmp_path / "run.py").write_text(code)
     with subprocess.Popen(
         [sys.executable, tmp_path / "run.py"],
         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])},
     ) as run:
-        wait_for(lambda: len(list((tmp_path / "begun").iterdir())) == 2, run)
+        wait_for(lambda: len(list((tmp_path / "started").iterdir())) == 2, run)
         workers = children(run)
         run.kill()
     wait_for(lambda: not any(map(is_alive, workers)))
@@ -217,49 +217,53 @@ if __name__ == "__main__":
 
 
 def test_stored_layers_have_the_same_scores_as_new_ones(real20, model, tmp_path):
-    ours = ModelMethod("pane", str(model), tmp_path / "kept")
-    fresh = score(real20, [ours], QUICK, tmp_path / "out")
-    stored = score(real20, [PredictionFolder("pane", tmp_path / "kept")], QUICK, tmp_path / "out")
+    method = ModelMethod("pane", str(model), tmp_path / "predictions")
+    fresh = score(real20, [method], QUICK, tmp_path / "out")
+    stored = score(real20, [PredictionFolder("pane", tmp_path / "predictions")], QUICK, tmp_path / "out")
     assert [row.scores for row in fresh] == [row.scores for row in stored]
 
 
 def test_two_workers_give_the_same_rows_as_one(real20, model, tmp_path):
-    methods = [IdentityBaseline(), ModelMethod("pane", str(model), tmp_path / "kept")]
+    methods = [IdentityBaseline(), ModelMethod("pane", str(model), tmp_path / "predictions")]
     config = EvaluationConfig(metrics=("psnr", "ssim", "psnr_region"))
     one = score(real20, methods, config, tmp_path / "one")
     two = score(real20, methods, config, tmp_path / "two", workers=2)
-    assert numbers(one) == numbers(two)
+    assert comparable(one) == comparable(two)
 
 
-def test_a_method_that_fails_on_one_picture_is_named_and_the_rest_is_scored(real20, tmp_path):
-    fake = Fake(predictions={"2": PhotoError("the picture is odd", "an even one", "paint another")})
+def test_if_a_method_fails_on_one_photo_the_others_are_scored(real20, tmp_path):
+    fake = FakeMethod(
+        predictions={
+            "2": PhotoError("the photo is damaged", "expected another photo", "choose another photo")
+        }
+    )
     rows = score(real20, [IdentityBaseline(), fake], QUICK, tmp_path / "out")
     assert [bool(row.error) for row in rows] == [False, False, False, True, False, False]
-    assert rows[3].error.startswith("fake failed on real20/2: the picture is odd")
+    assert rows[3].error.startswith("fake failed on real20/2: the photo is damaged")
 
 
-def test_a_crash_is_named_with_its_picture_and_is_tried_again_next_time(real20, tmp_path):
-    rows = score(real20, [Fake(predictions={"2": RuntimeError("boom")})], QUICK, tmp_path / "out")
+def test_a_crash_is_reported_with_its_case_and_the_next_run_tries_again(real20, tmp_path):
+    rows = score(real20, [FakeMethod(predictions={"2": RuntimeError("boom")})], QUICK, tmp_path / "out")
     assert rows[1].error == "fake failed on real20/2: RuntimeError: boom"
-    better = Fake()
-    assert not any(row.error for row in score(real20, [better], QUICK, tmp_path / "out"))
-    assert better.requested == ["2"]
+    working = FakeMethod()
+    assert not any(row.error for row in score(real20, [working], QUICK, tmp_path / "out"))
+    assert working.requested == ["2"]
 
 
-def test_a_prediction_of_another_size_is_refused_and_not_resized(real20, tmp_path):
+def test_a_prediction_of_another_size_is_an_error_and_is_not_resized(real20, tmp_path):
     small = Photo.from_array(np.zeros((8, 8, 3), np.uint8), encoding="srgb")
-    rows = score(real20, [Fake(predictions={"1": MethodOutput(small)})], QUICK, tmp_path / "out")
+    rows = score(real20, [FakeMethod(predictions={"1": MethodOutput(small)})], QUICK, tmp_path / "out")
     assert "fake's transmission of real20/1 is 8x8; expected 24x16" in rows[0].error
 
 
-def test_a_picture_that_cannot_be_decoded_fails_for_all_methods(real20, tmp_path):
+def test_a_photo_that_cannot_be_decoded_is_an_error_for_all_methods(real20, tmp_path):
     path = tmp_path / "real20" / "blended" / "2.png"
     path.write_bytes(path.read_bytes()[:200])
-    rows = score(real20, [IdentityBaseline(), Fake()], QUICK, tmp_path / "out")
+    rows = score(real20, [IdentityBaseline(), FakeMethod()], QUICK, tmp_path / "out")
     assert [row.case for row in rows if row.error] == ["2", "2"]
 
 
-def test_grey_alpha_and_sixteen_bits_are_measured_as_what_they_show(tmp_path):
+def test_grey_images_alpha_and_sixteen_bits_are_compared_by_their_8_bit_colours(tmp_path):
     rng = np.random.default_rng(3)
     grey = rng.integers(0, 256, (16, 24, 1), np.uint8)
     alpha = np.concatenate([grey.repeat(3, 2), np.full_like(grey, 9)], axis=2)
@@ -274,43 +278,46 @@ def test_grey_alpha_and_sixteen_bits_are_measured_as_what_they_show(tmp_path):
     assert row.scores == {"psnr": 100.0, "ssim": 1.0}
 
 
-def test_a_permuted_folder_gives_the_same_rows(tmp_path):
-    for order, place in ((NAMES, "a"), (NAMES[::-1], "b")):
+def test_the_order_of_the_files_in_a_folder_does_not_matter(tmp_path):
+    for order, folder in ((NAMES, "a"), (NAMES[::-1], "b")):
         for name in order:
-            paint(tmp_path / place / "transmission_layer" / f"{name}.png", int(name))
-            paint(tmp_path / place / "blended" / f"{name}.png", int(name), noise=9)
+            paint(tmp_path / folder / "transmission_layer" / f"{name}.png", int(name))
+            paint(tmp_path / folder / "blended" / f"{name}.png", int(name), noise=9)
     rows = [
         score(
-            read_benchmark("real20", tmp_path / place), [IdentityBaseline()], QUICK, tmp_path / f"out-{place}"
+            read_benchmark("real20", tmp_path / folder),
+            [IdentityBaseline()],
+            QUICK,
+            tmp_path / f"out-{folder}",
         )
-        for place in "ab"
+        for folder in "ab"
     ]
-    assert numbers(rows[0]) == numbers(rows[1])
+    assert comparable(rows[0]) == comparable(rows[1])
 
 
-def test_pictures_are_reduced_before_any_method_sees_them(tmp_path):
+def test_photos_are_downscaled_before_any_method_runs(tmp_path):
     repacked(tmp_path / "real20", ["1"], size=(80, 40))
-    fake = Fake()
-    seen = []
-    fake.predict = lambda case, photo: seen.append(photo.size) or MethodOutput(photo)
+    fake = FakeMethod()
+    sizes = []
+    fake.predict = lambda case, photo: sizes.append(photo.size) or MethodOutput(photo)
     (row,) = score(
         read_benchmark("real20", tmp_path / "real20"), [fake], replace(QUICK, size=20), tmp_path / "out"
     )
-    assert seen == [(40, 20)]
+    assert sizes == [(40, 20)]
     assert (row.width, row.height) == (40, 20)
 
 
-def test_a_folder_that_cannot_be_written_is_an_error(real20, tmp_path):
+def test_an_output_folder_that_cannot_be_written_is_an_error(real20, tmp_path):
     write(tmp_path, "out", data=b"a file")
     with pytest.raises(TargetError, match="was not written"):
-        score(real20, [Fake()], QUICK, tmp_path / "out")
+        score(real20, [FakeMethod()], QUICK, tmp_path / "out")
 
 
 def test_progress_is_reported_after_every_prediction(real20, tmp_path):
     calls = []
     score(
         real20,
-        [IdentityBaseline(), Fake()],
+        [IdentityBaseline(), FakeMethod()],
         QUICK,
         tmp_path / "out",
         on_progress=lambda *now: calls.append(now[:2]),
@@ -320,12 +327,12 @@ def test_progress_is_reported_after_every_prediction(real20, tmp_path):
 
 def test_lines_of_another_version_are_ignored(real20, tmp_path):
     (tmp_path / "out").mkdir()
-    (tmp_path / "out" / SCORES).write_text(json.dumps({"benchmark": "real20", "odd": 1}) + "\n[]\n7\n")
-    assert len(score(real20, [Fake()], QUICK, tmp_path / "out")) == 3
+    (tmp_path / "out" / SCORES_FILE).write_text(json.dumps({"benchmark": "real20", "odd": 1}) + "\n[]\n7\n")
+    assert len(score(real20, [FakeMethod()], QUICK, tmp_path / "out")) == 3
 
 
-def test_an_interrupt_keeps_the_logged_scores(real20, tmp_path, monkeypatch):
-    fake = Fake()
+def test_the_scores_before_an_interrupt_are_saved(real20, tmp_path, monkeypatch):
+    fake = FakeMethod()
 
     def predict(case, photo):
         if case.name == "3":
@@ -335,11 +342,11 @@ def test_an_interrupt_keeps_the_logged_scores(real20, tmp_path, monkeypatch):
     monkeypatch.setattr(fake, "predict", predict)
     with pytest.raises(KeyboardInterrupt):
         score(real20, [fake], QUICK, tmp_path / "out")
-    assert len((tmp_path / "out" / SCORES).read_text().splitlines()) == 2
+    assert len((tmp_path / "out" / SCORES_FILE).read_text().splitlines()) == 2
 
 
-class Large(Fake):
-    """Logs the process, its name and the case."""
+class ExclusiveMethod(FakeMethod):
+    """An exclusive method that logs the process, its name and the case."""
 
     exclusive = True
 
@@ -356,7 +363,7 @@ class Large(Fake):
 @pytest.mark.parametrize("workers", [1, 2])
 def test_exclusive_methods_run_one_after_another_on_all_cases(real20, tmp_path, workers):
     log = tmp_path / "log"
-    methods = [Large("one", log), Fake("small"), Large("two", log)]
+    methods = [ExclusiveMethod("one", log), FakeMethod("small"), ExclusiveMethod("two", log)]
     rows = score(real20, methods, QUICK, tmp_path / "out", workers=workers)
     requested = [line.split() for line in log.read_text().splitlines()]
     assert [name for _, name, _ in requested] == ["one"] * 3 + ["two"] * 3

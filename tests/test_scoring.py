@@ -1,4 +1,4 @@
-"""The scores of one case, against scikit-image and by hand."""
+"""The scores of one case agree with scikit-image and with direct calls of the metrics."""
 
 import numpy as np
 import pytest
@@ -50,7 +50,7 @@ def rendered(tmp_path):
 
 def test_the_baseline_scores_agree_with_scikit_image(triplet):
     truth, scorer = open_case(triplet, EvaluationConfig(metrics=("psnr", "ssim", "ssim_gaussian")))
-    photo, transmission = truth.pictures["photo"], truth.pictures["transmission"]
+    photo, transmission = truth.images["photo"], truth.images["transmission"]
     scores = scorer.score(IdentityBaseline().predict(truth.case, truth.photo))
     gaussian = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 255}
     assert scores == {
@@ -65,12 +65,12 @@ def test_the_baseline_scores_agree_with_scikit_image(triplet):
 def test_the_reflection_is_scored_if_there_is_a_ground_truth_and_a_prediction(triplet):
     config = EvaluationConfig(metrics=("psnr", "psnr_reflection"))
     truth, scorer = open_case(triplet, config)
-    mirrored = Photo.from_array(truth.pictures["reflection"], encoding="srgb")
-    assert scorer.score(MethodOutput(truth.photo, mirrored))["psnr_reflection"] == 100
+    reflection_image = Photo.from_array(truth.images["reflection"], encoding="srgb")
+    assert scorer.score(MethodOutput(truth.photo, reflection_image))["psnr_reflection"] == 100
     assert "psnr_reflection" not in scorer.score(MethodOutput(truth.photo))
 
 
-def test_where_there_is_no_reflection_the_region_has_no_score(tmp_path):
+def test_without_a_reflection_the_region_has_no_score(tmp_path):
     for role in ("blended", "transmission"):
         paint(tmp_path / "mine" / role / "a.png", 1)
     truth, scorer = open_case(
@@ -84,38 +84,38 @@ def test_where_there_is_no_reflection_the_region_has_no_score(tmp_path):
     assert scorer.region_share == 0
 
 
-def test_swept_thresholds_measure_smaller_and_smaller_regions(triplet):
+def test_a_larger_threshold_gives_a_smaller_region_and_a_lower_psnr(triplet):
     config = EvaluationConfig(metrics=("psnr_region",), thresholds=(0.01, 0.1))
     truth, scorer = open_case(triplet, config)
     scores = scorer.score(MethodOutput(truth.photo))
     assert scores["psnr_region@0.1"] < scores["psnr_region@0.01"]
 
 
-def test_the_failure_cases_are_scored_on_rendered_pictures_only(triplet, rendered):
+def test_the_failure_cases_are_scored_on_rendered_samples_only(triplet, rendered):
     config = EvaluationConfig(metrics=("psnr", "removed_content", "kept_reflection"))
     truth, scorer = open_case(triplet, config)
     assert list(scorer.score(MethodOutput(truth.photo))) == ["psnr"]
     truth, scorer = open_case(rendered, config, "rendered")
-    perfect = Photo.from_array(truth.pictures["transmission"], encoding="srgb")
+    perfect = Photo.from_array(truth.images["transmission"], encoding="srgb")
     unchanged, removed = scorer.score(MethodOutput(truth.photo)), scorer.score(MethodOutput(perfect))
     assert removed["kept_reflection"] == pytest.approx(0, abs=0.02)
     assert unchanged["kept_reflection"] > 0.5
     assert removed["removed_content"] == 0
 
 
-def test_pictures_too_small_for_a_metric_have_no_score(tmp_path):
+def test_images_that_are_too_small_for_a_metric_have_no_score(tmp_path):
     for role in ("blended", "transmission"):
         paint(tmp_path / "mine" / role / "a.png", 1, size=(8, 4))
     truth, scorer = open_case(tmp_path / "mine", EvaluationConfig(metrics=("psnr", "ssim")))
     assert scorer.score(MethodOutput(truth.photo)) == {"psnr": 100.0, "ssim": None}
 
 
-def test_lpips_of_the_dev_pairs_is_small_for_the_truth_and_large_for_noise(data, monkeypatch):
+def test_lpips_of_the_dev_pairs_is_zero_for_the_ground_truth_and_large_for_noise(data, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     config = EvaluationConfig(metrics=("lpips", "lpips_region"))
     truth, scorer = open_case(data / "real/dev/nature", config, "nature20")
-    perfect = Photo.from_array(truth.pictures["transmission"], encoding="srgb")
-    noise = np.random.default_rng(1).integers(0, 256, truth.pictures["photo"].shape, np.uint8)
+    perfect = Photo.from_array(truth.images["transmission"], encoding="srgb")
+    noise = np.random.default_rng(1).integers(0, 256, truth.images["photo"].shape, np.uint8)
     scores = [
         scorer.score(MethodOutput(photo))["lpips"]
         for photo in (perfect, truth.photo, Photo.from_array(noise, encoding="srgb"))
@@ -124,28 +124,28 @@ def test_lpips_of_the_dev_pairs_is_small_for_the_truth_and_large_for_noise(data,
     assert scorer.score(MethodOutput(truth.photo))["lpips_region"] > scores[1]
 
 
-def a_metric(name, score, **more):
+def make_metric(name, score, **more):
     return Metric(name, name, "", True, 3, "A score.", "transmission", score, **more)
 
 
 def test_a_new_metric_is_one_row_with_its_function(triplet, tmp_path, monkeypatch):
-    """No other place knows metrics by their names."""
+    """The code of the evaluation does not depend on the names of metrics."""
     monkeypatch.setitem(
         METRICS,
         "darkest",
-        a_metric(
+        make_metric(
             "darkest", lambda case: float(case.prediction.pixels.min()) - float(case.truth.pixels.min())
         ),
     )
     config = EvaluationConfig(metrics=("darkest",))
     (row,) = score(read_benchmark("pairs", triplet), [IdentityBaseline()], config, tmp_path / "out")
     truth, _ = open_case(triplet, config)
-    least = {role: float(picture.min()) for role, picture in truth.pictures.items()}
-    assert row.scores == {"darkest": least["photo"] - least["transmission"]} != {"darkest": 0}
+    minima = {role: float(picture.min()) for role, picture in truth.images.items()}
+    assert row.scores == {"darkest": minima["photo"] - minima["transmission"]} != {"darkest": 0}
 
 
-def test_a_metric_of_a_region_is_given_the_region_of_its_column(triplet, monkeypatch):
-    row = a_metric("share", lambda case: float(case.region.mean()), where="region")
+def test_a_metric_of_the_region_receives_the_region_of_its_column(triplet, monkeypatch):
+    row = make_metric("share", lambda case: float(case.region.mean()), where="region")
     monkeypatch.setitem(METRICS, "share", row)
     truth, scorer = open_case(triplet, EvaluationConfig(metrics=("share",), thresholds=(0.01, 0.1)))
     assert scorer.score(MethodOutput(truth.photo)) == {
@@ -154,9 +154,9 @@ def test_a_metric_of_a_region_is_given_the_region_of_its_column(triplet, monkeyp
     }
 
 
-def test_what_a_metric_needs_is_loaded_before_the_first_score(triplet, tmp_path, monkeypatch):
+def test_a_metric_is_prepared_once_before_the_first_score(triplet, tmp_path, monkeypatch):
     order = []
-    row = a_metric("late", lambda case: float(len(order)), prepare=lambda: order.append("prepared"))
+    row = make_metric("late", lambda case: float(len(order)), prepare=lambda: order.append("prepared"))
     monkeypatch.setitem(METRICS, "late", row)
     benchmarks, config = read_benchmark("pairs", triplet), EvaluationConfig(metrics=("late",))
     (first,) = score(benchmarks, [IdentityBaseline()], config, tmp_path / "out")
@@ -165,8 +165,8 @@ def test_what_a_metric_needs_is_loaded_before_the_first_score(triplet, tmp_path,
     assert order == ["prepared"]
 
 
-def test_features_are_computed_once_for_each_picture(triplet, monkeypatch):
-    """Two metrics share them, and those of the ground truth serve every prediction."""
+def test_features_are_computed_once_for_each_image(triplet, monkeypatch):
+    """Two metrics share the features. All predictions share the features of the ground truth."""
     computed = []
 
     def compute(picture):
@@ -177,44 +177,48 @@ def test_features_are_computed_once_for_each_picture(triplet, monkeypatch):
         return case.prediction.features(compute) - case.truth.features(compute)
 
     for name in ("one", "two"):
-        monkeypatch.setitem(METRICS, name, a_metric(name, measure))
+        monkeypatch.setitem(METRICS, name, make_metric(name, measure))
     truth, scorer = open_case(triplet, EvaluationConfig(metrics=("one", "two")))
     scores = [scorer.score(MethodOutput(photo)) for photo in (truth.photo, truth.photo)]
     assert scores[0] == scores[1]
-    assert [picture is truth.pictures["transmission"] for picture in computed] == [False, True, False]
+    assert [picture is truth.images["transmission"] for picture in computed] == [False, True, False]
 
 
-def test_every_row_scores_as_its_own_function_says(data, monkeypatch):
-    """Each row is checked against a direct call, so that a row with another's function is noticed."""
+def test_every_metric_gives_the_score_of_its_function(data, monkeypatch):
+    """A direct call of each function shows that no row of METRICS has the function of another."""
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     names = tuple(name for name, metric in METRICS.items() if metric.of == "transmission")
     truth, scorer = open_case(data / "real/dev/nature", EvaluationConfig(metrics=names, size=96), "nature20")
-    photo, behind = truth.pictures["photo"], truth.pictures["transmission"]
+    photo, background = truth.images["photo"], truth.images["transmission"]
     region = truth.region(0.08)
     assert scorer.score(MethodOutput(truth.photo)) == {
-        "psnr": pytest.approx(psnr(photo, behind), abs=1e-6),
-        "ssim": pytest.approx(ssim(photo, behind), abs=1e-6),
-        "ssim_gaussian": pytest.approx(ssim(photo, behind, window="gaussian"), abs=1e-6),
-        "lpips": pytest.approx(lpips(photo, behind), abs=1e-6),
-        "psnr_region": pytest.approx(psnr(photo, behind, region=region), abs=1e-6),
-        "ssim_region": pytest.approx(ssim(photo, behind, region=region), abs=1e-6),
-        "lpips_region": pytest.approx(lpips(photo, behind, region=region), abs=1e-6),
+        "psnr": pytest.approx(psnr(photo, background), abs=1e-6),
+        "ssim": pytest.approx(ssim(photo, background), abs=1e-6),
+        "ssim_gaussian": pytest.approx(ssim(photo, background, window="gaussian"), abs=1e-6),
+        "lpips": pytest.approx(lpips(photo, background), abs=1e-6),
+        "psnr_region": pytest.approx(psnr(photo, background, region=region), abs=1e-6),
+        "ssim_region": pytest.approx(ssim(photo, background, region=region), abs=1e-6),
+        "lpips_region": pytest.approx(lpips(photo, background, region=region), abs=1e-6),
     }
 
 
-def test_rows_of_rendered_samples_and_reflections_score_as_their_own_functions_say(rendered):
+def test_metrics_of_rendered_samples_and_reflections_give_the_scores_of_their_functions(rendered):
     names = ("psnr_reflection", "ssim_reflection", "removed_content", "removed_white", "kept_reflection")
     truth, scorer = open_case(rendered, EvaluationConfig(metrics=names), "rendered")
-    photo, behind, mirrored = (truth.pictures[role] for role in ("photo", "transmission", "reflection"))
+    photo, background, reflection_image = (
+        truth.images[role] for role in ("photo", "transmission", "reflection")
+    )
     scores = scorer.score(MethodOutput(truth.photo, truth.photo))
-    assert scores["psnr_reflection"] == pytest.approx(psnr(photo, mirrored), abs=1e-6)
-    assert scores["ssim_reflection"] == pytest.approx(ssim(photo, mirrored), abs=1e-6)
+    assert scores["psnr_reflection"] == pytest.approx(psnr(photo, reflection_image), abs=1e-6)
+    assert scores["ssim_reflection"] == pytest.approx(ssim(photo, reflection_image), abs=1e-6)
     for name, measure in (("removed_content", removed_content), ("kept_reflection", kept_reflection)):
-        assert scores[name] == pytest.approx(measure(photo, behind, photo, mirrored), abs=1e-6), name
-    assert scores["removed_white"] is None  # nothing behind this glass is white
+        assert scores[name] == pytest.approx(measure(photo, background, photo, reflection_image), abs=1e-6), (
+            name
+        )
+    assert scores["removed_white"] is None  # the background of this sample has no white area
 
 
-def test_lpips_features_are_computed_once_for_each_picture(data, monkeypatch):
+def test_lpips_features_are_computed_once_for_each_image(data, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     seen, features = [], Lpips.features
     monkeypatch.setattr(Lpips, "features", lambda self, picture: seen.append(1) or features(self, picture))

@@ -1,11 +1,12 @@
-"""Groups the pictures of a benchmark folder by name: photo, transmission and, if there is one, reflection.
+"""Groups the images of a benchmark folder by file name: photo, transmission and, if there is one, reflection.
 
-Pictures are paired by name only, never by sorted position. Two layouts are supported:
+Files are paired by name only, never by their position in a sorted list. Two layouts are supported:
 
 - Pairs: one folder per role with equal file names: blended/a.png, transmission_layer/a.png.
-- The original SIR2 tree: one folder per shot, with one letter per role: ab/3/ab-3-m-32.png, ab/3/ab-3-g-32.png.
+- The original folders of SIR2: one folder per shot, one letter in the file name per role: ab/3/ab-3-m-32.png, ab/3/ab-3-g-32.png.
 
-A name with exactly one picture for each role becomes a `PictureGroup`. Every other name is refused with a reason.
+A name with one photo, one transmission and at most one reflection becomes a `ImageGroup`. Every other name is excluded,
+with a reason.
 """
 
 from __future__ import annotations
@@ -26,18 +27,22 @@ ROLES: Final[dict[str, tuple[str, ...]]] = {
     "transmission": ("transmission_layer", "transmission", "gt", "ground_truth", "without_reflection", "t"),
     "reflection": ("reflection_layer", "reflection", "r"),
 }
-"""role -> accepted folder names, in lower case. The first one is the usual name."""
+"""role -> accepted folder names, in lower case. The transmission is the ground truth of the photo."""
 
 SIR2_TREES: Final[dict[str, tuple[str, ...]]] = {
     "postcard": ("kind", "scene", "variant"),
     "solidobject": ("scene", "kind", "variant"),
     "wildscene": ("scene",),
 }
-"""SIR2's three subsets -> the meaning of each folder level from the subset's root to a shot."""
+"""subset of SIR2 -> the meaning of each folder level, from the folder of the subset to the folder of a shot."""
 
 _KINDS: Final = ("focus", "thick")
-_LETTERS: Final = {"m": "photo", "g": "transmission", "r": "reflection"}
-_LETTER: Final = re.compile(r"(?<![^\W_])[mgr](?![^\W_])", re.IGNORECASE)
+"""The two series of SIR2's controlled scenes: the focus of the camera varies, or the thickness of the glass."""
+
+_ROLE_LETTERS: Final = {"m": "photo", "g": "transmission", "r": "reflection"}
+_ROLE_LETTER: Final = re.compile(r"(?<![^\W_])[mgr](?![^\W_])", re.IGNORECASE)
+"""m, g or r as a separate word; "_" separates words too."""
+
 _SYSTEM_FILES: Final = ("thumbs.db", "desktop.ini", "__macosx")
 
 _FilesByRole = Mapping[str, list[Path]]
@@ -45,8 +50,8 @@ _FilesByRole = Mapping[str, list[Path]]
 
 @final
 @dataclass(frozen=True)
-class PictureGroup:
-    """Pictures of one name: photo, transmission (ground truth) and, if there is one, reflection. `scene` is "" if unknown."""
+class ImageGroup:
+    """The files of one name: photo, transmission (ground truth) and, if there is one, reflection. `scene` is "" if unknown."""
 
     name: str
     scene: str
@@ -58,24 +63,24 @@ class PictureGroup:
 @final
 @dataclass(frozen=True)
 class FolderListing:
-    """The content of a folder: groups in natural order of their names.
+    """The content of a folder. The groups are in natural order of their names (2 before 10).
 
-    `remarks` are lines about ignored files, `refused` lines about files without a unique partner.
+    `remarks` names the ignored files. `excluded` names the images without a unique partner, with the reason.
     """
 
-    groups: tuple[PictureGroup, ...] = ()
+    groups: tuple[ImageGroup, ...] = ()
     remarks: tuple[str, ...] = ()
-    refused: tuple[str, ...] = ()
+    excluded: tuple[str, ...] = ()
 
 
 def natural_key(name: str) -> tuple[list[str | int], str]:
-    """Sort key for natural order: 2 before 10."""
+    """Returns the sort key for natural order: 2 before 10."""
     pieces = re.split(r"(\d+)", name)
     return [int(piece) if i % 2 else piece for i, piece in enumerate(pieces)], name
 
 
-def entries(folder: Path) -> tuple[list[Path], list[Path]]:
-    """The folders and the files in a folder, each in natural order, without hidden files and files of the system.
+def list_folder(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Returns the folders and the files in a folder, in natural order, without hidden files and system files.
 
     Raises:
         PhotoError: the folder cannot be read.
@@ -88,7 +93,7 @@ def entries(folder: Path) -> tuple[list[Path], list[Path]]:
     except OSError as error:
         raise PhotoError(
             f"{folder} cannot be read ({error.strerror or error})",
-            "a folder with pictures was expected",
+            "expected a folder with images",
             "give the path of your copy of the benchmark",
         ) from error
     return kinds
@@ -98,96 +103,99 @@ def entries(folder: Path) -> tuple[list[Path], list[Path]]:
 
 
 def find_roles(folder: Path) -> dict[str, Path]:
-    """role -> subfolder that has one of the role's names (see ROLES).
+    """Returns role -> subfolder. A subfolder has a role if its name is in ROLES.
 
     Raises:
         PhotoError: the folder cannot be read, or has two subfolders for one role.
     """
     roles = {name: role for role, names in ROLES.items() for name in names}
-    return _find_labelled(folder, lambda name: roles.get(re.sub(r"[\s-]+", "_", name.lower()), ""))
+    return _find_subfolders(folder, lambda name: roles.get(re.sub(r"[\s-]+", "_", name.lower()), ""))
 
 
 def find_split(folder: Path) -> Path:
-    """The folder itself if it contains pairs, else its only subfolder that does: train, val or test.
+    """Returns the folder itself if it contains pairs, else its only subfolder with pairs, such as train, val or test.
 
     Raises:
         PhotoError: several subfolders contain pairs, or a folder cannot be read.
     """
     if "photo" in find_roles(folder):
         return folder
-    splits = [path for path in entries(folder)[0] if "photo" in find_roles(path)]
+    splits = [path for path in list_folder(folder)[0] if "photo" in find_roles(path)]
     if len(splits) > 1:
         raise PhotoError(
-            f"{folder} has pairs in {join_names([path.name for path in splits])}",
-            "one split was expected",
+            f"{folder} has pairs in the subfolders {join_names([path.name for path in splits])}",
+            "expected one subfolder with pairs",
             f"give the path of one, for example {splits[0]}",
         )
     return splits[0] if splits else folder
 
 
 def read_folders(folder: Path) -> FolderListing:
-    """Groups from one folder per role, matched by file stem; suffixes may differ.
+    """Returns the groups of a folder with one subfolder per role. The file stems must be equal; suffixes may differ.
 
     Raises:
-        PhotoError: a folder is missing, empty or unreadable, or two folders have one role.
+        PhotoError: a folder is missing, empty or unreadable, or two folders have the same role.
     """
     roles = find_roles(folder)
     by_name: dict[str, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
     ignored: list[Path] = []
     for role in ROLES:
-        pictures, others = _role_pictures(folder, role, roles)
+        images, others = _role_files(folder, role, roles)
         ignored += others
-        for picture in pictures:
-            by_name[unicodedata.normalize("NFC", picture.stem)][role].append(picture)
-    pieces = [_make_group(folder, stem, "", by_name[stem]) for stem in sorted(by_name, key=natural_key)]
-    return _merge([*pieces, _ignored_remark(folder, [*ignored, *entries(folder)[1]])])
+        for image in images:
+            by_name[unicodedata.normalize("NFC", image.stem)][role].append(image)
+    listings = [_make_group(folder, stem, "", by_name[stem]) for stem in sorted(by_name, key=natural_key)]
+    return _merge([*listings, _ignored_remark(folder, [*ignored, *list_folder(folder)[1]])])
 
 
-def _role_pictures(folder: Path, role: str, roles: Mapping[str, Path]) -> tuple[list[Path], list[Path]]:
+def _role_files(folder: Path, role: str, roles: Mapping[str, Path]) -> tuple[list[Path], list[Path]]:
+    """Returns the image files of a role and the other files in its folder. A reflection is optional."""
     if role not in roles:
         if role == "reflection":
             return [], []
         raise PhotoError(
-            f"{folder} has no folder for the {role}",
-            f"expected one folder per role, side by side, this one named {join_names(ROLES[role], ' or ')}",
-            "rename your folder, or give the path of its parent folder",
+            f"{folder} has no subfolder for the {role}",
+            f"expected a subfolder with the name {join_names(ROLES[role], ' or ')}",
+            "rename the subfolder, or give the path of its parent folder",
         )
-    pictures, others = _pictures(roles[role])
-    if not pictures:
+    images, others = _image_files(roles[role])
+    if not images:
         raise PhotoError(
-            f"no pictures in {roles[role]}",
+            f"{roles[role]} contains no images",
             f"expected files ending in {', '.join(SUFFIXES)}",
-            "give another folder",
+            "choose another folder",
         )
-    return pictures, others
+    return images, others
 
 
-# --- the original SIR2 trees
+# --- the original folders of SIR2
 
 
 def find_subsets(folder: Path) -> dict[str, Path]:
-    """subset of SIR2 -> its folder. Only the beginning of the name is compared: "Postcard Dataset", "postcard".
+    """Returns subset of SIR2 -> subfolder. Compares only the start of the name: "Postcard Dataset" is "postcard".
 
     Raises:
-        PhotoError: the folder cannot be read, or has two folders for one subset.
+        PhotoError: the folder cannot be read, or has two subfolders for one subset.
     """
-    return _find_labelled(folder, _subset_of)
+    return _find_subfolders(folder, _subset_of)
 
 
 def read_tree(folder: Path, subset: str) -> FolderListing:
-    """Groups from one folder per shot, matched by file name without the letter of the role.
+    """Returns the groups of a subset of SIR2. Its folders have one subfolder per shot.
+
+    Files of a shot belong together if their names are equal without the letter of the role.
 
     Raises:
-        PhotoError: a folder cannot be read, or the tree contains no shot.
+        PhotoError: a folder cannot be read, or there is no shot.
     """
-    found = _refuse_duplicates(folder, _merge(_read_branches(folder, folder, SIR2_TREES[subset], {})))
-    if not found.groups and not found.refused:
+    listing = _exclude_duplicates(folder, _merge(_read_branches(folder, folder, SIR2_TREES[subset], {})))
+    if not listing.groups and not listing.excluded:
         raise PhotoError(
-            f"{folder} is not a {subset} set",
+            f"{folder} contains no shot of SIR2 {subset}",
             f"expected photos in {'/'.join(f'<{level}>' for level in SIR2_TREES[subset])}/*m*.*, or in {ROLES['photo'][0]}/",
-            "give the path of your copy",
+            "give the path of the subset in your copy of SIR2",
         )
-    return found
+    return listing
 
 
 def _subset_of(name: str) -> str:
@@ -198,110 +206,114 @@ def _subset_of(name: str) -> str:
 def _read_branches(
     root: Path, folder: Path, levels: Sequence[str], labels: Mapping[str, str]
 ) -> Iterator[FolderListing]:
+    """Yields a listing of each shot below `folder`, and remarks about the other files.
+
+    `levels` are the levels that remain below `folder`, `labels` the folder names of the levels above.
+    """
     if not levels:
         yield _read_shot(root, folder, labels)
         return
-    folders, files = entries(folder)
-    kinds = [path for path in folders if levels[0] != "kind" or path.name.lower() in _KINDS]
-    for path in kinds:
-        step = path.name.capitalize() if levels[0] == "kind" else path.name
-        yield from _read_branches(root, path, levels[1:], {**labels, levels[0]: step})
-    yield _ignored_remark(root, [*files, *(path for path in folders if path not in kinds)])
+    folders, files = list_folder(folder)
+    branches = [path for path in folders if levels[0] != "kind" or path.name.lower() in _KINDS]
+    for path in branches:
+        label = path.name.capitalize() if levels[0] == "kind" else path.name
+        yield from _read_branches(root, path, levels[1:], {**labels, levels[0]: label})
+    yield _ignored_remark(root, [*files, *(path for path in folders if path not in branches)])
 
 
 def _read_shot(root: Path, folder: Path, labels: Mapping[str, str]) -> FolderListing:
     by_name: dict[str, dict[str, list[Path]]] = defaultdict(lambda: defaultdict(list))
-    pictures, others = _pictures(folder)
-    for picture in pictures:
-        letters = _LETTER.findall(picture.stem)
+    images, others = _image_files(folder)
+    for image in images:
+        letters = _ROLE_LETTER.findall(image.stem)
         if len(letters) == 1:
-            by_name[_without_letter(picture.stem)][_LETTERS[letters[0].lower()]].append(picture)
+            by_name[_without_letter(image.stem)][_ROLE_LETTERS[letters[0].lower()]].append(image)
         else:
-            others.append(picture)
+            others.append(image)
     shot = "-".join(labels[level] for level in ("scene", "kind", "variant") if level in labels)
-    names = {rest: shot if len(by_name) == 1 else f"{shot}-{rest}".rstrip("-") for rest in by_name}
-    pieces = [_make_group(root, names[rest], labels["scene"], by_name[rest]) for rest in by_name]
-    return _merge([*pieces, _ignored_remark(root, others)])
+    names = {stem: shot if len(by_name) == 1 else f"{shot}-{stem}".rstrip("-") for stem in by_name}
+    listings = [_make_group(root, names[stem], labels["scene"], by_name[stem]) for stem in by_name]
+    return _merge([*listings, _ignored_remark(root, others)])
 
 
 def _without_letter(stem: str) -> str:
-    return "-".join(piece for piece in re.split(r"[-_ ]+", _LETTER.sub("", stem)) if piece)
+    return "-".join(word for word in re.split(r"[-_ ]+", _ROLE_LETTER.sub("", stem)) if word)
 
 
-def _refuse_duplicates(root: Path, found: FolderListing) -> FolderListing:
-    """Refuses all groups that share a name. Folders whose names differ only in case can cause this."""
-    counts = Counter(group.name for group in found.groups)
+def _exclude_duplicates(root: Path, listing: FolderListing) -> FolderListing:
+    """Excludes all groups whose name is not unique. The folders Focus and focus, for example, give equal names."""
+    counts = Counter(group.name for group in listing.groups)
     duplicates = tuple(
-        f"{_relative(root, group.photo)} is ambiguous: another photo has the name {group.name} too"
-        for group in found.groups
+        f"{_relative(root, group.photo)} is ambiguous: another photo has the same name, {group.name}"
+        for group in listing.groups
         if counts[group.name] > 1
     )
-    unique = tuple(group for group in found.groups if counts[group.name] == 1)
-    return FolderListing(unique, found.remarks, (*found.refused, *duplicates))
+    unique = tuple(group for group in listing.groups if counts[group.name] == 1)
+    return FolderListing(unique, listing.remarks, (*listing.excluded, *duplicates))
 
 
 # --- both layouts
 
 
-def _make_group(root: Path, name: str, scene: str, parts: _FilesByRole) -> FolderListing:
-    """A listing with one group, or with the reason why there is none."""
-    problem = _problem(root, parts)
-    if problem:
-        return FolderListing(refused=(problem,))
-    reflection = parts["reflection"][0] if parts.get("reflection") else None
-    return FolderListing(
-        (PictureGroup(name, scene, parts["photo"][0], parts["transmission"][0], reflection),)
-    )
+def _make_group(root: Path, name: str, scene: str, files: _FilesByRole) -> FolderListing:
+    """Returns a listing with one group, or with the reason why the files are excluded."""
+    reason = _exclusion_reason(root, files)
+    if reason:
+        return FolderListing(excluded=(reason,))
+    reflection = files["reflection"][0] if files.get("reflection") else None
+    return FolderListing((ImageGroup(name, scene, files["photo"][0], files["transmission"][0], reflection),))
 
 
-def _problem(root: Path, parts: _FilesByRole) -> str:
-    for role, paths in parts.items():
+def _exclusion_reason(root: Path, files: _FilesByRole) -> str:
+    for role, paths in files.items():
         if len(paths) > 1:
-            named = join_names([_relative(root, path) for path in paths])
-            return f"{named} are ambiguous: expected one {role} of that name"
+            names = [_relative(root, path) for path in paths]
+            return f"{join_names(names)} are ambiguous: expected one {role} with this name"
+    names = [_relative(root, path) for paths in files.values() for path in paths]
     for role in ("photo", "transmission"):
-        if not parts.get(role):
-            named = join_names([_relative(root, path) for paths in parts.values() for path in paths])
-            return f"{named} has no partner: there is no {role} of that name"
+        if not files.get(role):
+            verb = "has" if len(names) == 1 else "have"
+            return f"{join_names(names)} {verb} no partner: there is no {role} with this name"
     return ""
 
 
-def _pictures(folder: Path) -> tuple[list[Path], list[Path]]:
-    """The pictures of a folder in natural order, and all other entries."""
-    folders, files = entries(folder)
-    pictures = [path for path in files if path.suffix.lower() in SUFFIXES]
-    return pictures, [*folders, *(path for path in files if path.suffix.lower() not in SUFFIXES)]
+def _image_files(folder: Path) -> tuple[list[Path], list[Path]]:
+    """Returns the image files in a folder, in natural order, and everything else in it."""
+    folders, files = list_folder(folder)
+    images = [path for path in files if path.suffix.lower() in SUFFIXES]
+    return images, [*folders, *(path for path in files if path.suffix.lower() not in SUFFIXES)]
 
 
-def _find_labelled(folder: Path, label: Callable[[str], str]) -> dict[str, Path]:
+def _find_subfolders(folder: Path, key_of: Callable[[str], str]) -> dict[str, Path]:
+    """Returns key -> subfolder. `key_of` maps the name of a subfolder to its key, or to "" if it has none."""
     found: dict[str, Path] = {}
-    for path in entries(folder)[0]:
-        role = label(path.name)
-        if role and found.setdefault(role, path) != path:
+    for path in list_folder(folder)[0]:
+        key = key_of(path.name)
+        if key and found.setdefault(key, path) != path:
             raise PhotoError(
-                f"{folder} has two folders for {role}, {found[role].name} and {path.name}",
-                "expected one of each",
+                f"{folder} has two subfolders for {key}, {found[key].name} and {path.name}",
+                f"expected one subfolder for {key}",
                 "move or rename one of them",
             )
-    return {role: path for role, path in found.items() if role}
+    return found
 
 
 def _ignored_remark(root: Path, others: Iterable[Path]) -> FolderListing:
-    named = [_relative(root, path) for path in others]
-    return FolderListing(remarks=(f"ignored {join_names(named)}",) if named else ())
+    names = [_relative(root, path) for path in others]
+    return FolderListing(remarks=(f"ignored {join_names(names)}",) if names else ())
 
 
-def _merge(pieces: Iterable[FolderListing]) -> FolderListing:
-    listings = list(pieces)
+def _merge(parts: Iterable[FolderListing]) -> FolderListing:
+    listings = list(parts)
     return FolderListing(
         tuple(
             sorted(
-                (group for piece in listings for group in piece.groups),
+                (group for listing in listings for group in listing.groups),
                 key=lambda group: natural_key(group.name),
             )
         ),
-        tuple(line for piece in listings for line in piece.remarks),
-        tuple(line for piece in listings for line in piece.refused),
+        tuple(line for listing in listings for line in listing.remarks),
+        tuple(line for listing in listings for line in listing.excluded),
     )
 
 
@@ -310,6 +322,6 @@ def _relative(root: Path, path: Path) -> str:
 
 
 def join_names(names: Sequence[str], last: str = " and ") -> str:
-    """Names as text: "a, b and c". Of ten names or more, the first five and the number of the others."""
+    """Returns the names as text: "a, b and c". With ten names or more: the first five and the number of the others."""
     shown = [*names] if len(names) < 10 else [*names[:5], f"{len(names) - 5} more"]
     return last.join(([", ".join(shown[:-1])] if len(shown) > 1 else []) + shown[-1:])

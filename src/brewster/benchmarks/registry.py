@@ -1,10 +1,10 @@
-"""Reads public benchmarks from the user's own copies: every photo with its ground truth, paired by name.
+"""Reads public benchmarks from the user's own copies. Pairs each photo with its ground truth by file name.
 
 for benchmark in read_benchmark("sir2", Path("SIR2")):
-    print(benchmark.title, len(benchmark.cases), *benchmark.remarks, *benchmark.refused)
+    print(benchmark.title, len(benchmark.cases), *benchmark.remarks, *benchmark.excluded)
 
-`pairing` finds the pictures that belong together. This module names the cases, compares the sizes in the file headers,
-checks the number of pictures and draws the subset of the paper. A case that does not fit is listed in `refused`.
+The module `pairing` groups the files by name. This module makes a `Case` of each group, compares the image sizes in the
+file headers, checks the number of cases, and draws the paper's subset. `excluded` lists the files that cannot be used.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import Final, final
 from brewster.benchmarks.pairing import (
     SIR2_TREES,
     FolderListing,
-    PictureGroup,
+    ImageGroup,
     find_roles,
     find_split,
     find_subsets,
@@ -36,34 +36,34 @@ from brewster.errors import MissingExtra, PhotoError, UnreadablePhoto
 from brewster.photo import read_size
 
 PAPER_SEED: Final = 181
-"""Seed of `paper_draw`. The value is arbitrary: the number of pictures in the paper's average."""
+"""The seed of `paper_draw`. The value is arbitrary; 181 is also the number of images in the paper's average."""
 
-_RENDERED: Final = ("photo.jpg", "background.jpg", "reflection.jpg")
-_SCENES: Final = 20
-_SCALES: Final = {"0.25": "a quarter of the scale", "0.5": "half the scale", "2": "twice the scale"}
+_RENDERED_FILES: Final = ("photo.jpg", "background.jpg", "reflection.jpg")
+_MAX_SCENES: Final = 20
+"""Postcard and SolidObject have 20 scenes each. If a pattern finds more, the names do not identify the scenes."""
 
 
 @final
 @dataclass(frozen=True)
-class PictureFile:
-    """The location of a picture: a whole file, or `span` (offset, length) in bytes of a tar shard."""
+class ImageFile:
+    """The location of an encoded image: a whole file, or `span`, the (offset, length) in bytes within a tar shard."""
 
     path: Path
     span: tuple[int, int] | None = None
 
     def read(self) -> bytes:
-        """The encoded bytes of the picture.
+        """Returns the encoded bytes of the image.
 
         Raises:
-            UnreadablePhoto: the file is missing, not readable, or shorter than the span requires.
+            UnreadablePhoto: the file is missing, cannot be read, or ends before the end of the span.
         """
         try:
             return self._read()
         except OSError as error:
             raise UnreadablePhoto(
                 f"{self} cannot be read ({error.strerror or error})",
-                "expected the picture at the place where it was found",
-                "make the file readable and run again",
+                "expected a complete image file",
+                "restore the file or its permissions, and run again",
             ) from error
 
     def __str__(self) -> str:
@@ -75,7 +75,7 @@ class PictureFile:
             file.seek(offset)
             data = file.read(length)
         if len(data) < length:
-            raise OSError(f"it has {len(data)} of {length} bytes")
+            raise OSError(f"{len(data)} of {length} bytes are left")
         return data
 
 
@@ -84,85 +84,90 @@ class PictureFile:
 class Case:
     """A photo to separate, with its ground truth.
 
-    `name` is unique within the benchmark; reports and prediction folders use it. Cases of one `scene` show the same
-    objects, so they are not statistically independent; `scene` equals `name` if the scene is unknown. `relative_path` is
-    the photo's path relative to the benchmark folder, without suffix, with forward slashes. If `rendered`, the ground
-    truth is exact: transmission is the background without the glass, reflection is the light that the glass adds.
+    `name` is unique within the benchmark. Reports and folders of predictions use it. Cases with the same `scene` show the
+    same objects, so they are not statistically independent. `scene` equals `name` if the scene is unknown. `relative_path`
+    is the photo's path relative to the benchmark folder, without the suffix and with forward slashes. `ground_truth` is
+    the ground truth of the transmission, `reflection` that of the reflection. If `rendered` is true, both are exact:
+    `ground_truth` is the background without the glass, and `reflection` is the light that the glass adds.
     """
 
     benchmark: str
     name: str
     scene: str
     relative_path: str
-    photo: PictureFile
-    transmission: PictureFile
-    reflection: PictureFile | None = None
+    photo: ImageFile
+    ground_truth: ImageFile
+    reflection: ImageFile | None = None
     rendered: bool = False
 
 
 @final
 @dataclass(frozen=True)
 class Benchmark:
-    """Cases in natural order of their names (2 before 10); the order of the folder listing does not matter.
+    """The cases of a benchmark, in natural order of their names (2 before 10).
 
-    `expected` are the numbers of pictures that papers report. `remarks` are notes that are not failures. `refused` has
-    one line for each picture that was left out, with the reason.
+    `expected_counts` are the numbers of images that papers report. `remarks` are notes for the user. `excluded` has one
+    line for each file or case that is not used, with the reason.
     """
 
     name: str
     title: str
     cases: tuple[Case, ...]
-    expected: tuple[int, ...] = ()
+    expected_counts: tuple[int, ...] = ()
     remarks: tuple[str, ...] = ()
-    refused: tuple[str, ...] = ()
+    excluded: tuple[str, ...] = ()
 
 
 @final
 @dataclass(frozen=True)
 class BenchmarkLayout:
-    """A row of BENCHMARKS: its title ("" means the folder's name), the counts that papers report, and its reader.
+    """A row of BENCHMARKS: title ("" means the name of the folder), counts that papers report, and reader.
 
-    `scene` is set where the paper draws one case of each scene: it matches the part of a repacked file name that
-    identifies the scene.
+    `scene_pattern` is a regular expression. It matches the start of a file name that identifies the scene. It is set for
+    the benchmarks from which the paper draws one case per scene.
     """
 
     title: str
-    expected: tuple[int, ...]
+    expected_counts: tuple[int, ...]
     read: Callable[[str, Path], list[Benchmark]]
-    scene: str = ""
+    scene_pattern: str = ""
 
 
 def read_benchmark(name: str, folder: Path) -> list[Benchmark]:
-    """Reads a benchmark from a folder. Only file headers are decoded.
+    """Reads a benchmark from a folder. Decodes only the file headers.
 
     Returns:
-        One benchmark; for "sir2", one for each of its three subsets that the folder contains. An incomplete copy is
-        read as far as possible: see `remarks` and `refused`.
+        A list with one benchmark. For "sir2", a list with one benchmark for each of the three subsets in the folder.
+        If the copy is incomplete, `remarks` and `excluded` say what is missing.
 
     Raises:
-        PhotoError: the name is not in BENCHMARKS, or the folder is missing, empty or has another layout.
-        MissingExtra: a rendered set or an image format needs an extra that is not installed.
+        PhotoError: the name is not in BENCHMARKS, or the folder is missing or empty, or its layout is not supported.
+        MissingExtra: the extra for rendered sets or for the image format is not installed.
     """
     if name not in BENCHMARKS:
         close = difflib.get_close_matches(name.lower(), BENCHMARKS, 1)
         raise PhotoError(
             f"there is no benchmark {name!r}",
-            f"brewster reads {', '.join(BENCHMARKS)}",
-            f"did you mean {close[0]}?" if close else "for a folder of your own, use pairs=FOLDER",
+            f"expected one of {', '.join(BENCHMARKS)}",
+            f"did you mean {close[0]}?" if close else "use pairs=FOLDER for a folder of your own",
         )
     return BENCHMARKS[name].read(name, folder)
 
 
 def paper_draw(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ...]:
-    """The cases of the paper's protocol: one random case of each scene of Postcard and SolidObject, all of other sets.
+    """Draws the cases of the paper's protocol.
 
-    The paper's own draw is unpublished. This one takes, from the cases of a scene sorted by name, the choice of
-    Random("seed/benchmark/scene"). A scene's draw therefore does not depend on other scenes.
+    The paper does not publish its draw. This function draws one case of each scene with
+    `Random(f"{seed}/{benchmark}/{scene}").choice(...)` from the cases in natural order of their names. The draw of a scene
+    therefore does not depend on the other scenes.
+
+    Returns:
+        One random case of each scene of Postcard or SolidObject; all cases of any other benchmark.
 
     Raises:
-        PhotoError: the names do not identify the scenes.
+        PhotoError: the file names do not identify the scenes.
     """
-    if benchmark.name not in BENCHMARKS or not BENCHMARKS[benchmark.name].scene:
+    if benchmark.name not in BENCHMARKS or not BENCHMARKS[benchmark.name].scene_pattern:
         return benchmark.cases
     scenes: dict[str, list[Case]] = defaultdict(list)
     for case in benchmark.cases:
@@ -170,14 +175,14 @@ def paper_draw(benchmark: Benchmark, seed: int = PAPER_SEED) -> tuple[Case, ...]
     if any(case.scene == case.name for case in benchmark.cases):
         raise PhotoError(
             f"names such as {benchmark.cases[0].name!r} do not identify the scenes of {benchmark.title}",
-            "the paper's protocol draws one picture of each scene",
-            "use SIR2's original tree, or score the whole set without --paper",
+            "expected file names that begin with the scene, because the paper's protocol draws one case of each scene",
+            "use the original folders of SIR2, or run without --paper",
         )
     rng = {scene: Random(f"{seed}/{benchmark.name}/{scene}") for scene in sorted(scenes, key=natural_key)}  # noqa: S311
     return tuple(rng[scene].choice(scenes[scene]) for scene in rng)
 
 
-# --- the readers
+# --- readers of the layouts
 
 
 def _read_pairs(name: str, folder: Path) -> list[Benchmark]:
@@ -199,7 +204,7 @@ def _read_sir2(_: str, folder: Path) -> list[Benchmark]:
         raise PhotoError(
             f"{folder} contains no subset of SIR2",
             "expected folders whose names begin with Postcard, SolidObject and Wildscene",
-            "give their parent folder, or use postcard=, solidobject= or wildscene= for one subset",
+            "give the path of their parent folder, or use postcard=, solidobject= or wildscene= for one subset",
         )
     first, *others = [
         benchmark for name in SIR2_TREES if name in subsets for benchmark in _read_subset(name, folder)
@@ -209,41 +214,43 @@ def _read_sir2(_: str, folder: Path) -> list[Benchmark]:
 
 
 def _read_rendered(name: str, folder: Path) -> list[Benchmark]:
-    benchmark_name, cases, refused = _benchmark_name(name, folder), [], []
+    benchmark_name, cases, excluded = _benchmark_name(name, folder), [], []
     for key, files in _rendered_samples(folder):
-        if len(files) < len(_RENDERED):
-            refused.append(f"{key} is incomplete: {', '.join(_RENDERED)} are needed")
+        if len(files) < len(_RENDERED_FILES):
+            excluded.append(f"{key} is incomplete: expected {', '.join(_RENDERED_FILES)}")
             continue
         photo, background, reflection = files
         cases.append(
             Case(benchmark_name, key, key, f"{key}/photo", photo, background, reflection, rendered=True)
         )
-    return [_benchmark(name, folder, cases, FolderListing(refused=tuple(refused)))]
+    return [_make_benchmark(name, folder, cases, FolderListing(excluded=tuple(excluded)))]
 
 
-def _rendered_samples(folder: Path) -> list[tuple[str, list[PictureFile]]]:
-    """Name and files of each sample of a rendered set; missing files are left out."""
+def _rendered_samples(folder: Path) -> list[tuple[str, list[ImageFile]]]:
+    """Returns the name and the existing files of each sample of a rendered set."""
     try:
         from brewster.rendered.store import key, read_set  # noqa: PLC0415  (needs torch, an optional dependency)
 
         entries = list(read_set(folder))
     except ImportError as error:
         raise MissingExtra(
-            "torch is not installed", "reading a rendered set needs it", "run: pip install 'brewster[render]'"
+            "torch is not installed",
+            "expected torch, which reads rendered sets",
+            "run: pip install 'brewster[render]'",
         ) from error
     except (OSError, tarfile.TarError, ValueError) as error:
         raise _not_a_rendered_set(folder, str(error)) from error
     if not entries:
-        raise _not_a_rendered_set(folder, "no samples")
+        raise _not_a_rendered_set(folder, "it has no samples")
     return [
         (
             key(entry.index),
-            [PictureFile(entry.place, entry.spans[name]) for name in _RENDERED if name in entry.spans],
+            [ImageFile(entry.place, entry.spans[name]) for name in _RENDERED_FILES if name in entry.spans],
         )
         if entry.spans
         else (
             key(entry.index),
-            [PictureFile(entry.place / name) for name in _RENDERED if (entry.place / name).exists()],
+            [ImageFile(entry.place / name) for name in _RENDERED_FILES if (entry.place / name).exists()],
         )
         for entry in entries
     ]
@@ -252,81 +259,93 @@ def _rendered_samples(folder: Path) -> list[tuple[str, list[PictureFile]]]:
 def _not_a_rendered_set(folder: Path, reason: str) -> PhotoError:
     return PhotoError(
         f"{folder} is not a rendered set ({reason})",
-        "expected 000000/, 000001/ ... or shard-000000.tar, as `brewster render` writes them",
-        "give the output folder of `brewster render`",
+        "expected the folders 000000, 000001 ... or files such as shard-000000.tar",
+        "give the path of an output folder of `brewster render`",
     )
 
 
-# --- from listings to cases
+# --- from groups of files to cases
 
 
-def _from_listing(name: str, folder: Path, found: FolderListing) -> Benchmark:
-    scenes, remarks = _scenes(BENCHMARKS[name], found.groups)
+def _from_listing(name: str, folder: Path, listing: FolderListing) -> Benchmark:
+    scenes, remarks = _find_scenes(BENCHMARKS[name], listing.groups)
     benchmark_name = _benchmark_name(name, folder)
     cases = [
         _to_case(benchmark_name, scene, group, folder)
-        for scene, group in zip(scenes, found.groups, strict=True)
+        for scene, group in zip(scenes, listing.groups, strict=True)
     ]
-    return _benchmark(name, folder, cases, replace(found, remarks=(*found.remarks, *remarks)))
+    return _make_benchmark(name, folder, cases, replace(listing, remarks=(*listing.remarks, *remarks)))
 
 
-def _to_case(benchmark_name: str, scene: str, group: PictureGroup, root: Path) -> Case:
+def _to_case(benchmark_name: str, scene: str, group: ImageGroup, root: Path) -> Case:
     return Case(
         benchmark_name,
         group.name,
         scene,
         group.photo.relative_to(root).with_suffix("").as_posix(),
-        PictureFile(group.photo),
-        PictureFile(group.transmission),
-        PictureFile(group.reflection) if group.reflection else None,
+        ImageFile(group.photo),
+        ImageFile(group.transmission),
+        ImageFile(group.reflection) if group.reflection else None,
     )
 
 
-def _scenes(row: BenchmarkLayout, groups: Sequence[PictureGroup]) -> tuple[list[str], list[str]]:
-    """The scene of each group, and remarks. If one name does not identify its scene, every group is its own scene."""
-    if not row.scene or any(group.scene for group in groups):
+def _find_scenes(layout: BenchmarkLayout, groups: Sequence[ImageGroup]) -> tuple[list[str], list[str]]:
+    """Returns the scene of each group, and remarks.
+
+    If one name does not identify a scene, all names are used as scenes.
+    """
+    if not layout.scene_pattern or any(group.scene for group in groups):
         return [group.scene or group.name for group in groups], []
-    matched = [match[0] for group in groups if (match := re.match(row.scene, group.name))]
-    if len(matched) == len(groups) and len(set(matched)) <= _SCENES:
+    matched = [match[0] for group in groups if (match := re.match(layout.scene_pattern, group.name))]
+    if len(matched) == len(groups) and len(set(matched)) <= _MAX_SCENES:
         return matched, []
     return [group.name for group in groups], [
-        "the names do not identify the scenes, so the paper's draw is not possible"
+        "the file names do not identify the scenes, so the paper's draw is not possible"
     ]
 
 
-def _benchmark(name: str, folder: Path, cases: Sequence[Case], found: FolderListing) -> Benchmark:
-    row = BENCHMARKS[name]
-    mismatches = {case.name: mismatch for case in cases if (mismatch := _mismatch(case))}
+def _make_benchmark(name: str, folder: Path, cases: Sequence[Case], listing: FolderListing) -> Benchmark:
+    """Returns the benchmark without the cases whose images cannot be read or differ in size."""
+    layout = BENCHMARKS[name]
+    unusable = {case.name: reason for case in cases if (reason := _unusable_reason(case))}
     valid = tuple(
-        case for case in sorted(cases, key=lambda case: natural_key(case.name)) if case.name not in mismatches
+        case for case in sorted(cases, key=lambda case: natural_key(case.name)) if case.name not in unusable
     )
-    title = row.title or _folder_name(folder)
+    title = layout.title or _folder_name(folder)
     return Benchmark(
         _benchmark_name(name, folder),
         title,
         valid,
-        row.expected,
-        (*_count_remark(len(valid), title, row.expected), *_missing_reflections(valid), *found.remarks),
-        (*found.refused, *mismatches.values()),
+        layout.expected_counts,
+        (
+            *_count_remark(len(valid), layout.expected_counts),
+            *_missing_reflections(valid),
+            *listing.remarks,
+        ),
+        (*listing.excluded, *unusable.values()),
     )
 
 
-def _count_remark(count: int, title: str, expected: Sequence[int]) -> list[str]:
-    if not expected or count in expected:
+def _count_remark(count: int, expected_counts: Sequence[int]) -> list[str]:
+    if not expected_counts or count in expected_counts:
         return []
-    known = " or ".join(map(str, expected))
-    return [f"{count} {'picture' if count == 1 else 'pictures'}, where {title} has {known}"]
+    return [
+        f"found {count} {'image' if count == 1 else 'images'}, expected {' or '.join(map(str, expected_counts))}"
+    ]
 
 
 def _missing_reflections(cases: Sequence[Case]) -> list[str]:
-    without = [case.name for case in cases if case.reflection is None]
-    if not without or len(without) == len(cases):
+    missing = [case.name for case in cases if case.reflection is None]
+    if not missing or len(missing) == len(cases):
         return []
-    return [f"no reflection ground truth for {join_names(without)}"]
+    return [f"there is no ground truth of the reflection for {join_names(missing)}"]
 
 
 def _benchmark_name(name: str, folder: Path) -> str:
-    """The benchmark's identifier: a known set's name, else the folder's, made distinct from known sets and "average"."""
+    """Returns the name of the benchmark in results: `name` if its row has a title, else the name of the folder.
+
+    If the name of the folder is "average" or a name with a title, the result is "{name}-{folder}". So it is unique.
+    """
     if BENCHMARKS[name].title:
         return name
     safe = re.sub(r"[^A-Za-z0-9_.-]+", "-", _folder_name(folder)).strip("-.") or name
@@ -338,15 +357,15 @@ def _folder_name(folder: Path) -> str:
     return Path(os.path.abspath(folder)).name  # noqa: PTH100  (do not resolve links)
 
 
-def _mismatch(case: Case) -> str:
-    """Why a case cannot be scored according to the headers of its files, or ""."""
-    files = {"photo": case.photo, "truth": case.transmission, "reflection": case.reflection}
+def _unusable_reason(case: Case) -> str:
+    """Compares the sizes in the file headers. Returns the reason why the case cannot be scored, or "" if it can."""
+    files = {"photo": case.photo, "ground truth": case.ground_truth, "reflection": case.reflection}
     sizes: dict[str, tuple[int, int]] = {}
     for role, file in files.items():
         try:
             sizes |= {role: read_size(file.read())} if file else {}
         except PhotoError as error:
-            return f"{case.relative_path}: the {role} cannot be used: {error}"
+            return f"{case.relative_path}: the {role} cannot be read: {error}"
     different = (
         _size_mismatch(case.relative_path, role, sizes) for role in sizes if sizes[role] != sizes["photo"]
     )
@@ -354,15 +373,12 @@ def _mismatch(case: Case) -> str:
 
 
 def _size_mismatch(path: str, role: str, sizes: Mapping[str, tuple[int, int]]) -> str:
-    photo, truth = sizes["photo"], sizes[role]
-    across, down = truth[0] / photo[0], truth[1] / photo[1]
-    sizes_text = f"{path}: photo {photo[0]}x{photo[1]}, {role} {truth[0]}x{truth[1]}"
-    if abs(across / down - 1) <= 0.01 < abs(across - 1):
-        times = _SCALES.get(f"{across:.2g}", f"{across:.3g} times the scale")
-        return f"{sizes_text}: the {role} is at {times}"
-    return (
-        f"{sizes_text}: {'one of them is rotated' if truth == photo[::-1] else 'their sizes must be equal'}"
-    )
+    photo, layer = sizes["photo"], sizes[role]
+    scale_x, scale_y = layer[0] / photo[0], layer[1] / photo[1]
+    sizes_text = f"{path}: the photo is {photo[0]}x{photo[1]}, the {role} is {layer[0]}x{layer[1]}"
+    if abs(scale_x / scale_y - 1) <= 0.01 < abs(scale_x - 1):
+        return f"{sizes_text}: the {role} is resized by the factor {scale_x:.3g}"
+    return f"{sizes_text}: {'one of them is rotated' if layer == photo[::-1] else 'expected equal sizes'}"
 
 
 # --- the table
@@ -378,4 +394,4 @@ BENCHMARKS: Final[dict[str, BenchmarkLayout]] = {
     "pairs": BenchmarkLayout("", (), _read_pairs),
     "rendered": BenchmarkLayout("", (), _read_rendered),
 }
-"""What `read_benchmark` reads, by name. docs/evaluation.md describes the folders."""
+"""name -> layout of the benchmarks that `read_benchmark` supports. docs/evaluation.md describes the folders."""

@@ -241,7 +241,7 @@ class _EvaluateCommand:
 
     def run(self) -> bool:
         """Scores and prints the tables; returns whether no picture was left out and no method failed."""
-        from brewster.evaluate.evaluation import PAGE  # noqa: PLC0415
+        from brewster.evaluate.evaluation import REPORT_FILE  # noqa: PLC0415
         from brewster.evaluate.evaluation import evaluate as measure  # noqa: PLC0415
 
         config, benchmarks, methods = self._config(), self._read_benchmarks(), self._methods()
@@ -259,14 +259,14 @@ class _EvaluateCommand:
                 config,
                 self.out,
                 workers=self.workers,
-                shown=self.pictures,
+                max_report_cases=self.pictures,
                 on_progress=on_progress,
             )
         if self.as_json:
             write_out(f"{json.dumps(results)}\n".encode())
         elif not self.quiet:
             print_tables(results)
-            print_status(f"results are in {self.out}; {self.out / PAGE} shows the pictures")
+            print_status(f"results are in {self.out}; {self.out / REPORT_FILE} shows the pictures")
         return print_failures(results, quiet=self.quiet) and is_complete
 
     def _read_benchmarks(self) -> list[Benchmark]:
@@ -311,9 +311,9 @@ def print_remarks(benchmarks: Sequence[Benchmark], *, quiet: bool) -> bool:
     for benchmark in benchmarks:
         for remark in () if quiet else benchmark.remarks:
             print_status(f"{benchmark.title}: {remark}")
-        for reason in benchmark.refused:
+        for reason in benchmark.excluded:
             print_error(f"{benchmark.title}: {reason}")
-    return not any(benchmark.refused for benchmark in benchmarks)
+    return not any(benchmark.excluded for benchmark in benchmarks)
 
 
 def print_tables(results: Results) -> None:

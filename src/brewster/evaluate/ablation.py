@@ -1,10 +1,10 @@
-"""Ablation studies: trains a model for each choice of one value of a training recipe, and compares their scores.
+"""Ablation studies: trains one model for each choice of a recipe value, and compares the scores of the models.
 
     study = read_study(Path("recipes/ablations/mixing.toml"))
     ablate(study, study.open_benchmarks(), Path("out/ablations/mixing"))
 
-A study is a TOML file with a base recipe, the value, its choices and the benchmarks. The first choice is the reference
-of the comparisons. A stopped study resumes both training and evaluation.
+A study is a TOML file with a base recipe, the key of the value, its choices and the benchmarks. A stopped study can be
+resumed, in the training and in the evaluation.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from brewster.training.trainers import open_trainer
 
 Choice = str | int | float | bool
 AblationCallback = Callable[[str, int, int, Mapping[str, float], bool], None]
-"""Called with (choice, step, steps, losses, is_logged) after each training step."""
+"""Called with (label, step, steps, losses, is_logged) after each training step; `label` names the choice."""
 
-PLOT: Final = "plot.png"
+PLOT_FILE: Final = "plot.png"
 
 
 def _all_different(choices: list[Choice]) -> list[Choice]:
@@ -42,7 +42,7 @@ def _all_different(choices: list[Choice]) -> list[Choice]:
 
 @final
 class AblationStudy(FrozenModel):
-    """An ablation: one value of a training recipe takes each of several choices; everything else stays the same."""
+    """An ablation study: one value of a training recipe takes several choices, and the other values stay the same."""
 
     base: Path
     """The training recipe to change, relative to this file."""
@@ -63,7 +63,7 @@ class AblationStudy(FrozenModel):
     """The benchmarks to score on: a name and a folder relative to BREWSTER_DATA for each."""
 
     def label(self, choice: Choice) -> str:
-        """The name of a choice in tables: "mixing 8-bit"."""
+        """Returns the name of a choice in tables, such as "mixing 8-bit"."""
         return f"{self.value.rpartition('.')[2]} {str(choice).replace('/', ' ')}"
 
     def open_benchmarks(self) -> list[Benchmark]:
@@ -80,7 +80,7 @@ class AblationStudy(FrozenModel):
 
 
 def read_study(path: Path) -> AblationStudy:
-    """Reads and validates a study.
+    """Reads and validates a study. The path `base` is resolved relative to the folder of the file.
 
     Raises:
         RecipeError: the file is missing or not TOML, or its values are missing, unknown or invalid.
@@ -97,23 +97,23 @@ def ablate(
     workers: int = 1,
     on_progress: AblationCallback = lambda _choice, _step, _steps, _numbers, _logged: None,
 ) -> Results:
-    """Trains and evaluates every choice. `out` gets one folder per choice and the files that `evaluate` writes.
+    """Trains and evaluates every choice. Writes one folder per choice into `out`, and the files of `evaluate`.
 
-    If all choices are numbers, plot.png shows the metrics against them.
+    If all choices are numbers, plot.png shows each metric as a function of the choice.
 
     Args:
         study: the definition of the study.
         benchmarks: the benchmarks to score on, such as `study.open_benchmarks()`.
         out: a folder for this study only.
-        workers: number of processes that score in parallel.
+        workers: the number of processes that score in parallel.
         on_progress: called after each training step.
 
     Returns:
-        The results of `evaluate`; each choice is a method.
+        The results of `evaluate`. Each choice is a method.
 
     Raises:
         RecipeError: the base recipe or the value is invalid, or data is missing.
-        BrewsterError: as raised by training and `evaluate`.
+        BrewsterError: a training or the evaluation failed.
     """
     base = read_recipe(study.base)
     recipes = {study.label(choice): with_value(base, study.value, choice) for choice in study.choices}
@@ -132,19 +132,22 @@ def ablate(
         choice for choice in study.choices if isinstance(choice, int | float) and not isinstance(choice, bool)
     ]
     if len(numbers) == len(study.choices):
-        write_atomically(out / PLOT, _plot(study, numbers, results), overwrite=True)
+        write_atomically(out / PLOT_FILE, _plot(study, numbers, results), overwrite=True)
     return results
 
 
 def _train(recipe: CompactRecipe | LoraRecipe, folder: Path, on_step: loop.StepCallback) -> Path:
-    """Trains a recipe and returns the path of its model. The trainer is freed on return, so that memory does not grow."""
+    """Trains a recipe and returns the path of its model. A local trainer is freed on return, so that memory does not grow."""
     trainer = open_trainer(recipe)
     loop.run(trainer, folder, on_step)
     return trainer.export(folder)
 
 
 def _plot(study: AblationStudy, numbers: Sequence[float], results: Results) -> bytes:
-    """A PNG plot of PSNR, SSIM and LPIPS against the numbers: one line per set, intervals as bands."""
+    """Returns a PNG plot: PSNR, SSIM and LPIPS as functions of the choice.
+
+    There is one line for each benchmark and one for the average. The bands are the 95 % intervals.
+    """
     import io  # noqa: PLC0415
 
     from matplotlib.figure import Figure  # noqa: PLC0415  (only needed for plots)
@@ -164,6 +167,7 @@ def _plot(study: AblationStudy, numbers: Sequence[float], results: Results) -> b
         entry = results["metrics"][metric]
         panel.set_title(f"{entry['title']}{', ' + entry['unit'] if entry['unit'] else ''}")
         panel.set_xlabel(study.value)
+        # Choices such as 0, 10, ... 1000 need a logarithmic axis that is linear near 0.
         if len(numbers) > 2 and max(numbers) > 20 * max(1, sorted(numbers)[1]):
             panel.set_xscale("symlog", linthresh=max(1, sorted(numbers)[1]))
             panel.set_xticks(numbers, [f"{number:g}" for number in numbers])

@@ -1,4 +1,4 @@
-"""The settings of an evaluation. Every setting that changes a number is printed in every report."""
+"""The settings of an evaluation. Each report lists all settings that change the scores."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ class EvaluationConfig:
 
     metrics: tuple[str, ...] = DEFAULT_METRICS
     size: int | None = None
-    """The shorter side in px to which larger pictures are downscaled first; None keeps the original size."""
+    """Larger images are downscaled to this shorter side in px before the methods run. None: the original size."""
     quality: Quality = "standard"
     thresholds: tuple[float, ...] = (DEFAULT_THRESHOLD,)
-    """Thresholds of the reflection region, between 0 and 1. Each one gives its own columns."""
+    """Thresholds of the reflection region, as fractions of full scale, between 0 and 1. Each one has its own columns."""
     paper: bool = False
-    """Whether to report the paper's subset too (one picture of each scene), and to average over it."""
+    """Whether to report the paper's subset (one case of each scene) too, and to average over it."""
 
     def __post_init__(self) -> None:
-        """Raises BrewsterError for unknown metrics and invalid values."""
+        """Raises BrewsterError if a metric is unknown or a value is invalid."""
         for name in self.metrics:
             find_metric(name)
         if not self.metrics or len(set(self.metrics)) < len(self.metrics):
             raise BrewsterError(
                 f"the metrics are {', '.join(self.metrics) or 'none'}",
-                "expected each metric once",
+                "expected at least one metric, each of them once",
                 f"choose from {', '.join(METRICS)}",
             )
         columns = {f"{threshold:g}" for threshold in self.thresholds}
-        is_possible = all(0 < threshold < 1 for threshold in self.thresholds)
-        if not is_possible or not 0 < len(self.thresholds) == len(columns):
+        are_valid = all(0 < threshold < 1 for threshold in self.thresholds)
+        if not are_valid or not 0 < len(self.thresholds) == len(columns):
             raise BrewsterError(
-                f"the region's thresholds are {self.thresholds}",
-                "expected numbers between 0 and 1 that differ in their first six digits",
+                f"the thresholds of the reflection region are {self.thresholds}",
+                "expected numbers between 0 and 1 whose first six digits differ",
                 "choose other numbers",
             )
         if self.size is not None and self.size < 1:
@@ -54,7 +54,7 @@ class EvaluationConfig:
             )
 
     def columns(self) -> dict[str, Metric]:
-        """column -> metric. With several thresholds, a metric of the region has one column per threshold."""
+        """Returns column -> metric. With several thresholds, a metric of the region has one column per threshold."""
         columns = {}
         for name in self.metrics:
             metric = METRICS[name]
@@ -67,25 +67,25 @@ class EvaluationConfig:
         return columns
 
     def threshold(self, column: str) -> float:
-        """The threshold of the reflection region that a column uses."""
-        _, _, stated = column.partition("@")
-        return next(t for t in self.thresholds if f"{t:g}" == stated) if stated else self.thresholds[0]
+        """Returns the threshold of the reflection region for a column such as "psnr_region@0.05"."""
+        _, _, suffix = column.partition("@")
+        return next(t for t in self.thresholds if f"{t:g}" == suffix) if suffix else self.thresholds[0]
 
-    def choices(self) -> list[str]:
-        """Every setting as a sentence."""
+    def describe(self) -> list[str]:
+        """Returns one or more sentences for each setting."""
         size = (
-            "Pictures are compared at the size of the ground truth; nothing is resized."
+            "Images are compared at the size of the ground truth; nothing is resized."
             if self.size is None
-            else f"Pictures with a shorter side of more than {self.size} px are downscaled to it, photo and ground truth alike, "
-            "by area means in linear light, before any method runs. Smaller pictures keep their size."
+            else f"If the shorter side is longer than {self.size} px, photo and ground truth are downscaled to it before any "
+            "method runs, by area means in linear light. Smaller images keep their size."
         )
         region = _REGION.format(" or ".join(f"{threshold:g}" for threshold in self.thresholds))
-        quality = f'Models run with the same Separator as for users, at quality "{self.quality}".'
+        quality = f'Models run as in the command "brewster PHOTO", at quality "{self.quality}".'
         return [
             size,
             _VALUES,
             _PAIRS,
-            _NOTHING,
+            _BASELINE,
             quality,
             _IDENTICAL,
             region,
@@ -95,21 +95,23 @@ class EvaluationConfig:
 
 
 _VALUES: Final = (
-    "Metrics are computed on 8-bit sRGB values with three channels. Grey is repeated, alpha is dropped, embedded profiles "
-    "are converted. No border is cropped unless the metric says so."
+    "Metrics are computed on 8-bit sRGB values with three channels. Grey images are repeated in all channels, alpha is "
+    "dropped, and embedded profiles are converted. The border is included unless the definition of the metric says otherwise."
 )
-_PAIRS: Final = "Pictures are paired by name. A prediction of another size than the ground truth is a failure; it is not resized."
-_NOTHING: Final = '"input (unprocessed)" is the photo itself as transmission, and black as reflection.'
-_IDENTICAL: Final = f"The PSNR of identical pictures, which is infinite, counts as {IDENTICAL_DB:g} dB."
+_PAIRS: Final = "Images are paired by name. A prediction is never resized: it fails if its size differs from that of the ground truth."
+_BASELINE: Final = (
+    '"input (unprocessed)" is the baseline: its transmission is the photo itself, its reflection is black.'
+)
+_IDENTICAL: Final = f"The PSNR of identical images, which is infinite, counts as {IDENTICAL_DB:g} dB."
 _REGION: Final = (
-    "The reflection region is where photo and ground truth differ by more than {} of full scale (the largest difference of "
-    "the channels, averaged over 7x7 px). Pictures without such a region have no score there."
+    "The reflection region contains the pixels where photo and ground truth differ by more than {} of full scale (the largest "
+    "difference of the channels, averaged over 7x7 px). Images without such pixels have no score in the region."
 )
 _INTERVALS: Final = (
-    f"Intervals are 95 %, from {RESAMPLES:,} bootstrap resamples of whole scenes within each benchmark. Differences "
-    "are paired by picture. The mean of a method is over the pictures on which it did not fail; their number is printed."
+    f"Confidence intervals are 95 %, from {RESAMPLES:,} bootstrap resamples of whole scenes within each benchmark. Differences "
+    "are paired by image. The mean of a method is over the images on which it did not fail. The tables show their number."
 )
 _DRAW: Final = (
-    "The paper draws one picture of each scene of Postcard and SolidObject; its draw is unpublished. Ours uses the seed "
-    f"{PAPER_SEED} and is listed in results.json. The average is over the paper's five sets, with the drawn pictures."
+    "The paper draws one image of each scene of Postcard and SolidObject, and does not publish its draw. This draw uses the "
+    f"seed {PAPER_SEED} and is listed in results.json. The average is over the paper's five benchmarks, with the drawn images."
 )

@@ -1,4 +1,4 @@
-"""Runs a complete evaluation: scores every method on every benchmark, and writes results, tables and an HTML report.
+"""Runs an evaluation: scores every method on every benchmark, and writes results, tables and an HTML report.
 
 benchmarks = read_benchmark("nature20", Path("nature20"))
 methods = [IdentityBaseline(), PredictionFolder("RDNet", Path("rdnet"))]
@@ -34,8 +34,9 @@ from brewster.files import write_atomically
 from brewster.metrics import IDENTICAL_DB
 from brewster.photo import Photo
 
-RESULTS, PAGE, INPUTS = "results.json", "report.html", "inputs"
-PICTURES_SHOWN: Final = 50
+RESULTS_FILE, REPORT_FILE, INPUTS_FOLDER = "results.json", "report.html", "inputs"
+MAX_REPORT_CASES: Final = 50
+"""The default maximum of cases per benchmark in the report."""
 
 
 def evaluate(
@@ -45,48 +46,49 @@ def evaluate(
     out: Path,
     *,
     workers: int = 1,
-    shown: int = PICTURES_SHOWN,
+    max_report_cases: int = MAX_REPORT_CASES,
     on_progress: ScoreCallback = lambda _done, _total, _row: None,
 ) -> Results:
-    """Scores and writes results.json, tables.md, table.tex, table.csv and report.html into `out`.
+    """Scores the methods. Writes results.json, tables.md, table.tex, table.csv and report.html into `out`.
 
-    With `config.size`, the reduced photos are written into `out`/inputs. Each picture is read and decoded once. There are
-    two exceptions: exclusive methods, which read the cases again, and the pictures that the report shows of a benchmark
-    with more than `shown` cases or of an earlier run.
+    With `config.size`, it also writes the downscaled photos into `out`/inputs. Each image is read and decoded once, with
+    three exceptions. Exclusive methods read the cases again. The report reads the images of a case again if the benchmark
+    has more than `max_report_cases` cases, or if an earlier run scored the case.
 
     Args:
-        benchmarks: as `read_benchmark` returns them.
-        methods: in the order of the tables; the baseline belongs first.
+        benchmarks: the benchmarks, as `read_benchmark` returns them.
+        methods: the methods, in the order of the tables. The first one should be the baseline.
         config: the settings of the evaluation.
         out: a folder for this evaluation only. A stopped run is resumed from its files.
-        workers: number of processes that score in parallel.
-        shown: number of cases of each benchmark in the report: the worst of the first method that is not the baseline.
+        workers: the number of processes that score in parallel.
+        max_report_cases: the maximum of cases of each benchmark in the report. They are the cases with the worst scores of
+            the first method that is not the baseline.
         on_progress: called after each new row.
 
     Returns:
         The content of results.json.
 
     Raises:
-        BrewsterError: no case or no method, shared names, ambiguous predictions, the paper's draw is not possible, or an
-            optional dependency is missing.
+        BrewsterError: there is no case or no method, names are not unique, an image matches two cases, the file names do
+            not identify the scenes for the paper's draw, or an optional dependency is missing.
         TargetError: `out` cannot be written.
     """
     check(benchmarks, methods, config)
     cases = [case for part in benchmarks for case in part.cases]
     with TemporaryDirectory(prefix="brewster-report-") as folder:
-        complete = frozenset(part.name for part in benchmarks if len(part.cases) <= shown)
-        tiles = _TileCache(Path(folder), complete, config, out / INPUTS)
+        complete = frozenset(part.name for part in benchmarks if len(part.cases) <= max_report_cases)
+        tiles = _TileCache(Path(folder), complete, config, out / INPUTS_FOLDER)
         rows = score(
-            benchmarks, methods, config, out, workers=workers, on_progress=on_progress, on_decoded=tiles
+            benchmarks, methods, config, out, workers=workers, on_progress=on_progress, on_case_scored=tiles
         )
         if config.size:
-            _write_missing_inputs(cases, config.size, out / INPUTS)
+            _write_missing_inputs(cases, config.size, out / INPUTS_FOLDER)
         results = summarise(benchmarks, methods, config, rows)
         for method in methods:
             if remarks := list(_method_remarks(method, cases, rows)):
                 results["methods"][method.name]["remark"] = "; ".join(remarks)
-        _write(results, out)
-        write_report(results, _page_cases(cases, methods, rows, shown, tiles), out / PAGE)
+        _write_tables(results, out)
+        write_report(results, _report_cases(cases, methods, rows, max_report_cases, tiles), out / REPORT_FILE)
     return results
 
 
@@ -94,7 +96,8 @@ def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: Ev
     """Checks everything that can be checked before the evaluation starts.
 
     Raises:
-        BrewsterError: see `evaluate`.
+        BrewsterError: there is no case or no method, names are not unique, an image matches two cases, or the file names
+            do not identify the scenes for the paper's draw.
     """
     check_names(methods)
     names = [part.name for part in benchmarks]
@@ -106,11 +109,11 @@ def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: Ev
                 "rename one of the folders",
             )
     if not any(part.cases for part in benchmarks):
-        refused = [reason for part in benchmarks for reason in part.refused]
+        reasons = [reason for part in benchmarks for reason in part.excluded]
         raise PhotoError(
-            f"there is no pair in {', '.join(names) or 'no benchmark'}",
+            f"there is no case in {', '.join(names) or 'no benchmark'}",
             "expected photos with their ground truth",
-            "; ".join(refused[:5]) or "give a folder with pairs",
+            "; ".join(reasons[:5]) or "choose a folder with photos and their ground truth",
         )
     if config.paper:
         paper_draws(benchmarks)
@@ -121,24 +124,27 @@ def check(benchmarks: Sequence[Benchmark], methods: Sequence[Method], config: Ev
 
 
 def _method_remarks(method: Method, cases: Sequence[Case], rows: Sequence[ScoreRow]) -> Iterator[str]:
-    """Signs that a prediction folder is not what it should be: copies of the ground truth, or unused pictures."""
+    """Yields a remark if predictions of a folder equal the ground truth, or if images in the folder belong to no case."""
     if not isinstance(method, PredictionFolder):
         return
-    perfect = [row for row in rows if row.scores.get("psnr") == IDENTICAL_DB]
-    trivial = {row.id[:2] for row in perfect if row.method == BASELINE}
-    copied = [row for row in perfect if row.method == method.name and row.id[:2] not in trivial]
+    identical = [row for row in rows if row.scores.get("psnr") == IDENTICAL_DB]
+    unchanged = {row.id[:2] for row in identical if row.method == BASELINE}
+    copied = [row for row in identical if row.method == method.name and row.id[:2] not in unchanged]
     if copied:
-        yield f"its prediction equals the ground truth on {_pictures(len(copied))}: check the folder"
-    if unused := method.unused(cases):
-        yield f"{_pictures(unused)} of its folder {'fits' if unused == 1 else 'fit'} no case"
+        yield f"the predictions equal the ground truth for {_count_images(len(copied))}: check the folder"
+    if unmatched := method.count_unmatched(cases):
+        yield f"{_count_images(unmatched)} in the folder {'matches' if unmatched == 1 else 'match'} no case"
 
 
-def _pictures(count: int) -> str:
-    return f"{count} {'picture' if count == 1 else 'pictures'}"
+def _count_images(count: int) -> str:
+    return f"{count} {'image' if count == 1 else 'images'}"
 
 
 def _write_missing_inputs(cases: Sequence[Case], size: int, folder: Path) -> None:
-    """The reduced photos of cases that were not decoded in this run. Unreadable photos are skipped: rows report them."""
+    """Writes the downscaled photos of the cases that this run did not decode.
+
+    Skips unreadable photos, because their rows have the error.
+    """
     for case in cases:
         path = _input_path(folder, case)
         if not path.exists():
@@ -150,9 +156,9 @@ def _input_path(folder: Path, case: Case) -> Path:
     return folder / case.benchmark / f"{case.name}.png"
 
 
-def _write(results: Results, out: Path) -> None:
+def _write_tables(results: Results, out: Path) -> None:
     tables = {
-        RESULTS: json.dumps(results, indent=1, allow_nan=False) + "\n",
+        RESULTS_FILE: json.dumps(results, indent=1, allow_nan=False) + "\n",
         "tables.md": f"{to_markdown(results)}\n{published_to_markdown(read_published())}",
         "table.tex": to_latex(results),
         "table.csv": to_csv(results),
@@ -161,16 +167,16 @@ def _write(results: Results, out: Path) -> None:
         write_atomically(out / name, text.encode(errors="backslashreplace"), overwrite=True)
 
 
-# --- pictures of the report
+# --- images of the report
 
 
 @final
 @dataclass(frozen=True)
 class _TileCache:
-    """Writes what needs decoded pictures while they are in memory: the report's tiles and the reduced photos.
+    """Writes the tiles of the report and the downscaled photos while a case is decoded.
 
-    Tiles are made for benchmarks of which the report shows every case. They are files, because a worker process makes
-    them, and so that memory does not grow with the number of cases.
+    It stores the tiles of `benchmarks`, of which the report shows all cases. They are stored in files, because worker
+    processes create them, and because memory must not grow with the number of cases.
     """
 
     folder: Path
@@ -179,7 +185,7 @@ class _TileCache:
     inputs: Path
 
     def __call__(self, truth: GroundTruth, predictions: Mapping[str, MethodOutput]) -> None:
-        """Called once for each case that is decoded for scoring."""
+        """Stores the tiles and the downscaled photo of a case. `score` calls this after it has scored the case."""
         case = truth.case
         if self.config.size:
             truth.photo.save(_input_path(self.inputs, case), overwrite=True)
@@ -187,52 +193,52 @@ class _TileCache:
             return
         images = _case_images(truth, predictions, self.config)
         width, height = truth.photo.size
-        texts = {BASELINE: photo_tiles(images)}
-        texts |= {name: method_tiles(images, name) for name in predictions if name != BASELINE}
-        for method, text in texts.items():
-            data = json.dumps([width, height, text], ensure_ascii=True).encode()
+        tiles = {BASELINE: photo_tiles(images)}
+        tiles |= {name: method_tiles(images, name) for name in predictions if name != BASELINE}
+        for method, html in tiles.items():
+            data = json.dumps([width, height, html], ensure_ascii=True).encode()
             self._path(case, method).write_bytes(data)
 
     def read(self, case: Case, methods: Sequence[str]) -> CaseTiles | None:
-        """The tiles of a case with those of the methods; None if one is missing."""
-        texts = {}
+        """Returns the stored tiles of a case and the methods, or None if a file is missing."""
+        tiles = {}
         width = height = 0
         for method in (BASELINE, *methods):
             path = self._path(case, method)
             if not path.exists():
                 return None
-            width, height, texts[method] = json.loads(path.read_bytes())
-        return CaseTiles(case.benchmark, case.name, (width, height), texts.pop(BASELINE), texts)
+            width, height, tiles[method] = json.loads(path.read_bytes())
+        return CaseTiles(case.benchmark, case.name, (width, height), tiles.pop(BASELINE), tiles)
 
     def _path(self, case: Case, method: str) -> Path:
         name = json.dumps([case.benchmark, case.name, method])
         return self.folder / f"{hashlib.sha256(name.encode()).hexdigest()}.json"
 
 
-def _page_cases(
+def _report_cases(
     cases: Sequence[Case],
     methods: Sequence[Method],
     rows: Sequence[ScoreRow],
     limit: int,
     tiles: _TileCache,
 ) -> Iterator[CaseTiles]:
-    """The cases of the report, one at a time. Those without cached tiles are read and decoded again."""
-    good = {row.id: row for row in rows if not row.error}
-    for case in _worst_cases(cases, methods, tiles.config, good, limit):
-        scored = {
+    """Yields the cases of the report. Cases without stored tiles are read and decoded again."""
+    scored_rows = {row.id: row for row in rows if not row.error}
+    for case in _worst_cases(cases, methods, tiles.config, scored_rows, limit):
+        method_rows = {
             method: row
             for method in methods
-            if method.name != BASELINE and (row := good.get((case.benchmark, case.name, method.name)))
+            if method.name != BASELINE and (row := scored_rows.get((case.benchmark, case.name, method.name)))
         }
-        cached = tiles.read(case, [method.name for method in scored])
+        cached = tiles.read(case, [method.name for method in method_rows])
         if cached:
             yield cached
             continue
         try:
             truth = GroundTruth.open(case, tiles.config)
         except PhotoError:
-            continue  # the tables name it
-        predictions = {method.name: get_prediction(truth, method, row) for method, row in scored.items()}
+            continue  # the row of the case has this error, and the tables show it
+        predictions = {method.name: get_prediction(truth, method, row) for method, row in method_rows.items()}
         yield to_tiles(_case_images(truth, predictions, tiles.config))
 
 
@@ -243,14 +249,14 @@ def _case_images(
     return CaseImages(
         benchmark=truth.case.benchmark,
         name=truth.case.name,
-        photo=truth.pictures["photo"],
-        truth=truth.pictures["transmission"],
+        photo=truth.images["photo"],
+        ground_truth=truth.images["transmission"],
         region=truth.region(config.thresholds[0]),
         predictions={name: output.transmission.srgb_8bit() for name, output in others.items()},
         reflections={
             name: output.reflection.srgb_8bit() for name, output in others.items() if output.reflection
         },
-        reflection_truth=truth.pictures.get("reflection"),
+        reflection_ground_truth=truth.images.get("reflection"),
     )
 
 
@@ -261,14 +267,15 @@ def _worst_cases(
     rows: Mapping[RowId, ScoreRow],
     limit: int,
 ) -> list[Case]:
-    """Up to `limit` cases of each benchmark, those first that the first method failed on, then its worst scores.
+    """Returns up to `limit` cases of each benchmark: first those with an error, then those with the worst scores.
 
-    The first method is the first that is not the baseline; the scores are those of the first metric.
+    Errors and scores are those of the first method that is not the baseline, in the first metric. Cases that no method
+    could score come last.
     """
     method = next((method.name for method in methods if method.name != BASELINE), BASELINE)
     column, metric = next(iter(config.columns().items()))
 
-    def merit(case: Case) -> float:
+    def sort_key(case: Case) -> float:
         row = rows.get((case.benchmark, case.name, method))
         if row is None:
             is_readable = any((case.benchmark, case.name, other.name) in rows for other in methods)
@@ -276,7 +283,7 @@ def _worst_cases(
         score = row.scores.get(column)
         return math.inf if score is None else score if metric.higher_is_better else -score
 
-    chosen = []
+    worst = []
     for name in dict.fromkeys(case.benchmark for case in cases):
-        chosen += sorted((case for case in cases if case.benchmark == name), key=merit)[:limit]
-    return chosen
+        worst += sorted((case for case in cases if case.benchmark == name), key=sort_key)[:limit]
+    return worst

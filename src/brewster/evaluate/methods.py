@@ -1,7 +1,7 @@
 """The methods to evaluate: the unprocessed input, brewster's models, and folders with predictions of other methods.
 
-A method predicts a transmission and, optionally, a reflection for a case. Its `key` identifies everything that the
-prediction depends on apart from the photo, so that a stored prediction can be reused.
+A method predicts a transmission and, optionally, a reflection for a case. Its `key` identifies all inputs of the prediction
+except the photo. If the key and the photo are unchanged, a stored prediction is reused.
 """
 
 from __future__ import annotations
@@ -29,10 +29,12 @@ from brewster.options import Device, Quality
 from brewster.photo import Photo
 
 BASELINE: Final = "input (unprocessed)"
-PREDICTION_FORMAT: Final = 1
-"""Increase it when the same model predicts other layers, so that stored predictions are made again; see test_house_formats."""
+PREDICTION_FORMAT_VERSION: Final = 1
+"""Increase this version when the code changes the predictions of a model. Stored predictions of other versions are not
+reused. test_house_formats checks it."""
 
 _STEM_SUFFIXES: Final = {"transmission": ("_t", "_l"), "reflection": ("_r",)}
+"""Ends of the file stems that published code writes: rdnet_t (RDNet), dsrnet_l (DSRNet)."""
 
 
 @final
@@ -40,7 +42,8 @@ _STEM_SUFFIXES: Final = {"transmission": ("_t", "_l"), "reflection": ("_r",)}
 class MethodOutput:
     """The layers that a method predicts for a photo.
 
-    `seconds` is the wall time of the prediction if it was measured, `digest` that of the files that store the layers.
+    `seconds` is the wall time of the prediction, if it was measured. `digest` is the SHA-256 of the files of the layers, if
+    they are stored.
     """
 
     transmission: Photo
@@ -50,17 +53,17 @@ class MethodOutput:
 
     @classmethod
     def decode(cls, data: Mapping[str, bytes]) -> MethodOutput:
-        """Decodes the encoded pictures of a prediction, by layer.
+        """Decodes a prediction from layer -> encoded bytes.
 
         Raises:
-            PhotoError: a picture cannot be decoded.
+            PhotoError: a layer cannot be decoded.
         """
-        photos = {layer: Photo.open(picture) for layer, picture in data.items()}
+        photos = {layer: Photo.open(encoded) for layer, encoded in data.items()}
         return cls(photos["transmission"], photos.get("reflection"), digest=_digest(data.values()))
 
 
 class Method(Protocol):
-    """A method that predicts layers. It must be picklable, because worker processes run it. A failure is an exception."""
+    """A method that predicts the layers of photos. It must be picklable, because worker processes run it."""
 
     @property
     def name(self) -> str:
@@ -69,57 +72,61 @@ class Method(Protocol):
 
     @property
     def exclusive(self) -> bool:
-        """Whether it needs all memory for itself. Exclusive methods run after the others, one at a time."""
+        """Whether the method needs the whole memory. Exclusive methods run after the others, one at a time."""
         ...
 
     def about(self) -> dict[str, str]:
-        """A description for results.json; the first entry is its kind."""
+        """Returns a description for results.json. The first entry is the kind of method."""
         ...
 
     def key(self, case: Case) -> str:
-        """Identifies everything that the prediction depends on, apart from the photo."""
+        """Returns a text that identifies all inputs of the prediction except the photo."""
         ...
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:
-        """The predicted layers for the photo of a case."""
+        """Returns the predicted layers for the photo of a case.
+
+        Raises:
+            BrewsterError: the method failed. Any other exception counts as a failure too.
+        """
         ...
 
     def cached(self, case: Case) -> MethodOutput | None:
-        """The stored prediction, or None if there is none."""
+        """Returns the stored prediction, or None if there is none."""
         ...
 
 
 @final
 @dataclass(frozen=True)
 class IdentityBaseline:
-    """The baseline: the photo itself as transmission, black as reflection."""
+    """The baseline: the transmission is the photo itself, the reflection is black."""
 
     name: str = BASELINE
     exclusive: Final = False
 
     def about(self) -> dict[str, str]:
-        """The kind of method."""
+        """Returns the kind of method."""
         return {"kind": "baseline"}
 
     def key(self, case: Case) -> str:  # noqa: ARG002  (the same for all cases)
-        """A constant."""
-        return "nothing"
+        """Returns a constant."""
+        return "identity"
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002
-        """The photo and a black reflection."""
+        """Returns the photo and a black reflection."""
         return MethodOutput(photo, photo.with_pixels(np.zeros_like(photo.pixels)))
 
     def cached(self, case: Case) -> MethodOutput | None:  # noqa: ARG002
-        """None: the baseline is not stored."""
+        """Returns None: the baseline is not stored."""
         return None
 
 
 @final
 @dataclass(frozen=True)
 class ModelMethod:
-    """A model, run with `Separator` as users run it. Its predictions are stored as PNG files in `folder`.
+    """A model, run by `Separator`. Its predictions are stored as PNG files in `folder`.
 
-    The folder has the layout that `PredictionFolder` reads.
+    `PredictionFolder` can read this folder.
     """
 
     name: str
@@ -130,25 +137,25 @@ class ModelMethod:
 
     @property
     def exclusive(self) -> bool:
-        """True for large image models: two of them do not fit on one GPU."""
+        """True for diffusion models, because a GPU has memory for only one of them."""
         return is_large(self.model)
 
     def about(self) -> dict[str, str]:
-        """The kind of method, the digest of the model file, and the quality."""
+        """Returns the kind of method, the digest of the model file, and the quality."""
         return {"kind": "model", "sha256": self._sha256, "quality": self.quality}
 
     def key(self, case: Case) -> str:  # noqa: ARG002  (the same for all cases)
-        """The model's digest, the quality, and the format of predictions."""
-        return f"{self._sha256} {self.quality} {PREDICTION_FORMAT}"
+        """Returns the digest of the model, the quality, and the version of predictions."""
+        return f"{self._sha256} {self.quality} {PREDICTION_FORMAT_VERSION}"
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:
         """Separates the photo and stores both layers.
 
         Returns:
-            The layers as decoded from the stored bytes, so that a stored prediction has the same scores.
+            The layers, decoded from the stored bytes. So new and stored predictions have the same scores.
 
         Raises:
-            BrewsterError: the model or the photo cannot be used, or the layers cannot be written.
+            BrewsterError: the model cannot be loaded, the separation failed, or the layers cannot be written.
         """
         separator = (_load_exclusive_separator if self.exclusive else _load_separator)(
             self.model, self.device
@@ -163,7 +170,7 @@ class ModelMethod:
         return replace(MethodOutput.decode(data), seconds=seconds)
 
     def cached(self, case: Case) -> MethodOutput | None:
-        """The stored layers, or None.
+        """Returns the stored layers, or None if there are none.
 
         Raises:
             PhotoError: a stored layer cannot be read.
@@ -188,7 +195,7 @@ class ModelMethod:
 
 @cache
 def _load_separator(model: str, device: Device) -> Separator:
-    """A model, loaded once per process."""
+    """Loads a model. The cache keeps it, so that each process loads it once."""
     return Separator.load(model, device=device)
 
 
@@ -196,7 +203,7 @@ _exclusive_separators: dict[tuple[str, Device], Separator] = {}
 
 
 def _load_exclusive_separator(model: str, device: Device) -> Separator:
-    """A large model. The previous one is freed first, because two of them do not fit into memory."""
+    """Loads a diffusion model if it is not loaded. Frees the previous model first, because memory is limited."""
     if (model, device) not in _exclusive_separators:
         _exclusive_separators.clear()
         gc.collect()
@@ -207,144 +214,147 @@ def _load_exclusive_separator(model: str, device: Device) -> Separator:
 @final
 @dataclass(frozen=True)
 class PredictionFolder:
-    """A folder with the predictions of another method, found by file name; docs/evaluation.md lists the accepted names."""
+    """A folder with the predictions of another method. docs/evaluation.md lists the accepted file names."""
 
     name: str
     folder: Path
     exclusive: Final = False
-    _hashed: dict[Case, dict[str, bytes]] = field(default_factory=dict, init=False, repr=False, compare=False)
-    """The bytes that `key` hashed last. `predict` decodes them, so that each file is read once."""
+    _last_read: dict[Case, dict[str, bytes]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+    """The files that `key` read last, by case. `predict` decodes these bytes, so that each file is read once."""
 
     def about(self) -> dict[str, str]:
-        """The kind of method."""
+        """Returns the kind of method."""
         return {"kind": "predictions"}
 
     def key(self, case: Case) -> str:
-        """The digest of the files, or the error message if they cannot be read."""
-        self._hashed.clear()
+        """Returns the digest of the files. If they cannot be read, returns the error message; `predict` then fails."""
+        self._last_read.clear()
         try:
-            data = self._hashed[case] = self._read(case)
+            data = self._last_read[case] = self._read(case)
         except BrewsterError as error:
             return str(error)
         return _digest(data.values())
 
     def predict(self, case: Case, photo: Photo) -> MethodOutput:  # noqa: ARG002  (the predictions exist already)
-        """Reads the pictures for a case.
+        """Reads and decodes the prediction for a case.
 
         Raises:
             PhotoError: a layer has no file or several, or a file cannot be read.
         """
-        return MethodOutput.decode(self._hashed.pop(case, {}) or self._read(case))
+        return MethodOutput.decode(self._last_read.pop(case, {}) or self._read(case))
 
     def cached(self, case: Case) -> MethodOutput | None:
-        """Same as `predict`.
+        """Returns the same as `predict`, because the predictions are stored in the folder.
 
         Raises:
-            PhotoError: as `predict`.
+            PhotoError: a layer has no file or several, or a file cannot be read.
         """
-        return MethodOutput.decode(self._hashed.pop(case, {}) or self._read(case))
+        return MethodOutput.decode(self._last_read.pop(case, {}) or self._read(case))
 
     def _read(self, case: Case) -> dict[str, bytes]:
         return {layer: _read(path) for layer, path in self.files(case).items()}
 
     def files(self, case: Case) -> dict[str, Path]:
-        """layer -> file for a case: the transmission and, if there is one, the reflection.
+        """Returns layer -> file for a case: the transmission and, if there is one, the reflection.
 
         Raises:
-            PhotoError: there is no transmission, or more than one file for a layer.
+            PhotoError: there is no transmission, or there are several files for a layer.
         """
         found = {layer: self._candidates(case, layer) for layer in ("transmission", "reflection")}
         for layer, paths in found.items():
             if len(paths) > 1:
                 raise PhotoError(
-                    f"{self.name} has {len(paths)} pictures for the {layer} of {case.benchmark}/{case.name}"
+                    f"{self.name} has {len(paths)} files for the {layer} of {case.benchmark}/{case.name}"
                     f" ({', '.join(sorted(path.name for path in paths))})",
-                    "expected one",
+                    "expected one file",
                     "remove the others",
                 )
         if not found["transmission"]:
             raise PhotoError(
-                f"{self.name} has no picture for {case.benchmark}/{case.name}",
+                f"{self.name} has no prediction for {case.benchmark}/{case.name}",
                 f"expected a file such as {self.folder / case.benchmark / case.name}.png",
                 "add or rename the file",
             )
         return {layer: path for layer, paths in found.items() for path in paths}
 
-    def unused(self, cases: Iterable[Case]) -> int:
-        """The number of pictures in the folder that belong to none of the cases: a hint that names differ."""
+    def count_unmatched(self, cases: Iterable[Case]) -> int:
+        """Returns the number of images in the folder that belong to no case. If it is not 0, file names may be wrong."""
         layers = ("transmission", "reflection")
         used = {path for case in cases for layer in layers for path in self._candidates(case, layer)}
-        return sum(map(len, self._pictures.values())) - len(used)
+        return sum(map(len, self._images.values())) - len(used)
 
     def check_pairing(self, cases: Sequence[Case]) -> None:
         """Checks that the folder can be paired with the cases by name.
 
         Raises:
-            PhotoError: the folder is missing, one picture fits two cases, or no picture fits any case.
+            PhotoError: the folder is missing, one image matches two cases, or no image matches a case.
         """
         if not self.folder.is_dir():
             raise PhotoError(
                 f"{self.folder} is not a folder",
-                f"{self.name} needs a folder with its pictures",
-                "give another path",
+                f"expected a folder with the predictions of {self.name}",
+                "choose another folder",
             )
-        owners: defaultdict[Path, list[Case]] = defaultdict(list)
+        cases_by_path: defaultdict[Path, list[Case]] = defaultdict(list)
         for case in cases:
             for path in self._candidates(case, "transmission"):
-                owners[path].append(case)
-        for path, claimed in owners.items():
-            if len(claimed) > 1:
-                first, second, *_ = (f"{case.benchmark}/{case.name}" for case in claimed)
+                cases_by_path[path].append(case)
+        for path, matches in cases_by_path.items():
+            if len(matches) > 1:
+                first, second, *_ = (f"{case.benchmark}/{case.name}" for case in matches)
                 raise PhotoError(
-                    f"{path} fits two cases of {self.name}, {first} and {second}",
-                    "expected one case for each picture",
-                    f"move the pictures into the folders {', '.join(sorted({str(self.folder / case.benchmark) for case in claimed}))}",
+                    f"{path} matches two cases, {first} and {second}",
+                    "expected one case for each image",
+                    f"move the images into the folders {', '.join(sorted({str(self.folder / case.benchmark) for case in matches}))}",
                 )
-        if not owners:
+        if not cases_by_path:
             example = f"{cases[0].benchmark}/{cases[0].name}" if cases else "a case"
             raise PhotoError(
-                f"no picture in {self.folder} has the name of a case",
-                f"{self.name} needs pictures such as {example}.png",
-                "rename them, or give another folder",
+                f"no image in {self.folder} has the name of a case",
+                f"expected images such as {example}.png",
+                "rename the images, or choose another folder",
             )
 
     def _candidates(self, case: Case, layer: str) -> set[Path]:
-        """The files of a layer, under any of the accepted names."""
+        """Returns the files of a layer, with any of the accepted names."""
         root = self.folder / case.benchmark
         root = root if root.is_dir() else self.folder
-        places = [root / f"{stem}.{layer}" for stem in (case.name, case.relative_path)]
-        places += [root / folder / case.name for folder in (layer, f"{layer}_layer")]
-        places += [root / case.name / name for name in self._suffixed_stems(root / case.name, layer)]
+        paths = [root / f"{stem}.{layer}" for stem in (case.name, case.relative_path)]
+        paths += [root / folder / case.name for folder in (layer, f"{layer}_layer")]
+        paths += [root / case.name / name for name in self._suffixed_stems(root / case.name, layer)]
         if layer == "transmission":
-            places += [root / case.name]
-        return {path for place in places for path in self._pictures.get(_normalised(place), ())}
+            paths += [root / case.name]
+        return {file for path in paths for file in self._images.get(_normalised(path), ())}
 
     def _suffixed_stems(self, folder: Path, layer: str) -> list[str]:
-        """Stems such as rdnet_t or dsrnet_l, if the method wrote a folder for each picture."""
+        """Returns the stems such as rdnet_t or dsrnet_l in a folder. Some methods write one folder for each photo."""
         return [stem for stem in self._stems.get(folder, ()) if stem.endswith(_STEM_SUFFIXES[layer])]
 
     @cached_property
-    def _pictures(self) -> dict[Path, list[Path]]:
-        """path without suffix -> the pictures at that path."""
+    def _images(self) -> dict[Path, list[Path]]:
+        """path without suffix -> image files with this path."""
         found: defaultdict[Path, list[Path]] = defaultdict(list)
-        for path in filter(_is_picture, walk(self.folder, _is_picture)):
+        for path in filter(_is_image, walk(self.folder, _is_image)):
             found[_normalised(path.with_suffix(""))].append(path)
         return dict(found)
 
     @cached_property
     def _stems(self) -> dict[Path, list[str]]:
+        """folder -> stems of its image files."""
         stems: defaultdict[Path, list[str]] = defaultdict(list)
-        for place in self._pictures:
-            stems[place.parent].append(place.name)
+        for path in self._images:
+            stems[path.parent].append(path.name)
         return dict(stems)
 
 
-def _is_picture(path: Path) -> bool:
+def _is_image(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
 def _normalised(path: Path) -> Path:
-    """The path in Unicode form NFC: some file systems store an accented letter as two characters."""
+    """Returns the path in Unicode form NFC. Some file systems store an accented letter as two characters."""
     return Path(unicodedata.normalize("NFC", str(path)))
 
 
@@ -354,33 +364,37 @@ def _read(path: Path) -> bytes:
     except OSError as error:
         raise PhotoError(
             f"{path} cannot be read ({error.strerror or error})",
-            "expected a readable picture",
+            "expected a readable image file",
             "make the file readable and run again",
         ) from error
 
 
 def _digest(data: Iterable[bytes]) -> str:
-    """One SHA-256 of several files."""
-    return hashlib.sha256(b"".join(hashlib.sha256(one).digest() for one in data)).hexdigest()
+    """Returns one SHA-256 for the contents of several files."""
+    return hashlib.sha256(b"".join(hashlib.sha256(content).digest() for content in data)).hexdigest()
 
 
 def check_names(methods: Sequence[Method]) -> None:
     """Checks that there is a method, and that the names are unique and valid as folder names.
 
     Raises:
-        BrewsterError: there is no method, two methods share a name, or a name is not valid for a folder.
+        BrewsterError: there is no method, two methods have the same name, or a name is not valid for a folder.
     """
     if not methods:
-        raise BrewsterError("there is no method", "expected one or more", "start with IdentityBaseline()")
+        raise BrewsterError(
+            "there is no method", "expected at least one method", "add a method such as IdentityBaseline()"
+        )
     (name, count), *_ = Counter(method.name for method in methods).most_common(1)
     if count > 1:
         raise BrewsterError(
-            f"{count} methods have the name {name!r}", "expected unique names", "rename one with NAME=..."
+            f"{count} methods have the name {name!r}",
+            "expected unique names",
+            "rename one method with NAME=...",
         )
     for method in methods:
         if method.name in ("", ".", "..") or set("/\\") & set(method.name) or not method.name.isprintable():
             raise BrewsterError(
                 f"a method has the name {method.name!r}",
-                "names are used for folders: no slashes, no control characters, not . or ..",
+                "expected a valid folder name, without slashes and control characters, and not . or ..",
                 "choose another name with NAME=...",
             )

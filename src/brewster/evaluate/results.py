@@ -1,4 +1,4 @@
-"""Aggregates score rows into results.json: means and paired differences with confidence intervals, as plain values."""
+"""Aggregates score rows into the content of results.json: means and paired differences with confidence intervals."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from brewster.evaluate.runner import ScoreRow
 from brewster.evaluate.statistics import Stratum, differences, estimate
 
 AVERAGE: Final = "average"
-PAPER: Final = {"real20": 20, "nature20": 20, "postcard": 20, "solidobject": 20, "wildscene": 101}
-"""The sets in the paper's average, with the number of pictures of each."""
+PAPER_COUNTS: Final = {"real20": 20, "nature20": 20, "postcard": 20, "solidobject": 20, "wildscene": 101}
+"""The benchmarks in the paper's average -> the number of images of each."""
 _DIGITS: Final = 6
-_AVERAGED: Final = "The average is over pictures, not over sets: each picture has the same weight."
+_AVERAGE_NOTE: Final = "The average is over images, not over benchmarks: each image has the same weight."
 
 Results = dict[str, Any]
-"""The content of results.json: see docs/evaluation.md."""
+"""The content of results.json; docs/evaluation.md describes it."""
 
 
 @final
 @dataclass(frozen=True)
 class Selection:
-    """The pictures of a table: a whole benchmark, or the paper's draw from it."""
+    """The cases of a table: a whole benchmark, or the paper's draw from it."""
 
     key: str
     title: str
@@ -41,10 +41,10 @@ def summarise(
     config: EvaluationConfig,
     rows: Sequence[ScoreRow],
 ) -> Results:
-    """The content of results.json. The order of the rows does not matter.
+    """Returns the content of results.json. The order of the rows does not matter.
 
     Raises:
-        BrewsterError: the paper's draw was requested, and the names of a benchmark do not identify its scenes.
+        BrewsterError: the paper's draw is requested, but the file names of a benchmark do not identify its scenes.
     """
     by_id = {row.id: row for row in rows}
     method_names = [method.name for method in methods]
@@ -53,8 +53,10 @@ def summarise(
     full = [Selection(part.name, part.title, part.cases) for part in benchmarks if part.cases]
     drawn = paper_draws(benchmarks) if config.paper else []
     tables = [[selection] for selection in (*full, *drawn)]
-    together = _averaged([part for part in full if part.key in PAPER] if config.paper else full, drawn)
-    selections = {group[0].key: group for group in tables} | ({AVERAGE: together} if together else {})
+    averaged = _average_selections(
+        [part for part in full if part.key in PAPER_COUNTS] if config.paper else full, drawn
+    )
+    selections = {group[0].key: group for group in tables} | ({AVERAGE: averaged} if averaged else {})
     series = [(method, column) for method in method_names for column in columns]
     directions = {name: metric.higher_is_better for name, metric in columns.items()}
     strata = {key: [_stratum(part, series, by_id) for part in group] for key, group in selections.items()}
@@ -64,33 +66,36 @@ def summarise(
             "size": config.size or "native",
             "quality": config.quality,
             "region_thresholds": list(config.thresholds),
-            "choices": _choices(config, together),
+            "choices": _choices(config, averaged),
         },
         "metrics": {name: metric.to_dict() for name, metric in columns.items()},
-        "benchmarks": {part.name: _describe(part) for part in benchmarks},
-        "selections": {key: _titled(key, group) for key, group in selections.items()},
+        "benchmarks": {part.name: _describe_benchmark(part) for part in benchmarks},
+        "selections": {key: _describe_selection(key, group) for key, group in selections.items()},
         "methods": {method.name: method.about() for method in methods},
         "unmeasured": [] if config.metrics == DEFAULT_METRICS else _unmeasured(config, measured),
         "draw": {"seed": PAPER_SEED} | {part.key: [case.name for case in part.cases] for part in drawn},
-        "pictures": [_picture(case, method_names, by_id) for part in benchmarks for case in part.cases],
+        "pictures": [_describe_case(case, method_names, by_id) for part in benchmarks for case in part.cases],
         "tables": {key: _table(strata[key], series) for key in selections},
         "differences": {
-            key: [_flattened(difference) for difference in differences(strata[key], series, directions)]
+            key: [
+                _describe_difference(difference)
+                for difference in differences(strata[key], series, directions)
+            ]
             for key in selections
         },
     }
 
 
 def _unmeasured(config: EvaluationConfig, measured: set[str]) -> list[str]:
-    """Requested metrics without a score, because no picture has the ground truth that they need."""
+    """Returns the requested metrics without a score: no case has the ground truth that they need."""
     return [name for name in config.columns() if name not in measured]
 
 
 def paper_draws(benchmarks: Sequence[Benchmark]) -> list[Selection]:
-    """The paper's draws from the benchmarks that it does not use completely.
+    """Returns the paper's draw from each benchmark of which it uses only a part.
 
     Raises:
-        BrewsterError: the names of a benchmark do not identify its scenes.
+        BrewsterError: the file names of a benchmark do not identify its scenes.
     """
     draws = [(part, paper_draw(part)) for part in benchmarks if part.cases]
     return [
@@ -100,27 +105,30 @@ def paper_draws(benchmarks: Sequence[Benchmark]) -> list[Selection]:
     ]
 
 
-def _averaged(full: Sequence[Selection], drawn: Sequence[Selection]) -> list[Selection]:
-    """The selections of the average: each benchmark's draw if there is one; empty for a single benchmark."""
+def _average_selections(full: Sequence[Selection], drawn: Sequence[Selection]) -> list[Selection]:
+    """Returns the selections of the average: the draw from each benchmark, or the benchmark if there is no draw.
+
+    The list is empty if there is only one benchmark.
+    """
     draws = {part.key.partition(":")[0]: part for part in drawn}
     return [draws.get(part.key, part) for part in full] if len(full) > 1 else []
 
 
-def _titled(key: str, group: Sequence[Selection]) -> dict[str, Any]:
-    pictures = sum(len(part.cases) for part in group)
-    return {"title": "Average" if key == AVERAGE else group[0].title, "pictures": pictures}
+def _describe_selection(key: str, group: Sequence[Selection]) -> dict[str, Any]:
+    image_count = sum(len(part.cases) for part in group)
+    return {"title": "Average" if key == AVERAGE else group[0].title, "pictures": image_count}
 
 
-def _choices(config: EvaluationConfig, together: Sequence[Selection]) -> list[str]:
-    """The settings as sentences, how the average is computed, and how it differs from the paper's."""
-    choices = [*config.choices(), *([_AVERAGED] if together else [])]
-    there = {part.key.partition(":")[0]: len(part.cases) for part in together}
-    if not config.paper or there == PAPER:
+def _choices(config: EvaluationConfig, averaged: Sequence[Selection]) -> list[str]:
+    """Returns sentences: the settings, how the average is computed, and how it differs from that of the paper."""
+    choices = [*config.describe(), *([_AVERAGE_NOTE] if averaged else [])]
+    counts = {part.key.partition(":")[0]: len(part.cases) for part in averaged}
+    if not config.paper or counts == PAPER_COUNTS:
         return choices
-    found = ", ".join(f"{count} of {name}" for name, count in there.items()) or "too few sets"
+    found = ", ".join(f"{count} of {name}" for name, count in counts.items()) or "too few benchmarks"
     return [
         *choices,
-        f"The paper's average is over {sum(PAPER.values())} pictures; this one is over {found}.",
+        f"The paper's average is over {sum(PAPER_COUNTS.values())} images; this one is over {found}.",
     ]
 
 
@@ -149,7 +157,7 @@ def _table(strata: Sequence[Stratum], series: Sequence[tuple[str, str]]) -> dict
     return table
 
 
-def _flattened(difference: Any) -> dict[str, Any]:  # noqa: ANN401  (a Difference)
+def _describe_difference(difference: Any) -> dict[str, Any]:  # noqa: ANN401  (a Difference)
     row = asdict(difference)
     return _rounded(row.pop("estimate") | row)
 
@@ -158,28 +166,28 @@ def _rounded(row: dict[str, Any]) -> dict[str, Any]:
     return {name: round(value, _DIGITS) if isinstance(value, float) else value for name, value in row.items()}
 
 
-def _describe(part: Benchmark) -> dict[str, Any]:
+def _describe_benchmark(part: Benchmark) -> dict[str, Any]:
     return {
         "title": part.title,
         "pictures": len(part.cases),
-        "expected": list(part.expected),
+        "expected": list(part.expected_counts),
         "remarks": list(part.remarks),
-        "refused": list(part.refused),
+        "refused": list(part.excluded),
     }
 
 
-def _picture(
+def _describe_case(
     case: Case, methods: Sequence[str], rows: Mapping[tuple[str, str, str], ScoreRow]
 ) -> dict[str, Any]:
-    own = {method: rows[case.benchmark, case.name, method] for method in methods}
-    seen = next((row for row in own.values() if not row.error), None)
+    case_rows = {method: rows[case.benchmark, case.name, method] for method in methods}
+    scored = next((row for row in case_rows.values() if not row.error), None)
     return {
         "benchmark": case.benchmark,
         "name": case.name,
         "scene": case.scene,
-        "width": seen.width if seen else None,
-        "height": seen.height if seen else None,
-        "region_share": seen.region_share if seen else None,
-        "scores": {method: row.scores for method, row in own.items() if not row.error},
-        "errors": {method: row.error for method, row in own.items() if row.error},
+        "width": scored.width if scored else None,
+        "height": scored.height if scored else None,
+        "region_share": scored.region_share if scored else None,
+        "scores": {method: row.scores for method, row in case_rows.items() if not row.error},
+        "errors": {method: row.error for method, row in case_rows.items() if row.error},
     }

@@ -1,9 +1,9 @@
-"""Scores every method on every case, in one process or several; a stopped run can be resumed.
+"""Scores every method on every case, in one or several processes. A stopped run can be resumed.
 
     rows = score(read_benchmark("nature20", folder), [IdentityBaseline(), model], EvaluationConfig(), Path("out/evaluate"))
 
-`scores.jsonl` in the output folder gets one line for each scored prediction. A later run reuses the lines whose inputs
-have not changed. The files of a case are read once: the same bytes are hashed and, if a row is missing, decoded.
+The file `scores.jsonl` in the output folder has one line for each scored prediction. A later run reuses a line if its inputs
+have not changed. Each file of a case is read once: its bytes are hashed and, if a score is missing, decoded.
 """
 
 from __future__ import annotations
@@ -26,15 +26,16 @@ from brewster.evaluate.methods import Method, MethodOutput, check_names
 from brewster.evaluate.scoring import CaseFiles, GroundTruth, Scorer
 from brewster.worker_setup import exit_with_parent, single_torch_thread
 
-SCORES: Final = "scores.jsonl"
-SCORE_FORMAT: Final = 2
-"""Increase it when the same prediction gets other scores, so that logged rows are scored again; see test_house_formats."""
+SCORES_FILE: Final = "scores.jsonl"
+SCORE_FORMAT_VERSION: Final = 3
+"""Increase this version when the scores of a prediction or the fields of `ScoreRow` change. Rows of other versions are
+scored again. test_house_formats checks the scores."""
 
 ScoreCallback = Callable[[int, int, "ScoreRow"], None]
 """Called with (done, total, row) after each prediction that was scored."""
 
-DecodedCallback = Callable[[GroundTruth, Mapping[str, MethodOutput]], None]
-"""Called with a decoded case and its new predictions, by method, in the process that scored them."""
+CaseCallback = Callable[[GroundTruth, Mapping[str, MethodOutput]], None]
+"""Called with (case, method -> new prediction) after a case is scored, in the process that scored it."""
 
 RowId = tuple[str, str, str]
 
@@ -42,17 +43,17 @@ RowId = tuple[str, str, str]
 @final
 @dataclass(frozen=True)
 class ScoreRow:
-    """The scores of one method on one case, or the error. A line of scores.jsonl has these fields.
+    """The scores of one method on one case, or the error. These are also the fields of a line of scores.jsonl.
 
-    `key` is a digest of everything that the scores depend on, `answer_key` of everything that the prediction depends
-    on. Equal digests mean that the work need not be repeated. `digest` is that of the prediction's files, if it has any.
+    `score_key` is a digest of all inputs of the scores, `prediction_key` of all inputs of the prediction. A score or a
+    prediction is reused if its key is unchanged. `digest` is the SHA-256 of the files of the prediction, if it has any.
     """
 
     benchmark: str
     case: str
     method: str
-    answer_key: str
-    key: str
+    prediction_key: str
+    score_key: str
     scores: dict[str, float | None] = field(default_factory=dict)
     error: str | None = None
     seconds: float | None = None
@@ -85,68 +86,70 @@ def score(
     *,
     workers: int = 1,
     on_progress: ScoreCallback = lambda _done, _total, _row: None,
-    on_decoded: DecodedCallback | None = None,
+    on_case_scored: CaseCallback | None = None,
 ) -> list[ScoreRow]:
-    """Runs every method on every case and scores the predictions; unchanged rows of an earlier run are reused.
+    """Runs every method on every case and scores the predictions. Reuses the rows of an earlier run if nothing changed.
 
-    Exclusive methods run last, one after another and in this process; each of them reads the cases again.
+    Exclusive methods run last, one after another, in this process. Each of them reads the cases again.
 
     Args:
-        benchmarks: as `read_benchmark` returns them.
-        methods: with unique names.
+        benchmarks: the benchmarks, as `read_benchmark` returns them.
+        methods: the methods. Their names must be unique.
         config: the settings of the evaluation.
         out: the folder of scores.jsonl.
-        workers: number of processes that score in parallel.
+        workers: the number of processes that score in parallel.
         on_progress: called after each new row.
-        on_decoded: called once for each case with new rows. With several workers it must be picklable.
+        on_case_scored: called once for each case with new rows. With several workers, it must be picklable.
 
     Returns:
-        One row for each case and method, in the order of benchmarks, cases and methods, for any number of workers. A
-        row of a method that failed has an `error`.
+        One row for each case and method, in the order of benchmarks, cases and methods. The number of workers does not
+        change the order. If a method failed on a case, its row has an `error`.
 
     Raises:
-        BrewsterError: names of methods are shared or invalid, a metric is not available, or a worker process died.
+        BrewsterError: two methods have the same name, a name is not valid for a folder, a metric is not available, or
+            a worker process died.
         TargetError: `out` cannot be written.
     """
     check_names(methods)
-    logged = _read_log(out / SCORES)
-    cases = {(case.benchmark, case.name): case for part in benchmarks for case in part.cases}
+    logged = _read_log(out / SCORES_FILE)
+    cases = {(case.benchmark, case.name): case for benchmark in benchmarks for case in benchmark.cases}
     ids = [(*case, method.name) for case in cases for method in methods]
     _prepare_metrics(config, ids, logged)
-    log, rows = _ScoreLog(out / SCORES), dict[RowId, ScoreRow]()
+    log, rows = _ScoreLog(out / SCORES_FILE), dict[RowId, ScoreRow]()
 
-    def on_rows(case_rows: Sequence[ScoreRow]) -> None:
+    def log_rows(case_rows: Sequence[ScoreRow]) -> None:
         for row in case_rows:
             rows[row.id] = row
             if row != logged.get(row.id):
                 log.write(row)
                 on_progress(len(rows), len(ids), row)
 
-    state = _WorkerState({method.name: method for method in methods}, config, on_decoded)
-    shared = [method.name for method in methods if not method.exclusive]
-    _run_tasks(_tasks(cases.values(), shared, logged), state, on_rows, workers)
+    state = _WorkerState({method.name: method for method in methods}, config, on_case_scored)
+    parallel_methods = [method.name for method in methods if not method.exclusive]
+    _run_tasks(_tasks(cases.values(), parallel_methods, logged), state, log_rows, workers)
     for method in methods:
         if method.exclusive:
-            _run_tasks(_tasks(cases.values(), [method.name], logged), state, on_rows, 1)
+            _run_tasks(_tasks(cases.values(), [method.name], logged), state, log_rows, 1)
     return [rows[row_id] for row_id in ids]
 
 
 def _tasks(
     cases: Iterable[Case], methods: Sequence[str], logged: Mapping[RowId, ScoreRow]
 ) -> list[_ScoringTask]:
-    def of_case(case: Case) -> dict[str, ScoreRow]:
+    def logged_rows(case: Case) -> dict[str, ScoreRow]:
         ids = ((case.benchmark, case.name, method) for method in methods)
         return {row_id[2]: logged[row_id] for row_id in ids if row_id in logged}
 
-    return [_ScoringTask(case, tuple(methods), of_case(case)) for case in cases] if methods else []
+    return [_ScoringTask(case, tuple(methods), logged_rows(case)) for case in cases] if methods else []
 
 
 def _prepare_metrics(
     config: EvaluationConfig, ids: Sequence[RowId], logged: Mapping[RowId, ScoreRow]
 ) -> None:
-    """Loads what metrics need, such as weights, before the workers start: once, and an error stops the run.
+    """Calls `Metric.prepare`, which loads the weights of LPIPS, for example.
 
-    A logged row with a score of the metric shows that an earlier run has loaded it.
+    It is called before the workers start, so that it runs once and its error stops the evaluation. It is not called for a
+    metric that has a score in every row of an earlier run.
     """
     columns: dict[Callable[[], object], set[str]] = {}
     for column, metric in config.columns().items():
@@ -163,15 +166,15 @@ def _prepare_metrics(
 @final
 @dataclass(frozen=True)
 class _WorkerState:
-    """What a process needs to score any case."""
+    """The data that a process needs to score cases."""
 
     methods: Mapping[str, Method]
     config: EvaluationConfig
-    on_decoded: DecodedCallback | None
+    on_case_scored: CaseCallback | None
 
 
 def _score_case(task: _ScoringTask, state: _WorkerState) -> list[ScoreRow]:
-    """The rows of a case. Pictures are decoded only if a row of an earlier run cannot be reused."""
+    """Returns the rows of a case. Decodes its images only if a row of an earlier run cannot be reused."""
     case = task.case
     try:
         files = CaseFiles.read(case)
@@ -195,42 +198,46 @@ def _score_rows(
     rows: Sequence[ScoreRow], truth: GroundTruth, task: _ScoringTask, state: _WorkerState
 ) -> list[ScoreRow]:
     scorer, predictions = Scorer(truth, state.config), dict[str, MethodOutput]()
-    done = []
+    scored = []
     for row in rows:
         if _is_scored(row, task.logged):
-            done.append(task.logged[row.method])
+            scored.append(task.logged[row.method])
             continue
         try:
             prediction = get_prediction(truth, state.methods[row.method], row)
             truth.check(prediction, row.method)
         except BrewsterError as error:
-            done.append(_method_failed(row, str(error)))
-        except Exception as error:  # noqa: BLE001  (a crash on one picture must not stop the evaluation)
-            done.append(_method_failed(row, f"{type(error).__name__}: {error}"))
+            scored.append(_method_failed(row, str(error)))
+        except Exception as error:  # noqa: BLE001  (a crash on one image must not stop the evaluation)
+            scored.append(_method_failed(row, f"{type(error).__name__}: {error}"))
         else:
             predictions[row.method] = prediction
-            done.append(_scored_row(row, truth, scorer, prediction))
-    if state.on_decoded:
-        state.on_decoded(truth, predictions)
-    return done
+            scored.append(_scored_row(row, truth, scorer, prediction))
+    if state.on_case_scored:
+        state.on_case_scored(truth, predictions)
+    return scored
 
 
 def _empty_row(
     files: CaseFiles, method: Method, config: EvaluationConfig, logged: Mapping[str, ScoreRow]
 ) -> ScoreRow:
-    """A row without scores, whose keys are digests of everything that the scores depend on."""
+    """Returns a row without scores, with the keys that show whether a row of an earlier run can be reused."""
     case = files.case
-    photo, *truths = files.digests()
+    photo, *ground_truths = files.digests()
+    # `paper` selects cases for the tables and changes no score. `quality` is a part of the keys of models, and does not
+    # affect other methods.
     settings = asdict(config) | {"paper": None, "quality": None}
-    answer_key = _digest(photo, config.size, method.key(case))
-    key = _digest(answer_key, truths, settings, case.rendered, SCORE_FORMAT)
-    row = ScoreRow(case.benchmark, case.name, method.name, answer_key, key)
-    before = logged.get(method.name)
-    return replace(row, digest=before.digest) if before and before.answer_key == answer_key else row
+    prediction_key = _digest(photo, config.size, method.key(case))
+    score_key = _digest(prediction_key, ground_truths, settings, case.rendered, SCORE_FORMAT_VERSION)
+    row = ScoreRow(case.benchmark, case.name, method.name, prediction_key, score_key)
+    logged_row = logged.get(method.name)
+    if logged_row and logged_row.prediction_key == prediction_key:
+        return replace(row, digest=logged_row.digest)
+    return row
 
 
 def _is_scored(row: ScoreRow, logged: Mapping[str, ScoreRow]) -> bool:
-    return row.method in logged and logged[row.method].key == row.key
+    return row.method in logged and logged[row.method].score_key == row.score_key
 
 
 def _scored_row(row: ScoreRow, truth: GroundTruth, scorer: Scorer, prediction: MethodOutput) -> ScoreRow:
@@ -247,10 +254,10 @@ def _scored_row(row: ScoreRow, truth: GroundTruth, scorer: Scorer, prediction: M
 
 
 def get_prediction(truth: GroundTruth, method: Method, row: ScoreRow) -> MethodOutput:
-    """The stored prediction if its digest is that of the row, else a new one.
+    """Returns the stored prediction if it has the digest of the row, else a new prediction.
 
     Raises:
-        BrewsterError: what the method raises.
+        BrewsterError: the method failed.
     """
     cached = method.cached(truth.case) if row.digest else None
     return cached if cached and cached.digest == row.digest else method.predict(truth.case, truth.photo)
@@ -276,7 +283,7 @@ RowsCallback = Callable[[Sequence[ScoreRow]], None]
 def _run_tasks(
     tasks: Sequence[_ScoringTask], state: _WorkerState, on_rows: RowsCallback, workers: int
 ) -> None:
-    """Runs the tasks in this process or in several worker processes; calls `on_rows` after each task.
+    """Runs the tasks in this process or in several worker processes. Calls `on_rows` after each task.
 
     Each process computes metrics with one thread, so that the scores do not depend on the number of workers.
     """
@@ -294,8 +301,8 @@ def _run_tasks(
     except BrokenProcessPool as error:
         raise BrewsterError(
             "a worker process died",
-            "it was killed or ran out of memory",
-            "run again with fewer workers; the scores so far are saved",
+            "expected it to finish (it was killed, or the memory was exhausted)",
+            "run again with fewer workers (the finished scores are saved)",
         ) from error
     except KeyboardInterrupt:
         pool.shutdown(cancel_futures=True)
@@ -310,13 +317,12 @@ def _finished(futures: set[Future[list[ScoreRow]]]) -> Iterator[list[ScoreRow]]:
     return (future.result() for future in futures if not future.cancelled() and not future.exception())
 
 
-_worker_state: list[_WorkerState] = []  # one element in a worker process
+_worker_state: list[_WorkerState] = []  # empty, or with one element in a worker process
 
 
 def _initialize_worker(state: _WorkerState) -> None:
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # only the parent handles Ctrl-C: it lets running cases finish
+    # Only the parent process handles Ctrl-C, so that the workers can finish their current case.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     exit_with_parent()
     _worker_state.append(state)
 
@@ -331,7 +337,7 @@ def _score_case_in_worker(task: _ScoringTask) -> list[ScoreRow]:
 
 @final
 class _ScoreLog:
-    """The file scores.jsonl. It is created with the first row."""
+    """The file scores.jsonl. The first call of `write` creates it."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -345,16 +351,16 @@ class _ScoreLog:
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             with self._path.open("ab+") as file:
-                file.write(self._separator(file) + json.dumps(asdict(row)).encode() + b"\n")
+                file.write(self._missing_newline(file) + json.dumps(asdict(row)).encode() + b"\n")
         except OSError as error:
             raise TargetError(
                 f"{self._path} was not written ({error.strerror or error})",
-                "a writable output folder was expected",
-                "free some space or choose another folder with -o, and run again; the scores so far are saved",
+                "expected a writable output folder",
+                "free disk space or choose another folder with -o, and run again (the finished scores are saved)",
             ) from error
 
-    def _separator(self, file: Any) -> bytes:  # noqa: ANN401  (the type that open returns)
-        """A newline if the last line is incomplete, as a killed run can leave it."""
+    def _missing_newline(self, file: Any) -> bytes:  # noqa: ANN401  (the type that open returns)
+        """Returns a newline if the file does not end with one: a killed run can leave an incomplete line."""
         if not file.seek(0, 2):
             return b""
         file.seek(-1, 2)
@@ -362,7 +368,7 @@ class _ScoreLog:
 
 
 def _read_log(path: Path) -> dict[RowId, ScoreRow]:
-    """The last row of earlier runs for each id, without failures, incomplete lines and lines of other versions."""
+    """Returns the last row for each id. Skips rows with errors, incomplete lines and lines of other versions."""
     rows = {}
     for line in path.read_text(errors="replace").splitlines() if path.is_file() else ():
         try:

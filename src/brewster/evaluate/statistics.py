@@ -1,6 +1,6 @@
 """Means with bootstrap confidence intervals, and paired differences between methods.
 
-Pictures of one scene, such as ten shots of a postcard, are not independent. The bootstrap therefore draws whole scenes.
+Images of one scene, such as ten shots of a postcard, are not independent. The bootstrap therefore resamples whole scenes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _PERCENTILES: Final = (2.5, 97.5)
 @final
 @dataclass(frozen=True)
 class Estimate:
-    """A mean and its 95 % interval. `low` and `high` are None if no benchmark has two scenes with a value."""
+    """A mean of `count` values and its 95 % interval. `low` and `high` are None if no benchmark has two scenes with a value."""
 
     mean: float
     low: float | None
@@ -36,9 +36,10 @@ class Estimate:
 @final
 @dataclass(frozen=True, eq=False)
 class Stratum:
-    """The scores of a benchmark: `values` (pictures, series), NaN for a missing score, and the scene of each picture.
+    """The scores of a benchmark: `values` (n, s) for n images and s series, and the scene of each image.
 
-    `name` seeds the resampling, so that the intervals of a benchmark do not depend on the other benchmarks of the run.
+    A missing score is NaN. `name` seeds the bootstrap, so that the intervals of a benchmark do not depend on the other
+    benchmarks of the run.
     """
 
     name: str
@@ -47,11 +48,13 @@ class Stratum:
 
 
 def estimate(strata: Sequence[Stratum]) -> list[Estimate | None]:
-    """The mean of each series over all pictures of all strata, with its interval; None for a series without values.
+    """Computes the mean of each series over all images of all strata, and its 95 % interval.
 
-    Stratified cluster bootstrap with percentile intervals (Efron and Tibshirani 1993, chapter 13): 95 %, 10,000
-    resamples, fixed seed. Each resample draws, with replacement, as many scenes of a stratum as it has; a drawn scene
-    contributes all its pictures.
+    Stratified cluster bootstrap with percentile intervals (Efron and Tibshirani 1993, chapter 13), 10,000 resamples and a
+    fixed seed. For a stratum of k scenes, each resample draws k scenes with replacement, and all images of these scenes.
+
+    Returns:
+        One estimate for each series; None for a series without values.
     """
     resampled = [_resample(stratum) for stratum in strata]
     sums, counts = (np.sum([part[i] for part in resampled], axis=0) for i in range(2))
@@ -64,21 +67,22 @@ def estimate(strata: Sequence[Stratum]) -> list[Estimate | None]:
 
 
 def _scenes(stratum: Stratum) -> NDArray[np.int64]:
-    """The number of scenes with a value, for each series, (s,)."""
+    """Returns the number of scenes with a value, for each series, (s,)."""
     names = np.array(stratum.scenes)
-    return np.array([len(set(names[has])) for has in np.isfinite(stratum.values).T])
+    return np.array([len(set(names[is_valid])) for is_valid in np.isfinite(stratum.values).T])
 
 
 def _resample(stratum: Stratum) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Sums and counts of the values in each resample, (10,000, s) each."""
-    names = {scene: i for i, scene in enumerate(sorted(set(stratum.scenes)))}
-    scene_index = np.array([names[scene] for scene in stratum.scenes], int)
-    sums, counts = (np.zeros((len(names), stratum.values.shape[1])) for _ in range(2))
+    """Returns the sums and the counts of the values in each resample, (10,000, s) each."""
+    index_of = {scene: i for i, scene in enumerate(sorted(set(stratum.scenes)))}
+    scene_index = np.array([index_of[scene] for scene in stratum.scenes], int)
+    sums, counts = (np.zeros((len(index_of), stratum.values.shape[1])) for _ in range(2))
     np.add.at(sums, scene_index, np.nan_to_num(stratum.values))
     np.add.at(counts, scene_index, np.isfinite(stratum.values))
     rng = np.random.default_rng([SEED, zlib.crc32(stratum.name.encode())])
-    times = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), RESAMPLES).astype(float)
-    return times @ sums, times @ counts
+    # How often each resample contains each scene: drawing k of k scenes with replacement is a multinomial distribution.
+    draws = rng.multinomial(len(index_of), np.full(len(index_of), 1 / len(index_of)), RESAMPLES).astype(float)
+    return draws @ sums, draws @ counts
 
 
 def _estimate(
@@ -97,9 +101,9 @@ def _estimate(
 @final
 @dataclass(frozen=True)
 class Difference:
-    """The mean of `method` minus `than` in one metric over the pictures that both have, with its interval.
+    """The mean of score(method) - score(than) in one metric, over the images with both scores, with its interval.
 
-    `better` is the number of pictures on which `method` is better than `than`.
+    `better` is the number of images on which `method` has a better score than `than`.
     """
 
     method: str
@@ -112,12 +116,15 @@ class Difference:
 def differences(
     strata: Sequence[Stratum], series: Sequence[tuple[str, str]], directions: Mapping[str, bool]
 ) -> list[Difference]:
-    """Compares each method with every method before it, in every metric, paired by picture.
+    """Compares each method with all methods before it, in every metric, paired by image.
 
     Args:
-        strata: scores whose columns are `series`.
+        strata: the scores. Column i of `values` is `series[i]`.
         series: (method, metric) of each column.
         directions: metric -> whether higher is better.
+
+    Returns:
+        One difference for each pair of methods and metric, if an image has both scores.
     """
     column_of = {name: i for i, name in enumerate(series)}
     methods = list(dict.fromkeys(method for method, _ in series))

@@ -1,9 +1,9 @@
-"""The HTML report: one self-contained page with all scores, the pictures and their error maps.
+"""Writes the HTML report: one self-contained page with all scores, the images and their error maps.
 
     write_report(json.loads(Path("results.json").read_text()), cases, Path("report.html"))
 
-The template page.html has the style, the controls and the viewer. The content that this module adds is readable without
-JavaScript. Cases are written one at a time, so that memory does not grow with their number.
+The template page.html contains the style, the controls and the viewer. This module adds the content, which is readable
+without JavaScript. It writes one case at a time, so that memory does not grow with the number of cases.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ _DASH: Final = "&ndash;"
 
 
 def write_report(results: Results, cases: Iterable[CaseTiles], path: Path) -> None:
-    """Writes the page atomically and replaces an older one. The same input gives the same bytes.
+    """Writes the page atomically and replaces an older one. Equal arguments give equal bytes.
 
     Args:
         results: the content of results.json.
-        cases: the cases to show, in this order. They are consumed one at a time.
+        cases: the cases to show, in this order. The function reads one at a time.
         path: the HTML file.
 
     Raises:
@@ -51,22 +51,25 @@ def write_report(results: Results, cases: Iterable[CaseTiles], path: Path) -> No
 
 
 def _page(results: Results, cases: Iterable[CaseTiles]) -> Iterator[str]:
-    """The template with its <!--part--> comments replaced. "data" is the last part, because it needs the scores of all cases."""
+    """Yields the template with its comments <!--part--> replaced.
+
+    The last part is "data", because it needs the scores of all cases.
+    """
     scores: list[Any] = []
     parts = {
         "results": _results(results),
         "cases": _cases(results, cases, scores),
         "data": _data(results, scores),
     }
-    for place, text in enumerate(re.split(r"<!--(\w+)-->", _TEMPLATE.read_text("utf-8"))):
-        if place % 2:
+    for i, text in enumerate(re.split(r"<!--(\w+)-->", _TEMPLATE.read_text("utf-8"))):
+        if i % 2:  # `re.split` alternates between text and the names of parts
             yield from parts[text]
         else:
             yield text
 
 
 def _data(results: Results, scores: list[Any]) -> Iterator[str]:
-    """The data that the page sorts by, as JSON. "<" is escaped, so that a name cannot close the script element."""
+    """Yields the data for sorting, as JSON. "<" is escaped, so that a name cannot close the script element."""
     data = {
         "metrics": {
             name: {"title": metric["title"], "unit": metric["unit"], "higher": metric["higher_is_better"]}
@@ -85,10 +88,10 @@ def _data(results: Results, scores: list[Any]) -> Iterator[str]:
 
 
 def _results(results: Results) -> Iterator[str]:
-    pictures, methods = results["pictures"], results["methods"]
+    images, methods = results["pictures"], results["methods"]
     benchmarks, config = results["benchmarks"], results["protocol"]
     yield (
-        f"<p class=lede>{_count(len(methods), 'method')} on {_count(len(pictures), 'picture')} of "
+        f"<p class=lede>{_count(len(methods), 'method')} on {_count(len(images), 'image')} of "
         f"{_count(len(benchmarks), 'benchmark')}: size {escape(str(config['size']))}, quality "
         f"{escape(str(config['quality']))}, brewster {escape(results['brewster'])}.</p>\n"
     )
@@ -99,47 +102,49 @@ def _results(results: Results) -> Iterator[str]:
 
 
 def _problems(results: Results) -> Iterator[str]:
-    """Failures, refused files and remarks."""
-    pictures, benchmarks = results["pictures"], results["benchmarks"].values()
-    failed = [
-        (f"{one['benchmark']}/{one['name']}", *error) for one in pictures for error in one["errors"].items()
+    """Yields the errors of methods, the excluded files and the remarks."""
+    images, benchmarks = results["pictures"], results["benchmarks"].values()
+    errors = [
+        (f"{image['benchmark']}/{image['name']}", *error)
+        for image in images
+        for error in image["errors"].items()
     ]
-    counts = Counter(method for _, method, _ in failed)
+    counts = Counter(method for _, method, _ in errors)
     counted = ", ".join(
-        f"{method} on {count} of {_count(len(pictures), 'picture')}" for method, count in counts.items()
+        f"{method} on {count} of {_count(len(images), 'image')}" for method, count in counts.items()
     )
-    yield _note(f"Failed: {counted}", [f"{name}, {method}: {error}" for name, method, error in failed])
-    refused, benchmark_remarks = (
-        [f"{benchmark['title']}: {point}" for benchmark in benchmarks for point in benchmark[kind]]
+    yield _note(f"Failed: {counted}", [f"{name}, {method}: {error}" for name, method, error in errors])
+    excluded, benchmark_remarks = (
+        [f"{benchmark['title']}: {text}" for benchmark in benchmarks for text in benchmark[kind]]
         for kind in ("refused", "remarks")
     )
-    points = benchmark_remarks + remarks(results)
-    yield _note(_count(len(refused), "file refused"), refused)
-    yield _note(_count(len(points), "remark"), points)
-    if not failed:
-        yield "<p>No method failed on any picture.</p>\n"
+    all_remarks = benchmark_remarks + remarks(results)
+    yield _note(_count(len(excluded), "file excluded"), excluded)
+    yield _note(_count(len(all_remarks), "remark"), all_remarks)
+    if not errors:
+        yield "<p>No method failed on any image.</p>\n"
 
 
-def _note(title: str, points: Sequence[str]) -> str:
-    """A collapsible list, open if it has at most five points; "" if it has none."""
-    if not points:
+def _note(title: str, items: Sequence[str]) -> str:
+    """Returns a collapsible list, which is open if it has at most five items; "" if there are no items."""
+    if not items:
         return ""
-    is_open = " open" if len(points) <= 5 else ""
-    return f"<details class=note{is_open}><summary>{escape(title)}</summary>{_list(points)}</details>\n"
+    is_open = " open" if len(items) <= 5 else ""
+    return f"<details class=note{is_open}><summary>{escape(title)}</summary>{_list(items)}</details>\n"
 
 
-def _list(points: Iterable[str]) -> str:
-    return f"<ul>{''.join(f'<li>{escape(point)}</li>' for point in points)}</ul>"
+def _list(items: Iterable[str]) -> str:
+    return f"<ul>{''.join(f'<li>{escape(item)}</li>' for item in items)}</ul>"
 
 
 def _count(number: int, noun: str) -> str:
-    """A number with its noun; the first word of the noun gets the plural."""
+    """Returns a number and its noun. The first word of the noun has the plural."""
     first, *rest = noun.split()
     return " ".join([f"{number:,}", first if number == 1 else f"{first}s", *rest])
 
 
-def _used(results: Results) -> dict[str, Any]:
-    """The metrics that have a value in any table."""
+def _scored_metrics(results: Results) -> dict[str, Any]:
+    """Returns the metrics that have a value in any table."""
     rows = [row for table in results["tables"].values() for row in table.values()]
     return {name: metric for name, metric in results["metrics"].items() if any(row.get(name) for row in rows)}
 
@@ -161,17 +166,17 @@ def _table(caption: str, metrics: Results, bodies: Iterable[str]) -> str:
 
 
 def _body(title: str, metrics: Results, rows: Iterable[tuple[str, Iterable[str]]]) -> str:
-    lines = (f"<tr><th scope=row>{escape(name)}</th>{''.join(cells)}</tr>\n" for name, cells in rows)
+    rows_html = (f"<tr><th scope=row>{escape(name)}</th>{''.join(cells)}</tr>\n" for name, cells in rows)
     span = len(metrics) + 1
-    return f"<tbody><tr><th scope=rowgroup colspan={span}><span>{title}</span></th></tr>\n{''.join(lines)}</tbody>\n"
+    return f"<tbody><tr><th scope=rowgroup colspan={span}><span>{title}</span></th></tr>\n{''.join(rows_html)}</tbody>\n"
 
 
 def _means(results: Results) -> str:
-    metrics = _used(results)
+    metrics = _scored_metrics(results)
     bodies = []
     for name, table in results["tables"].items():
         best = {metric: next(iter(ranking(table, metric, about)), None) for metric, about in metrics.items()}
-        pictures = results["selections"][name]["pictures"]
+        image_count = results["selections"][name]["pictures"]
         rows = (
             (
                 method,
@@ -180,26 +185,26 @@ def _means(results: Results) -> str:
                         row.get(metric),
                         metrics[metric],
                         best[metric] if is_complete(table, method, metric) else None,
-                        pictures,
+                        image_count,
                     )
                     for metric in metrics
                 ],
             )
             for method, row in table.items()
         )
-        counted = f" <small>{_count(pictures, 'picture')}</small>"
-        bodies.append(_body(escape(_title(results, name)) + counted, metrics, rows))
-    return _table("Means and their 95 % intervals; a star marks the best of a column", metrics, bodies)
+        count = f" <small>{_count(image_count, 'image')}</small>"
+        bodies.append(_body(escape(_title(results, name)) + count, metrics, rows))
+    return _table("Means and their 95 % intervals. A star marks the best mean of a column", metrics, bodies)
 
 
-def _mean(estimate: Results | None, about: Results, best: str | None, pictures: int) -> str:
+def _mean(estimate: Results | None, about: Results, best: str | None, image_count: int) -> str:
     if not estimate:
         return f"<td>{_DASH}</td>"
-    mean, wins = _number(estimate["mean"], about), f"{estimate['mean']:.{about['digits']}f}" == best
-    is_best = " class=best" if wins else ""
-    star = "<span class=star>&starf;<span class=hidden> best </span></span>" if wins else ""
-    some = f"<small>{estimate['count']} of {pictures}</small>" if estimate["count"] != pictures else ""
-    return f"<td{is_best}>{star}<b>{mean}</b>{_interval(estimate, about)}{some}</td>"
+    mean, is_best = _number(estimate["mean"], about), f"{estimate['mean']:.{about['digits']}f}" == best
+    style = " class=best" if is_best else ""
+    star = "<span class=star>&starf;<span class=hidden> best </span></span>" if is_best else ""
+    count = f"<small>{estimate['count']} of {image_count}</small>" if estimate["count"] != image_count else ""
+    return f"<td{style}>{star}<b>{mean}</b>{_interval(estimate, about)}{count}</td>"
 
 
 def _interval(estimate: Results, about: Results, sign: str = "") -> str:
@@ -216,28 +221,31 @@ def _number(value: float | None, about: Results, sign: str = "") -> str:
 
 
 def _differences(results: Results) -> str:
-    """Differences to the unprocessed input, then, collapsed, differences between methods."""
-    to_baseline, between = (_pairs(results, is_baseline) for is_baseline in (True, False))
-    legend = "Mean change, its 95 % interval, and the number of pictures with a better score"
+    """Returns two tables: differences from the unprocessed input and, collapsed, differences between methods."""
+    to_baseline, between = (_difference_bodies(results, is_baseline) for is_baseline in (True, False))
+    legend = "Mean difference, its 95 % interval, and the number of images with a better score"
     first = (
-        _table(f"Against the unprocessed input. {legend}", _used(results), to_baseline) if to_baseline else ""
+        _table(f"Differences from the unprocessed input. {legend}", _scored_metrics(results), to_baseline)
+        if to_baseline
+        else ""
     )
     if not between:
         return first
-    second = _table(f"Between methods. {legend}", _used(results), between)
+    second = _table(f"Differences between methods. {legend}", _scored_metrics(results), between)
     return f"{first}<details><summary>Differences between methods</summary>{second}</details>\n"
 
 
-def _pairs(results: Results, is_baseline: bool) -> list[str]:
-    metrics, bodies = _used(results), []
+def _difference_bodies(results: Results, is_baseline: bool) -> list[str]:
+    """Returns the table bodies: differences from the baseline if `is_baseline`, else those between other methods."""
+    metrics, bodies = _scored_metrics(results), []
     for name, differences in results["differences"].items():
         rows: dict[str, dict[str, Results]] = {}
         for row in differences:
             if (row["than"] == BASELINE) == is_baseline:
-                pair = row["method"] if is_baseline else f"{row['method']} against {row['than']}"
+                pair = row["method"] if is_baseline else f"{row['method']} minus {row['than']}"
                 rows.setdefault(pair, {})[row["metric"]] = row
         cells = (
-            (pair, [_change(row.get(metric), metrics[metric]) for metric in metrics])
+            (pair, [_difference(row.get(metric), metrics[metric]) for metric in metrics])
             for pair, row in rows.items()
         )
         if rows:
@@ -245,7 +253,7 @@ def _pairs(results: Results, is_baseline: bool) -> list[str]:
     return bodies
 
 
-def _change(row: Results | None, about: Results) -> str:
+def _difference(row: Results | None, about: Results) -> str:
     if not row:
         return f"<td>{_DASH}</td>"
     is_inconclusive = row["low"] is None or row["low"] <= 0 <= row["high"]
@@ -264,7 +272,7 @@ def _change(row: Results | None, about: Results) -> str:
 
 
 def _method_notes(results: Results) -> Iterator[str]:
-    yield f"<details><summary>How it was measured</summary>{_list(results['protocol']['choices'])}<dl>"
+    yield f"<details><summary>Settings and definitions</summary>{_list(results['protocol']['choices'])}<dl>"
     for name, metric in results["metrics"].items():
         better = "higher is better" if metric["higher_is_better"] else "lower is better"
         yield f"<dt>{escape(metric['title'])} <code>{escape(name)}</code></dt><dd>{escape(metric['about'])} ({better})</dd>\n"
@@ -275,63 +283,63 @@ def _method_notes(results: Results) -> Iterator[str]:
     yield "</dl></details>\n"
 
 
-# --- pictures
+# --- images
 
 
 def _cases(results: Results, cases: Iterable[CaseTiles], scores: list[Any]) -> Iterator[str]:
-    known = {(picture["benchmark"], picture["name"]): picture for picture in results["pictures"]}
-    steps = (f"<i style='background:rgb({red},{green},{blue})'></i>" for red, green, blue in COLOUR_MAP)
+    entries = {(entry["benchmark"], entry["name"]): entry for entry in results["pictures"]}
+    colours = (f"<i style='background:rgb({red},{green},{blue})'></i>" for red, green, blue in COLOUR_MAP)
     yield (
-        f"<p class=legend>Errors, of 255: 0 <span>{''.join(steps)}</span> {MAX_ERROR} and more. "
-        f"Pictures are embedded with at most {MAX_SIDE_PX} px on the longer side.</p>\n"
+        f"<p class=legend>Colours of error maps, in 8-bit levels: 0 <span>{''.join(colours)}</span> {MAX_ERROR} or more. "
+        f"The longer side of embedded images has at most {MAX_SIDE_PX} px.</p>\n"
     )
     for case in cases:
-        picture = known.get((case.benchmark, case.name), {"scores": {}, "errors": {}})
-        scores.append(picture["scores"])
-        yield _case(results, case, picture)
-    if len(scores) < len(known):
+        entry = entries.get((case.benchmark, case.name), {"scores": {}, "errors": {}})
+        scores.append(entry["scores"])
+        yield _case(results, case, entry)
+    if len(scores) < len(entries):
         yield (
-            f"<p>{len(scores):,} of {_count(len(known), 'picture')} are on this page: of each benchmark those that the "
-            "first method after the baseline failed on, then its worst by the first metric.</p>\n"
+            f"<p>This page shows {len(scores):,} of {_count(len(entries), 'image')}: for each benchmark, first the images on "
+            "which the first method after the baseline failed, then its worst scores in the first metric.</p>\n"
         )
 
 
-def _case(results: Results, case: CaseTiles, picture: Results) -> str:
+def _case(results: Results, case: CaseTiles, entry: Results) -> str:
     facts = [
         escape(_title(results, case.benchmark)),
         f"{case.size[0]} &times; {case.size[1]} px",
     ]
-    if (share := picture.get("region_share")) is not None:
-        facts.append(f"region {share:.0%}")
+    if (share := entry.get("region_share")) is not None:
+        facts.append(f"reflection region {share:.0%}")
     others = [name for name in results["methods"] if name != BASELINE]
-    rows = [_row(results, picture, BASELINE, case.photo)]
-    rows += [_row(results, picture, method, case.methods.get(method, "")) for method in others]
+    rows = [_row(results, entry, BASELINE, case.photo)]
+    rows += [_row(results, entry, method, case.methods.get(method, "")) for method in others]
     return (
         f'<article data-benchmark="{escape(case.benchmark)}" data-name="{escape(case.name)}">\n'
         f"<h3>{escape(case.name)}</h3><p>{' &middot; '.join(facts)} <span class=key></span></p>\n{''.join(rows)}</article>\n"
     )
 
 
-def _row(results: Results, picture: Results, method: str, tiles: str) -> str:
-    error = picture["errors"].get(method)
+def _row(results: Results, entry: Results, method: str, tiles: str) -> str:
+    error = entry["errors"].get(method)
     failure = f"<p class=failure>Failed: {escape(error)}</p>" if error else ""
     title = "photo, input (unprocessed)" if method == BASELINE else method
     return (
-        f"<section><div><h4>{escape(title)}</h4>{failure}{_scores(results, picture['scores'], method)}</div>"
+        f"<section><div><h4>{escape(title)}</h4>{failure}{_scores(results, entry['scores'], method)}</div>"
         f"<div class=tiles>{tiles}</div></section>\n"
     )
 
 
 def _scores(results: Results, scores: Results, method: str) -> str:
-    """A method's scores on one picture, and their change to the unprocessed input."""
-    mine, baseline = scores.get(method, {}), scores.get(BASELINE, {})
+    """Returns a table with the scores of a method on one image, and their differences from the unprocessed input."""
+    method_scores, baseline_scores = scores.get(method, {}), scores.get(BASELINE, {})
     lines = []
     for name, about in results["metrics"].items():
         if all(row.get(name) is None for row in scores.values()) or method not in scores:
             continue
-        value, before = mine.get(name), baseline.get(name)
-        has_change = method != BASELINE and value is not None and before is not None and value != before
-        change = _gain(value - before, about) if has_change else ""
+        value, baseline = method_scores.get(name), baseline_scores.get(name)
+        has_change = method != BASELINE and value is not None and baseline is not None and value != baseline
+        change = _gain(value - baseline, about) if has_change else ""
         lines.append(
             f"<tr><th scope=row>{escape(about['title'])}</th><td>{_number(value, about)}</td><td>{change}</td></tr>"
         )

@@ -1,4 +1,4 @@
-"""The pictures of a case in the HTML report: downscaled layers, coloured error maps, and the region as an overlay."""
+"""Makes the images of a case for the HTML report: downscaled layers, error maps, and the region as an overlay."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ Pixels = NDArray[np.uint8]
 Float32 = NDArray[np.float32]
 
 MAX_SIDE_PX: Final = 480
-"""The maximum of the longer side of an embedded picture, in px."""
+"""The maximum of the longer side of an embedded image, in px."""
 
 MAX_ERROR: Final = 96
-"""The error, of 255, that gets the last colour of the map; larger errors get it too."""
+"""Errors from this value up, of 255, have the last colour of the map."""
 
 _INFERNO: Final = (
     0x000004,
@@ -35,49 +35,51 @@ _INFERNO: Final = (
     0xF7D13D,
     0xFCFFA4,
 )
-_STEPS: Final = 16
+_COLOUR_COUNT: Final = 16
 
 
 def _colour_map() -> Pixels:
     anchors = np.array([[colour >> shift & 255 for shift in (16, 8, 0)] for colour in _INFERNO])
-    at = np.linspace(0, 1, _STEPS)
-    channels = [np.interp(at, np.linspace(0, 1, len(anchors)), anchors[:, channel]) for channel in range(3)]
+    positions = np.linspace(0, 1, _COLOUR_COUNT)
+    channels = [
+        np.interp(positions, np.linspace(0, 1, len(anchors)), anchors[:, channel]) for channel in range(3)
+    ]
     colours: Pixels = np.rint(np.stack(channels, axis=1)).astype(np.uint8)
     return colours
 
 
 COLOUR_MAP: Final = _colour_map()
-"""Colours of error maps, sRGB uint8 (16, 3): matplotlib's "inferno" (CC0). Its lightness grows evenly, so that it can be
-read in a grey print. Each colour covers a sixteenth of MAX_ERROR. With 16 colours, lossless files are small."""
+"""Colours of error maps, sRGB uint8 (16, 3), from "inferno" of matplotlib (CC0). The lightness increases evenly, so that a
+grey print is readable. Each colour covers MAX_ERROR / 16. Images with only 16 colours give small lossless files."""
 
 _LINEAR: Final = srgb.to_linear(np.linspace(0, 1, 256, dtype=np.float32))
-_TINT: Final = (255, 40, 150)
-_TINT_ALPHA: Final = 115
+_OVERLAY_COLOUR: Final = (255, 40, 150)
+_OVERLAY_ALPHA: Final = 115
 
 
 @final
 @dataclass(frozen=True, eq=False)
 class CaseImages:
-    """The pictures of a case at full size: uint8 sRGB (H, W, 3); region bool (H, W).
+    """The images of a case at full size, uint8 sRGB (H, W, 3), and the reflection region, bool (H, W).
 
-    `predictions` are the transmissions by method, without the baseline; `reflections` the reflection layers by method,
-    if the method predicts them.
+    `predictions` is method -> transmission, without the baseline. `reflections` is method -> reflection, for the methods
+    that predict it.
     """
 
     benchmark: str
     name: str
     photo: Pixels
-    truth: Pixels
+    ground_truth: Pixels
     region: NDArray[np.bool_]
     predictions: Mapping[str, Pixels]
     reflections: Mapping[str, Pixels] = field(default_factory=dict)
-    reflection_truth: Pixels | None = None
+    reflection_ground_truth: Pixels | None = None
 
 
 @final
 @dataclass(frozen=True)
 class CaseTiles:
-    """The pictures of a case as HTML with embedded files. `size` is that of the photo, (width, height) in px."""
+    """The images of a case as HTML with embedded files. `size` is that of the photo, (width, height) in px."""
 
     benchmark: str
     name: str
@@ -87,7 +89,7 @@ class CaseTiles:
 
 
 def to_tiles(case: CaseImages) -> CaseTiles:
-    """Downscales and encodes all pictures of a case."""
+    """Downscales and encodes all images of a case."""
     height, width = case.photo.shape[:2]
     names = dict.fromkeys((*case.predictions, *case.reflections))
     methods = {name: method_tiles(case, name) for name in names}
@@ -95,33 +97,46 @@ def to_tiles(case: CaseImages) -> CaseTiles:
 
 
 def photo_tiles(case: CaseImages) -> str:
-    """HTML of the photo, its error, the ground truth, the region and, if there is one, the true reflection."""
+    """Returns HTML with the photo, its error map, the ground truth, the region and, if known, the true reflection."""
     tiles = [
-        _tile(case, "picture", "photo", webp(case.photo)),
-        _tile(case, "error", "error of the photo", lossless(error_map(case.photo, case.truth))),
-        _tile(case, "picture", "truth", webp(case.truth)),
+        _tile(case, "picture", "photo", encode_webp(case.photo)),
+        _tile(case, "error", "error of the photo", encode_lossless(error_map(case.photo, case.ground_truth))),
+        _tile(case, "picture", "ground truth", encode_webp(case.ground_truth)),
         _tile(case, "region", "reflection region", overlay(case.region)),
     ]
-    if case.reflection_truth is not None:
-        tiles.append(_tile(case, "reflection", "true reflection", webp(case.reflection_truth)))
+    if case.reflection_ground_truth is not None:
+        tiles.append(
+            _tile(
+                case,
+                "reflection",
+                "ground truth of the reflection",
+                encode_webp(case.reflection_ground_truth),
+            )
+        )
     return "".join(tiles)
 
 
 def method_tiles(case: CaseImages, method: str) -> str:
-    """HTML of a method's transmission, its error and its reflection. Empty if the method failed."""
+    """Returns HTML with the transmission of a method, its error map and its reflection; "" if the method failed."""
     tiles = []
     if method in case.predictions:
         prediction = case.predictions[method]
-        tiles.append(_tile(case, "picture", method, webp(prediction)))
-        tiles.append(_tile(case, "error", f"error of {method}", lossless(error_map(prediction, case.truth))))
+        tiles.append(_tile(case, "picture", method, encode_webp(prediction)))
+        tiles.append(
+            _tile(
+                case, "error", f"error of {method}", encode_lossless(error_map(prediction, case.ground_truth))
+            )
+        )
     if method in case.reflections:
-        tiles.append(_tile(case, "reflection", f"reflection by {method}", webp(case.reflections[method])))
+        tiles.append(
+            _tile(case, "reflection", f"reflection by {method}", encode_webp(case.reflections[method]))
+        )
     return "".join(tiles)
 
 
 def _tile(case: CaseImages, kind: str, caption: str, data: bytes) -> str:
-    """A picture as a button that opens it. In the viewer, arrow keys step through pictures of one kind."""
-    width, height = size_of(case.photo)
+    """Returns HTML: an image as a button that opens the viewer. The arrow keys switch between images of one kind."""
+    width, height = embedded_size(case.photo)
     return (
         f"<figure><button type=button data-kind={kind}><img width={width} height={height} loading=lazy "
         f'alt="{escape(caption)}, {escape(case.name)}" src="data:image/webp;base64,{base64.b64encode(data).decode()}">'
@@ -129,57 +144,60 @@ def _tile(case: CaseImages, kind: str, caption: str, data: bytes) -> str:
     )
 
 
-def size_of(picture: NDArray[Any]) -> tuple[int, int]:
-    """(width, height) of the embedded version of a picture."""
-    height, width = picture.shape[:2]
+def embedded_size(image: NDArray[Any]) -> tuple[int, int]:
+    """Returns the (width, height) of the embedded version of an image."""
+    height, width = image.shape[:2]
     scale = min(1, MAX_SIDE_PX / max(height, width))
     return max(1, round(width * scale)), max(1, round(height * scale))
 
 
-def webp(picture: Pixels) -> bytes:
-    """A picture as WebP, sRGB (H, W, 3), downscaled to `size_of` it by area means in linear light."""
-    if size_of(picture) != picture.shape[1::-1]:
-        encoded = srgb.to_encoded(_area_means(_LINEAR[picture]))
-        picture = np.rint(encoded * 255).clip(0, 255).astype(np.uint8)
-    return Photo.from_array(picture, encoding="srgb").encode("webp")
+def encode_webp(image: Pixels) -> bytes:
+    """Downscales an sRGB image (H, W, 3) to its embedded size by area means in linear light; returns a WebP file."""
+    if embedded_size(image) != image.shape[1::-1]:
+        encoded = srgb.to_encoded(_area_means(_LINEAR[image]))
+        image = np.rint(encoded * 255).clip(0, 255).astype(np.uint8)
+    return Photo.from_array(image, encoding="srgb").encode("webp")
 
 
 def error_map(prediction: Pixels, truth: Pixels) -> Pixels:
-    """The error of a prediction (H, W, 3) in colours of COLOUR_MAP, uint8 (h, w, 3), downscaled like the picture.
+    """Returns the error of a prediction (H, W, 3) in colours of COLOUR_MAP, uint8 (h, w, 3), at the embedded size.
 
-    The error is the largest absolute difference of the channels, averaged over the area of each new pixel.
+    The error is max over channels |prediction - truth|, averaged over the area of each new pixel.
     """
     errors = np.abs(prediction.astype(np.int16) - truth).max(axis=2)
     means = _area_means(errors.astype(np.float32)[..., None])[..., 0]
-    colours: Pixels = COLOUR_MAP[(means / MAX_ERROR * _STEPS).astype(int).clip(0, _STEPS - 1)]
+    colours: Pixels = COLOUR_MAP[(means / MAX_ERROR * _COLOUR_COUNT).astype(int).clip(0, _COLOUR_COUNT - 1)]
     return colours
 
 
-def lossless(picture: Pixels, alpha: Pixels | None = None) -> bytes:
-    """A picture (H, W, 3) with its `alpha` (H, W) as lossless WebP."""
-    return Photo(picture, alpha, FileInfo(container="webp", lossless=True)).encode()
+def encode_lossless(image: Pixels, alpha: Pixels | None = None) -> bytes:
+    """Returns an image (H, W, 3) with its `alpha` (H, W) as a lossless WebP file."""
+    return Photo(image, alpha, FileInfo(container="webp", lossless=True)).encode()
 
 
 def overlay(region: NDArray[np.bool_]) -> bytes:
-    """A WebP that is tinted where at least half of a pixel is in the region, else transparent. The page draws it over the photo."""
+    """Returns a WebP file to draw over the photo: coloured inside the region, transparent outside.
+
+    A new pixel is inside if at least half of its area is in the region.
+    """
     inside = _area_means(region.astype(np.float32)[..., None])[..., 0] >= 0.5
-    alpha = np.where(inside, np.uint8(_TINT_ALPHA), np.uint8(0))
-    tint = np.broadcast_to(np.array(_TINT, np.uint8), (*alpha.shape, 3)).copy()
-    return lossless(tint, alpha)
+    alpha = np.where(inside, np.uint8(_OVERLAY_ALPHA), np.uint8(0))
+    colour = np.broadcast_to(np.array(_OVERLAY_COLOUR, np.uint8), (*alpha.shape, 3)).copy()
+    return encode_lossless(colour, alpha)
 
 
 def _area_means(values: Float32) -> Float32:
-    """Downscales (H, W, C) to the size of embedded pictures: the mean over the area of each new pixel.
+    """Downscales (H, W, C) to the embedded size. Each new pixel is the mean over its area.
 
-    Photo.small computes the same row by row to save memory; this is faster.
+    Photo.resized computes the same row by row to save memory. This function is faster.
     """
-    width, height = size_of(values)
+    width, height = embedded_size(values)
     rows = np.tensordot(_area_weights(values.shape[0], height), values, 1)
     return np.tensordot(_area_weights(values.shape[1], width), rows, (1, 1)).transpose(1, 0, 2)
 
 
 def _area_weights(old: int, new: int) -> Float32:
-    """The weights of `old` pixels in the means of `new` pixels along one axis, (new, old). Each row sums to 1."""
+    """Returns the weights of the `old` pixels in each of the `new` pixels along one axis, (new, old). Each row sums to 1."""
     edges, pixels = np.linspace(0, old, new + 1), np.arange(old)
     overlap = np.minimum(edges[1:, None], pixels + 1) - np.maximum(edges[:-1, None], pixels)
     return (overlap.clip(0) * new / old).astype(np.float32)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final
 
-from brewster.evaluate.report.tables import MAIN, is_complete, ranking
+from brewster.evaluate.report.tables import MAIN_METRICS, is_complete, ranking
 from brewster.evaluate.results import AVERAGE, Results
 
 _SIR2: Final = ("postcard", "solidobject", "wildscene")
 _MARKS: Final = ("\\textbf", "\\underline", "\\uuline")
-"""The paper's marks of the first, second and third place."""
+"""The paper's marks for the best, the second and the third value of a column."""
 _DAGGER: Final = "$^\\dagger$"
 _ESCAPES: Final = str.maketrans(
     {letter: f"\\{letter}" for letter in "&%$#_{}"}
@@ -19,28 +19,28 @@ _ESCAPES: Final = str.maketrans(
 
 
 def to_latex(results: Results) -> str:
-    """One row per method, three metrics per set, SIR2's subsets under one heading, the average last.
+    """Returns a table with one row per method and three metrics per benchmark. The average is the last column group.
 
-    The best three values of a column are marked as in the paper, but never the last one. A dagger marks means over fewer
-    pictures than those of other methods. The table needs the packages multirow and ulem.
+    The best three values of a column are marked as in the paper, but the worst value has no mark. A dagger marks a mean
+    over fewer images than those of other methods. The table needs the LaTeX packages multirow and ulem.
     """
-    metrics = [name for name in MAIN if name in results["metrics"]]
-    keys = _of_the_paper(results)
+    metrics = [name for name in MAIN_METRICS if name in results["metrics"]]
+    keys = _table_selections(results)
     if not metrics or not keys:
-        return "% PSNR, SSIM and LPIPS were not measured\n"
+        return "% PSNR, SSIM and LPIPS have no scores\n"
     columns = "|".join("c" * len(metrics) for _ in keys)
     titles = [_title(results, name) for name in metrics]
     rows = [
         _line([_escape(method), *(cell for key in keys for cell in _cells(results, key, method, metrics))])
         for method in results["methods"]
     ]
-    note = f"{_DAGGER} over fewer pictures than others; do not compare"
+    note = f"{_DAGGER} mean over fewer images than in the other rows; do not compare"
     is_noted = any(_DAGGER in row for row in rows)
     return "\n".join([
         "% brewster evaluate; needs \\usepackage{multirow} and \\usepackage[normalem]{ulem}",
         f"\\begin{{tabular}}{{l|{columns}}}",
         "\\hline",
-        *_heads(results, keys, len(metrics)),
+        *_header_rows(results, keys, len(metrics)),
         "\\hline",
         _line(["", *(titles * len(keys))]),
         "\\hline",
@@ -52,8 +52,11 @@ def to_latex(results: Results) -> str:
     ])  # fmt: skip
 
 
-def _of_the_paper(results: Results) -> list[str]:
-    """The selections of the table: a benchmark's draw instead of the whole, SIR2's subsets side by side, the average last."""
+def _table_selections(results: Results) -> list[str]:
+    """Returns the selections of the table. The subsets of SIR2 are adjacent, and the average is last.
+
+    If there is a draw from a benchmark, it replaces the whole benchmark.
+    """
     keys = [
         key for key in results["selections"] if f"{key}:paper" not in results["selections"] and key != AVERAGE
     ]
@@ -61,28 +64,30 @@ def _of_the_paper(results: Results) -> list[str]:
     return [*keys, *([AVERAGE] if AVERAGE in results["selections"] else [])]
 
 
-def _heads(results: Results, keys: Sequence[str], width: int) -> list[str]:
-    """The header rows with the names of the sets. SIR2's subsets get a common heading."""
+def _header_rows(results: Results, keys: Sequence[str], width: int) -> list[str]:
+    """Returns the header rows with the names of the benchmarks. The subsets of SIR2 have a common heading."""
     sir2 = [key for key in keys if key.partition(":")[0] in _SIR2]
 
-    def head(key: str, rows: int) -> str:
+    def heading(key: str, rows: int) -> str:
         selection = results["selections"][key]
         name = selection["title"].partition(",")[0].removeprefix("SIR2 ")
         text = f"{_escape(name)} ({selection['pictures']})"
-        return _over(width, _tall(text) if rows > 1 else text, is_last=key == keys[-1])
+        return _multicolumn(width, _multirow(text) if rows > 1 else text, is_last=key == keys[-1])
 
     if len(sir2) < 2:
-        return [_line(["Method", *(head(key, 1) for key in keys)])]
-    pictures = sum(results["selections"][key]["pictures"] for key in sir2)
-    above, below = [_tall("Method")], [""]
+        return [_line(["Method", *(heading(key, 1) for key in keys)])]
+    image_count = sum(results["selections"][key]["pictures"] for key in sir2)
+    above, below = [_multirow("Method")], [""]
     for key in keys:
         if key == sir2[0]:
             above.append(
-                _over(width * len(sir2), f"SIR$^2$ ({pictures})", is_last=keys[-len(sir2) :] == sir2)
+                _multicolumn(
+                    width * len(sir2), f"SIR$^2$ ({image_count})", is_last=keys[-len(sir2) :] == sir2
+                )
             )
         elif key not in sir2:
-            above.append(head(key, 2))
-        below.append(head(key, 1) if key in sir2 else _over(width, "", is_last=key == keys[-1]))
+            above.append(heading(key, 2))
+        below.append(heading(key, 1) if key in sir2 else _multicolumn(width, "", is_last=key == keys[-1]))
     first = 2 + width * keys.index(sir2[0])
     return [_line(above), f"\\cline{{{first}-{first + width * len(sir2) - 1}}}", _line(below)]
 
@@ -91,11 +96,11 @@ def _line(cells: Iterable[str]) -> str:
     return f"{' & '.join(cells)} \\\\"
 
 
-def _tall(text: str) -> str:
+def _multirow(text: str) -> str:
     return f"\\multirow{{2}}{{*}}{{{text}}}"
 
 
-def _over(columns: int, text: str, *, is_last: bool) -> str:
+def _multicolumn(columns: int, text: str, *, is_last: bool) -> str:
     return f"\\multicolumn{{{columns}}}{{{'c' if is_last else 'c|'}}}{{{text}}}"
 
 
@@ -105,7 +110,7 @@ def _title(results: Results, metric: str) -> str:
 
 
 def _cells(results: Results, key: str, method: str, metrics: Iterable[str]) -> Iterator[str]:
-    """The means, with one more digit in the average, as in the paper."""
+    """Yields the means with their marks. As in the paper, the average has one more digit."""
     table = results["tables"][key]
     for metric in metrics:
         about: dict[str, Any] = results["metrics"][metric]
@@ -122,5 +127,5 @@ def _cells(results: Results, key: str, method: str, metrics: Iterable[str]) -> I
 
 
 def _escape(text: str) -> str:
-    """The text with LaTeX's special characters escaped."""
+    """Escapes the special characters of LaTeX."""
     return text.translate(_ESCAPES)

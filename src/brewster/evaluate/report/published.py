@@ -1,4 +1,4 @@
-"""Published scores of other methods (published.toml), as rows and as Markdown. They are never mixed with measured scores.
+"""Reads published scores of other methods from published.toml. Reports show them in a section of their own.
 
 for row in read_published():
     print(row.method, row.scores["real20"]["psnr"], row.protocol)
@@ -13,25 +13,26 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final, TypeVar, final
 
-_FILE: Final = Path(__file__).with_name("published.toml")
-_HEADING: Final = "Published by others, not measured here; protocols differ"
+_PUBLISHED_FILE: Final = Path(__file__).with_name("published.toml")
+_HEADING: Final = "Published scores of other methods (not measured here; the protocols differ)"
 _METRICS: Final = {"psnr": "PSNR (dB)", "ssim": "SSIM", "lpips": "LPIPS", "lpips_region": "regional LPIPS"}
 
-_Name = TypeVar("_Name")
+_Item = TypeVar("_Item")
 
 
 @final
 @dataclass(frozen=True)
 class PublishedScores:
-    """The scores of a method as one source printed them.
+    """The scores of a method as a paper printed them.
 
-    `scores` is set -> metric -> value: PSNR in dB, SSIM and LPIPS without a unit; str(value) has the printed digits.
-    `protocol` describes the pictures, their number and size, and what is unknown.
+    `source` is the paper, `copied_from` the table that the numbers were copied from. `protocol` describes the images, their
+    number and size, and says what is unknown. `scores` is benchmark -> metric -> value: PSNR in dB, SSIM and LPIPS without
+    a unit. str(value) has the printed digits.
     """
 
     method: str
     source: str
-    read_in: str
+    copied_from: str
     protocol: str
     scores: dict[str, dict[str, float]]
 
@@ -40,9 +41,9 @@ class _PrintedNumber(float):
     """A number that keeps its printed digits: 26.60, not 26.6."""
 
     def __new__(cls, printed: str) -> _PrintedNumber:
-        figure = super().__new__(cls, printed)
-        figure._printed = printed
-        return figure
+        number = super().__new__(cls, printed)
+        number._printed = printed
+        return number
 
     _printed: str
 
@@ -51,19 +52,19 @@ class _PrintedNumber(float):
 
 
 def read_published() -> list[PublishedScores]:
-    """The rows of published.toml, in file order."""
-    tables = tomllib.loads(_FILE.read_text("utf-8"), parse_float=_PrintedNumber)["table"]
+    """Returns the rows of published.toml, in the order of the file."""
+    tables = tomllib.loads(_PUBLISHED_FILE.read_text("utf-8"), parse_float=_PrintedNumber)["table"]
     return [
-        PublishedScores(method, table["source"], table["read_in"], table["protocol"].strip(), scores)
+        PublishedScores(method, table["source"], table["copied_from"], table["protocol"].strip(), scores)
         for table in tables
         for method, scores in table["rows"].items()
     ]
 
 
 def to_markdown(published: Sequence[PublishedScores]) -> str:
-    """A Markdown section with one table per protocol, below the protocol and its sources.
+    """Returns a Markdown section with one table per protocol. The protocol and the sources are above the table.
 
-    Only consecutive rows of one protocol share a table.
+    Consecutive rows with the same protocol are in one table.
     """
     groups = groupby(published, key=lambda row: row.protocol)
     parts = [_table(protocol, list(rows)) for protocol, rows in groups]
@@ -71,25 +72,29 @@ def to_markdown(published: Sequence[PublishedScores]) -> str:
 
 
 def _table(protocol: str, rows: list[PublishedScores]) -> str:
-    sets = _names(name for row in rows for name in row.scores)
-    metrics = _names(metric for row in rows for scores in row.scores.values() for metric in scores)
-    said = " / ".join(_METRICS.get(metric, metric) for metric in metrics)
+    benchmarks = _distinct(name for row in rows for name in row.scores)
+    metrics = _distinct(metric for row in rows for scores in row.scores.values() for metric in scores)
+    titles = " / ".join(_METRICS.get(metric, metric) for metric in metrics)
     lines = [
         f"**Protocol.** {protocol}",
         "",
         *_sources(rows),
         "",
-        _line([f"published: {said}", *sets]),
-        _line(["---"] * (1 + len(sets))),
-        *(_line([row.method, *(_cell(row, name, metrics) for name in sets)]) for row in rows),
+        _line([f"published: {titles}", *benchmarks]),
+        _line(["---"] * (1 + len(benchmarks))),
+        *(_line([row.method, *(_cell(row, name, metrics) for name in benchmarks)]) for row in rows),
     ]
     return "\n".join(lines)
 
 
 def _sources(rows: list[PublishedScores]) -> list[str]:
-    places = _names((row.source, row.read_in) for row in rows)
-    methods = {place: [row.method for row in rows if (row.source, row.read_in) == place] for place in places}
-    return [f"- {', '.join(methods[place])}: {place[0]}; read in {place[1]}" for place in places]
+    methods: dict[tuple[str, str], list[str]] = {}
+    for row in rows:
+        methods.setdefault((row.source, row.copied_from), []).append(row.method)
+    return [
+        f"- {', '.join(names)}: {source}; copied from {location}"
+        for (source, location), names in methods.items()
+    ]
 
 
 def _cell(row: PublishedScores, name: str, metrics: list[str]) -> str:
@@ -101,6 +106,6 @@ def _line(cells: Iterable[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
-def _names(names: Iterable[_Name]) -> list[_Name]:
-    """The distinct names, in the order of their first occurrence."""
-    return list(dict.fromkeys(names))
+def _distinct(items: Iterable[_Item]) -> list[_Item]:
+    """Returns the items without repetitions, in the order of their first occurrence."""
+    return list(dict.fromkeys(items))

@@ -9,13 +9,11 @@ from typing import Any, Final
 
 from brewster.evaluate.results import Results
 
-MAIN: Final = ("psnr", "ssim", "lpips")
+MAIN_METRICS: Final = ("psnr", "ssim", "lpips")
 """The metrics of the overview table."""
 
 _ARROWS: Final = {True: "↑", False: "↓"}
-_UNEQUAL_COUNTS: Final = (
-    "\n\nDo not compare a mean over fewer pictures with the others; differences are over common pictures."
-)
+_UNEQUAL_COUNTS_NOTE: Final = "\n\nDo not compare a mean over fewer images with the other means. Differences use the images that both methods have."
 _MINUS: Final = "\N{MINUS SIGN}"
 
 
@@ -23,26 +21,26 @@ _MINUS: Final = "\N{MINUS SIGN}"
 
 
 def to_markdown(results: Results) -> str:
-    """All tables: an overview, details of each benchmark with intervals and differences, notes, and the settings."""
+    """Returns all tables as Markdown: an overview, a table per benchmark with intervals and differences, notes, settings."""
     parts = [
         _overview(results),
         *(_details(results, key) for key in results["selections"]),
         _notes(results),
-        _choices(results),
+        _settings(results),
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def overview(results: Results) -> str:
-    """The tables without notes and settings, for the terminal."""
+    """Returns the tables without notes and settings, for the terminal."""
     return (
         "\n\n".join([_overview(results), *(_details(results, key) for key in results["selections"])]) + "\n"
     )
 
 
 def _overview(results: Results) -> str:
-    """One row per method, one column per selection, the main metrics in each cell."""
-    metrics = [name for name in MAIN if name in results["metrics"]]
+    """Returns a table with one row per method and one column per selection. Each cell has the main metrics."""
+    metrics = [name for name in MAIN_METRICS if name in results["metrics"]]
     if not metrics:
         return ""
     titles = " / ".join(_heading(results, name) for name in metrics)
@@ -51,11 +49,11 @@ def _overview(results: Results) -> str:
         [method, *(_cell(results, key, method, metrics) for key in results["selections"])]
         for method in results["methods"]
     ]
-    return f"{titles}\n\n{_grid(rows)}{_UNEQUAL_COUNTS if _has_unequal_counts(results, metrics) else ''}"
+    return f"{titles}\n\n{_grid(rows)}{_UNEQUAL_COUNTS_NOTE if _has_unequal_counts(results, metrics) else ''}"
 
 
 def _has_unequal_counts(results: Results, metrics: Iterable[str]) -> bool:
-    """Whether a method has a mean over fewer pictures than another."""
+    """Returns whether a method has a mean over fewer images than another method."""
     return any(
         metric in row and not is_complete(table, method, metric)
         for table in results["tables"].values()
@@ -65,24 +63,24 @@ def _has_unequal_counts(results: Results, metrics: Iterable[str]) -> bool:
 
 
 def _cell(results: Results, key: str, method: str, metrics: Iterable[str]) -> str:
-    row, pictures = results["tables"][key][method], results["selections"][key]["pictures"]
+    row, image_count = results["tables"][key][method], results["selections"][key]["pictures"]
     text = " / ".join(_number(results, name, row[name]["mean"]) if name in row else "-" for name in metrics)
     counts = sorted({row[name]["count"] if name in row else 0 for name in metrics})
-    if counts == [pictures]:
+    if counts == [image_count]:
         return text
-    return f"{text} ({' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} of {pictures})"
+    return f"{text} ({' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} of {image_count})"
 
 
 def _details(results: Results, key: str) -> str:
-    """A table of one selection: one row per metric, with the means of the methods and the differences between them."""
+    """Returns the table of a selection: one row per metric, with the means of the methods and their differences."""
     selection, table = results["selections"][key], results["tables"][key]
-    methods, apart = list(results["methods"]), results["differences"][key]
-    pairs = list(dict.fromkeys((row["method"], row["than"]) for row in apart))
+    methods, differences = list(results["methods"]), results["differences"][key]
+    pairs = list(dict.fromkeys((row["method"], row["than"]) for row in differences))
     rows = [["", *methods, *(f"{method} {_MINUS} {than}" for method, than in pairs)]]
     for metric in results["metrics"]:
         if not any(metric in table[method] for method in methods):
             continue
-        found = {(row["method"], row["than"]): row for row in apart if row["metric"] == metric}
+        by_pair = {(row["method"], row["than"]): row for row in differences if row["metric"] == metric}
         means = [
             _mean(results, metric, table[method].get(metric), selection["pictures"]) for method in methods
         ]
@@ -90,17 +88,17 @@ def _details(results: Results, key: str) -> str:
             [
                 _heading(results, metric),
                 *means,
-                *(_difference_cell(results, metric, found.get(pair)) for pair in pairs),
+                *(_difference_cell(results, metric, by_pair.get(pair)) for pair in pairs),
             ]
         )
-    return f"### {selection['title']} ({selection['pictures']} pictures)\n\n{_grid(rows)}"
+    return f"### {selection['title']} ({selection['pictures']} images)\n\n{_grid(rows)}"
 
 
-def _mean(results: Results, metric: str, entry: Mapping[str, Any] | None, pictures: int) -> str:
+def _mean(results: Results, metric: str, entry: Mapping[str, Any] | None, image_count: int) -> str:
     if entry is None:
         return "-"
-    some = f", {entry['count']} of {pictures}" if entry["count"] != pictures else ""
-    return f"{_number(results, metric, entry['mean'])}{_interval(results, metric, entry)}{some}"
+    count = f", {entry['count']} of {image_count}" if entry["count"] != image_count else ""
+    return f"{_number(results, metric, entry['mean'])}{_interval(results, metric, entry)}{count}"
 
 
 def _difference_cell(results: Results, metric: str, row: Mapping[str, Any] | None) -> str:
@@ -121,39 +119,42 @@ def _interval(results: Results, metric: str, entry: Mapping[str, Any], *, sign: 
 
 
 def _notes(results: Results) -> str:
-    """Remarks, refused files, metrics without a score, and failures."""
+    """Returns the notes: remarks, excluded files, metrics without a score, and errors."""
     lines = [
         f"- {part['title']}: {text}"
         for part in results["benchmarks"].values()
-        for text in (*part["remarks"], *(f"left out: {reason}" for reason in part["refused"]))
+        for text in (*part["remarks"], *(f"excluded: {reason}" for reason in part["refused"]))
     ]
     lines += [f"- {remark}" for remark in remarks(results)]
-    lines += [f"- {name}: no picture has the ground truth that it needs" for name in results["unmeasured"]]
+    lines += [
+        f"- {name} is not scored: no image has the ground truth that it needs"
+        for name in results["unmeasured"]
+    ]
     lines += [f"- {error}" for error in failures(results)]
     return "\n".join(["### Notes", "", *lines]) if lines else ""
 
 
 def remarks(results: Mapping[str, Any]) -> list[str]:
-    """The remarks on methods."""
+    """Returns the remarks on methods."""
     return [f"{name}: {about['remark']}" for name, about in results["methods"].items() if "remark" in about]
 
 
 def failures(results: Results) -> list[str]:
-    """The errors of methods, without repetitions."""
+    """Returns the errors of methods, without repetitions."""
     errors = (error for picture in results["pictures"] for error in picture["errors"].values())
     return list(dict.fromkeys(errors))
 
 
-def _choices(results: Results) -> str:
+def _settings(results: Results) -> str:
     metrics = (f"{entry['title']}: {entry['about']}" for entry in results["metrics"].values())
     lines = [*results["protocol"]["choices"], *metrics]
-    return "\n".join(["### How it was measured", "", *(f"- {line}" for line in lines)])
+    return "\n".join(["### Settings and definitions", "", *(f"- {line}" for line in lines)])
 
 
 def _grid(rows: Iterable[Iterable[str]]) -> str:
-    head, *body = [[cell.replace("|", "\\|") for cell in row] for row in rows]
-    widths = [max(map(len, column)) for column in zip(head, *body, strict=True)]
-    lines = [head, [":" + "-" * max(2, width - 1) for width in widths], *body]
+    header, *body = [[cell.replace("|", "\\|") for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(header, *body, strict=True)]
+    lines = [header, [":" + "-" * max(2, width - 1) for width in widths], *body]
     return "\n".join(
         f"| {' | '.join(cell.ljust(width) for cell, width in zip(line, widths, strict=True))} |"
         for line in lines
@@ -171,9 +172,10 @@ def _number(results: Results, metric: str, value: float, *, sign: str = "") -> s
 
 
 def ranking(table: Mapping[str, Any], metric: str, about: Mapping[str, Any]) -> list[str]:
-    """The means as printed, the best first, without repetitions; equal printed means get the same mark.
+    """Returns the distinct means in descending order of quality, as they are printed.
 
-    Methods with a score on fewer pictures than others are left out. With fewer than two methods the list is empty.
+    The list has no means of methods with scores on fewer images than other methods. It is empty if fewer than two methods
+    remain.
     """
     means = [row[metric]["mean"] for method, row in table.items() if is_complete(table, method, metric)]
     if len(means) < 2:
@@ -183,7 +185,7 @@ def ranking(table: Mapping[str, Any], metric: str, about: Mapping[str, Any]) -> 
 
 
 def is_complete(table: Mapping[str, Any], method: str, metric: str) -> bool:
-    """Whether no other method has a score in this metric on more pictures."""
+    """Returns whether no other method has this score on more images."""
     counts = {name: row[metric]["count"] for name, row in table.items() if row.get(metric)}
     return counts.get(method) == max(counts.values(), default=0)
 
@@ -192,7 +194,7 @@ def is_complete(table: Mapping[str, Any], method: str, metric: str) -> bool:
 
 
 def to_csv(results: Results) -> str:
-    """One line for each set, method and metric, and for each difference; `than` is the other method."""
+    """Returns a CSV table: one line for each mean, and one for each difference of `method` minus `than`."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["set", "method", "than", "metric", "unit", "mean", "low", "high", "better", "count"])

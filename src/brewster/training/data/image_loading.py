@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from brewster.benchmarks.pairing import PictureGroup, read_folders
+from brewster.benchmarks.pairing import ImageGroup, read_folders
 from brewster.errors import PhotoError, RecipeError
 from brewster.image_formats import SUFFIXES
 from brewster.photo import Photo
@@ -86,12 +86,12 @@ def read_pairs(folders: Sequence[Path], max_pairs: int | None = None) -> list[tu
     ]
 
 
-def _evenly_spaced(groups: list[PictureGroup], max_pairs: int | None) -> list[PictureGroup]:
+def _evenly_spaced(groups: list[ImageGroup], max_pairs: int | None) -> list[ImageGroup]:
     count = min(len(groups), max_pairs or len(groups))
     return [groups[number * len(groups) // count] for number in range(count)]
 
 
-def _picture_groups(folder: Path) -> list[PictureGroup]:
+def _picture_groups(folder: Path) -> list[ImageGroup]:
     try:
         found = read_folders(folder)
     except PhotoError as error:
@@ -100,16 +100,16 @@ def _picture_groups(folder: Path) -> list[PictureGroup]:
             "a folder that contains blended/ and transmission_layer/",
             _FOLDER_CURE,
         ) from error
-    if found.refused:
+    if found.excluded:
         raise RecipeError(
-            f"{folder}: {found.refused[0]} (pictures without a partner: {len(found.refused)})",
+            f"{folder}: {found.excluded[0]} (pictures without a partner: {len(found.excluded)})",
             "one transmission with the name of each photo, and no other files",
             "add or remove files until the names match",
         )
     return sorted(found.groups, key=lambda group: group.photo)
 
 
-def _read_pair(group: PictureGroup) -> tuple[Tensor, Tensor]:
+def _read_pair(group: ImageGroup) -> tuple[Tensor, Tensor]:
     photo, transmission = (
         torch.from_numpy(Photo.open(path).srgb_8bit().copy()) for path in (group.photo, group.transmission)
     )

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from brewster.benchmarks.pairing import PictureGroup, read_folders
+from brewster.benchmarks.pairing import ImageGroup, read_folders
 from brewster.errors import RecipeError
 from brewster.models.diffusion.families.family import Backbone
 from brewster.models.diffusion.panels import PanelFit, compose, conditioning_image, fit_panel
@@ -196,7 +196,7 @@ def _read_pairs(folder: Path, recipe: LoraRecipe) -> list[TrainingSample]:
     return [_read_sample(group, *pair) for group, pair in zip(groups, pictures, strict=True)]
 
 
-def _check_reflections(folder: Path, groups: Sequence[PictureGroup]) -> None:
+def _check_reflections(folder: Path, groups: Sequence[ImageGroup]) -> None:
     missing = [group.name for group in groups if group.reflection is None]
     if missing:
         raise RecipeError(
@@ -206,7 +206,7 @@ def _check_reflections(folder: Path, groups: Sequence[PictureGroup]) -> None:
         )
 
 
-def _read_sample(group: PictureGroup, photo: Tensor, transmission: Tensor) -> TrainingSample:
+def _read_sample(group: ImageGroup, photo: Tensor, transmission: Tensor) -> TrainingSample:
     if group.reflection is None:
         return TrainingSample(layers_from_pair(photo, transmission), Pairs.reflection_weight)
     reflection = _read_picture(group.reflection)
