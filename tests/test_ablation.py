@@ -1,4 +1,4 @@
-"""Studies: one value, several choices, trained and measured alike."""
+"""Studies: one key, several values, trained and measured alike."""
 
 import io
 import os
@@ -38,22 +38,22 @@ def test_every_ablation_of_the_paper_is_ready():
 def test_a_study_changes_one_value_of_both_the_full_and_the_tiny_recipe(path):
     study = read_study(path)
     for base in (read_recipe(study.base), read_recipe(RECIPES / TINY.get(path.stem, "tiny.toml"))):
-        recipes = [with_value(base, study.value, choice) for choice in study.choices]
+        recipes = [with_value(base, study.key, value) for value in study.values]
         assert base in recipes
-        assert len({recipe.model_dump_json() for recipe in recipes}) == len(study.choices)
+        assert len({recipe.model_dump_json() for recipe in recipes}) == len(study.values)
 
 
 def test_the_training_sizes_are_the_papers():
-    assert read_study(RECIPES / "size.toml").choices == [0, 10, 50, 100, 300, 1000]
+    assert read_study(RECIPES / "size.toml").values == [0, 10, 50, 100, 300, 1000]
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("value = 'seed'\nchoices = [1, 2]\nbenchmarks = { real20 = 'x' }", "base"),
-        ("base = 'b'\nvalue = 'seed'\nchoices = [1]\nbenchmarks = { real20 = 'x' }", "choices"),
-        ("base = 'b'\nvalue = 'seed'\nchoices = [1, 2]\nbenchmarks = {}", "benchmarks"),
-        ("base = 'b'\nvalue = 'seed'\nchoice = 3", "choice"),
+        ("key = 'seed'\nvalues = [1, 2]\nbenchmarks = { real20 = 'x' }", "base"),
+        ("base = 'b'\nkey = 'seed'\nvalues = [1]\nbenchmarks = { real20 = 'x' }", "values"),
+        ("base = 'b'\nkey = 'seed'\nvalues = [1, 2]\nbenchmarks = {}", "benchmarks"),
+        ("base = 'b'\nkey = 'seed'\nvalue = 3", "there is no key value"),
         ("base =", "TOML"),
     ],
 )
@@ -83,7 +83,7 @@ def pairs(tmp_path):
     return read_benchmark("real20", tmp_path / "real20")
 
 
-def test_choices_are_compared_with_the_first_and_numbers_are_drawn(quick, pairs, data, tmp_path, monkeypatch):
+def test_values_are_compared_with_the_first_and_numbers_are_drawn(quick, pairs, data, tmp_path, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     calls = []
     results = ablate(
@@ -141,7 +141,7 @@ def test_every_study_runs_end_to_end_at_tiny_size(path, little_data, tmp_path):
     done = as_user("ablate", path, "--base", base, "-o", tmp_path / "out", env=environment)
     assert done.returncode == 0, done.stderr.decode()
     text = done.stdout.decode()
-    for choice in read_study(path).choices:
-        assert f" {choice} " in text
+    for value in read_study(path).values:
+        assert f" {value} " in text
     assert (tmp_path / "out" / "report.html").is_file()
     assert (tmp_path / "out" / "plot.png").is_file() == (path.stem in {"size", "pairs"})

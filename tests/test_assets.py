@@ -237,7 +237,7 @@ def test_highlights_raise_whites_and_nothing_else(folder):
     picture[:6, :6] = 255
     data = file_of(picture, "PNG")
     plain = plane_light(folder, "a.png", data)
-    raised = plane_light(folder, "a.png", data, highlights=9)
+    raised = plane_light(folder, "a.png", data, highlight_boost=9)
     factor = raised / plain
     np.testing.assert_allclose(factor[:6, :6], 10, rtol=1e-5)
     np.testing.assert_allclose(factor[6:], 1, rtol=1e-6)
@@ -248,7 +248,7 @@ def test_near_whites_are_raised_less_than_whites_and_keep_their_hue(folder):
     greys = np.linspace(150, 255, 64).astype(np.uint8)
     picture = np.broadcast_to(greys[:, None] * np.array([1, 0.9, 0.5]), (16, 64, 3)).astype(np.uint8)
     data = file_of(picture, "PNG")
-    factor = plane_light(folder, "a.png", data, highlights=5) / plane_light(folder, "a.png", data)
+    factor = plane_light(folder, "a.png", data, highlight_boost=5) / plane_light(folder, "a.png", data)
     np.testing.assert_allclose(factor, np.broadcast_to(factor[..., :1], factor.shape), rtol=1e-5)
     assert (np.diff(factor[0, :, 0]) >= -1e-6).all()
     assert factor[0, 0, 0] == pytest.approx(1)
@@ -256,7 +256,7 @@ def test_near_whites_are_raised_less_than_whites_and_keep_their_hue(folder):
 
 
 def test_a_black_picture_is_dark_and_finite(folder):
-    light = plane_light(folder, "a.png", file_of(np.zeros((8, 8, 3), np.uint8), "PNG"), highlights=3)
+    light = plane_light(folder, "a.png", file_of(np.zeros((8, 8, 3), np.uint8), "PNG"), highlight_boost=3)
     assert not light.any()
 
 

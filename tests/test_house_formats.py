@@ -131,10 +131,10 @@ LPIPS = {
     2: {"lpips": 0.033937, "lpips_region": 0.035948, "lpips_reflection": 0.283549},
 }
 SCENES = {
-    1: {"tiny": "3110c6324c047d3d", "window": "e2d8b2c9af23a561"},
+    2: {"tiny": "b8473c2883ad1619", "window": "bd20ed9f789a3ff3"},
 }
 SAMPLES = {
-    1: {
+    2: {
         "photo, light": [1.0143, 0.8571, 1.1205],
         "transmission, light": [0.7423, 0.6429, 0.8384],
         "background, light": [0.9394, 0.7656, 1.0188],
@@ -148,7 +148,7 @@ SAMPLES = {
     },
 }
 MAPS = {
-    1: {
+    2: {
         "room": [
             -1.134,
             -1.145,

@@ -25,7 +25,7 @@ from brewster.training.recipe import LoraRecipe
 from set_folders import make
 
 RECIPE = {
-    "backbone": "tiny:kontext", "budget_px": 3 * 32 * 16, "seed": 1, "steps": 6, "batch": 1,
+    "backbone": "tiny:kontext", "budget_px": 3 * 32 * 16, "seed": 1, "steps": 6, "batch_size": 1,
     "learning_rate": 1e-2, "warmup_steps": 2, "weight_decay": 1e-4, "report_every": 6, "checkpoint_every": 2,
 }  # fmt: skip
 

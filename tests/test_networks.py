@@ -86,10 +86,11 @@ def test_a_run_of_one_network_is_not_resumed_with_another(recipe, small, tmp_pat
         train(with_value(recipe, "network", small), tmp_path, silent)
 
 
-def test_checkpoints_older_than_the_choice_of_network_hold_the_default_one(recipe, tmp_path):
+def test_a_checkpoint_with_an_older_recipe_contains_the_default_network(recipe, tmp_path):
     trainer = CompactTrainer(recipe)
-    older = recipe.model_dump_json(exclude={"network"})
+    older = recipe.model_dump_json(exclude={"network"}).replace('"batch_size"', '"batch"')
     assert "network" not in older
+    assert "batch_size" not in older
     average = {name: torch.full_like(value, 2.0) for name, value in trainer.average.items()}
     checkpoint = replace(
         Checkpoint(0, older, trainer.state_dict()), state=trainer.state_dict() | {"average": average}

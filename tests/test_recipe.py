@@ -154,7 +154,7 @@ def test_the_path_of_a_scene_recipe_is_relative_to_the_recipe(tmp_path):
         ),
         (("[mix]", "[mix]\ngamma_log = [1.2, 0.8]"), r"mix\.gamma_log is .* expected low <= high"),
         (("[mix]", "[mix]\nnoise = [0, nan]"), r"mix\.noise"),
-        (("[mix]", "[mix]\nabsent_probability = 1.5"), r"mix\.absent_probability"),
+        (("[mix]", "[mix]\nno_glass_probability = 1.5"), r"mix\.no_glass_probability"),
         (("[mix]", "[mix]\nveil_probability = -0.1"), r"mix\.veil_probability"),
     ],
 )
@@ -174,7 +174,7 @@ def test_a_recipe_with_a_backbone_is_a_lora_recipe():
 
 def test_the_kontext_recipe_is_the_papers():
     recipe = read_recipe(KONTEXT)
-    assert (recipe.backbone, recipe.rank, recipe.steps, recipe.batch) == ("kontext", 16, 4000, 1)
+    assert (recipe.backbone, recipe.rank, recipe.steps, recipe.batch_size) == ("kontext", 16, 4000, 1)
     assert recipe.layout.panels == ("I", "T", "R")
     assert recipe.layout.composite_size((512, 512))[0] * 512 == recipe.budget_px
     assert recipe.data.rendered.target == "transmission"

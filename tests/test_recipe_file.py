@@ -38,7 +38,7 @@ double_probability = 2
 thickness_mm = [5, 4]
 [behind]
 map_probabilty = 0.5
-[developmnt]
+[camera_respons]
 contrast = [0, 1]
 """
     assert problems(text) == [
@@ -54,8 +54,8 @@ contrast = [0, 1]
             " did you mean behind.map_probability?"
         ),
         (
-            "mine.toml: there is no key developmnt (its value is { contrast = [0, 1] }); expected a key of the recipe;"
-            " did you mean development?"
+            "mine.toml: there is no key camera_respons (its value is { contrast = [0, 1] }); expected a key of the recipe;"
+            " did you mean camera_response?"
         ),
     ]
 

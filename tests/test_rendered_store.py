@@ -47,7 +47,7 @@ def test_a_sample_is_five_photographs_their_light_and_their_scene(four, scene):
 
 def test_only_the_photo_has_the_quality_of_the_scene(scene):
     coarse = scene.model_copy(
-        update={"development": scene.development.model_copy(update={"jpeg_quality": 1})}
+        update={"camera_response": scene.camera_response.model_copy(update={"jpeg_quality": 1})}
     )
     fine, rough = (store.encode_sample(render(each, None), "fake") for each in (scene, coarse))
     assert len(rough["photo.jpg"]) < len(fine["photo.jpg"])

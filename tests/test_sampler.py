@@ -82,8 +82,8 @@ def test_no_texel_of_a_map_spans_more_pixels_than_the_recipe_allows(fifty, recip
     maps = 0
     for scene in fifty[recipe]:
         for side, most in (
-            (scene.behind, asked.behind.most_px_per_texel),
-            (scene.front, asked.front.most_px_per_texel),
+            (scene.behind, asked.behind.max_px_per_texel),
+            (scene.front, asked.front.max_px_per_texel),
         ):
             if side.map:
                 maps += 1
@@ -97,7 +97,7 @@ def test_a_picture_behind_the_glass_fills_the_view():
     recipe = changed(
         "vitrine",
         camera={"width": 24, "height": 16, "pinhole_probability": 1.0},
-        behind={"fill": (1.05, 1.5), "turn_deg": (0.0, 0.0)},
+        behind={"relative_width": (1.05, 1.5), "turn_deg": (0.0, 0.0)},
     )
     for index in range(12):
         scene = drawn(recipe, index)

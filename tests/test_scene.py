@@ -99,8 +99,8 @@ def test_an_impossible_scene_is_refused_and_the_value_named(text, says, written)
         ("glass.tints = []", "at least one colour"),
         ("camera.fov_deg = [nan, 50]", r"camera\.fov_deg"),
         (
-            "development.jpeg_quality = [97, 60]",
-            r"development\.jpeg_quality is \[97, 60\]; expected low <= high",
+            "camera_response.jpeg_quality = [97, 60]",
+            r"camera_response\.jpeg_quality is \[97, 60\]; expected low <= high",
         ),
         ("behind.map_probability = 1.5", r"behind\.map_probability is 1.5; .*from 0 to 1"),
         ("colour = 'red'", "no key colour"),

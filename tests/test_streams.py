@@ -161,6 +161,6 @@ def test_pairs_to_validate_on_are_evenly_spaced_in_order_of_name(recipe, root):
         grey = np.full((8, 8, 3), 30 * number, np.uint8)
         for role in ("blended", "transmission"):
             Photo.from_array(grey, encoding="srgb").save(root / "many" / role / f"{number}.png")
-    data = recipe.data.model_copy(update={"validate_on": (Path("many"),), "validate_at_most": 3})
+    data = recipe.data.model_copy(update={"validate_on": (Path("many"),), "max_validation_pairs": 3})
     seen = [int(photo[0, 0, 0]) // 30 for photo, _ in validation_pairs(data)["many"]]
     assert seen == [0, 2, 4]

@@ -57,7 +57,7 @@ def test_an_8_bit_sample_is_the_blend_of_its_own_background_and_mirror(folder):
         photo, *layers = blended_layers(behind, mirror, scene)
         found = stream.sample(number).permute(2, 0, 1) / 255
         torch.testing.assert_close(found[3:], torch.cat(layers))
-        seen = pixels(encode_jpeg(photo, scene.development.jpeg_quality)).permute(2, 0, 1) / 255
+        seen = pixels(encode_jpeg(photo, scene.camera_response.jpeg_quality)).permute(2, 0, 1) / 255
         torch.testing.assert_close(found[:3], seen)
 
 

@@ -60,7 +60,9 @@ class Assets:
         bright = ((picture.max(axis=2, keepdims=True) - 0.8) / 0.2).clip(0, 1)
         mean = (picture @ _LUMINANCE).mean() + np.float32(1e-4)
         light: Float32 = (
-            picture * (1 + np.float32(plane.highlights) * bright**2) * (np.float32(plane.luminance) / mean)
+            picture
+            * (1 + np.float32(plane.highlight_boost) * bright**2)
+            * (np.float32(plane.luminance) / mean)
         )
         return light
 

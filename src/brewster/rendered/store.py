@@ -67,8 +67,9 @@ def statistics(sample: LightSample, developed: DevelopedSample) -> dict[str, flo
     return {name: float(f"{measure(sample, developed):.6g}") for name, measure in STATISTICS.items()}
 
 
-SAMPLE_FORMAT: Final = 1
-"""To be raised when the same job gives other samples, so that no set mixes the two. See test_house_formats."""
+SAMPLE_FORMAT: Final = 2
+"""Version of the files of a sample. Increase it if the same job gives other files, so that no set contains samples of two
+versions (tests/test_house_formats.py). 2: scene.toml has [camera_response] and `highlight_boost`."""
 
 
 def encode_sample(sample: LightSample, renderer: str) -> dict[str, bytes]:
@@ -81,7 +82,7 @@ def encode_sample(sample: LightSample, renderer: str) -> dict[str, bytes]:
     made = {"version": brewster.__version__, "renderer": renderer}
     outcome = {**made, **developed.camera_settings(), **statistics(sample, developed)}
     qualities = dict.fromkeys(LAYERS, _GROUND_TRUTH_QUALITY) | {
-        "photo": sample.scene.development.jpeg_quality
+        "photo": sample.scene.camera_response.jpeg_quality
     }
     files = {f"{name}.jpg": encode_jpeg(layer, qualities[name]) for name, layer in developed.layers().items()}
     light = {name: layer.permute(1, 2, 0).float().cpu().numpy() for name, layer in sample.layers().items()}

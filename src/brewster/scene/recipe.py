@@ -44,7 +44,7 @@ class GlassRecipe(FrozenModel):
     """Thickness of a pane."""
     structural_probability: Share = 0.0
     """Probability of thick structural glass."""
-    structural_mm: LogRange = (10.0, 40.0)
+    structural_thickness_mm: LogRange = (10.0, 40.0)
     """Thickness of a pane of structural glass."""
     index: Range = (1.45, 1.65)
     """Refractive index, the same for all panes of a scene; at least 1."""
@@ -90,7 +90,7 @@ class CameraRecipe(FrozenModel):
     pitch_deg: Range = (-12.0, 12.0)
     """Angle of the optical axis above the horizon."""
     fov_deg: Range = (30.0, 90.0)
-    """Horizontal field of view. A map of low resolution raises the lower end; see most_px_per_texel."""
+    """Horizontal field of view. A map of low resolution raises the lower end; see max_px_per_texel."""
     pinhole_probability: Share = 0.7
     """Probability of a pinhole camera, which has no defocus."""
     aperture_mm_log: LogRange = (1.0, 15.0)
@@ -106,7 +106,7 @@ class SideRecipe(FrozenModel):
     """Probability of an environment map. Without one there is always a picture."""
     maps: tuple[str, ...] = ()
     """Categories of maps to draw from, such as indoor, outdoor or night; empty for all."""
-    most_px_per_texel: PositiveFloat = 2.5
+    max_px_per_texel: PositiveFloat = 2.5
     """A map is used only if a texel of it covers at most this many pixels."""
     dome_probability: Share = 0.0
     """Probability that the map is on a sphere of finite radius around the glass instead of at infinity."""
@@ -116,17 +116,17 @@ class SideRecipe(FrozenModel):
     """Probability of a picture on a plane, in front of the map if there is one."""
     distance_mm_log: LogRange = (1000.0, 8000.0)
     """Distance of the picture from the glass."""
-    fill: Range = (1.05, 1.5)
+    relative_width: Range = (1.05, 1.5)
     """Width of the picture over the width that exactly covers the view."""
     turn_deg: Range = (0.0, 0.0)
     """Rotation of the picture about the vertical axis; about the horizontal axis it is half as large."""
-    highlights: Range = (0.0, 0.0)
-    """Extra brightness of clipped whites in a picture: white is (1 + highlights) times as bright."""
+    highlight_boost: Range = (0.0, 0.0)
+    """Extra brightness of clipped whites in a picture: white is (1 + highlight_boost) times as bright."""
     luminance_log: LogRange = (1.0, 1.0)
     """Mean luminance of the content. Only the ratio between the two sides matters."""
 
 
-class DevelopmentRecipe(FrozenModel):
+class CameraResponseRecipe(FrozenModel):
     """The camera response: from linear light to an 8-bit photograph."""
 
     exposure: LogRange = (0.2, 0.5)
@@ -169,7 +169,7 @@ class SceneRecipe(FrozenModel):
     """The content behind the glass, which the transmission shows."""
     front: SideRecipe = SideRecipe()
     """The content in front of the glass, which the reflection shows. It has the same keys as [behind]."""
-    development: DevelopmentRecipe = DevelopmentRecipe()
+    camera_response: CameraResponseRecipe = CameraResponseRecipe()
 
 
 def read_scene_recipe(name: str) -> SceneRecipe:

@@ -16,8 +16,8 @@ from brewster import __version__
 from brewster.errors import RecipeError
 from brewster.scene.camera import Camera, axes, dot
 from brewster.scene.glass import Glazing, Pane, Point
-from brewster.scene.recipe import CameraRecipe, DevelopmentRecipe, GlassRecipe, SceneRecipe, SideRecipe
-from brewster.scene.scene import Development, Scene
+from brewster.scene.recipe import CameraRecipe, CameraResponseRecipe, GlassRecipe, SceneRecipe, SideRecipe
+from brewster.scene.scene import CameraResponse, Scene
 from brewster.scene.values import FrozenModel
 from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
 
@@ -108,7 +108,7 @@ def _draw_once(recipe: SceneRecipe, catalog: Catalog, rng: _SceneRng, seed: int,
         camera=_focus_camera(recipe.camera, draft, behind, front),
         behind=behind,
         front=front,
-        development=_draw_development(recipe.development, rng),
+        camera_response=_draw_camera_response(recipe.camera_response, rng),
     )
 
 
@@ -123,7 +123,9 @@ def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
 
     def pane() -> Pane:
         return Pane(
-            thickness_mm=rng.from_log_range(recipe.structural_mm if structural else recipe.thickness_mm),
+            thickness_mm=rng.from_log_range(
+                recipe.structural_thickness_mm if structural else recipe.thickness_mm
+            ),
             index=index,
             absorption_per_m=(red, green, blue),
             roughness=rough,
@@ -146,7 +148,7 @@ def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng:
     if not sharp:
         raise RecipeError(
             f"none of {len(catalog.maps)} maps fits the recipe",
-            f"expected categories {', '.join(recipe.maps) or 'any'}, and texels finer than {recipe.most_px_per_texel:g} px"
+            f"expected categories {', '.join(recipe.maps) or 'any'}, and texels finer than {recipe.max_px_per_texel:g} px"
             f" at {camera.fov_deg[1]:g} degrees",
             "give other --maps or larger ones, or a smaller --size",
         )
@@ -155,7 +157,7 @@ def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng:
 
 def _min_fov_deg(asset: Asset, recipe: SideRecipe, camera: CameraRecipe) -> float:
     """The smallest field of view in degrees in which a texel of the map does not cover too many pixels."""
-    return camera.width * 360 / asset.width / recipe.most_px_per_texel
+    return camera.width * 360 / asset.width / recipe.max_px_per_texel
 
 
 def _draw_camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]], rng: _SceneRng) -> Camera:
@@ -197,7 +199,7 @@ def _draw_side(recipe: SideRecipe, asset: Asset | None, draft: _PartialScene, ne
 
 
 def _draw_plane(recipe: SideRecipe, draft: _PartialScene, luminance: float, distance_mm: float) -> Plane:
-    """A picture whose width is `fill` times what covers the view, seen directly or mirrored."""
+    """A picture whose width is `relative_width` times what covers the view, seen directly or mirrored."""
     if not draft.catalog.pictures:
         raise RecipeError(
             "there are no pictures to draw from", "the recipe needs pictures", "name a folder with --photos"
@@ -209,11 +211,11 @@ def _draw_plane(recipe: SideRecipe, draft: _PartialScene, luminance: float, dist
         source=asset.source,
         distance_mm=_six_digits(distance_mm),
         offset_mm=(_six_digits((left + right) / 2), _six_digits((bottom + top) / 2)),
-        width_mm=_six_digits(cover * rng.from_range(recipe.fill)),
+        width_mm=_six_digits(cover * rng.from_range(recipe.relative_width)),
         heading_deg=rng.from_range(recipe.turn_deg),
         pitch_deg=rng.from_range(recipe.turn_deg) / 2,
         luminance=luminance,
-        highlights=rng.from_range(recipe.highlights),
+        highlight_boost=rng.from_range(recipe.highlight_boost),
     )
 
 
@@ -262,8 +264,8 @@ def _focus_camera(recipe: CameraRecipe, draft: _PartialScene, behind: Side, fron
     )
 
 
-def _draw_development(recipe: DevelopmentRecipe, rng: _SceneRng) -> Development:
-    return Development(
+def _draw_camera_response(recipe: CameraResponseRecipe, rng: _SceneRng) -> CameraResponse:
+    return CameraResponse(
         exposure=rng.from_log_range(recipe.exposure),
         white_balance=rng.choice(recipe.white_balance),
         white_balance_strength=rng.from_range(recipe.white_balance_strength),

@@ -24,7 +24,7 @@ MAX_INCIDENCE_DEG = 85.0
 WhiteBalance = Literal["none", "grey-world", "white-patch", "grey-edge"]
 
 
-class Development(FrozenModel):
+class CameraResponse(FrozenModel):
     """The camera response, from linear light to a photograph. It is computed for I and applied to all layers."""
 
     exposure: Annotated[float, Field(gt=0, le=1)] = 0.4
@@ -60,7 +60,7 @@ class Scene(FrozenModel):
     camera: Camera = Camera()
     behind: Side = Side()
     front: Side = Side()
-    development: Development = Development()
+    camera_response: CameraResponse = CameraResponse()
 
     @model_validator(mode="after")
     def _check_geometry(self) -> Scene:

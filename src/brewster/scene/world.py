@@ -49,9 +49,9 @@ class Plane(FrozenModel):
     heading_deg: Annotated[float, Field(gt=-80, lt=80)] = 0.0
     pitch_deg: Annotated[float, Field(gt=-80, lt=80)] = 0.0
     luminance: NonNegativeFloat = 1.0
-    """Its mean luminance, before `highlights` is applied."""
-    highlights: NonNegativeFloat = 0.0
-    """Extra brightness of clipped whites: white is (1 + highlights) times as bright."""
+    """Its mean luminance, before `highlight_boost` is applied."""
+    highlight_boost: NonNegativeFloat = 0.0
+    """Extra brightness of clipped whites: white is (1 + highlight_boost) times as bright."""
 
     @property
     def nearest_mm(self) -> float:

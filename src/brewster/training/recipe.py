@@ -79,7 +79,7 @@ class TrainingRecipe(FrozenModel):
     """Seed of all random numbers. The same recipe and data give the same weights."""
     steps: PositiveInt
     """Number of training steps."""
-    batch: PositiveInt
+    batch_size: PositiveInt
     """Samples per training step."""
     learning_rate: PositiveFloat
     """Peak learning rate of AdamW."""
@@ -117,8 +117,8 @@ class CompactRecipe(TrainingRecipe):
 
     @model_validator(mode="after")
     def _check_shares(self) -> Self:
-        real = _share_of(self.batch, "pairs_share", self.data.pairs_share)
-        _share_of(self.batch - real, "rendered.share", self.data.rendered_share)
+        real = _share_of(self.batch_size, "pairs_share", self.data.pairs_share)
+        _share_of(self.batch_size - real, "rendered.share", self.data.rendered_share)
         return self
 
     def size_at(self, step: int) -> int:
@@ -209,7 +209,7 @@ def _share_of(samples: int, name: str, share: float) -> int:
     part = round(samples * share)
     if samples and 0 < share < 1 and part in (0, samples):
         raise ValueError(
-            f"{name} = {share:g} gives {part} of {samples} samples; raise batch or change the share"
+            f"{name} = {share:g} gives {part} of {samples} samples; raise batch_size or change the share"
         )
     return part
 

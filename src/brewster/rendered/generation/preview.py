@@ -52,7 +52,7 @@ COLUMNS: Final = {
             (more, "float64", more),
         )
     },
-    "jpeg_quality": ("int64", "development.jpeg_quality"),
+    "jpeg_quality": ("int64", "camera_response.jpeg_quality"),
     "exposure_ev": ("float64", "outcome.exposure_ev"),
     "mirror_exposure_ev": ("float64", "outcome.mirror_exposure_ev"),
     **{name: ("float64", f"outcome.{name}") for name in STATISTICS},

@@ -72,7 +72,7 @@ class DataRecipe(FrozenModel):
     """Further file names to leave out of training. The compact model is validated on mixtures of them."""
     validate_on: tuple[Path, ...] = ()
     """Folders of real pairs to validate on."""
-    validate_at_most: PositiveInt = 40
+    max_validation_pairs: PositiveInt = 40
     """Largest number of pairs from each folder in `validate_on`, evenly spaced in the order of their names."""
 
     @property

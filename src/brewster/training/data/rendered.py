@@ -167,7 +167,7 @@ def _blended_sample(entry: StoredSample) -> Tensor:
         scene = read_scene_of(entry)
     background, mirror = (_picture(entry, name).permute(2, 0, 1) / 255 for name in ("background", "mirror"))
     photo, *layers = blended_layers(background, mirror, scene)
-    seen = Photo.open(encode_jpeg(photo, scene.development.jpeg_quality)).pixels.copy()
+    seen = Photo.open(encode_jpeg(photo, scene.camera_response.jpeg_quality)).pixels.copy()
     return torch.cat([torch.from_numpy(picture) for picture in (seen, *map(to_uint8, layers))], dim=2)
 
 

@@ -238,7 +238,7 @@ def _settings(recipe: LoraRecipe) -> str:
     one_step = recipe.objective == "one_step"
     rows = {
         "rank, alpha": f"{recipe.rank}, {recipe.alpha}",
-        "steps, batch": f"{recipe.steps}, {recipe.batch}",
+        "steps, batch": f"{recipe.steps}, {recipe.batch_size}",
         "seed": recipe.seed,
         "panels": f"{' '.join(recipe.panels)}, {recipe.direction}, at most {recipe.budget_px} pixels together",
         "objective": "one step from the photo" if one_step else "flow matching",
