@@ -58,7 +58,7 @@ class AblationStudy(FrozenModel):
     benchmarks: Annotated[
         dict[str, Path],
         Field(min_length=1),
-        KeyNote("table of name = folder", "at least 1 entry", instead=True),
+        KeyNote("table of name = folder", "at least 1 entry", replaces_constraints=True),
     ]
     """The benchmarks to score on: a name and a folder relative to BREWSTER_DATA for each."""
 
@@ -85,7 +85,7 @@ def read_study(path: Path) -> AblationStudy:
     Raises:
         RecipeError: the file is missing or not TOML, or its values are missing, unknown or invalid.
     """
-    study = read_toml(AblationStudy, path, compare="docs/recipes.md")
+    study = read_toml(AblationStudy, path, reference="docs/recipes.md")
     return study.model_copy(update={"base": path.parent / study.base})
 
 

@@ -226,7 +226,7 @@ def read_scene_of(entry: StoredSample) -> Scene:
             f"the scene of {entry.place} is not TOML", "expected a scene file", _CURE
         ) from error
     values = {name: table[name] for name in table if name != "outcome"}
-    return validated(Scene, values, owner=f"the scene of {entry.place}", compare="brewster render --help")
+    return validated(Scene, values, source=f"the scene of {entry.place}", reference="brewster render --help")
 
 
 def _blocks(out: Path) -> list[int]:

@@ -82,7 +82,7 @@ class MixRecipe(FrozenModel):
     crop: Range = (0.35, 1.0)
     """Side of the crop over the shorter side of the photo."""
     temperature: Range = (-0.35, 0.35)
-    """Colour temperature of the light: logarithm of the gain of red, and minus that of blue."""
+    """Colour temperature t of the light: the gains of red and blue are about exp(t) and exp(-t)."""
     background_map_probability: Share = 0.2
     """Probability that the background is a view of an environment map instead of a photo."""
     background_level_log: LogRange = (0.03, 0.5)
