@@ -22,7 +22,7 @@ from brewster.training.lora.latents import (
     open_samples,
 )
 from brewster.training.recipe import LoraRecipe
-from set_folders import make
+from set_folders import render_set
 
 RECIPE = {
     "backbone": "tiny:kontext", "budget_px": 3 * 32 * 16, "seed": 1, "steps": 6, "batch_size": 1,
@@ -39,7 +39,7 @@ def backbone():
 def root(tmp_path_factory):
     """A data folder with a set, pairs, and pairs with reflections."""
     root = tmp_path_factory.mktemp("data")
-    make(root / "set", count=3)
+    render_set(root / "set", count=3)
     for folder, roles in (
         ("pairs", ["blended", "transmission"]),
         ("trios", ["blended", "transmission", "reflection"]),

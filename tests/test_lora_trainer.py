@@ -26,7 +26,7 @@ from brewster.training.loop import run
 from brewster.training.lora.trainer import LoraTrainer
 from brewster.training.recipe import LoraRecipe
 from brewster.training.trainers import open_trainer
-from set_folders import make
+from set_folders import render_set
 
 RECIPE = {
     "backbone": "tiny:kontext", "rank": 2, "alpha": 2, "budget_px": 3 * 32 * 16,
@@ -37,7 +37,7 @@ RECIPE = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    make(tmp_path_factory.mktemp("sets") / "tiny", count=3)
+    render_set(tmp_path_factory.mktemp("sets") / "tiny", count=3)
     return next(tmp_path_factory.getbasetemp().glob("sets*/tiny"))
 
 

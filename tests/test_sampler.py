@@ -13,7 +13,7 @@ from brewster.scene.recipe import RECIPES, read_scene_recipe
 from brewster.scene.sampler import Asset, Catalog, draw
 from brewster.scene.scene import Scene
 from brewster.scene.world import AssetSource
-from worlds_of_one import WORLDS, Worlds
+from synthetic_scenes import ASSETS, SyntheticAssets
 
 WIDTHS = {asset.source: asset.width for asset in BUILTIN_CATALOG.maps}
 
@@ -101,7 +101,7 @@ def test_a_picture_behind_the_glass_fills_the_view():
     )
     for index in range(12):
         scene = drawn(recipe, index)
-        white = Worlds(**{scene.behind.plane.source.file: WORLDS.pictures["white"][:, :24]})
+        white = SyntheticAssets(**{scene.behind.plane.source.file: ASSETS.pictures["white"][:, :24]})
         scene = scene.model_copy(update={"front": Scene().front, "samples": 4})
         sample = render(scene, white)
         assert float(sample.background.min()) > 0.99 * scene.behind.plane.luminance

@@ -11,7 +11,7 @@ from brewster.scene.camera import Camera
 from brewster.scene.recipe import RECIPES, read_scene_recipe
 from brewster.scene.sampler import draw
 from brewster.scene.scene import Scene, read_scene
-from worlds_of_one import pixel_directions
+from synthetic_scenes import pixel_directions
 
 MAP = "source.file = 'builtin:street:1'"
 

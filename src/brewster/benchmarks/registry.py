@@ -238,12 +238,12 @@ def _rendered_samples(folder: Path) -> list[tuple[str, list[PictureFile]]]:
     return [
         (
             key(entry.index),
-            [PictureFile(entry.place, entry.spans[name]) for name in _RENDERED if name in entry.spans],
+            [PictureFile(entry.path, entry.spans[name]) for name in _RENDERED if name in entry.spans],
         )
         if entry.spans
         else (
             key(entry.index),
-            [PictureFile(entry.place / name) for name in _RENDERED if (entry.place / name).exists()],
+            [PictureFile(entry.path / name) for name in _RENDERED if (entry.path / name).exists()],
         )
         for entry in entries
     ]

@@ -26,9 +26,7 @@ _COLUMNS = ("file", "asset", "category", "resolution", "md5", "authors", "licenc
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,200}", re.ASCII)
 _RETRY_DELAYS_S = (1.0, 2.0, 4.0, 8.0)  # between five attempts
 _TIMEOUT_S = 30.0
-_MAX_CONSECUTIVE_FAILURES = (
-    5  # more failures are not due to single assets, but to the server or the connection
-)
+_MAX_CONSECUTIVE_FAILURES = 5  # then the cause is the server or the connection, not a single asset
 
 
 @final
