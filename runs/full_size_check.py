@@ -217,7 +217,7 @@ def estimate(name, quantise):
     recipe = read_recipe(Path(__file__).parents[1] / f"recipes/train/{name}.toml")
     resources = estimate_resources(recipe, card)
     # A training step costs three passes: forward, recomputation for gradient checkpointing, backward.
-    forward_s = resources.seconds / 3 / recipe.batch
+    forward_s = resources.seconds / 3 / recipe.batch_size
     passes = STEPS * (1 if find_family(name).guided_by_embedding else 2)
     return Row(
         name, quantise, "ESTIMATED from meta tensors, not measured", card.name,

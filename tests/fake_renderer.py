@@ -19,43 +19,48 @@ def render(scene, assets):
 
 
 def slow(scene, assets):
+    """Takes 0.1 s for each sample."""
     time.sleep(0.1)
     return render(scene, assets)
 
 
-def waits(scene, assets):
-    """Never finishes sample 2 if FAKE_WAIT is set."""
+def blocking(scene, assets):
+    """Never finishes sample 2 if the environment variable FAKE_WAIT is set."""
     if scene.index == 2 and "FAKE_WAIT" in os.environ:
         Event().wait()
     return render(scene, assets)
 
 
-def deadly_once(scene, assets):
-    """Kills the first worker at sample 2, as the kernel does when memory runs out."""
-    mark = Path(os.environ["FAKE_MARK"])
-    if scene.index == 2 and not mark.exists():
-        mark.touch()
+def crashing_once(scene, assets):
+    """Kills the first process that renders sample 2, as the kernel does if memory is exhausted."""
+    marker = Path(os.environ["FAKE_MARKER"])
+    if scene.index == 2 and not marker.exists():
+        marker.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return render(scene, assets)
 
 
-def deadly(scene, assets):
+def crashing(scene, assets):
+    """Kills every process that renders sample 2."""
     if scene.index == 2:
         os.kill(os.getpid(), signal.SIGKILL)
     return render(scene, assets)
 
 
-def picky(scene, assets):
+def rejecting(scene, assets):
+    """Raises a RecipeError for sample 1."""
     if scene.index == 1:
-        raise RecipeError("sample 1 is odd", "it should be even", "count by two")
+        raise RecipeError("sample 1 cannot be rendered", "expected another sample", "choose another index")
     return render(scene, assets)
 
 
-def clumsy(scene, assets):
+def buggy(scene, assets):
+    """Raises an unexpected exception for sample 1."""
     if scene.index == 1:
-        raise ZeroDivisionError("oops")
+        raise ZeroDivisionError("division by zero")
     return render(scene, assets)
 
 
-def deviceless(scene, assets):
-    raise DeviceError("there is no light", "a lamp; or two", "buy one")
+def without_device(scene, assets):
+    """Raises the error of a missing device for every sample."""
+    raise DeviceError("there is no GPU", "expected a GPU; or a CPU", "use another computer")

@@ -8,23 +8,25 @@ from brewster.rendered.generation.workers import SerialExecutor
 from brewster.scene.recipe import read_scene_recipe
 
 
-def job(out, renderer="render", seed=7, recipe="tiny"):
+def make_job(out, renderer="render", seed=7, recipe="tiny"):
     return RenderJob(out, read_scene_recipe(recipe), BUILTIN_CATALOG, seed, f"fake_renderer:{renderer}")
 
 
-def make(out, count=4, first=0, executor=SerialExecutor, shards=False, **of_job):
-    """Builds a set. Returns the result for each sample."""
+def render_set(out, count=4, first=0, executor=SerialExecutor, shards=False, **job_values):
+    """Renders a set. Returns the results of its samples."""
     results = []
-    requested = job(out, **of_job)
-    build(requested, range(first, first + count), executor(requested), shards=shards, report=results.append)
+    job = make_job(out, **job_values)
+    build(job, range(first, first + count), executor(job), shards=shards, report=results.append)
     return results
 
 
 def statuses(results):
+    """Sample index -> status."""
     return {result.index: result.status for result in results}
 
 
 def names(folder):
+    """The names of the files and folders in a folder."""
     return {path.name for path in folder.iterdir()}
 
 

@@ -1,4 +1,4 @@
-"""Ablation studies: one model for each choice of a value, all trained and scored in the same way."""
+"""Ablation studies: one model for each value of a key, all trained and scored in the same way."""
 
 import io
 import os
@@ -38,22 +38,22 @@ def test_every_ablation_of_the_paper_has_a_study():
 def test_a_study_changes_one_value_of_both_the_full_and_the_tiny_recipe(path):
     study = read_study(path)
     for base in (read_recipe(study.base), read_recipe(RECIPES / TINY.get(path.stem, "tiny.toml"))):
-        recipes = [with_value(base, study.value, choice) for choice in study.choices]
+        recipes = [with_value(base, study.key, value) for value in study.values]
         assert base in recipes
-        assert len({recipe.model_dump_json() for recipe in recipes}) == len(study.choices)
+        assert len({recipe.model_dump_json() for recipe in recipes}) == len(study.values)
 
 
 def test_the_training_sizes_are_those_of_the_paper():
-    assert read_study(RECIPES / "size.toml").choices == [0, 10, 50, 100, 300, 1000]
+    assert read_study(RECIPES / "size.toml").values == [0, 10, 50, 100, 300, 1000]
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("value = 'seed'\nchoices = [1, 2]\nbenchmarks = { real20 = 'x' }", "base"),
-        ("base = 'b'\nvalue = 'seed'\nchoices = [1]\nbenchmarks = { real20 = 'x' }", "choices"),
-        ("base = 'b'\nvalue = 'seed'\nchoices = [1, 2]\nbenchmarks = {}", "benchmarks"),
-        ("base = 'b'\nvalue = 'seed'\nchoice = 3", "choice"),
+        ("key = 'seed'\nvalues = [1, 2]\nbenchmarks = { real20 = 'x' }", "base"),
+        ("base = 'b'\nkey = 'seed'\nvalues = [1]\nbenchmarks = { real20 = 'x' }", "values"),
+        ("base = 'b'\nkey = 'seed'\nvalues = [1, 2]\nbenchmarks = {}", "benchmarks"),
+        ("base = 'b'\nkey = 'seed'\nvalue = 3", "there is no key value"),
         ("base =", "TOML"),
     ],
 )
@@ -83,7 +83,7 @@ def pairs(tmp_path):
     return read_benchmark("real20", tmp_path / "real20")
 
 
-def test_choices_are_compared_with_the_first_and_numbers_are_plotted(
+def test_values_are_compared_with_the_first_and_numbers_are_plotted(
     without_training, pairs, data, tmp_path, monkeypatch
 ):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
@@ -104,7 +104,7 @@ def test_choices_are_compared_with_the_first_and_numbers_are_plotted(
     assert 0.005 < (plot < 128).mean() < 0.5
 
 
-def test_choices_that_are_not_numbers_are_not_plotted(without_training, pairs, data, tmp_path, monkeypatch):
+def test_values_that_are_not_numbers_are_not_plotted(without_training, pairs, data, tmp_path, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     ablate(read_study(RECIPES / "mixing.toml"), pairs, tmp_path / "out")
     assert not (tmp_path / "out" / "plot.png").exists()
@@ -143,7 +143,7 @@ def test_every_study_runs_end_to_end_at_tiny_size(path, few_pairs, tmp_path):
     result = as_user("ablate", path, "--base", base, "-o", tmp_path / "out", env=environment)
     assert result.returncode == 0, result.stderr.decode()
     text = result.stdout.decode()
-    for choice in read_study(path).choices:
-        assert f" {choice} " in text
+    for value in read_study(path).values:
+        assert f" {value} " in text
     assert (tmp_path / "out" / "report.html").is_file()
     assert (tmp_path / "out" / "plot.png").is_file() == (path.stem in {"size", "pairs"})

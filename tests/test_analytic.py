@@ -15,23 +15,23 @@ from brewster.render.rays.layered_glass import all_orders, paper_orders
 from brewster.scene.camera import axes
 from brewster.scene.glass import Glazing, Pane
 from brewster.scene.world import Side
-from worlds_of_one import (
-    WORLDS,
-    Worlds,
-    a_scene,
-    around,
-    at,
-    board,
+from synthetic_scenes import (
+    ASSETS,
+    SyntheticAssets,
+    camera_towards_glass,
     centroid,
+    make_scene,
+    map_side,
+    map_with_bright_texel,
     pixel_directions,
-    scenes,
-    soft,
-    sun,
+    plane_side,
+    random_scenes,
+    smooth_map,
 )
 
 without_shrinking = settings(phases=[Phase.explicit, Phase.generate], deadline=None, database=None)
 examples_25, examples_10 = (settings(without_shrinking, max_examples=count) for count in (25, 10))
-UNIFORM_SIDES = {"far": around(), "dome": around(radius_mm=3000.0), "near": board()}
+UNIFORM_SIDES = {"far": map_side(), "dome": map_side(radius_mm=3000.0), "near": plane_side()}
 
 
 def closed_form(scene, throughput_of=all_orders):
@@ -46,9 +46,9 @@ def closed_form(scene, throughput_of=all_orders):
 
 
 @examples_25
-@given(scenes(orders="all"))
+@given(random_scenes(orders="all"))
 def test_the_photo_is_the_sum_of_its_two_layers(scene):
-    sample = render(scene, WORLDS)
+    sample = render(scene, ASSETS)
     layers = sample.layers().values()
     assert all(layer.shape == (3, 16, 16) and layer.dtype == torch.float32 for layer in layers)
     assert all(torch.isfinite(layer).all() and (layer >= 0).all() for layer in layers)
@@ -61,10 +61,10 @@ def test_the_photo_is_the_sum_of_its_two_layers(scene):
 
 
 @examples_10
-@given(scenes(orders="all"))
+@given(random_scenes(orders="all"))
 def test_the_choice_of_orders_changes_the_layers_and_not_the_photo(scene):
     complete, paper = (
-        render(scene.model_copy(update={"orders": orders}), WORLDS) for orders in ("all", "paper")
+        render(scene.model_copy(update={"orders": orders}), ASSETS) for orders in ("all", "paper")
     )
     for name in ("photo", "background", "mirror"):
         assert torch.equal(getattr(complete, name), getattr(paper, name))
@@ -77,17 +77,17 @@ def test_the_choice_of_orders_changes_the_layers_and_not_the_photo(scene):
 
 
 @examples_10
-@given(scenes(front=Side()))
+@given(random_scenes(front=Side()))
 def test_without_light_in_front_there_is_no_reflection(scene):
-    sample = render(scene, WORLDS)
+    sample = render(scene, ASSETS)
     assert not sample.reflection.any()
     assert not sample.mirror.any()
 
 
 @examples_10
-@given(scenes(behind=Side(), orders="all"))
+@given(random_scenes(behind=Side(), orders="all"))
 def test_without_light_behind_the_photo_is_the_reflection(scene):
-    sample = render(scene, WORLDS)
+    sample = render(scene, ASSETS)
     assert not sample.transmission.any()
     assert not sample.background.any()
     assert torch.equal(sample.photo, sample.reflection)
@@ -98,18 +98,18 @@ def test_without_light_behind_the_photo_is_the_reflection(scene):
 @pytest.mark.parametrize("aperture_mm", [0.0, 20.0])
 def test_glass_with_index_one_is_invisible(side, count, aperture_mm):
     sides = {
-        "far": around("mottled"),
-        "dome": around("mottled", radius_mm=2000.0),
-        "near": board("mottled", width_mm=500),
+        "far": map_side("mottled"),
+        "dome": map_side("mottled", radius_mm=2000.0),
+        "near": plane_side("mottled", width_mm=500),
     }
-    scene = a_scene(
-        camera=at(15, 5, aperture_mm=aperture_mm),
+    scene = make_scene(
+        camera=camera_towards_glass(15, 5, aperture_mm=aperture_mm),
         panes=[{"index": 1.0, "thickness_mm": 20.0}] * count,
         behind=sides[side],
         front=sides[side],
         samples=4,
     )
-    sample = render(scene, WORLDS)
+    sample = render(scene, ASSETS)
     torch.testing.assert_close(sample.transmission, sample.background, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(sample.photo, sample.background, rtol=1e-4, atol=1e-4)
     assert sample.mirror.any()
@@ -124,15 +124,15 @@ def test_in_uniform_light_every_pixel_equals_the_closed_form(side, aperture_mm, 
         {"thickness_mm": 6.0, "absorption_per_m": (4.0, 1.5, 20.0)},
         {"index": 1.7, "absorption_per_m": (2.0, 9.0, 1.0)},
     ]
-    scene = a_scene(
-        camera=at(30, aperture_mm=aperture_mm, focus_mm=800),
+    scene = make_scene(
+        camera=camera_towards_glass(30, aperture_mm=aperture_mm, focus_mm=800),
         panes=panes,
         behind=UNIFORM_SIDES[side],
         front=UNIFORM_SIDES[side],
         orders=orders,
         samples=16,
     )
-    sample = render(scene, WORLDS)
+    sample = render(scene, ASSETS)
     transmittance, reflectance = closed_form(scene, all_orders if orders == "all" else paper_orders)
     torch.testing.assert_close(sample.transmission, transmittance, rtol=2e-3, atol=0)
     torch.testing.assert_close(sample.reflection, reflectance, rtol=1e-2, atol=0)
@@ -143,14 +143,14 @@ def test_in_uniform_light_every_pixel_equals_the_closed_form(side, aperture_mm, 
 
 def test_far_light_has_no_ghost_in_parallel_glass():
     """R is MR times a factor that depends on the angle only: all orders leave in one direction."""
-    scene = a_scene(
-        camera=at(40, 10, width=25, height=25),
+    scene = make_scene(
+        camera=camera_towards_glass(40, 10, width=25, height=25),
         panes=[{"thickness_mm": 30.0}, {}],
-        front=around("mottled"),
-        behind=around("mottled", heading_deg=90),
+        front=map_side("mottled"),
+        behind=map_side("mottled", heading_deg=90),
         samples=1,
     )
-    sample = render(scene, WORLDS)
+    sample = render(scene, ASSETS)
     transmittance, reflectance = closed_form(scene)
     torch.testing.assert_close(sample.reflection, sample.mirror * reflectance, rtol=1e-4, atol=1e-7)
     torch.testing.assert_close(sample.transmission, sample.background * transmittance, rtol=1e-4, atol=1e-7)
@@ -158,21 +158,21 @@ def test_far_light_has_no_ghost_in_parallel_glass():
 
 def test_content_behind_a_thick_pane_appears_nearer_by_a_third_of_its_thickness():
     """The image's area grows by (distance / (distance - t (1 - 1 / n)))^2."""
-    scene = a_scene(
-        camera=at(0, distance_mm=1000, fov_deg=10, width=48, height=48),
+    scene = make_scene(
+        camera=camera_towards_glass(0, distance_mm=1000, fov_deg=10, width=48, height=48),
         panes=[{"thickness_mm": 90.0}],
-        behind=board("mottled", distance_mm=500, width_mm=100),
+        behind=plane_side("mottled", distance_mm=500, width_mm=100),
         orders="paper",
     )
-    sample = render(scene, WORLDS)
+    sample = render(scene, ASSETS)
     area_ratio = float(sample.transmission.sum() / sample.background.sum()) / 0.96**2
     assert area_ratio == pytest.approx((1500 / 1470) ** 2, rel=2e-3)
 
 
 def test_a_wedge_deflects_rays_by_half_its_angle():
-    light = Worlds(sun=sun(256, 128, 0))
-    scene = a_scene(
-        camera={"fov_deg": 10}, panes=[{"wedge_deg": 2.0}], behind=around("sun"), orders="paper", samples=64
+    light = SyntheticAssets(sun=map_with_bright_texel(256, 128, 0))
+    scene = make_scene(
+        camera={"fov_deg": 10}, panes=[{"wedge_deg": 2.0}], behind=map_side("sun"), orders="paper", samples=64
     )
     sample = render(scene, light)
     (deflected_x, _), (straight_x, _) = centroid(sample.transmission), centroid(sample.background)
@@ -181,16 +181,16 @@ def test_a_wedge_deflects_rays_by_half_its_angle():
 
 def test_a_very_small_wedge_renders_like_parallel_glass():
     scenes_ = (
-        a_scene(
-            camera=at(25),
+        make_scene(
+            camera=camera_towards_glass(25),
             panes=[{"wedge_deg": wedge_deg}],
-            behind=around("soft", heading_deg=40),
-            front=around("soft"),
+            behind=map_side("soft", heading_deg=40),
+            front=map_side("soft"),
             samples=256,
         )
         for wedge_deg in (0.0, 1e-6)
     )
-    parallel, wedged = (render(scene, WORLDS) for scene in scenes_)
+    parallel, wedged = (render(scene, ASSETS) for scene in scenes_)
     for layer in parallel.layers():
         torch.testing.assert_close(getattr(wedged, layer), getattr(parallel, layer), rtol=1e-3, atol=0)
 
@@ -200,7 +200,8 @@ def test_a_very_small_wedge_renders_like_parallel_glass():
 
 def test_the_right_half_of_a_map_appears_on_the_right_and_its_top_half_at_the_top():
     right, top = (
-        render(a_scene(behind=around(name, heading_deg=180)), WORLDS).background for name in ("right", "top")
+        render(make_scene(behind=map_side(name, heading_deg=180)), ASSETS).background
+        for name in ("right", "top")
     )
     assert right[:, :, 15:].min() == top[:, :9].min() == 1
     assert right[:, :, :9].max() == top[:, 15:].max() == 0
@@ -209,12 +210,14 @@ def test_the_right_half_of_a_map_appears_on_the_right_and_its_top_half_at_the_to
 @pytest.mark.parametrize("heading_deg", [0, 90, -120])
 def test_a_camera_that_turns_right_sees_a_map_move_left(heading_deg):
     """A camera with the sun's heading sees it in the centre; a turn of 5 degrees moves it by 4 pixels."""
-    light = Worlds(sun=sun(64, 32, 0))
+    light = SyntheticAssets(sun=map_with_bright_texel(64, 32, 0))
     glass = Glazing(heading_deg=heading_deg)
     positions = []
     for rotation_deg in (0, 5):
-        camera = at(heading_deg + rotation_deg, fov_deg=30)
-        scene = a_scene(camera=camera, glass=glass, behind=around("sun", heading_deg=heading_deg), samples=16)
+        camera = camera_towards_glass(heading_deg + rotation_deg, fov_deg=30)
+        scene = make_scene(
+            camera=camera, glass=glass, behind=map_side("sun", heading_deg=heading_deg), samples=16
+        )
         positions.append(centroid(render(scene, light).background))
     half_texel = 360 / 128 / 2
     pixels_per_degree = 24 / math.degrees(2 * math.tan(math.radians(15)))
@@ -226,8 +229,8 @@ def test_a_camera_that_turns_right_sees_a_map_move_left(heading_deg):
 def test_a_picture_in_front_of_the_glass_is_mirrored_and_one_behind_it_is_not():
     picture = np.zeros((32, 32, 3), np.float32)
     picture[:8, 24:] = 1  # the upper right corner
-    scene = a_scene(behind=board("corner", width_mm=300), front=board("corner", width_mm=300))
-    sample = render(scene, Worlds(corner=picture))
+    scene = make_scene(behind=plane_side("corner", width_mm=300), front=plane_side("corner", width_mm=300))
+    sample = render(scene, SyntheticAssets(corner=picture))
     x, y = centroid(sample.background)
     assert x > 14
     assert y < 10
@@ -237,8 +240,8 @@ def test_a_picture_in_front_of_the_glass_is_mirrored_and_one_behind_it_is_not():
 
 
 def test_a_map_in_front_of_the_glass_is_mirrored_too():
-    seen_from_the_glass = around("right", heading_deg=0)
-    mirror = render(a_scene(front=seen_from_the_glass), WORLDS).mirror
+    seen_from_the_glass = map_side("right", heading_deg=0)
+    mirror = render(make_scene(front=seen_from_the_glass), ASSETS).mirror
     assert mirror[:, :, :9].min() == 1
     assert mirror[:, :, 15:].max() == 0
 
@@ -269,12 +272,12 @@ def test_a_plane_appears_where_pinhole_geometry_projects_it(drawn):
     """The centroid of a small plane, or of its mirror image if the plane is in front."""
     heading, pitch = drawn["glass_deg"]
     to_glass = np.array(axes(heading, pitch))
-    camera = at(
+    camera = camera_towards_glass(
         heading + drawn["camera_deg"][0], pitch + drawn["camera_deg"][1], fov_deg=40, width=48, height=48
     )
     position = np.array([30.0, -20.0, 70.0])
     camera["position_mm"] = tuple(np.array(camera["position_mm"]) + position)
-    empty = a_scene(
+    empty = make_scene(
         camera=camera, glass=Glazing(heading_deg=heading, pitch_deg=pitch, position_mm=tuple(position))
     )
     eye = to_glass @ (np.array(empty.camera.position_mm) - position)
@@ -290,8 +293,8 @@ def test_a_plane_appears_where_pinhole_geometry_projects_it(drawn):
         "pitch_deg": drawn["turn_deg"][1],
     }
     which = "behind" if drawn["is_behind"] else "front"
-    scene = empty.model_copy(update={"behind": Side(), "front": Side(), which: board("square", **plane)})
-    sample = render(scene, Worlds(square=np.ones((16, 16, 3), np.float32)))
+    scene = empty.model_copy(update={"behind": Side(), "front": Side(), which: plane_side("square", **plane)})
+    sample = render(scene, SyntheticAssets(square=np.ones((16, 16, 3), np.float32)))
     image = sample.background if drawn["is_behind"] else sample.mirror
     position = projected(scene, np.array([*offset, -distance_mm]), to_glass)
     assert centroid(image) == pytest.approx(position, abs=0.25)
@@ -300,10 +303,10 @@ def test_a_plane_appears_where_pinhole_geometry_projects_it(drawn):
 @pytest.mark.parametrize("is_behind", [True, False])
 def test_a_plane_has_the_size_of_its_pinhole_projection(is_behind):
     which = "behind" if is_behind else "front"
-    scene = a_scene(
-        **{which: board("wide", distance_mm=700, width_mm=310)}, camera={"width": 40, "height": 40}
+    scene = make_scene(
+        **{which: plane_side("wide", distance_mm=700, width_mm=310)}, camera={"width": 40, "height": 40}
     )
-    sample = render(scene, Worlds(wide=np.ones((16, 32, 3), np.float32)))
+    sample = render(scene, SyntheticAssets(wide=np.ones((16, 32, 3), np.float32)))
     image = sample.background if is_behind else sample.mirror
     width_px = 310 / 1200 / (2 * math.tan(math.radians(15))) * 40
     assert float(image[0].sum()) == pytest.approx(width_px * width_px / 2, rel=0.01)
@@ -318,37 +321,37 @@ def test_a_sun_of_one_texel_does_not_flicker(texels):
 
     A pixel is `texels` texels wide.
     """
-    light, fov_deg = Worlds(sun=sun(256, 128, 0)), 360 / 512 * texels * 32
+    light, fov_deg = SyntheticAssets(sun=map_with_bright_texel(256, 128, 0)), 360 / 512 * texels * 32
     energies = []
     for tenth in range(10):
         rotation_deg = tenth / 10 * fov_deg / 32
-        camera = at(rotation_deg, rotation_deg / 2, fov_deg=fov_deg, width=32, height=32)
-        sample = render(a_scene(camera=camera, behind=around("sun"), samples=36), light)
+        camera = camera_towards_glass(rotation_deg, rotation_deg / 2, fov_deg=fov_deg, width=32, height=32)
+        sample = render(make_scene(camera=camera, behind=map_side("sun"), samples=36), light)
         energies.append(float(sample.background.sum()))
     assert max(energies) / min(energies) < 1.01
 
 
-KINDS = {
-    "far": {"front": around("soft")},
-    "near": {"front": around("soft", radius_mm=3000.0), "behind": board("mottled")},
-    "lens": {"front": around("soft", radius_mm=3000.0), "camera": {"aperture_mm": 10}},
-    "wedge": {"front": around("soft"), "panes": [{"wedge_deg": 0.5}]},
-    "rough": {"front": around("soft"), "panes": [{"roughness": 0.1}]},
+GLASS_KINDS = {
+    "far": {"front": map_side("soft")},
+    "near": {"front": map_side("soft", radius_mm=3000.0), "behind": plane_side("mottled")},
+    "lens": {"front": map_side("soft", radius_mm=3000.0), "camera": {"aperture_mm": 10}},
+    "wedge": {"front": map_side("soft"), "panes": [{"wedge_deg": 0.5}]},
+    "rough": {"front": map_side("soft"), "panes": [{"roughness": 0.1}]},
 }
 
 
-@pytest.mark.parametrize("kind", sorted(KINDS))
+@pytest.mark.parametrize("kind", sorted(GLASS_KINDS))
 def test_the_same_scene_gives_the_same_bytes(kind):
-    one, other = (render(a_scene(**KINDS[kind], samples=4), WORLDS) for _ in range(2))
+    one, other = (render(make_scene(**GLASS_KINDS[kind], samples=4), ASSETS) for _ in range(2))
     for first, second in zip(one.layers().values(), other.layers().values(), strict=True):
         assert first.numpy().tobytes() == second.numpy().tobytes()
 
 
-@pytest.mark.parametrize("kind", sorted(KINDS))
+@pytest.mark.parametrize("kind", sorted(GLASS_KINDS))
 def test_the_result_does_not_depend_on_the_batch_size(kind, monkeypatch):
-    one_batch = render(a_scene(**KINDS[kind], samples=4), WORLDS)
+    one_batch = render(make_scene(**GLASS_KINDS[kind], samples=4), ASSETS)
     monkeypatch.setattr(analytic, "_CPU_BATCH_RAYS", 100)
-    many_batches = render(a_scene(**KINDS[kind], samples=4), WORLDS)
+    many_batches = render(make_scene(**GLASS_KINDS[kind], samples=4), ASSETS)
     for first, second in zip(one_batch.layers().values(), many_batches.layers().values(), strict=True):
         if kind == "rough":  # orders end by their mean weight over a batch
             assert float(first.mean()) == pytest.approx(float(second.mean()), rel=2e-3)
@@ -357,8 +360,8 @@ def test_the_result_does_not_depend_on_the_batch_size(kind, monkeypatch):
 
 
 def test_another_index_changes_the_random_numbers_and_not_the_means():
-    scene = a_scene(panes=[{"wedge_deg": 0.5}], behind=around("mottled"), samples=16)
-    one, other = (render(scene.model_copy(update={"index": index}), WORLDS).background for index in (0, 1))
+    scene = make_scene(panes=[{"wedge_deg": 0.5}], behind=map_side("mottled"), samples=16)
+    one, other = (render(scene.model_copy(update={"index": index}), ASSETS).background for index in (0, 1))
     assert not torch.equal(one, other)
     assert float(one.mean()) == pytest.approx(float(other.mean()), rel=2e-3)
 
@@ -373,12 +376,15 @@ def test_another_index_changes_the_random_numbers_and_not_the_means():
 )
 def test_framed_and_curved_glass_is_refused_with_a_hint_to_mitsuba(glass):
     with pytest.raises(RecipeError, match="--renderer mitsuba"):
-        render(a_scene(glass=glass), WORLDS)
+        render(make_scene(glass=glass), ASSETS)
 
 
 def test_a_dome_and_a_map_at_infinity_agree_when_the_dome_is_large():
     far, dome = (
-        render(a_scene(camera=at(20), behind=around("soft", radius_mm=radius)), Worlds(soft=soft(64)))
+        render(
+            make_scene(camera=camera_towards_glass(20), behind=map_side("soft", radius_mm=radius)),
+            SyntheticAssets(soft=smooth_map(64)),
+        )
         for radius in (math.inf, 1e7)
     )
     torch.testing.assert_close(far.transmission, dome.transmission, rtol=1e-3, atol=0)
@@ -388,8 +394,9 @@ def test_a_dome_and_a_map_at_infinity_agree_when_the_dome_is_large():
 
 
 def test_the_ghost_distance_of_a_scene_is_the_formula_divided_by_the_pixel_size():
-    scene = a_scene(
-        camera=at(30, distance_mm=1000 / math.cos(math.radians(30))), front=around(radius_mm=3000.0)
+    scene = make_scene(
+        camera=camera_towards_glass(30, distance_mm=1000 / math.cos(math.radians(30))),
+        front=map_side(radius_mm=3000.0),
     )
     inside = math.asin(math.sin(math.radians(30)) / 1.5)
     ghost_mm = 2 * 4 * math.tan(inside) * math.cos(math.radians(30))
@@ -399,4 +406,4 @@ def test_the_ghost_distance_of_a_scene_is_the_formula_divided_by_the_pixel_size(
 
 
 def test_far_content_has_no_ghost():
-    assert analytic.ghost_distance_px(a_scene(camera=at(30))) == 0
+    assert analytic.ghost_distance_px(make_scene(camera=camera_towards_glass(30))) == 0

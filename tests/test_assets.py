@@ -21,12 +21,12 @@ def luminance(light):
 
 
 def sphere_mean(values):
-    share = np.sin((np.arange(len(values)) + 0.5) * np.pi / len(values))
-    return (values.mean(axis=1) * share).sum() / share.sum()
+    solid_angle = np.sin((np.arange(len(values)) + 0.5) * np.pi / len(values))
+    return (values.mean(axis=1) * solid_angle).sum() / solid_angle.sum()
 
 
 def sky(random):
-    """A map without lamps: (32, 64, 3), nothing brighter than a few times the mean, one texel the brightest."""
+    """A map without lamps: (32, 64, 3), with a maximum of about three times the mean in one texel."""
     texels = random.uniform(0.2, 1.8, (HEIGHT, WIDTH, 3)).astype(np.float32)
     texels[8, 9] = 3
     return texels
@@ -60,8 +60,8 @@ def plane_light(folder, name, data, **values):
     return Assets([folder]).plane_light(plane)
 
 
-def refused(error, name, *words):
-    """Checks that the message has three parts and names the file."""
+def check_message(error, name, *words):
+    """Checks that the message has three parts and contains the name of the file and the words."""
     message = str(error.value)
     assert name in message
     assert message.count("; ") >= 2
@@ -71,7 +71,7 @@ def refused(error, name, *words):
 # --- maps
 
 
-def test_a_map_has_the_mean_luminance_that_the_scene_says(folder, random):
+def test_a_map_has_the_mean_luminance_of_the_scene(folder, random):
     texels = sky(random)
     light = map_light(folder, "sky.exr", exr_of(texels * 37), luminance=2.5)
     assert light.dtype == np.float32
@@ -79,14 +79,13 @@ def test_a_map_has_the_mean_luminance_that_the_scene_says(folder, random):
     np.testing.assert_allclose(light / light.mean(), texels / texels.mean(), rtol=1e-4)
 
 
-def test_lamps_are_left_out_of_the_mean_but_not_of_the_light(folder, random):
+def test_lamps_are_excluded_from_the_mean_but_not_from_the_light(folder, random):
     texels = sky(random)
     plain = map_light(folder, "plain.exr", exr_of(texels))
     texels[20, 30] = 1e5
     lit = map_light(folder, "lamp.exr", exr_of(texels))
-    # The lamp brings the cap of ten means, not its light, to the mean: one texel of 2048, at most.
-    wide = sphere_mean(luminance(lit))
-    assert wide > 10
+    # In the mean, the lamp counts with ten times the mean in one of 2048 texels.
+    assert sphere_mean(luminance(lit)) > 10
     mean = sphere_mean(np.minimum(luminance(texels), 10 * sphere_mean(luminance(texels))))
     np.testing.assert_allclose(lit, texels / mean, rtol=1e-4)
     assert lit[20, 30, 0] > 1e4
@@ -102,13 +101,13 @@ def test_negative_values_are_set_to_zero(folder, random):
 
 
 def test_builtin_maps_need_no_folder(monkeypatch, random):
-    asked = []
+    calls = []
     monkeypatch.setitem(
-        assets_module.ENVIRONMENTS, "street", lambda seed, height: asked.append((seed, height)) or sky(random)
+        assets_module.ENVIRONMENTS, "street", lambda seed, height: calls.append((seed, height)) or sky(random)
     )
     light = Assets().map_light(EnvironmentMap(source=AssetSource(file="builtin:street:7"), luminance=3))
     assert sphere_mean(luminance(light)) == pytest.approx(3, rel=1e-4)
-    assert asked == [(7, assets_module.BUILTIN_HEIGHT)]
+    assert calls == [(7, assets_module.BUILTIN_HEIGHT)]
 
 
 @pytest.mark.parametrize(
@@ -117,7 +116,7 @@ def test_builtin_maps_need_no_folder(monkeypatch, random):
 def test_maps_that_are_not_built_in_are_refused(name):
     with pytest.raises(RecipeError, match="is not built in") as error:
         Assets().map_light(EnvironmentMap(source=AssetSource(file=name)))
-    refused(error, name, "street, room, night")
+    check_message(error, name, "street, room, night")
 
 
 # --- files that cannot be used
@@ -126,7 +125,7 @@ def test_maps_that_are_not_built_in_are_refused(name):
 def test_a_missing_file_is_named_with_the_folders_that_were_searched(folder):
     with pytest.raises(RecipeError, match="was not found") as error:
         Assets([folder]).map_light(EnvironmentMap(source=AssetSource(file="gone.hdr")))
-    refused(error, "gone.hdr", str(folder), "--maps")
+    check_message(error, "gone.hdr", str(folder), "--maps")
     with pytest.raises(RecipeError, match="no folder"):
         Assets().map_light(EnvironmentMap(source=AssetSource(file="gone.hdr")))
 
@@ -134,14 +133,14 @@ def test_a_missing_file_is_named_with_the_folders_that_were_searched(folder):
 def test_another_file_of_the_same_name_is_refused(folder, random):
     data = hdr_of(sky(random))
     (folder / "sky.hdr").write_bytes(data)
-    right, wrong = hashlib.sha256(data).hexdigest(), hashlib.sha256(b"").hexdigest()
+    correct, wrong = hashlib.sha256(data).hexdigest(), hashlib.sha256(b"").hexdigest()
     assets = Assets([folder])
-    assets.map_light(EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=right)))
+    assets.map_light(EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=correct)))
     with pytest.raises(RecipeError, match="not the file that the scene was drawn with") as error:
         assets.map_light(
             EnvironmentMap(source=AssetSource(file="sky.hdr", sha256=wrong))
-        )  # not even from memory
-    refused(error, str(folder / "sky.hdr"), wrong)
+        )  # the cached map of the other file is not used
+    check_message(error, str(folder / "sky.hdr"), wrong)
 
 
 def test_the_folder_with_the_right_file_is_found(tmp_path, folder, random):
@@ -165,14 +164,14 @@ def test_a_file_that_cannot_be_read_is_named(folder, random, monkeypatch):
     (folder / "sky.hdr").write_text("")
     with pytest.raises(RecipeError, match="Permission denied") as error:
         Assets([folder]).map_light(EnvironmentMap(source=AssetSource(file="sky.hdr")))
-    refused(error, "sky.hdr")
+    check_message(error, "sky.hdr")
 
 
 @pytest.mark.parametrize("kind", [hdr_of, exr_of])
 def test_a_map_that_is_not_twice_as_wide_as_high_is_refused(folder, random, kind):
     with pytest.raises(UnsupportedPhoto, match="60 x 32") as error:
         map_light(folder, "narrow.hdr", kind(sky(random)[:, :60]))
-    refused(error, "narrow.hdr", "twice as wide")
+    check_message(error, "narrow.hdr", "twice as wide")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
@@ -181,22 +180,22 @@ def test_texels_that_are_not_finite_are_refused(folder, random, value):
     texels[5, 6, 1] = value
     with pytest.raises(UnsupportedPhoto, match="infinite or NaN") as error:
         map_light(folder, "broken.exr", exr_of(texels))
-    refused(error, "broken.exr")
+    check_message(error, "broken.exr")
 
 
 def test_a_black_map_is_refused(folder):
     with pytest.raises(UnsupportedPhoto, match="black") as error:
         map_light(folder, "night.hdr", hdr_of(np.zeros((HEIGHT, WIDTH, 3), np.float32)))
-    refused(error, "night.hdr")
+    check_message(error, "night.hdr")
 
 
 def test_an_ordinary_photo_saved_as_a_map_is_refused(folder, random):
-    """Its sky is white as paper: a true map has one sun, not a tenth of its texels at one value."""
+    """The maximum of an HDR map is in few texels, but here it is in an eighth of them."""
     encoded = (sky(random) / 2).clip(0, 1)
     encoded[:4] = 1
     with pytest.raises(UnsupportedPhoto, match="clipped") as error:
         map_light(folder, "photo.hdr", hdr_of(to_linear(encoded)))
-    refused(error, "photo.hdr", "use it as a photo")
+    check_message(error, "photo.hdr", "use it as a picture")
 
 
 def test_a_map_with_one_sun_is_not_clipped(folder, random):
@@ -211,19 +210,19 @@ def test_a_corrupt_map_is_refused_by_name(folder, random, damage):
     bad = {"empty": b"", "cut": data[:-900], "header": data.replace(b"-Y", b"?Y"), "other": b"<html>"}[damage]
     with pytest.raises(PhotoError) as error:
         map_light(folder, "bad.hdr", bad)
-    refused(error, "bad.hdr")
+    check_message(error, "bad.hdr")
 
 
 def test_an_exr_that_ends_early_is_refused_by_name(folder, random):
     with pytest.raises(UnreadablePhoto) as error:
         map_light(folder, "bad.exr", exr_of(sky(random))[:-900])
-    refused(error, "bad.exr")
+    check_message(error, "bad.exr")
 
 
 # --- pictures
 
 
-def test_a_picture_has_the_mean_luminance_that_the_scene_says(folder):
+def test_a_picture_has_the_mean_luminance_of_the_scene(folder):
     light = plane_light(folder, "a.png", file_of(smooth(), "PNG"), luminance=4)
     assert light.shape == (48, 64, 3)
     assert light.dtype == np.float32
@@ -237,7 +236,7 @@ def test_highlights_raise_whites_and_nothing_else(folder):
     picture[:6, :6] = 255
     data = file_of(picture, "PNG")
     plain = plane_light(folder, "a.png", data)
-    raised = plane_light(folder, "a.png", data, highlights=9)
+    raised = plane_light(folder, "a.png", data, highlight_boost=9)
     factor = raised / plain
     np.testing.assert_allclose(factor[:6, :6], 10, rtol=1e-5)
     np.testing.assert_allclose(factor[6:], 1, rtol=1e-6)
@@ -248,7 +247,7 @@ def test_near_whites_are_raised_less_than_whites_and_keep_their_hue(folder):
     greys = np.linspace(150, 255, 64).astype(np.uint8)
     picture = np.broadcast_to(greys[:, None] * np.array([1, 0.9, 0.5]), (16, 64, 3)).astype(np.uint8)
     data = file_of(picture, "PNG")
-    factor = plane_light(folder, "a.png", data, highlights=5) / plane_light(folder, "a.png", data)
+    factor = plane_light(folder, "a.png", data, highlight_boost=5) / plane_light(folder, "a.png", data)
     np.testing.assert_allclose(factor, np.broadcast_to(factor[..., :1], factor.shape), rtol=1e-5)
     assert (np.diff(factor[0, :, 0]) >= -1e-6).all()
     assert factor[0, 0, 0] == pytest.approx(1)
@@ -256,7 +255,7 @@ def test_near_whites_are_raised_less_than_whites_and_keep_their_hue(folder):
 
 
 def test_a_black_picture_is_dark_and_finite(folder):
-    light = plane_light(folder, "a.png", file_of(np.zeros((8, 8, 3), np.uint8), "PNG"), highlights=3)
+    light = plane_light(folder, "a.png", file_of(np.zeros((8, 8, 3), np.uint8), "PNG"), highlight_boost=3)
     assert not light.any()
 
 
@@ -264,14 +263,14 @@ def test_a_black_picture_is_dark_and_finite(folder):
 def test_a_file_that_is_no_picture_is_refused_by_name(folder, data, error):
     with pytest.raises(error) as caught:
         plane_light(folder, "photo.jpg", data)
-    refused(caught, "photo.jpg")
+    check_message(caught, "photo.jpg")
 
 
 def test_a_picture_whose_pixels_are_missing_is_refused_by_name(folder):
     data = file_of(smooth(), "JPEG")
     with pytest.raises(UnreadablePhoto) as caught:
         plane_light(folder, "photo.jpg", data[: len(data) // 2])
-    refused(caught, "photo.jpg")
+    check_message(caught, "photo.jpg")
 
 
 def test_builtin_paintings_and_no_others():
@@ -281,15 +280,15 @@ def test_builtin_paintings_and_no_others():
     assert Assets().plane_light(plane("builtin:painting:3")).shape == (512, 768, 3)
     with pytest.raises(RecipeError, match="is not built in") as error:
         Assets().plane_light(plane("builtin:street:3"))
-    refused(error, "builtin:street:3", "painting")
+    check_message(error, "builtin:street:3", "painting")
 
 
 # --- memory
 
 
-def test_the_cache_keeps_the_most_recently_used_and_is_bounded(folder, random, monkeypatch):
+def test_the_cache_has_a_maximum_size_and_keeps_the_most_recently_used_maps(folder, random, monkeypatch):
     one = sky(random).nbytes
-    monkeypatch.setattr(assets_module, "_CACHE_BYTES", 2 * one)
+    monkeypatch.setattr(assets_module, "_MAX_CACHE_BYTES", 2 * one)
     opened = []
     monkeypatch.setattr(Photo, "open", classmethod(lambda _cls, data: opened.append(data) or _original(data)))
     for name in "abc":
@@ -304,8 +303,8 @@ def test_the_cache_keeps_the_most_recently_used_and_is_bounded(folder, random, m
     assert [read(name) for name in "ababacacb"] == [1, 1, 0, 0, 0, 1, 0, 0, 1]
 
 
-def test_a_map_larger_than_the_bound_is_cached_alone(folder, random, monkeypatch):
-    monkeypatch.setattr(assets_module, "_CACHE_BYTES", 10)
+def test_a_map_larger_than_the_cache_is_cached_alone(folder, random, monkeypatch):
+    monkeypatch.setattr(assets_module, "_MAX_CACHE_BYTES", 10)
     (folder / "a.hdr").write_bytes(hdr_of(sky(random)))
     assets = Assets([folder])
     first = assets.map_light(EnvironmentMap(source=AssetSource(file="a.hdr")))

@@ -14,7 +14,7 @@ from brewster.errors import UnsupportedPhoto
 from brewster.photo import Photo
 from brewster.render.camera_response import develop, encode_jpeg, to_uint8, with_jpeg
 from brewster.render.sample import LAYERS, LightSample
-from brewster.scene.scene import Development, Scene
+from brewster.scene.scene import CameraResponse, Scene
 from brewster.srgb import REC709_LUMINANCE, to_encoded, to_linear
 
 some = settings(max_examples=60, deadline=None, database=None)
@@ -24,8 +24,8 @@ PICTURES = arrays.arrays(np.float32, SHAPE, elements=LIGHT, fill=st.nothing()) |
     np.float32, SHAPE, elements=LIGHT
 )
 BALANCES = ["grey-world", "white-patch", "grey-edge"]
-DEVELOPMENTS = st.builds(
-    Development,
+RESPONSES = st.builds(
+    CameraResponse,
     exposure=st.floats(0.01, 1),
     white_balance=st.sampled_from(["none", *BALANCES]),
     white_balance_strength=st.floats(0, 1),
@@ -33,11 +33,11 @@ DEVELOPMENTS = st.builds(
 )
 
 
-def sample_of(photo, reflection=None, mirror=None, seed=0, index=0, **development):
+def sample_of(photo, reflection=None, mirror=None, seed=0, index=0, **response):
     photo = torch.as_tensor(photo, dtype=torch.float32)
     reflection = photo * 0.25 if reflection is None else torch.as_tensor(reflection)
     return LightSample(
-        Scene(seed=seed, index=index, development=Development(**development)),
+        Scene(seed=seed, index=index, camera_response=CameraResponse(**response)),
         photo=photo,
         transmission=photo - reflection,
         background=(photo - reflection) / 0.9,
@@ -109,9 +109,9 @@ def test_the_overexposed_share_counts_pixels_that_clip_in_any_channel():
 
 
 @some
-@given(PICTURES, DEVELOPMENTS)
-def test_the_same_light_has_the_same_value_in_every_layer(picture, development):
-    sample = sample_of(picture, **development.model_dump())
+@given(PICTURES, RESPONSES)
+def test_the_same_light_has_the_same_value_in_every_layer(picture, response):
+    sample = sample_of(picture, **response.model_dump())
     alike = LightSample(sample.scene, *[sample.photo] * 5)
     layers = develop(alike).layers()
     assert list(layers) == list(LAYERS)
@@ -124,9 +124,9 @@ def test_the_same_light_has_the_same_value_in_every_layer(picture, development):
 
 
 @some
-@given(PICTURES, DEVELOPMENTS)
-def test_the_recorded_settings_reproduce_the_pictures(picture, development):
-    sample = sample_of(picture, **development.model_dump())
+@given(PICTURES, RESPONSES)
+def test_the_recorded_settings_reproduce_the_pictures(picture, response):
+    sample = sample_of(picture, **response.model_dump())
     developed = develop(sample)
     recorded = tomllib.loads(tomli_w.dumps(developed.camera_settings()))
     assert recorded["white_balance"] == list(developed.white_balance)
@@ -134,7 +134,7 @@ def test_the_recorded_settings_reproduce_the_pictures(picture, development):
         ev = recorded["mirror_exposure_ev" if name == "mirror" else "exposure_ev"]
         encoded = to_encoded(exposed(getattr(sample, name), developed, ev).clamp(0, 1))
         smooth = encoded**2 * (3 - 2 * encoded)
-        expected = encoded + development.contrast * (smooth - encoded)
+        expected = encoded + response.contrast * (smooth - encoded)
         torch.testing.assert_close(developed.layers()[name], expected, atol=2e-6, rtol=0)
     assert recorded["overexposed"] == pytest.approx(
         (exposed(sample.photo, developed) >= 1).any(0).float().mean().item(), abs=1e-6
@@ -243,8 +243,8 @@ def test_gains_are_between_a_third_and_three(picture, balance, strength):
 # --- noise
 
 
-def flat(level, **development):
-    return sample_of(torch.full((3, 200, 200), level), exposure=level, **development)
+def flat(level, **response):
+    return sample_of(torch.full((3, 200, 200), level), exposure=level, **response)
 
 
 @pytest.mark.parametrize("level", [0.2, 0.6])

@@ -17,9 +17,9 @@ from picture_files import exif_block, file_of, smooth
 KINDS = ["JPEG", "PNG", "TIFF", "WEBP", "AVIF", "GIF"]
 
 
-def sky(random, height=16, width=32):
+def encoded_map(random, height=16, width=32):
     texels = random.uniform(0.2, 1.8, (height, width, 3)).astype(np.float32)
-    texels[3, 4] = 5  # its sun: a map's highest value is no texel's but one's
+    texels[3, 4] = 5  # the sun: a map whose maximum is in many texels is refused as clipped
     return Photo.from_array(texels, encoding="linear").encode("hdr")
 
 
@@ -28,7 +28,7 @@ def maps(tmp_path, random):
     folder = tmp_path / "maps"
     folder.mkdir()
     for name in ("b.hdr", "a.hdr", "c.HDR"):
-        (folder / name).write_bytes(sky(random))
+        (folder / name).write_bytes(encoded_map(random))
     return folder
 
 
@@ -45,7 +45,7 @@ def photos(tmp_path):
 # --- catalogs
 
 
-def test_without_folders_everything_is_built_in():
+def test_without_folders_all_assets_are_built_in():
     catalog, refused = read_catalog([], [])
     assert catalog == BUILTIN_CATALOG
     assert not refused
@@ -74,7 +74,7 @@ def test_an_asset_has_the_size_upright_and_the_sha256_of_its_file(maps, photos):
             assert asset.source.sha256 == hashlib.sha256(data).hexdigest()
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])  # spreadsheets write the second
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])  # spreadsheet programs write utf-8-sig
 def test_a_manifest_gives_categories(maps, encoding):
     rows = "file,licence,category\na.hdr,CC0,indoor\nc.HDR,CC0,\nelsewhere.hdr,CC0,night\n"
     (maps / "manifest.csv").write_text(rows, encoding=encoding)
@@ -103,7 +103,7 @@ def test_an_empty_folder_is_an_error(tmp_path, are_maps):
     assert str(tmp_path) in str(error.value)
 
 
-def test_maps_are_no_photos_nor_photos_maps(maps, photos):
+def test_maps_are_not_listed_as_photos_and_photos_not_as_maps(maps, photos):
     with pytest.raises(RecipeError, match="no maps in"):
         read_catalog([photos], [])
     with pytest.raises(RecipeError, match="no photos in"):
@@ -115,10 +115,10 @@ def test_a_missing_folder_is_an_error(tmp_path):
         read_catalog([tmp_path / "gone"], [])
 
 
-def test_what_cannot_be_used_is_left_out_and_named(maps, photos, random):
-    whole = sky(random)
-    (maps / "cut.hdr").write_bytes(whole[:-100])
-    (maps / "square.hdr").write_bytes(sky(random, 16, 16))
+def test_unusable_files_are_skipped_and_reported(maps, photos, random):
+    complete = encoded_map(random)
+    (maps / "cut.hdr").write_bytes(complete[:-100])
+    (maps / "square.hdr").write_bytes(encoded_map(random, 16, 16))
     (photos / "empty.jpg").write_bytes(b"")
     (photos / "page.png").write_bytes(b"<html>")
     (photos / "folder.webp").mkdir()
@@ -153,11 +153,11 @@ def test_the_order_of_the_file_system_does_not_matter(maps, photos, monkeypatch)
     assert found[0] == found[1]
 
 
-def test_of_two_files_of_one_name_the_one_in_the_first_folder_is_used(maps, tmp_path, random):
+def test_of_two_files_with_one_name_that_in_the_first_folder_is_used(maps, tmp_path, random):
     other = tmp_path / "other"
     other.mkdir()
-    (other / "a.hdr").write_bytes(sky(random, 32, 64))
-    (other / "d.hdr").write_bytes(sky(random, 32, 64))
+    (other / "a.hdr").write_bytes(encoded_map(random, 32, 64))
+    (other / "d.hdr").write_bytes(encoded_map(random, 32, 64))
     widths = {
         folders: [asset.width for asset in read_catalog(folders, [])[0].maps]
         for folders in ((maps, other), (other, maps))
@@ -204,7 +204,9 @@ def test_the_size_of_a_heic():
 @pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF", "WEBP"])
 def test_a_size_needs_the_header_only(kind):
     data = file_of(np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8), kind)
-    part = data if kind in ("TIFF", "WEBP") else data[: len(data) * 9 // 10]  # these two need their end
+    part = (
+        data if kind in ("TIFF", "WEBP") else data[: len(data) * 9 // 10]
+    )  # the readers of these two need the whole file
     assert read_size(part) == (64, 48)
     with pytest.raises(UnreadablePhoto):
         read_size(data[:9])

@@ -21,7 +21,7 @@ from brewster.rendered.generation import workers
 from cli_helpers import as_user, errors, lines
 from set_folders import hashes
 
-FAKED = """
+COMMAND_WITH_FAKE_RENDERER = """
 import sys
 from brewster.cli import main
 from brewster.rendered.generation import workers
@@ -31,14 +31,22 @@ sys.exit(main(sys.argv[1:]))
 
 
 @pytest.fixture
-def fake(monkeypatch):
+def fake_renderer(monkeypatch):
     monkeypatch.setitem(workers.RENDERERS, "analytic", "fake_renderer:render")
 
 
-def faked(*args, renderer="render", **options):
-    """The command with a fake renderer, in a process of its own."""
+def start_with_fake_renderer(*args, renderer="render", **options):
+    """Starts the command with a fake renderer in a process of its own."""
     path = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
-    command = [sys.executable, "-c", FAKED.format(renderer), "render", *map(str, args), "--workers", "0"]
+    command = [
+        sys.executable,
+        "-c",
+        COMMAND_WITH_FAKE_RENDERER.format(renderer),
+        "render",
+        *map(str, args),
+        "--workers",
+        "0",
+    ]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=path, **options)
 
 
@@ -50,7 +58,7 @@ def test_a_set_is_rendered_with_preview_and_each_scene_can_be_rendered_again(bar
     assert code == 0, err
     assert [(line["index"], line["status"]) for line in lines(out)] == [(0, "rendered"), (1, "rendered")]
     assert "2 rendered" in err
-    assert {path.name for path in (tmp_path / "set" / "000001").iterdir()} == set(store.FILES)
+    assert {path.name for path in (tmp_path / "set" / "000001").iterdir()} == set(store.SAMPLE_FILES)
     assert Photo.open(tmp_path / "set" / "000001" / "photo.jpg").size == (48, 32)
     assert Photo.open(tmp_path / "set" / "preview.png").size == (800, 240)
     assert parquet.read_table(tmp_path / "set" / "index.parquet")["orders"].to_pylist() == ["paper"] * 2
@@ -59,7 +67,7 @@ def test_a_set_is_rendered_with_preview_and_each_scene_can_be_rendered_again(bar
         assert hashes(tmp_path / "again" / index) == hashes(tmp_path / "set" / index)
 
 
-def test_the_same_command_resumes_and_a_larger_count_adds_samples(bare, fake, tmp_path):
+def test_the_same_command_resumes_and_a_larger_count_adds_samples(bare, fake_renderer, tmp_path):
     bare("render", "set", "--recipe", "tiny", "--count", 2, "--workers", 0)
     code, out, err = bare("render", "-o", "set", "--recipe", "tiny", "--count", 3, "--workers", 0, "--json")
     assert (code, [line["status"] for line in lines(out)]) == (0, ["skipped", "skipped", "rendered"])
@@ -67,28 +75,30 @@ def test_the_same_command_resumes_and_a_larger_count_adds_samples(bare, fake, tm
     assert "1 rendered, 2 skipped" in err
 
 
-def test_the_option_shards_packs_samples_into_tar_files(bare, fake, tmp_path):
+def test_the_option_shards_packs_samples_into_tar_files(bare, fake_renderer, tmp_path):
     assert (
         bare("render", "set", "--recipe", "tiny", "--count", 2, "--first", 99, "--workers", 0, "--shards")[0]
         == 0
     )
     for shard, key in (("shard-000000.tar", "000099"), ("shard-000001.tar", "000100")):
         with tarfile.open(tmp_path / "set" / shard) as tar:
-            assert tar.getnames() == [f"{key}.{name}" for name in store.FILES]
+            assert tar.getnames() == [f"{key}.{name}" for name in store.SAMPLE_FILES]
 
 
-def test_quiet_prints_nothing(bare, fake):
+def test_quiet_prints_nothing(bare, fake_renderer):
     assert bare("render", "set", "--recipe", "tiny", "--count", 1, "--workers", 0, "--quiet") == (0, b"", "")
 
 
-def test_a_sample_that_fails_is_named_and_the_exit_code_is_one(bare, monkeypatch):
-    monkeypatch.setitem(workers.RENDERERS, "analytic", "fake_renderer:picky")
+def test_a_sample_that_fails_is_reported_and_the_exit_code_is_one(bare, monkeypatch):
+    monkeypatch.setitem(workers.RENDERERS, "analytic", "fake_renderer:rejecting")
     code, _, err = bare("render", "set", "--recipe", "tiny", "--count", 3, "--workers", 0, "--quiet")
     assert code == 1
-    assert errors(err) == ["error: sample 1: sample 1 is odd; it should be even; count by two."]
+    assert errors(err) == [
+        "error: sample 1: sample 1 cannot be rendered; expected another sample; choose another index."
+    ]
 
 
-def test_another_job_in_the_folder_is_one_error_line(bare, fake):
+def test_another_job_in_the_folder_is_one_error_line(bare, fake_renderer):
     bare("render", "set", "--recipe", "tiny", "--count", 1, "--workers", 0)
     code, _, err = bare("render", "set", "--recipe", "tiny", "--count", 1, "--workers", 0, "--seed", 3)
     assert code == 1
@@ -96,7 +106,7 @@ def test_another_job_in_the_folder_is_one_error_line(bare, fake):
     assert "its seed is 0, and 3 was requested" in err
 
 
-def test_a_photo_that_cannot_light_a_scene_is_left_out_and_named(bare, fake, tmp_path):
+def test_a_damaged_photo_is_excluded_and_reported(bare, fake_renderer, tmp_path):
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "broken.jpg").write_bytes(b"not a picture")
     grey = Photo.open(next((Path(__file__).parent / "pictures").glob("mixture*.jpg")))
@@ -109,7 +119,7 @@ def test_a_photo_that_cannot_light_a_scene_is_left_out_and_named(bare, fake, tmp
 
 
 @pytest.mark.parametrize(
-    ("args", "says"),
+    ("args", "message"),
     [
         ((), "Name one folder"),
         (("set", "-o", "other"), "Name one folder"),
@@ -120,13 +130,13 @@ def test_a_photo_that_cannot_light_a_scene_is_left_out_and_named(bare, fake, tmp
         (("set", "--scene", "scene.toml", "--count", "3"), "--count belongs to a set"),
     ],
 )
-def test_a_wrong_usage_is_explained(bare, args, says):
+def test_a_wrong_usage_is_explained(bare, args, message):
     code, _, err = bare("render", *args)
     assert code == 2
-    assert says in err
+    assert message in err
 
 
-def test_a_missing_package_is_named_with_the_command_that_installs_it(bare, monkeypatch):
+def test_the_error_for_a_missing_package_has_the_command_that_installs_it(bare, monkeypatch):
     found = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name, *rest: None if name == "torch" else found(name, *rest)
@@ -146,7 +156,9 @@ def test_a_full_disk_is_one_error_line(tmp_path):
     def limit_file_size():
         resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
 
-    run = faked("set", "--recipe", "tiny", "--count", 2, cwd=tmp_path, preexec_fn=limit_file_size)
+    run = start_with_fake_renderer(
+        "set", "--recipe", "tiny", "--count", 2, cwd=tmp_path, preexec_fn=limit_file_size
+    )
     _, err = run.communicate()
     assert run.returncode == 1
     assert err.startswith(b"error: ")
@@ -155,9 +167,9 @@ def test_a_full_disk_is_one_error_line(tmp_path):
     assert sorted(path.name for path in (tmp_path / "set").iterdir()) == [".lock", "set.toml"]
 
 
-def test_a_killed_and_restarted_run_gives_the_same_set_as_an_undisturbed_one(bare, fake, tmp_path):
+def test_a_killed_and_restarted_run_gives_the_same_set_as_an_undisturbed_one(bare, fake_renderer, tmp_path):
     command = ("--recipe", "tiny", "--count", 20, "--shards")
-    run = faked("set", *command, renderer="slow", cwd=tmp_path)
+    run = start_with_fake_renderer("set", *command, renderer="slow", cwd=tmp_path)
     deadline = time.monotonic() + 30
     while len(list(tmp_path.glob("set/0*"))) < 4 and time.monotonic() < deadline:
         time.sleep(0.01)

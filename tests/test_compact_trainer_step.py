@@ -12,7 +12,7 @@ from brewster.training.data.sample_rng import SampleRng
 from brewster.training.lora.trainer import LoraTrainer
 from brewster.training.losses import separation_loss
 from brewster.training.recipe import LoraRecipe
-from set_folders import make
+from set_folders import render_set
 
 
 def hard_batch(step, count, size):
@@ -122,12 +122,12 @@ def test_the_loss_is_the_sum_of_its_parts(trainer):
 @pytest.fixture
 def lora(tmp_path):
     """Builds a LoRA's trainer on the toy twin of kontext."""
-    make(tmp_path / "tiny", count=1)
+    render_set(tmp_path / "tiny", count=1)
 
     def build(**changes):
         values = {
             "backbone": "tiny:kontext", "rank": 2, "alpha": 2, "budget_px": 3 * 32 * 16, "seed": 1, "steps": 6,
-            "batch": 1, "learning_rate": 1e-3, "warmup_steps": 4, "weight_decay": 0.0, "report_every": 6,
+            "batch_size": 1, "learning_rate": 1e-3, "warmup_steps": 4, "weight_decay": 0.0, "report_every": 6,
             "checkpoint_every": 6, "data": {"rendered": {"sets": [tmp_path / "tiny"], "target": "transmission"}},
         }  # fmt: skip
         one = LoraTrainer(LoraRecipe.model_validate(values | changes))

@@ -8,7 +8,16 @@ import torch
 from brewster.render.analytic import render
 from brewster.render.rays.defocus import _disc_kernel, defocus_blur, margin_px
 from brewster.scene.camera import Camera
-from worlds_of_one import WORLDS, Worlds, a_scene, around, at, board, centroid, sun
+from synthetic_scenes import (
+    ASSETS,
+    SyntheticAssets,
+    camera_towards_glass,
+    centroid,
+    make_scene,
+    map_side,
+    map_with_bright_texel,
+    plane_side,
+)
 
 
 def lens_camera(aperture_mm, focus_mm=500.0, **more):
@@ -24,8 +33,8 @@ def test_without_an_aperture_the_camera_is_a_pinhole():
 
 
 def test_a_camera_with_a_tiny_aperture_is_treated_as_a_pinhole():
-    scenes = (a_scene(camera={"aperture_mm": a}, behind=around("mottled")) for a in (0.0, 0.1))
-    pinhole, tiny = (render(scene, WORLDS).photo for scene in scenes)
+    scenes = (make_scene(camera={"aperture_mm": a}, behind=map_side("mottled")) for a in (0.0, 0.1))
+    pinhole, tiny = (render(scene, ASSETS).photo for scene in scenes)
     assert torch.equal(pinhole, tiny)
 
 
@@ -60,9 +69,12 @@ def test_a_point_is_blurred_to_a_disc_of_radius_aperture_over_twice_the_focus_di
 
 
 def test_defocus_changes_neither_the_position_nor_the_energy_of_the_sun():
-    light = Worlds(sun=sun(128, 64, 0))
+    light = SyntheticAssets(sun=map_with_bright_texel(128, 64, 0))
     scenes = (
-        a_scene(camera=at(0, width=48, height=48, aperture_mm=a, focus_mm=600.0), behind=around("sun"))
+        make_scene(
+            camera=camera_towards_glass(0, width=48, height=48, aperture_mm=a, focus_mm=600.0),
+            behind=map_side("sun"),
+        )
         for a in (0.0, 40.0)
     )
     sharp, soft = (render(scene, light).background for scene in scenes)
@@ -87,14 +99,14 @@ def test_defocus_by_convolution_equals_monte_carlo_integration(incidence_deg):
     """A tiny wedge makes the renderer use Monte Carlo integration."""
     by_convolution, by_monte_carlo = (
         render(
-            a_scene(
-                camera=at(incidence_deg, aperture_mm=40, focus_mm=800, fov_deg=40),
+            make_scene(
+                camera=camera_towards_glass(incidence_deg, aperture_mm=40, focus_mm=800, fov_deg=40),
                 panes=[{"wedge_deg": wedge_deg}],
-                behind=around("soft", heading_deg=60),
-                front=around("soft"),
+                behind=map_side("soft", heading_deg=60),
+                front=map_side("soft"),
                 samples=196,
             ),
-            WORLDS,
+            ASSETS,
         )
         for wedge_deg in (0.0, 1e-9)
     )
@@ -112,12 +124,12 @@ def test_defocus_by_convolution_equals_monte_carlo_integration(incidence_deg):
 def test_a_near_picture_is_sharp_in_the_focus_plane():
     images = [
         render(
-            a_scene(
-                camera=at(0, aperture_mm=60, focus_mm=focus_mm),
-                behind=board("line", distance_mm=504, width_mm=1600),
+            make_scene(
+                camera=camera_towards_glass(0, aperture_mm=60, focus_mm=focus_mm),
+                behind=plane_side("line", distance_mm=504, width_mm=1600),
                 samples=64,
             ),
-            WORLDS,
+            ASSETS,
         ).background
         for focus_mm in (650, 1004, 3500)
     ]

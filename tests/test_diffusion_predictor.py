@@ -68,7 +68,9 @@ def lora(tmp_path_factory):
     with torch.no_grad():
         for parameter in lora_parameters(backbone):
             parameter.normal_(0, 0.1, generator=torch.Generator().manual_seed(3))
-    save_lora(folder, backbone, prompt, DecompositionTask(budget_px=SMALL_BUDGET_PX), base=f"{TINY_PREFIX}kontext")
+    save_lora(
+        folder, backbone, prompt, DecompositionTask(budget_px=SMALL_BUDGET_PX), base=f"{TINY_PREFIX}kontext"
+    )
     return folder
 
 

@@ -7,7 +7,7 @@ import torch
 
 from brewster.render.rays.emitters import CameraView, SideEmitters
 from brewster.render.rays.envmap_sampling import EnvmapDistribution, direction_to_uv, uv_to_direction
-from worlds_of_one import WORLDS, around, sun
+from synthetic_scenes import ASSETS, map_side, map_with_bright_texel
 
 AHEAD = torch.tensor([0.0, 0.0, -1.0])
 HEIGHT = 32
@@ -38,7 +38,7 @@ def texel_directions(u_offset):
 
 def make_emitters(side, behind=True):
     view = CameraView(height_mm=1000.0, pixel_rad=0.01, aperture_mm=0.0, focus_mm=3000.0)
-    return SideEmitters(side, WORLDS, view, behind=behind, to_world=torch.eye(3), device="cpu")
+    return SideEmitters(side, ASSETS, view, behind=behind, to_world=torch.eye(3), device="cpu")
 
 
 def test_texture_coordinates_and_directions_are_inverse():
@@ -73,7 +73,7 @@ def test_no_direction_is_sampled_on_the_other_side_of_the_glass():
 def test_nearly_all_samples_hit_the_sun():
     row, column, u_offset = 12, 60, 0.1
     distribution = EnvmapDistribution(
-        to_texels(sun(HEIGHT, row, column, light=1e4, night=0.01)), AHEAD, u_offset
+        to_texels(map_with_bright_texel(HEIGHT, row, column, light=1e4, background=0.01)), AHEAD, u_offset
     )
     u, v = direction_to_uv(distribution.sample(uniforms(5000), u_offset), u_offset)
     is_near_sun = ((u * 2 * HEIGHT - column - 0.5).abs() <= 1.51) & ((v * HEIGHT - row - 0.5).abs() <= 1.51)
@@ -100,7 +100,7 @@ def test_the_density_matches_the_frequency_of_samples(u_offset):
 @pytest.mark.parametrize("behind", [True, False])
 def test_the_mean_of_one_over_the_density_is_the_solid_angle(radius_mm, behind):
     """A cone of half-angle 60 degrees has a solid angle of pi, from any point inside a dome."""
-    emitters = make_emitters(around("soft", radius_mm=radius_mm, heading_deg=25), behind)
+    emitters = make_emitters(map_side("soft", radius_mm=radius_mm, heading_deg=25), behind)
     origin = torch.tensor([[300.0], [-200.0], [0.0]]).expand(3, 200_000)
     direction, pdf = emitters.sample(origin, uniforms(200_000))
     outward = -direction[2] if behind else direction[2]

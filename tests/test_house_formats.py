@@ -29,7 +29,7 @@ from brewster.rendered.store import SAMPLE_FORMAT
 from brewster.scene.recipe import read_scene_recipe
 from brewster.scene.sampler import draw
 from picture_files import smooth
-from worlds_of_one import WORLDS, a_scene, around, board
+from synthetic_scenes import ASSETS, make_scene, map_side, plane_side
 
 ANSWERS = {
     1: {
@@ -131,10 +131,10 @@ LPIPS = {
     3: {"lpips": 0.033937, "lpips_region": 0.035948, "lpips_reflection": 0.283549},
 }
 SCENES = {
-    1: {"tiny": "3110c6324c047d3d", "window": "e2d8b2c9af23a561"},
+    2: {"tiny": "b8473c2883ad1619", "window": "bd20ed9f789a3ff3"},
 }
 SAMPLES = {
-    1: {
+    2: {
         "photo, light": [1.0143, 0.8571, 1.1205],
         "transmission, light": [0.7423, 0.6429, 0.8384],
         "background, light": [0.9394, 0.7656, 1.0188],
@@ -148,7 +148,7 @@ SAMPLES = {
     },
 }
 MAPS = {
-    1: {
+    2: {
         "room": [
             -1.134,
             -1.145,
@@ -258,15 +258,15 @@ def test_a_changed_scene_needs_a_new_sample_format():
 
 
 def test_a_changed_rendering_needs_a_new_sample_format():
-    scene = a_scene(
+    scene = make_scene(
         camera={"aperture_mm": 5.0},
         panes=[{"absorption_per_m": (20.0, 5.0, 10.0)}, {}],
-        behind=board("soft"),
-        front=around("soft", radius_mm=4000.0, luminance=2.0),
+        behind=plane_side("soft"),
+        front=map_side("soft", radius_mm=4000.0, luminance=2.0),
         samples=4,
         seed=5,
     )
-    sample = render(scene, WORLDS)
+    sample = render(scene, ASSETS)
     made = {f"{name}, light": layer[:, 5, 17].tolist() for name, layer in sample.layers().items()}
     made |= {name: layer[1, 3::9, 4::9].ravel().tolist() for name, layer in develop(sample).layers().items()}
     rounded = {name: [round(value, 4) for value in values] for name, values in made.items()}

@@ -21,7 +21,7 @@ from file_server import loopback_only, unused_address
 
 REPO = "somebody/some-lora"
 VALUES = {
-    "seed": 1, "steps": 6, "batch": 2, "learning_rate": 1e-2, "warmup_steps": 2, "weight_decay": 1e-4,
+    "seed": 1, "steps": 6, "batch_size": 2, "learning_rate": 1e-2, "warmup_steps": 2, "weight_decay": 1e-4,
     "report_every": 6, "checkpoint_every": 2,
 }  # fmt: skip
 

@@ -22,10 +22,10 @@ from brewster.training.lora.latents import (
     open_samples,
 )
 from brewster.training.recipe import LoraRecipe
-from set_folders import make
+from set_folders import render_set
 
 RECIPE = {
-    "backbone": "tiny:kontext", "budget_px": 3 * 32 * 16, "seed": 1, "steps": 6, "batch": 1,
+    "backbone": "tiny:kontext", "budget_px": 3 * 32 * 16, "seed": 1, "steps": 6, "batch_size": 1,
     "learning_rate": 1e-2, "warmup_steps": 2, "weight_decay": 1e-4, "report_every": 6, "checkpoint_every": 2,
 }  # fmt: skip
 
@@ -39,7 +39,7 @@ def backbone():
 def root(tmp_path_factory):
     """A data folder with a rendered set, pairs without reflection, and pairs with reflection."""
     root = tmp_path_factory.mktemp("data")
-    make(root / "set", count=3)
+    render_set(root / "set", count=3)
     for folder, roles in (
         ("pairs", ["blended", "transmission"]),
         ("trios", ["blended", "transmission", "reflection"]),

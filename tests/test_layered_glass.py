@@ -22,7 +22,7 @@ from brewster.render.rays.layered_glass import (
 )
 from brewster.render.rays.rough_glass import _reflectances
 from brewster.scene.glass import Glazing, Pane
-from worlds_of_one import WORLDS, a_scene, at, board
+from synthetic_scenes import ASSETS, camera_towards_glass, make_scene, plane_side
 
 examples_40 = settings(max_examples=40, deadline=None, database=None)
 COSINES = st.floats(0.05, 1)
@@ -251,15 +251,17 @@ def test_lateral_shifts_follow_snells_law_in_glass_and_are_unrefracted_in_the_ga
 def render_mirrored_line(incidence_deg, thickness_mm):
     """Renders the reflection of a thin line in front of the glass: its mean per column, and the pixel size there in mm."""
     before, away, slant = 600.0, 400.0, math.radians(incidence_deg)
-    camera = at(incidence_deg, distance_mm=before / math.cos(slant), fov_deg=0.6, width=48, height=16)
-    line = board(
+    camera = camera_towards_glass(
+        incidence_deg, distance_mm=before / math.cos(slant), fov_deg=0.6, width=48, height=16
+    )
+    line = plane_side(
         "line",
         distance_mm=away,
         width_mm=20 / math.cos(slant) ** 2,
         offset_mm=(away * math.tan(slant) + 10 / 64 / math.cos(slant) ** 2, 0),
     )
-    scene = a_scene(camera=camera, panes=[{"thickness_mm": thickness_mm}], front=line, samples=25)
-    columns = render(scene, WORLDS).reflection.mean((0, 1)).numpy()
+    scene = make_scene(camera=camera, panes=[{"thickness_mm": thickness_mm}], front=line, samples=25)
+    columns = render(scene, ASSETS).reflection.mean((0, 1)).numpy()
     return columns, scene.camera.pixel_rad * (before + away) / math.cos(slant)
 
 

@@ -26,18 +26,18 @@ from brewster.training.loop import run
 from brewster.training.lora.trainer import LoraTrainer
 from brewster.training.recipe import LoraRecipe
 from brewster.training.trainers import open_trainer
-from set_folders import make
+from set_folders import render_set
 
 RECIPE = {
     "backbone": "tiny:kontext", "rank": 2, "alpha": 2, "budget_px": 3 * 32 * 16,
-    "seed": 1, "steps": 6, "batch": 2, "learning_rate": 1e-2, "warmup_steps": 2, "weight_decay": 1e-4,
+    "seed": 1, "steps": 6, "batch_size": 2, "learning_rate": 1e-2, "warmup_steps": 2, "weight_decay": 1e-4,
     "report_every": 6, "checkpoint_every": 2,
 }  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    make(tmp_path_factory.mktemp("sets") / "tiny", count=3)
+    render_set(tmp_path_factory.mktemp("sets") / "tiny", count=3)
     return next(tmp_path_factory.getbasetemp().glob("sets*/tiny"))
 
 
@@ -123,7 +123,7 @@ def test_a_checkpoint_contains_the_lora_and_no_weights_of_the_base(initialized):
 @pytest.mark.parametrize("objective", ["flow", "one_step"])
 def test_training_lowers_the_loss_of_a_repeated_step(initialized, backbone, objective):
     trainer = initialized(
-        backbone=f"tiny:{backbone}", objective=objective, batch=1, rank=4, learning_rate=5e-2
+        backbone=f"tiny:{backbone}", objective=objective, batch_size=1, rank=4, learning_rate=5e-2
     )
     losses = [trainer.training_step(0)["loss"] for _ in range(15)]
     assert losses[-1] < 0.9 * losses[0]
@@ -182,7 +182,7 @@ def test_a_panel_of_weight_zero_has_no_loss_and_the_others_share_its_weight(init
 
 
 def test_the_loss_of_a_batch_is_the_mean_of_its_samples(initialized):
-    trainer = initialized(batch=2)
+    trainer = initialized(batch_size=2)
     alone = [trainer._losses(SampleRng(1, 0, slot)) for slot in range(2)]
     expected = sum(part.item() for parts in alone for part in parts.values()) / 2
     assert trainer.training_step(0)["loss"] == pytest.approx(expected)
@@ -223,9 +223,9 @@ def test_two_processes_train_the_lora_of_one_process_with_the_whole_batch(recipe
 def test_a_batch_that_cannot_be_divided_is_refused(recipe, monkeypatch):
     monkeypatch.setattr(distributed, "world_size", lambda: 2)
     with pytest.raises(
-        RecipeError, match=r"batch = 1 cannot be divided equally among 2 processes; .*; raise batch"
+        RecipeError, match=r"batch_size = 1 cannot be divided equally among 2 processes; .*; raise batch_size"
     ):
-        LoraTrainer(recipe(batch=1))
+        LoraTrainer(recipe(batch_size=1))
 
 
 def test_a_nan_loss_stops_the_run_and_keeps_the_last_valid_checkpoint(recipe, tmp_path, monkeypatch):

@@ -12,7 +12,7 @@ from brewster.training.data.sample_rng import SampleRng
 
 QUIET = MixRecipe(
     crop=(1, 1), temperature=(0, 0), background_map_probability=0, background_level_log=(0.1, 0.1),
-    highlight_boost=(0, 0), shadow_probability=0, absent_probability=0, partial_probability=0, transmittance=(1, 1),
+    highlight_boost=(0, 0), shadow_probability=0, no_glass_probability=0, partial_probability=0, transmittance=(1, 1),
     veil_probability=0, reflection_map_probability=0, reflection_ratio_log=(0.5, 0.5),
     reflection_contrast_log=(1, 1), lamp_probability=0, sign_probability=0, sharp_probability=1,
     ghost_probability=0, falloff_probability=0, edge_probability=0, exposure=(1, 1), overexposed_probability=0,
@@ -204,7 +204,7 @@ def test_photos_are_drawn_in_proportion_to_their_weights(photos):
 
 
 def test_samples_without_glass_have_no_reflection(photos):
-    recipe = QUIET.model_copy(update={"absent_probability": 1.0})
+    recipe = QUIET.model_copy(update={"no_glass_probability": 1.0})
     batch = Mixtures(photos, [], recipe, seed=1)(0, 4, 64)
     assert not batch.reflection_encoded.any()
     rounding = 0.5 / 255 + 1e-6

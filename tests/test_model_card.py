@@ -18,7 +18,7 @@ from brewster.models.diffusion.sampling import sample
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.training.lora.model_card import card_text, with_benchmark_tables, write_card
 from brewster.training.recipe import LoraRecipe, read_recipe
-from set_folders import make
+from set_folders import render_set
 
 RECIPES = Path(__file__).parents[1] / "recipes" / "train"
 
@@ -67,7 +67,7 @@ def test_a_toy_is_marked_as_one_and_names_no_base():
 
 
 def test_sets_are_listed_with_their_scenes_and_without_local_paths(tmp_path, monkeypatch):
-    make(tmp_path / "sets" / "window", count=3)
+    render_set(tmp_path / "sets" / "window", count=3)
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
     listed = "`sets/window` (3 samples of the scenes `tiny`, orders all)"
     assert listed in card()

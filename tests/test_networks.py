@@ -88,13 +88,14 @@ def test_a_run_of_one_network_is_not_resumed_with_another(recipe, small_network,
         train(with_value(recipe, "network", small_network), tmp_path, ignore_progress)
 
 
-def test_a_checkpoint_without_the_key_network_has_the_default_network(recipe, tmp_path):
+def test_a_checkpoint_with_an_older_recipe_contains_the_default_network(recipe, tmp_path):
     trainer = CompactTrainer(recipe)
-    recipe_without_network = recipe.model_dump_json(exclude={"network"})
-    assert "network" not in recipe_without_network
+    older = recipe.model_dump_json(exclude={"network"}).replace('"batch_size"', '"batch"')
+    assert "network" not in older
+    assert "batch_size" not in older
     average = {name: torch.full_like(value, 2.0) for name, value in trainer.average.items()}
     checkpoint = replace(
-        Checkpoint(0, recipe_without_network, trainer.state_dict()),
+        Checkpoint(0, older, trainer.state_dict()),
         state=trainer.state_dict() | {"average": average},
     )
     checkpoint.write(tmp_path / "start.pt")

@@ -33,7 +33,10 @@ def wall(distance, grey):
 def test_a_near_surface_hides_a_far_one_whichever_is_drawn_first(order):
     walls = wall(1.0, 0.25), wall(5.0, 0.75)
     picture = render(
-        ProceduralEnvironment([walls[i] for i in order], [], lambda ways, _: np.zeros_like(ways), 0.0), 32
+        ProceduralEnvironment(
+            [walls[i] for i in order], [], lambda directions, _: np.zeros_like(directions), 0.0
+        ),
+        32,
     )
     assert picture[16, 0].tolist() == [0.25] * 3
     assert set(np.unique(picture[10:22, :4])) == {0.25}

@@ -22,8 +22,8 @@ def luminance(picture):
     return picture @ np.array(REC709_LUMINANCE, np.float32)
 
 
-def dark(ways, _texel):
-    return np.zeros_like(ways)
+def dark(directions, _texel):
+    return np.zeros_like(directions)
 
 
 def solid_angles(height):
@@ -32,10 +32,12 @@ def solid_angles(height):
 
 @pytest.fixture(scope="module")
 def both_maps():
-    """Each world built once, which takes a second, and shown at two heights."""
+    """Each environment, built once, since that takes a second, and rendered at two heights."""
     heights = 64, 128
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rooms, "render", lambda world, _height: [render(world, each) for each in heights])
+        patch.setattr(
+            rooms, "render", lambda environment, _height: [render(environment, each) for each in heights]
+        )
         return {name: ENVIRONMENTS[name](7, 0) for name in NAMES}
 
 

@@ -17,7 +17,7 @@ TRAINING = sorted((Path(__file__).parents[1] / "recipes").glob("**/*.toml"))
 
 @pytest.fixture
 def problems(tmp_path):
-    def problems(text, read=lambda path: read_toml(SceneRecipe, path, compare="docs/recipes.md")):
+    def problems(text, read=lambda path: read_toml(SceneRecipe, path, reference="docs/recipes.md")):
         (tmp_path / "mine.toml").write_text(text)
         with pytest.raises(RecipeError) as caught:
             read(tmp_path / "mine.toml")
@@ -38,7 +38,7 @@ double_probability = 2
 thickness_mm = [5, 4]
 [behind]
 map_probabilty = 0.5
-[developmnt]
+[camera_respons]
 contrast = [0, 1]
 """
     assert problems(text) == [
@@ -46,7 +46,7 @@ contrast = [0, 1]
         "mine.toml: samples is 0; expected an integer, above 0; compare with docs/recipes.md.",
         "mine.toml: glass.double_probability is 2; expected a number, from 0 to 1; compare with docs/recipes.md.",
         (
-            "mine.toml: glass.thickness_mm is [5, 4]; expected low <= high, and low is 5, high is 4; compare with"
+            "mine.toml: glass.thickness_mm is [5, 4]; expected low <= high, but low is 5 and high is 4; compare with"
             " docs/recipes.md."
         ),
         (
@@ -54,8 +54,8 @@ contrast = [0, 1]
             " did you mean behind.map_probability?"
         ),
         (
-            "mine.toml: there is no key developmnt (its value is { contrast = [0, 1] }); expected a key of the recipe;"
-            " did you mean development?"
+            "mine.toml: there is no key camera_respons (its value is { contrast = [0, 1] }); expected a key of the recipe;"
+            " did you mean camera_response?"
         ),
     ]
 
@@ -72,7 +72,7 @@ def test_a_misspelt_choice_is_corrected_and_an_unknown_key_lists_the_known_ones(
     ) or (
         lines[0].endswith('orders is "papr"; expected a string, one of "all", "paper"; did you mean "paper"?')
     )
-    assert any("[glass] has the keys double_probability, gap_mm" in line for line in lines)
+    assert any("expected a key of [glass], one of double_probability, gap_mm" in line for line in lines)
 
 
 def test_problems_of_a_training_recipe_are_reported_alike(problems):
@@ -81,14 +81,17 @@ def test_problems_of_a_training_recipe_are_reported_alike(problems):
     assert "seed is 1.5; expected an integer" in found
     assert "steps is missing" in found
     assert "data.pairs_share is 3" in found
-    assert "there is no key panel_weights.X (its value is 1); [panel_weights] has the keys I, T, R" in found
+    assert (
+        "there is no key panel_weights.X (its value is 1); expected a key of [panel_weights], one of I, T, R"
+        in found
+    )
     assert "there is no key rnk (its value is 4); expected a key of the recipe; did you mean rank?" in found
 
 
 def test_an_error_with_several_problems_survives_another_process(problems, tmp_path):
     (tmp_path / "mine.toml").write_text("")
     with pytest.raises(RecipeError) as caught:
-        read_toml(SceneRecipe, tmp_path / "mine.toml", compare="docs/recipes.md")
+        read_toml(SceneRecipe, tmp_path / "mine.toml", reference="docs/recipes.md")
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
     assert len(caught.value.sentences()) == 2
 
@@ -145,8 +148,8 @@ def test_an_unknown_recipe_cannot_be_shown(bare):
     assert (code, err) == (
         1,
         (
-            "error: there is no training recipe 'compat'; the packaged recipes are compact, lora;"
-            " name one of them, or a .toml file.\n"
+            "error: there is no training recipe 'compat'; expected one of the packaged recipes compact, lora;"
+            " choose one of them, or a .toml file.\n"
         ),
     )
     assert bare("train")[0] == 2

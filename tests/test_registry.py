@@ -29,7 +29,7 @@ from brewster.benchmarks.registry import (
 from brewster.errors import PhotoError, UnreadablePhoto
 from brewster.photo import Photo
 from picture_files import exif_block, file_of, smooth
-from set_folders import make
+from set_folders import render_set
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +158,7 @@ def test_a_folder_has_its_name_also_as_the_current_folder(tmp_path, monkeypatch)
 
 @pytest.mark.parametrize("shards", [False, True])
 def test_a_rendered_set_gives_its_background_and_its_reflection(tmp_path, shards):
-    make(tmp_path / "set", count=3, shards=shards)
+    render_set(tmp_path / "set", count=3, shards=shards)
     read = only("rendered", tmp_path / "set")
     assert (read.name, read.title, read.remarks, read.excluded) == ("set", "set", (), ())
     assert names(read.cases) == ["000000", "000001", "000002"]
@@ -166,14 +166,14 @@ def test_a_rendered_set_gives_its_background_and_its_reflection(tmp_path, shards
         assert case.rendered
         assert (case.scene, case.relative_path) == (case.name, f"{case.name}/photo")
         assert Photo.open(case.photo.read()).size == (24, 16)
-    make(tmp_path / "again", count=3)
+    render_set(tmp_path / "again", count=3)
     for case, file in ((read.cases[1], "background"), (read.cases[2], "background")):
         assert case.ground_truth.read() == (tmp_path / "again" / case.name / f"{file}.jpg").read_bytes()
         assert case.reflection.read() == (tmp_path / "again" / case.name / "reflection.jpg").read_bytes()
 
 
 def test_an_incomplete_rendered_sample_is_excluded(tmp_path):
-    make(tmp_path, count=2)
+    render_set(tmp_path, count=2)
     (tmp_path / "000001" / "background.jpg").unlink()
     read = only("rendered", tmp_path)
     assert names(read.cases) == ["000000"]

@@ -8,13 +8,13 @@ import torch
 from brewster.errors import MissingExtra
 from brewster.render.analytic import render
 from brewster.render.mitsuba import renderer
-from worlds_of_one import WORLDS, a_scene, at, board
+from synthetic_scenes import ASSETS, camera_towards_glass, make_scene, plane_side
 
-SCENE = a_scene(
-    camera=at(25, 5, width=16, height=16, fov_deg=12),
+SCENE = make_scene(
+    camera=camera_towards_glass(25, 5, width=16, height=16, fov_deg=12),
     panes=[{"thickness_mm": 12.0, "absorption_per_m": (20.0, 5.0, 30.0)}],
-    behind=board("mottled", width_mm=900),
-    front=board("mottled", width_mm=400, offset_mm=(420.0, 0.0)),
+    behind=plane_side("mottled", width_mm=900),
+    front=plane_side("mottled", width_mm=400, offset_mm=(420.0, 0.0)),
     samples=64,
 )
 RUNS = 4
@@ -30,7 +30,7 @@ def traced_layers():
     ):
         patch.setattr(renderer, "_variant", lambda polarised: "scalar_rgb")
         try:
-            samples = [renderer.trace(scene, WORLDS, noise=0.02, max_samples=512).layers() for scene in seeds]
+            samples = [renderer.trace(scene, ASSETS, noise=0.02, max_samples=512).layers() for scene in seeds]
         except MissingExtra as error:
             pytest.skip(f"Mitsuba cannot be used: {error}")
     return {name: torch.stack([sample[name] for sample in samples]).double() for name in samples[0]}
@@ -39,7 +39,7 @@ def traced_layers():
 @pytest.mark.parametrize("layer", ["photo", "transmission", "background", "reflection", "mirror"])
 def test_the_analytic_renderer_and_mitsuba_render_the_same_image(traced_layers, layer):
     """The mean error is at most 1.3 times the noise plus 1 % of the mean light; the means differ by at most 1.5 %."""
-    analytic = render(SCENE, WORLDS).layers()[layer].double()
+    analytic = render(SCENE, ASSETS).layers()[layer].double()
     mitsuba, noise = traced_layers[layer].mean(0), traced_layers[layer].std(0) / RUNS**0.5
     light = float(mitsuba.mean())
     assert float((analytic - mitsuba).abs().mean()) < 1.3 * float(noise.mean()) + 0.01 * light

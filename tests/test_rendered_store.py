@@ -1,4 +1,4 @@
-"""A set on disk: the files of a sample, folders and shards, the index, and the contact sheet."""
+"""Rendered sets on disk: the files of a sample, folders and shards, the index, and the contact sheet."""
 
 import io
 import shutil
@@ -19,13 +19,13 @@ from brewster.scene.recipe import read_scene_recipe
 from brewster.scene.sampler import draw
 from brewster.scene.scene import read_scene
 from fake_renderer import render
-from set_folders import BUILTIN_CATALOG, hashes, make
+from set_folders import BUILTIN_CATALOG, hashes, render_set
 
 
 @pytest.fixture(scope="module")
-def four(tmp_path_factory):
+def four_samples(tmp_path_factory):
     out = tmp_path_factory.mktemp("set") / "four"
-    make(out)
+    render_set(out)
     return out
 
 
@@ -34,12 +34,12 @@ def scene():
     return draw(read_scene_recipe("tiny"), BUILTIN_CATALOG, seed=7, index=3)
 
 
-def test_a_sample_is_five_photographs_their_light_and_their_scene(four, scene):
-    folder = four / "000003"
-    assert {path.name for path in folder.iterdir()} == set(store.FILES)
+def test_a_sample_is_five_photographs_their_light_and_their_scene(four_samples, scene):
+    folder = four_samples / "000003"
+    assert {path.name for path in folder.iterdir()} == set(store.SAMPLE_FILES)
     assert all(Photo.open(folder / f"{layer}.jpg").size == (24, 16) for layer in LAYERS)
-    assert read_scene(folder / store.SCENE) == scene
-    light = read_layers((folder / store.LIGHT).read_bytes())
+    assert read_scene(folder / store.SCENE_FILE) == scene
+    light = read_layers((folder / store.LIGHT_FILE).read_bytes())
     sample = render(scene, None)
     for name, layer in sample.layers().items():
         np.testing.assert_allclose(light[name], layer.permute(1, 2, 0).numpy(), rtol=1e-3)
@@ -47,11 +47,11 @@ def test_a_sample_is_five_photographs_their_light_and_their_scene(four, scene):
 
 def test_only_the_photo_has_the_quality_of_the_scene(scene):
     coarse = scene.model_copy(
-        update={"development": scene.development.model_copy(update={"jpeg_quality": 1})}
+        update={"camera_response": scene.camera_response.model_copy(update={"jpeg_quality": 1})}
     )
-    fine, rough = (store.encode_sample(render(each, None), "fake") for each in (scene, coarse))
+    fine, rough = (store.encode_sample(render(variant, None), "fake") for variant in (scene, coarse))
     assert len(rough["photo.jpg"]) < len(fine["photo.jpg"])
-    assert {name for name in fine if fine[name] != rough[name]} == {"photo.jpg", store.SCENE}
+    assert {name for name in fine if fine[name] != rough[name]} == {"photo.jpg", store.SCENE_FILE}
 
 
 def test_statistics_compare_the_luminance_of_the_layers(scene):
@@ -62,15 +62,15 @@ def test_statistics_compare_the_luminance_of_the_layers(scene):
     assert found["overexposed"] == 0
 
 
-def test_folders_and_shards_read_alike(four, tmp_path):
+def test_folders_and_shards_read_alike(four_samples, tmp_path):
     packed = tmp_path / "packed"
-    shutil.copytree(four, packed)
+    shutil.copytree(four_samples, packed)
     store.pack(packed, 0)
     assert not list(packed.glob("0000*"))
-    folders, members = list(store.read_set(four)), list(store.read_set(packed))
+    folders, members = list(store.read_set(four_samples)), list(store.read_set(packed))
     assert [entry.index for entry in folders] == [entry.index for entry in members] == [0, 1, 2, 3]
     for one, other in zip(folders, members, strict=True):
-        assert all(one.read(name) == other.read(name) for name in store.FILES)
+        assert all(one.read(name) == other.read(name) for name in store.SAMPLE_FILES)
         (light, scene), (same_light, same_scene) = store.open_sample(one), store.open_sample(other)
         assert scene == same_scene
         assert list(light) == list(LAYERS)
@@ -79,40 +79,42 @@ def test_folders_and_shards_read_alike(four, tmp_path):
         assert light["photo"].dtype == np.float32
 
 
-def test_a_shard_is_a_plain_tar_that_webdataset_reads_and_that_depends_on_its_samples_alone(four, tmp_path):
+def test_a_shard_is_a_tar_file_for_webdataset_and_depends_on_its_samples_only(four_samples, tmp_path):
     for name in ("one", "other"):
-        shutil.copytree(four, tmp_path / name)
-    shutil.move(tmp_path / "other" / "000001", tmp_path / "kept")
+        shutil.copytree(four_samples, tmp_path / name)
+    shutil.move(tmp_path / "other" / "000001", tmp_path / "moved")
     store.pack(tmp_path / "other", 0)
-    shutil.move(tmp_path / "kept", tmp_path / "other" / "000001")
+    shutil.move(tmp_path / "moved", tmp_path / "other" / "000001")
     for name in ("one", "other"):
         store.pack(tmp_path / name, 0)
     assert hashes(tmp_path / "one") == hashes(tmp_path / "other")
     with tarfile.open(tmp_path / "one" / "shard-000000.tar") as tar:
         members = tar.getmembers()
         assert [member.name for member in members] == [
-            f"{index:06d}.{name}" for index in range(4) for name in store.FILES
+            f"{index:06d}.{name}" for index in range(4) for name in store.SAMPLE_FILES
         ]
         assert {(member.mtime, member.uid, member.gid, member.mode) for member in members} == {
             (0, 0, 0, 0o644)
         }
-        assert tar.extractfile("000002.photo.jpg").read() == (four / "000002" / "photo.jpg").read_bytes()
+        assert (
+            tar.extractfile("000002.photo.jpg").read() == (four_samples / "000002" / "photo.jpg").read_bytes()
+        )
 
 
-def test_packing_removes_folders_that_are_in_the_shard_already(four, tmp_path):
-    shutil.copytree(four, tmp_path / "set")
+def test_packing_removes_folders_of_samples_in_the_shard(four_samples, tmp_path):
+    shutil.copytree(four_samples, tmp_path / "set")
     store.pack(tmp_path / "set", 0)
     shard = (tmp_path / "set" / "shard-000000.tar").read_bytes()
-    shutil.copytree(four / "000002", tmp_path / "set" / "000002")
+    shutil.copytree(four_samples / "000002", tmp_path / "set" / "000002")
     entries = list(store.read_set(tmp_path / "set"))
     assert [entry.index for entry in entries] == [0, 1, 2, 3]
-    assert {entry.place.name for entry in entries} == {"shard-000000.tar"}
+    assert {entry.path.name for entry in entries} == {"shard-000000.tar"}
     store.pack(tmp_path / "set", 0)
     assert not (tmp_path / "set" / "000002").exists()
     assert (tmp_path / "set" / "shard-000000.tar").read_bytes() == shard
 
 
-def test_a_sample_that_another_process_has_written_stays(tmp_path):
+def test_a_sample_of_another_process_is_not_replaced(tmp_path):
     store.write_folder(tmp_path / "000000", {"a": b"first"})
     store.write_folder(tmp_path / "000000", {"a": b"second"})
     assert (tmp_path / "000000" / "a").read_bytes() == b"first"
@@ -128,10 +130,10 @@ def test_a_sample_that_cannot_be_written_leaves_nothing(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-def test_a_damaged_scene_is_named(four, tmp_path):
-    shutil.copytree(four, tmp_path / "set")
+def test_a_damaged_scene_is_reported(four_samples, tmp_path):
+    shutil.copytree(four_samples, tmp_path / "set")
     for text in ("no toml", "seed = 'seven'"):
-        (tmp_path / "set" / "000000" / store.SCENE).write_text(text)
+        (tmp_path / "set" / "000000" / store.SCENE_FILE).write_text(text)
         with pytest.raises(RecipeError, match="000000"):
             store.open_sample(next(store.read_set(tmp_path / "set")))
 
@@ -142,10 +144,10 @@ def test_samples_beyond_a_million_keep_their_order(tmp_path):
     assert [entry.index for entry in store.read_set(tmp_path)] == [5, 999_999, 1_000_000]
 
 
-def test_the_index_has_a_row_a_sample_with_what_it_was_made_from(four, monkeypatch):
-    table = parquet.read_table(four / preview.INDEX).to_pylist()
+def test_the_index_has_a_row_with_the_parameters_of_each_sample(four_samples, monkeypatch):
+    table = parquet.read_table(four_samples / preview.INDEX_FILE).to_pylist()
     assert [row["index"] for row in table] == [0, 1, 2, 3]
-    for row, entry in zip(table, store.read_set(four), strict=True):
+    for row, entry in zip(table, store.read_set(four_samples), strict=True):
         _, scene = store.open_sample(entry)
         pane = scene.glass.panes[0]
         assert (row["thickness_mm"], row["refractive_index"]) == (pane.thickness_mm, pane.index)
@@ -154,34 +156,36 @@ def test_the_index_has_a_row_a_sample_with_what_it_was_made_from(four, monkeypat
         assert row["front_map_file"] == (scene.front.map and scene.front.map.source.file)
         assert row["behind_plane_distance_mm"] == (scene.behind.plane and scene.behind.plane.distance_mm)
         assert (row["seed"], row["recipe"], row["renderer"]) == (7, "tiny", "fake_renderer:render")
-        assert row["place"] == entry.place.name
+        assert row["place"] == entry.path.name
         assert row["reflection_to_transmission"] == pytest.approx(1, abs=0.2)
 
 
-def test_the_index_is_written_in_batches_and_the_same_each_time(four, tmp_path, monkeypatch):
-    shutil.copytree(four, tmp_path / "set")
+def test_the_index_is_written_in_batches_and_the_same_each_time(four_samples, tmp_path, monkeypatch):
+    shutil.copytree(four_samples, tmp_path / "set")
     preview.write_index(tmp_path / "set")
-    assert hashes(tmp_path / "set") == hashes(four)
+    assert hashes(tmp_path / "set") == hashes(four_samples)
     monkeypatch.setattr(preview, "_BATCH_ROWS", 3)
     preview.write_index(tmp_path / "set")
-    assert parquet.ParquetFile(tmp_path / "set" / preview.INDEX).num_row_groups == 2
-    assert parquet.read_table(tmp_path / "set" / preview.INDEX) == parquet.read_table(four / preview.INDEX)
+    assert parquet.ParquetFile(tmp_path / "set" / preview.INDEX_FILE).num_row_groups == 2
+    assert parquet.read_table(tmp_path / "set" / preview.INDEX_FILE) == parquet.read_table(
+        four_samples / preview.INDEX_FILE
+    )
 
 
-def test_the_sheet_shows_a_row_of_five_a_sample_and_goes_on_in_a_second_column(four, tmp_path):
-    shutil.copytree(four, tmp_path / "set")
+def test_the_contact_sheet_has_a_row_for_each_sample_in_two_columns(four_samples, tmp_path):
+    shutil.copytree(four_samples, tmp_path / "set")
     preview.write_preview(tmp_path / "set")
-    assert Photo.open(tmp_path / "set" / preview.PREVIEW).size == (5 * 160, 4 * 120)
+    assert Photo.open(tmp_path / "set" / preview.PREVIEW_FILE).size == (5 * 160, 4 * 120)
     for index in range(4, 23):
-        shutil.copytree(four / "000000", tmp_path / "set" / store.key(index))
+        shutil.copytree(four_samples / "000000", tmp_path / "set" / store.key(index))
     preview.write_preview(tmp_path / "set")
-    sheet = Photo.open(io.BytesIO((tmp_path / "set" / preview.PREVIEW).read_bytes()).getvalue())
+    sheet = Photo.open(io.BytesIO((tmp_path / "set" / preview.PREVIEW_FILE).read_bytes()).getvalue())
     assert sheet.size == (2 * 5 * 160, 20 * 120)
     assert (sheet.pixels[-120:, 800:] == 255).all()
 
 
 def test_an_empty_set_has_an_empty_index_and_no_sheet(tmp_path):
-    make(tmp_path / "set", count=0)
+    render_set(tmp_path / "set", count=0)
     preview.write_preview(tmp_path / "set")
-    assert parquet.read_table(tmp_path / "set" / preview.INDEX).num_rows == 0
-    assert not (tmp_path / "set" / preview.PREVIEW).exists()
+    assert parquet.read_table(tmp_path / "set" / preview.INDEX_FILE).num_rows == 0
+    assert not (tmp_path / "set" / preview.PREVIEW_FILE).exists()

@@ -10,11 +10,18 @@ from brewster.render.rays.ggx import sample_visible_normal, smith_g1, vndf_over_
 from brewster.render.rays.layered_glass import all_orders
 from brewster.render.rays.rough_glass import surfaces
 from brewster.scene.glass import Glazing, Pane
-from worlds_of_one import WORLDS, a_scene, around, at, soft
+from synthetic_scenes import ASSETS, camera_towards_glass, make_scene, map_side, smooth_map
 
 
 def rough_scene(alpha, count=1, samples=16, **more):
-    return a_scene(**{"camera": at(20), "panes": [{"roughness": alpha}] * count, "samples": samples, **more})
+    return make_scene(
+        **{
+            "camera": camera_towards_glass(20),
+            "panes": [{"roughness": alpha}] * count,
+            "samples": samples,
+            **more,
+        }
+    )
 
 
 def mean(image):
@@ -22,15 +29,15 @@ def mean(image):
 
 
 def test_smooth_glass_is_the_limit_of_rough_glass():
-    sides = {"behind": around("soft", heading_deg=50), "front": around("soft")}
-    smooth, nearly_smooth = (render(rough_scene(alpha, samples=64, **sides), WORLDS) for alpha in (0.0, 1e-3))
+    sides = {"behind": map_side("soft", heading_deg=50), "front": map_side("soft")}
+    smooth, nearly_smooth = (render(rough_scene(alpha, samples=64, **sides), ASSETS) for alpha in (0.0, 1e-3))
     assert mean(nearly_smooth.transmission) == pytest.approx(mean(smooth.transmission), rel=2e-3)
     assert mean(nearly_smooth.reflection) == pytest.approx(mean(smooth.reflection), rel=5e-3)
 
 
 @pytest.mark.parametrize(("alpha", "count"), [(0.02, 1), (0.05, 1), (0.05, 2)])
 def test_in_uniform_light_rough_glass_creates_no_light_and_loses_little(alpha, count):
-    sample = render(rough_scene(alpha, count, samples=2 if count == 2 else 16), WORLDS)
+    sample = render(rough_scene(alpha, count, samples=2 if count == 2 else 16), ASSETS)
     total = mean(sample.transmission) + mean(sample.reflection)
     assert 0.985 < total < 1.003
     smooth = all_orders(Glazing(panes=(Pane(),) * count, gap_mm=9), torch.tensor(0.94))
@@ -41,9 +48,12 @@ def test_rougher_glass_blurs_an_edge_behind_it_more():
     steepness = []
     for alpha in (0.01, 0.05, 0.15):
         scene = rough_scene(
-            alpha, samples=8, camera=at(0, fov_deg=60), behind=around("right", heading_deg=180)
+            alpha,
+            samples=8,
+            camera=camera_towards_glass(0, fov_deg=60),
+            behind=map_side("right", heading_deg=180),
         )
-        columns = render(scene, WORLDS).transmission.mean((0, 1))
+        columns = render(scene, ASSETS).transmission.mean((0, 1))
         steepness.append(float(columns.diff().max()))
     assert steepness[0] > 1.2 * steepness[1] > 1.5 * steepness[2]
 
@@ -51,11 +61,11 @@ def test_rougher_glass_blurs_an_edge_behind_it_more():
 @pytest.mark.parametrize(("alpha", "radius_mm"), [(0.1, float("inf")), (0.3, 2500.0)], ids=["far", "dome"])
 def test_light_sampling_does_not_change_the_mean(monkeypatch, alpha, radius_mm):
     """The same light with a smooth gradient surrounds the glass on both sides."""
-    side = around("soft", heading_deg=30, radius_mm=radius_mm)
+    side = map_side("soft", heading_deg=30, radius_mm=radius_mm)
     scene = rough_scene(alpha, samples=32, behind=side, front=side)
-    combined = render(scene, WORLDS)
+    combined = render(scene, ASSETS)
     monkeypatch.setattr(rough_glass, "_MIN_LIGHT_SAMPLING_WEIGHT", 2.0)
-    facets_only = render(scene, WORLDS)
+    facets_only = render(scene, ASSETS)
     assert not torch.equal(combined.photo, facets_only.photo)
     assert mean(combined.photo) == pytest.approx(mean(facets_only.photo), rel=5e-3)
     assert mean(combined.transmission) == pytest.approx(mean(facets_only.transmission), rel=5e-3)
@@ -64,12 +74,14 @@ def test_light_sampling_does_not_change_the_mean(monkeypatch, alpha, radius_mm):
 
 
 def test_light_sampling_halves_the_noise_of_a_small_sun_in_frosted_glass(monkeypatch):
-    WORLDS.pictures["lamp"] = soft(64) * 0.02
-    WORLDS.pictures["lamp"][30:32, :2] += 500
-    scene = rough_scene(0.2, samples=16, camera=at(0), behind=around("lamp", heading_deg=5))
-    combined = render(scene, WORLDS).transmission
+    ASSETS.pictures["lamp"] = smooth_map(64) * 0.02
+    ASSETS.pictures["lamp"][30:32, :2] += 500
+    scene = rough_scene(
+        0.2, samples=16, camera=camera_towards_glass(0), behind=map_side("lamp", heading_deg=5)
+    )
+    combined = render(scene, ASSETS).transmission
     monkeypatch.setattr(rough_glass, "_MIN_LIGHT_SAMPLING_WEIGHT", 2.0)
-    facets_only = render(scene, WORLDS).transmission
+    facets_only = render(scene, ASSETS).transmission
     assert mean(combined) == pytest.approx(mean(facets_only), rel=0.1)
 
     def relative_noise(image):

@@ -13,7 +13,7 @@ from brewster.scene.recipe import RECIPES, read_scene_recipe
 from brewster.scene.sampler import Asset, Catalog, draw
 from brewster.scene.scene import Scene
 from brewster.scene.world import AssetSource
-from worlds_of_one import WORLDS, Worlds
+from synthetic_scenes import ASSETS, SyntheticAssets
 
 WIDTHS = {asset.source: asset.width for asset in BUILTIN_CATALOG.maps}
 
@@ -82,8 +82,8 @@ def test_no_texel_of_a_map_spans_more_pixels_than_the_recipe_allows(fifty, recip
     maps = 0
     for scene in fifty[recipe]:
         for side, most in (
-            (scene.behind, asked.behind.most_px_per_texel),
-            (scene.front, asked.front.most_px_per_texel),
+            (scene.behind, asked.behind.max_px_per_texel),
+            (scene.front, asked.front.max_px_per_texel),
         ):
             if side.map:
                 maps += 1
@@ -97,11 +97,11 @@ def test_a_picture_behind_the_glass_fills_the_view():
     recipe = changed(
         "vitrine",
         camera={"width": 24, "height": 16, "pinhole_probability": 1.0},
-        behind={"fill": (1.05, 1.5), "turn_deg": (0.0, 0.0)},
+        behind={"relative_width": (1.05, 1.5), "turn_deg": (0.0, 0.0)},
     )
     for index in range(12):
         scene = drawn(recipe, index)
-        white = Worlds(**{scene.behind.plane.source.file: WORLDS.pictures["white"][:, :24]})
+        white = SyntheticAssets(**{scene.behind.plane.source.file: ASSETS.pictures["white"][:, :24]})
         scene = scene.model_copy(update={"front": Scene().front, "samples": 4})
         sample = render(scene, white)
         assert float(sample.background.min()) > 0.99 * scene.behind.plane.luminance
@@ -139,17 +139,19 @@ def test_a_recipe_of_maps_needs_maps_that_are_sharp_enough():
         Catalog(pictures=BUILTIN_CATALOG.pictures),
         Catalog(maps=(Asset(source=AssetSource(file="a.hdr"), width=64, height=32),)),
     ):
-        with pytest.raises(RecipeError, match=rf"none of {len(catalog.maps)} maps fits the recipe"):
+        with pytest.raises(
+            RecipeError, match=rf"none of {len(catalog.maps)} maps is suitable for the recipe"
+        ):
             drawn(asked, 0, catalog=catalog)
 
 
 @pytest.mark.parametrize(
     ("camera", "says"),
     [
-        ({"incidence_deg": (88.0, 89.0)}, "gave no possible scene in 100 attempts; a corner of the view"),
+        ({"incidence_deg": (88.0, 89.0)}, "gave no possible scene in 100 attempts; .* a corner of the view"),
         (
             {"incidence_deg": (180.0, 180.0)},
-            "gave no possible scene in 100 attempts; the camera is .* behind",
+            "gave no possible scene in 100 attempts; expected the camera .* behind",
         ),
         ({"fov_deg": (155.0, 160.0)}, "gave no possible scene in 100 attempts; .*less than 150"),
     ],

@@ -12,7 +12,7 @@ from brewster.evaluate.methods import IdentityBaseline, MethodOutput
 from brewster.evaluate.runner import score
 from brewster.evaluate.scoring import GroundTruth, Scorer
 from brewster.metrics import METRICS, Lpips, Metric, kept_reflection, lpips, psnr, removed_content, ssim
-from set_folders import make
+from set_folders import render_set
 
 
 def open_case(folder, config, name="pairs"):
@@ -33,7 +33,7 @@ def triplet(tmp_path):
 @pytest.fixture
 def rendered(tmp_path):
     """A sample as `brewster render` writes it, with a bright reflection in the right half."""
-    make(tmp_path / "set", count=1)
+    render_set(tmp_path / "set", count=1)
     background = np.full((48, 64, 3), 0.3, np.float32)
     background[8:40, 4:28] = 0.05
     reflection = np.zeros_like(background)

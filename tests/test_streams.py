@@ -16,7 +16,7 @@ from brewster.training.data.rendered import RenderedSets
 from brewster.training.recipe import read_recipe, with_value
 from brewster.training.streams import open_stream, validation_pairs
 from cli_helpers import picture
-from set_folders import make
+from set_folders import render_set
 
 TINY = Path(__file__).parents[1] / "recipes/ablations/tiny.toml"
 
@@ -76,7 +76,7 @@ def test_an_unset_data_folder_is_an_error(recipe, monkeypatch):
 
 
 def test_sets_have_a_path_in_the_data_folder_or_an_absolute_path(recipe, root):
-    make(root / "set", count=3)
+    render_set(root / "set", count=3)
     below, absolute = (
         open_stream(with_data(recipe, rendered={"sets": [folder], "count": 2}))
         for folder in ("set", root / "set")
@@ -104,7 +104,7 @@ def test_orders_and_seed_of_a_recipe_reach_the_scenes(recipe, builtin):
 
 
 def test_each_batch_is_divided_by_the_shares(recipe, root):
-    make(root / "set", count=2)
+    render_set(root / "set", count=2)
     data = {"photos": ["photos"], "pairs": ["real"], "rendered": {"sets": ["set"], "share": 0.25}}
     blend = open_stream(with_data(recipe, **data, pairs_share=0.5))
     batch = blend(0, 8, 32)
@@ -161,6 +161,6 @@ def test_pairs_to_validate_on_are_evenly_spaced_in_order_of_name(recipe, root):
         grey = np.full((8, 8, 3), 30 * number, np.uint8)
         for role in ("blended", "transmission"):
             Photo.from_array(grey, encoding="srgb").save(root / "many" / role / f"{number}.png")
-    data = recipe.data.model_copy(update={"validate_on": (Path("many"),), "validate_at_most": 3})
+    data = recipe.data.model_copy(update={"validate_on": (Path("many"),), "max_validation_pairs": 3})
     seen = [int(photo[0, 0, 0]) // 30 for photo, _ in validation_pairs(data)["many"]]
     assert seen == [0, 2, 4]

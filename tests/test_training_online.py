@@ -52,7 +52,7 @@ def test_the_photo_has_jpeg_artefacts_and_the_ground_truth_has_none(assets, mixi
     sample = stream(assets, mixing=mixing).sample(0)
 
     def change(encoded):
-        decoded = Photo.open(encode_jpeg(encoded, sample.scene.development.jpeg_quality)).pixels.copy()
+        decoded = Photo.open(encode_jpeg(encoded, sample.scene.camera_response.jpeg_quality)).pixels.copy()
         return (torch.from_numpy(decoded).permute(2, 0, 1) / 255 - encoded).abs().mean()
 
     assert change(sample.photo_encoded) < 1e-3

@@ -11,12 +11,12 @@ from brewster.render.camera_response import encode_jpeg
 from brewster.rendered.store import read_scene_of, read_set
 from brewster.training.data.alpha_blend import blended_layers
 from brewster.training.data.rendered import CachedRendered, RenderedSets
-from set_folders import make
+from set_folders import render_set
 
 
 @pytest.fixture
 def folder(tmp_path):
-    make(tmp_path / "set", count=3)
+    render_set(tmp_path / "set", count=3)
     return tmp_path / "set"
 
 
@@ -57,7 +57,7 @@ def test_an_8_bit_sample_is_the_blend_of_its_own_background_and_mirror(folder):
         photo, *layers = blended_layers(behind, mirror, scene)
         found = stream.sample(number).permute(2, 0, 1) / 255
         torch.testing.assert_close(found[3:], torch.cat(layers))
-        seen = pixels(encode_jpeg(photo, scene.development.jpeg_quality)).permute(2, 0, 1) / 255
+        seen = pixels(encode_jpeg(photo, scene.camera_response.jpeg_quality)).permute(2, 0, 1) / 255
         torch.testing.assert_close(found[:3], seen)
 
 
@@ -82,7 +82,7 @@ def test_a_batch_from_disk_depends_on_seed_and_step_alone(folder):
 
 
 def test_shards_and_folders_hold_the_same_samples(folder, tmp_path):
-    make(tmp_path / "shards", count=3, shards=True)
+    render_set(tmp_path / "shards", count=3, shards=True)
     assert list((tmp_path / "shards").glob("*.tar"))
     one, other = (RenderedSets([place], seed=1, mixing="8-bit") for place in (folder, tmp_path / "shards"))
     assert same(one(0, 4, 32), other(0, 4, 32))
@@ -97,7 +97,7 @@ def test_only_the_first_samples_are_used_where_a_count_is_given(folder):
 
 
 def test_sets_follow_one_another(folder, tmp_path):
-    make(tmp_path / "more", count=2, seed=8)
+    render_set(tmp_path / "more", count=2, seed=8)
     both = RenderedSets([folder, tmp_path / "more"], seed=1)
     assert len(both) == 5
     assert torch.equal(both.sample(3), RenderedSets([tmp_path / "more"], seed=1).sample(0))

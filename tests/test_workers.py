@@ -1,4 +1,4 @@
-"""Several processes give the same bytes as one, even if workers die."""
+"""Several processes render the same bytes as one process, even if workers die."""
 
 import os
 import signal
@@ -16,58 +16,58 @@ from brewster.rendered.generation import workers
 from brewster.rendered.generation.job import RenderTask
 from brewster.rendered.generation.workers import ProcessExecutor, SerialExecutor, render_again
 from other_processes import children, is_alive, started, wait_for
-from set_folders import hashes, job, make, names, statuses
+from set_folders import hashes, make_job, names, render_set, statuses
 
 TESTS = Path(__file__).parent
 
 
-def two(job):
-    return ProcessExecutor(job, 2)
+def two_workers(render_job):
+    return ProcessExecutor(render_job, 2)
 
 
-def in_a_process(out, count):
-    """A run with a worker that never finishes sample 2, in a process that can be killed."""
+def start_blocking_run(out, count):
+    """Starts a run in a process of its own, with a worker that never finishes sample 2."""
     code = f"""
 from pathlib import Path
 from brewster.rendered.generation.workers import ProcessExecutor
-from set_folders import make
-make(Path({str(out)!r}), {count}, renderer="waits", executor=lambda job: ProcessExecutor(job, 1))
+from set_folders import render_set
+render_set(Path({str(out)!r}), {count}, renderer="blocking", executor=lambda job: ProcessExecutor(job, 1))
 """
-    waiting = {**os.environ, "FAKE_WAIT": "1"}
-    return started([sys.executable, "-c", code], cwd=TESTS, stderr=subprocess.PIPE, env=waiting)
+    environment = {**os.environ, "FAKE_WAIT": "1"}
+    return started([sys.executable, "-c", code], cwd=TESTS, stderr=subprocess.PIPE, env=environment)
 
 
-def test_two_workers_make_what_one_process_makes_even_if_one_of_them_dies(tmp_path, monkeypatch):
-    monkeypatch.setenv("FAKE_MARK", str(tmp_path / "mark"))
-    results = make(tmp_path / "two", count=5, renderer="deadly_once", executor=two)
-    assert (tmp_path / "mark").exists()
+def test_two_workers_render_the_set_of_one_process_even_if_one_of_them_dies(tmp_path, monkeypatch):
+    monkeypatch.setenv("FAKE_MARKER", str(tmp_path / "marker"))
+    results = render_set(tmp_path / "two", count=5, renderer="crashing_once", executor=two_workers)
+    assert (tmp_path / "marker").exists()
     assert statuses(results) == dict.fromkeys(range(5), "rendered")
-    make(tmp_path / "one", count=5, renderer="deadly_once")
+    render_set(tmp_path / "one", count=5, renderer="crashing_once")
     assert hashes(tmp_path / "one") == hashes(tmp_path / "two")
 
 
 def test_workers_of_a_killed_run_exit_and_the_run_is_resumed(tmp_path):
     out, count = tmp_path / "set", 4
-    with in_a_process(out, count) as run:
+    with start_blocking_run(out, count) as run:
         wait_for(lambda: len(list(out.glob("0*"))) == 2, run)
         workers = children(run)
         run.kill()
         run.communicate()
     wait_for(lambda: not any(map(is_alive, workers)))
     assert sorted(folder.name for folder in out.glob("0*")) == ["000000", "000001"]
-    assert all(names(folder) == set(store.FILES) for folder in out.glob("0*"))
-    results = make(out, count=count, renderer="waits")
+    assert all(names(folder) == set(store.SAMPLE_FILES) for folder in out.glob("0*"))
+    results = render_set(out, count=count, renderer="blocking")
     assert statuses(results) == {0: "skipped", 1: "skipped", 2: "rendered", 3: "rendered"}
-    make(tmp_path / "undisturbed", count=count, renderer="waits")
+    render_set(tmp_path / "undisturbed", count=count, renderer="blocking")
     assert hashes(out) == hashes(tmp_path / "undisturbed")
 
 
 def test_ctrl_c_stops_all_workers_and_leaves_no_partial_files(tmp_path):
     out = tmp_path / "set"
-    with in_a_process(out, 4) as run:
+    with start_blocking_run(out, 4) as run:
         wait_for(lambda: len(list(out.glob("0*"))) == 2, run)
         workers = children(run)
-        for pid in [*map(int, workers), run.pid]:  # a terminal sends it to all processes
+        for pid in [*map(int, workers), run.pid]:  # as a terminal sends Ctrl-C to all processes
             os.kill(pid, signal.SIGINT)
         _, err = run.communicate()
     assert err.count(b"KeyboardInterrupt") == 1
@@ -75,9 +75,9 @@ def test_ctrl_c_stops_all_workers_and_leaves_no_partial_files(tmp_path):
     assert not list(out.glob(".brewster-*"))
 
 
-def test_a_sample_that_kills_every_worker_is_named_and_the_rest_goes_on(tmp_path, monkeypatch):
+def test_a_sample_that_kills_every_worker_fails_and_the_others_are_rendered(tmp_path, monkeypatch):
     monkeypatch.setattr(workers, "MAX_ATTEMPTS", 1)
-    results = make(tmp_path / "set", renderer="deadly", executor=partial(ProcessExecutor, count=1))
+    results = render_set(tmp_path / "set", renderer="crashing", executor=partial(ProcessExecutor, count=1))
     assert statuses(results) == {0: "rendered", 1: "rendered", 2: "failed", 3: "rendered"}
     assert "its worker died 1 times (exit code -9)" in next(
         result.error for result in results if result.error
@@ -85,39 +85,41 @@ def test_a_sample_that_kills_every_worker_is_named_and_the_rest_goes_on(tmp_path
 
 
 def test_a_fatal_error_in_a_worker_ends_the_run(tmp_path):
-    with pytest.raises(DeviceError, match=r"^there is no light; a lamp; or two; buy one\.$"):
-        make(tmp_path / "set", renderer="deviceless", executor=partial(ProcessExecutor, count=1))
+    with pytest.raises(
+        DeviceError, match=r"^there is no GPU; expected a GPU; or a CPU; use another computer\.$"
+    ):
+        render_set(tmp_path / "set", renderer="without_device", executor=partial(ProcessExecutor, count=1))
 
 
 def test_serial_rendering_restores_the_number_of_torch_threads(tmp_path):
     threads = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
-        make(tmp_path / "set", count=1)
+        render_set(tmp_path / "set", count=1)
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(threads)
 
 
 def test_a_scene_is_rendered_again_byte_for_byte(tmp_path):
-    make(tmp_path / "set", count=2)
-    scene = tmp_path / "set" / "000001" / store.SCENE
+    render_set(tmp_path / "set", count=2)
+    scene = tmp_path / "set" / "000001" / store.SCENE_FILE
     render_again(scene, tmp_path / "again", renderer="fake_renderer:render")
     assert hashes(tmp_path / "again") == hashes(scene.parent)
 
 
-def test_a_scene_file_cannot_choose_what_code_is_run(tmp_path):
-    make(tmp_path / "set", count=1)
+def test_a_scene_file_cannot_run_a_renderer_that_is_not_in_the_table(tmp_path):
+    render_set(tmp_path / "set", count=1)
     with pytest.raises(RecipeError, match="was rendered by 'fake_renderer:render'"):
-        render_again(tmp_path / "set" / "000000" / store.SCENE, tmp_path / "again")
+        render_again(tmp_path / "set" / "000000" / store.SCENE_FILE, tmp_path / "again")
 
 
 def test_a_scene_is_never_rendered_into_a_folder_with_files(tmp_path):
-    make(tmp_path / "set", count=1)
-    scene = tmp_path / "set" / "000000" / store.SCENE
-    for taken in (scene, scene.parent):
+    render_set(tmp_path / "set", count=1)
+    scene = tmp_path / "set" / "000000" / store.SCENE_FILE
+    for existing in (scene, scene.parent):
         with pytest.raises(TargetError, match="exists; expected a new or empty folder"):
-            render_again(scene, taken, renderer="fake_renderer:render")
+            render_again(scene, existing, renderer="fake_renderer:render")
 
 
 def test_every_renderer_can_be_imported():
@@ -125,11 +127,11 @@ def test_every_renderer_can_be_imported():
 
 
 def test_a_task_that_is_tried_again_renders_missing_samples_only(tmp_path):
-    requested = job(tmp_path)
-    runner = workers.TaskRunner(requested)
+    job = make_job(tmp_path)
+    runner = workers.TaskRunner(job)
     task = RenderTask("render", (0, 1))
     runner(task)
     before = (tmp_path / "000000").stat().st_ino
     assert [result.status for result in runner(task)] == ["rendered", "rendered"]
     assert (tmp_path / "000000").stat().st_ino == before
-    assert not SerialExecutor(requested).is_busy()
+    assert not SerialExecutor(job).is_busy()

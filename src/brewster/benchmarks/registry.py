@@ -245,12 +245,12 @@ def _rendered_samples(folder: Path) -> list[tuple[str, list[ImageFile]]]:
     return [
         (
             key(entry.index),
-            [ImageFile(entry.place, entry.spans[name]) for name in _RENDERED_FILES if name in entry.spans],
+            [ImageFile(entry.path, entry.spans[name]) for name in _RENDERED_FILES if name in entry.spans],
         )
         if entry.spans
         else (
             key(entry.index),
-            [ImageFile(entry.place / name) for name in _RENDERED_FILES if (entry.place / name).exists()],
+            [ImageFile(entry.path / name) for name in _RENDERED_FILES if (entry.path / name).exists()],
         )
         for entry in entries
     ]

@@ -1,1 +1,1 @@
-"""Environment maps and pictures of scenes: files in folders, identified by name and sha256, and procedural ones."""
+"""Environment maps and pictures of scenes, from files or procedurally generated."""

@@ -1,4 +1,4 @@
-"""Environment maps and pictures of scenes: read from folders by name and sha256, or computed if they are builtin.
+"""Loads the environment maps and pictures of scenes: files by name and sha256, and built-in sources.
 
 assets = Assets([Path("hdri"), Path("photos")])
 assets.map_light(EnvironmentMap(source=AssetSource(file="builtin:street:7")))  # (H, 2 H, 3) float32
@@ -24,23 +24,26 @@ from brewster.srgb import REC709_LUMINANCE
 Float32 = NDArray[np.float32]
 
 BUILTIN_HEIGHT = 512
-_CACHE_BYTES = 300_000_000
-_CLIPPED_SHARE = 0.002
+_MAX_CACHE_BYTES = 300_000_000
+_MAX_CLIPPED_SHARE = 0.002
 _LUMINANCE = np.array(REC709_LUMINANCE, np.float32)
 
 
 class Assets:
-    """Reads sources from the first folder that has the exact file. A cache keeps the most recently used ones."""
+    """Loads sources from the first folder that contains the exact file, with a cache of the most recently used ones."""
 
     def __init__(self, folders: Sequence[Path] = ()) -> None:
         self._folders = tuple(folders)
         self._cache: OrderedDict[tuple[str, str, str], Float32] = OrderedDict()
 
     def map_light(self, environment: EnvironmentMap) -> Float32:
-        """The radiance of a lat-long map, (H, 2 H, 3), scaled so that its mean luminance without lamps is the scene's.
+        """Returns the radiance of a lat-long map, (H, 2 H, 3).
+
+        It is scaled to the mean luminance in the scene. The mean is computed with values clipped at ten times the mean,
+        so that lamps hardly count.
 
         Raises:
-            RecipeError: the file is missing, or has another sha256 than the scene says.
+            RecipeError: the file is missing, or has another sha256 than in the scene.
             UnsupportedPhoto: the map is not 2:1, has values that are not finite, is black, or is clipped (not HDR).
             PhotoError: the file cannot be decoded.
         """
@@ -50,17 +53,21 @@ class Assets:
         return light
 
     def plane_light(self, plane: Plane) -> Float32:
-        """The radiance of a picture, (H, W, 3), decoded by its colour profile or as sRGB, with raised highlights.
+        """Returns the radiance of a picture, (H, W, 3), with brighter highlights (see `Plane.highlight_boost`).
+
+        The file is decoded with its colour profile, or as sRGB.
 
         Raises:
-            RecipeError: the file is missing, or has another sha256 than the scene says.
+            RecipeError: the file is missing, or has another sha256 than in the scene.
             PhotoError: the file cannot be decoded.
         """
         picture = self._cached("picture", plane.source, self._read_picture)
-        bright = ((picture.max(axis=2, keepdims=True) - 0.8) / 0.2).clip(0, 1)
+        highlight = ((picture.max(axis=2, keepdims=True) - 0.8) / 0.2).clip(0, 1)
         mean = (picture @ _LUMINANCE).mean() + np.float32(1e-4)
         light: Float32 = (
-            picture * (1 + np.float32(plane.highlights) * bright**2) * (np.float32(plane.luminance) / mean)
+            picture
+            * (1 + np.float32(plane.highlight_boost) * highlight**2)
+            * (np.float32(plane.luminance) / mean)
         )
         return light
 
@@ -68,7 +75,10 @@ class Assets:
         key = (kind, source.file, source.sha256)
         if key not in self._cache:
             self._cache[key] = read(source)
-            while sum(array.nbytes for array in self._cache.values()) > _CACHE_BYTES and len(self._cache) > 1:
+            while (
+                sum(array.nbytes for array in self._cache.values()) > _MAX_CACHE_BYTES
+                and len(self._cache) > 1
+            ):
                 self._cache.popitem(last=False)
         self._cache.move_to_end(key)
         return self._cache[key]
@@ -103,19 +113,19 @@ class Assets:
             raise RecipeError(
                 f"{paths[0]} is not the file that the scene was drawn with",
                 f"expected the sha256 {source.sha256}",
-                "name the folder that holds the original",
+                "choose the folder of the original file",
             )
         searched = ", ".join(map(str, self._folders)) or "no folder"
         raise RecipeError(
             f"{source.file} was not found in {searched}",
             "expected the file that the scene was drawn with",
-            "name its folder with --maps or --photos",
+            "choose its folder with --maps or --photos",
         )
 
 
 @contextmanager
 def naming_file(name: str) -> Iterator[None]:
-    """Adds the name of the file to errors within this block, if they do not contain it."""
+    """Adds the name of the file to the errors raised within this block, unless they contain it."""
     try:
         yield
     except BrewsterError as error:
@@ -125,7 +135,7 @@ def naming_file(name: str) -> Iterator[None]:
 
 
 def read_bytes(path: Path) -> bytes:
-    """The bytes of a file.
+    """Returns the bytes of a file.
 
     Raises:
         RecipeError: the file cannot be read.
@@ -134,12 +144,12 @@ def read_bytes(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise RecipeError(
-            f"{path} cannot be read ({error.strerror})", "expected an image file", "leave it out"
+            f"{path} cannot be read ({error.strerror})", "expected an image file", "remove it from the folder"
         ) from error
 
 
 def check_map(texels: Float32, name: str) -> Float32:
-    """Checks that a map can light a scene, and returns it.
+    """Returns the map if it can light a scene.
 
     Raises:
         UnsupportedPhoto: the map is not 2:1, has values that are not finite, is black, or is clipped like an 8-bit image.
@@ -148,33 +158,33 @@ def check_map(texels: Float32, name: str) -> Float32:
     if width != 2 * height:
         raise UnsupportedPhoto(
             f"{name} is {width} x {height}",
-            "a lat-long map is twice as wide as it is high",
-            "convert it to one",
+            "expected a lat-long map, twice as wide as high",
+            "convert it to a lat-long map",
         )
     brightest = texels.max()
     if not np.isfinite(texels).all() or brightest <= 0:
         raise UnsupportedPhoto(
             f"{name} is black, or has values that are not finite",
             "expected finite radiance in every texel, above 0 in some",
-            "repair the map or leave it out",
+            "repair the map, or remove it",
         )
-    if (texels.max(axis=2) >= brightest).mean() > _CLIPPED_SHARE:
+    if (texels.max(axis=2) >= brightest).mean() > _MAX_CLIPPED_SHARE:
         raise UnsupportedPhoto(
-            f"{name} is clipped: many texels have its highest value",
+            f"{name} is clipped: many texels have its maximum",
             "expected the full dynamic range of the light",
-            "use it as a photo, or find its unclipped original",
+            "use it as a picture, or find its unclipped original",
         )
     return texels
 
 
 def _mean_luminance(texels: Float32) -> np.float32:
-    """Mean luminance over the sphere, with values limited to ten times the mean, so that lamps hardly count."""
+    """Mean luminance over the sphere of values clipped at ten times the mean, so that lamps hardly count."""
     height = texels.shape[0]
-    share = np.sin((np.arange(height) + 0.5) / height * np.pi)[:, None]
+    solid_angle = np.sin((np.arange(height) + 0.5) / height * np.pi)[:, None]
     luminance = np.maximum(texels, 0) @ _LUMINANCE
-    shares = np.broadcast_to(share / share.sum() / luminance.shape[1], luminance.shape)
-    limit = 10 * (luminance * shares).sum()
-    return np.float32((np.minimum(luminance, limit) * shares).sum())
+    weights = np.broadcast_to(solid_angle / solid_angle.sum() / luminance.shape[1], luminance.shape)
+    limit = 10 * (luminance * weights).sum()
+    return np.float32((np.minimum(luminance, limit) * weights).sum())
 
 
 def _parse_builtin(source: AssetSource, known: Iterable[str]) -> tuple[str, int]:
@@ -182,7 +192,7 @@ def _parse_builtin(source: AssetSource, known: Iterable[str]) -> tuple[str, int]
     if name not in known or not seed.isdigit():
         raise RecipeError(
             f"{source.file!r} is not built in",
-            f"builtin:NAME:NUMBER with NAME one of {', '.join(known)}",
+            f"expected builtin:NAME:SEED with one of the names {', '.join(known)}",
             "correct the source in the scene",
         )
     return name, int(seed)

@@ -1,4 +1,4 @@
-"""Catalogs of environment maps and pictures to draw scenes from: folders of files, or the builtin ones."""
+"""Catalogs of environment maps and pictures for random scenes, from folders of files or built in."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ BUILTIN_CATALOG = Catalog(
         for seed in range(_PAINTING_COUNT)
     ),
 )
-"""Maps and pictures that need no file: streets, rooms, streets at night, and paintings."""
+"""Maps and pictures that are computed: streets, rooms, streets at night, and paintings."""
 
 
 def read_catalog(
     maps: Sequence[Path], pictures: Sequence[Path], exclude: Sequence[str] = ()
 ) -> tuple[Catalog, list[BrewsterError]]:
-    """Lists the maps and pictures of folders.
+    """Lists the maps and pictures in folders.
 
-    Maps are decoded and checked. Of pictures only the header is read, so that other damage is found when a picture is
-    used. A `manifest.csv` with the columns file and category gives the categories of maps. Without a folder for maps or
-    for pictures, the builtin ones are listed. File names that match a pattern of `exclude` are skipped.
+    Maps are decoded and validated. Only the headers of pictures are read: a picture with other damage raises an error
+    when it is used. A `manifest.csv` with the columns file and category contains the categories of maps. If there is no
+    folder for maps or for pictures, the built-in ones are listed. Files that match a pattern in `exclude` are skipped.
 
     Returns: the catalog, and an error for each file that cannot be used.
 
@@ -76,8 +76,8 @@ def _read_folders(
     if not found:
         raise RecipeError(
             f"no {'maps' if are_maps else 'photos'} in {', '.join(map(str, folders))}",
-            "lat-long .hdr or .exr files" if are_maps else "picture files",
-            str(refused[0]) if refused else "name another folder",
+            "expected lat-long .hdr or .exr files" if are_maps else "expected image files",
+            str(refused[0]) if refused else "choose another folder",
         )
     return tuple(found[name] for name in sorted(found))
 
@@ -100,7 +100,9 @@ def _list_files(folder: Path, are_maps: bool) -> Iterator[Path]:
         entries = sorted(folder.iterdir())
     except OSError as error:
         raise RecipeError(
-            f"{folder} cannot be read ({error.strerror})", "expected a folder of files", "name another folder"
+            f"{folder} cannot be read ({error.strerror})",
+            "expected a folder of files",
+            "choose another folder",
         ) from error
     for path in entries:
         image_format = format_of(path)
@@ -118,5 +120,5 @@ def _read_categories(folder: Path) -> dict[str, str]:
         raise RecipeError(
             f"{folder / 'manifest.csv'} cannot be read ({error})",
             "expected a table with the columns file and category, in UTF-8",
-            "save it as UTF-8, or remove it",
+            "save it in UTF-8, or remove it",
         ) from error

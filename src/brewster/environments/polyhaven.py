@@ -3,7 +3,7 @@
     for result in pull(DownloadRequest(indoor=2, outdoor=1), maps_folder()):
         print(result.status, result.file)
 
-Uses one connection at a time. A partial download is kept, and the next call resumes it (brewster.download).
+Files are downloaded one at a time. The next call resumes a partial download (see brewster.download).
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ _COLUMNS = ("file", "asset", "category", "resolution", "md5", "authors", "licenc
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][\w.-]{0,200}", re.ASCII)
 _RETRY_DELAYS_S = (1.0, 2.0, 4.0, 8.0)  # between five attempts
 _TIMEOUT_S = 30.0
-_MAX_CONSECUTIVE_FAILURES = 5  # then the server or the connection is the cause, not an asset
+_MAX_CONSECUTIVE_FAILURES = 5  # then the cause is the server or the connection, not a single asset
 
 
 @final
 @dataclass(frozen=True)
 class DownloadRequest:
-    """How many maps of each category to download, in which resolution and format, from which server."""
+    """Number of maps of each category, their resolution and format, and the server."""
 
     indoor: int = 140
     outdoor: int = 30
@@ -45,7 +45,7 @@ class DownloadRequest:
 @final
 @dataclass(frozen=True)
 class DownloadResult:
-    """The result for one asset. `missing`: it has no file of the requested resolution and format."""
+    """The result for one asset. Status "missing": the asset has no file of the requested resolution and format."""
 
     asset: str
     category: str
@@ -58,7 +58,7 @@ class DownloadResult:
 
 
 class _Asset(NamedTuple):
-    """A map in the list of the server. Its id is not yet checked for use as a file name."""
+    """A map in the list of the server. Its id may be unsafe as a file name."""
 
     id: str
     category: str
@@ -74,29 +74,31 @@ def pull(request: DownloadRequest, out: Path) -> Iterator[DownloadResult]:
     """Downloads maps into a folder, in the order of their ids, and lists them in its manifest.csv.
 
     A map that exists already is skipped. An asset without a suitable file is replaced by the next one. A failed
-    download is not replaced, so that the next call requests the same maps.
+    download is not replaced, so that the next call downloads the same maps.
 
     Yields: a result for each asset.
 
     Raises:
         DownloadError: the list of the server cannot be downloaded, or several assets in a row failed.
-        TargetError: the folder cannot be written to, or holds a manifest.csv of another program.
+        TargetError: the folder cannot be written to, or contains the manifest.csv of another program.
     """
     _read_manifest(out)  # refuses the manifest of another program before any download
     assets = _list_assets(request)
     consecutive_failures = 0
     for category, wanted in (("indoor", request.indoor), ("outdoor", request.outdoor)):
         candidates = (asset for asset in assets if asset.category == category)
-        taken = 0
-        while taken < wanted and (asset := next(candidates, None)):
+        count = 0
+        while count < wanted and (asset := next(candidates, None)):
             result = _download_asset(asset, request, out)
             yield result
-            taken += result.status != "missing"
+            count += result.status != "missing"
             consecutive_failures = consecutive_failures + 1 if result.status == "failed" else 0
             if consecutive_failures == _MAX_CONSECUTIVE_FAILURES:
-                cure = "see their errors, and run again: partial downloads are kept"
+                cure = "see their errors, and run again to resume the downloads"
                 raise DownloadError(
-                    f"{consecutive_failures} assets in a row failed", "the others were not tried", cure
+                    f"{consecutive_failures} assets in a row failed",
+                    "expected at least one of them to succeed",
+                    cure,
                 )
 
 
@@ -135,7 +137,10 @@ def _list_assets(request: DownloadRequest) -> list[_Asset]:
 
 
 def _category(record: object) -> str | None:
-    """The category, indoor before outdoor. Reads `categories` and `attributes`, which will replace it."""
+    """Returns "indoor", "outdoor" or None. If a map has both categories, it counts as indoor.
+
+    Both `categories` and `attributes` are read, because the API will replace the first by the second.
+    """
     categories = _nested(record, "categories")
     words = [*categories] if isinstance(categories, list) else []
     words.append(_nested(record, "attributes", "environment"))
@@ -154,7 +159,11 @@ def _find_remote_file(asset: _Asset, request: DownloadRequest) -> RemoteFile | N
             return None
         case {"url": str(address), "size": int(size), "md5": str(md5)} if size > 0:
             return RemoteFile(address, size, "md5", md5.lower())
-    raise DownloadError(f"{url} describes no file", "expected url, size and MD5 sum", "try another --server")
+    raise DownloadError(
+        f"the response of {url} is incomplete",
+        "expected url, size and MD5 sum of a file",
+        "try another --server",
+    )
 
 
 def _file_name(asset: _Asset, request: DownloadRequest) -> str:
@@ -169,9 +178,13 @@ def _fetch_json(url: str) -> dict[str, object]:
     try:
         parsed = json.loads(_downloader().read(url))
     except (ValueError, RecursionError) as error:
-        raise DownloadError(f"{url} answered no JSON ({error})", "expected JSON", "check --server") from error
+        raise DownloadError(
+            f"the response of {url} is not JSON ({error})", "expected JSON", "check --server"
+        ) from error
     if not isinstance(parsed, dict):
-        raise DownloadError(f"{url} answered {parsed!r:.40}", "expected a JSON object", "check --server")
+        raise DownloadError(
+            f"the response of {url} is {parsed!r:.40}", "expected a JSON object", "check --server"
+        )
     return parsed
 
 
@@ -192,25 +205,28 @@ def _is_downloaded(target: Path, remote: RemoteFile) -> bool:
     with target_errors(target):
         exists = target.exists()
         if exists and file_digest(target, remote.algorithm) != remote.digest:
-            expected, cure = f"expected the MD5 sum {remote.digest}", "move it away, and run again"
-            raise DownloadError(f"{target} exists, and is not the file of the server", expected, cure)
+            expected, cure = f"expected the MD5 sum {remote.digest}", "move or delete it, and run again"
+            raise DownloadError(f"{target} exists, but differs from the file on the server", expected, cure)
     return exists
 
 
 def _read_manifest(out: Path) -> list[dict[str, str]]:
-    """The rows of the manifest whose maps exist."""
+    """Returns the rows of the manifest whose files exist."""
     path = out / "manifest.csv"
     with target_errors(path):
         text = path.read_text("utf-8", errors="replace") if path.exists() else ",".join(_COLUMNS)
         rows = csv.DictReader(io.StringIO(text, newline=""))
         if tuple(rows.fieldnames or ()) != _COLUMNS:
-            expected, cure = f"expected a table with the columns {','.join(_COLUMNS)}", "name another folder"
+            expected, cure = (
+                f"expected a table with the columns {','.join(_COLUMNS)}",
+                "choose another folder",
+            )
             raise TargetError(f"{path} was not written by brewster", expected, cure)
         return [row for row in rows if (out / row["file"]).is_file()]
 
 
 def _add_to_manifest(out: Path, row: dict[str, str]) -> None:
-    """Adds a map to the manifest. The file is replaced atomically, so that it is always complete."""
+    """Adds a map to the manifest, or replaces its row. The file is replaced atomically, so that it is always complete."""
     rows = _read_manifest(out)
     if row not in rows:
         rows = [other for other in rows if other["file"] != row["file"]]

@@ -1,10 +1,10 @@
-"""Ablation studies: trains one model for each choice of a recipe value, and compares the scores of the models.
+"""Ablation studies: trains a model for each of several values of one key of a training recipe, and compares their scores.
 
     study = read_study(Path("recipes/ablations/mixing.toml"))
     ablate(study, study.open_benchmarks(), Path("out/ablations/mixing"))
 
-A study is a TOML file with a base recipe, the key of the value, its choices and the benchmarks. A stopped study can be
-resumed, in the training and in the evaluation.
+A study is a TOML file with a base recipe, the key, its values and the benchmarks. The first value is the reference
+of the comparisons. A stopped study resumes both training and evaluation.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ from brewster.training import loop
 from brewster.training.recipe import CompactRecipe, LoraRecipe, data_folder, read_recipe, with_value
 from brewster.training.trainers import open_trainer
 
-Choice = str | int | float | bool
+Value = str | int | float | bool
 AblationCallback = Callable[[str, int, int, Mapping[str, float], bool], None]
-"""Called with (label, step, steps, losses, is_logged) after each training step; `label` names the choice."""
+"""Called with (label, step, steps, losses, is_logged) after each training step; `label` names the value of the key."""
 
 PLOT_FILE: Final = "plot.png"
 
 
-def _all_different(choices: list[Choice]) -> list[Choice]:
-    if len({str(choice) for choice in choices}) < len(choices):
+def _all_different(values: list[Value]) -> list[Value]:
+    if len({str(value) for value in values}) < len(values):
         raise ValueError("a value occurs twice; expected different values")
-    return choices
+    return values
 
 
 @final
 class AblationStudy(FrozenModel):
-    """An ablation study: one value of a training recipe takes several choices, and the other values stay the same."""
+    """An ablation: one key of a training recipe gets each of several values. All other keys stay the same."""
 
     base: Path
     """The training recipe to change, relative to this file."""
-    value: str
-    """The key that changes, with its tables: "data.rendered.mixing"."""
-    choices: Annotated[
-        list[Choice],
+    key: str
+    """The key whose value changes, with its tables: "data.rendered.mixing"."""
+    values: Annotated[
+        list[Value],
         Field(min_length=2),
         AfterValidator(_all_different),
         KeyNote("list of values", "all different"),
@@ -58,13 +58,13 @@ class AblationStudy(FrozenModel):
     benchmarks: Annotated[
         dict[str, Path],
         Field(min_length=1),
-        KeyNote("table of name = folder", "at least 1 entry", instead=True),
+        KeyNote("table of name = folder", "at least 1 entry", replaces_constraints=True),
     ]
     """The benchmarks to score on: a name and a folder relative to BREWSTER_DATA for each."""
 
-    def label(self, choice: Choice) -> str:
-        """Returns the name of a choice in tables, such as "mixing 8-bit"."""
-        return f"{self.value.rpartition('.')[2]} {str(choice).replace('/', ' ')}"
+    def label(self, value: Value) -> str:
+        """The name of a value in tables: "mixing 8-bit"."""
+        return f"{self.key.rpartition('.')[2]} {str(value).replace('/', ' ')}"
 
     def open_benchmarks(self) -> list[Benchmark]:
         """Reads the benchmarks of the study.
@@ -85,7 +85,7 @@ def read_study(path: Path) -> AblationStudy:
     Raises:
         RecipeError: the file is missing or not TOML, or its values are missing, unknown or invalid.
     """
-    study = read_toml(AblationStudy, path, compare="docs/recipes.md")
+    study = read_toml(AblationStudy, path, reference="docs/recipes.md")
     return study.model_copy(update={"base": path.parent / study.base})
 
 
@@ -95,11 +95,11 @@ def ablate(
     out: Path,
     *,
     workers: int = 1,
-    on_progress: AblationCallback = lambda _choice, _step, _steps, _numbers, _logged: None,
+    on_progress: AblationCallback = lambda _label, _step, _steps, _numbers, _logged: None,
 ) -> Results:
-    """Trains and evaluates every choice. Writes one folder per choice into `out`, and the files of `evaluate`.
+    """Trains and evaluates a model for every value. `out` gets one folder per value and the files that `evaluate` writes.
 
-    If all choices are numbers, plot.png shows each metric as a function of the choice.
+    If all values are numbers, plot.png shows the metrics against them.
 
     Args:
         study: the definition of the study.
@@ -109,14 +109,14 @@ def ablate(
         on_progress: called after each training step.
 
     Returns:
-        The results of `evaluate`. Each choice is a method.
+        The results of `evaluate`; the model of each value is a method.
 
     Raises:
-        RecipeError: the base recipe or the value is invalid, or data is missing.
-        BrewsterError: a training or the evaluation failed.
+        RecipeError: the base recipe, the key or a value is invalid, or data is missing.
+        BrewsterError: as raised by training and `evaluate`.
     """
     base = read_recipe(study.base)
-    recipes = {study.label(choice): with_value(base, study.value, choice) for choice in study.choices}
+    recipes = {study.label(value): with_value(base, study.key, value) for value in study.values}
     models = []
     for label, recipe in recipes.items():
         folder = out / label.replace(" ", "-")
@@ -129,9 +129,9 @@ def ablate(
         )
     results = evaluate(benchmarks, [IdentityBaseline(), *models], EvaluationConfig(), out, workers=workers)
     numbers = [
-        choice for choice in study.choices if isinstance(choice, int | float) and not isinstance(choice, bool)
+        value for value in study.values if isinstance(value, int | float) and not isinstance(value, bool)
     ]
-    if len(numbers) == len(study.choices):
+    if len(numbers) == len(study.values):
         write_atomically(out / PLOT_FILE, _plot(study, numbers, results), overwrite=True)
     return results
 
@@ -144,7 +144,7 @@ def _train(recipe: CompactRecipe | LoraRecipe, folder: Path, on_step: loop.StepC
 
 
 def _plot(study: AblationStudy, numbers: Sequence[float], results: Results) -> bytes:
-    """Returns a PNG plot: PSNR, SSIM and LPIPS as functions of the choice.
+    """Returns a PNG plot: PSNR, SSIM and LPIPS as functions of the value.
 
     There is one line for each benchmark and one for the average. The bands are the 95 % intervals.
     """
@@ -167,7 +167,7 @@ def _plot(study: AblationStudy, numbers: Sequence[float], results: Results) -> b
         entry = results["metrics"][metric]
         panel.set_title(f"{entry['title']}{', ' + entry['unit'] if entry['unit'] else ''}")
         panel.set_xlabel(study.value)
-        # Choices such as 0, 10, ... 1000 need a logarithmic axis that is linear near 0.
+        # Values such as 0, 10, ... 1000 need a logarithmic axis that is linear near 0.
         if len(numbers) > 2 and max(numbers) > 20 * max(1, sorted(numbers)[1]):
             panel.set_xscale("symlog", linthresh=max(1, sorted(numbers)[1]))
             panel.set_xticks(numbers, [f"{number:g}" for number in numbers])

@@ -22,7 +22,7 @@ from torch import Generator, Tensor
 
 from brewster.photo import FileInfo, Photo
 from brewster.render.sample import LAYERS, LightSample
-from brewster.scene.scene import Development, Scene
+from brewster.scene.scene import CameraResponse, Scene
 from brewster.srgb import REC709_LUMINANCE, to_encoded
 
 _EV_RANGE: Final = (-64.0, 32.0)
@@ -73,22 +73,22 @@ class DevelopedSample:
 
 
 def develop(sample: LightSample) -> DevelopedSample:
-    """Applies exposure, white balance, noise and tone curve, as the scene's `development` describes them.
+    """Applies exposure, white balance, noise and tone curve, as the scene's `camera_response` describes them.
 
     Exposure is rounded to a thousandth of a stop before it is applied, and gains to four decimals. So the recorded
     values are exactly the applied ones, and rounding errors of different devices do not change them.
     """
-    development = sample.scene.development
-    white_balance = _white_balance(sample.photo, development)
+    response = sample.scene.camera_response
+    white_balance = _white_balance(sample.photo, response)
     gains = sample.photo.new_tensor(white_balance).view(3, 1, 1)
-    ev = _exposure_ev(sample.photo * gains, development.exposure)
-    mirror_ev = _exposure_ev(sample.mirror * gains, development.exposure)
+    ev = _exposure_ev(sample.photo * gains, response.exposure)
+    mirror_ev = _exposure_ev(sample.mirror * gains, response.exposure)
     exposed = sample.map(lambda light: light * (gains * math.exp2(ev))).layers()
     exposed["photo"] = _add_noise(exposed["photo"], sample.scene)
     exposed["mirror"] = sample.mirror * (gains * math.exp2(mirror_ev))
     return DevelopedSample(
         scene=sample.scene,
-        **{f"{name}_encoded": _tone_curve(light, development.contrast) for name, light in exposed.items()},
+        **{f"{name}_encoded": _tone_curve(light, response.contrast) for name, light in exposed.items()},
         exposure_ev=ev,
         mirror_exposure_ev=mirror_ev,
         white_balance=white_balance,
@@ -114,7 +114,7 @@ def encode_jpeg(encoded: Tensor, quality: int) -> bytes:
 def with_jpeg(developed: DevelopedSample) -> DevelopedSample:
     """The same sample, with I compressed to a JPEG of the scene's `jpeg_quality` and decoded again."""
     photo = developed.photo_encoded
-    decoded = Photo.open(encode_jpeg(photo, developed.scene.development.jpeg_quality)).pixels
+    decoded = Photo.open(encode_jpeg(photo, developed.scene.camera_response.jpeg_quality)).pixels
     levels = torch.from_numpy(decoded.copy()).to(photo.device).permute(2, 0, 1)
     return replace(developed, photo_encoded=levels.to(photo.dtype).contiguous() / 255)
 
@@ -160,18 +160,18 @@ def _exposure_ev(light: Tensor, target: float) -> float:
 # --- white balance
 
 
-def _white_balance(photo: Tensor, development: Development) -> tuple[float, float, float]:
+def _white_balance(photo: Tensor, response: CameraResponse) -> tuple[float, float, float]:
     """RGB gains that correct the illuminant's colour by the requested strength and keep its luminance.
 
     The colour is estimated on the exposed image, without pixels that clip in any channel, because a camera
     loses their colour, too. If all pixels clip, all of them are used.
     """
-    if development.white_balance == "none":
+    if response.white_balance == "none":
         return 1.0, 1.0, 1.0
-    exposed = (photo * math.exp2(_exposure_ev(photo, development.exposure))).clamp(0, 1)
+    exposed = (photo * math.exp2(_exposure_ev(photo, response.exposure))).clamp(0, 1)
     valid = (exposed < 1).all(0)
-    colour = _ILLUMINANT_ESTIMATORS[development.white_balance](exposed, valid if valid.any() else ~valid)
-    return _gains(colour, development.white_balance_strength)
+    colour = _ILLUMINANT_ESTIMATORS[response.white_balance](exposed, valid if valid.any() else ~valid)
+    return _gains(colour, response.white_balance_strength)
 
 
 def _gains(colour: Tensor, strength: float) -> tuple[float, float, float]:
@@ -232,11 +232,11 @@ def _add_noise(exposed: Tensor, scene: Scene) -> Tensor:
     Both are nearly Gaussian, and so is their sum (A. Foi et al., IEEE Trans. Image Proc. 17, 2008). The noise depends
     on the scene's seed and index only.
     """
-    development = scene.development
-    if development.shot_noise == development.read_noise == 0:
+    response = scene.camera_response
+    if response.shot_noise == response.read_noise == 0:
         return exposed
     # torch's generator on the CPU uses only 32 bits of its seed, so seed and index are hashed into 32 bits.
     seed = int(np.random.SeedSequence((scene.seed, scene.index)).generate_state(1)[0])
     normal = torch.randn(exposed.shape, generator=Generator().manual_seed(seed)).to(exposed.device)
-    variance = development.shot_noise**2 * exposed.clamp(0, 1) + development.read_noise**2
+    variance = response.shot_noise**2 * exposed.clamp(0, 1) + response.read_noise**2
     return exposed + variance.sqrt() * normal

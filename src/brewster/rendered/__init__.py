@@ -1,1 +1,1 @@
-"""Rendered samples on disk: the store that reads and writes them, and their generation by many processes."""
+"""Rendered sets: the store of samples on disk, and their generation with several processes."""

@@ -1,9 +1,9 @@
-"""A set of rendered samples on disk: one folder per sample or shards of a hundred samples, and an index.
+"""Stores rendered samples: one folder per sample, or shards (tar files) of a hundred samples, and an index.
 
     for entry in read_set(Path("out/window")):
         layers, scene = open_sample(entry)
 
-Writing is atomic: a file or folder is written under a hidden name, flushed to disk, and then renamed.
+Writing is atomic: a file or folder is written with a hidden name, flushed to disk, and then renamed.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from brewster.scene.scene import Scene
 Float32 = NDArray[np.float32]
 
 SHARD_SIZE: Final = 100
-LIGHT, SCENE = "layers.exr", "scene.toml"
-FILES: Final = (*(f"{layer}.jpg" for layer in LAYERS), LIGHT, SCENE)
-"""The files of a sample: five photographs, their linear light, and their scene."""
+LIGHT_FILE, SCENE_FILE = "layers.exr", "scene.toml"
+SAMPLE_FILES: Final = (*(f"{layer}.jpg" for layer in LAYERS), LIGHT_FILE, SCENE_FILE)
+"""The files of a sample: five photographs, their linear light, and the scene."""
 
 _GROUND_TRUTH_QUALITY: Final = 95
-_CURE: Final = "delete that sample and render the set again"
+_CURE: Final = "delete this sample, and render the set again"
 
 
 # --- encoding a sample
@@ -58,35 +58,36 @@ STATISTICS: Final[dict[str, Callable[[LightSample, DevelopedSample], float]]] = 
     "overexposed": lambda _, developed: developed.overexposed,
     "ghost_px": lambda sample, _: ghost_distance_px(sample.scene),
 }
-"""Statistics for selecting samples, in every scene.toml and in the index: the ratio of mean luminances, the share of
-pixels that are clipped in any channel, and the distance between the first two mirror images in px."""
+"""Statistics for the selection of samples, in every scene.toml and in the index: mean luminance of R / mean luminance of T;
+share of the pixels of I with a clipped channel; distance in px between the first two mirror images."""
 
 
 def statistics(sample: LightSample, developed: DevelopedSample) -> dict[str, float]:
-    """The value of each of STATISTICS, rounded to six digits."""
+    """Returns the values of STATISTICS, rounded to six significant digits."""
     return {name: float(f"{measure(sample, developed):.6g}") for name, measure in STATISTICS.items()}
 
 
-SAMPLE_FORMAT: Final = 1
-"""To be raised when the same job gives other samples, so that no set mixes the two. See test_house_formats."""
+SAMPLE_FORMAT: Final = 2
+"""Version of the files of a sample. Increase it if the same job gives other files, so that no set contains samples of two
+versions (tests/test_house_formats.py). 2: scene.toml has [camera_response] and `highlight_boost`."""
 
 
 def encode_sample(sample: LightSample, renderer: str) -> dict[str, bytes]:
-    """The files of a sample: name -> bytes.
+    """Encodes a sample. Returns its files: name -> bytes.
 
     Raises:
         MissingExtra: OpenEXR is not installed.
     """
     developed = develop(sample)
-    made = {"version": brewster.__version__, "renderer": renderer}
-    outcome = {**made, **developed.camera_settings(), **statistics(sample, developed)}
+    origin = {"version": brewster.__version__, "renderer": renderer}
+    outcome = {**origin, **developed.camera_settings(), **statistics(sample, developed)}
     qualities = dict.fromkeys(LAYERS, _GROUND_TRUTH_QUALITY) | {
-        "photo": sample.scene.development.jpeg_quality
+        "photo": sample.scene.camera_response.jpeg_quality
     }
     files = {f"{name}.jpg": encode_jpeg(layer, qualities[name]) for name, layer in developed.layers().items()}
     light = {name: layer.permute(1, 2, 0).float().cpu().numpy() for name, layer in sample.layers().items()}
-    files[LIGHT] = write_layers(light, {"software": f"brewster {brewster.__version__}"})
-    files[SCENE] = sample.scene.to_toml(outcome=outcome).encode()
+    files[LIGHT_FILE] = write_layers(light, {"software": f"brewster {brewster.__version__}"})
+    files[SCENE_FILE] = sample.scene.to_toml(outcome=outcome).encode()
     return files
 
 
@@ -94,15 +95,15 @@ def encode_sample(sample: LightSample, renderer: str) -> dict[str, bytes]:
 
 
 def key(index: int) -> str:
-    """The name of a sample: that of its folder, and the prefix of its files in a shard."""
+    """Returns the name of a sample. It is the name of its folder, and the prefix of its files in a shard."""
     return f"{index:06d}"
 
 
 def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Writes the folder of a sample. If another process wrote it first, that folder stays: its content is the same.
+    """Writes the folder of a sample, unless it exists: another process may have written it, with the same content.
 
     Raises:
-        TargetError: the file or folder cannot be written, for example because the disk is full.
+        TargetError: a file or folder cannot be written, for example because the disk is full.
     """
     with atomic_path(folder) as part:
         part.mkdir(parents=True)
@@ -111,7 +112,7 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 def remove_partial_files(out: Path) -> None:
-    """Removes partial files of killed runs. No other run may be writing to the folder."""
+    """Removes the partial files of killed runs. Call it only if no other run writes to the folder."""
     for part in out.glob(f"{TEMPORARY_PREFIX}*"):
         discard(part)
 
@@ -120,17 +121,18 @@ def remove_partial_files(out: Path) -> None:
 
 
 def shard_name(block: int) -> str:
-    """The name of the shard with the samples from index 100 * block."""
+    """Returns the name of the shard with the samples 100 * block to 100 * block + 99."""
     return f"shard-{block:06d}.tar"
 
 
 def pack(out: Path, block: int) -> None:
-    """Moves the finished folders of a block into its shard, which keeps the samples that it has.
+    """Moves the finished samples of a block from folders into its shard. Samples that are already in the shard remain there.
 
-    Members are named as WebDataset expects (000007.photo.jpg). The bytes depend on the samples only.
+    The names of the members follow the convention of WebDataset (000007.photo.jpg). The bytes of the shard depend on the
+    samples only.
 
     Raises:
-        TargetError: the file or folder cannot be written, for example because the disk is full.
+        TargetError: a file or folder cannot be written, for example because the disk is full.
     """
     entries = list(read_block(out, block))
     if any(not entry.spans for entry in entries):
@@ -145,23 +147,23 @@ def pack(out: Path, block: int) -> None:
 
 
 def has_folders(out: Path, block: int) -> bool:
-    """Whether samples of this block are in folders, finished or left over from packing."""
+    """Whether there are folders with samples of this block. They may be in the shard as well, if packing was interrupted."""
     return next(_folders(out, block), None) is not None
 
 
 def _add(tar: tarfile.TarFile, entry: StoredSample) -> None:
-    for name in FILES:
+    for name in SAMPLE_FILES:
         data, member = entry.read(name), tarfile.TarInfo(f"{key(entry.index)}.{name}")
         member.size = len(data)
         tar.addfile(member, BytesIO(data))
 
 
 def _remove(folder: Path) -> None:
-    """Removes the folder of a sample. It is renamed first, so that no reader sees a partial sample."""
-    doomed = temporary_path(folder)
+    """Removes the folder of a sample. It is renamed first, so that no reader finds a partial sample."""
+    hidden = temporary_path(folder)
     with contextlib.suppress(OSError):  # another process has removed it
-        folder.replace(doomed)
-        discard(doomed)
+        folder.replace(hidden)
+        discard(hidden)
 
 
 # --- reading
@@ -169,30 +171,30 @@ def _remove(folder: Path) -> None:
 
 @dataclass(frozen=True)
 class StoredSample:
-    """A finished sample. `place` is its folder, or a shard that has its files at `spans` (offset, length)."""
+    """A finished sample. `path` is its folder, or a shard. In a shard, `spans` has (offset, length) of each of its files."""
 
     index: int
-    place: Path
+    path: Path
     spans: Mapping[str, tuple[int, int]] = field(default_factory=dict, repr=False)
 
     def read(self, name: str) -> bytes:
-        """The bytes of one of FILES."""
+        """Returns the bytes of a file. `name` is one of SAMPLE_FILES."""
         if not self.spans:
-            return (self.place / name).read_bytes()
+            return (self.path / name).read_bytes()
         offset, length = self.spans[name]
-        with self.place.open("rb") as shard:
+        with self.path.open("rb") as shard:
             shard.seek(offset)
             return shard.read(length)
 
 
 def read_set(out: Path) -> Iterator[StoredSample]:
-    """The finished samples of a set, from folders and shards, in the order of their indices."""
+    """Yields the finished samples of a set from folders and shards, in the order of their indices."""
     for block in _blocks(out):
         yield from read_block(out, block)
 
 
 def read_block(out: Path, block: int) -> Iterator[StoredSample]:
-    """The finished samples of a block of a hundred indices, in order. A sample in the shard replaces its folder."""
+    """Yields the finished samples of a block of a hundred indices in order. If a sample is in both, the shard is used."""
     entries = {int(folder.name): StoredSample(int(folder.name), folder) for folder in _folders(out, block)}
     entries |= {entry.index: entry for entry in _members(out / shard_name(block))}
     yield from (entry for _, entry in sorted(entries.items()))
@@ -205,31 +207,29 @@ def open_sample(entry: StoredSample) -> tuple[dict[str, Float32], Scene]:
 
     Raises:
         MissingExtra: OpenEXR is not installed.
-        PhotoError: its image file is damaged.
-        RecipeError: its scene file is damaged.
+        PhotoError: the image file is damaged.
+        RecipeError: the scene file is damaged.
     """
-    light = read_layers(entry.read(LIGHT))
+    light = read_layers(entry.read(LIGHT_FILE))
     return {name: light[name] for name in LAYERS}, read_scene_of(entry)
 
 
 def read_scene_of(entry: StoredSample) -> Scene:
-    """The scene of a sample.
+    """Reads the scene of a sample.
 
     Raises:
-        RecipeError: its scene file is damaged.
+        RecipeError: the scene file is damaged.
     """
     try:
-        table = tomllib.loads(entry.read(SCENE).decode())
+        table = tomllib.loads(entry.read(SCENE_FILE).decode())
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise RecipeError(
-            f"the scene of {entry.place} is not TOML", "expected a scene file", _CURE
-        ) from error
+        raise RecipeError(f"the scene of {entry.path} is not TOML", "expected a scene file", _CURE) from error
     values = {name: table[name] for name in table if name != "outcome"}
-    return validated(Scene, values, owner=f"the scene of {entry.place}", compare="brewster render --help")
+    return validated(Scene, values, source=f"the scene of {entry.path}", reference="brewster render --help")
 
 
 def _blocks(out: Path) -> list[int]:
-    """The numbers of the blocks with at least one finished sample."""
+    """Returns the numbers of the blocks with at least one finished sample, in ascending order."""
     with os.scandir(out) as found:
         names = (re.fullmatch(r"(?:shard-(\d{6,})\.tar|(\d{6,}))", item.name) for item in found)
         return sorted({int(name[1]) if name[1] else int(name[2]) // SHARD_SIZE for name in names if name})

@@ -1,4 +1,4 @@
-"""The camera, a thin lens and a sensor, and the coordinate axes of a heading and a pitch."""
+"""The camera (a thin lens and a sensor), and the axes of an object with a given heading and pitch."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ Axes = tuple[Point, Point, Point]
 class Camera(FrozenModel):
     """Position, orientation and thin lens of a camera with square pixels.
 
-    `fov_deg` is the horizontal field of view. An aperture of 0 is a pinhole. `focus_mm` is measured along the axis.
+    `fov_deg` is the horizontal field of view. `aperture_mm` is the diameter of the lens; 0 is a pinhole. `focus_mm` is the
+    distance from the lens to the plane in focus, along the optical axis.
     """
 
     position_mm: Point = (0.0, 0.0, 1000.0)
@@ -36,11 +37,11 @@ class Camera(FrozenModel):
 
     @property
     def pixel_rad(self) -> float:
-        """The angle that a pixel spans in the middle of the image, in radians."""
+        """Angle of view of one pixel at the centre of the image, in radians."""
         return 2 * self.half_width / self.width
 
     def corners(self) -> list[Point]:
-        """Directions through the four corners of the image, not of unit length."""
+        """Directions through the four corners of the image, not normalised."""
         right, up, back = axes(self.heading_deg, self.pitch_deg)
         across, down = self.half_width, self.half_width * self.height / self.width
         return [
@@ -51,19 +52,19 @@ class Camera(FrozenModel):
 
 
 def axes(heading_deg: float, pitch_deg: float) -> Axes:
-    """The axes of an object that faces `heading_deg` (0 is -z, 90 is +x), `pitch_deg` above the horizon.
+    """The axes of an object with a heading (0 is -z, 90 is +x) and a pitch above the horizon.
 
-    Returns: unit vectors (right, up, back) in world coordinates.
+    Returns: unit vectors (right, up, back) in world coordinates; back is opposite to the viewing direction.
     """
     heading, pitch = math.radians(heading_deg), math.radians(pitch_deg)
-    ahead = (math.sin(heading) * math.cos(pitch), math.sin(pitch), -math.cos(heading) * math.cos(pitch))
+    forward = (math.sin(heading) * math.cos(pitch), math.sin(pitch), -math.cos(heading) * math.cos(pitch))
     right = (math.cos(heading), 0.0, math.sin(heading))
     up = (
-        right[1] * ahead[2] - right[2] * ahead[1],
-        right[2] * ahead[0] - right[0] * ahead[2],
-        right[0] * ahead[1] - right[1] * ahead[0],
+        right[1] * forward[2] - right[2] * forward[1],
+        right[2] * forward[0] - right[0] * forward[2],
+        right[0] * forward[1] - right[1] * forward[0],
     )
-    return right, up, _scale(ahead, -1)
+    return right, up, _scale(forward, -1)
 
 
 def dot(one: Point, other: Point) -> float:

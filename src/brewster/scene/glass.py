@@ -13,13 +13,13 @@ from pydantic import Field, model_validator
 from brewster.scene.values import FrozenModel, NonNegativeFloat, PositiveFloat
 
 Point = tuple[float, float, float]
-"""World coordinates in mm: x to the right, y up, -z ahead."""
+"""World coordinates in mm: x to the right, y up, -z forward."""
 
 DEFAULT_INDEX = 1.5
 
 
 class Pane(FrozenModel):
-    """One sheet of glass. `wedge_deg` rotates its far surface about the vertical axis."""
+    """One sheet of glass. Its far surface is rotated by `wedge_deg` about the vertical axis."""
 
     thickness_mm: Annotated[float, Field(gt=0, le=200)] = 4.0
     index: Annotated[float, Field(ge=1, le=3)] = DEFAULT_INDEX
@@ -49,9 +49,11 @@ class Glazing(FrozenModel):
     @model_validator(mode="after")
     def _check_geometry(self) -> Glazing:
         if len(self.panes) > 1 and self.gap_mm == 0:
-            raise ValueError("gap_mm is 0; several panes need a gap above 0")
+            raise ValueError("expected a gap_mm above 0 between several panes, but it is 0")
         if self.radii_mm and (len(self.panes) > 1 or not all(self.radii_mm) or self.frame_mm is None):
-            raise ValueError("curved glass needs one pane, two radii other than 0, and a frame")
+            raise ValueError(
+                "expected one pane, two radii other than 0 and a frame, because the glass is curved"
+            )
         return self
 
     @property

@@ -1,7 +1,7 @@
-"""Scene recipes: the distributions that random scenes of one kind are drawn from. TOML in, frozen values out.
+"""Scene recipes: distributions of the parameters of random scenes, read from TOML into frozen models.
 
-A range is sampled uniformly; where its key ends in `_log`, uniformly in the logarithm. A `_probability` is the share
-of scenes that have the feature. The packaged recipes are the TOML files in `recipes/` next to this file.
+A `Range` is sampled uniformly, a `LogRange` uniformly in the logarithm. A `_probability` is the share of scenes that have
+the feature. The packaged recipes are the TOML files in the folder `recipes` next to this file.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from brewster.scene.values import (
 )
 
 _FOLDER: Final = Path(__file__).parent / "recipes"
-_COMPARE: Final = "docs/recipes.md"
+_REFERENCE: Final = "docs/recipes.md"
 RECIPES: Final = tuple(sorted(path.stem for path in _FOLDER.glob("*.toml")))
 """The names of the packaged recipes."""
 
@@ -44,35 +44,38 @@ class GlassRecipe(FrozenModel):
     """Thickness of a pane."""
     structural_probability: Share = 0.0
     """Probability of thick structural glass."""
-    structural_mm: LogRange = (10.0, 40.0)
+    structural_thickness_mm: LogRange = (10.0, 40.0)
     """Thickness of a pane of structural glass."""
     index: Range = (1.45, 1.65)
     """Refractive index, the same for all panes of a scene; at least 1."""
     tints: Annotated[
         tuple[tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat], ...], KeyNote(unit="1/m")
     ] = ((4.0, 1.5, 2.5),)
-    """Absorption coefficients for red, green and blue, one of which is drawn. Clear float glass is slightly green."""
+    """Absorption coefficients for red, green and blue, one of which is drawn. They are larger for red
+    and blue than for green, because clear float glass is slightly green."""
     tint_strength_log: LogRange = (0.3, 2.0)
     """Factor on the absorption coefficients."""
     rough_probability: Share = 0.0
     """Probability of rough glass."""
     roughness_log: LogRange = (0.01, 0.1)
-    """GGX width (alpha) of rough glass: 0.05 is satin, 0.2 frosted."""
+    """GGX width (alpha) of the surfaces of rough glass: 0.05 is satin, 0.2 frosted."""
     wedge_probability: Share = 0.0
-    """Probability of panes whose two surfaces are not parallel."""
+    """Probability of wedged panes, whose two surfaces are not parallel."""
     wedge_deg_log: LogRange = (0.01, 0.3)
-    """Angle between the two surfaces of such a pane."""
+    """Angle between the two surfaces of a wedged pane."""
     pitch_deg: Range = (0.0, 0.0)
-    """Tilt of the glazing, above the horizon positive."""
+    """Elevation of the normal of the glass above the horizon; 0 for upright glass."""
 
     @model_validator(mode="after")
     def _check_values(self) -> Self:
         if self.index[0] < 1:
-            raise ValueError(f"index starts at {self.index[0]:g}, and a refractive index is at least 1")
+            raise ValueError(f"expected an index of at least 1, but it starts at {self.index[0]:g}")
         if self.gap_mm[0] <= 0 and self.double_probability:
-            raise ValueError(f"gap_mm starts at {self.gap_mm[0]:g}, and double glazing needs a gap above 0")
+            raise ValueError(
+                f"expected a gap_mm above 0 for double glazing, but it starts at {self.gap_mm[0]:g}"
+            )
         if not self.tints:
-            raise ValueError("tints is empty, and at least one colour is needed")
+            raise ValueError("expected at least one colour, but tints is empty")
         return self
 
 
@@ -90,47 +93,47 @@ class CameraRecipe(FrozenModel):
     pitch_deg: Range = (-12.0, 12.0)
     """Angle of the optical axis above the horizon."""
     fov_deg: Range = (30.0, 90.0)
-    """Horizontal field of view. A map of low resolution raises the lower end; see most_px_per_texel."""
+    """Horizontal field of view. For maps of low resolution, the lower limit is raised as `max_px_per_texel` requires."""
     pinhole_probability: Share = 0.7
     """Probability of a pinhole camera, which has no defocus."""
     aperture_mm_log: LogRange = (1.0, 15.0)
     """Aperture diameter of a camera with a lens."""
     focus_on_front_probability: Share = 0.15
-    """Probability that the lens is focused on the mirrored content instead of the content behind the glass."""
+    """Probability that the camera is focused on the mirrored content instead of the content behind the glass."""
 
 
 class SideRecipe(FrozenModel):
     """The content on one side of the glass: an environment map, a picture on a plane, or both."""
 
     map_probability: Share = 1.0
-    """Probability of an environment map. Without one there is always a picture."""
+    """Probability of an environment map. A side without a map has a picture."""
     maps: tuple[str, ...] = ()
-    """Categories of maps to draw from, such as indoor, outdoor or night; empty for all."""
-    most_px_per_texel: PositiveFloat = 2.5
-    """A map is used only if a texel of it covers at most this many pixels."""
+    """Categories of the maps, such as indoor, outdoor or night. Empty: all maps."""
+    max_px_per_texel: PositiveFloat = 2.5
+    """Largest width of a texel of the map in the image. It limits the choice of maps and the field of view."""
     dome_probability: Share = 0.0
-    """Probability that the map is on a sphere of finite radius around the glass instead of at infinity."""
+    """Probability that the map is on a sphere (dome) of finite radius around the glass instead of at infinity."""
     radius_mm_log: LogRange = (3000.0, 10_000.0)
-    """Radius of that sphere."""
+    """Radius of the dome."""
     picture_probability: Share = 0.0
     """Probability of a picture on a plane, in front of the map if there is one."""
     distance_mm_log: LogRange = (1000.0, 8000.0)
-    """Distance of the picture from the glass."""
-    fill: Range = (1.05, 1.5)
-    """Width of the picture over the width that exactly covers the view."""
+    """Distance of the picture behind the last pane; in [front], behind the camera."""
+    relative_width: Range = (1.05, 1.5)
+    """Width of the picture, divided by the width that exactly covers the view."""
     turn_deg: Range = (0.0, 0.0)
-    """Rotation of the picture about the vertical axis; about the horizontal axis it is half as large."""
-    highlights: Range = (0.0, 0.0)
-    """Extra brightness of clipped whites in a picture: white is (1 + highlights) times as bright."""
+    """Rotation of the picture about the vertical axis. The rotation about the horizontal axis has half this range."""
+    highlight_boost: Range = (0.0, 0.0)
+    """Extra brightness of clipped whites in a picture: the light of white is multiplied by 1 + highlight_boost."""
     luminance_log: LogRange = (1.0, 1.0)
-    """Mean luminance of the content. Only the ratio between the two sides matters."""
+    """Mean luminance of the content. Only the ratio between the two sides has an effect, because the exposure is automatic."""
 
 
-class DevelopmentRecipe(FrozenModel):
-    """The camera response: from linear light to an 8-bit photograph."""
+class CameraResponseRecipe(FrozenModel):
+    """The camera response: the conversion of linear light into an 8-bit photograph."""
 
     exposure: LogRange = (0.2, 0.5)
-    """Mean luminance of the photo I after exposure, where clipped values count as 1."""
+    """Mean luminance of the photo I after exposure and clipping to 0..1."""
     white_balance: Annotated[tuple[WhiteBalance, ...], Field(min_length=1)] = (
         "none",
         "grey-world",
@@ -139,52 +142,54 @@ class DevelopmentRecipe(FrozenModel):
     )
     """Methods of automatic white balance, one of which is drawn."""
     white_balance_strength: Range = (0.3, 1.0)
-    """Share of the estimated white balance that is applied; at most 1."""
+    """Strength of the white balance: 0 is none, 1 the full correction. Gains are raised to this power; at most 1."""
     contrast: Range = (-0.1, 0.5)
-    """Strength of an S-shaped tone curve: 0 is the sRGB curve, negative values flatten it."""
+    """Weight of an S-shaped tone curve: 0 is the sRGB curve, negative values give less contrast."""
     shot_noise: Range = (0.0, 0.02)
-    """Standard deviation at white of noise that grows with the square root of the light, in I only."""
+    """Shot noise of the photo I: its standard deviation at white. It is proportional to the square root of the light."""
     read_noise: Range = (0.0, 0.004)
-    """Standard deviation of noise that does not depend on the light, in I only."""
+    """Read noise of the photo I: its standard deviation, which does not depend on the light."""
     jpeg_quality: JpegQualityRange = (60, 97)
-    """JPEG quality of the photo I; the other images are written with quality 95."""
+    """JPEG quality of the photo I. The other images have a quality of 95."""
 
 
 class SceneRecipe(FrozenModel):
-    """One kind of scene."""
+    """Distributions of the parameters of random scenes."""
 
     name: str
-    """The name of the recipe. Recipes of different names draw different scenes from the same seed."""
+    """The name of the recipe. The scenes depend on it: recipes with different names give different scenes for the same seed."""
     about: str
     """A description of the scenes."""
     orders: Literal["all", "paper"] = "all"
-    """Light paths in T and R. all: every order of reflection, so that I = T + R. paper: the single paths of the paper."""
+    """Light paths in T and R. all: all orders of reflection, so that I = T + R. paper: T contains only the
+    path without a reflection, R only paths that do not enter the last pane."""
     samples: PositiveInt = 8
-    """Rays per pixel, where random sampling is needed (lenses), and at most that many elsewhere."""
+    """Rays per pixel of scenes that need Monte Carlo sampling (a wedged pane, or a lens and near content), and the maximum
+    for other scenes without rough glass."""
     rough_samples: PositiveInt = 16
     """Rays per pixel for scenes with rough glass."""
     glass: GlassRecipe = GlassRecipe()
     camera: CameraRecipe = CameraRecipe()
     behind: SideRecipe = SideRecipe()
-    """The content behind the glass, which the transmission shows."""
+    """The content behind the glass, which is visible in the transmission."""
     front: SideRecipe = SideRecipe()
-    """The content in front of the glass, which the reflection shows. It has the same keys as [behind]."""
-    development: DevelopmentRecipe = DevelopmentRecipe()
+    """The content in front of the glass, which is visible in the reflection. It has the same keys as [behind]."""
+    camera_response: CameraResponseRecipe = CameraResponseRecipe()
 
 
 def read_scene_recipe(name: str) -> SceneRecipe:
-    """A packaged recipe by its name, or one of your own by its path.
+    """Reads a packaged recipe by its name, or another one from a .toml file.
 
     Raises:
         RecipeError: the name is unknown, the file is missing or not TOML, or keys are missing, unknown or have
             impossible values.
     """
     if name in RECIPES:
-        return read_toml(SceneRecipe, _FOLDER / f"{name}.toml", compare=_COMPARE)
+        return read_toml(SceneRecipe, _FOLDER / f"{name}.toml", reference=_REFERENCE)
     if not name.endswith(".toml"):
         raise RecipeError(
             f"there is no recipe {name!r}",
-            f"the packaged recipes are {', '.join(RECIPES)}",
-            "name one of them, or a .toml file",
+            f"expected one of the packaged recipes {', '.join(RECIPES)}",
+            "choose one of them, or a .toml file",
         )
-    return read_toml(SceneRecipe, Path(name), compare=_COMPARE)
+    return read_toml(SceneRecipe, Path(name), reference=_REFERENCE)

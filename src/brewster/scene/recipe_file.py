@@ -1,6 +1,6 @@
-"""Recipes as TOML files: read and checked with all problems named at once, and written with all defaults.
+"""Reads recipes from TOML files and reports all problems at once; writes recipes with all defaults.
 
-recipe = read_toml(SceneRecipe, Path("mine.toml"), compare="docs/recipes.md")
+recipe = read_toml(SceneRecipe, Path("mine.toml"), reference="docs/recipes.md")
 print(commented_toml(recipe))
 """
 
@@ -21,9 +21,9 @@ from brewster.errors import RecipeError
 from brewster.scene.recipe_keys import (
     REQUIRED,
     RecipeKey,
-    choices,
+    allowed_keys,
     describe,
-    names_in,
+    literal_values,
     recipe_keys,
     recipe_tables,
 )
@@ -33,14 +33,14 @@ Model = TypeVar("Model", bound=FrozenModel)
 
 _WIDTH: Final = 100
 _ESCAPES: Final = {code: f"\\u{code:04x}" for code in (*range(32), 127, ord('"'), ord("\\"))}
-_LONGEST_VALUE: Final = 60
+_MAX_VALUE_LENGTH: Final = 60
 
 
 # --- reading
 
 
-def read_toml(model: type[Model], path: Path, *, compare: str) -> Model:
-    """Reads and checks a TOML file; `compare` names what a user can compare a wrong file with.
+def read_toml(model: type[Model], path: Path, *, reference: str) -> Model:
+    """Reads and validates a TOML file. Error messages refer the user to `reference`.
 
     Returns: the values as an instance of `model`.
 
@@ -50,26 +50,28 @@ def read_toml(model: type[Model], path: Path, *, compare: str) -> Model:
     try:
         values = tomllib.loads(path.read_text("utf-8"))
     except OSError as error:
-        raise RecipeError(f"{path} cannot be read", "expected a TOML file", f"see {compare}") from error
+        raise RecipeError(f"{path} cannot be read", "expected a TOML file", f"see {reference}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise RecipeError(
-            f"{path} is not TOML ({error})", "expected a TOML file", "correct that place"
+            f"{path} is not TOML ({error})", "expected a TOML file", "correct the file there"
         ) from error
-    return validated(model, values, owner=str(path), compare=compare)
+    return validated(model, values, source=str(path), reference=reference)
 
 
-def validated(model: type[Model], values: Mapping[str, Any], *, owner: str, compare: str) -> Model:
-    """The values as an instance of `model`; `owner` is what error messages call their source.
+def validated(model: type[Model], values: Mapping[str, Any], *, source: str, reference: str) -> Model:
+    """Returns the values as an instance of `model`. Error messages contain `source`, the origin of the values.
 
     Raises:
-        RecipeError: keys are missing, unknown or have impossible values; one sentence for each.
+        RecipeError: keys are missing, unknown or have impossible values. It has one sentence for each of them.
     """
     try:
         return model.model_validate(values)
     except ValidationError as error:
         problems = {
             str(problem): problem
-            for problem in (_problem(model, values, details, (owner, compare)) for details in error.errors())
+            for problem in (
+                _problem(model, values, details, (source, reference)) for details in error.errors()
+            )
         }
         first, *others = problems.values()
         raise RecipeError(first.happened, first.expected, first.cure, tuple(others)) from error
@@ -78,27 +80,27 @@ def validated(model: type[Model], values: Mapping[str, Any], *, owner: str, comp
 def _problem(
     model: type[FrozenModel], values: Mapping[str, Any], details: ErrorDetails, names: tuple[str, str]
 ) -> RecipeError:
-    """One of pydantic's errors as a sentence: file, key and value; what is allowed; what to do."""
-    owner, compare = names
+    """Translates an error of pydantic: source, key and value; what is allowed; what to do. `names` are source and reference."""
+    source, reference = names
     location, kind = details["loc"], details["type"]
     path, value = _look_up(values, location)
-    cure = f"compare with {compare}"
+    cure = f"compare with {reference}"
     if kind == "missing":
         missing = [*path, str(location[-1])]
-        return RecipeError(f"{owner}: {_dotted(missing)} is missing", _expected(model, missing), "add it")
+        return RecipeError(f"{source}: {_dotted(missing)} is missing", _expected(model, missing), "add it")
     if kind == "extra_forbidden" or location[-1:] == ("[key]",):
-        return _unknown_key(model, path, value, owner)
+        return _unknown_key(model, path, value, source)
     message = details["msg"].removeprefix("Value error, ")
     if isinstance(value, Mapping):
-        subject = f"{owner}: [{_dotted(path)}]" if path else owner
-        return RecipeError(f"{subject} contradicts itself", message, cure)
-    happened = f"{owner}: {_dotted(path)} is {_shortened(value)}"
+        table = f" of [{_dotted(path)}]" if path else ""
+        return RecipeError(f"{source}: the values{table} are inconsistent", message, cure)
+    happened = f"{source}: {_dotted(path)} is {_shortened(value)}"
     if kind == "value_error":
         return RecipeError(happened, message, cure)
     if kind == "finite_number":
         return RecipeError(happened, "expected a finite number", cure)
-    names_of = [choice for choice in choices(model, path) if isinstance(choice, str)]
-    close = get_close_matches(str(value), names_of, n=1)
+    allowed = [name for name in literal_values(model, path) if isinstance(name, str)]
+    close = get_close_matches(str(value), allowed, n=1)
     return RecipeError(happened, _expected(model, path), f'did you mean "{close[0]}"?' if close else cure)
 
 
@@ -106,9 +108,9 @@ def _look_up(
     values: Any,  # noqa: ANN401  (what TOML holds)
     location: Sequence[str | int],
 ) -> tuple[list[str | int], Any]:
-    """The part of pydantic's location that the values hold, and the value there.
+    """Returns the part of pydantic's location that exists in the values, and the value there.
 
-    Behind it pydantic may name a member of a union, or "[key]".
+    The rest of the location may be a member of a union, or "[key]".
     """
     path: list[str | int] = []
     for part in location:
@@ -122,24 +124,26 @@ def _look_up(
 
 
 def _unknown_key(
-    model: type[FrozenModel], path: Sequence[str | int], value: object, owner: str
+    model: type[FrozenModel], path: Sequence[str | int], value: object, source: str
 ) -> RecipeError:
     table = path[:-1]
-    subject = f"[{_dotted(table)}]" if table else "the recipe"
+    owner = f"[{_dotted(table)}]" if table else "the recipe"
     close = similar_key(model, path)
+    known = "" if close else f", one of {', '.join(allowed_keys(model, table))}"
     return RecipeError(
-        f"{owner}: there is no key {_dotted(path)} (its value is {_shortened(value)})",
-        f"expected a key of {subject}"
-        if close
-        else f"{subject} has the keys {', '.join(names_in(model, table))}",
+        f"{source}: there is no key {_dotted(path)} (its value is {_shortened(value)})",
+        f"expected a key of {owner}{known}",
         f"did you mean {close}?" if close else "remove it",
     )
 
 
 def similar_key(model: type[FrozenModel], path: Sequence[str | int]) -> str | None:
-    """The known key that an unknown one resembles: one of its table, or one of the same name in another table."""
+    """Returns the known key that is most similar to an unknown one.
+
+    It is a key of the same table with a similar name, else a key of another table with the same name, else None.
+    """
     *table, name = path
-    close = get_close_matches(str(name), names_in(model, table), n=1)
+    close = get_close_matches(str(name), allowed_keys(model, table), n=1)
     if close:
         return _dotted([*table, close[0]])
     paths = [key.path for key in recipe_keys(model)] + [table.path for table in recipe_tables(model)]
@@ -156,16 +160,16 @@ def _dotted(path: Sequence[str | int]) -> str:
 
 def _shortened(value: object) -> str:
     text = _toml(value)
-    return text if len(text) <= _LONGEST_VALUE else f"{text[:_LONGEST_VALUE]}..."
+    return text if len(text) <= _MAX_VALUE_LENGTH else f"{text[:_MAX_VALUE_LENGTH]}..."
 
 
 # --- writing
 
 
 def commented_toml(recipe: FrozenModel) -> str:
-    """The recipe as TOML: every key, those with default values too, each below a comment with its description.
+    """Returns the recipe as TOML with all keys, also those with default values. A comment above each key describes it.
 
-    An optional key that is not set is a comment. Reading the text gives an equal recipe.
+    An optional key that is not set is commented out. `read_toml` returns an equal recipe from the text.
     """
     values = recipe.model_dump(mode="json")
     lines: list[str] = []
@@ -180,15 +184,15 @@ def commented_toml(recipe: FrozenModel) -> str:
 
 
 def _key_lines(key: RecipeKey, value: object, *, is_set: bool) -> Iterator[str]:
-    """The description of a key as comments, and its value."""
+    """Yields the description of a key as comment lines, then the line with its value."""
     yield from _comment(f"{key.meaning} ({', '.join(_facts(key))})")
     name = key.path.rpartition(".")[2]
-    is_given = is_set and value is not None
-    yield _line(f"{name} = {'' if value is None else _toml(value)}".rstrip(), is_set=is_given)
+    has_value = is_set and value is not None
+    yield _line(f"{name} = {'' if value is None else _toml(value)}".rstrip(), is_set=has_value)
 
 
 def _facts(key: RecipeKey) -> Iterator[str]:
-    """Type, allowed values, unit and default of a key in words."""
+    """Yields type, allowed values, unit and default of a key in words."""
     yield key.kind
     if key.allowed:
         yield key.allowed

@@ -1,9 +1,9 @@
-"""The keys of a recipe: type, unit, allowed values, default and meaning, read from its pydantic model.
+"""Describes the keys of a recipe from its pydantic model: type, unit, allowed values, default and meaning.
 
     for key in recipe_keys(SceneRecipe):
         print(key.path, key.kind, key.allowed)
 
-docs/recipes.md, `--show-recipe` and the error messages of recipes are made from these descriptions.
+docs/recipes.md, `--show-recipe` and the error messages of recipes contain these descriptions.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pydantic.fields import FieldInfo
 from brewster.scene.values import FrozenModel, KeyNote
 
 REQUIRED: Final = object()
-"""The default of a key that has none."""
+"""Stands for the default of a key that has no default."""
 
 _UNITS: Final = {"mm": "mm", "deg": "degrees", "px": "px", "per_m": "1/m", "px_per_texel": "px per texel"}
 _SUFFIX: Final = re.compile(rf"(?:^|_)({'|'.join(sorted(_UNITS, key=len, reverse=True))})(?:_log)?$")
@@ -34,15 +34,15 @@ class RecipeKey:
     """One key of a recipe."""
 
     path: str
-    """The names of its tables and its own, with dots between: "data.rendered.mixing"."""
+    """The names of its tables and its own name, separated by dots: "data.rendered.mixing"."""
     kind: str
     """The type in words: "number", "list of paths"."""
     allowed: str
-    """The allowed values in words, or "" where any value of the type is."""
+    """The allowed values in words, or "" if every value of the type is allowed."""
     unit: str
     """The unit, or "" for a number without one."""
     default: Any
-    """The default as the model holds it, or REQUIRED."""
+    """The default value of the model, or REQUIRED."""
     meaning: str
     """What the key does."""
 
@@ -50,66 +50,66 @@ class RecipeKey:
 @final
 @dataclass(frozen=True)
 class RecipeTable:
-    """One table of a recipe; the recipe itself is the table of path ""."""
+    """One table of a recipe. The recipe itself is the table with the path ""."""
 
     path: str
     model: type[FrozenModel]
     meaning: str
-    """What the table is about."""
+    """What the keys of the table describe."""
 
     @property
     def keys(self) -> list[RecipeKey]:
-        """The keys of the table that are not tables themselves, in the order of the model."""
+        """The keys of the table in the order of the model, without its tables."""
         return [
             _key(_joined(self.path, name), name, field)
             for name, field in self.model.model_fields.items()
-            if _model_in(field.annotation) is None
+            if _table_model(field.annotation) is None
         ]
 
 
 def recipe_tables(model: type[FrozenModel], path: str = "", meaning: str = "") -> Iterator[RecipeTable]:
-    """The recipe itself and all tables in it, optional ones too."""
+    """Yields the recipe itself and all its tables, including optional ones."""
     yield RecipeTable(path, model, _one_paragraph(meaning or model.__doc__))
     for name, field in model.model_fields.items():
-        if table := _model_in(field.annotation):
+        if table := _table_model(field.annotation):
             yield from recipe_tables(table, _joined(path, name), field.description or "")
 
 
 def recipe_keys(model: type[FrozenModel]) -> Iterator[RecipeKey]:
-    """Every key of a recipe that is not a table, table by table."""
+    """Yields all keys of a recipe, table by table, without the tables themselves."""
     for table in recipe_tables(model):
         yield from table.keys
 
 
 def describe(model: type[FrozenModel], path: Sequence[str | int]) -> str:
-    """What may stand at a place in a recipe: "an integer, above 0".
+    """Describes the values that are allowed at a path of a recipe: "an integer, above 0".
 
     Args:
         model: the model of the recipe.
-        path: names of keys, and indices into lists.
+        path: names of keys and indices of list items.
     """
     annotation, metadata = _annotation_at(model, path)
-    kind, allowed = _words(annotation, metadata)
+    kind, allowed = _type_and_limits(annotation, metadata)
     return f"{'an' if kind[:1] in 'aeiou' else 'a'} {kind}{', ' if allowed else ''}{allowed}"
 
 
-def choices(model: type[FrozenModel], path: Sequence[str | int]) -> tuple[Any, ...]:
-    """The values of a place that allows a fixed list of them; else nothing."""
+def literal_values(model: type[FrozenModel], path: Sequence[str | int]) -> tuple[Any, ...]:
+    """Returns the allowed values at a path if they are a fixed list (a Literal), else an empty tuple."""
     annotation, _ = _annotation_at(model, path)
     return get_args(annotation) if get_origin(annotation) is Literal else ()
 
 
-def names_in(model: type[FrozenModel], path: Sequence[str | int]) -> list[str]:
-    """The keys that the table at a place may hold, where they are a fixed list."""
+def allowed_keys(model: type[FrozenModel], path: Sequence[str | int]) -> list[str]:
+    """Returns the allowed keys of the table at a path; an empty list if any key is allowed."""
     annotation, _ = _annotation_at(model, path)
-    if table := _model_in(annotation):
+    if table := _table_model(annotation):
         return list(table.model_fields)
     keys = get_args(annotation)[0] if get_origin(annotation) is dict else None
     return [str(name) for name in get_args(keys)]
 
 
 def _key(path: str, name: str, field: FieldInfo) -> RecipeKey:
-    kind, allowed = _words(field.annotation, field.metadata)
+    kind, allowed = _type_and_limits(field.annotation, field.metadata)
     default = REQUIRED if field.is_required() else field.get_default(call_default_factory=True)
     suffix = _SUFFIX.search(name)
     unit = next((note.unit for note in field.metadata if isinstance(note, KeyNote) and note.unit), "")
@@ -128,39 +128,39 @@ def _one_paragraph(text: str | None) -> str:
 # --- annotations in words
 
 
-def _words(annotation: Any, metadata: Sequence[Any]) -> tuple[str, str]:  # noqa: ANN401  (a type)
-    """The type and the allowed values in words."""
-    annotation, metadata = _flat(annotation, metadata)
+def _type_and_limits(annotation: Any, metadata: Sequence[Any]) -> tuple[str, str]:  # noqa: ANN401  (a type)
+    """Returns the type and the allowed values in words."""
+    annotation, metadata = _unwrapped(annotation, metadata)
     notes = [note for note in metadata if isinstance(note, KeyNote)]
     kind, allowed = _kind(annotation)
     kind = next((note.kind for note in notes if note.kind), kind)
-    if any(note.instead for note in notes):
+    if any(note.replaces_constraints for note in notes):
         return kind, ", ".join(note.allowed for note in notes if note.allowed)
     parts = [allowed, *_limits(metadata), *(note.allowed for note in notes)]
     return kind, ", ".join(part for part in parts if part)
 
 
 def _kind(annotation: Any) -> tuple[str, str]:  # noqa: ANN401
-    """The type in words without its constraints, and what its parts allow."""
+    """Returns the type in words, and the allowed values of its parts. Constraints of the type itself are not included."""
     origin, args = get_origin(annotation), get_args(annotation)
     if origin is Literal:
         return _KINDS[type(args[0])], f"one of {', '.join(_quoted(value) for value in args)}"
     if origin is dict:
-        (key, allowed_key), (value, allowed_value) = (_words(part, ()) for part in args)
-        return f"table of {key} -> {value}", _each(allowed_key, allowed_value)
+        (key, allowed_key), (value, allowed_value) = (_type_and_limits(part, ()) for part in args)
+        return f"table of {key} -> {value}", _limits_of_parts(allowed_key, allowed_value)
     if origin is list or (origin is tuple and args[-1] is ...):
-        kind, allowed = _words(args[0], ())
-        return f"list of {_plural(kind)}", _each(allowed)
+        kind, allowed = _type_and_limits(args[0], ())
+        return f"list of {_plural(kind)}", _limits_of_parts(allowed)
     if origin is tuple:
-        kinds, allowed_parts = zip(*(_words(part, ()) for part in args), strict=True)
-        return f"list [{', '.join(kinds)}]", _each(*allowed_parts)
+        kinds, allowed_parts = zip(*(_type_and_limits(part, ()) for part in args), strict=True)
+        return f"list [{', '.join(kinds)}]", _limits_of_parts(*allowed_parts)
     if origin in (Union, types.UnionType):
-        return " or ".join(_words(part, ())[0] for part in args), ""
+        return " or ".join(_type_and_limits(part, ())[0] for part in args), ""
     return _KINDS.get(annotation, "table"), ""
 
 
 def _limits(metadata: Sequence[Any]) -> Iterator[str]:
-    """Numeric limits and lengths in words."""
+    """Yields limits of numbers and lengths in words."""
     low = next((limit for limit in metadata if isinstance(limit, Ge | Gt)), None)
     high = next((limit for limit in metadata if isinstance(limit, Le | Lt)), None)
     if isinstance(low, Ge) and isinstance(high, Le):
@@ -177,8 +177,8 @@ def _limits(metadata: Sequence[Any]) -> Iterator[str]:
             yield f"at least {limit.min_length} {'entry' if limit.min_length == 1 else 'entries'}"
 
 
-def _each(*allowed: str) -> str:
-    """What the parts of a list or a table allow: once if it is the same for all."""
+def _limits_of_parts(*allowed: str) -> str:
+    """Returns the allowed values of the parts of a list or a table in words: only once if they are equal for all parts."""
     if len(set(allowed)) == 1:
         return f"each {allowed[0].removeprefix('each ')}" if allowed[0] else ""
     return "; ".join(allowed)
@@ -199,21 +199,21 @@ def _annotation_at(model: type[FrozenModel], path: Sequence[str | int]) -> tuple
     annotation: Any = model
     metadata: Sequence[Any] = ()
     for part in path:
-        table = _model_in(annotation)
+        table = _table_model(annotation)
         if table and part in table.model_fields:
             field = table.model_fields[str(part)]
-            annotation, metadata = _flat(field.annotation, field.metadata)
+            annotation, metadata = _unwrapped(field.annotation, field.metadata)
             continue
         args = [arg for arg in get_args(_without_none(annotation)) if arg is not ...]
         if not args:
             break
         index = part if isinstance(part, int) and len(args) > part else -1
-        annotation, metadata = _flat(args[index], ())
+        annotation, metadata = _unwrapped(args[index], ())
     return annotation, metadata
 
 
-def _flat(annotation: Any, metadata: Sequence[Any]) -> tuple[Any, Sequence[Any]]:  # noqa: ANN401
-    """A type without Annotated and None, and all metadata of it, as pydantic reads it."""
+def _unwrapped(annotation: Any, metadata: Sequence[Any]) -> tuple[Any, Sequence[Any]]:  # noqa: ANN401
+    """Returns a type without Annotated and None, and all its metadata in one list."""
     annotation = _without_none(annotation)
     while get_origin(annotation) is Annotated:
         annotation, *more = get_args(annotation)
@@ -232,7 +232,7 @@ def _without_none(annotation: Any) -> Any:  # noqa: ANN401
     return annotation
 
 
-def _model_in(annotation: Any) -> type[FrozenModel] | None:  # noqa: ANN401
-    annotation, _ = _flat(annotation, ())
+def _table_model(annotation: Any) -> type[FrozenModel] | None:  # noqa: ANN401
+    annotation, _ = _unwrapped(annotation, ())
     is_model = isinstance(annotation, type) and issubclass(annotation, FrozenModel)
     return annotation if is_model else None

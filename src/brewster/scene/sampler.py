@@ -16,8 +16,8 @@ from brewster import __version__
 from brewster.errors import RecipeError
 from brewster.scene.camera import Camera, axes, dot
 from brewster.scene.glass import Glazing, Pane, Point
-from brewster.scene.recipe import CameraRecipe, DevelopmentRecipe, GlassRecipe, SceneRecipe, SideRecipe
-from brewster.scene.scene import Development, Scene
+from brewster.scene.recipe import CameraRecipe, CameraResponseRecipe, GlassRecipe, SceneRecipe, SideRecipe
+from brewster.scene.scene import CameraResponse, Scene
 from brewster.scene.values import FrozenModel
 from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
 
@@ -26,7 +26,7 @@ _MAX_FOCUS_MM: Final = 1e6
 
 
 class Asset(FrozenModel):
-    """A map or a picture: its source, its size in px, and a category such as indoor, outdoor or night."""
+    """A map or a picture in a catalog: source, size in px, and a category such as indoor, outdoor or night."""
 
     source: AssetSource
     width: int
@@ -35,14 +35,14 @@ class Asset(FrozenModel):
 
 
 class Catalog(FrozenModel):
-    """The environment maps and pictures to draw from."""
+    """The environment maps and pictures that scenes are drawn from."""
 
     maps: tuple[Asset, ...] = ()
     pictures: tuple[Asset, ...] = ()
 
 
 def draw(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) -> Scene:
-    """The scene of this index. An impossible one (such as a view that grazes the glass) is drawn again.
+    """Draws the scene with this index. An impossible scene, such as a view at a grazing angle, is drawn again.
 
     Raises:
         RecipeError: the catalog has no suitable maps or pictures, or no scene was possible in 100 attempts.
@@ -62,12 +62,12 @@ def draw(recipe: SceneRecipe, catalog: Catalog, seed: int, index: int) -> Scene:
 
 
 def _six_digits(number: float) -> float:
-    """The number rounded to six digits, so that scene files stay readable."""
+    """Rounds to six significant digits, so that scene files are readable."""
     return float(f"{number:.6g}")
 
 
 class _SceneRng(Random):
-    """Random numbers from the value types of a recipe."""
+    """A random number generator with a method for each type of distribution in recipes."""
 
     def from_range(self, bounds: tuple[float, float]) -> float:
         return _six_digits(self.uniform(*bounds))
@@ -81,7 +81,7 @@ class _SceneRng(Random):
 
 @dataclass(frozen=True)
 class _PartialScene:
-    """The parts of a scene that are drawn before its two sides."""
+    """The glass and the camera of a scene, which are drawn before its two sides."""
 
     rng: _SceneRng
     catalog: Catalog
@@ -94,9 +94,9 @@ def _draw_once(recipe: SceneRecipe, catalog: Catalog, rng: _SceneRng, seed: int,
     behind_map = _choose_map(recipe.behind, recipe.camera, catalog, rng)
     front_map = _choose_map(recipe.front, recipe.camera, catalog, rng)
     camera = _draw_camera(recipe, [(recipe.behind, behind_map), (recipe.front, front_map)], rng)
-    draft = _PartialScene(rng, catalog, glass, camera)
-    behind = _draw_side(recipe.behind, behind_map, draft, glass.depth_mm)
-    front = _draw_side(recipe.front, front_map, draft, _camera_in_glass_frame(camera, glass)[2])
+    partial = _PartialScene(rng, catalog, glass, camera)
+    behind = _draw_side(recipe.behind, behind_map, partial, glass.depth_mm)
+    front = _draw_side(recipe.front, front_map, partial, _camera_in_glass_frame(camera, glass)[2])
     return Scene(
         recipe=recipe.name,
         seed=seed,
@@ -105,10 +105,10 @@ def _draw_once(recipe: SceneRecipe, catalog: Catalog, rng: _SceneRng, seed: int,
         orders=recipe.orders,
         samples=recipe.rough_samples if glass.is_rough else recipe.samples,
         glass=glass,
-        camera=_focus_camera(recipe.camera, draft, behind, front),
+        camera=_focus_camera(recipe.camera, partial, behind, front),
         behind=behind,
         front=front,
-        development=_draw_development(recipe.development, rng),
+        camera_response=_draw_camera_response(recipe.camera_response, rng),
     )
 
 
@@ -123,7 +123,9 @@ def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
 
     def pane() -> Pane:
         return Pane(
-            thickness_mm=rng.from_log_range(recipe.structural_mm if structural else recipe.thickness_mm),
+            thickness_mm=rng.from_log_range(
+                recipe.structural_thickness_mm if structural else recipe.thickness_mm
+            ),
             index=index,
             absorption_per_m=(red, green, blue),
             roughness=rough,
@@ -138,88 +140,90 @@ def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
 
 
 def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng: _SceneRng) -> Asset | None:
-    """A map with enough resolution for the widest view of the recipe; None for a side with a picture only."""
-    wanted = [asset for asset in catalog.maps if not recipe.maps or asset.category in ("", *recipe.maps)]
-    sharp = [asset for asset in wanted if _min_fov_deg(asset, recipe, camera) <= camera.fov_deg[1]]
-    if not rng.bernoulli(recipe.map_probability) or (not sharp and recipe.picture_probability > 0):
+    """Draws a map with sufficient resolution for the widest view of the recipe. Returns None for a side without a map."""
+    candidates = [asset for asset in catalog.maps if not recipe.maps or asset.category in ("", *recipe.maps)]
+    sufficient = [asset for asset in candidates if _min_fov_deg(asset, recipe, camera) <= camera.fov_deg[1]]
+    if not rng.bernoulli(recipe.map_probability) or (not sufficient and recipe.picture_probability > 0):
         return None
-    if not sharp:
+    if not sufficient:
         raise RecipeError(
-            f"none of {len(catalog.maps)} maps fits the recipe",
-            f"expected categories {', '.join(recipe.maps) or 'any'}, and texels finer than {recipe.most_px_per_texel:g} px"
-            f" at {camera.fov_deg[1]:g} degrees",
-            "give other --maps or larger ones, or a smaller --size",
+            f"none of {len(catalog.maps)} maps is suitable for the recipe",
+            f"expected categories {', '.join(recipe.maps) or 'any'}, and texels of at most {recipe.max_px_per_texel:g} px"
+            f" for a field of view of {camera.fov_deg[1]:g} degrees",
+            "choose other or larger --maps, or a smaller --size",
         )
-    return rng.choice(sharp)
+    return rng.choice(sufficient)
 
 
 def _min_fov_deg(asset: Asset, recipe: SideRecipe, camera: CameraRecipe) -> float:
-    """The smallest field of view in degrees in which a texel of the map does not cover too many pixels."""
-    return camera.width * 360 / asset.width / recipe.most_px_per_texel
+    """Smallest horizontal field of view in degrees for which a texel of the map covers at most `max_px_per_texel`."""
+    return camera.width * 360 / asset.width / recipe.max_px_per_texel
 
 
 def _draw_camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]], rng: _SceneRng) -> Camera:
-    """A camera whose axis meets the glass near its middle. Its focus is set later."""
-    wanted = recipe.camera
+    """Draws a camera whose axis meets the glass near its centre. Its focus is set in `_focus_camera`."""
+    ranges = recipe.camera
     min_fov_deg = max(
-        [wanted.fov_deg[0], *(_min_fov_deg(asset, side, wanted) for side, asset in maps if asset)]
+        [ranges.fov_deg[0], *(_min_fov_deg(asset, side, ranges) for side, asset in maps if asset)]
     )
-    heading, pitch = rng.from_range(wanted.incidence_deg), rng.from_range(wanted.pitch_deg)
+    heading, pitch = rng.from_range(ranges.incidence_deg), rng.from_range(ranges.pitch_deg)
     _, _, back = axes(heading, pitch)
-    distance_mm = rng.from_log_range(wanted.distance_mm_log) / max(back[2], 0.1)
+    distance_mm = rng.from_log_range(ranges.distance_mm_log) / max(back[2], 0.1)
     x, y, z = (_six_digits(distance_mm * part) for part in back)
     return Camera(
         position_mm=(x, y, z),
         heading_deg=heading,
         pitch_deg=pitch,
-        fov_deg=rng.from_range((min_fov_deg, wanted.fov_deg[1])),
-        width=wanted.width,
-        height=wanted.height,
+        fov_deg=rng.from_range((min_fov_deg, ranges.fov_deg[1])),
+        width=ranges.width,
+        height=ranges.height,
     )
 
 
-def _draw_side(recipe: SideRecipe, asset: Asset | None, draft: _PartialScene, nearest_mm: float) -> Side:
-    """A map, a picture, or both; the picture stands further from the glass than `nearest_mm`."""
-    rng = draft.rng
+def _draw_side(recipe: SideRecipe, asset: Asset | None, partial: _PartialScene, base_mm: float) -> Side:
+    """Draws a map, a picture, or both. The distance of the picture from the glass is `base_mm` plus the distance drawn."""
+    rng = partial.rng
     luminance = rng.from_log_range(recipe.luminance_log)
-    world = plane = None
+    environment_map = plane = None
     if asset:
         is_dome = rng.bernoulli(recipe.dome_probability)
-        world = EnvironmentMap(
+        environment_map = EnvironmentMap(
             source=asset.source,
             heading_deg=rng.from_range((0, 360)),
             luminance=luminance,
             radius_mm=rng.from_log_range(recipe.radius_mm_log) if is_dome else math.inf,
         )
     if rng.bernoulli(recipe.picture_probability) or not asset:
-        plane = _draw_plane(recipe, draft, luminance, nearest_mm + rng.from_log_range(recipe.distance_mm_log))
-    return Side(map=world, plane=plane)
+        plane = _draw_plane(recipe, partial, luminance, base_mm + rng.from_log_range(recipe.distance_mm_log))
+    return Side(map=environment_map, plane=plane)
 
 
-def _draw_plane(recipe: SideRecipe, draft: _PartialScene, luminance: float, distance_mm: float) -> Plane:
-    """A picture whose width is `fill` times what covers the view, seen directly or mirrored."""
-    if not draft.catalog.pictures:
+def _draw_plane(recipe: SideRecipe, partial: _PartialScene, luminance: float, distance_mm: float) -> Plane:
+    """Draws a picture. Its width is `relative_width` times the width that covers the view, which is direct or mirrored."""
+    if not partial.catalog.pictures:
         raise RecipeError(
-            "there are no pictures to draw from", "the recipe needs pictures", "name a folder with --photos"
+            "there are no pictures to draw from",
+            "expected pictures, because the recipe uses them",
+            "choose a folder with --photos",
         )
-    rng, asset = draft.rng, draft.rng.choice(draft.catalog.pictures)
-    (left, right), (bottom, top) = _visible_extent(draft.camera, draft.glass, distance_mm)
+    rng, asset = partial.rng, partial.rng.choice(partial.catalog.pictures)
+    (left, right), (bottom, top) = _visible_extent(partial.camera, partial.glass, distance_mm)
     cover = max(right - left, (top - bottom) * asset.width / asset.height)
     return Plane(
         source=asset.source,
         distance_mm=_six_digits(distance_mm),
         offset_mm=(_six_digits((left + right) / 2), _six_digits((bottom + top) / 2)),
-        width_mm=_six_digits(cover * rng.from_range(recipe.fill)),
+        width_mm=_six_digits(cover * rng.from_range(recipe.relative_width)),
         heading_deg=rng.from_range(recipe.turn_deg),
         pitch_deg=rng.from_range(recipe.turn_deg) / 2,
         luminance=luminance,
-        highlights=rng.from_range(recipe.highlights),
+        highlight_boost=rng.from_range(recipe.highlight_boost),
     )
 
 
 def _camera_in_glass_frame(camera: Camera, glass: Glazing) -> Point:
-    (x, y, z), (at_x, at_y, at_z) = camera.position_mm, glass.position_mm
-    return _to_glass_frame((x - at_x, y - at_y, z - at_z), glass)
+    (x, y, z), (glass_x, glass_y, glass_z) = camera.position_mm, glass.position_mm
+    return _to_glass_frame((x - glass_x, y - glass_y, z - glass_z), glass)
 
 
 def _to_glass_frame(vector: Point, glass: Glazing) -> Point:
@@ -230,40 +234,40 @@ def _to_glass_frame(vector: Point, glass: Glazing) -> Point:
 def _visible_extent(
     camera: Camera, glass: Glazing, distance_mm: float
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The ranges of x and y, in mm, that the view covers on a plane at this distance behind the glass.
+    """Returns the ranges of x and y in mm that the view covers on a plane at this distance behind the glass.
 
     A mirrored plane at the same distance in front of the glass covers the same ranges.
     """
     x, y, z = _camera_in_glass_frame(camera, glass)
-    places = []
+    points = []
     for corner in camera.corners():
-        across, upward, towards = _to_glass_frame(corner, glass)
-        length = (z + distance_mm) / max(-towards, 1e-3)
-        places.append((x + length * across, y + length * upward))
-    xs, ys = zip(*places, strict=True)
+        x_rate, y_rate, z_rate = _to_glass_frame(corner, glass)
+        length = (z + distance_mm) / max(-z_rate, 1e-3)
+        points.append((x + length * x_rate, y + length * y_rate))
+    xs, ys = zip(*points, strict=True)
     return (min(xs), max(xs)), (min(ys), max(ys))
 
 
-def _focus_camera(recipe: CameraRecipe, draft: _PartialScene, behind: Side, front: Side) -> Camera:
-    """The camera with its lens focused on the content of one side."""
-    rng, camera = draft.rng, draft.camera
-    on = front if rng.bernoulli(recipe.focus_on_front_probability) else behind
+def _focus_camera(recipe: CameraRecipe, partial: _PartialScene, behind: Side, front: Side) -> Camera:
+    """Returns the camera, focused on the content of one side."""
+    rng, camera = partial.rng, partial.camera
+    focused_side = front if rng.bernoulli(recipe.focus_on_front_probability) else behind
     is_pinhole, aperture = (
         rng.bernoulli(recipe.pinhole_probability),
         rng.from_log_range(recipe.aperture_mm_log),
     )
-    distance_mm = _camera_in_glass_frame(camera, draft.glass)[2] + on.distance_mm
-    slant = _to_glass_frame(axes(camera.heading_deg, camera.pitch_deg)[2], draft.glass)[2]
+    distance_mm = _camera_in_glass_frame(camera, partial.glass)[2] + focused_side.distance_mm
+    cosine = _to_glass_frame(axes(camera.heading_deg, camera.pitch_deg)[2], partial.glass)[2]
     return camera.model_copy(
         update={
-            "focus_mm": _six_digits(min(distance_mm / max(slant, 0.1), _MAX_FOCUS_MM)),
+            "focus_mm": _six_digits(min(distance_mm / max(cosine, 0.1), _MAX_FOCUS_MM)),
             "aperture_mm": 0.0 if is_pinhole else aperture,
         }
     )
 
 
-def _draw_development(recipe: DevelopmentRecipe, rng: _SceneRng) -> Development:
-    return Development(
+def _draw_camera_response(recipe: CameraResponseRecipe, rng: _SceneRng) -> CameraResponse:
+    return CameraResponse(
         exposure=rng.from_log_range(recipe.exposure),
         white_balance=rng.choice(recipe.white_balance),
         white_balance_strength=rng.from_range(recipe.white_balance_strength),

@@ -19,24 +19,24 @@ from brewster.scene.values import FrozenModel, NonNegativeFloat, PositiveInt, Se
 from brewster.scene.world import Side
 
 MAX_INCIDENCE_DEG = 85.0
-"""The largest angle of incidence in a view; steeper ones are refused."""
+"""The largest angle of incidence of the four corners of the view on flat glass. Scenes above it are refused."""
 
 WhiteBalance = Literal["none", "grey-world", "white-patch", "grey-edge"]
 
 
-class Development(FrozenModel):
-    """The camera response, from linear light to a photograph. It is computed for I and applied to all layers."""
+class CameraResponse(FrozenModel):
+    """The camera response: from linear light to a photograph. Exposure and gains are computed on I and applied to all layers."""
 
     exposure: Annotated[float, Field(gt=0, le=1)] = 0.4
-    """The mean luminance of I after exposure, where clipped values count as 1."""
+    """Mean luminance of I after exposure and clipping to 0..1."""
     white_balance: WhiteBalance = "none"
     white_balance_strength: Share = 1.0
     contrast: Annotated[float, Field(ge=-0.5, le=0.9)] = 0.0
-    """Strength of an S-shaped tone curve on encoded values: 0 is the sRGB curve."""
+    """Weight of an S-shaped tone curve on encoded values: 0 is the sRGB curve."""
     shot_noise: NonNegativeFloat = 0.0
-    """Standard deviation at white of noise that grows with the square root of the light, in I only."""
+    """Standard deviation at white of the noise that is added to I only. It is proportional to the square root of the light."""
     read_noise: NonNegativeFloat = 0.0
-    """Standard deviation of noise that does not depend on the light, in I only."""
+    """Standard deviation of the noise that is added to I only and does not depend on the light."""
     jpeg_quality: Annotated[int, Field(ge=1, le=100)] = 95
     """JPEG quality of I. The ground truth is written with quality 95."""
 
@@ -44,8 +44,8 @@ class Development(FrozenModel):
 class Scene(FrozenModel):
     """Everything that a sample depends on: the same scene and version give the same bytes.
 
-    orders "all": T and R are the full sums, so that I = T + R. "paper": T is the path without any reflection,
-    R is what never enters the last pane (for one pane, the first surface alone).
+    `orders` "all": T and R contain all light paths, so that I = T + R. "paper": T contains only the path without a
+    reflection, and R only the paths that do not enter the last pane (for one pane: the reflection at its first surface).
     """
 
     recipe: str = ""
@@ -55,19 +55,19 @@ class Scene(FrozenModel):
     """The version of brewster that drew the scene."""
     orders: Literal["all", "paper"] = "all"
     samples: PositiveInt = 16
-    """Rays per pixel where random sampling is needed (lens, rough glass), and at most that many elsewhere."""
+    """Rays per pixel of scenes with rough or wedged glass, or with a lens and near content; the maximum for others."""
     glass: Glazing = Glazing()
     camera: Camera = Camera()
     behind: Side = Side()
     front: Side = Side()
-    development: Development = Development()
+    camera_response: CameraResponse = CameraResponse()
 
     @model_validator(mode="after")
     def _check_geometry(self) -> Scene:
         _, _, normal = axes(self.glass.heading_deg, self.glass.pitch_deg)
         offset = self.camera_above_glass_mm
         if offset <= 0:
-            raise ValueError(f"the camera is {-offset:g} mm behind the glass; move it in front of the glass")
+            raise ValueError(f"expected the camera in front of the glass, but it is {-offset:g} mm behind it")
         if self.glass.is_flat:
             self._check_incidence(normal)
         self._check_focus(normal, offset)
@@ -86,8 +86,8 @@ class Scene(FrozenModel):
             cosine = -dot(corner, normal) / math.sqrt(dot(corner, corner))
             if cosine <= math.cos(math.radians(MAX_INCIDENCE_DEG)):
                 raise ValueError(
-                    f"a corner of the view meets the glass at more than {MAX_INCIDENCE_DEG:g} degrees;"
-                    " turn the camera to the glass or narrow fov_deg"
+                    f"expected angles of incidence up to {MAX_INCIDENCE_DEG:g} degrees, but a corner of the view exceeds them:"
+                    " turn the camera to the glass, or reduce fov_deg"
                 )
 
     def _check_focus(self, normal: tuple[float, float, float], offset: float) -> None:
@@ -95,36 +95,36 @@ class Scene(FrozenModel):
         depth = self.camera.focus_mm * dot(back, normal) - offset
         if self.camera.aperture_mm > 0 and 0 <= depth <= self.glass.depth_mm:
             raise ValueError(
-                f"the focus is {depth:g} mm inside the glass; choose focus_mm in front of or behind it"
+                f"expected a focus_mm in front of the glass or behind it, but the focus is {depth:g} mm inside the glass"
             )
 
     def _check_distances(self) -> None:
-        """Glass and camera must be inside a dome, and a plane, rotated or not, must not touch the glass."""
-        reach = math.dist(self.camera.position_mm, self.glass.position_mm)
+        """Checks that glass and camera are inside every dome, and that no plane touches the glass."""
+        camera_distance_mm = math.dist(self.camera.position_mm, self.glass.position_mm)
         for side, surface_mm in ((self.behind, self.glass.depth_mm), (self.front, 0.0)):
-            if side.map and side.map.radius_mm <= max(reach, self.glass.depth_mm):
+            if side.map and side.map.radius_mm <= max(camera_distance_mm, self.glass.depth_mm):
                 raise ValueError(
-                    f"the camera is outside the dome of {side.map.radius_mm:g} mm; raise radius_mm"
+                    f"expected the camera and the glass inside the dome, but its radius_mm is {side.map.radius_mm:g}: raise it"
                 )
             if side.plane and side.plane.nearest_mm <= surface_mm:
                 raise ValueError(
-                    f"a plane at {side.plane.distance_mm:g} mm touches the glass; raise distance_mm"
+                    f"expected a plane that does not touch the glass, but its distance_mm is {side.plane.distance_mm:g}: raise it"
                 )
 
     def to_toml(self, **extra_tables: dict[str, Any]) -> str:
-        """The scene as TOML, followed by extra tables. Reading it gives an equal scene."""
+        """The scene as TOML, followed by extra tables. `read_scene` returns an equal scene from it."""
         import tomli_w  # noqa: PLC0415  (not needed to read a scene)
 
         return tomli_w.dumps({**self.model_dump(mode="json", exclude_none=True), **extra_tables})
 
 
 def read_scene(path: Path) -> Scene:
-    """Reads a scene file or the `scene.toml` of a sample, whose table `outcome` is ignored.
+    """Reads a scene file or the `scene.toml` of a sample. Its table `outcome` is ignored.
 
     Raises:
-        RecipeError: the file is missing or not TOML, or the scene is not possible.
+        RecipeError: the file is missing or not TOML, or its values are unknown or not possible.
     """
-    return read_toml(_SceneFile, path, compare="brewster render --help").scene()
+    return read_toml(_SceneFile, path, reference="brewster render --help").scene()
 
 
 class _SceneFile(Scene):

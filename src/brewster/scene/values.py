@@ -1,4 +1,4 @@
-"""The base class of every recipe and scene, and the value types that they share."""
+"""The base class of all recipes and scenes, and their common value types."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 
 class FrozenModel(BaseModel):
-    """An immutable model. Unknown keys, NaN and infinity are refused.
+    """An immutable pydantic model that refuses unknown keys, NaN and infinity.
 
-    The docstring below an attribute becomes the description of its key: in docs/recipes.md, in `--show-recipe`.
+    The docstring below an attribute is the description of its key in docs/recipes.md and in `--show-recipe`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
@@ -19,21 +19,21 @@ class FrozenModel(BaseModel):
 
 @dataclass(frozen=True)
 class KeyNote:
-    """Metadata of a key for its description, where the type and the constraints do not say it."""
+    """Additions to the description of a key, for facts that its type and constraints do not contain."""
 
     kind: str = ""
-    """The type in words, instead of the one derived from the annotation."""
+    """The type in words. It replaces the words for the annotation."""
     allowed: str = ""
-    """The allowed values in words, after those derived from the constraints."""
+    """The allowed values in words. They follow the words for the constraints."""
     unit: str = ""
-    """The unit, where the name of the key has no suffix such as `_mm`."""
-    instead: bool = False
-    """Whether `allowed` replaces the words derived from the constraints."""
+    """The unit, for keys whose name has no suffix such as `_mm`."""
+    replaces_constraints: bool = False
+    """Whether `allowed` replaces the words for the constraints."""
 
 
 def _ascending(bounds: tuple[float, float]) -> tuple[float, float]:
     if bounds[0] > bounds[1]:
-        raise ValueError(f"expected low <= high, and low is {bounds[0]:g}, high is {bounds[1]:g}")
+        raise ValueError(f"expected low <= high, but low is {bounds[0]:g} and high is {bounds[1]:g}")
     return bounds
 
 

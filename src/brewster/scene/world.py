@@ -1,4 +1,4 @@
-"""The content on the two sides of the glass: an environment map, a picture on a plane, or a picture in front of a map."""
+"""The content on each side of the glass: an environment map, a picture on a plane, or a picture in front of a map."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from pydantic import Field, PlainSerializer, model_validator
 from brewster.scene.values import FrozenModel, NonNegativeFloat, PositiveFloat
 
 BUILTIN = "builtin:"
-"""The prefix of sources that are computed instead of read: `builtin:street:7` is the street with seed 7."""
+"""Prefix of sources that are computed instead of read from a file: `builtin:street:7` is the street with seed 7."""
 
 Radius = Annotated[float, Field(gt=0, allow_inf_nan=True), PlainSerializer(float)]
 
 
 class AssetSource(FrozenModel):
-    """The name of a file in an assets folder and the sha256 of its bytes, or a builtin environment, without sha256."""
+    """The name of a file in an assets folder and the sha256 of its bytes, or a built-in source without sha256."""
 
     file: str
     sha256: str = ""
@@ -27,41 +27,41 @@ class EnvironmentMap(FrozenModel):
 
     source: AssetSource
     heading_deg: float = 0.0
-    """The direction of the left edge of the map."""
+    """Heading of the left edge of the map."""
     luminance: NonNegativeFloat = 1.0
-    """Its mean luminance over the sphere, without lamps, in the arbitrary unit of the scene."""
+    """Mean luminance over the sphere, in the arbitrary unit of the scene. Lamps hardly count (see `Assets.map_light`)."""
     radius_mm: Radius = math.inf
 
 
 class Plane(FrozenModel):
     """A picture on an upright plane. Its height follows from the aspect ratio of the picture.
 
-    A plane in front of the glass is visible in the reflection only. Between the glass and the camera it should be
-    outside the view, because the analytic renderer does not show it directly.
+    A plane in front of the glass is visible in the reflection only. If it is between the glass and the camera, choose a
+    position outside the direct view: the analytic renderer does not show it there.
     """
 
     source: AssetSource
     distance_mm: PositiveFloat
-    """Distance from the position of the glazing, along its normal."""
+    """Distance from the position of the glazing along the normal of the glass."""
     offset_mm: tuple[float, float] = (0.0, 0.0)
-    """Offset of its centre to the right and up, as seen by a camera that looks through the glass."""
+    """Offset of the centre to the right and up, as seen by a camera that looks through the glass."""
     width_mm: PositiveFloat
     heading_deg: Annotated[float, Field(gt=-80, lt=80)] = 0.0
     pitch_deg: Annotated[float, Field(gt=-80, lt=80)] = 0.0
     luminance: NonNegativeFloat = 1.0
-    """Its mean luminance, before `highlights` is applied."""
-    highlights: NonNegativeFloat = 0.0
-    """Extra brightness of clipped whites: white is (1 + highlights) times as bright."""
+    """Mean luminance of the picture before `highlight_boost` is applied."""
+    highlight_boost: NonNegativeFloat = 0.0
+    """Extra brightness of clipped whites: the light of white is multiplied by 1 + highlight_boost."""
 
     @property
     def nearest_mm(self) -> float:
-        """The smallest distance of the rotated plane from the glass, if the plane is square."""
-        turned = sum(abs(math.sin(math.radians(angle))) for angle in (self.heading_deg, self.pitch_deg))
-        return self.distance_mm - turned * self.width_mm / 2
+        """Lower bound of the distance between the glass and the rotated plane, which is assumed to be square."""
+        sines = sum(abs(math.sin(math.radians(angle))) for angle in (self.heading_deg, self.pitch_deg))
+        return self.distance_mm - sines * self.width_mm / 2
 
 
 class Side(FrozenModel):
-    """The content on one side of the glass. Without map and plane, the side is black."""
+    """The content on one side of the glass. The side is black if it has neither a map nor a plane."""
 
     map: EnvironmentMap | None = None
     plane: Plane | None = None
@@ -69,7 +69,9 @@ class Side(FrozenModel):
     @model_validator(mode="after")
     def _check_distance(self) -> Side:
         if self.map and self.plane and self.plane.distance_mm >= self.map.radius_mm:
-            raise ValueError("the plane is outside the dome of the map; distance_mm must be below radius_mm")
+            raise ValueError(
+                "expected the plane inside the dome of the map: distance_mm must be below radius_mm"
+            )
         return self
 
     @property

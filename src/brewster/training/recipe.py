@@ -1,6 +1,6 @@
-"""Training recipes: the settings of one training run. TOML in, frozen values out.
+"""Training recipes: the settings of one training run, read from TOML into frozen models.
 
-Paths of data in a recipe are relative to the folder that the environment variable BREWSTER_DATA names.
+Data paths in a recipe are relative to the folder in the environment variable BREWSTER_DATA.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from brewster.scene.values import (
 from brewster.training.data.data_recipe import DataRecipe
 from brewster.training.data.mixtures import MixRecipe
 
-_COMPARE: Final = "docs/recipes.md"
+_REFERENCE: Final = "docs/recipes.md"
 
 _TEMPLATE_FOLDER: Final = Path(__file__).parent / "recipes"
 TEMPLATES: Final = tuple(sorted(path.stem for path in _TEMPLATE_FOLDER.glob("*.toml")))
-"""The names of the packaged recipes to start from: one for the compact network, one for a LoRA."""
+"""The names of the packaged recipes, starting points for new recipes: one for the compact network, one for a LoRA."""
 
 ENCODED_SUFFIX: Final = ".safetensors"
 """The file name suffix of an encoded prompt."""
@@ -48,13 +48,13 @@ ENCODED_SUFFIX: Final = ".safetensors"
 def _ascending_from_0(sizes: list[tuple[float, int]]) -> list[tuple[float, int]]:
     starts, sides = zip(*sizes, strict=True)
     if starts[0] != 0 or list(starts) != sorted(set(starts)) or list(sides) != sorted(sides):
-        raise ValueError("expected shares that start at 0 and increase, and sides that never decrease")
+        raise ValueError("expected shares that start at 0 and increase, and sides that do not decrease")
     return sizes
 
 
 def _known_network(name: str) -> str:
     if name not in NETWORKS:
-        raise ValueError(f"there is no network {name!r}: one of {', '.join(NETWORKS)}")
+        raise ValueError(f"expected one of the networks: {', '.join(NETWORKS)}")
     return name
 
 
@@ -67,7 +67,7 @@ Sizes = Annotated[
         "list of [share, side]",
         f"shares from 0 to 1, the first 0, increasing; sides multiples of {MAX_STRIDE}, never decreasing",
         "px",
-        instead=True,
+        replaces_constraints=True,
     ),
 ]
 
@@ -79,18 +79,18 @@ class TrainingRecipe(FrozenModel):
     """Seed of all random numbers. The same recipe and data give the same weights."""
     steps: PositiveInt
     """Number of training steps."""
-    batch: PositiveInt
-    """Samples per training step."""
+    batch_size: PositiveInt
+    """Number of samples per training step."""
     learning_rate: PositiveFloat
     """Peak learning rate of AdamW."""
     warmup_steps: PositiveInt
-    """Steps over which the learning rate rises linearly from 0 to its peak."""
+    """Number of steps in which the learning rate rises linearly from 0 to its peak."""
     weight_decay: NonNegativeFloat
     """Weight decay of AdamW."""
     report_every: PositiveInt
-    """Steps between two reports: log line, validation, example images."""
+    """Number of steps between two reports: log line, validation, example images."""
     checkpoint_every: PositiveInt
-    """Steps between two checkpoints, from which a stopped run resumes."""
+    """Number of steps between two checkpoints. A stopped run resumes from the last one."""
     data: DataRecipe
 
 
@@ -100,25 +100,26 @@ class CompactRecipe(TrainingRecipe):
     network: Annotated[
         str, AfterValidator(_known_network), KeyNote(allowed=f"one of {', '.join(NETWORKS)}")
     ] = DEFAULT_NETWORK
-    """The network, a name in the table of `brewster.models.networks`."""
+    """Name of the network in the table `NETWORKS` of `brewster.models.networks`."""
     sizes: Sizes
-    """Side of the training images from each share of the run on. Small images first make training faster."""
+    """Side of the training images. Each entry is valid from the given share of the steps: `[0.5, 160]` sets sides of 160 px
+    from half of the steps. Smaller images at the beginning make training faster."""
     encoder_learning_rate: PositiveFloat
     """Peak learning rate of the pretrained encoder."""
     average_decay: Share
-    """Decay per step of the exponential moving average (EMA) of the weights, which is exported."""
+    """Decay per step of the exponential moving average (EMA) of the weights. The exported model has the averaged weights."""
     decay_share: Share = 1.0
-    """Last share of the run, over which the learning rate falls to zero along a cosine. Before, it is constant."""
+    """Share of the steps, at the end, in which the learning rate falls to zero along a cosine. Before, it is constant."""
     precision: Literal["float32", "auto"] = "float32"
-    """auto: bfloat16 where the processor supports it. Depthwise convolutions and the head stay in float32."""
+    """auto: bfloat16 if the processor supports it natively, except for depthwise convolutions and the head."""
     start_from: tuple[Path, ...] = ()
-    """Checkpoints, relative to this recipe. The run starts from the mean of their averaged weights."""
+    """Checkpoint files, relative to this recipe. The run starts from the mean of their averaged weights."""
     mix: MixRecipe = MixRecipe()
 
     @model_validator(mode="after")
     def _check_shares(self) -> Self:
-        real = _share_of(self.batch, "pairs_share", self.data.pairs_share)
-        _share_of(self.batch - real, "rendered.share", self.data.rendered_share)
+        real = _share_of(self.batch_size, "pairs_share", self.data.pairs_share)
+        _share_of(self.batch_size - real, "rendered.share", self.data.rendered_share)
         return self
 
     def size_at(self, step: int) -> int:
@@ -127,47 +128,50 @@ class CompactRecipe(TrainingRecipe):
 
 
 class LoraRecipe(TrainingRecipe):
-    """A training run of a LoRA on a large backbone. Defaults are the paper's, or common values where it gives none.
+    """A training run of a LoRA on a large backbone. Defaults are those of the paper, or common values if it states none.
 
-    Each sample of a batch is a real pair with probability `data.pairs_share`, else a rendered one, uncropped and in
-    its own aspect ratio. Mixtures and scenes rendered during training are square, and are not supported.
+    Each sample of a batch is a real pair with probability `data.pairs_share`, else a sample of a rendered set.
+    Samples keep their aspect ratio, and are cropped only if `crops` is above 0. Mixtures and scenes that are rendered during training are not supported.
     """
 
     backbone: str
-    """A name in the table of backbones, a hub id, a folder, or "tiny:NAME" for a toy version with random weights."""
+    """A name in the table of backbones, an id on the Hugging Face hub, a folder, or "tiny:NAME" for a toy version with random
+    weights."""
     rank: PositiveInt = 16
     """Rank of the LoRA matrices."""
     alpha: PositiveInt = 16
-    """Scale of the LoRA: its output is multiplied by alpha / rank."""
+    """Scale of the LoRA: the product of its matrices is multiplied by alpha / rank."""
     quantise: Quantisation | None = None
-    """Quantisation of the frozen backbone. Not set: none."""
+    """Quantisation of the frozen backbone. Not set: no quantisation."""
     panels: tuple[Panel, ...] = ("I", "T", "R")
     """The images that the model generates side by side: photo I, transmission T, reflection R. T is required."""
     direction: Direction = "side by side"
-    """How the panels are arranged in the composite image."""
+    """Arrangement of the panels in the composite image."""
     budget_px: PositiveInt = PAPER_PX
     """Largest number of pixels of all panels together."""
     panel_weights: Annotated[
         dict[Panel, NonNegativeFloat],
-        KeyNote("table of panel = weight", 'panels "I", "T", "R"; weights at least 0', instead=True),
+        KeyNote(
+            "table of panel = weight", 'panels "I", "T", "R"; weights at least 0', replaces_constraints=True
+        ),
     ] = Field(default_factory=dict)
     """Weight of each panel in the loss; 1 for panels that are not listed."""
     objective: Objective = "flow"
     """flow: flow matching, from noise to panels in many steps. one_step: from the photo to the panels in one step."""
     guidance: NonNegativeFloat = 1.0
-    """Guidance scale during training. 1 means none for backbones with classifier-free guidance."""
+    """Guidance scale during training. For backbones with classifier-free guidance, 1 means no guidance."""
     logit_mean: float = 0.0
     """Mean of the logit-normal distribution of training times (Esser et al. 2024), before the resolution shift."""
     logit_deviation: PositiveFloat = 1.0
     """Standard deviation of that distribution."""
     flip: bool = True
-    """Whether every sample is also used mirrored left to right."""
+    """Whether each sample is also used with left and right exchanged."""
     crops: Annotated[int, Field(ge=0)] = 0
     """Number of different crops of each sample, in addition to the uncropped sample."""
     reflections: Literal["given", "difference"] = "given"
-    """R of real pairs. given: pairs without a reflection image are refused. difference: R = photo - transmission, linear."""
+    """R of real pairs. given: from the reflection image, which every pair must have. difference: R = I - T in linear light."""
     prompt: str = "paper"
-    """A prompt by name, encoded with the text encoder of the backbone, or an encoded one: a .safetensors file,
+    """The name of a prompt, which the text encoder of the backbone encodes, or a .safetensors file with an encoded prompt,
     relative to this recipe."""
 
     @property
@@ -177,7 +181,7 @@ class LoraRecipe(TrainingRecipe):
 
     @property
     def task(self) -> DecompositionTask:
-        """The task of the trained adapter. Inference uses the paper's guidance, or in one step that of training."""
+        """The task of the trained adapter. Its guidance is that of the paper, or that of training if the objective is one_step."""
         guidance = GUIDANCE if self.objective == "flow" else self.guidance
         return DecompositionTask(self.layout, self.budget_px, self.objective, guidance)
 
@@ -186,7 +190,8 @@ class LoraRecipe(TrainingRecipe):
         rendered = self.data.rendered
         if self.data.photos or self.data.maps or (rendered and rendered.recipe):
             raise ValueError(
-                "a LoRA is trained on rendered sets and pairs only; remove photos, maps and rendered.recipe"
+                "expected rendered sets and pairs only, because a LoRA is trained on these:"
+                " remove photos, maps and rendered.recipe"
             )
         if "T" not in self.panels or len(set(self.panels)) < len(self.panels):
             raise ValueError(f"panels is {list(self.panels)}; each panel may occur once, and T is required")
@@ -194,10 +199,11 @@ class LoraRecipe(TrainingRecipe):
             raise ValueError("a toy backbone (tiny:) cannot be quantised; remove quantise")
         if self.prompt not in PROMPTS and not self.prompt.endswith(ENCODED_SUFFIX):
             raise ValueError(
-                f"prompt is {self.prompt!r}: one of {', '.join(PROMPTS)}, or a {ENCODED_SUFFIX} file"
+                f"expected one of the prompts {', '.join(PROMPTS)}, or a {ENCODED_SUFFIX} file,"
+                f" but prompt is {self.prompt!r}"
             )
         if not any(self.panel_weights.get(panel, 1) for panel in self.panels):
-            raise ValueError("panel_weights gives every panel the weight 0; at least one must be above 0")
+            raise ValueError("expected a weight above 0 for at least one panel, but all panel_weights are 0")
         return self
 
 
@@ -205,17 +211,22 @@ AnyRecipe = TypeVar("AnyRecipe", bound=TrainingRecipe)
 
 
 def _share_of(samples: int, name: str, share: float) -> int:
-    """The number of samples of a share. A share between 0 and 1 must give at least one, and leave at least one."""
+    """Returns round(samples * share).
+
+    Raises:
+        ValueError: a share between 0 and 1 gives no sample or all samples.
+    """
     part = round(samples * share)
     if samples and 0 < share < 1 and part in (0, samples):
         raise ValueError(
-            f"{name} = {share:g} gives {part} of {samples} samples; raise batch or change the share"
+            f"expected at least one sample of each source, but {name} = {share:g} gives {part} of {samples} samples:"
+            " raise batch_size, or change the share"
         )
     return part
 
 
 def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
-    """Reads and checks a recipe, and resolves its paths that are relative to the file.
+    """Reads and validates a recipe, and resolves the paths in it that are relative to the file.
 
     Returns: a LoraRecipe if the file has the key `backbone`, else a CompactRecipe.
 
@@ -236,35 +247,35 @@ def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
 
 
 def read_template(name: str) -> CompactRecipe | LoraRecipe:
-    """A packaged recipe to start from (one of TEMPLATES), or a recipe file. Paths stay as they are written.
+    """Reads a packaged recipe (a name of TEMPLATES) or a recipe file. Relative paths are not resolved.
 
     Raises:
-        RecipeError: the name is unknown, or what `read_recipe` raises.
+        RecipeError: the name is unknown, or the file is not a valid recipe (see `read_recipe`).
     """
     if name in TEMPLATES:
         return _read_unresolved(_TEMPLATE_FOLDER / f"{name}.toml")
     if not name.endswith(".toml"):
         raise RecipeError(
             f"there is no training recipe {name!r}",
-            f"the packaged recipes are {', '.join(TEMPLATES)}",
-            "name one of them, or a .toml file",
+            f"expected one of the packaged recipes {', '.join(TEMPLATES)}",
+            "choose one of them, or a .toml file",
         )
     return _read_unresolved(Path(name))
 
 
 def _read_unresolved(path: Path) -> CompactRecipe | LoraRecipe:
-    return read_toml(_recipe_class(path), path, compare=_COMPARE)
+    return read_toml(_recipe_class(path), path, reference=_REFERENCE)
 
 
 def _recipe_class(path: Path) -> type[CompactRecipe] | type[LoraRecipe]:
-    with suppress(OSError, ValueError):  # read_toml reports these errors
+    with suppress(OSError, ValueError):  # read_toml raises an error for such a file
         if "backbone" in tomllib.loads(path.read_text("utf-8")):
             return LoraRecipe
     return CompactRecipe
 
 
 def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
-    """A copy of the recipe with one value changed, checked again as a whole.
+    """Returns a copy of the recipe with one value changed. The copy is validated as a whole.
 
     Args:
         recipe: the recipe to change.
@@ -272,26 +283,26 @@ def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
         value: the new value.
 
     Raises:
-        RecipeError: the recipe has no such key, or the value is impossible there.
+        RecipeError: the recipe has no such key, or the value is not allowed for it.
     """
     if key_path not in _key_paths(recipe):
         close = similar_key(type(recipe), key_path.split("."))
         raise RecipeError(
             f"the recipe has no key {key_path}",
             "expected a key with its tables, such as data.pairs_share",
-            f"did you mean {close}?" if close else f"see {_COMPARE}",
+            f"did you mean {close}?" if close else f"see {_REFERENCE}",
         )
     values = target = recipe.model_dump(exclude_unset=True)
     *tables, last = key_path.split(".")
     for name in tables:
         target = target.setdefault(name, {})
     target[last] = value
-    owner = f"the recipe with {key_path} = {value!r}"
-    return validated(type(recipe), values, owner=owner, compare=_COMPARE)
+    source = f"the recipe with {key_path} = {value!r}"
+    return validated(type(recipe), values, source=source, reference=_REFERENCE)
 
 
 def _key_paths(values: FrozenModel, prefix: str = "") -> Iterator[str]:
-    """The paths of all keys and tables that the recipe has; those of an optional table only if it is set."""
+    """Yields the paths of all keys and tables of the recipe. Those inside an optional table are included only if it is set."""
     for name in type(values).model_fields:
         yield prefix + name
         inner = getattr(values, name)
@@ -300,7 +311,7 @@ def _key_paths(values: FrozenModel, prefix: str = "") -> Iterator[str]:
 
 
 def data_folder() -> Path:
-    """The folder that the environment variable BREWSTER_DATA names.
+    """Returns the folder in the environment variable BREWSTER_DATA.
 
     Raises:
         RecipeError: the variable is not set, or the folder does not exist.

@@ -50,7 +50,7 @@ def validation_pairs(data: DataRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]
     folders = tuple(dict.fromkeys(data.validate_on))
     root = data_folder() if folders else Path()
     return {
-        name: read_pairs([root / folder], data.validate_at_most)
+        name: read_pairs([root / folder], data.max_validation_pairs)
         for name, folder in zip(_unique_names(folders), folders, strict=True)
     }
 

@@ -53,14 +53,14 @@ def _stretch(picture: Floats, size: int, axis: int, wrap: bool) -> Floats:
     old = picture.shape[axis]
     if old == size:
         return picture
-    place = (np.arange(size, dtype=np.float32) + 0.5) * (old / size) - 0.5
-    low = np.floor(place).astype(np.int32)
-    share = (place - low).reshape([-1 if side == axis else 1 for side in range(picture.ndim)])
+    coordinates = (np.arange(size, dtype=np.float32) + 0.5) * (old / size) - 0.5
+    low = np.floor(coordinates).astype(np.int32)
+    fraction = (coordinates - low).reshape([-1 if side == axis else 1 for side in range(picture.ndim)])
     mode: Literal["wrap", "clip"] = "wrap" if wrap else "clip"
     first: Floats = picture.take(low, axis, mode=mode)
     second: Floats = picture.take(low + 1, axis, mode=mode)
     second -= first
-    second *= share
+    second *= fraction
     second += first
     return second
 
@@ -178,7 +178,7 @@ class Quad:
         self._normal = normal if normal @ corner < 0 else -normal
 
     @cached_property
-    def forms(self) -> Floats:
+    def projection(self) -> Floats:
         """The matrix (3, 3) from a direction to its coordinates (across, down, 1) divided by the distance."""
         corner, across, down = self._outline
         return np.linalg.inv(np.stack([across, down, corner], 1).astype(np.float64)).astype(np.float32)
@@ -230,55 +230,62 @@ class ProceduralEnvironment:
     glows: Sequence[Glow]
     sky: Callable[[Floats, float], Floats]
     """(unit directions (h, w, 3), angle of a texel) -> radiance (h, w, 3), where there is no surface."""
-    turn: float
+    rotation: float
     """Azimuth of the -z axis of the environment in the map, in radians."""
 
 
-def render(world: ProceduralEnvironment, height: int) -> NDArray[np.float32]:
+def render(environment: ProceduralEnvironment, height: int) -> NDArray[np.float32]:
     """The lat-long map (height, 2 height, 3) of an environment, with four rays per texel.
 
     It is rendered in strips that fit into the processor cache.
     """
-    strips = [_strip(world, height, top) for top in range(0, height, _STRIP_ROWS)]
+    strips = [_strip(environment, height, top) for top in range(0, height, _STRIP_ROWS)]
     picture: NDArray[np.float32] = np.concatenate(strips).astype(np.float32)
-    for glow in world.glows:
-        if not _is_occluded(world, glow.position):
-            _add_glow(picture, glow, world.turn)
+    for glow in environment.glows:
+        if not _is_occluded(environment, glow.position):
+            _add_glow(picture, glow, environment.rotation)
     return picture
 
 
-def _strip(world: ProceduralEnvironment, height: int, top: int) -> Floats:
+def _strip(environment: ProceduralEnvironment, height: int, top: int) -> Floats:
     rows = min(_STRIP_ROWS, height - top)
     polar = (np.arange(2 * top, 2 * (top + rows)) + 0.5) * (np.pi / (2 * height))
-    closeness = np.zeros((2 * rows, 4 * height), np.float32)
-    colours = np.zeros((*closeness.shape, 3), np.float32)
-    for quad in world.quads:
+    inverse_depth = np.zeros((2 * rows, 4 * height), np.float32)
+    colours = np.zeros((*inverse_depth.shape, 3), np.float32)
+    for quad in environment.quads:
         low, high = quad.bounds[2:]
         inside = np.flatnonzero((polar >= low) & (polar <= high))
         if inside.size:
             chosen = slice(inside[0], inside[-1] + 1)
-            for columns in _columns(quad, world.turn, 4 * height):
-                _rasterise(quad, world.turn, polar[chosen], (columns, closeness[chosen], colours[chosen]))
+            for columns in _columns(quad, environment.rotation, 4 * height):
+                _rasterise(
+                    quad,
+                    environment.rotation,
+                    polar[chosen],
+                    (columns, inverse_depth[chosen], colours[chosen]),
+                )
     blocks = colours.reshape(rows, 2, 2 * height, 2, 3)
     solid = blocks[:, 0, :, 0] + blocks[:, 0, :, 1] + blocks[:, 1, :, 0] + blocks[:, 1, :, 1]
-    free = (closeness == 0).reshape(rows, 2, 2 * height, 2).mean((1, 3), dtype=np.float32)[..., None]
+    free = (inverse_depth == 0).reshape(rows, 2, 2 * height, 2).mean((1, 3), dtype=np.float32)[..., None]
     radiance: Floats = solid * 0.25
     if free.any():
-        radiance = radiance + free * world.sky(directions(height, world.turn, top, rows), np.pi / height)
+        radiance = radiance + free * environment.sky(
+            directions(height, environment.rotation, top, rows), np.pi / height
+        )
     return radiance
 
 
-def directions(height: int, turn: float, top: int, rows: int) -> Floats:
-    """Unit directions (rows, 2 height, 3) of texel centres from row `top`, in an environment rotated by `turn`."""
+def directions(height: int, rotation: float, top: int, rows: int) -> Floats:
+    """Unit directions (rows, 2 height, 3) of texel centres from row `top`, in an environment rotated by `rotation`."""
     polar = (np.arange(top, top + rows) + 0.5)[:, None] * (np.pi / height)
-    azimuth = (np.arange(2 * height) + 0.5) * (np.pi / height) - turn
+    azimuth = (np.arange(2 * height) + 0.5) * (np.pi / height) - rotation
     parts = np.sin(polar) * np.sin(azimuth), np.cos(polar) + 0 * azimuth, -np.sin(polar) * np.cos(azimuth)
     return np.stack(parts, 2).astype(np.float32)
 
 
-def _columns(quad: Quad, turn: float, width: int) -> list[slice]:
+def _columns(quad: Quad, rotation: float, width: int) -> list[slice]:
     """The columns that a quad may cover: one range, or two where it crosses the seam of the map."""
-    low, high = ((angle + turn) * width / (2 * np.pi) for angle in quad.bounds[:2])
+    low, high = ((angle + rotation) * width / (2 * np.pi) for angle in quad.bounds[:2])
     first, count = int(np.floor(low)) % width, int(np.ceil(high) - np.floor(low)) + 1
     if count >= width:
         return [slice(0, width)]
@@ -288,51 +295,51 @@ def _columns(quad: Quad, turn: float, width: int) -> list[slice]:
     ]
 
 
-def _rasterise(quad: Quad, turn: float, polar: Floats, target: tuple[slice, Floats, Floats]) -> None:
+def _rasterise(quad: Quad, rotation: float, polar: Floats, target: tuple[slice, Floats, Floats]) -> None:
     """Draws a quad on some rows and columns, where it is closer than the surfaces drawn before."""
-    columns, closeness, colours = target[0], target[1][:, target[0]], target[2][:, target[0]]
+    columns, inverse_depth, colours = target[0], target[1][:, target[0]], target[2][:, target[0]]
     width = target[1].shape[1]
-    azimuth = (np.arange(columns.start, columns.stop) + 0.5) * (2 * np.pi / width) - turn
+    azimuth = (np.arange(columns.start, columns.stop) + 0.5) * (2 * np.pi / width) - rotation
     heading = np.stack([np.sin(azimuth), -np.cos(azimuth)]).astype(np.float32)
     level, rise = np.sin(polar).astype(np.float32)[:, None], np.cos(polar).astype(np.float32)[:, None]
     across, down, near = (
-        level * (form[0] * heading[0] + form[2] * heading[1]) + rise * form[1] for form in quad.forms
+        level * (row[0] * heading[0] + row[2] * heading[1]) + rise * row[1] for row in quad.projection
     )
-    hit = (near > closeness) & (across >= 0) & (across < near) & (down >= 0) & (down < near)
+    hit = (near > inverse_depth) & (across >= 0) & (across < near) & (down >= 0) & (down < near)
     across, down, near = across[hit], down[hit], near[hit]
     if not near.size:
         return
     # The footprint of a ray grows with distance, and with the angle to the normal of the surface.
-    spot = quad.density * 2 * np.pi / width / near * np.maximum(near * quad.distance, 0.01) ** -0.6
-    texels = quad.texture.sample(across / near, down / near, spot)
+    footprint = quad.density * 2 * np.pi / width / near * np.maximum(near * quad.distance, 0.01) ** -0.6
+    texels = quad.texture.sample(across / near, down / near, footprint)
     opaque = texels[:, 3] > 0.5
     if not opaque.all():
         hit[hit], texels, near = opaque, texels[opaque], near[opaque]
-    closeness[hit] = near
+    inverse_depth[hit] = near
     colours[hit] = texels[:, :3]
 
 
-def _is_occluded(world: ProceduralEnvironment, position: Floats) -> bool:
-    for quad in world.quads:
-        across, down, near = quad.forms @ position
+def _is_occluded(environment: ProceduralEnvironment, position: Floats) -> bool:
+    for quad in environment.quads:
+        across, down, near = quad.projection @ position
         if near > 1.05 and 0 <= across < near and 0 <= down < near:
-            place = np.array([[across / near], [down / near]], np.float32)
-            if quad.texture.sample(place[0], place[1], np.ones(1, np.float32))[0, 3] > 0.5:
+            coordinates = np.array([[across / near], [down / near]], np.float32)
+            if quad.texture.sample(coordinates[0], coordinates[1], np.ones(1, np.float32))[0, 3] > 0.5:
                 return True
     return False
 
 
-def _add_glow(picture: Floats, glow: Glow, turn: float) -> None:
+def _add_glow(picture: Floats, glow: Glow, rotation: float) -> None:
     """Adds a disc at least three texels wide with exactly the energy of the glow."""
     height, texel = picture.shape[0], np.pi / picture.shape[0]
     distance = float(np.linalg.norm(glow.position))
-    aim, radius = glow.position / distance, glow.radius / distance
-    wide = max(radius, 1.5 * texel)
-    polar = float(np.arccos(np.clip(aim[1], -1, 1)))
-    top = max(0, int((polar - wide) / texel) - 2)
-    rows = min(height, int((polar + wide) / texel) + 3) - top
-    chord = np.linalg.norm(directions(height, turn, top, rows) - aim, axis=2)
-    weight = np.clip((wide - chord) / texel + 0.5, 0, 1)
+    direction, radius = glow.position / distance, glow.radius / distance
+    disc_radius = max(radius, 1.5 * texel)
+    polar = float(np.arccos(np.clip(direction[1], -1, 1)))
+    top = max(0, int((polar - disc_radius) / texel) - 2)
+    rows = min(height, int((polar + disc_radius) / texel) + 3) - top
+    chord = np.linalg.norm(directions(height, rotation, top, rows) - direction, axis=2)
+    weight = np.clip((disc_radius - chord) / texel + 0.5, 0, 1)
     solid_angle = np.sin((np.arange(top, top + rows) + 0.5) * texel)[:, None] * texel**2
     energy = np.pi * radius**2 / (weight * solid_angle).sum()
     picture[top : top + rows] += (weight * energy)[..., None] * np.asarray(glow.radiance, np.float32)

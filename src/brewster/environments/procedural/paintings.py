@@ -89,12 +89,12 @@ def _stroke(random: Generator, picture: Floats, size: float, paint: tuple[Floats
     top, left = int(random.integers(-reach // 2, height)), int(random.integers(-reach // 2, width))
     part = picture[max(0, top) : max(0, top + reach), max(0, left) : max(0, left + reach)]
     y, x = np.mgrid[: part.shape[0], : part.shape[1]].astype(np.float32) / reach - 0.5
-    angle, bend, thick = random.uniform(0, np.pi), random.uniform(-1, 1), random.uniform(0.05, 0.2)
+    angle, bend, thickness = random.uniform(0, np.pi), random.uniform(-1, 1), random.uniform(0.05, 0.2)
     along = x * np.cos(angle) + y * np.sin(angle)
-    aside = y * np.cos(angle) - x * np.sin(angle) + bend * (along * along - 0.1)
-    streak = bristles[(aside * 400).astype(np.int32) % 256, (along * 30).astype(np.int32) % 256]
-    ragged = thick * np.clip((0.42 + 0.06 * streak - np.abs(along)) * 20, 0, 1)
-    mask = np.clip((ragged - np.abs(aside)) * reach + 0.5, 0, 1) * np.clip(streak, 0.2, 1)
+    across = y * np.cos(angle) - x * np.sin(angle) + bend * (along * along - 0.1)
+    streak = bristles[(across * 400).astype(np.int32) % 256, (along * 30).astype(np.int32) % 256]
+    ragged = thickness * np.clip((0.42 + 0.06 * streak - np.abs(along)) * 20, 0, 1)
+    mask = np.clip((ragged - np.abs(across)) * reach + 0.5, 0, 1) * np.clip(streak, 0.2, 1)
     _blend(part, mask[..., None], colour * streak[..., None])
 
 
@@ -109,9 +109,9 @@ def _poster(random: Generator, height: int, width: int) -> Floats:
         band = np.abs(slope - random.uniform(-0.6, 0.6)) - random.uniform(0.02, 0.15)
         _blend(picture, _inside(band, height), ink)
     for _ in range(random.integers(1, 6)):
-        place = random.uniform(-0.45, 0.45) * width / height, random.uniform(-0.3, 0.4)
+        centre = random.uniform(-0.45, 0.45) * width / height, random.uniform(-0.3, 0.4)
         radius = random.uniform(0.05, 0.3)
-        disc = _ellipse(grid, place, (radius, radius))
+        disc = _ellipse(grid, centre, (radius, radius))
         if random.uniform() < 0.5:
             disc = np.maximum(disc, np.abs(np.mod(slope * random.uniform(12, 30), 1) - 0.5) * 0.04 - 0.01)
         _blend(picture, _inside(disc, height), inks[random.integers(4)])
@@ -126,9 +126,9 @@ def _poster(random: Generator, height: int, width: int) -> Floats:
 def _print_line(random: Generator, picture: Floats, line: tuple[float, float, int], ink: Floats) -> None:
     """Prints a line at (top, size) in heights, of a number of glyphs, as wide as the margins allow."""
     height, width = picture.shape[:2]
-    top, tall = round(line[0] * height), max(2, round(line[1] * height))
-    wide = min(round(width * 0.9), max(4, round(tall * 0.75 * line[2])))
-    part = picture[top : top + tall, width // 20 :][:, :wide]
+    top, rows = round(line[0] * height), max(2, round(line[1] * height))
+    columns = min(round(width * 0.9), max(4, round(rows * 0.75 * line[2])))
+    part = picture[top : top + rows, width // 20 :][:, :columns]
     if part.size:
         _blend(part, lettering(random, line[2], *part.shape[:2])[..., None], ink)
 
@@ -173,10 +173,10 @@ def _portrait(random: Generator, height: int, width: int) -> Floats:
     ground = tint(random, random.uniform(0.05, 0.4), random.uniform(0.1, 0.6))
     picture = ground * np.clip(1 + 0.35 * fractal(random, height, width, 2, 4), 0.2, 3)[..., None]
     for _ in range(random.integers(5, 30)):
-        place = random.uniform(-0.5, 0.5) * width / height, random.uniform(-0.5, 0.5)
+        centre = random.uniform(-0.5, 0.5) * width / height, random.uniform(-0.5, 0.5)
         radius = random.uniform(0.02, 0.09)
         colour = tint(random, 0.6, 0.6)
-        _paint_ellipse(picture, place, (radius, radius), colour)
+        _paint_ellipse(picture, centre, (radius, radius), colour)
     skin = vector(0.62, 0.36, 0.25) * random.uniform(0.2, 1.1)
     hair, cloth = (
         vector(0.4, 0.25, 0.14) * random.uniform(0.05, 1.4),
@@ -189,9 +189,9 @@ def _portrait(random: Generator, height: int, width: int) -> Floats:
     weave = texture * (
         1 + 0.3 * np.sign(np.sin((grid[0] + random.uniform(-1, 1) * grid[1]) * random.uniform(40, 160)))
     )
-    tall = random.uniform(0.16, 0.3)
+    hair_length = random.uniform(0.16, 0.3)
     parts = [
-        ((0.0, tall * 0.4), (0.19, 0.2 + tall * 0.7), hair, strands),
+        ((0.0, hair_length * 0.4), (0.19, 0.2 + hair_length * 0.7), hair, strands),
         ((0.0, 0.62), (0.4, 0.36), cloth, weave),
         ((0.0, 0.22), (0.075, 0.13), skin * 0.75, texture),
         ((0.0, 0.0), (0.145, 0.2), skin, texture),
@@ -217,8 +217,8 @@ def tree(random: Generator, height: float, density: float) -> Canvas:
     reach = random.uniform(0.2, 0.3)
     for _ in range(24):
         radius = random.uniform(0.06, 0.15)
-        place = np.clip(random.normal(0, reach * 0.6, 2), -0.4 + radius, 0.4 - radius) - (0, 0.1)
-        crown = np.minimum(crown, _ellipse((x, y), (float(place[0]), float(place[1])), (radius, radius)))
+        centre = np.clip(random.normal(0, reach * 0.6, 2), -0.4 + radius, 0.4 - radius) - (0, 0.1)
+        crown = np.minimum(crown, _ellipse((x, y), (float(centre[0]), float(centre[1])), (radius, radius)))
     leaves = 0.7 * fractal(random, size, size, 8, 4) + 0.8 * fractal(random, size, size, 48, 3)
     trunk = np.abs(x + 0.02 * np.sin(y * 9)) - 0.02 - 0.02 * np.clip(y, 0, 1)
     trunk = np.where(y > -0.2, trunk, 9)
@@ -249,23 +249,23 @@ def figure(random: Generator, height: float, density: float) -> Canvas:
     ]
     canvas.pixels[..., 3] = 0
     shade = np.clip(1 + 0.1 * fractal(random, rows, columns, 40, 3) - 2 * grid[0], 0.3, 1.6)[..., None]
-    for place, radii, colour in parts:
-        inside = _ellipse(grid, place, radii) < 0
+    for centre, radii, colour in parts:
+        inside = _ellipse(grid, centre, radii) < 0
         canvas.pixels[inside, :3] = (colour * shade)[inside]
         canvas.pixels[inside, 3] = 1
     return canvas
 
 
-def outside(random: Generator) -> Floats:
+def window_view(random: Generator) -> Floats:
     """The defocused view from a window (24, 24, 3): sky, roofs and trees, about 1 at its brightest."""
     sky = vector(0.6, 0.8, 1) if random.uniform() < 0.6 else vector(0.95, 0.97, 1)
     down = np.linspace(0, 1, 24, dtype=np.float32)[:, None, None]
     view = sky + (vector(1, 1, 1) - sky) * down + np.zeros((24, 24, 1), np.float32)
     left = 0
     while left < 24:
-        wide, top = int(random.integers(2, 7)), int(random.integers(6, 20))
-        view[top:, left : left + wide] = tint(random, random.uniform(0.1, 0.35), 0.35)
-        left += wide
+        columns, top = int(random.integers(2, 7)), int(random.integers(6, 20))
+        view[top:, left : left + columns] = tint(random, random.uniform(0.1, 0.35), 0.35)
+        left += columns
     leaf = vector(0.1, 0.18, 0.05) * random.uniform(0.6, 1.6)
     view[random.integers(14, 22) :] = leaf * (0.6 + random.uniform(size=(24, 1)).astype(np.float32))
     return view
@@ -305,10 +305,10 @@ def door(random: Generator, canvas: Canvas, left: float) -> None:
     canvas.rect((left + 0.8, top + 1.0, 0.05, 0.12), vector(0.6, 0.55, 0.4))
 
 
-def hang_pictures(random: Generator, canvas: Canvas, left: float, wide: float) -> None:
+def hang_pictures(random: Generator, canvas: Canvas, left: float, width_m: float) -> None:
     """Paints one large framed picture or several small ones."""
     count = int(random.integers(1, 4))
-    each = wide / count
+    each = width_m / count
     for index in range(count):
         width, height = each * 0.85, random.uniform(0.35, 0.9)
         start, top = left + index * each, random.uniform(0.4, 0.7)

@@ -52,61 +52,64 @@ class SceneLighting:
         for lamp in self.lamps:
             if np.linalg.norm(lamp.position - middle) > span + 30:
                 continue
-            way = lamp.position - points
-            squared = np.maximum(np.einsum("hwc,hwc->hw", way, way), 0.04)
-            weight = np.clip(way @ normal, 0, None) / (np.pi * squared * np.sqrt(squared))
+            to_lamp = lamp.position - points
+            squared = np.maximum(np.einsum("hwc,hwc->hw", to_lamp, to_lamp), 0.04)
+            weight = np.clip(to_lamp @ normal, 0, None) / (np.pi * squared * np.sqrt(squared))
             if lamp.facing is not None:
-                weight *= np.clip(-(way @ lamp.facing), 0, None) / np.sqrt(squared)
+                weight *= np.clip(-(to_lamp @ lamp.facing), 0, None) / np.sqrt(squared)
             light += weight[..., None] * lamp.intensity
         return light * self.shade(points, normal)
 
     def shade(self, points: Floats, normal: Floats) -> Floats:
         """The factor (h, w, 1) of the contact shadows on the floor; 1 on other surfaces."""
-        left = np.ones((*points.shape[:2], 1), np.float32)
+        factor = np.ones((*points.shape[:2], 1), np.float32)
         if normal[1] < 0.9 or points[0, 0, 1] > self.floor + 0.01:
-            return left
+            return factor
         for x, z, half_width, half_depth in self.contacts:
-            beside = np.clip(np.abs(points[..., :1] - x) - half_width, 0, None)
-            behind = np.clip(np.abs(points[..., 2:] - z) - half_depth, 0, None)
-            left *= 1 - 0.75 * np.exp(-(beside**2 + behind**2) / 0.12)
-        return left
+            x_distance = np.clip(np.abs(points[..., :1] - x) - half_width, 0, None)
+            z_distance = np.clip(np.abs(points[..., 2:] - z) - half_depth, 0, None)
+            factor *= 1 - 0.75 * np.exp(-(x_distance**2 + z_distance**2) / 0.12)
+        return factor
 
 
-def vertical_quad(canvas: Canvas, foot: Floats, towards: Floats | None, light: Lighting) -> Quad:
+def vertical_quad(canvas: Canvas, foot: Floats, normal: Floats | None, light: Lighting) -> Quad:
     """A vertical canvas with the middle of its lower edge at `foot`, facing a direction or the viewer."""
-    facing = unit(-foot * vector(1, 0, 1)) if towards is None else towards
+    facing = unit(-foot * vector(1, 0, 1)) if normal is None else normal
     across = np.cross(-facing, UP) * canvas.width
     rise = UP * canvas.height
     return Quad(canvas, foot - across / 2 + rise, (across, -rise), light)
 
 
-def horizontal_quad(canvas: Canvas, centre: Floats, light: Lighting, turn: float = 0) -> Quad:
+def horizontal_quad(canvas: Canvas, centre: Floats, light: Lighting, rotation: float = 0) -> Quad:
     """A horizontal canvas. Its top is towards -z before the rotation about the vertical axis."""
-    across = vector(np.cos(turn), 0, np.sin(turn)) * canvas.width
-    down = vector(-np.sin(turn), 0, np.cos(turn)) * canvas.height
+    across = vector(np.cos(rotation), 0, np.sin(rotation)) * canvas.width
+    down = vector(-np.sin(rotation), 0, np.cos(rotation)) * canvas.height
     return Quad(canvas, centre - across / 2 - down / 2, (across, down), light)
 
 
 def box(
-    paint: Painter, foot: Floats, size: tuple[float, float, float], light: Lighting, turn: float = 0
+    paint: Painter, foot: Floats, size: tuple[float, float, float], light: Lighting, rotation: float = 0
 ) -> list[Quad]:
     """The visible faces of a box (width, height, depth). Its front is towards +z before the rotation."""
     width, height, depth = size
-    ahead, aside = vector(-np.sin(turn), 0, np.cos(turn)), vector(np.cos(turn), 0, np.sin(turn))
+    forward, sideways = (
+        vector(-np.sin(rotation), 0, np.cos(rotation)),
+        vector(np.cos(rotation), 0, np.sin(rotation)),
+    )
     faces = []
-    for name, normal, reach, wide in (
-        ("front", ahead, depth, width),
-        ("back", -ahead, depth, width),
-        ("right", aside, width, depth),
-        ("left", -aside, width, depth),
+    for name, normal, extent, face_width in (
+        ("front", forward, depth, width),
+        ("back", -forward, depth, width),
+        ("right", sideways, width, depth),
+        ("left", -sideways, width, depth),
     ):
-        middle = foot + normal * (reach / 2)
+        middle = foot + normal * (extent / 2)
         if normal @ middle < -0.02:
-            faces.append(vertical_quad(paint(name, wide, height), middle, normal, light))
+            faces.append(vertical_quad(paint(name, face_width, height), middle, normal, light))
     if foot[1] + height < -0.02:
-        faces.append(horizontal_quad(paint("top", width, depth), foot + UP * height, light, turn))
+        faces.append(horizontal_quad(paint("top", width, depth), foot + UP * height, light, rotation))
     elif foot[1] > 0.02:
-        faces.append(horizontal_quad(paint("bottom", width, depth), foot, light, turn))
+        faces.append(horizontal_quad(paint("bottom", width, depth), foot, light, rotation))
     return faces
 
 
@@ -134,17 +137,17 @@ class WindowStyle:
     """The colour of the sky that the glass reflects."""
 
 
-def window(random: Generator, canvas: Canvas, place: Box, panes: WindowStyle) -> None:
+def window(random: Generator, canvas: Canvas, outline: Box, style: WindowStyle) -> None:
     """Paints a window: glass that reflects the sky or shows a lit room, curtains or a blind, glazing bars."""
-    left, top, width, height = place
-    canvas.rect(place, panes.frame)
+    left, top, width, height = outline
+    canvas.rect(outline, style.frame)
     bar = min(0.07, width / 8)
     inner = (left + bar, top + bar, width - 2 * bar, height - 2 * bar)
     glass = canvas.area(inner)
     if not glass.size:
         return
     fall = np.linspace(1, random.uniform(0.2, 0.7), glass.shape[0], dtype=np.float32)[:, None, None]
-    if random.uniform() < panes.lit:
+    if random.uniform() < style.lit:
         glass[..., :3] = vector(1, random.uniform(0.6, 0.85), random.uniform(0.3, 0.7)) * (1.2 - fall)
         glass[..., 4] = 0.4 * np.exp(random.uniform(0, 3))
         canvas.rect(
@@ -153,13 +156,13 @@ def window(random: Generator, canvas: Canvas, place: Box, panes: WindowStyle) ->
         )
     else:
         slant = np.linspace(0, random.uniform(-0.5, 0.5), glass.shape[1], dtype=np.float32)[:, None]
-        glass[..., :3] = panes.sky * random.uniform(0.05, 0.45) * np.clip(fall + slant, 0.1, 1.2) + 0.01
-        glass[..., 4] = 0 if panes.lit else 0.7
+        glass[..., :3] = style.sky * random.uniform(0.05, 0.45) * np.clip(fall + slant, 0.1, 1.2) + 0.01
+        glass[..., 4] = 0 if style.lit else 0.7
     _add_curtains(random, glass)
-    for index in range(1, panes.columns):
-        canvas.rect((left + width * index / panes.columns - bar / 2, top, bar, height), panes.frame)
-    for index in range(1, panes.rows):
-        canvas.rect((left, top + height * index / panes.rows - bar / 2, width, bar), panes.frame)
+    for index in range(1, style.columns):
+        canvas.rect((left + width * index / style.columns - bar / 2, top, bar, height), style.frame)
+    for index in range(1, style.rows):
+        canvas.rect((left, top + height * index / style.rows - bar / 2, width, bar), style.frame)
 
 
 def _add_curtains(random: Generator, glass: Floats) -> None:
@@ -167,13 +170,15 @@ def _add_curtains(random: Generator, glass: Floats) -> None:
     height, width = glass.shape[:2]
     choice, cloth = random.uniform(), tint(random, 0.5, 0.15)
     if choice < 0.3:
-        wide = max(1, round(width * random.uniform(0.1, 0.35)))
-        folds = 0.7 + 0.3 * np.cos(np.arange(wide, dtype=np.float32) * 2)[:, None]
-        glass[:, :wide, :3] = cloth * folds
-        glass[:, -wide:, :3] = cloth * folds
+        curtain_columns = max(1, round(width * random.uniform(0.1, 0.35)))
+        folds = 0.7 + 0.3 * np.cos(np.arange(curtain_columns, dtype=np.float32) * 2)[:, None]
+        glass[:, :curtain_columns, :3] = cloth * folds
+        glass[:, -curtain_columns:, :3] = cloth * folds
     elif choice < 0.55:
-        tall = round(height * random.uniform(0.2, 0.9))
-        glass[:tall, :, :3] = cloth * (0.7 + 0.3 * (np.arange(tall, dtype=np.float32) % 4 < 2))[:, None, None]
+        blind_rows = round(height * random.uniform(0.2, 0.9))
+        glass[:blind_rows, :, :3] = (
+            cloth * (0.7 + 0.3 * (np.arange(blind_rows, dtype=np.float32) % 4 < 2))[:, None, None]
+        )
 
 
 def car(random: Generator, foot: Floats, away: bool, light: Lighting, *, night: bool) -> list[Quad]:
@@ -204,11 +209,11 @@ def car(random: Generator, foot: Floats, away: bool, light: Lighting, *, night: 
             canvas.rect((width / 2 - 0.04, 0, 0.08, height * (face in {"left", "right"})), colour)
         return canvas
 
-    long, tall = random.uniform(3.8, 4.8), random.uniform(0.75, 1.0)
-    roof = foot + UP * (tall + 0.12) + vector(0, 0, random.uniform(-0.3, 0.3))
+    length_m, height_m = random.uniform(3.8, 4.8), random.uniform(0.75, 1.0)
+    roof = foot + UP * (height_m + 0.12) + vector(0, 0, random.uniform(-0.3, 0.3))
     return [
-        *box(body, foot + UP * 0.12, (1.8, tall, long), light),
-        *box(cabin, roof, (1.5, random.uniform(0.45, 0.7), long * 0.55), light),
+        *box(body, foot + UP * 0.12, (1.8, height_m, length_m), light),
+        *box(cabin, roof, (1.5, random.uniform(0.45, 0.7), length_m * 0.55), light),
     ]
 
 
@@ -235,12 +240,12 @@ def bookshelf(random: Generator) -> Painter:
             canvas.rect((0.03, top + 0.03, width - 0.06, step - 0.03), wood * 0.15)
             left = 0.04
             while left < width - 0.08:
-                thick, tall = random.uniform(0.015, 0.055), step * random.uniform(0.5, 0.85)
+                thickness_m, height_m = random.uniform(0.015, 0.055), step * random.uniform(0.5, 0.85)
                 if random.uniform() < 0.9:
                     spine = tint(random, random.uniform(0.03, 0.5), 0.8)
-                    canvas.rect((left, top + step - tall, thick - 0.004, tall), spine)
-                    canvas.rect((left, top + step - tall * 0.8, thick - 0.004, 0.02), spine * 2)
-                left += thick
+                    canvas.rect((left, top + step - height_m, thickness_m - 0.004, height_m), spine)
+                    canvas.rect((left, top + step - height_m * 0.8, thickness_m - 0.004, 0.02), spine * 2)
+                left += thickness_m
         return canvas
 
     return paint
@@ -268,40 +273,45 @@ def cabinet(random: Generator) -> Painter:
 
 
 def facade(
-    random: Generator, wide: float, floors: int, *, density: float, night: bool, sky: Floats
+    random: Generator, width_m: float, floors: int, *, density: float, night: bool, sky: Floats
 ) -> Canvas:
     """The front of a house: a grid of windows above a shop or an entrance, below a cornice."""
-    storey, bays = random.uniform(2.8, 3.7), max(2, round(wide / random.uniform(1.8, 4.2)))
-    bay = wide / bays
+    storey, bays = random.uniform(2.8, 3.7), max(2, round(width_m / random.uniform(1.8, 4.2)))
+    bay = width_m / bays
     wall = tint(random, random.uniform(0.12, 0.6), random.uniform(0.05, 0.3)) * vector(1.1, 1, 0.88)
-    panes = WindowStyle(
+    style = WindowStyle(
         frame=vector(0.7, 0.7, 0.68) if random.uniform() < 0.6 else tint(random, 0.08, 0.5),
         columns=int(random.integers(1, 4)),
         rows=int(random.integers(1, 4)),
         lit=random.uniform(0.15, 0.7) if night else 0,
         sky=sky,
     )
-    cells = _cells(random, Canvas(bay, storey, density, wall), panes)
+    cells = _cells(random, Canvas(bay, storey, density, wall), style)
     pattern = random.integers(0, len(cells), (floors, bays))
     body = cells[pattern].transpose(0, 2, 1, 3, 4).reshape(floors * cells.shape[1], -1, 5)
-    base = _ground_floor(random, Canvas(body.shape[1] / density, storey * 1.15, density, wall), panes)
+    base = _ground_floor(random, Canvas(body.shape[1] / density, storey * 1.15, density, wall), style)
     cornice = Canvas(body.shape[1] / density, 0.7, density, wall * 1.15)
-    cornice.area((0, 0.4, wide, 0.15))[..., :3] *= 0.4
-    canvas = Canvas(wide, 0.7 + storey * (floors + 1.15), density, wall)
+    cornice.area((0, 0.4, width_m, 0.15))[..., :3] *= 0.4
+    canvas = Canvas(width_m, 0.7 + storey * (floors + 1.15), density, wall)
     canvas.pixels = np.concatenate([cornice.pixels, body, base.pixels])
     canvas.add_noise(random, random.uniform(0.06, 0.16), 8)
     return canvas
 
 
-def _cells(random: Generator, blank: Canvas, panes: WindowStyle) -> Floats:
+def _cells(random: Generator, blank: Canvas, style: WindowStyle) -> Floats:
     """Variants (n, h, w, 5) of one bay of one storey: the same window with different content."""
     width, height = blank.width, blank.height
-    share, tall = random.uniform(0.4, 0.92), random.uniform(0.45, 0.85)
-    place = (width * (1 - share) / 2, height * (1 - tall) * 0.45, width * share, height * tall)
+    width_fraction, height_fraction = random.uniform(0.4, 0.92), random.uniform(0.45, 0.85)
+    outline = (
+        width * (1 - width_fraction) / 2,
+        height * (1 - height_fraction) * 0.45,
+        width * width_fraction,
+        height * height_fraction,
+    )
     stone = random.uniform(0.25, 0.6)
     band, sill, balcony = random.uniform(size=3) < (0.4, 0.5, 0.25)
     rail = tint(random, 0.1, 0.3)
-    kinds = []
+    cells = []
     for _ in range(9):
         cell = Canvas(width, height, blank.density, blank.colour)
         for course in np.arange(0, height, stone):
@@ -309,40 +319,42 @@ def _cells(random: Generator, blank: Canvas, panes: WindowStyle) -> Floats:
         if band:
             cell.area((0, height - 0.2, width, 0.2))[..., :3] *= 1.3
             cell.area((0, height - 0.04, width, 0.04))[..., :3] *= 0.4
-        around = 0.12
-        cell.area((place[0] - around, place[1] - around, place[2] + 2 * around, place[3] + around))[
+        margin = 0.12
+        cell.area((outline[0] - margin, outline[1] - margin, outline[2] + 2 * margin, outline[3] + margin))[
             ..., :3
         ] *= 1.25
-        window(random, cell, place, panes)
+        window(random, cell, outline, style)
         if sill:
-            cell.area((place[0] - 0.1, place[1] + place[3], place[2] + 0.2, 0.1))[..., :3] = 0.5
-            cell.area((place[0] - 0.1, place[1] + place[3] + 0.1, place[2] + 0.2, 0.08))[..., :3] *= 0.5
+            cell.area((outline[0] - 0.1, outline[1] + outline[3], outline[2] + 0.2, 0.1))[..., :3] = 0.5
+            cell.area((outline[0] - 0.1, outline[1] + outline[3] + 0.1, outline[2] + 0.2, 0.08))[..., :3] *= (
+                0.5
+            )
         if balcony:
             for left in np.arange(0.1, width - 0.1, 0.15):
                 cell.rect((left, height - 1.05, 0.04, 0.95), rail)
             cell.rect((0, height - 1.1, width, 0.07), rail)
             cell.rect((0, height - 0.12, width, 0.12), rail * 2)
-        kinds.append(cell.pixels)
-    return np.stack(kinds)
+        cells.append(cell.pixels)
+    return np.stack(cells)
 
 
-def _ground_floor(random: Generator, canvas: Canvas, panes: WindowStyle) -> Canvas:
+def _ground_floor(random: Generator, canvas: Canvas, style: WindowStyle) -> Canvas:
     """Paints shop windows below signs, doors between them, and a plinth."""
     bottom, left = canvas.height, 0.3
-    glow = 8 if panes.lit else 0
+    glow = 8 if style.lit else 0
     shops = random.uniform() < 0.7
     canvas.rect((0, bottom - 0.4, canvas.width, 0.4), vector(0.12, 0.12, 0.12))
     while left < canvas.width - 1.5:
-        wide = min(random.uniform(1.8, 4.5), canvas.width - left - 0.3)
+        width_m = min(random.uniform(1.8, 4.5), canvas.width - left - 0.3)
         sign, ink = tint(random, random.uniform(0.02, 0.4), 1), tint(random, 0.7, 0.5)
         if shops:
-            window(random, canvas, (left, 1.0, wide - 0.3, bottom - 1.5), panes)
-            _wares(random, canvas, (left + 0.1, bottom - 1.6, wide - 0.5), glow / 3)
-            canvas.rect((left - 0.1, 0.25, wide - 0.1, 0.6), sign, glow=glow * (random.uniform() < 0.3))
-            canvas.write(random, (left + 0.1, 0.33, wide - 0.6, 0.44), ink, glow=glow)
+            window(random, canvas, (left, 1.0, width_m - 0.3, bottom - 1.5), style)
+            _shop_goods(random, canvas, (left + 0.1, bottom - 1.6, width_m - 0.5), glow / 3)
+            canvas.rect((left - 0.1, 0.25, width_m - 0.1, 0.6), sign, glow=glow * (random.uniform() < 0.3))
+            canvas.write(random, (left + 0.1, 0.33, width_m - 0.6, 0.44), ink, glow=glow)
         else:
-            window(random, canvas, (left + 0.3, 0.9, 1.1, 1.5), panes)
-        left += wide
+            window(random, canvas, (left + 0.3, 0.9, 1.1, 1.5), style)
+        left += width_m
         if left < canvas.width - 1.2 and random.uniform() < 0.6:
             door = tint(random, 0.15, 0.8)
             canvas.rect((left - 0.1, bottom - 2.4, 1.2, 2.4), door * 0.4)
@@ -353,11 +365,11 @@ def _ground_floor(random: Generator, canvas: Canvas, panes: WindowStyle) -> Canv
     return canvas
 
 
-def _wares(random: Generator, canvas: Canvas, place: tuple[float, float, float], glow: float) -> None:
+def _shop_goods(random: Generator, canvas: Canvas, baseline: tuple[float, float, float], glow: float) -> None:
     """Paints goods in a shop window, from (left, top) over a width, about 1 m tall."""
-    left, top, wide = place
+    left, top, width_m = baseline
     offset = 0.0
-    while offset < wide - 0.4:
-        size, tall = random.uniform(0.15, 0.5), random.uniform(0.2, 0.9)
-        canvas.rect((left + offset, top + 1 - tall, size, tall), tint(random, 0.3, 0.9), glow=glow)
+    while offset < width_m - 0.4:
+        size, height_m = random.uniform(0.15, 0.5), random.uniform(0.2, 0.9)
+        canvas.rect((left + offset, top + 1 - height_m, size, height_m), tint(random, 0.3, 0.9), glow=glow)
         offset += size + random.uniform(0, 0.3)

@@ -33,11 +33,11 @@ from brewster.environments.procedural.paintings import (
     figure,
     flooring,
     hang_pictures,
-    outside,
     painting,
     rug,
     tree,
     wallpaper,
+    window_view,
 )
 from brewster.environments.procedural.props import (
     UP,
@@ -69,7 +69,7 @@ def night(seed: int, height: int) -> NDArray[np.float32]:
 
 def room(seed: int, height: int) -> NDArray[np.float32]:
     """A furnished room, radiance (height, 2 height, 3): the walls are below 1, the lamps 15 to 500."""
-    return render(_BoxRoom(Generator(PCG64(seed))).world(), height)
+    return render(_BoxRoom(Generator(PCG64(seed))).environment(), height)
 
 
 ENVIRONMENTS: Final[dict[str, Callable[[int, int], NDArray[np.float32]]]] = {
@@ -85,11 +85,15 @@ class _BoxRoom:
 
     def __init__(self, random: Generator) -> None:
         self.random = random
-        wide, deep, self.tall = random.uniform(3.5, 8), random.uniform(3.5, 9), random.uniform(2.4, 3.3)
+        width_m, depth_m, self.height_m = (
+            random.uniform(3.5, 8),
+            random.uniform(3.5, 9),
+            random.uniform(2.4, 3.3),
+        )
         self.floor = -random.uniform(1.2, 1.7)
         share = random.uniform(0.3, 0.7, 2)
-        self.low = vector(-wide * share[0], self.floor, -deep * share[1])
-        self.high = vector(wide, self.tall, deep) + self.low
+        self.low = vector(-width_m * share[0], self.floor, -depth_m * share[1])
+        self.high = vector(width_m, self.height_m, depth_m) + self.low
         self.evening = random.uniform() < 0.25
         self.daylight = float(np.exp(random.uniform(-3, -1.5) if self.evening else random.uniform(1.8, 3.4)))
         self.lamps = SceneLighting(vector(0.25, 0.24, 0.22), self.floor)
@@ -108,23 +112,25 @@ class _BoxRoom:
             corner = 1 - 0.3 * np.exp(-np.abs(points - end) / 0.3)
             total *= corner[..., :1] * corner[..., 1:2] * corner[..., 2:]
         if (facing := float(normal @ self.sun)) > 0:
-            for foot, inward, wide, tall in self.openings:
+            for foot, inward, width_m, height_m in self.openings:
                 if (slope := float(inward @ self.sun)) < -0.05:
-                    way = ((foot - points) @ inward / slope)[..., None]
-                    place = points + way * self.sun - foot
-                    aside = np.abs(place @ np.cross(inward, UP))
-                    margin = np.minimum(wide / 2 - aside, tall / 2 - np.abs(place[..., 1] - tall / 2))
-                    inside = np.clip(margin * 8 + 0.5, 0, 1) * (way[..., 0] > 0.05)
+                    distance = ((foot - points) @ inward / slope)[..., None]
+                    hit = points + distance * self.sun - foot
+                    across = np.abs(hit @ np.cross(inward, UP))
+                    margin = np.minimum(
+                        width_m / 2 - across, height_m / 2 - np.abs(hit[..., 1] - height_m / 2)
+                    )
+                    inside = np.clip(margin * 8 + 0.5, 0, 1) * (distance[..., 0] > 0.05)
                     total += inside[..., None] * self.lamps.shade(points, normal) * facing * self.sunlight
         return total
 
-    def world(self) -> ProceduralEnvironment:
+    def environment(self) -> ProceduralEnvironment:
         """Builds the room. Lights come first; lighting is baked into textures when they are rendered."""
         random = self.random
         paint = tint(random, random.uniform(0.3, 0.75), random.uniform(0, 0.2))
-        ways = [vector(0, 0, 1), vector(-1, 0, 0), vector(0, 0, -1), vector(1, 0, 0)]
+        inward_normals = [vector(0, 0, 1), vector(-1, 0, 0), vector(0, 0, -1), vector(1, 0, 0)]
         first = int(random.integers(4))
-        for index, inward in enumerate(ways):
+        for index, inward in enumerate(inward_normals):
             role = (
                 "windows"
                 if index == first
@@ -134,12 +140,15 @@ class _BoxRoom:
             self._wall(inward, tint(random, random.uniform(0.08, 0.5), 0.7) if accent else paint, role)
         self._ceiling()
         self._floor()
-        for inward in ways:
+        for inward in inward_normals:
             self._furnish_wall(inward)
         for _ in range(random.integers(3, 9)):
             self._place_free_standing()
         return ProceduralEnvironment(
-            self.quads, self.glows, lambda ways, _texel: np.zeros_like(ways), random.uniform(0, 2 * np.pi)
+            self.quads,
+            self.glows,
+            lambda directions, _texel: np.zeros_like(directions),
+            random.uniform(0, 2 * np.pi),
         )
 
     def _wall_base(self, inward: Floats) -> tuple[Floats, float]:
@@ -152,48 +161,50 @@ class _BoxRoom:
 
     def _wall(self, inward: Floats, colour: Floats, role: str) -> None:
         random = self.random
-        foot, long = self._wall_base(inward)
-        canvas = Canvas(long, self.tall, _DENSITY, colour)
+        foot, length_m = self._wall_base(inward)
+        canvas = Canvas(length_m, self.height_m, _DENSITY, colour)
         wallpaper(random, canvas)
         left = random.uniform(0.3, 0.8)
         sill = random.choice([0.1, 0.9, 0.9])
-        while left < long - 1.2:
-            wide = min(random.uniform(0.9, 2.2), long - left - 0.3)
+        while left < length_m - 1.2:
+            width_m = min(random.uniform(0.9, 2.2), length_m - left - 0.3)
             choice = random.uniform()
             if role == "windows" and choice < 0.75:
-                self._opening((left, wide, float(sill)), canvas, foot, inward)
+                self._opening((left, width_m, float(sill)), canvas, foot, inward)
             elif choice < 0.15:
                 door(random, canvas, left)
             elif role != "bare":
-                hang_pictures(random, canvas, left, wide)
-            left += wide + random.uniform(0.3, 1.2)
+                hang_pictures(random, canvas, left, width_m)
+            left += width_m + random.uniform(0.3, 1.2)
         self.quads.append(vertical_quad(canvas, foot, inward, self.light))
 
     def _opening(
-        self, place: tuple[float, float, float], canvas: Canvas, foot: Floats, inward: Floats
+        self, opening: tuple[float, float, float], canvas: Canvas, foot: Floats, inward: Floats
     ) -> None:
         """Adds a window at (left, width, sill height) of a wall: blurred view, light, bars and curtains."""
-        random, (left, wide, sill) = self.random, place
+        random, (left, width_m, sill) = self.random, opening
         top = random.uniform(0.25, 0.45)
-        tall = self.tall - sill - top
-        canvas.rect((left - 0.08, top - 0.08, wide + 0.16, tall + 0.16), vector(0.75, 0.74, 0.7))
-        view = outside(random)
-        canvas.paste(resize(view, 90, 90), (left, top, wide, tall), glow=self.daylight)
+        height_m = self.height_m - sill - top
+        canvas.rect((left - 0.08, top - 0.08, width_m + 0.16, height_m + 0.16), vector(0.75, 0.74, 0.7))
+        view = window_view(random)
+        canvas.paste(resize(view, 90, 90), (left, top, width_m, height_m), glow=self.daylight)
         for part in range(random.integers(1, 4)):
-            canvas.rect((left + wide * part / 3 - 0.03, top, 0.06, tall), vector(0.7, 0.7, 0.68))
-        canvas.rect((left, top + tall * random.uniform(0.2, 0.6), wide, 0.05), vector(0.7, 0.7, 0.68))
+            canvas.rect((left + width_m * part / 3 - 0.03, top, 0.06, height_m), vector(0.7, 0.7, 0.68))
+        canvas.rect((left, top + height_m * random.uniform(0.2, 0.6), width_m, 0.05), vector(0.7, 0.7, 0.68))
         if random.uniform() < 0.5:
             cloth = tint(random, 0.5, 0.3)
-            for start in (left - 0.3, left + wide - 0.15):
-                curtain(canvas.area((start, top - 0.15, 0.45, self.tall - top)), cloth, self.daylight * 0.04)
+            for start in (left - 0.3, left + width_m - 0.15):
+                curtain(
+                    canvas.area((start, top - 0.15, 0.45, self.height_m - top)), cloth, self.daylight * 0.04
+                )
         across = np.cross(-inward, UP)
-        middle = foot + across * (left + wide / 2 - canvas.width / 2) + UP * sill
+        middle = foot + across * (left + width_m / 2 - canvas.width / 2) + UP * sill
         mean = view.mean((0, 1)) * self.daylight
         for share in (0.25, 0.75):
-            source = middle + UP * tall * share + inward * 0.05
-            self.lamps.lamps.append(Lamp(source, mean * wide * tall / 2, inward))
-        self.lamps.ambient = self.lamps.ambient + mean * (wide * tall * 0.01)
-        self.openings.append((middle, inward, wide, tall))
+            source = middle + UP * height_m * share + inward * 0.05
+            self.lamps.lamps.append(Lamp(source, mean * width_m * height_m / 2, inward))
+        self.lamps.ambient = self.lamps.ambient + mean * (width_m * height_m * 0.01)
+        self.openings.append((middle, inward, width_m, height_m))
 
     def _ceiling(self) -> None:
         """Adds a ceiling with lamps of one kind, or none by day. Their radiance follows from the size of the room."""
@@ -205,22 +216,24 @@ class _BoxRoom:
         canvas.add_noise(random, 0.03)
         colour = vector(1, random.uniform(0.75, 0.98), random.uniform(0.5, 0.95))
         shapes = [(0.6, 0.6, 3.0), (0.12, 1.2, 1.8), (1.2, 0.12, 1.8), (0.11, 0.11, 1.4), (0.2, 0.2, 2.2)]
-        wide, deep, gap = shapes[random.integers(len(shapes))]
+        width_m, depth_m, gap = shapes[random.integers(len(shapes))]
         rows = [max(1, int(side / gap)) for side in (size[0], size[2])]
         light = random.uniform(0.6, 1.6)
-        radiance = light * size[0] * size[2] / (0.6 * rows[0] * rows[1] * wide * deep)
+        radiance = light * size[0] * size[2] / (0.6 * rows[0] * rows[1] * width_m * depth_m)
         if not self.evening and random.uniform() < 0.35:
             rows = [0, 0]
         middle = (self.low + self.high) / 2
         for x in (np.arange(rows[0]) + 0.5) * size[0] / max(1, rows[0]):
             for z in (np.arange(rows[1]) + 0.5) * size[2] / max(1, rows[1]):
                 canvas.rect(
-                    (x - wide / 2 - 0.04, z - deep / 2 - 0.04, wide + 0.08, deep + 0.08),
+                    (x - width_m / 2 - 0.04, z - depth_m / 2 - 0.04, width_m + 0.08, depth_m + 0.08),
                     vector(0.4, 0.4, 0.4),
                 )
-                canvas.rect((x - wide / 2, z - deep / 2, wide, deep), colour, glow=float(radiance))
-                place = vector(self.low[0] + x, self.high[1] - 0.05, self.low[2] + z)
-                self.lamps.lamps.append(Lamp(place, colour * float(radiance) * wide * deep, -UP))
+                canvas.rect(
+                    (x - width_m / 2, z - depth_m / 2, width_m, depth_m), colour, glow=float(radiance)
+                )
+                position = vector(self.low[0] + x, self.high[1] - 0.05, self.low[2] + z)
+                self.lamps.lamps.append(Lamp(position, colour * float(radiance) * width_m * depth_m, -UP))
         if random.uniform() < 0.4:
             self._pendant(colour)
         self.lamps.ambient = self.lamps.ambient + colour * (0.35 * light if rows[0] else 0)
@@ -230,13 +243,15 @@ class _BoxRoom:
     def _pendant(self, colour: Floats) -> None:
         """Adds a pendant lamp: a bulb below a shade."""
         share = vector(*self.random.uniform(0.25, 0.75, 3))
-        place = self.low + share * (self.high - self.low)
-        place[1] = self.high[1] - self.random.uniform(0.5, 0.9)
+        position = self.low + share * (self.high - self.low)
+        position[1] = self.high[1] - self.random.uniform(0.5, 0.9)
         dark, cloth = (plain_painter(self.random, tint(self.random, value, 0.6)) for value in (0.03, 0.3))
-        self.quads += box(dark, place, (0.015, float(self.high[1] - place[1]), 0.015), self.light)
-        self.quads += box(cloth, place + UP * 0.05, (0.34, 0.2, 0.34), self.light, self.random.uniform(0, 1))
-        self.glows.append(Glow(place, 0.05, colour * 300))
-        self.lamps.lamps.append(Lamp(place, colour * 300 * np.float32(np.pi * 0.05**2)))
+        self.quads += box(dark, position, (0.015, float(self.high[1] - position[1]), 0.015), self.light)
+        self.quads += box(
+            cloth, position + UP * 0.05, (0.34, 0.2, 0.34), self.light, self.random.uniform(0, 1)
+        )
+        self.glows.append(Glow(position, 0.05, colour * 300))
+        self.lamps.lamps.append(Lamp(position, colour * 300 * np.float32(np.pi * 0.05**2)))
 
     def _floor(self) -> None:
         random, size = self.random, self.high - self.low
@@ -247,7 +262,7 @@ class _BoxRoom:
         middle = (self.low + self.high) / 2
         self.quads.append(horizontal_quad(canvas, vector(middle[0], self.floor, middle[2]), self.light))
 
-    def _reserve_floor(self, foot: Floats, size: tuple[float, float, float], turn: float) -> bool:
+    def _reserve_floor(self, foot: Floats, size: tuple[float, float, float], rotation: float) -> bool:
         """Reserves floor space for a piece of furniture. Returns False if the viewer or another piece is there."""
         reach = max(size[0], size[2]) / 2
         if np.hypot(foot[0], foot[2]) < reach + 0.7:
@@ -255,35 +270,35 @@ class _BoxRoom:
         for x, z, half_width, half_depth in self.lamps.contacts:
             if abs(x - foot[0]) < half_width + reach * 0.8 and abs(z - foot[2]) < half_depth + reach * 0.8:
                 return False
-        across = abs(np.cos(turn)) * size[0] + abs(np.sin(turn)) * size[2]
-        deep = abs(np.sin(turn)) * size[0] + abs(np.cos(turn)) * size[2]
-        self.lamps.contacts.append((float(foot[0]), float(foot[2]), float(across / 2), float(deep / 2)))
+        across = abs(np.cos(rotation)) * size[0] + abs(np.sin(rotation)) * size[2]
+        depth_m = abs(np.sin(rotation)) * size[0] + abs(np.cos(rotation)) * size[2]
+        self.lamps.contacts.append((float(foot[0]), float(foot[2]), float(across / 2), float(depth_m / 2)))
         return True
 
     def _furnish_wall(self, inward: Floats) -> None:
         """Adds shelves, cabinets and sofas along a wall."""
         random = self.random
-        middle, long = self._wall_base(inward)
-        turn = float(np.arctan2(-inward[0], inward[2]))
-        lit = any(np.array_equal(inward, way) for _, way, _, _ in self.openings)
-        for offset in np.arange(-long / 2 + 1.1, long / 2 - 1, random.uniform(1.2, 2)):
+        middle, length_m = self._wall_base(inward)
+        rotation = float(np.arctan2(-inward[0], inward[2]))
+        lit = any(np.array_equal(inward, normal) for _, normal, _, _ in self.openings)
+        for offset in np.arange(-length_m / 2 + 1.1, length_m / 2 - 1, random.uniform(1.2, 2)):
             kind = random.choice(["shelf", "cabinet", "sofa", "plant", "screen", "nothing"])
-            wide, deep = random.uniform(0.8, 1.8), random.uniform(0.3, 0.5)
-            tall = random.uniform(0.5, 0.85) if lit or kind != "shelf" else random.uniform(1.2, 2.2)
+            width_m, depth_m = random.uniform(0.8, 1.8), random.uniform(0.3, 0.5)
+            height_m = random.uniform(0.5, 0.85) if lit or kind != "shelf" else random.uniform(1.2, 2.2)
             if kind == "sofa":
-                wide, deep = random.uniform(1.5, 2.2), 0.85
-            foot = middle + np.cross(-inward, UP) * offset + inward * (deep / 2 + 0.02)
-            if kind == "nothing" or not self._reserve_floor(foot, (wide, tall, deep), turn):
+                width_m, depth_m = random.uniform(1.5, 2.2), 0.85
+            foot = middle + np.cross(-inward, UP) * offset + inward * (depth_m / 2 + 0.02)
+            if kind == "nothing" or not self._reserve_floor(foot, (width_m, height_m, depth_m), rotation):
                 continue
             if kind == "plant":
                 self._plant(foot)
             elif kind == "sofa":
-                self._sofa(foot, (wide, tall, deep), turn)
+                self._sofa(foot, (width_m, height_m, depth_m), rotation)
             else:
                 paint = bookshelf(random) if kind == "shelf" else cabinet(random)
-                self.quads += box(paint, foot, (wide, tall, deep), self.light, turn)
+                self.quads += box(paint, foot, (width_m, height_m, depth_m), self.light, rotation)
                 if kind == "screen":
-                    self._screen(foot + UP * (tall + 0.08), inward)
+                    self._screen(foot + UP * (height_m + 0.08), inward)
 
     def _screen(self, foot: Floats, inward: Floats) -> None:
         random = self.random
@@ -292,28 +307,35 @@ class _BoxRoom:
         canvas.paste(picture, (0.03, 0.03, 1.04, 0.56), glow=random.choice([0.05, 2.5]))
         self.quads.append(vertical_quad(canvas, foot, inward, self.light))
 
-    def _sofa(self, foot: Floats, size: tuple[float, float, float], turn: float) -> None:
-        wide, _, deep = size
+    def _sofa(self, foot: Floats, size: tuple[float, float, float], rotation: float) -> None:
+        width_m, _, depth_m = size
         cloth = plain_painter(self.random, tint(self.random, self.random.uniform(0.05, 0.4), 0.6), 60, 0.2)
-        ahead, aside = vector(-np.sin(turn), 0, np.cos(turn)), vector(np.cos(turn), 0, np.sin(turn))
-        back = foot - ahead * (deep / 2 - 0.1)
-        self.quads += box(cloth, foot, (wide, 0.42, deep), self.light, turn)
-        self.quads += box(cloth, back, (wide, 0.85, 0.2), self.light, turn)
+        forward, sideways = (
+            vector(-np.sin(rotation), 0, np.cos(rotation)),
+            vector(np.cos(rotation), 0, np.sin(rotation)),
+        )
+        back = foot - forward * (depth_m / 2 - 0.1)
+        self.quads += box(cloth, foot, (width_m, 0.42, depth_m), self.light, rotation)
+        self.quads += box(cloth, back, (width_m, 0.85, 0.2), self.light, rotation)
         for side in (-1, 1):
             self.quads += box(
-                cloth, foot + aside * side * (wide / 2 - 0.08), (0.16, 0.6, deep), self.light, turn
+                cloth,
+                foot + sideways * side * (width_m / 2 - 0.08),
+                (0.16, 0.6, depth_m),
+                self.light,
+                rotation,
             )
-        for place in np.arange(-wide / 2 + 0.45, wide / 2 - 0.3, 0.6):
+        for offset in np.arange(-width_m / 2 + 0.45, width_m / 2 - 0.3, 0.6):
             cushion = plain_painter(self.random, tint(self.random, 0.35, 0.9), 60, 0.2)
-            seat = back + aside * place + ahead * 0.2 + UP * 0.42
-            self.quads += box(cushion, seat, (0.4, 0.36, 0.12), self.light, turn)
+            seat = back + sideways * offset + forward * 0.2 + UP * 0.42
+            self.quads += box(cushion, seat, (0.4, 0.36, 0.12), self.light, rotation)
 
     def _plant(self, foot: Floats) -> None:
-        tall = self.random.uniform(0.7, 1.5)
+        height_m = self.random.uniform(0.7, 1.5)
         self.quads += box(
             plain_painter(self.random, tint(self.random, 0.3, 0.5)), foot, (0.3, 0.3, 0.3), self.light, 0.4
         )
-        self.quads.append(vertical_quad(tree(self.random, tall, 90), foot + UP * 0.25, None, self.light))
+        self.quads.append(vertical_quad(tree(self.random, height_m, 90), foot + UP * 0.25, None, self.light))
 
     def _place_free_standing(self) -> None:
         """Adds a table with chairs, a person or a floor lamp."""
@@ -322,11 +344,11 @@ class _BoxRoom:
         share = vector(random.uniform(), 0, random.uniform())
         foot = self.low + margin + share * (self.high - self.low - 2 * margin)
         foot[1] = self.floor
-        kind, turn = random.choice(["table", "table", "person", "lamp"]), random.uniform(0, 2 * np.pi)
+        kind, rotation = random.choice(["table", "table", "person", "lamp"]), random.uniform(0, 2 * np.pi)
         if kind == "table":
             size = random.uniform(0.8, 1.6), 0.74, random.uniform(0.6, 0.9)
-            if self._reserve_floor(foot, size, turn):
-                self._table(foot, size, turn)
+            if self._reserve_floor(foot, size, rotation):
+                self._table(foot, size, rotation)
         elif kind == "person" and self._reserve_floor(foot, (0.5, 1.7, 0.4), 0):
             self.quads.append(
                 vertical_quad(figure(random, random.uniform(1.55, 1.85), 90), foot, None, self.light)
@@ -334,21 +356,24 @@ class _BoxRoom:
         elif kind == "lamp" and self._reserve_floor(foot, (0.4, 1.6, 0.4), 0):
             self._floor_lamp(foot)
 
-    def _table(self, foot: Floats, size: tuple[float, float, float], turn: float) -> None:
-        random, (wide, tall, deep) = self.random, size
+    def _table(self, foot: Floats, size: tuple[float, float, float], rotation: float) -> None:
+        random, (width_m, height_m, depth_m) = self.random, size
         wood = plain_painter(random, vector(0.35, 0.22, 0.12) * random.uniform(0.4, 1.6), 60, 0.2)
-        ahead, aside = vector(-np.sin(turn), 0, np.cos(turn)), vector(np.cos(turn), 0, np.sin(turn))
-        self.quads += box(wood, foot + UP * (tall - 0.05), (wide, 0.05, deep), self.light, turn)
+        forward, sideways = (
+            vector(-np.sin(rotation), 0, np.cos(rotation)),
+            vector(np.cos(rotation), 0, np.sin(rotation)),
+        )
+        self.quads += box(wood, foot + UP * (height_m - 0.05), (width_m, 0.05, depth_m), self.light, rotation)
         for right in (-0.45, 0.45):
             for front in (-0.42, 0.42):
-                leg = foot + aside * right * wide + ahead * front * deep
-                self.quads += box(wood, leg, (0.06, tall - 0.05, 0.06), self.light, turn)
+                leg = foot + sideways * right * width_m + forward * front * depth_m
+                self.quads += box(wood, leg, (0.06, height_m - 0.05, 0.06), self.light, rotation)
         for _ in range(random.integers(1, 6)):
             thing = (
                 foot
-                + UP * tall
-                + aside * random.uniform(-0.4, 0.4) * wide
-                + ahead * random.uniform(-0.3, 0.3) * deep
+                + UP * height_m
+                + sideways * random.uniform(-0.4, 0.4) * width_m
+                + forward * random.uniform(-0.3, 0.3) * depth_m
             )
             bulk = random.uniform(0.05, 0.25), random.uniform(0.03, 0.3), random.uniform(0.05, 0.2)
             self.quads += box(
@@ -356,13 +381,13 @@ class _BoxRoom:
             )
         seat = plain_painter(random, tint(random, 0.2, 0.6), 60, 0.2)
         for side in (-1, 1):
-            chair = foot + ahead * side * (deep / 2 + 0.3)
+            chair = foot + forward * side * (depth_m / 2 + 0.3)
             if np.hypot(chair[0], chair[2]) > 1:
-                self.quads += box(seat, chair + UP * 0.42, (0.42, 0.05, 0.42), self.light, turn)
+                self.quads += box(seat, chair + UP * 0.42, (0.42, 0.05, 0.42), self.light, rotation)
                 self.quads += box(
-                    seat, chair + ahead * side * 0.2 + UP * 0.47, (0.42, 0.45, 0.04), self.light, turn
+                    seat, chair + forward * side * 0.2 + UP * 0.47, (0.42, 0.45, 0.04), self.light, rotation
                 )
-                self.quads += box(wood, chair, (0.3, 0.42, 0.05), self.light, turn)
+                self.quads += box(wood, chair, (0.3, 0.42, 0.05), self.light, rotation)
 
     def _floor_lamp(self, foot: Floats) -> None:
         colour = vector(1, 0.78, 0.5)

@@ -53,27 +53,28 @@ class _Sky:
     """Irradiance / pi (3,) on a surface that faces the sun; 0 when clouds hide it."""
     noise: PaintingTexture
 
-    def __call__(self, ways: Floats, texel: float) -> Floats:
+    def __call__(self, directions: Floats, texel: float) -> Floats:
         """Radiance (h, w, 3) in unit directions."""
-        rise = np.maximum(ways[..., 1:2], 0)
+        rise = np.maximum(directions[..., 1:2], 0)
         radiance = self.zenith + (self.horizon - self.zenith) * np.exp(-5 * rise)
-        nearness = np.maximum(ways @ self.sun, 0)[..., None]
+        nearness = np.maximum(directions @ self.sun, 0)[..., None]
         halo = 0.03 * nearness**8 + 0.12 * nearness**64 + 0.6 * nearness**800
         radiance = radiance + self.sunlight * halo
-        thickness = self._thickness(ways, rise[..., 0], texel)
+        thickness = self._thickness(directions, rise[..., 0], texel)
         veil = np.clip(thickness * 1.5, 0, 1) * np.clip(rise * 8, 0, 1)
         dark = np.clip(1.25 - 0.45 * thickness, 0.5, 1.2)
         lit = self.cloud * dark + self.sunlight * halo * np.exp(-3 * thickness)
         result: Floats = radiance + (lit - radiance) * veil
         return result
 
-    def _thickness(self, ways: Floats, rise: Floats, texel: float) -> Floats:
+    def _thickness(self, directions: Floats, rise: Floats, texel: float) -> Floats:
         """The thickness (h, w, 1) of clouds in each direction: a flat layer that curves down at the horizon."""
         height = rise + 0.1
-        places = [(ways[..., axis] / height * 0.35 % 1).ravel() for axis in (0, 2)]
-        spot = (texel * 0.35 * 512 / height**1.5).ravel()
+        coordinates = [(directions[..., axis] / height * 0.35 % 1).ravel() for axis in (0, 2)]
+        footprint = (texel * 0.35 * 512 / height**1.5).ravel()
         return np.maximum(
-            self.noise.sample(places[0], places[1], spot).reshape(*rise.shape, 1) - self.cover, 0
+            self.noise.sample(coordinates[0], coordinates[1], footprint).reshape(*rise.shape, 1) - self.cover,
+            0,
         )
 
 
@@ -116,7 +117,7 @@ class _Street:
     def __init__(self, random: Generator, *, night: bool) -> None:
         self.random, self.night = random, night
         self.ground = -float(random.choice([1.6, 1.6, random.uniform(3, 8)]))
-        self.reach = {side: random.uniform(6, 16) for side in (-1, 1)}
+        self.half_width = {side: random.uniform(6, 16) for side in (-1, 1)}
         self.pavement = random.uniform(2.4, 3.6)
         self.sky = _night_sky(random) if night else _day_sky(random)
         ambient = vector(0.04, 0.04, 0.05) if night else 0.5 * (self.sky.zenith + self.sky.horizon)
@@ -146,15 +147,15 @@ class _Street:
         x, y, z = np.moveaxis(points, 2, 0)
         sun = self.sky.sun
         side = 1 if sun[0] > 0 else -1
-        way = (side * self.reach[side] - x) / (sun[0] + 1e-6 * side)
-        place = np.clip((z + way * sun[2] + 128).astype(np.int32), 0, 255)
-        above = y + way * sun[1] - self.roofs[side][place]
-        lit = np.where(way < 0.3, 1, np.clip(above * 1.5 + 0.5, 0, 1))
+        distance = (side * self.half_width[side] - x) / (sun[0] + 1e-6 * side)
+        column = np.clip((z + distance * sun[2] + 128).astype(np.int32), 0, 255)
+        above = y + distance * sun[1] - self.roofs[side][column]
+        lit = np.where(distance < 0.3, 1, np.clip(above * 1.5 + 0.5, 0, 1))
         for crown, radius in self.crowns:
             offset = crown - points
             along = offset @ sun
-            aside = np.einsum("hwc,hwc->hw", offset, offset) - along * along
-            lit *= 1 - 0.85 * (np.clip(1.3 - aside / radius**2, 0, 0.5) * 2) * (along > 0)
+            squared_distance = np.einsum("hwc,hwc->hw", offset, offset) - along * along
+            lit *= 1 - 0.85 * (np.clip(1.3 - squared_distance / radius**2, 0, 0.5) * 2) * (along > 0)
         return lit
 
 
@@ -187,29 +188,29 @@ def _row_of_houses(street: _Street, side: int) -> None:
     while z < _END:
         if random.uniform() < 0.12:
             z += random.uniform(3, 9)
-        wide = random.uniform(8, 22)
+        width_m = random.uniform(8, 22)
         floors = max(1, round(typical * random.uniform(0.6, 1.5)))
-        back = street.reach[side] + random.choice([0, 0, random.uniform(0.3, 2)])
-        foot = vector(side * back, street.ground, z + wide / 2)
-        _house(street, foot, wide, floors)
-        z += wide
+        back = street.half_width[side] + random.choice([0, 0, random.uniform(0.3, 2)])
+        foot = vector(side * back, street.ground, z + width_m / 2)
+        _house(street, foot, width_m, floors)
+        z += width_m
 
 
-def _house(street: _Street, foot: Floats, wide: float, floors: int) -> None:
+def _house(street: _Street, foot: Floats, width_m: float, floors: int) -> None:
     random, side = street.random, 1 if foot[0] > 0 else -1
-    towards = vector(-side, 0, 0)
-    near = float(np.hypot(foot[0], max(0, abs(foot[2]) - wide / 2)))
+    normal = vector(-side, 0, 0)
+    near = float(np.hypot(foot[0], max(0, abs(foot[2]) - width_m / 2)))
     front = facade(
         random,
-        wide,
+        width_m,
         floors,
         density=float(np.clip(170 / near, 4, 26)),
         night=street.night,
         sky=street.sky.horizon,
     )
-    street.quads.append(vertical_quad(front, foot, towards, street.light))
-    start = int(foot[2] - wide / 2 + 128)
-    street.roofs[side][start : start + round(wide)] = foot[1] + front.height
+    street.quads.append(vertical_quad(front, foot, normal, street.light))
+    start = int(foot[2] - width_m / 2 + 128)
+    street.roofs[side][start : start + round(width_m)] = foot[1] + front.height
     gable = Canvas(12, front.height, 8, front.colour)
     for index in range(floors):
         gable.rect(
@@ -217,23 +218,25 @@ def _house(street: _Street, foot: Floats, wide: float, floors: int) -> None:
         )
     gable.add_noise(random, 0.15)
     end = -np.sign(foot[2])  # the end that the viewer sees
-    corner = foot + vector(side * 6, 0, end * wide / 2)
-    if abs(foot[2]) > wide / 2:
+    corner = foot + vector(side * 6, 0, end * width_m / 2)
+    if abs(foot[2]) > width_m / 2:
         street.quads.append(vertical_quad(gable, corner, vector(0, 0, end), street.light))
     if random.uniform() < 0.45:
-        _roof(street, foot + UP * front.height, wide, side)
+        _roof(street, foot + UP * front.height, width_m, side)
 
 
-def _roof(street: _Street, eave: Floats, wide: float, side: int) -> None:
+def _roof(street: _Street, eave: Floats, width_m: float, side: int) -> None:
     """Adds a tiled roof with skylights above the eave."""
     random = street.random
     slope = vector(-side * random.uniform(3, 5), -random.uniform(2, 4), 0)
-    canvas = Canvas(wide, float(np.linalg.norm(slope)), 12, tint(random, 0.12, 0.3) + vector(0.06, 0.01, 0))
+    canvas = Canvas(
+        width_m, float(np.linalg.norm(slope)), 12, tint(random, 0.12, 0.3) + vector(0.06, 0.01, 0)
+    )
     canvas.pixels[::3, :, :3] *= 0.7
     canvas.add_noise(random, 0.25, 12)
-    for left in np.arange(1.5, wide - 1.5, random.uniform(2.5, 5)):
+    for left in np.arange(1.5, width_m - 1.5, random.uniform(2.5, 5)):
         canvas.rect((left, 1.2, 0.9, 1.3), vector(0.5, 0.55, 0.6), glow=0)
-    across = vector(0, 0, side) * wide
+    across = vector(0, 0, side) * width_m
     street.quads.append(Quad(canvas, eave - slope - across / 2, (across, slope), street.light))
 
 
@@ -242,24 +245,29 @@ def _paving(street: _Street) -> None:
     random = street.random
     asphalt, slabs = random.uniform(0.05, 0.12), tint(random, random.uniform(0.2, 0.4), 0.06)
     stripes = random.uniform() < 0.4
-    for long, density in ((44.0, 20.0), (2 * _END + 40, 5.0)):
-        wide = street.reach[-1] + street.reach[1] + 30
-        canvas = Canvas(wide, long, density, slabs)
-        middle = 15 + street.reach[-1]
+    for length_m, density in ((44.0, 20.0), (2 * _END + 40, 5.0)):
+        width_m = street.half_width[-1] + street.half_width[1] + 30
+        canvas = Canvas(width_m, length_m, density, slabs)
+        middle = 15 + street.half_width[-1]
         canvas.pixels[:: max(2, round(density * 0.6)), :, :3] *= 0.75
         canvas.pixels[:, :: max(2, round(density * 0.6)), :3] *= 0.75
-        left, right = middle - street.reach[-1] + street.pavement, middle + street.reach[1] - street.pavement
-        canvas.rect((left - 0.2, 0, right - left + 0.4, long), vector(0.3, 0.3, 0.29))
-        canvas.rect((left, 0, right - left, long), vector(1, 1, 1.03) * asphalt)
-        for start in np.arange(0.5, long, 6):
+        left, right = (
+            middle - street.half_width[-1] + street.pavement,
+            middle + street.half_width[1] - street.pavement,
+        )
+        canvas.rect((left - 0.2, 0, right - left + 0.4, length_m), vector(0.3, 0.3, 0.29))
+        canvas.rect((left, 0, right - left, length_m), vector(1, 1, 1.03) * asphalt)
+        for start in np.arange(0.5, length_m, 6):
             canvas.rect(((left + right) / 2 - 0.08, start, 0.16, 3), vector(0.55, 0.55, 0.52))
-        if stripes and long < 50:
+        if stripes and length_m < 50:
             for start in np.arange(left + 0.4, right - 0.4, 1.0):
-                canvas.rect((start, long / 2 - 11, 0.5, 3.5), vector(0.6, 0.6, 0.58))
-        canvas.add_noise(random, 0.06, long / 3, 3)
-        canvas.add_noise(random, 0.1, long * 6, 2)
+                canvas.rect((start, length_m / 2 - 11, 0.5, 3.5), vector(0.6, 0.6, 0.58))
+        canvas.add_noise(random, 0.06, length_m / 3, 3)
+        canvas.add_noise(random, 0.1, length_m * 6, 2)
         centre = vector(
-            (street.reach[1] - street.reach[-1]) / 2, street.ground - (0.04 if long > 50 else 0), 0
+            (street.half_width[1] - street.half_width[-1]) / 2,
+            street.ground - (0.04 if length_m > 50 else 0),
+            0,
         )
         street.quads.append(horizontal_quad(canvas, centre, street.light))
 
@@ -284,7 +292,7 @@ def _ends(street: _Street) -> None:
 def _trees(street: _Street, side: int, *, park: bool) -> None:
     random = street.random
     typical = random.uniform(5, 10)
-    first = street.reach[side] - street.pavement + 0.6
+    first = street.half_width[side] - street.pavement + 0.6
     rows = [first, first + 7, first + 16] if park else [first]
     for row in rows:
         for z in np.arange(-60, 60, random.uniform(8, 15)):
@@ -299,62 +307,65 @@ def _trees(street: _Street, side: int, *, park: bool) -> None:
 def _light_lamps(street: _Street) -> None:
     """Adds street lamps along both kerbs. They come first, since lighting is baked into everything else."""
     random = street.random
-    tall, gap = random.uniform(5, 8), random.uniform(16, 26)
+    height_m, gap = random.uniform(5, 8), random.uniform(16, 26)
     colour = vector(1, random.uniform(0.5, 0.9), random.uniform(0.15, 0.8)) * random.uniform(100, 250)
     start = random.uniform(0, gap)
     for index, z in enumerate(np.arange(-60 + start, 60, gap)):
         side = 1 if index % 2 else -1
-        place = vector(side * (street.reach[side] - street.pavement - 0.5), street.ground + tall, z)
-        street.lamps.lamps.append(Lamp(place, colour, -UP))
-        street.glows.append(Glow(place - UP * 0.12, 0.16, colour / (np.pi * 0.16**2)))
+        position = vector(
+            side * (street.half_width[side] - street.pavement - 0.5), street.ground + height_m, z
+        )
+        street.lamps.lamps.append(Lamp(position, colour, -UP))
+        street.glows.append(Glow(position - UP * 0.12, 0.16, colour / (np.pi * 0.16**2)))
         street.quads += box(
-            plain_painter(random, vector(0.1, 0.1, 0.1)), place, (0.9, 0.12, 0.35), street.light
+            plain_painter(random, vector(0.1, 0.1, 0.1)), position, (0.9, 0.12, 0.35), street.light
         )
 
 
 def _poles(street: _Street, side: int) -> None:
     """Adds posts, road signs on posts, and signs that hang from the houses."""
     random = street.random
-    kerb = street.reach[side] - street.pavement + 0.3
+    kerb = street.half_width[side] - street.pavement + 0.3
     for z in np.arange(-55 + random.uniform(0, 15), 60, random.uniform(12, 20)):
         foot = vector(side * kerb, street.ground, z)
-        tall = random.uniform(2.5, 6)
+        height_m = random.uniform(2.5, 6)
         street.quads.append(
-            vertical_quad(Canvas(0.12, tall, 30, vector(0.15, 0.16, 0.16)), foot, None, street.light)
+            vertical_quad(Canvas(0.12, height_m, 30, vector(0.15, 0.16, 0.16)), foot, None, street.light)
         )
         face = Canvas(0.7, 0.7, 90, tint(random, 0.4, 1))
         face.rect((0.06, 0.06, 0.58, 0.58), vector(0.8, 0.8, 0.8))
         face.write(random, (0.1, 0.2, 0.5, 0.28), tint(random, 0.05, 1))
-        towards = vector(0, 0, -np.sign(z))
+        normal = vector(0, 0, -np.sign(z))
         street.quads.append(
-            vertical_quad(face, foot + UP * (tall - 0.6) + towards * 0.08, towards, street.light)
+            vertical_quad(face, foot + UP * (height_m - 0.6) + normal * 0.08, normal, street.light)
         )
         if random.uniform() < 0.6:
             _hanging_sign(
-                street, vector(side * (street.reach[side] - 0.6), street.ground + random.uniform(3, 5), z + 4)
+                street,
+                vector(side * (street.half_width[side] - 0.6), street.ground + random.uniform(3, 5), z + 4),
             )
 
 
 def _hanging_sign(street: _Street, foot: Floats) -> None:
     random, colour = street.random, tint(street.random, 0.5, 1)
     glow = random.uniform(5, 40) if street.night else 0
-    tall = random.uniform(0.6, 2.5)
-    canvas = Canvas(1.1, tall, 60, colour * (0.1 if glow else 1))
+    height_m = random.uniform(0.6, 2.5)
+    canvas = Canvas(1.1, height_m, 60, colour * (0.1 if glow else 1))
     ink = colour if glow else vector(0.9, 0.9, 0.85)
     canvas.rect((0.05, 0.05, 1, 0.05), ink, glow=glow)
-    canvas.rect((0.05, tall - 0.1, 1, 0.05), ink, glow=glow)
-    for top in np.arange(0.18, tall - 0.5, 0.5):
+    canvas.rect((0.05, height_m - 0.1, 1, 0.05), ink, glow=glow)
+    for top in np.arange(0.18, height_m - 0.5, 0.5):
         canvas.write(random, (0.12, top, 0.86, 0.36), ink, glow=glow)
-    towards = vector(0, 0, -np.sign(foot[2]))
-    street.quads.append(vertical_quad(canvas, foot, towards, street.light))
+    normal = vector(0, 0, -np.sign(foot[2]))
+    street.quads.append(vertical_quad(canvas, foot, normal, street.light))
     if glow:
-        street.lamps.lamps.append(Lamp(foot + UP * tall / 2, colour * glow * 0.4))
+        street.lamps.lamps.append(Lamp(foot + UP * height_m / 2, colour * glow * 0.4))
 
 
 def _cars(street: _Street) -> None:
     random = street.random
     for side in (-1, 1):
-        if (x := street.reach[side] - street.pavement - 1.1) < 2.4 and street.ground > -3:
+        if (x := street.half_width[side] - street.pavement - 1.1) < 2.4 and street.ground > -3:
             continue
         for z in np.arange(-45, 45, 6.0):
             if random.uniform() < 0.45:
@@ -365,22 +376,22 @@ def _cars(street: _Street) -> None:
                 if street.night and not away and random.uniform() < 0.5:
                     nose = foot - vector(0, 0, np.sign(z) * 2.6) + UP * 0.7
                     for offset in (-0.65, 0.65):
-                        place = nose + vector(offset, 0, 0)
-                        street.glows.append(Glow(place, 0.07, vector(1, 0.93, 0.8) * 4000))
+                        position = nose + vector(offset, 0, 0)
+                        street.glows.append(Glow(position, 0.07, vector(1, 0.93, 0.8) * 4000))
 
 
 def _people(street: _Street) -> None:
     random = street.random
     for _ in range(random.integers(3, 12)):
         side = random.choice([-1, 1])
-        x = street.reach[side] - random.uniform(0.5, street.pavement - 0.3)
+        x = street.half_width[side] - random.uniform(0.5, street.pavement - 0.3)
         foot = vector(side * x, street.ground, random.uniform(-30, 30))
         street.quads.append(
             vertical_quad(figure(random, random.uniform(1.55, 1.9), 60), foot, None, street.light)
         )
     for _ in range(4):  # posters on a column
         side = random.choice([-1, 1])
-        foot = vector(side * (street.reach[side] - 0.8), street.ground, random.uniform(-20, 20))
+        foot = vector(side * (street.half_width[side] - 0.8), street.ground, random.uniform(-20, 20))
         picture = painting(int(random.integers(1 << 30)), 96, 144)
         canvas = Canvas(1.2, 2.2, 80, vector(0.1, 0.1, 0.1))
         canvas.paste(picture, (0.08, 0.08, 1.04, 1.6), glow=6 if street.night else 0)

@@ -1,1 +1,1 @@
-"""Generation of rendered sets: the job, its executors (one process, several, a Ray cluster), index and preview."""
+"""Generation of rendered sets: job, executors (one process, several processes, a Ray cluster), index and preview."""

@@ -1,10 +1,10 @@
-"""Renders a set: the job, the schedule of its tasks, and the lock. The executors are in `workers` and `ray_cluster`.
+"""Renders sets: the job, the schedule of its tasks, and the lock. The executors are in `workers` and `ray_cluster`.
 
     job = RenderJob(Path("out/window"), read_scene_recipe("window"), read_catalog([], [])[0], seed=7)
     build(job, range(1000), ProcessExecutor(job, 8))
 
-A sample depends on (job, index) only and is written atomically by the process that rendered it. So existing samples are
-finished, a killed run can resume without other state, and memory and time per sample do not grow with the count.
+A sample depends only on (job, index). The process that renders it writes it atomically. So every existing sample is
+complete, a killed run needs no other state to resume, and memory and time per sample do not depend on the number of samples.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from brewster.rendered.generation.preview import write_index
 from brewster.scene.recipe import SceneRecipe
 from brewster.scene.sampler import Catalog
 
-RECORD: Final = "set.toml"
-_LOCK: Final = ".lock"
-FATAL: Final = (TargetError, MissingExtra, DeviceError)
-"""Errors that every sample would raise; they end the run."""
+RECORD_FILE: Final = "set.toml"
+_LOCK_FILE: Final = ".lock"
+FATAL_ERRORS: Final = (TargetError, MissingExtra, DeviceError)
+"""Errors that occur for every sample. They end the run."""
 
 
 @final
 @dataclass(frozen=True)
 class RenderJob:
-    """What to render, and where. Any other value, except of `out` and `folders`, gives another set.
+    """What to render, and the folder of the set. All values except `out` and `folders` determine the bytes of the set.
 
-    `renderer` is a name in workers.RENDERERS or "module:function". `folders` hold the files of the catalog.
+    `renderer` is a name in workers.RENDERERS or "module:function". `folders` contain the files of the catalog.
     """
 
     out: Path
@@ -50,7 +50,7 @@ class RenderJob:
     folders: tuple[Path, ...] = ()
 
     def record(self) -> dict[str, Any]:
-        """The values that the bytes of the set depend on, for set.toml."""
+        """Returns the values that determine the bytes of the set, for set.toml."""
         return {
             "format": store.SAMPLE_FORMAT,
             "renderer": self.renderer,
@@ -63,14 +63,16 @@ class RenderJob:
 @final
 @dataclass(frozen=True)
 class RenderTask:
-    """Indices of samples to render, or of blocks of a hundred samples to pack into shards."""
+    """The indices of samples to render ("render"), or of blocks of a hundred samples to pack into shards ("pack")."""
 
     kind: Literal["render", "pack"]
     indices: tuple[int, ...]
 
-    def failed_results(self, why: str) -> list[RenderResult]:
-        """The results if no worker could finish the task."""
-        message = f"{why}; a sample must fit into memory; use fewer --workers, or a smaller --size."
+    def failed_results(self, reason: str) -> list[RenderResult]:
+        """Returns the results if no worker could finish the task."""
+        message = (
+            f"{reason}; expected a sample that fits into memory; use fewer --workers, or a smaller --size."
+        )
         first = 1 if self.kind == "render" else store.SHARD_SIZE
         return [
             RenderResult(number * first, "failed", error=message, kind="WorkerLost")
@@ -81,9 +83,9 @@ class RenderTask:
 @final
 @dataclass(frozen=True)
 class RenderResult:
-    """The result for one sample or, if packing failed, for the first sample of its block.
+    """The result for one sample. If packing fails, it is the result for the first sample of the block.
 
-    `kind` is the name of the error's class. `fatal` is the error itself if it ends the run.
+    `kind` is the class name of the error. `fatal` is the error itself if it ends the run.
     """
 
     index: int
@@ -98,10 +100,10 @@ ResultCallback = Callable[[RenderResult], None]
 
 
 class Executor(AbstractContextManager[Any], Protocol):
-    """Runs tasks, a limited number at a time. Leaving the context ends the running tasks."""
+    """Runs a limited number of tasks at a time. On exit from the context, the running tasks are stopped."""
 
-    chunk: int
-    """The number of samples per task."""
+    chunk_size: int
+    """Number of samples per task."""
 
     def has_capacity(self) -> bool:
         """Whether another task can be submitted now."""
@@ -113,7 +115,7 @@ class Executor(AbstractContextManager[Any], Protocol):
         """Starts a task."""
 
     def wait(self) -> Sequence[RenderResult]:
-        """Waits for an event. Returns: the results of finished tasks, possibly none."""
+        """Waits until a task ends. Returns the results of finished tasks; none if a task is tried again."""
 
 
 def build(
@@ -124,20 +126,20 @@ def build(
     shards: bool = False,
     report: ResultCallback = lambda _: None,
 ) -> None:
-    """Renders the missing samples, packs them into shards on request, and writes the index.
+    """Renders the missing samples of a set, packs them into shards on request, and writes the index.
 
-    A sample that fails is reported and skipped. The next call tries it again.
+    A sample that fails is reported and skipped. The next call renders it again.
 
     Args:
-        job: what to render, and where.
+        job: what to render, and the folder of the set.
         indices: the indices of the samples.
         executor: runs the tasks.
-        shards: whether to pack each hundred samples into a tar file.
+        shards: whether to pack every hundred samples into a tar file.
         report: called with the result of every sample.
 
     Raises:
-        TargetError: the folder holds something else, another run is writing there, the disk is full or read-only.
-        MissingExtra, DeviceError: the renderer cannot run here.
+        TargetError: the folder contains something else, another run writes to it, or the disk is full or read-only.
+        MissingExtra, DeviceError: the renderer cannot run on this machine.
     """
     with _exclusive_lock(job.out):
         _check_record(job)
@@ -145,7 +147,7 @@ def build(
         try:
             with executor:
                 _run_tasks(
-                    _Schedule(job.out, indices, executor.chunk, shards=shards, report=report), executor
+                    _Schedule(job.out, indices, executor.chunk_size, shards=shards, report=report), executor
                 )
         finally:
             store.remove_partial_files(job.out)
@@ -168,67 +170,71 @@ def _run_tasks(schedule: _Schedule, executor: Executor) -> None:
 
 @final
 class _Schedule:
-    """The remaining tasks, block by block: missing samples to render, and complete blocks to pack."""
+    """Schedules tasks block by block: missing samples to render, and complete blocks to pack."""
 
     def __init__(
-        self, out: Path, indices: range, chunk: int, *, shards: bool, report: ResultCallback
+        self, out: Path, indices: range, chunk_size: int, *, shards: bool, report: ResultCallback
     ) -> None:
-        self._out, self._indices, self._chunk = out, indices, chunk
+        self._out, self._indices, self._chunk_size = out, indices, chunk_size
         self._shards, self._report = shards, report
-        self._packs: deque[int] = deque()
-        self._left: dict[int, int] = {}
-        """Block -> number of samples to render before it can be packed."""
-        self._renders = self._plan_tasks()
+        self._blocks_to_pack: deque[int] = deque()
+        self._remaining: dict[int, int] = {}
+        """Block -> number of samples that must be rendered before the block is packed."""
+        self._render_tasks = self._plan_tasks()
 
     def next(self) -> RenderTask | None:
-        """The next task; None if there is none, or none before another result."""
-        return RenderTask("pack", (self._packs.popleft(),)) if self._packs else next(self._renders, None)
+        """Returns the next task, or None if there is no task before the next result."""
+        return (
+            RenderTask("pack", (self._blocks_to_pack.popleft(),))
+            if self._blocks_to_pack
+            else next(self._render_tasks, None)
+        )
 
     def record_result(self, result: RenderResult) -> None:
-        """Counts a result. When all samples of a block are rendered, the block is scheduled for packing."""
+        """Records a result. When all samples of a block are rendered, the block is scheduled for packing."""
         block = result.index // store.SHARD_SIZE
         if result.status == "failed":
-            self._left.pop(block, None)
-        elif block in self._left:
-            self._left[block] -= 1
-            if self._left[block] == 0:
-                del self._left[block]
-                self._packs.append(block)
+            self._remaining.pop(block, None)
+        elif block in self._remaining:
+            self._remaining[block] -= 1
+            if self._remaining[block] == 0:
+                del self._remaining[block]
+                self._blocks_to_pack.append(block)
         self._report(result)
 
     def _plan_tasks(self) -> Iterator[RenderTask]:
-        size, wanted = store.SHARD_SIZE, self._indices
-        for block in range(wanted.start // size, -(-wanted.stop // size)):
-            present = {entry.index for entry in store.read_block(self._out, block)}
-            here = range(max(wanted.start, block * size), min(wanted.stop, (block + 1) * size))
-            missing = [index for index in here if index not in present]
+        size, requested = store.SHARD_SIZE, self._indices
+        for block in range(requested.start // size, -(-requested.stop // size)):
+            existing = {entry.index for entry in store.read_block(self._out, block)}
+            in_block = range(max(requested.start, block * size), min(requested.stop, (block + 1) * size))
+            missing = [index for index in in_block if index not in existing]
             if self._shards and missing:
-                self._left[block] = len(missing)
+                self._remaining[block] = len(missing)
             elif self._shards and store.has_folders(self._out, block):
                 yield RenderTask("pack", (block,))
-            for index in here:
-                if index in present:
+            for index in in_block:
+                if index in existing:
                     self._report(RenderResult(index, "skipped"))
-            for at in range(0, len(missing), self._chunk):
-                yield RenderTask("render", tuple(missing[at : at + self._chunk]))
+            for first in range(0, len(missing), self._chunk_size):
+                yield RenderTask("render", tuple(missing[first : first + self._chunk_size]))
 
 
-# --- one set, one job, one run at a time
+# --- the lock and the record of a set: one job, one run at a time
 
 
 @contextmanager
 def _exclusive_lock(out: Path) -> Iterator[None]:
-    """Holds the lock of the folder. It is released by the operating system if the process is killed."""
+    """Holds the lock of the folder within this block. If the process is killed, the operating system releases the lock."""
     try:
         out.mkdir(parents=True, exist_ok=True)
-        (out / _LOCK).touch()
+        (out / _LOCK_FILE).touch()
     except OSError as error:
         raise TargetError(
             f"{out} cannot be written to ({error.strerror})",
             "expected a folder for the set",
-            "name another one",
+            "choose another folder",
         ) from error
-    lock = filelock.FileLock(out / _LOCK, blocking=False, fallback_to_soft=False)
+    lock = filelock.FileLock(out / _LOCK_FILE, blocking=False, fallback_to_soft=False)
     _acquire(lock, out)
     try:
         yield
@@ -242,32 +248,32 @@ def _acquire(lock: filelock.BaseFileLock, out: Path) -> None:
     except filelock.Timeout as error:
         raise TargetError(
             f"another run is writing in {out}",
-            "only one run can write at a time",
-            "wait for it, or name another folder",
+            "expected no other run, because only one can write at a time",
+            "wait until it has ended, or choose another folder",
         ) from error
     except OSError as error:
         raise TargetError(
             f"{out} cannot be locked ({error.strerror})",
-            "locks keep two runs from writing to the same set",
-            "name a folder on a file system with locks",
+            "expected a file system with locks, so that only one run writes to a set",
+            "choose a folder on another file system",
         ) from error
 
 
 def _check_record(job: RenderJob) -> None:
     """Writes the record of the job into a new set, or compares it with the record of an existing set."""
-    path, text = job.out / RECORD, tomli_w.dumps(job.record())
+    path, text = job.out / RECORD_FILE, tomli_w.dumps(job.record())
     if not path.exists():
         _check_is_set(job.out)
         write_atomically(path, text.encode())
         return
-    present, requested = dict(_flatten(_read_record(path))), dict(_flatten(tomllib.loads(text)))
-    for name in {**present, **requested}:
-        old, new = present.get(name, "not set"), requested.get(name, "not set")
+    existing, requested = dict(_flatten(_read_record(path))), dict(_flatten(tomllib.loads(text)))
+    for name in {**existing, **requested}:
+        old, new = existing.get(name, "not set"), requested.get(name, "not set")
         if old != new:
             raise TargetError(
-                f"{job.out} holds another set: its {name} is {old}, and {new} was requested",
-                "a folder holds one set only",
-                "name another folder, or use the same settings",
+                f"{job.out} contains another set: its {name} is {old}, and {new} was requested",
+                "expected the settings of that set, or a new folder",
+                "choose another folder, or use the same settings",
             )
 
 
@@ -276,7 +282,7 @@ def _read_record(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text("utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise TargetError(
-            f"{path} cannot be read ({error})", "expected the record of a set", "name another folder"
+            f"{path} cannot be read ({error})", "expected the record of a set", "choose another folder"
         ) from error
 
 
@@ -284,9 +290,9 @@ def _check_is_set(out: Path) -> None:
     foreign = next((path for path in out.iterdir() if not path.name.startswith(".")), None)
     if foreign:
         raise TargetError(
-            f"{out} holds {foreign.name} and is no set",
+            f"{out} contains {foreign.name}, but no set",
             "expected an empty folder or a set",
-            "name a new folder",
+            "choose a new folder",
         )
 
 

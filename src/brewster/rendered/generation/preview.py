@@ -1,4 +1,4 @@
-"""Overviews of a set: index.parquet with a row per sample, and preview.png, a contact sheet of the first samples."""
+"""Writes index.parquet, with a row for each sample of a set, and preview.png, a contact sheet of its first samples."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from torch.nn import functional
 from brewster.files import atomic_path, write_atomically
 from brewster.photo import Photo
 from brewster.render.sample import LAYERS
-from brewster.rendered.store import SCENE, STATISTICS, StoredSample, read_set
+from brewster.rendered.store import SCENE_FILE, STATISTICS, StoredSample, read_set
 
-INDEX, PREVIEW = "index.parquet", "preview.png"
+INDEX_FILE, PREVIEW_FILE = "index.parquet", "preview.png"
 _BATCH_ROWS: Final = 1000
 
 
@@ -52,18 +52,18 @@ COLUMNS: Final = {
             (more, "float64", more),
         )
     },
-    "jpeg_quality": ("int64", "development.jpeg_quality"),
+    "jpeg_quality": ("int64", "camera_response.jpeg_quality"),
     "exposure_ev": ("float64", "outcome.exposure_ev"),
     "mirror_exposure_ev": ("float64", "outcome.mirror_exposure_ev"),
     **{name: ("float64", f"outcome.{name}") for name in STATISTICS},
     "renderer": ("string", "outcome.renderer"),
     "version": ("string", "outcome.version"),
 }
-"""Column of the index -> its type and its path in scene.toml. The first pane is the one nearest to the camera."""
+"""Column of the index -> its type, and its path in scene.toml. Pane 0 is the one nearest to the camera."""
 
 
 def write_index(out: Path) -> None:
-    """Writes index.parquet, a row per sample in order. Its bytes depend on the samples and their locations only.
+    """Writes index.parquet, with a row for each sample in order. Its bytes depend only on the samples and their paths.
 
     Raises:
         TargetError: the file cannot be written, for example because the disk is full.
@@ -76,23 +76,23 @@ def write_index(out: Path) -> None:
     }
     schema = pa.schema([(name, pa.type_for_alias(kind)) for name, kind in kinds.items()])
     rows = map(_row, read_set(out))
-    with atomic_path(out / INDEX) as part, parquet.ParquetWriter(part, schema) as writer:
+    with atomic_path(out / INDEX_FILE) as part, parquet.ParquetWriter(part, schema) as writer:
         while batch := list(islice(rows, _BATCH_ROWS)):
             writer.write_batch(pa.RecordBatch.from_pylist(batch, schema=schema))
 
 
 def _row(entry: StoredSample) -> dict[str, Any]:
-    scene = tomllib.loads(entry.read(SCENE).decode())
-    own = {"index": entry.index, "place": entry.place.name, "panes": len(scene["glass"]["panes"])}
-    return own | {name: _lookup(scene, path.split(".")) for name, (_, path) in COLUMNS.items()}
+    scene = tomllib.loads(entry.read(SCENE_FILE).decode())
+    columns = {"index": entry.index, "place": entry.path.name, "panes": len(scene["glass"]["panes"])}
+    return columns | {name: _lookup(scene, path.split(".")) for name, (_, path) in COLUMNS.items()}
 
 
 def _lookup(table: Any, path: list[str]) -> Any:  # noqa: ANN401  (what TOML holds)
-    """The value at a path, or None where the scene has no such part."""
-    for step in path:
-        if isinstance(table, dict) and step not in table:
+    """Returns the value at a path, or None if the scene has no such part."""
+    for part in path:
+        if isinstance(table, dict) and part not in table:
             return None
-        table = table[int(step) if isinstance(table, list) else step]
+        table = table[int(part) if isinstance(table, list) else part]
     return table
 
 
@@ -104,29 +104,31 @@ _WHITE: Final = 255
 
 
 def write_preview(out: Path) -> None:
-    """Writes preview.png: the first 40 samples, each a row of its five photographs.
+    """Writes preview.png with the first 40 samples. The five photographs of a sample form a row.
 
     Raises:
         TargetError: the file cannot be written.
     """
-    strips = [_strip(entry) for entry in islice(read_set(out), _SHEET_ROWS * _SHEET_COLUMNS)]
-    columns = [np.concatenate(strips[at : at + _SHEET_ROWS]) for at in range(0, len(strips), _SHEET_ROWS)]
+    rows = [_contact_sheet_row(entry) for entry in islice(read_set(out), _SHEET_ROWS * _SHEET_COLUMNS)]
+    columns = [
+        np.concatenate(rows[first : first + _SHEET_ROWS]) for first in range(0, len(rows), _SHEET_ROWS)
+    ]
     if columns:
-        tallest = len(columns[0])
+        height = len(columns[0])
         padded = [
-            np.pad(column, ((0, tallest - len(column)), (0, 0), (0, 0)), constant_values=_WHITE)
+            np.pad(column, ((0, height - len(column)), (0, 0), (0, 0)), constant_values=_WHITE)
             for column in columns
         ]
         sheet = Photo.from_array(np.concatenate(padded, axis=1), encoding="srgb")
-        write_atomically(out / PREVIEW, sheet.encode("png"), overwrite=True)
+        write_atomically(out / PREVIEW_FILE, sheet.encode("png"), overwrite=True)
 
 
-def _strip(entry: StoredSample) -> NDArray[np.uint8]:
+def _contact_sheet_row(entry: StoredSample) -> NDArray[np.uint8]:
     return np.concatenate([_cell(entry.read(f"{layer}.jpg")) for layer in LAYERS], axis=1)
 
 
 def _cell(data: bytes) -> NDArray[np.uint8]:
-    """A photograph, scaled down and centred in a white cell (120, 160, 3)."""
+    """Scales a photograph down, and centres it in a white cell (120, 160, 3)."""
     pixels = torch.from_numpy(Photo.open(data).pixels.copy()).permute(2, 0, 1)[None].float()
     scale = min((cell - 4) / side for cell, side in zip(_CELL, pixels.shape[2:], strict=True))
     height, width = (max(1, round(side * scale)) for side in pixels.shape[2:])

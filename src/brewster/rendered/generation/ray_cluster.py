@@ -1,6 +1,6 @@
-"""Executor of render tasks on a Ray cluster. Each node writes its samples into a folder that all nodes share.
+"""Runs render tasks on a Ray cluster. All nodes write their samples into a shared folder.
 
-The head node sends indices and receives results; no image data passes through it.
+The nodes exchange only indices and results, no image data.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from brewster.worker_setup import single_torch_thread
 LOCAL: Final = "local"
 _CONNECT_TIMEOUT_S: Final = 10.0
 _TASKS_PER_CPU: Final = 2
-"""Submitted tasks per processor, so that no processor waits for the head node."""
+"""Number of submitted tasks per processor. With 2, no processor waits for the head node."""
 
 
 @final
 class RayExecutor:
-    """Runs tasks on the Ray cluster at an address, or on a cluster on this machine only ("local").
+    """Runs tasks on the Ray cluster at an address, or on a cluster of this machine only ("local").
 
-    A task whose node is lost is tried on another node.
+    If a node is lost, its tasks are run on another node.
     """
 
-    chunk = 4
+    chunk_size = 4
 
     def __init__(self, job: RenderJob, address: str = LOCAL, workers: int | None = None) -> None:
         self._job, self._address, self._workers = job, address, workers
         self._tasks: dict[Any, RenderTask] = {}
 
     def has_capacity(self) -> bool:
-        """Whether more tasks can be submitted. The number of nodes may change."""
+        """Whether more tasks can be submitted. The limit depends on the current number of nodes."""
         processors = int(self._ray.cluster_resources().get("CPU", 1))
         return len(self._tasks) < _TASKS_PER_CPU * max(1, processors)
 
@@ -49,7 +49,7 @@ class RayExecutor:
         self._tasks[self._run_task.remote(self._job_ref, task)] = task
 
     def wait(self) -> list[RenderResult]:
-        """The results of the next finished task."""
+        """Returns the results of the next finished task; none if it was lost and its samples are tried again."""
         (done, *_), _ = self._ray.wait(list(self._tasks), num_returns=1)
         task = self._tasks.pop(done)
         try:
@@ -59,7 +59,7 @@ class RayExecutor:
         return results
 
     def _handle_lost_task(self, task: RenderTask, reason: str) -> list[RenderResult]:
-        """Submits each sample of a lost task alone, since only one of them may be the cause."""
+        """Submits each sample of a lost task as a task of its own, because one sample may be the cause."""
         if len(task.indices) == 1:
             return task.failed_results(f"its process or node was lost {MAX_ATTEMPTS} times ({reason})")
         for number in task.indices:
@@ -104,22 +104,24 @@ def _ray() -> ModuleType:
         ray = importlib.import_module("ray")
     except ImportError as error:
         raise MissingExtra(
-            "a cluster needs the package ray", "it is not installed", "run: pip install 'brewster[cluster]'"
+            "the package ray is not installed",
+            "expected it for rendering on a cluster",
+            "run: pip install 'brewster[cluster]'",
         ) from error
-    # Ray reports lost processes on standard output, which is reserved for --json. It has no option to turn that off.
+    # Ray prints lost processes on standard output, which is reserved for --json. There is no option to prevent this.
     importlib.import_module("ray._private.worker")._worker_logs_enabled = False  # type: ignore[attr-defined]
     return ray
 
 
 def _check_reachable(address: str) -> None:
-    """Raises OSError if nothing listens at HOST:PORT. Ray itself would retry for many minutes."""
+    """Raises OSError if no program listens at HOST:PORT. Ray itself would retry for many minutes."""
     host, _, port = address.rpartition(":")
     if host and port.isdigit() and "/" not in host:
         socket.create_connection((host, int(port)), timeout=_CONNECT_TIMEOUT_S).close()
 
 
 _runners: list[tuple[RenderJob, TaskRunner]] = []
-"""The job and the task runner of this process. They are kept between tasks, so that maps are read once."""
+"""The job and the task runner of this process. They are reused for the next tasks, so that maps are read once."""
 
 
 def _run_task(job: RenderJob, task: RenderTask) -> list[RenderResult]:

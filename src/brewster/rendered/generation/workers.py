@@ -1,7 +1,7 @@
-"""Executors of render tasks on one machine: in this process, or in several processes.
+"""Runs render tasks on one machine: in this process, or in several processes.
 
-Every process uses one thread. With more, torch sums in another order, and the bytes of a sample would depend on the
-number of cores.
+Every process uses one torch thread. With several threads, the order of sums depends on the number of cores, and so do the
+bytes of a sample.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from brewster.environments.assets import Assets
 from brewster.errors import BrewsterError, RecipeError, TargetError
 from brewster.render.sample import LightSample
 from brewster.rendered import store
-from brewster.rendered.generation.job import FATAL, RenderJob, RenderResult, RenderTask
+from brewster.rendered.generation.job import FATAL_ERRORS, RenderJob, RenderResult, RenderTask
 from brewster.scene.sampler import draw
 from brewster.scene.scene import Scene, read_scene
 from brewster.worker_setup import exit_with_parent, single_torch_thread
@@ -39,29 +39,29 @@ RENDERERS: Final = {
 """Name of a renderer -> its module and function."""
 
 MAX_ATTEMPTS: Final = 3
-"""Number of workers that may die at the same task before the task fails."""
+"""Maximum number of workers that may die at the same task. Then the task fails."""
 
 
 @final
 class TaskRunner:
-    """Runs the tasks of a job in this process. Errors are returned as results."""
+    """Runs the tasks of a job in this process. Errors become results with the status "failed"."""
 
     def __init__(self, job: RenderJob) -> None:
         self._job, self._assets = job, Assets(job.folders)
 
     def __call__(self, task: RenderTask) -> list[RenderResult]:
-        """Runs a task. Returns: a result per sample; for packing, results of failures only."""
+        """Runs a task. Returns the results of all samples; for packing, only those of failures."""
         if task.kind == "render":
             return [self._attempt(index, lambda index=index: self._render(index)) for index in task.indices]  # type: ignore[misc]
-        tried = [
+        results = [
             self._attempt(block * store.SHARD_SIZE, lambda block=block: store.pack(self._job.out, block))  # type: ignore[misc]
             for block in task.indices
         ]
-        return [result for result in tried if result.error]
+        return [result for result in results if result.error]
 
     def _render(self, index: int) -> None:
         folder = self._job.out / store.key(index)
-        if not folder.is_dir():  # the previous worker may have finished a part of the task
+        if not folder.is_dir():  # a worker that died may have finished a part of the task
             scene = draw(self._job.recipe, self._job.catalog, self._job.seed, index)
             sample = find_renderer(self._job.renderer)(scene, self._assets)
             store.write_folder(folder, store.encode_sample(sample, self._job.renderer))
@@ -71,7 +71,7 @@ class TaskRunner:
         try:
             work()
         except BrewsterError as error:
-            fatal = error if isinstance(error, FATAL) else None
+            fatal = error if isinstance(error, FATAL_ERRORS) else None
             return RenderResult(index, "failed", error=str(error), kind=type(error).__name__, fatal=fatal)
         except MemoryError:
             return RenderResult(
@@ -80,29 +80,31 @@ class TaskRunner:
                 error="the sample does not fit into memory; use fewer --workers",
                 kind="MemoryError",
             )
-        except Exception as bug:  # noqa: BLE001  (one sample must not end the run)
+        except Exception as bug:  # noqa: BLE001  (a bug in one sample must not end the run)
             message = f"internal error ({type(bug).__name__}: {bug}); please report it"
             return RenderResult(index, "failed", error=message, kind=type(bug).__name__)
         return RenderResult(index, "rendered", time.perf_counter() - started)
 
 
 def find_renderer(name: str) -> Renderer:
-    """A renderer by its name in RENDERERS or by "module:function"."""
+    """Imports a renderer by its name in RENDERERS, or by "module:function"."""
     module, _, function = RENDERERS.get(name, name).partition(":")
-    found: Renderer = getattr(importlib.import_module(module), function)
-    return found
+    renderer: Renderer = getattr(importlib.import_module(module), function)
+    return renderer
 
 
 def render_again(path: Path, folder: Path, folders: Sequence[Path] = (), renderer: str | None = None) -> None:
-    """Renders a scene file into a new folder, by default with the renderer that the file names.
+    """Renders a scene file into a new folder, by default with the renderer that is recorded in the file.
 
     Raises:
-        RecipeError: the scene cannot be read, or a file that it uses is missing.
+        RecipeError: the scene cannot be read, or a file of the scene is missing.
         TargetError: the folder is not empty, or cannot be written.
     """
     scene = read_scene(path)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise TargetError(f"{folder} exists", "expected a new or empty folder", "name another one with -o")
+        raise TargetError(
+            f"{folder} exists", "expected a new or empty folder", "choose another folder with -o"
+        )
     chosen = renderer or _recorded_renderer(path)
     with single_torch_thread():
         sample = find_renderer(chosen)(scene, Assets(folders))
@@ -110,13 +112,13 @@ def render_again(path: Path, folder: Path, folders: Sequence[Path] = (), rendere
 
 
 def _recorded_renderer(path: Path) -> str:
-    """The renderer that a scene file names. Only names in RENDERERS are allowed, so that a file cannot run other code."""
+    """Returns the renderer that is recorded in a scene file. It must be in RENDERERS, so that a file cannot run other code."""
     name = tomllib.loads(path.read_text("utf-8")).get("outcome", {}).get("renderer", "analytic")
     if name not in RENDERERS:
         raise RecipeError(
             f"{path} was rendered by {name!r}",
             f"expected one of {', '.join(RENDERERS)}",
-            "choose it with --renderer",
+            "choose a renderer with --renderer",
         )
     return str(name)
 
@@ -128,26 +130,26 @@ def _recorded_renderer(path: Path) -> str:
 class SerialExecutor:
     """Runs tasks in this process, one at a time."""
 
-    chunk = 1
+    chunk_size = 1
 
     def __init__(self, job: RenderJob) -> None:
         self._runner, self._threads = TaskRunner(job), single_torch_thread()
         self._task: RenderTask | None = None
 
     def has_capacity(self) -> bool:
-        """Whether no task is waiting."""
+        """Whether no task is stored."""
         return self._task is None
 
     def is_busy(self) -> bool:
-        """Whether a task is waiting."""
+        """Whether a task is stored."""
         return self._task is not None
 
     def submit(self, task: RenderTask) -> None:
-        """Stores the task, which `wait` runs."""
+        """Stores the task. `wait` runs it."""
         self._task = task
 
     def wait(self) -> list[RenderResult]:
-        """Runs the task. Returns: its results."""
+        """Runs the stored task. Returns its results."""
         task, self._task = self._task, None
         return self._runner(task) if task else []
 
@@ -173,9 +175,9 @@ class _Worker:
 
 @final
 class ProcessExecutor:
-    """Runs tasks in several processes, one task each. A dead process is replaced and its task is tried again."""
+    """Runs tasks in several processes, one task in each. If a process dies, another one runs its task again."""
 
-    chunk = 1
+    chunk_size = 1
 
     def __init__(self, job: RenderJob, count: int) -> None:
         self._job, self._count = job, count
@@ -195,7 +197,7 @@ class ProcessExecutor:
         self._assign(task, 1)
 
     def wait(self) -> list[RenderResult]:
-        """The results of the next finished task; none if a worker died and its task is tried again."""
+        """Returns the results of the next finished task; none if a worker has died and its task is tried again."""
         pipe = connection.wait(list(self._busy))[0]
         assert isinstance(pipe, Connection)
         worker, task, attempt = self._busy.pop(pipe)
@@ -214,12 +216,12 @@ class ProcessExecutor:
 
     def _spawn(self) -> _Worker:
         context = get_context("spawn")
-        ours, theirs = context.Pipe()
-        process = context.Process(target=_worker_main, args=(theirs, self._job), daemon=True)
+        parent_end, child_end = context.Pipe()
+        process = context.Process(target=_worker_main, args=(child_end, self._job), daemon=True)
         with _interrupts_blocked():
             process.start()
-        theirs.close()
-        return _Worker(process, ours)
+        child_end.close()
+        return _Worker(process, parent_end)
 
     def _handle_dead_worker(self, worker: _Worker, task: RenderTask, attempt: int) -> list[RenderResult]:
         worker.pipe.close()
@@ -237,7 +239,7 @@ class ProcessExecutor:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Closes all pipes, at which idle workers exit. After an error, busy workers are killed."""
+        """Closes all pipes. Idle workers exit when their pipe closes. After an error, all workers are killed."""
         for worker in [*self._idle, *(worker for worker, _, _ in self._busy.values())]:
             worker.pipe.close()
             if error:
@@ -251,23 +253,23 @@ class ProcessExecutor:
 def _interrupts_blocked() -> Iterator[None]:
     """Blocks SIGINT in processes started within this block.
 
-    A terminal sends Ctrl-C to all processes of a group. The parent process stops its workers itself.
+    A terminal sends Ctrl-C to all processes of a group, but only the parent process may stop its workers.
     """
-    if sys.platform == "win32":  # no signal masks there; _worker_main ignores Ctrl-C as soon as it runs
+    if sys.platform == "win32":  # Windows has no signal masks; _worker_main ignores Ctrl-C as soon as it runs
         yield
         return
-    resource_tracker.ensure_running()  # otherwise it would start below and unblock the signal
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    resource_tracker.ensure_running()  # otherwise it starts within this block, and unblocks the signal
+    previous = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, previous)
 
 
 def _worker_main(pipe: Connection, job: RenderJob) -> None:
     """Main function of a worker: runs tasks until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    exit_with_parent()  # a resumed run may render the same sample
+    exit_with_parent()  # otherwise it and a resumed run could render the same sample
     runner = TaskRunner(job)
     with single_torch_thread(), suppress(EOFError):
         while True:

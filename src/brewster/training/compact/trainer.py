@@ -206,7 +206,9 @@ class CompactTrainer:
         for ahead in range(step, step + 1 + self._data_workers):
             if ahead not in self._prefetched:
                 size = self.recipe.size_at(ahead)
-                self._prefetched[ahead] = self._data_pool.submit(self.stream, ahead, self.recipe.batch, size)
+                self._prefetched[ahead] = self._data_pool.submit(
+                    self.stream, ahead, self.recipe.batch_size, size
+                )
         return self._prefetched.pop(step).result()
 
     def _set_learning_rates(self, step: int) -> None:
@@ -223,7 +225,7 @@ class CompactTrainer:
             self.average[name].lerp_(value, 1 - decay)
 
     def _training_pairs(self) -> ValidationPairs:
-        batch = self.stream(0, self.recipe.batch, self.recipe.size_at(0)).to(torch.device("cpu"))
+        batch = self.stream(0, self.recipe.batch_size, self.recipe.size_at(0)).to(torch.device("cpu"))
         pairs = zip(batch.photo_encoded[:, None], batch.transmission_encoded[:, None], strict=True)
         return {"training": list(pairs)}
 

@@ -1,4 +1,4 @@
-"""The part of a training recipe that says what a model is trained on: photos, real pairs and rendered samples."""
+"""The table [data] of a training recipe: photos, real pairs and rendered samples."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from brewster.training.data.online import Mixing
 
 
 class RenderedRecipe(FrozenModel):
-    """Rendered samples: either `sets` from `brewster render`, or a scene `recipe` to render during training."""
+    """Rendered samples: either from `sets` of `brewster render`, or rendered during training from a scene `recipe`."""
 
     sets: tuple[Path, ...] = ()
     """Folders of rendered sets, relative to BREWSTER_DATA."""
     recipe: str | None = None
-    """A packaged scene recipe by its name, or a TOML file, relative to this recipe."""
+    """The name of a packaged scene recipe, or a TOML file, relative to this recipe."""
     count: Annotated[int, Field(ge=0)] | None = None
-    """Number of different samples. Not set: all of the sets, or no limit with `recipe`. 0: no rendered samples."""
+    """Number of different samples. Not set: all samples of `sets`, or no limit for `recipe`. 0: no rendered samples."""
     share: Share = 1.0
-    """Share of rendered samples in each batch, after real pairs are taken off; the rest are mixtures of photos."""
+    """Share of rendered samples among the samples of a batch that are not real pairs; the others are mixtures of photos."""
     mixing: Mixing = "light"
     """How a photo is composed. light: T + R in linear light. 8-bit: a blend of 8-bit images, for comparison."""
     target: Target = "background"
     """What the network predicts behind the glass: the background B without glass, or the transmission T."""
     orders: Literal["all", "paper"] | None = None
-    """Replaces the key `orders` of the scene recipe."""
+    """Replaces the key `orders` of the scene recipe. Not set: that of the scene recipe."""
     seed: Seed | None = None
     """Seed of the scenes. Not set: the seed of this recipe."""
     maps: tuple[Path, ...] = ()
@@ -40,21 +40,23 @@ class RenderedRecipe(FrozenModel):
     def _check_source(self) -> Self:
         if bool(self.sets) == bool(self.recipe):
             raise ValueError(
-                "rendered samples come either from sets on disk or from a recipe during training: set one of the two"
+                "expected either sets (rendered before) or recipe (rendered during training): exactly one of the two"
             )
         unused = [
             name for name in ("orders", "seed", "maps", "photos") if getattr(self, name) not in (None, ())
         ]
         if self.sets and unused:
-            raise ValueError(f"sets are rendered already, so that {', '.join(unused)} would have no effect")
+            raise ValueError(
+                f"expected no {', '.join(unused)}: they have no effect on sets, which are already rendered"
+            )
         return self
 
 
 class DataRecipe(FrozenModel):
-    """Training data: folders relative to BREWSTER_DATA.
+    """Training data. Folders are relative to BREWSTER_DATA.
 
-    Each batch has a share `pairs_share` of real pairs. Of the rest, a share `rendered.share` is rendered, and the
-    remaining samples are mixtures of photos and maps. A source with a share of 0 is not read.
+    A batch of n samples has n * pairs_share real pairs. Of the other samples, the share `rendered.share` is rendered, and
+    the rest are mixtures of photos and maps. A source with a share of 0 is not read.
     """
 
     photos: tuple[Path, ...] = ()
@@ -64,46 +66,49 @@ class DataRecipe(FrozenModel):
     pairs: tuple[Path, ...] = ()
     """Folders of real pairs: a photo through glass and the same view without glass."""
     pairs_share: Share = 0.0
-    """Share of real pairs in each batch. Required with `pairs`."""
+    """Share of real pairs in each batch. Required if `pairs` is set."""
     rendered: RenderedRecipe | None = None
     exclude: tuple[str, ...] = ()
-    """File names of photos and maps to leave out; * and ? match as in a shell."""
+    """File names of photos and maps to exclude. * and ? are wildcards as in a shell."""
     held_out: tuple[str, ...] = ()
-    """Further file names to leave out of training. The compact model is validated on mixtures of them."""
+    """File names to exclude from training, in addition to `exclude`. The compact model is validated on mixtures of them."""
     validate_on: tuple[Path, ...] = ()
     """Folders of real pairs to validate on."""
-    validate_at_most: PositiveInt = 40
-    """Largest number of pairs from each folder in `validate_on`, evenly spaced in the order of their names."""
+    max_validation_pairs: PositiveInt = 40
+    """Maximum number of pairs from each folder in `validate_on`. They are evenly spaced in the order of their names."""
 
     @property
     def excluded_files(self) -> tuple[str, ...]:
-        """File names and patterns that training leaves out."""
+        """File names and patterns that are excluded from training."""
         return self.exclude + self.held_out
 
     @property
     def rendered_share(self) -> float:
-        """The share of rendered samples after real pairs are taken off; 0 if there are none."""
+        """Share of rendered samples among the samples that are not real pairs; 0 if nothing is rendered."""
         return self.rendered.share if self.rendered and self.rendered.count != 0 else 0.0
 
     @property
     def is_empty(self) -> bool:
-        """Whether every source has a share, or a count, of 0."""
+        """Whether there is no source with a share and a count above 0."""
         return not (self.photos or self.pairs_share or self.rendered_share)
 
     @model_validator(mode="after")
     def _check_shares(self) -> Self:
         if not (self.photos or self.pairs or self.rendered):
-            raise ValueError("there is no training data: set at least one of photos, pairs and rendered")
+            raise ValueError("expected at least one of photos, pairs and rendered")
         if self.pairs_share and not self.pairs:
-            raise ValueError(f"pairs_share is {self.pairs_share:g}, and pairs is empty")
+            raise ValueError(f"expected pairs, because pairs_share is {self.pairs_share:g}")
         if self.pairs and "pairs_share" not in self.model_fields_set:
-            raise ValueError("pairs needs pairs_share, their share of each batch; it may be 0")
+            raise ValueError(
+                "expected pairs_share, the share of the pairs in each batch, because pairs is set; 0 is allowed"
+            )
         if self.photos and self.rendered and "share" not in self.rendered.model_fields_set:
             raise ValueError(
-                "photos and rendered together need rendered.share, the share that is rendered; it may be 0 or 1"
+                "expected rendered.share, the share of rendered samples, because photos and rendered are set;"
+                " 0 and 1 are allowed"
             )
         if not (self.photos or self.is_empty or self.pairs_share == 1 or self.rendered_share == 1):
             raise ValueError(
-                "pairs and rendered samples fill a part of each batch only, and there are no photos for the rest"
+                "expected photos for the rest of each batch: pairs and rendered samples are only a part of it"
             )
         return self

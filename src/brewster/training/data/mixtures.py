@@ -82,7 +82,7 @@ class MixRecipe(FrozenModel):
     crop: Range = (0.35, 1.0)
     """Side of the crop over the shorter side of the photo."""
     temperature: Range = (-0.35, 0.35)
-    """Colour temperature of the light: logarithm of the gain of red, and minus that of blue."""
+    """Colour temperature t of the light: the gains of red and blue are about exp(t) and exp(-t)."""
     background_map_probability: Share = 0.2
     """Probability that the background is a view of an environment map instead of a photo."""
     background_level_log: LogRange = (0.03, 0.5)
@@ -92,7 +92,7 @@ class MixRecipe(FrozenModel):
     shadow_probability: Share = 0.15
     """Probability of a hard shadow on the background."""
 
-    absent_probability: Share = 0.12
+    no_glass_probability: Share = 0.12
     """Probability of a sample without glass, so that the network leaves plain photos unchanged."""
     partial_probability: Share = 0.12
     """Probability of glass that covers only a part of the image."""
@@ -174,7 +174,7 @@ class Mixtures:
         recipe = self._recipe
         background = self._background(rng, size)
         reflection = self._reflection(rng, size) * background.mean()
-        if rng.bernoulli(recipe.absent_probability):
+        if rng.bernoulli(recipe.no_glass_probability):
             return _expose_and_develop(rng, recipe, background, background, torch.zeros_like(background))
         glass = effects.window(rng, size) if rng.bernoulli(recipe.partial_probability) else torch.ones(1)
         transmittance = rng.uniform(recipe.transmittance) * (1 + 0.02 * rng.normal(3, 1, 1))

@@ -22,7 +22,7 @@ from brewster.environments.assets import naming_file
 from brewster.errors import RecipeError
 from brewster.photo import Photo
 from brewster.render.camera_response import encode_jpeg, to_uint8
-from brewster.rendered.store import SCENE, StoredSample, key, read_scene_of, read_set
+from brewster.rendered.store import SCENE_FILE, StoredSample, key, read_scene_of, read_set
 from brewster.scene.values import Range
 from brewster.srgb import to_encoded
 from brewster.training.data.alpha_blend import blended_layers
@@ -163,18 +163,18 @@ def _entries(folder: Path) -> list[StoredSample]:
 
 
 def _blended_sample(entry: StoredSample) -> Tensor:
-    with _file_errors(entry, SCENE):
+    with _file_errors(entry, SCENE_FILE):
         scene = read_scene_of(entry)
     background, mirror = (_picture(entry, name).permute(2, 0, 1) / 255 for name in ("background", "mirror"))
     photo, *layers = blended_layers(background, mirror, scene)
-    seen = Photo.open(encode_jpeg(photo, scene.development.jpeg_quality)).pixels.copy()
+    seen = Photo.open(encode_jpeg(photo, scene.camera_response.jpeg_quality)).pixels.copy()
     return torch.cat([torch.from_numpy(picture) for picture in (seen, *map(to_uint8, layers))], dim=2)
 
 
 def _picture(entry: StoredSample, layer: str) -> Tensor:
     """Reads a layer of a sample, (H, W, 3) sRGB uint8."""
     name = f"{layer}.jpg"
-    with _file_errors(entry, name), naming_file(f"{name} of sample {key(entry.index)} in {entry.place}"):
+    with _file_errors(entry, name), naming_file(f"{name} of sample {key(entry.index)} in {entry.path}"):
         return torch.from_numpy(Photo.open(entry.read(name)).pixels.copy())
 
 
@@ -184,7 +184,7 @@ def _file_errors(entry: StoredSample, name: str) -> Iterator[None]:
         yield
     except (OSError, KeyError) as error:
         raise RecipeError(
-            f"{name} of sample {key(entry.index)} in {entry.place} cannot be read",
+            f"{name} of sample {key(entry.index)} in {entry.path} cannot be read",
             "a sample with five pictures and a scene",
             "delete the sample and render the set again",
         ) from error

@@ -24,7 +24,7 @@ from brewster.models.diffusion.panels import fit_panel
 from brewster.models.diffusion.prompt import PROMPT, PROMPT_FILE, load_prompt
 from brewster.models.diffusion.sampling import GUIDANCE, STEPS
 from brewster.models.zoo import TINY_PREFIX
-from brewster.rendered.generation.job import RECORD
+from brewster.rendered.generation.job import RECORD_FILE
 from brewster.rendered.store import read_set
 from brewster.training.recipe import LoraRecipe
 from brewster.training.streams import resolve_folders
@@ -238,7 +238,7 @@ def _settings(recipe: LoraRecipe) -> str:
     one_step = recipe.objective == "one_step"
     rows = {
         "rank, alpha": f"{recipe.rank}, {recipe.alpha}",
-        "steps, batch": f"{recipe.steps}, {recipe.batch}",
+        "steps, batch": f"{recipe.steps}, {recipe.batch_size}",
         "seed": recipe.seed,
         "panels": f"{' '.join(recipe.panels)}, {recipe.direction}, at most {recipe.budget_px} pixels together",
         "objective": "one step from the photo" if one_step else "flow matching",
@@ -303,7 +303,7 @@ def _set_description(folder: Path) -> str:
     """The name of a set; and, if the set can be read, its number of samples and their scene recipe."""
     with suppress(BrewsterError, OSError, ValueError, KeyError):
         (place,) = resolve_folders([folder])
-        recipe = tomllib.loads((place / RECORD).read_text())["recipe"]
+        recipe = tomllib.loads((place / RECORD_FILE).read_text())["recipe"]
         count = sum(1 for _ in read_set(place))
         return f"`{_folder_name(folder)}` ({count} samples of the scenes `{recipe['name']}`, orders {recipe['orders']})"
     return f"`{_folder_name(folder)}`"

@@ -178,7 +178,9 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
         "rest": _OVERHEAD_GIB,
     }
     tflop = (
-        _FORWARD_PASSES_PER_STEP * recipe.batch * _forward_tflop(backbone, generated_tokens, condition_tokens)
+        _FORWARD_PASSES_PER_STEP
+        * recipe.batch_size
+        * _forward_tflop(backbone, generated_tokens, condition_tokens)
     )
     return ResourceEstimate(
         recipe,

@@ -167,9 +167,9 @@ class LoraTrainer:
     def _compute_gradients(self, step: int) -> dict[str, Tensor]:
         """Accumulates the gradients of this process's slots of the batch. Returns the parts of the loss."""
         totals: dict[str, Tensor] = {}
-        for slot in range(distributed.rank(), self.recipe.batch, distributed.world_size()):
+        for slot in range(distributed.rank(), self.recipe.batch_size, distributed.world_size()):
             parts = self._losses(SampleRng(self.recipe.seed, step, slot))
-            share = {name: part / self.recipe.batch for name, part in parts.items()}
+            share = {name: part / self.recipe.batch_size for name, part in parts.items()}
             torch.stack(list(share.values())).sum().backward()  # type: ignore[no-untyped-call]
             totals = {name: totals.get(name, 0) + part.detach() for name, part in share.items()}
         return totals
@@ -232,11 +232,11 @@ class LoraTrainer:
 
 
 def _check_batch(recipe: LoraRecipe) -> None:
-    if recipe.batch % distributed.world_size():
+    if recipe.batch_size % distributed.world_size():
         raise RecipeError(
-            f"batch = {recipe.batch} cannot be divided equally among {distributed.world_size()} processes",
-            "a batch that is a multiple of the number of processes",
-            "raise batch to a multiple, or start fewer processes",
+            f"batch_size = {recipe.batch_size} cannot be divided equally among {distributed.world_size()} processes",
+            "a batch size that is a multiple of the number of processes",
+            "raise batch_size to a multiple, or start fewer processes",
         )
 
 

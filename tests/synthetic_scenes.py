@@ -1,4 +1,4 @@
-"""Synthetic environments and scenes without files: constant light, a single bright texel, a half, a line."""
+"""Synthetic maps, pictures and scenes for tests, without files: constant light, one bright texel, a bright half, a line."""
 
 import math
 
@@ -11,87 +11,97 @@ from brewster.scene.scene import Scene
 from brewster.scene.world import AssetSource, EnvironmentMap, Plane, Side
 
 
-class Worlds:
-    """Assets without files: images (H, W, 3) by the name of their source."""
+class SyntheticAssets:
+    """Replaces `Assets`: images (H, W, 3) in memory by the name of their source."""
 
     def __init__(self, **pictures):
         self.pictures = {"white": np.ones((16, 32, 3), np.float32), **pictures}
 
-    def map_light(self, lit):
-        return self.pictures[lit.source.file] * np.float32(lit.luminance)
+    def map_light(self, environment):
+        return self.pictures[environment.source.file] * np.float32(environment.luminance)
 
     def plane_light(self, plane):
         return self.pictures[plane.source.file] * np.float32(plane.luminance)
 
 
-def towards(height):
+def map_directions(height):
     """Unit directions (H, 2 H, 3) of the texels of a latitude-longitude map whose left edge is at -z."""
     heading = (np.arange(2 * height) + 0.5) / height * np.pi
     polar = (np.arange(height)[:, None] + 0.5) / height * np.pi
-    across = np.sin(polar)
+    horizontal = np.sin(polar)
     return np.stack(
-        np.broadcast_arrays(across * np.sin(heading), np.cos(polar), -across * np.cos(heading)), axis=-1
+        np.broadcast_arrays(horizontal * np.sin(heading), np.cos(polar), -horizontal * np.cos(heading)),
+        axis=-1,
     )
 
 
-def soft(height):
+def smooth_map(height):
     """A smooth map, different in each channel."""
-    x, y, z = np.moveaxis(towards(height), -1, 0)
+    x, y, z = np.moveaxis(map_directions(height), -1, 0)
     return np.stack([1 + 0.5 * x * z, 1 + 0.4 * y - 0.3 * z, 1 + 0.6 * x * y + 0.2 * y], -1).astype(
         np.float32
     )
 
 
-def sun(height, row, column, light=1e4, night=0.0):
-    """A dark map with one bright texel."""
-    texels = np.full((height, 2 * height, 3), night, np.float32)
+def map_with_bright_texel(height, row, column, light=1e4, background=0.0):
+    """A map with one bright texel and a uniform background."""
+    texels = np.full((height, 2 * height, 3), background, np.float32)
     texels[row, column] = light
     return texels
 
 
-def bright(shape, where):
-    """A black image that is white at an index."""
+def image_with_white_part(shape, part):
+    """A black image (H, W, 3) that is white in `part`, an index or slices."""
     texels = np.zeros((*shape, 3), np.float32)
-    texels[where] = 1
+    texels[part] = 1
     return texels
 
 
-WORLDS = Worlds(
-    soft=soft(64),
+ASSETS = SyntheticAssets(
+    soft=smooth_map(64),
     mottled=np.random.default_rng(3).random((16, 32, 3), np.float32),
-    right=bright((32, 64), np.s_[:, 32:]),
-    top=bright((32, 64), np.s_[:16]),
-    line=bright((64, 64), np.s_[:, 32]),
+    right=image_with_white_part((32, 64), np.s_[:, 32:]),
+    top=image_with_white_part((32, 64), np.s_[:16]),
+    line=image_with_white_part((64, 64), np.s_[:, 32]),
 )
 
 
-def around(name="white", **more):
-    return Side(map=EnvironmentMap(source=AssetSource(file=name), **more))
+def map_side(name="white", **values):
+    """A side of a scene with an environment map."""
+    return Side(map=EnvironmentMap(source=AssetSource(file=name), **values))
 
 
-def board(name="white", **more):
-    return Side(plane=Plane(source=AssetSource(file=name), **{"distance_mm": 800, "width_mm": 8000, **more}))
+def plane_side(name="white", **values):
+    """A side of a scene with a picture on a plane."""
+    return Side(
+        plane=Plane(source=AssetSource(file=name), **{"distance_mm": 800, "width_mm": 8000, **values})
+    )
 
 
-def at(heading_deg, pitch_deg=0.0, distance_mm=500.0, **more):
+def camera_towards_glass(heading_deg, pitch_deg=0.0, distance_mm=500.0, **values):
     """Values of a camera whose axis meets the centre of the glass."""
     back = axes(heading_deg, pitch_deg)[2]
     return {
         "heading_deg": heading_deg,
         "pitch_deg": pitch_deg,
         "position_mm": tuple(distance_mm * part for part in back),
-        **more,
+        **values,
     }
 
 
-def a_scene(camera=None, panes=(), **more):
-    """A scene of 24 x 24 pixels with uniform white light on both sides and ordinary glass; `panes` are dictionaries."""
+def make_scene(camera=None, panes=(), **values):
+    """A scene of 24 x 24 px. By default, it has ordinary glass and uniform white light on both sides.
+
+    `camera` and each item of `panes` are dictionaries of values.
+    """
     if panes:
         gap = 12.0 if len(panes) > 1 else 0.0
-        more["glass"] = Glazing(panes=tuple(Pane(**pane) for pane in panes), gap_mm=gap)
+        values["glass"] = Glazing(panes=tuple(Pane(**pane) for pane in panes), gap_mm=gap)
     return Scene(
-        camera=Camera(**{"width": 24, "height": 24, "fov_deg": 30, **at(0), **(camera or {})}),
-        **{"behind": around(), "front": around(), **more},
+        camera=Camera(
+            **{"width": 24, "height": 24, "fov_deg": 30, **camera_towards_glass(0), **(camera or {})}
+        ),
+        **{"behind": map_side(), "front": map_side(), **values},
     )
 
 
@@ -101,12 +111,12 @@ def pixel_directions(camera):
     half = math.tan(math.radians(camera.fov_deg) / 2)
     x = ((np.arange(camera.width) + 0.5) * 2 - camera.width) / camera.width * half
     y = (camera.height - (np.arange(camera.height) + 0.5) * 2) / camera.width * half
-    ways = x[None, :, None] * right + y[:, None, None] * up - back
-    return ways / np.linalg.norm(ways, axis=-1, keepdims=True)
+    directions = x[None, :, None] * right + y[:, None, None] * up - back
+    return directions / np.linalg.norm(directions, axis=-1, keepdims=True)
 
 
 def centroid(picture):
-    """The centroid of an image (3, H, W), in pixels to the right and down from its upper left corner."""
+    """The centroid (x, y) of an image (3, H, W) in pixels, measured from its upper left corner."""
     light = np.asarray(picture, np.float64).sum(0)
     height, width = light.shape
     return (
@@ -117,21 +127,21 @@ def centroid(picture):
 
 SIDES = (
     Side(),
-    around("mottled", heading_deg=70),
-    around("mottled", radius_mm=4000.0),
-    board("mottled", width_mm=900),
-    Side(map=around("soft").map, plane=board("mottled", width_mm=400, heading_deg=20).plane),
-    Side(map=around("soft", radius_mm=5000.0).map, plane=board("mottled", width_mm=400).plane),
+    map_side("mottled", heading_deg=70),
+    map_side("mottled", radius_mm=4000.0),
+    plane_side("mottled", width_mm=900),
+    Side(map=map_side("soft").map, plane=plane_side("mottled", width_mm=400, heading_deg=20).plane),
+    Side(map=map_side("soft", radius_mm=5000.0).map, plane=plane_side("mottled", width_mm=400).plane),
 )
 
 
-KINDS = ["smooth", "smooth", "wedge"]
+GLASS_KINDS = ["smooth", "smooth", "wedge"]
 
 
 @st.composite
-def scenes(draw, **fixed):
+def random_scenes(draw, **fixed):
     """Scenes of every kind that the analytic renderer supports, except rough glass: panes, tints, wedges, sides, lenses."""
-    kind = draw(st.sampled_from(KINDS))
+    kind = draw(st.sampled_from(GLASS_KINDS))
     panes = draw(st.integers(1, 2))
     tint = draw(st.sampled_from([(0.0, 0.0, 0.0), (20.0, 0.0, 5.0)]))
     heading, pitch = draw(st.floats(-30, 30)), draw(st.floats(-15, 15))
@@ -151,7 +161,7 @@ def scenes(draw, **fixed):
             }
             for _ in range(panes)
         ],
-        "camera": at(
+        "camera": camera_towards_glass(
             heading,
             pitch,
             draw(st.floats(300, 2000)),
@@ -161,4 +171,4 @@ def scenes(draw, **fixed):
             aperture_mm=draw(st.sampled_from([0.0, 0.0, 60.0])),
         ),
     }
-    return a_scene(**{**values, **fixed})
+    return make_scene(**{**values, **fixed})
