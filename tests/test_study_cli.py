@@ -50,7 +50,9 @@ def answer_all(study, participants, rng):
 
 
 def test_create_prints_a_summary_and_the_next_command(bare, folders):
-    code, out, err = bare("study", "create", "study", *folders, "--seed", 4, "--pairs", 3, "--catches", 2)
+    code, out, err = bare(
+        "study", "create", "study", *folders, "--seed", 4, "--pairs", 3, "--catch-trials", 2
+    )
     assert (code, out) == (0, b"")
     assert "4 comparisons of 2 methods; a participant sees 3 of them and 2 catch trials (seed 4)" in err
     assert "next: brewster study serve study" in err
@@ -80,7 +82,7 @@ def test_report_prints_tables_and_writes_all_files(bare, created, random):
     names = {path.name for path in (created.folder / "report").iterdir()}
     assert names == {"report.json", "report.md", "table.tex", "table.csv", "answers.csv", "plot.png"}
     # replaces the first report
-    code, out, _ = bare("study", "report", "study", "--json", "--least-seconds", 99)
+    code, out, _ = bare("study", "report", "study", "--json", "--min-seconds", 99)
     assert json.loads(out)["excluded"] == {"failed": 0, "fast": 12}
 
 
@@ -130,7 +132,7 @@ def test_a_server_continues_after_a_kill_and_stops_with_ctrl_c(created):
         link = post(f"{url}participants", json={"agreed": True}).json()["link"]
         given = {"trial": 0, "choice": "right", "seconds": 3}
         assert post(f"{url}{link[1:]}/answers", json=given).json()["kept"] == "right"
-    with serve(created.folder, "--called", "study.example") as second:
+    with serve(created.folder, "--host-name", "study.example") as second:
         url = second.stdout.readline().strip()
         state = get(f"{url}{link[1:]}/trial", headers={"Host": "study.example"}).json()
         assert state["trial"] == 1
@@ -177,7 +179,7 @@ def test_an_invalid_token_file_is_refused(bare, created):
     "name", ["study.example.org:443", "https://study.example.org", "study.example.org/", "", "bücher.example"]
 )
 def test_a_name_that_no_host_header_contains_is_a_wrong_argument(bare, created, name):
-    code, _, err = bare("study", "serve", "study", "--called", name, "--port", 0)
+    code, _, err = bare("study", "serve", "study", "--host-name", name, "--port", 0)
     assert (code, "is not a bare host name" in err) == (2, True)
 
 
@@ -208,7 +210,7 @@ def test_create_limits_the_number_of_catch_trials(bare, tmp_path):
     names = [f"{i}" for i in range(26)]
     for seed, name in enumerate(("inputs", "ours", "rdnet")):
         write_pictures(tmp_path / name, names, size=(4, 3), seed=seed)
-    args = ["--inputs", "inputs", "--method", "ours=ours", "--method", "RDNet=rdnet", "--catches"]
+    args = ["--inputs", "inputs", "--method", "ours=ours", "--method", "RDNet=rdnet", "--catch-trials"]
     code, _, err = bare("study", "create", "study", *args, 25)
     assert (code, "25 catch trials for each participant were requested; at most 24 are available" in err) == (
         1,

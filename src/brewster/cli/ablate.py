@@ -13,7 +13,7 @@ from brewster.cli.terminal import interrupts, print_status
 
 
 @click.command
-@click.argument("study", type=click.Path(path_type=Path))
+@click.argument("path", metavar="ABLATION", type=click.Path(path_type=Path))
 @click.option(
     "-o",
     "--output",
@@ -26,7 +26,7 @@ from brewster.cli.terminal import interrupts, print_status
     "--base",
     metavar="RECIPE",
     type=click.Path(path_type=Path),
-    help="A training recipe to use instead of the one in STUDY, such as a tiny one for a test run.",
+    help="A training recipe to use instead of the one in ABLATION, such as a tiny one for a test run.",
 )
 @click.option(
     "--workers",
@@ -38,9 +38,9 @@ from brewster.cli.terminal import interrupts, print_status
 @click.option("--quiet", is_flag=True, help="Print only errors, and no tables.")
 @click.pass_context
 def ablate(
-    context: click.Context, /, *, study: Path, out: Path | None, base: Path | None, workers: int, quiet: bool
+    context: click.Context, /, *, path: Path, out: Path | None, base: Path | None, workers: int, quiet: bool
 ) -> None:
-    """Train and evaluate a model for each choice of the one setting that STUDY, a TOML file, varies.
+    """Train and evaluate a model for each choice of the one setting that ABLATION, a TOML file, varies.
 
     The environment variable BREWSTER_DATA names the data folder. The same command resumes an interrupted run. The
     tables go to standard output; the tables and report.html are also written to the output folder.
@@ -50,11 +50,11 @@ def ablate(
     from brewster.evaluate.ablation import ablate as run  # noqa: PLC0415  (imports torch, two seconds)
     from brewster.evaluate.ablation import read_study  # noqa: PLC0415
 
-    ablation, name = read_study(study), study.stem
+    study, name = read_study(path), path.stem
     if base:
-        ablation, name = ablation.model_copy(update={"base": base}), f"{name}-{base.stem}"
+        study, name = study.model_copy(update={"base": base}), f"{name}-{base.stem}"
     out = out or Path("out") / "ablations" / name
-    benchmarks = ablation.open_benchmarks()
+    benchmarks = study.open_benchmarks()
     is_complete = print_remarks(benchmarks, quiet=quiet)
 
     def on_progress(choice: str, step: int, steps: int, metrics: Mapping[str, float], logged: bool) -> None:
@@ -62,7 +62,7 @@ def ablate(
         if logged and not quiet:
             print_status(f"{choice}, step {step} of {steps}: loss {metrics['loss']:.4f}")
 
-    results = run(ablation, benchmarks, out, workers=workers, on_progress=on_progress)
+    results = run(study, benchmarks, out, workers=workers, on_progress=on_progress)
     if not quiet:
         print_tables(results)
         print_status(f"results are in {out}")

@@ -94,7 +94,7 @@ class _Size(click.ParamType[int]):
 @click.option(
     "--benchmark",
     "benchmarks",
-    metavar="NAME=DIR",
+    metavar="NAME=FOLDER",
     type=NamedValue("real20=data/real20"),
     multiple=True,
     required=True,
@@ -111,7 +111,7 @@ class _Size(click.ParamType[int]):
 )
 @click.option(
     "--predictions",
-    metavar="NAME=DIR",
+    metavar="NAME=FOLDER",
     type=NamedValue("RDNet=out/rdnet"),
     multiple=True,
     help="A folder with the predictions of another method, named like the photos of the benchmark; repeatable.",

@@ -106,14 +106,14 @@ class _Size(click.ParamType[tuple[int, int]]):
 )
 @click.option(
     "--maps",
-    metavar="DIR",
+    metavar="FOLDER",
     type=_FOLDER,
     multiple=True,
     help="A folder of HDR environment maps; repeatable. By default the built-in environments.",
 )
 @click.option(
     "--photos",
-    metavar="DIR",
+    metavar="FOLDER",
     type=_FOLDER,
     multiple=True,
     help="A folder of photos that are placed in front of the environment maps; repeatable.",

@@ -23,7 +23,7 @@ _MAX_BYTES: Final = 10_000  # an answer has eighty bytes
 _FOLDER: Final = click.Path(path_type=Path, file_okay=False)
 _WARNING: Final = (
     "warning: everybody who can reach {host} can take part, and the connection is not encrypted; "
-    "behind a proxy that encrypts, keep 127.0.0.1 and give the name of the proxy with --called"
+    "behind a proxy that encrypts, keep 127.0.0.1 and give the name of the proxy with --host-name"
 )
 
 
@@ -42,7 +42,7 @@ def study() -> None:
     "--inputs",
     type=_FOLDER,
     required=True,
-    metavar="DIR",
+    metavar="FOLDER",
     help="The photos, or a folder of photos for each dataset.",
 )
 @click.option(
@@ -51,7 +51,7 @@ def study() -> None:
     type=NamedValue("RDNet=out/rdnet"),
     multiple=True,
     required=True,
-    metavar="NAME=DIR",
+    metavar="NAME=FOLDER",
     help="The outputs of a method, named like the inputs; give two or more. The first method is compared with each other method.",
 )
 @click.option(
@@ -69,7 +69,7 @@ def study() -> None:
     help="Number of pairs per participant; by default 40, or all if there are fewer.",
 )
 @click.option(
-    "--catches",
+    "--catch-trials",
     type=click.IntRange(0),
     metavar="NUMBER",
     help="Number of catch trials per participant, alternately two equal pictures and a degraded one; by default 4.",
@@ -94,14 +94,14 @@ def create(
     datasets: tuple[str, ...],
     all_pairs: bool,
     pairs: int | None,
-    catches: int | None,
+    catch_trials: int | None,
     seed: int | None,
     consent: Path | None,
 ) -> None:
     """Create a study in the folder OUT from folders of outputs.
 
-    Pictures are paired by name, independent of their format: DIR/real/12.png and DIR/nature/3.jpg belong to the datasets
-    real and nature; DIR/12.png belongs to the only dataset. If a picture is missing, duplicate, unreadable or of another
+    Pictures are paired by name, independent of their format: FOLDER/real/12.png and FOLDER/nature/3.jpg belong to the datasets
+    real and nature; FOLDER/12.png belongs to the only dataset. If a picture is missing, duplicate, unreadable or of another
     size, it is named, and nothing is written. The study has copies of all pictures, and can be moved.
     """
     from brewster.user_study.create import CATCH_POOL_SIZE, DEFAULT_CONSENT, StudyOptions  # noqa: PLC0415  (imports pyvips)
@@ -117,7 +117,7 @@ def create(
         )
     text = DEFAULT_CONSENT if consent is None else _read_consent(consent)
     chosen = StudyOptions(
-        datasets=datasets, pairs=pairs, catches=catches, all_pairs=all_pairs, seed=seed, consent=text
+        datasets=datasets, pairs=pairs, catches=catch_trials, all_pairs=all_pairs, seed=seed, consent=text
     )
     total = len(find_pictures(inputs, datasets)) * (1 + len(folders)) + CATCH_POOL_SIZE
     with progress(total, shown=True) as advance:
@@ -156,15 +156,27 @@ def _read_names(_context: click.Context, _parameter: click.Parameter, names: tup
 @click.argument("folder", metavar="STUDY", type=_FOLDER)
 @address_options(8420, "Require this token in each request; auto generates one and stores it in STUDY/token.")
 @click.option(
-    "--called",
+    "--host-name",
+    "host_names",
     multiple=True,
     callback=_read_names,
     metavar="NAME",
     help="Another host name of this server, such as that of a proxy in front of it: study.example.org; repeatable.",
 )
-@click.option("--most", type=click.IntRange(1), metavar="NUMBER", help="The largest number of participants.")
+@click.option(
+    "--max-participants",
+    type=click.IntRange(1),
+    metavar="NUMBER",
+    help="The largest number of participants.",
+)
 def serve(
-    folder: Path, *, host: str, port: int, called: list[str], token: str | None, most: int | None
+    folder: Path,
+    *,
+    host: str,
+    port: int,
+    host_names: list[str],
+    token: str | None,
+    max_participants: int | None,
 ) -> None:
     """Serve the page for participants until Ctrl-C.
 
@@ -185,10 +197,10 @@ def serve(
         print_status(_WARNING.format(host=host))
     token = load_or_create_token(folder) if token == AUTO else token
     limits = RequestLimits.for_host(host, token=token, max_bytes=_MAX_BYTES)
-    limits = replace(limits, hosts=limits.hosts | {*called})
+    limits = replace(limits, hosts=limits.hosts | {*host_names})
     store = AnswerStore(frozen_study)
     app = web.create_app(
-        study_router(frozen_study, store, max_participants=most, token=token),
+        study_router(frozen_study, store, max_participants=max_participants, token=token),
         limits=limits,
         index="study.html",
     )
@@ -204,11 +216,11 @@ def serve(
     "--output",
     "out",
     type=_FOLDER,
-    metavar="DIR",
+    metavar="FOLDER",
     help="The folder for the report; by default STUDY/report.",
 )
 @click.option(
-    "--most-failed",
+    "--max-failed",
     type=click.FloatRange(0, 1),
     default=0.25,
     show_default=True,
@@ -216,7 +228,7 @@ def serve(
     help="Exclude participants who fail a larger share of the catch trials.",
 )
 @click.option(
-    "--least-seconds",
+    "--min-seconds",
     type=click.FloatRange(0),
     default=1.5,
     show_default=True,
@@ -224,9 +236,7 @@ def serve(
     help="Exclude participants who need less time for half of all trials.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the results as JSON instead of the tables.")
-def report(
-    folder: Path, *, out: Path | None, most_failed: float, least_seconds: float, as_json: bool
-) -> None:
+def report(folder: Path, *, out: Path | None, max_failed: float, min_seconds: float, as_json: bool) -> None:
     """Evaluate the answers, with and without the exclusion of unreliable participants.
 
     The tables go to standard output. The folder gets report.md, report.json, table.tex (in the layout of the paper's
@@ -242,7 +252,7 @@ def report(
     frozen_study = read_study(folder)
     with contextlib.closing(AnswerStore(frozen_study, read_only=True)) as store:
         answered = collect_answers(store.all_answers())
-    results = summarise(frozen_study, answered, ExclusionRule(most_failed, least_seconds))
+    results = summarise(frozen_study, answered, ExclusionRule(max_failed, min_seconds))
     out = folder / "report" if out is None else out
     write(results, frozen_study, answered, out)
     write_out((json.dumps(results) + "\n" if as_json else overview(results)).encode())

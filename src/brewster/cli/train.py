@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     help="Estimate memory and time for the recipe of a large backbone, check whether they fit, and do not train.",
 )
 @click.option(
-    "--card",
+    "--gpu",
+    "gpu_name",
     metavar="NAME",
     help='Estimate for this graphics card, such as "RTX 4090", instead of the one in this machine; implies --plan.',
 )
@@ -47,7 +48,7 @@ def train(
     recipe: Path | None,
     out: Path | None,
     plan: bool,
-    card: str | None,
+    gpu_name: str | None,
     show_recipe: str | None,
     quiet: bool,
 ) -> None:
@@ -67,8 +68,8 @@ def train(
     parsed, out = read_recipe(recipe), out or Path("out") / recipe.stem
     if isinstance(parsed, LoraRecipe):
         require_extra("large", "a large backbone")
-    if plan or card:
-        _print_plan(parsed, card)
+    if plan or gpu_name:
+        _print_plan(parsed, gpu_name)
         return
     _make_folder(out)
     from brewster.training.distributed import is_main_process  # noqa: PLC0415
@@ -100,8 +101,8 @@ def _show_recipe(name: str) -> None:
     print_out(commented_toml(read_template(name)).rstrip())
 
 
-def _print_plan(recipe: CompactRecipe | LoraRecipe, card: str | None) -> None:
-    from brewster.training.lora.resource_estimate import estimate_resources, find_card, is_local_gpu  # noqa: PLC0415
+def _print_plan(recipe: CompactRecipe | LoraRecipe, gpu_name: str | None) -> None:
+    from brewster.training.lora.resource_estimate import estimate_resources, find_gpu, is_local_gpu  # noqa: PLC0415
     from brewster.training.recipe import LoraRecipe  # noqa: PLC0415
 
     if not isinstance(recipe, LoraRecipe):
@@ -110,10 +111,10 @@ def _print_plan(recipe: CompactRecipe | LoraRecipe, card: str | None) -> None:
             "--plan needs the recipe of a large backbone",
             "train it without --plan",
         )
-    gpu = find_card(card)
-    if card is None and not is_local_gpu(gpu):
+    gpu = find_gpu(gpu_name)
+    if gpu_name is None and not is_local_gpu(gpu):
         print_status(
-            f"no graphics card found: the plan is for {gpu.name}, the paper's card; choose another with --card"
+            f"no graphics card found: the plan is for {gpu.name}, the paper's card; choose another with --gpu"
         )
     estimate = estimate_resources(recipe, gpu)
     print_out(estimate.table())

@@ -131,7 +131,7 @@ def _pair_pictures(inputs: Path, methods: Mapping[str, Path], datasets: Sequence
         raise BrewsterError(
             f"the study has {len(methods)} method",
             "a study compares two or more methods",
-            "add another --method NAME=DIR",
+            "add another --method NAME=FOLDER",
         )
     files = _StudyFiles(
         find_pictures(inputs, datasets),
