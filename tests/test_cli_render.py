@@ -111,10 +111,10 @@ def test_a_photo_that_cannot_light_a_scene_is_left_out_and_named(bare, fake, tmp
 @pytest.mark.parametrize(
     ("args", "says"),
     [
-        ((), "Name one folder"),
-        (("set", "-o", "other"), "Name one folder"),
-        (("set", "--size", "512"), "512x384 is one"),
-        (("set", "--size", "8x8"), "sides go from 16"),
+        ((), "Give one output folder"),
+        (("set", "-o", "other"), "Give one output folder"),
+        (("set", "--size", "512"), "such as 512x384"),
+        (("set", "--size", "8x8"), "from 16 to 16384"),
         (("set", "--count", "-1"), "--count"),
         (("set", "--maps", "nowhere"), "--maps"),
         (("set", "--scene", "scene.toml", "--count", "3"), "--count belongs to a set"),
@@ -133,7 +133,7 @@ def test_a_missing_package_is_named_with_the_command_that_installs_it(bare, monk
     )
     code, _, err = bare("render", "set")
     assert code == 1
-    assert "rendering needs torch" in err
+    assert "rendering needs packages that are not installed: torch" in err
     assert "pip install 'brewster[render]'" in err
 
 

@@ -102,8 +102,8 @@ def test_a_port_that_is_taken_is_an_error_and_no_traceback(bare, reachable):
 def test_the_page_opens_in_the_browser_only_when_asked(monkeypatch, capsys):
     opened = []
     monkeypatch.setattr(command.webbrowser, "open", opened.append)
-    command.print_link("http://127.0.0.1:1/", None, opens=False)
-    command.print_link("http://127.0.0.1:1/", "token", opens=True)
+    command.print_link("http://127.0.0.1:1/", None, open_browser=False)
+    command.print_link("http://127.0.0.1:1/", "token", open_browser=True)
     assert opened == ["http://127.0.0.1:1/?token=token"]
     assert capsys.readouterr().out.splitlines() == ["http://127.0.0.1:1/", "http://127.0.0.1:1/?token=token"]
     assert serve.name == "serve"
