@@ -9,7 +9,7 @@ from brewster import Photo, Separator
 from brewster.errors import ModelError, PhotoError, TargetError
 from brewster.inference import SeparationTask, plan_files, separate_files, separate_tasks
 from brewster.options import Options
-from front_door import LAYERS, picture, results, tree
+from front_door import LAYERS, layer_files, picture, tree
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def test_a_folder_is_mirrored_and_a_damaged_photo_does_not_stop_the_batch(folder
         str(folder / name) for name in ("a.jpg", "b.jpg", "c/d.jpg")
     ]
     assert [result.error is None for result in found] == [True, False, True]
-    assert tree(tmp_path / "out") == sorted(results("a") + [f"c/{name}" for name in results("d")])
+    assert tree(tmp_path / "out") == sorted(layer_files("a") + [f"c/{name}" for name in layer_files("d")])
     first = found[0]
     assert (first.model, first.sha256, first.device) == ("pane", "0" * 64, "cpu")
     assert first.outputs == {layer: str(tmp_path / f"out/a.{layer}.jpg") for layer in LAYERS}
@@ -46,7 +46,7 @@ def test_layers_are_written_next_to_their_photo_by_default(tmp_path, separator):
     (tmp_path / "a.jpg").write_bytes(picture())
     (result,) = separate_files(str(tmp_path / "a.jpg"), separator=separator)
     assert result.status == "separated"
-    assert tree(tmp_path) == ["a.jpg", *results("a")]
+    assert tree(tmp_path) == ["a.jpg", *layer_files("a")]
 
 
 def test_the_options_choose_layers_and_formats(tmp_path, separator):
@@ -105,7 +105,7 @@ def test_a_photo_is_separated_when_its_result_is_requested(folder, tmp_path, sep
     batch = separate_files(folder, tmp_path / "out", separator=separator)
     assert not (tmp_path / "out").exists()
     assert next(batch).status == "separated"
-    assert tree(tmp_path / "out") == results("a")
+    assert tree(tmp_path / "out") == layer_files("a")
 
 
 def test_a_model_that_does_not_exist_ends_the_batch(folder, tmp_path):
@@ -126,7 +126,7 @@ def test_an_unexpected_exception_is_raised_again_after_the_last_photo(
     monkeypatch.setattr(Separator, "__call__", fail_on_first)
     with pytest.raises(ZeroDivisionError, match="a bug"):
         list(separate_files(folder, tmp_path / "out", separator=separator))
-    assert tree(tmp_path / "out") == [f"c/{name}" for name in results("d")]
+    assert tree(tmp_path / "out") == [f"c/{name}" for name in layer_files("d")]
 
 
 def test_progress_names_the_file_and_grows_and_keyboard_interrupt_stops(folder, tmp_path, separator):

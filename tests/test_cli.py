@@ -74,8 +74,8 @@ def test_the_options_offer_the_values_that_the_library_accepts():
 
 
 def test_every_option_of_a_separation_is_an_option_of_the_command():
-    offered = {param.name for param in cli.commands["separate"].params}
-    assert {field.name for field in fields(Options)} <= offered
+    option_names = {param.name for param in cli.commands["separate"].params}
+    assert {field.name for field in fields(Options)} <= option_names
 
 
 def test_a_web_form_can_be_made_from_the_same_options():
@@ -105,11 +105,11 @@ def test_without_a_command_the_photo_is_separated_and_the_layers_are_next_to_it(
 
 
 @pytest.mark.parametrize(
-    "words", [["separate", "a.png", "-o", "x"], ["a.png", "-o", "x"], ["-o", "x", "a.png"]]
+    "arguments", [["separate", "a.png", "-o", "x"], ["a.png", "-o", "x"], ["-o", "x", "a.png"]]
 )
-def test_the_word_separate_is_optional_and_options_may_come_first(run, tmp_path, words):
+def test_the_command_name_separate_is_optional_and_options_may_come_first(run, tmp_path, arguments):
     (tmp_path / "a.png").write_bytes(picture(container="png"))
-    assert run(*words)[0] == 0
+    assert run(*arguments)[0] == 0
     assert tree(tmp_path / "x") == ["a.reflection.png", "a.transmission.png"]
 
 
@@ -127,8 +127,8 @@ def test_the_layers_are_the_output_of_the_model(run, tmp_path):
 def test_strength_zero_returns_the_photo_bit_by_bit(run, tmp_path):
     (tmp_path / "a.png").write_bytes(picture(container="png"))
     assert run("a.png", "--strength", 0)[0] == 0
-    same = Photo.open(tmp_path / "a.transmission.png").pixels == Photo.open(tmp_path / "a.png").pixels
-    assert same.all()
+    is_equal = Photo.open(tmp_path / "a.transmission.png").pixels == Photo.open(tmp_path / "a.png").pixels
+    assert is_equal.all()
 
 
 def test_only_the_requested_layers_are_written(run, tmp_path):
@@ -159,14 +159,14 @@ def test_additive_layers_are_floats_that_sum_to_the_photo(run, tmp_path, format_
     assert (layers[0].linear() + layers[1].linear() == Photo.open(tmp_path / "a.jpg").linear()).all()
 
 
-def test_a_picture_named_as_the_output_takes_the_transmission(run, tmp_path):
+def test_an_image_file_as_the_output_gets_the_transmission(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(picture())
     assert run("a.jpg", "-o", "new/clear.png")[0] == 0
     assert tree(tmp_path / "new") == ["clear.png"]
     assert Photo.open(tmp_path / "new" / "clear.png").file_info.container == "png"
 
 
-def test_a_folder_may_have_the_name_of_a_picture(run, tmp_path):
+def test_an_output_folder_may_have_an_image_suffix(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(picture())
     (tmp_path / "old.png").mkdir()
     for folder in ("old.png", "new.png/"):
@@ -202,7 +202,7 @@ def test_a_file_can_go_to_standard_output_and_standard_input_to_a_file(run, tmp_
 
 
 @pytest.mark.parametrize("stdin", [b"", b"hello"])
-def test_standard_input_without_a_picture_is_an_error_and_gives_no_output(run, stdin):
+def test_standard_input_without_an_image_is_an_error_and_gives_no_output(run, stdin):
     code, out, err = run("-", stdin=stdin)
     assert (code, out) == (1, b"")
     assert err.startswith("error: -: ")
@@ -211,52 +211,52 @@ def test_standard_input_without_a_picture_is_an_error_and_gives_no_output(run, s
 
 def test_a_full_standard_output_gives_one_error_line(model, tmp_path):
     with Path("/dev/full").open("wb") as full:
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-m", "brewster", "-", "--model", model],
             input=picture(),
             stdout=full,
             stderr=subprocess.PIPE,
             check=False,
         )
-    assert done.returncode == 1
+    assert process.returncode == 1
     assert (
-        done.stderr.decode()
+        process.stderr.decode()
         .splitlines()[-1]
         .startswith("error: -: standard output was not written (No space")
     )
 
 
-def test_no_picture_is_written_to_a_terminal(run, tmp_path, monkeypatch):
+def test_no_image_is_written_to_a_terminal(run, tmp_path, monkeypatch):
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
     code, out, err = run("-", stdin=picture())
     assert (code, out) == (2, b"")
     assert "terminal" in err
 
 
-NOISY = """
+PRINTING_CLI = """
 import ctypes, os, sys
 from brewster.cli import main
 from brewster.photo import Photo
 
 original = Photo.open.__func__
-def noisy(cls, *args, **options):
+def print_and_open(cls, *args, **options):
     print("printed in Python")
     ctypes.CDLL(None).puts(b"printed in C")
     os.system("echo printed by a child")
     return original(cls, *args, **options)
-Photo.open = classmethod(noisy)
+Photo.open = classmethod(print_and_open)
 sys.exit(main(sys.argv[1:]))
 """
 
 
 def test_output_of_libraries_does_not_reach_standard_output(model, tmp_path):
     """C code has its own buffer, which is written when the process exits: after any temporary redirection."""
-    command = [sys.executable, "-c", NOISY, "-", "--model", model]
-    done = subprocess.run(command, input=picture(), capture_output=True, check=False)
-    plain = as_user("-", "--model", model, input=picture())
-    assert (done.returncode, done.stdout) == (0, plain.stdout)
-    for place in (b"in Python", b"in C", b"by a child"):
-        assert done.stderr.count(b"printed " + place) == 1
+    command = [sys.executable, "-c", PRINTING_CLI, "-", "--model", model]
+    process = subprocess.run(command, input=picture(), capture_output=True, check=False)
+    expected = as_user("-", "--model", model, input=picture())
+    assert (process.returncode, process.stdout) == (0, expected.stdout)
+    for origin in (b"in Python", b"in C", b"by a child"):
+        assert process.stderr.count(b"printed " + origin) == 1
 
 
 def test_a_damaged_exr_does_not_corrupt_the_json(model, tmp_path):
@@ -265,26 +265,26 @@ def test_a_damaged_exr_does_not_corrupt_the_json(model, tmp_path):
     data = bytearray(Photo.from_array(light, encoding="linear").encode("exr"))
     data[-1] ^= 0xFF
     (tmp_path / "a.exr").write_bytes(data)
-    done = as_user(tmp_path / "a.exr", "--model", model, "--json")
-    assert done.returncode == 1
-    assert [line["status"] for line in lines(done.stdout)] == ["failed"]
-    assert b"Warning: " in done.stderr
-    done = as_user("-", "--model", model, input=bytes(data))
-    assert (done.returncode, done.stdout) == (1, b"")
+    process = as_user(tmp_path / "a.exr", "--model", model, "--json")
+    assert process.returncode == 1
+    assert [line["status"] for line in lines(process.stdout)] == ["failed"]
+    assert b"Warning: " in process.stderr
+    process = as_user("-", "--model", model, input=bytes(data))
+    assert (process.returncode, process.stdout) == (1, b"")
 
 
 def test_help_goes_to_standard_output():
-    for words in (["--help"], ["separate", "--help"], ["models", "list", "--help"], ["--version"]):
-        done = as_user(*words)
-        assert (done.returncode, done.stderr) == (0, b"")
-        assert done.stdout
+    for arguments in (["--help"], ["separate", "--help"], ["models", "list", "--help"], ["--version"]):
+        process = as_user(*arguments)
+        assert (process.returncode, process.stderr) == (0, b"")
+        assert process.stdout
 
 
 # --- usage
 
 
 @pytest.mark.parametrize(
-    "words",
+    "arguments",
     [
         [],
         ["separate"],
@@ -293,7 +293,7 @@ def test_help_goes_to_standard_output():
         ["a.jpg", "--quality", "superb"],
         ["a.jpg", "--layers", "background"],
         ["a.jpg", "--layers", ""],
-        ["a.jpg", "--device", "toaster"],
+        ["a.jpg", "--device", "tpu"],
         ["a.jpg", "--max-pixels", "0"],
         ["a.jpg", "--sharpen"],
         ["a.jpg", "--additive", "--format", "jpeg"],
@@ -306,13 +306,13 @@ def test_help_goes_to_standard_output():
         ["a.jpg", "-o", "clear.jpg", "--additive"],
         ["a.jpg", "-o", "clear.gif"],
         ["modles"],
-        ["models", "burn"],
+        ["models", "delete"],
     ],
     ids=" ".join,
 )
-def test_contradictory_or_invalid_arguments_are_a_wrong_usage(bare, tmp_path, words):
+def test_contradictory_or_invalid_arguments_give_exit_code_2(bare, tmp_path, arguments):
     (tmp_path / "a.jpg").write_bytes(picture())
-    code, out, err = bare(*words)
+    code, out, err = bare(*arguments)
     assert (code, out) == (2, b"")
     assert "Traceback" not in err
     assert tree(tmp_path) == ["a.jpg"]
@@ -326,7 +326,7 @@ def test_a_misspelled_command_gives_a_suggestion_unless_a_photo_has_that_name(ru
 
 
 @pytest.mark.parametrize(
-    ("words", "reason"),
+    ("arguments", "message"),
     [
         (["a.jpg", "--model", "compcat"], "did you mean compact?"),
         (["a.jpg", "--model", "a.jpg"], "is not a model"),
@@ -335,39 +335,39 @@ def test_a_misspelled_command_gives_a_suggestion_unless_a_photo_has_that_name(ru
         (["empty"], "there is no picture in empty"),
     ],
 )
-def test_an_error_is_one_line_with_exit_code_1(run, bare, tmp_path, words, reason):
+def test_an_error_is_one_line_with_exit_code_1(run, bare, tmp_path, arguments, message):
     (tmp_path / "a.jpg").write_bytes(picture())
     (tmp_path / "empty").mkdir()
-    code, out, err = (bare if "--model" in words else run)(*words)
+    code, out, err = (bare if "--model" in arguments else run)(*arguments)
     assert (code, out) == (1, b"")
     assert err.startswith("error: ")
     assert err.count("\n") == 1
-    assert reason in err
+    assert message in err
 
 
 # --- progress
 
 
 def test_a_terminal_shows_progress_and_standard_output_stays_clean(model, tmp_path):
-    """The bar is drawn on a pseudo terminal; nothing of it goes to standard output."""
+    """Standard error is a pseudo terminal, where the bar is drawn; standard output is a pipe, and stays empty."""
     for index in range(3):
         (tmp_path / f"{index}.jpg").write_bytes(picture())
-    terminal, end = pty.openpty()
+    controller, terminal = pty.openpty()
     command = [sys.executable, "-m", "brewster", tmp_path, "--model", model]
-    done = subprocess.run(
+    process = subprocess.run(
         command,
         stdout=subprocess.PIPE,
-        stderr=end,
+        stderr=terminal,
         check=False,
         env=os.environ | {"TERM": "xterm", "COLUMNS": "200"},
     )
-    os.close(end)
-    shown = os.read(terminal, 1 << 16).decode(errors="replace")  # a read may end within a character
     os.close(terminal)
-    assert (done.returncode, done.stdout) == (0, b"")
-    assert "\x1b[" in shown
-    assert "/3" in shown
-    assert "0.transmission.jpg" in shown
+    output = os.read(controller, 1 << 16).decode(errors="replace")  # a read may end within a character
+    os.close(controller)
+    assert (process.returncode, process.stdout) == (0, b"")
+    assert "\x1b[" in output
+    assert "/3" in output
+    assert "0.transmission.jpg" in output
 
 
 # --- Python

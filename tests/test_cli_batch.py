@@ -13,28 +13,28 @@ import pyvips
 
 from brewster import Photo
 from brewster.inference import Separator
-from front_door import LAYERS, errors, lines, picture, results, tree
+from front_door import LAYERS, errors, layer_files, lines, picture, tree
 
 # --- damaged photos
 
 
-def truncated():
+def truncated_jpeg():
     data = picture(600, 400)
     return data[: len(data) // 2]
 
 
-def animated(suffix):
+def animation(suffix):
     black = pyvips.Image.black(8, 8, bands=3)
     pages = black.join(black + 255, "vertical").cast("uchar").copy(interpretation="srgb")
     pages.set_type(pyvips.GValue.gint_type, "page-height", 8)
     return pages.write_to_buffer(suffix)
 
 
-def five_channels():
+def five_channel_tiff():
     return pyvips.Image.black(8, 8, bands=5).tiffsave_buffer()
 
 
-def cmyk():
+def cmyk_jpeg():
     return pyvips.Image.black(8, 8, bands=4).copy(interpretation="cmyk").jpegsave_buffer()
 
 
@@ -49,30 +49,30 @@ def write_exr_with_nan(folder):
 def test_damaged_photos_are_named_at_the_end_and_the_others_are_separated(run, tmp_path):
     folder = tmp_path / "in"
     folder.mkdir()
-    bad = {
-        "animated.gif": animated(".gif"),
-        "animated.webp": animated(".webp"),
-        "cmyk.jpg": cmyk(),
+    damaged = {
+        "animated.gif": animation(".gif"),
+        "animated.webp": animation(".webp"),
+        "cmyk.jpg": cmyk_jpeg(),
         "empty.jpg": b"",
-        "five.tiff": five_channels(),
-        "half.jpg": truncated(),
-        "text.jpg": b"This is not a picture.",
+        "five.tiff": five_channel_tiff(),
+        "half.jpg": truncated_jpeg(),
+        "text.jpg": b"This is not an image.",
     }
-    for name, data in bad.items():
+    for name, data in damaged.items():
         (folder / name).write_bytes(data)
     write_exr_with_nan(folder)
     for name in ("a", "good", "zebra"):
         (folder / f"{name}.jpg").write_bytes(picture())
     code, out, err = run("in", "-o", "out", "--quiet")
     assert (code, out) == (1, b"")
-    assert tree(tmp_path / "out") == results("a", "good", "zebra")
-    assert len(err.splitlines()) == len(errors(err)) == len(bad) + 1
-    for name in (*bad, "nan.exr"):
+    assert tree(tmp_path / "out") == layer_files("a", "good", "zebra")
+    assert len(err.splitlines()) == len(errors(err)) == len(damaged) + 1
+    for name in (*damaged, "nan.exr"):
         assert sum(f"in/{name}" in line for line in errors(err)) == 1, name
-    assert len(tree(folder)) == len(bad) + 4
+    assert len(tree(folder)) == len(damaged) + 4
 
 
-def test_a_picture_of_one_pixel_is_separated(run, tmp_path):
+def test_an_image_of_one_pixel_is_separated(run, tmp_path):
     (tmp_path / "a.png").write_bytes(picture(1, 1, "png"))
     assert run("a.png")[0] == 0
     assert Photo.open(tmp_path / "a.transmission.png").size == (1, 1)
@@ -91,7 +91,7 @@ def test_a_photo_above_the_pixel_limit_is_rejected_and_one_at_the_limit_is_not(r
     assert code == 1
     assert len(errors(err)) == 1
     assert "large.jpg" in errors(err)[0]
-    assert tree(tmp_path / "out") == results("small")
+    assert tree(tmp_path / "out") == layer_files("small")
 
 
 def test_an_unexpected_exception_is_raised_after_the_other_photos_are_separated(
@@ -109,7 +109,7 @@ def test_an_unexpected_exception_is_raised_after_the_other_photos_are_separated(
     monkeypatch.setattr(Separator, "__call__", fail)
     with pytest.raises(ZeroDivisionError):
         run(".", "-o", "out")
-    assert tree(tmp_path / "out") == results("b", "c")
+    assert tree(tmp_path / "out") == layer_files("b", "c")
     assert (
         "error: a.jpg: internal error in brewster (ZeroDivisionError: a bug)"
         in capfdbinary.readouterr().err.decode()
@@ -121,49 +121,49 @@ def test_a_photo_that_does_not_fit_into_memory_does_not_stop_the_others(run, tmp
         (tmp_path / f"{name}.jpg").write_bytes(picture())
     separate = Separator.__call__
 
-    def fill(self, source, **options):
+    def run_out_of_memory(self, source, **options):
         if source.name == "a.jpg":
             raise MemoryError
         return separate(self, source, **options)
 
-    monkeypatch.setattr(Separator, "__call__", fill)
+    monkeypatch.setattr(Separator, "__call__", run_out_of_memory)
     code, _, err = run(".", "-o", "out")
     assert code == 1
     assert "error: a.jpg: the photo does not fit into memory" in err
-    assert tree(tmp_path / "out") == results("b")
+    assert tree(tmp_path / "out") == layer_files("b")
 
 
 # --- names and folders
 
 
-def test_two_pictures_that_differ_in_suffix_only_give_two_results(run, tmp_path):
+def test_two_images_that_differ_only_in_suffix_get_separate_layers(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(picture())
     (tmp_path / "a.png").write_bytes(picture(container="png"))
     assert run(".", "-o", "out")[0] == 0
-    assert tree(tmp_path / "out") == sorted(results("a.jpg") + results("a.png", suffix="png"))
+    assert tree(tmp_path / "out") == sorted(layer_files("a.jpg") + layer_files("a.png", suffix="png"))
 
 
 def test_the_tree_below_a_folder_is_mirrored(run, tmp_path):
-    for place in ("in/x", "in/y/z"):
-        (tmp_path / place).mkdir(parents=True)
-        (tmp_path / place / "a.jpg").write_bytes(picture())
+    for folder in ("in/x", "in/y/z"):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "a.jpg").write_bytes(picture())
     assert run("in", "-o", "out")[0] == 0
     assert tree(tmp_path / "out") == sorted(
-        f"{place}/{name}" for place in ("x", "y/z") for name in results("a")
+        f"{folder}/{name}" for folder in ("x", "y/z") for name in layer_files("a")
     )
 
 
-NAMES = ["with space", "Schöne Fenster é", "two\nlines", "[bold]red", "-dash", b"\xff\xfe not text"]
+FILE_NAMES = ["with space", "Schöne Fenster é", "two\nlines", "[bold]red", "-dash", b"\xff\xfe not text"]
 
 
 def test_any_file_name_works_and_each_error_is_one_line(run, tmp_path):
-    names = [os.fsdecode(name) for name in NAMES]
+    names = [os.fsdecode(name) for name in FILE_NAMES]
     for name in names:
         (tmp_path / f"{name}.jpg").write_bytes(picture())
     (tmp_path / "bad\nname.jpg").write_bytes(b"")
     code, out, err = run(".", "-o", "out", "--json")
     assert code == 1
-    assert tree(tmp_path / "out") == results(*names)
+    assert tree(tmp_path / "out") == layer_files(*names)
     assert {line["source"] for line in lines(out)} == {f"{name}.jpg" for name in (*names, "bad\nname")}
     assert len(errors(err)) == 1
     assert r"bad\nname.jpg" in errors(err)[0]
@@ -172,20 +172,20 @@ def test_any_file_name_works_and_each_error_is_one_line(run, tmp_path):
 def test_a_name_that_looks_like_an_option_comes_after_two_dashes(run, tmp_path, model):
     (tmp_path / "-dash.jpg").write_bytes(picture())
     assert run("--quiet", "--model", model, "--", "-dash.jpg", with_model=False)[0] == 0
-    assert tree(tmp_path) == ["-dash.jpg", *results("-dash")]
+    assert tree(tmp_path) == ["-dash.jpg", *layer_files("-dash")]
 
 
 def test_link_loops_end(run, tmp_path):
     folder = tmp_path / "in"
     folder.mkdir()
     (folder / "a.jpg").write_bytes(picture())
-    (folder / "round").symlink_to(folder)
+    (folder / "loop").symlink_to(folder)
     (folder / "self.jpg").symlink_to("self.jpg")
     code, _, err = run("in", "-o", "out")
     assert code == 1
     assert len(errors(err)) == 1
     assert "self.jpg" in errors(err)[0]
-    assert tree(tmp_path / "out") == results("a")
+    assert tree(tmp_path / "out") == layer_files("a")
 
 
 # --- targets
@@ -217,19 +217,19 @@ def test_a_full_disk_leaves_no_partial_file_and_the_next_photo_is_tried(run, tmp
         (tmp_path / f"{name}.jpg").write_bytes(picture())
     fsync, calls = os.fsync, []
 
-    def full_for_a_while(file):
+    def fail_at_the_second_call(file):
         calls.append(file)
         if len(calls) == 2:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         fsync(file)
 
-    monkeypatch.setattr(os, "fsync", full_for_a_while)
+    monkeypatch.setattr(os, "fsync", fail_at_the_second_call)
     code, out, err = run(".", "-o", "out", "--json")
     assert code == 1
     assert errors(err)[0].startswith(
         "error: a.jpg: out/a.reflection.jpg was not written (No space left on device)"
     )
-    assert tree(tmp_path / "out") == ["a.transmission.jpg", *results("b")]
+    assert tree(tmp_path / "out") == ["a.transmission.jpg", *layer_files("b")]
     assert lines(out)[0]["outputs"] == {"transmission": "out/a.transmission.jpg"}
 
 
@@ -242,20 +242,20 @@ def test_a_real_limit_on_file_size_leaves_no_partial_file(model, tmp_path):
         resource.setrlimit(resource.RLIMIT_FSIZE, (500, 500))
 
     command = [sys.executable, "-m", "brewster", "a.png", "--format", "tiff", "--model", model]
-    done = subprocess.run(command, cwd=tmp_path, preexec_fn=limit, capture_output=True, check=False)
-    assert done.returncode == 1
-    assert done.stderr.startswith(b"error: a.png: a.transmission.tiff was not written (File too large)")
+    process = subprocess.run(command, cwd=tmp_path, preexec_fn=limit, capture_output=True, check=False)
+    assert process.returncode == 1
+    assert process.stderr.startswith(b"error: a.png: a.transmission.tiff was not written (File too large)")
     assert tree(tmp_path) == ["a.png"]
 
 
-@pytest.mark.parametrize("make", ["same", "symlink", "hardlink"])
-def test_a_photo_is_never_overwritten_by_its_own_layer(run, tmp_path, make):
+@pytest.mark.parametrize("link", ["same", "symlink", "hardlink"])
+def test_a_photo_is_never_overwritten_by_its_own_layer(run, tmp_path, link):
     data = picture()
     (tmp_path / "a.jpg").write_bytes(data)
-    target = "a.jpg" if make == "same" else "b.jpg"
-    if make == "symlink":
+    target = "a.jpg" if link == "same" else "b.jpg"
+    if link == "symlink":
         (tmp_path / "b.jpg").symlink_to("a.jpg")
-    if make == "hardlink":
+    if link == "hardlink":
         (tmp_path / "b.jpg").hardlink_to(tmp_path / "a.jpg")
     for overwrite in ([], ["--overwrite"]):
         code, _, err = run("a.jpg", "-o", target, *overwrite)
@@ -318,7 +318,7 @@ def test_a_folder_run_twice_does_not_separate_its_own_results(run, tmp_path):
     (tmp_path / "a.jpg").write_bytes(picture())
     run(".")
     assert run(".")[0] == 0
-    assert tree(tmp_path) == ["a.jpg", *results("a")]
+    assert tree(tmp_path) == ["a.jpg", *layer_files("a")]
 
 
 def test_the_same_photo_gives_the_same_bytes_twice(run, tmp_path):
@@ -351,23 +351,23 @@ def test_json_has_the_result_of_each_photo(run, tmp_path, model):
     (tmp_path / "a.jpg").write_bytes(picture())
     (tmp_path / "b.jpg").write_bytes(b"")
     code, out, err = run(".", "--json", "--quiet")
-    done, failed = lines(out)
+    separated, failed = lines(out)
     assert code == 1
     assert len(err.splitlines()) == 1
-    made_by = {"model", "sha256", "device", "seconds", "residual", "reconstruction_error", "doubtful"}
-    keys = {"source", "status", "outputs", "error"} | made_by
-    assert keys == set(done) == set(failed)
-    assert done["outputs"] == {layer: f"a.{layer}.jpg" for layer in LAYERS}
-    assert (done["source"], done["status"], done["model"], done["error"]) == (
+    model_keys = {"model", "sha256", "device", "seconds", "residual", "reconstruction_error", "doubtful"}
+    keys = {"source", "status", "outputs", "error"} | model_keys
+    assert keys == set(separated) == set(failed)
+    assert separated["outputs"] == {layer: f"a.{layer}.jpg" for layer in LAYERS}
+    assert (separated["source"], separated["status"], separated["model"], separated["error"]) == (
         "a.jpg",
         "separated",
         "pane",
         None,
     )
-    assert len(done["sha256"]) == 64
-    assert done["device"]
-    assert set(done["seconds"]) == {"decode", "network", "detail", "encode"}
-    assert done["residual"] == pytest.approx(0, abs=0.01)
+    assert len(separated["sha256"]) == 64
+    assert separated["device"]
+    assert set(separated["seconds"]) == {"decode", "network", "detail", "encode"}
+    assert separated["residual"] == pytest.approx(0, abs=0.01)
     assert (failed["source"], failed["status"], failed["outputs"]) == ("b.jpg", "failed", {})
     assert failed["error"]
 

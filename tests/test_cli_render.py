@@ -1,4 +1,4 @@
-"""`brewster render`, as a user calls it."""
+"""The command `brewster render`."""
 
 import importlib.util
 import json
@@ -21,7 +21,7 @@ from brewster.rendered.generation import workers
 from front_door import as_user, errors, lines
 from set_folders import hashes
 
-FAKED = """
+FAKE_CLI = """
 import sys
 from brewster.cli import main
 from brewster.rendered.generation import workers
@@ -31,14 +31,14 @@ sys.exit(main(sys.argv[1:]))
 
 
 @pytest.fixture
-def fake(monkeypatch):
+def fake_analytic(monkeypatch):
     monkeypatch.setitem(workers.RENDERERS, "analytic", "fake_renderer:render")
 
 
-def faked(*args, renderer="render", **options):
-    """The command with a fake renderer, in a process of its own."""
+def start_with_fake_renderer(*args, renderer="render", **options):
+    """Starts the command with a fake renderer in its own process. Returns the process."""
     path = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
-    command = [sys.executable, "-c", FAKED.format(renderer), "render", *map(str, args), "--workers", "0"]
+    command = [sys.executable, "-c", FAKE_CLI.format(renderer), "render", *map(str, args), "--workers", "0"]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=path, **options)
 
 
@@ -59,7 +59,7 @@ def test_a_set_is_rendered_with_preview_and_each_scene_can_be_rendered_again(bar
         assert hashes(tmp_path / "again" / index) == hashes(tmp_path / "set" / index)
 
 
-def test_the_same_command_resumes_and_a_larger_count_adds_samples(bare, fake, tmp_path):
+def test_the_same_command_resumes_and_a_larger_count_adds_samples(bare, fake_analytic, tmp_path):
     bare("render", "set", "--recipe", "tiny", "--count", 2, "--workers", 0)
     code, out, err = bare("render", "-o", "set", "--recipe", "tiny", "--count", 3, "--workers", 0, "--json")
     assert (code, [line["status"] for line in lines(out)]) == (0, ["skipped", "skipped", "rendered"])
@@ -67,7 +67,7 @@ def test_the_same_command_resumes_and_a_larger_count_adds_samples(bare, fake, tm
     assert "1 rendered, 2 skipped" in err
 
 
-def test_the_option_shards_packs_samples_into_tar_files(bare, fake, tmp_path):
+def test_the_option_shards_packs_samples_into_tar_files(bare, fake_analytic, tmp_path):
     assert (
         bare("render", "set", "--recipe", "tiny", "--count", 2, "--first", 99, "--workers", 0, "--shards")[0]
         == 0
@@ -77,18 +77,18 @@ def test_the_option_shards_packs_samples_into_tar_files(bare, fake, tmp_path):
             assert tar.getnames() == [f"{key}.{name}" for name in store.FILES]
 
 
-def test_quiet_prints_nothing(bare, fake):
+def test_quiet_prints_nothing(bare, fake_analytic):
     assert bare("render", "set", "--recipe", "tiny", "--count", 1, "--workers", 0, "--quiet") == (0, b"", "")
 
 
-def test_a_sample_that_fails_is_named_and_the_exit_code_is_one(bare, monkeypatch):
+def test_a_sample_that_fails_is_listed_and_the_exit_code_is_one(bare, monkeypatch):
     monkeypatch.setitem(workers.RENDERERS, "analytic", "fake_renderer:picky")
     code, _, err = bare("render", "set", "--recipe", "tiny", "--count", 3, "--workers", 0, "--quiet")
     assert code == 1
     assert errors(err) == ["error: sample 1: sample 1 is odd; it should be even; count by two."]
 
 
-def test_another_job_in_the_folder_is_one_error_line(bare, fake):
+def test_another_job_in_the_folder_is_one_error_line(bare, fake_analytic):
     bare("render", "set", "--recipe", "tiny", "--count", 1, "--workers", 0)
     code, _, err = bare("render", "set", "--recipe", "tiny", "--count", 1, "--workers", 0, "--seed", 3)
     assert code == 1
@@ -96,9 +96,9 @@ def test_another_job_in_the_folder_is_one_error_line(bare, fake):
     assert "its seed is 0, and 3 was requested" in err
 
 
-def test_a_photo_that_cannot_light_a_scene_is_left_out_and_named(bare, fake, tmp_path):
+def test_an_unreadable_photo_is_left_out_and_listed(bare, fake_analytic, tmp_path):
     (tmp_path / "photos").mkdir()
-    (tmp_path / "photos" / "broken.jpg").write_bytes(b"not a picture")
+    (tmp_path / "photos" / "broken.jpg").write_bytes(b"not an image")
     grey = Photo.open(next((Path(__file__).parent / "pictures").glob("mixture*.jpg")))
     grey.save(tmp_path / "photos" / "fine.jpg")
     code, _, err = bare(
@@ -109,7 +109,7 @@ def test_a_photo_that_cannot_light_a_scene_is_left_out_and_named(bare, fake, tmp
 
 
 @pytest.mark.parametrize(
-    ("args", "says"),
+    ("args", "message"),
     [
         ((), "Give one output folder"),
         (("set", "-o", "other"), "Give one output folder"),
@@ -120,16 +120,16 @@ def test_a_photo_that_cannot_light_a_scene_is_left_out_and_named(bare, fake, tmp
         (("set", "--scene", "scene.toml", "--count", "3"), "--count belongs to a set"),
     ],
 )
-def test_a_wrong_usage_is_explained(bare, args, says):
+def test_invalid_arguments_are_explained(bare, args, message):
     code, _, err = bare("render", *args)
     assert code == 2
-    assert says in err
+    assert message in err
 
 
 def test_a_missing_package_is_named_with_the_command_that_installs_it(bare, monkeypatch):
-    found = importlib.util.find_spec
+    find_spec = importlib.util.find_spec
     monkeypatch.setattr(
-        importlib.util, "find_spec", lambda name, *rest: None if name == "torch" else found(name, *rest)
+        importlib.util, "find_spec", lambda name, *rest: None if name == "torch" else find_spec(name, *rest)
     )
     code, _, err = bare("render", "set")
     assert code == 1
@@ -146,7 +146,9 @@ def test_a_full_disk_is_one_error_line(tmp_path):
     def limit_file_size():
         resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
 
-    run = faked("set", "--recipe", "tiny", "--count", 2, cwd=tmp_path, preexec_fn=limit_file_size)
+    run = start_with_fake_renderer(
+        "set", "--recipe", "tiny", "--count", 2, cwd=tmp_path, preexec_fn=limit_file_size
+    )
     _, err = run.communicate()
     assert run.returncode == 1
     assert err.startswith(b"error: ")
@@ -155,9 +157,9 @@ def test_a_full_disk_is_one_error_line(tmp_path):
     assert sorted(path.name for path in (tmp_path / "set").iterdir()) == [".lock", "set.toml"]
 
 
-def test_a_killed_and_restarted_run_gives_the_same_set_as_an_undisturbed_one(bare, fake, tmp_path):
+def test_a_killed_and_restarted_run_gives_the_same_set_as_an_uninterrupted_run(bare, fake_analytic, tmp_path):
     command = ("--recipe", "tiny", "--count", 20, "--shards")
-    run = faked("set", *command, renderer="slow", cwd=tmp_path)
+    run = start_with_fake_renderer("set", *command, renderer="slow", cwd=tmp_path)
     deadline = time.monotonic() + 30
     while len(list(tmp_path.glob("set/0*"))) < 4 and time.monotonic() < deadline:
         time.sleep(0.01)
@@ -167,9 +169,9 @@ def test_a_killed_and_restarted_run_gives_the_same_set_as_an_undisturbed_one(bar
     run.kill()
     run.communicate()
     assert 4 <= len(list(tmp_path.glob("set/0*"))) < 20
-    for name in ("set", "undisturbed"):
+    for name in ("set", "uninterrupted"):
         assert bare("render", name, *command, "--workers", 0)[0] == 0
-    assert hashes(tmp_path / "set") == hashes(tmp_path / "undisturbed")
+    assert hashes(tmp_path / "set") == hashes(tmp_path / "uninterrupted")
 
 
 @pytest.mark.slow
@@ -184,11 +186,11 @@ def test_a_run_with_two_workers_can_be_killed_and_resumed(tmp_path):
     run.kill()
     run.wait()
     time.sleep(1)  # until the workers have exited
-    for name in ("set", "undisturbed"):
-        done = as_user("render", name, *command, "--json", cwd=tmp_path)
-        assert done.returncode == 0, done.stderr
-    assert {json.loads(line)["status"] for line in done.stdout.splitlines()} == {"rendered"}
-    assert hashes(tmp_path / "set") == hashes(tmp_path / "undisturbed")
+    for name in ("set", "uninterrupted"):
+        process = as_user("render", name, *command, "--json", cwd=tmp_path)
+        assert process.returncode == 0, process.stderr
+    assert {json.loads(line)["status"] for line in process.stdout.splitlines()} == {"rendered"}
+    assert hashes(tmp_path / "set") == hashes(tmp_path / "uninterrupted")
 
 
 def test_render_is_a_command_of_brewster(capsys):
