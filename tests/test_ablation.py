@@ -16,7 +16,7 @@ from brewster.errors import RecipeError
 from brewster.evaluate import ablation as module
 from brewster.evaluate.ablation import ablate, read_study
 from brewster.training.recipe import read_recipe, with_value
-from front_door import as_user
+from cli_helpers import run_process
 
 RECIPES = Path(__file__).parents[1] / "recipes" / "ablations"
 STUDIES = [path for path in sorted(RECIPES.glob("*.toml")) if "base" in tomllib.loads(path.read_text())]
@@ -138,7 +138,7 @@ def test_every_study_runs_end_to_end_at_tiny_size(path, little_data, tmp_path):
     """Real rendering, real training, real measuring, on four real pairs."""
     environment = {**os.environ, "BREWSTER_DATA": str(little_data)}
     base = RECIPES / TINY.get(path.stem, "tiny.toml")
-    done = as_user("ablate", path, "--base", base, "-o", tmp_path / "out", env=environment)
+    done = run_process("ablate", path, "--base", base, "-o", tmp_path / "out", env=environment)
     assert done.returncode == 0, done.stderr.decode()
     text = done.stdout.decode()
     for choice in read_study(path).choices:

@@ -11,12 +11,12 @@ import pytest
 from brewster import Photo
 from brewster.errors import UnreadablePhoto
 from brewster.inference import Separator
-from front_door import errors, layer_files, lines, picture, tree
+from cli_helpers import error_lines, image_bytes, json_lines, layer_files, list_files
 from other_processes import started, wait_for
 
 
 def test_ctrl_c_while_a_file_is_written_leaves_no_partial_file(run, tmp_path, monkeypatch):
-    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
     fsync, calls = os.fsync, []
 
     def interrupt_the_second_call(file):
@@ -29,7 +29,7 @@ def test_ctrl_c_while_a_file_is_written_leaves_no_partial_file(run, tmp_path, mo
     code, _, err = run("a.jpg")
     assert code == 130
     assert "stopped" in err
-    assert tree(tmp_path) == ["a.jpg", "a.transmission.jpg"]
+    assert list_files(tmp_path) == ["a.jpg", "a.transmission.jpg"]
 
 
 def raise_interrupt_in_c_callback():
@@ -46,7 +46,7 @@ def test_ctrl_c_that_c_code_drops_stops_the_batch_before_anything_is_written(
     run, tmp_path, monkeypatch, with_error
 ):
     for name in ("a", "b", "c"):
-        (tmp_path / f"{name}.jpg").write_bytes(picture())
+        (tmp_path / f"{name}.jpg").write_bytes(image_bytes())
     separate = Separator.__call__
 
     def interrupt_at_b(self, source, **options):
@@ -61,10 +61,10 @@ def test_ctrl_c_that_c_code_drops_stops_the_batch_before_anything_is_written(
     monkeypatch.setattr(Separator, "__call__", interrupt_at_b)
     code, out, err = run(".", "-o", "out", "--json")
     assert code == 130
-    assert tree(tmp_path / "out") == layer_files("a")
-    assert [line["source"] for line in lines(out)] == ["a.jpg"]
+    assert list_files(tmp_path / "out") == layer_files("a")
+    assert [line["source"] for line in json_lines(out)] == ["a.jpg"]
     assert "Traceback" not in err
-    assert not errors(err)
+    assert not error_lines(err)
     assert run(".", "-o", "out")[0] == 130  # b is interrupted again: no state of the first run remains
     monkeypatch.setattr(Separator, "__call__", separate)
     assert run(".", "-o", "out")[0] == 0
@@ -73,7 +73,7 @@ def test_ctrl_c_that_c_code_drops_stops_the_batch_before_anything_is_written(
 def test_other_exceptions_that_c_code_drops_are_still_reported(run, tmp_path, monkeypatch):
     dropped = []
     monkeypatch.setattr(sys, "unraisablehook", dropped.append)
-    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
     fsync = os.fsync
 
     def fail():
@@ -107,7 +107,7 @@ def test_ctrl_c_during_a_batch_leaves_only_complete_files_and_the_same_command_r
     names = [f"{index:02}" for index in range(12)]
     (tmp_path / "in").mkdir()
     for index, name in enumerate(names):
-        (tmp_path / "in" / f"{name}.jpg").write_bytes(picture(400, 300, seed=index))
+        (tmp_path / "in" / f"{name}.jpg").write_bytes(image_bytes(400, 300, seed=index))
     command = [sys.executable, "-c", ENDLESS_CLI, "in", "-o", "out", "--model", model, "--quality", "draft"]
     with started(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as batch:
         wait_for((tmp_path / "started").exists, batch)
@@ -115,7 +115,7 @@ def test_ctrl_c_during_a_batch_leaves_only_complete_files_and_the_same_command_r
         _, err = batch.communicate()
     assert batch.returncode == 130
     assert b"Traceback" not in err
-    assert tree(tmp_path / "out") == layer_files(*names[:6])
+    assert list_files(tmp_path / "out") == layer_files(*names[:6])
     assert all(Photo.open(path).size == (400, 300) for path in tmp_path.glob("out/*"))
     assert run("in", "-o", "out", "--quality", "draft")[0] == 0
-    assert tree(tmp_path / "out") == layer_files(*names)
+    assert list_files(tmp_path / "out") == layer_files(*names)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from brewster.web.application import create_app
 from brewster.web.middleware import RequestLimits, is_loopback
-from glass_server import client, request
+from web_servers import client, request
 
 TOKEN = "a-token-nobody-guesses"
 

@@ -10,9 +10,9 @@ from brewster.inference import Separator
 from brewster.options import Options
 from brewster.srgb import to_encoded, to_linear
 from brewster.web.preview import PREVIEW_PIXELS, preview
-from front_door import picture
-from glass_server import form, make_app, pane, request
+from cli_helpers import image_bytes
 from picture_files import exif_block, file_of, smooth
+from web_servers import form, make_app, pane, request
 
 MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
 
@@ -72,7 +72,7 @@ def out_of_range(tile):
 
 @pytest.mark.parametrize("strength", [0.1, 0.5, 0.9])
 def test_layers_that_are_clipped_at_full_strength_are_correct_below_it(strength):
-    data = picture(120, 90, "png")
+    data = image_bytes(120, 90, "png")
     made = Separator(out_of_range)(data, strength=strength)
     for layer, ours in zip(
         (made.transmission, made.reflection), maps_of(data, out_of_range).at(strength), strict=True
@@ -97,7 +97,7 @@ def test_a_large_photo_is_made_smaller_and_looks_like_its_large_separation(shipp
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 900), (3000, 2)])
 def test_unusual_sizes_work(size):
-    maps = maps_of(picture(*size, "png"))
+    maps = maps_of(image_bytes(*size, "png"))
     assert [maps.head["width"], maps.head["height"]] == maps.head["full"] == list(size)
 
 
@@ -135,13 +135,13 @@ def test_a_picture_brighter_than_white_is_clipped_to_the_range():
 
 def test_progress_reaches_the_end():
     progress = []
-    preview(Separator(pane), Photo.open(picture(60, 40, "png")), Options(), progress.append)
+    preview(Separator(pane), Photo.open(image_bytes(60, 40, "png")), Options(), progress.append)
     assert progress == sorted(progress)
     assert progress[-1] == 1
 
 
 def test_the_preview_route_returns_the_maps_and_refuses_invalid_files():
-    answer = request(make_app(), "POST", "/preview", **form(picture(60, 40, "png"), quality="draft"))
+    answer = request(make_app(), "POST", "/preview", **form(image_bytes(60, 40, "png"), quality="draft"))
     assert Maps(answer.content).head["full"] == [60, 40]
     refused = request(make_app(), "POST", "/preview", **form(b"no picture"))
     assert refused.status_code == 422

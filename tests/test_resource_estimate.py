@@ -85,11 +85,11 @@ def test_an_unknown_backbone_has_no_estimate():
         estimate_resources(with_value(read_recipe(RECIPES / "klein.toml"), "backbone", "somebody/else"), CARD)
 
 
-def test_the_command_prints_the_estimate_and_trains_nothing(bare, tmp_path):
-    code, out, _ = bare("train", RECIPES / "large-tiny.toml", "--plan", "--gpu", "A100")
+def test_the_command_prints_the_estimate_and_trains_nothing(run_without_model, tmp_path):
+    code, out, _ = run_without_model("train", RECIPES / "large-tiny.toml", "--plan", "--gpu", "A100")
     assert code == 0
     assert b"A100" in out
     assert list(tmp_path.iterdir()) == []
-    code, _, err = bare("train", RECIPES / "tiny.toml", "--plan")
+    code, _, err = run_without_model("train", RECIPES / "tiny.toml", "--plan")
     assert code != 0
     assert "train it without --plan" in err

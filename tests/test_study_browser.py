@@ -12,8 +12,8 @@ from brewster.web.application import create_app
 from brewster.web.middleware import RequestLimits
 from brewster.web.study import study_router
 from file_server import loopback_only
-from glass_server import served_port
 from small_studies import copy_without_answers, make_study
+from web_servers import served_port
 
 READY = "#trial:not(.waiting):not([hidden])"
 

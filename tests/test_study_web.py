@@ -12,8 +12,8 @@ from brewster.user_study.store import AnswerStore
 from brewster.web.application import create_app
 from brewster.web.middleware import RequestLimits
 from brewster.web.study import study_router
-from glass_server import request
 from small_studies import copy_without_answers, make_study
+from web_servers import request
 
 TOKEN = "a-token-nobody-guesses"
 
