@@ -26,7 +26,7 @@ brewster assets pull polyhaven "$BREWSTER_DATA/hdri" --indoor 140 --outdoor 30 -
 # 2. Render 1,000 samples with the paper's orders of reflection (T is the path without any reflection).
 #    5 MB per sample, measured with the built-in environments, 5 GB in total; est. 2.5-4 CPU-seconds per sample
 #    (docs/rendering.md, scaled to this size): an hour on one core, 10 minutes on eight. Your own photos in front of the maps
-#    improve the data: --photos DIR.
+#    improve the data: --photos FOLDER.
 brewster render "$BREWSTER_DATA/sets/window" --recipe window --count 1000 --size 640x480 --orders paper --seed 10 \
     --maps "$BREWSTER_DATA/hdri"
 

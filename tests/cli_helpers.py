@@ -1,4 +1,4 @@
-"""Shared helpers for tests of the command line: a model of a pane, pictures, and the command in a process."""
+"""Helpers for tests of the command line: a model, image files, the command in its own process, and its output."""
 
 import json
 import subprocess
@@ -14,7 +14,7 @@ LAYERS = ("transmission", "reflection")
 
 
 def write_pane(path):
-    """An ONNX model of a pane that transmits 80 % and reflects 20 %."""
+    """Writes an ONNX model whose transmission is 80 % and whose reflection is 20 % of the photo. Returns its path."""
     shape = [1, 3, "height", "width"]
     shares = {"transmission": 0.8, "reflection": 0.2}
     graph = helper.make_graph(
@@ -31,31 +31,35 @@ def write_pane(path):
     return path
 
 
-def picture(width=60, height=40, container="jpeg", seed=1):
-    """The bytes of a picture."""
+def image_bytes(width=60, height=40, container="jpeg", seed=1):
+    """Returns an image of random 10x10 blocks as the bytes of a file."""
     small = np.random.default_rng(seed).integers(0, 256, (height // 10 + 1, width // 10 + 1, 3), np.uint8)
     array = np.kron(small, np.ones((10, 10, 1), np.uint8))[:height, :width]
     return Photo.from_array(array, encoding="srgb").encode(container)
 
 
-def as_user(*args, **kwargs):
+def run_process(*args, **kwargs):
     """Runs the command `brewster` in its own process."""
     return subprocess.run(
         [sys.executable, "-m", "brewster", *map(str, args)], capture_output=True, check=False, **kwargs
     )
 
 
-def tree(folder):
+def list_files(folder):
+    """The paths of all files below a folder, sorted."""
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
 
-def results(*names, suffix="jpg"):
+def layer_files(*names, suffix="jpg"):
+    """The file names of the layers of these photos, sorted."""
     return sorted(f"{name}.{layer}.{suffix}" for name in names for layer in LAYERS)
 
 
-def lines(out):
+def json_lines(out):
+    """The JSON values in the lines of the output."""
     return [json.loads(line) for line in out.splitlines()]
 
 
-def errors(err):
+def error_lines(err):
+    """The lines of standard error that are error messages."""
     return [line for line in err.splitlines() if line.startswith("error: ")]

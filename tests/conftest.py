@@ -124,7 +124,7 @@ def model(tmp_path_factory):
 
 @pytest.fixture
 def run(model, monkeypatch, tmp_path, capfdbinary):
-    """Runs a command in an empty folder: exit code, standard output (bytes) and standard error (text)."""
+    """Runs a command in an empty folder, with the model of a pane. Returns (exit code, stdout as bytes, stderr as text)."""
     monkeypatch.chdir(tmp_path)
 
     def run(*args, stdin=b"", with_model=True):
@@ -137,8 +137,8 @@ def run(model, monkeypatch, tmp_path, capfdbinary):
 
 
 @pytest.fixture
-def bare(run):
-    """The same for commands without the option --model."""
+def run_without_model(run):
+    """Runs a command like `run`, but without the option --model."""
     return lambda *args: run(*args, with_model=False)
 
 

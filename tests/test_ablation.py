@@ -16,7 +16,7 @@ from brewster.errors import RecipeError
 from brewster.evaluate import ablation as module
 from brewster.evaluate.ablation import ablate, read_study
 from brewster.training.recipe import read_recipe, with_value
-from cli_helpers import as_user
+from cli_helpers import run_process
 
 RECIPES = Path(__file__).parents[1] / "recipes" / "ablations"
 STUDIES = [path for path in sorted(RECIPES.glob("*.toml")) if "base" in tomllib.loads(path.read_text())]
@@ -140,7 +140,7 @@ def test_every_study_runs_end_to_end_at_tiny_size(path, few_pairs, tmp_path):
     """Nothing is replaced: the study renders, trains on four real pairs, and evaluates."""
     environment = {**os.environ, "BREWSTER_DATA": str(few_pairs)}
     base = RECIPES / TINY.get(path.stem, "tiny.toml")
-    result = as_user("ablate", path, "--base", base, "-o", tmp_path / "out", env=environment)
+    result = run_process("ablate", path, "--base", base, "-o", tmp_path / "out", env=environment)
     assert result.returncode == 0, result.stderr.decode()
     text = result.stdout.decode()
     for value in read_study(path).values:

@@ -11,14 +11,14 @@ from brewster.errors import TargetError
 from brewster.web.application import listen, server_url
 from brewster.web.job_queue import JobQueue
 from brewster.web.middleware import RequestLimits
-from cli_helpers import picture
+from cli_helpers import image_bytes
 from file_server import loopback_only
 from other_processes import started
 from web_servers import BlockingBackend, make_app, raw_exchange, served_port
 
 HEAD = "POST /separate HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Type: multipart/form-data; boundary=x\r\n"
 PLAIN = b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
-PHOTO = picture(40, 30, "png")
+PHOTO = image_bytes(40, 30, "png")
 FORM = b'--x\r\nContent-Disposition: form-data; name="photo"; filename="a.png"\r\n\r\n%b\r\n--x--\r\n' % PHOTO
 
 

@@ -9,7 +9,7 @@ from brewster import Photo, Separator
 from brewster.errors import ModelError, PhotoError, TargetError
 from brewster.inference import SeparationTask, plan_files, separate_files, separate_tasks
 from brewster.options import Options
-from cli_helpers import LAYERS, picture, results, tree
+from cli_helpers import LAYERS, image_bytes, layer_files, list_files
 
 
 @pytest.fixture
@@ -22,7 +22,7 @@ def photo_folder(tmp_path):
     """A folder with a photo, a damaged file, and a subfolder with a photo."""
     (tmp_path / "in" / "c").mkdir(parents=True)
     for name in ("a.jpg", "c/d.jpg"):
-        (tmp_path / "in" / name).write_bytes(picture())
+        (tmp_path / "in" / name).write_bytes(image_bytes())
     (tmp_path / "in" / "b.jpg").write_bytes(b"not an image")
     return tmp_path / "in"
 
@@ -34,7 +34,9 @@ def test_a_folder_is_mirrored_and_a_damaged_photo_does_not_stop_the_batch(photo_
         str(photo_folder / name) for name in ("a.jpg", "b.jpg", "c/d.jpg")
     ]
     assert [result.error is None for result in batch_results] == [True, False, True]
-    assert tree(tmp_path / "out") == sorted(results("a") + [f"c/{name}" for name in results("d")])
+    assert list_files(tmp_path / "out") == sorted(
+        layer_files("a") + [f"c/{name}" for name in layer_files("d")]
+    )
     first = batch_results[0]
     assert (first.model, first.sha256, first.device) == ("pane", "0" * 64, "cpu")
     assert first.outputs == {layer: str(tmp_path / f"out/a.{layer}.jpg") for layer in LAYERS}
@@ -43,23 +45,23 @@ def test_a_folder_is_mirrored_and_a_damaged_photo_does_not_stop_the_batch(photo_
 
 
 def test_layers_are_written_next_to_their_photo_by_default(tmp_path, separator):
-    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
     (result,) = separate_files(str(tmp_path / "a.jpg"), separator=separator)
     assert result.status == "separated"
-    assert tree(tmp_path) == ["a.jpg", *results("a")]
+    assert list_files(tmp_path) == ["a.jpg", *layer_files("a")]
 
 
 def test_the_options_choose_layers_and_formats(tmp_path, separator):
-    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
     options = Options(layers=("transmission", "confidence"), format="tiff", strength=0)
     list(separate_files([tmp_path / "a.jpg"], tmp_path / "out", options, separator))
-    assert tree(tmp_path / "out") == ["a.confidence.png", "a.transmission.tiff"]
+    assert list_files(tmp_path / "out") == ["a.confidence.png", "a.transmission.tiff"]
     written, photo = Photo.open(tmp_path / "out/a.transmission.tiff"), Photo.open(tmp_path / "a.jpg")
     assert (written.pixels == photo.pixels).all()
 
 
 def test_finished_photos_are_skipped_without_a_model_and_missing_layers_are_added(tmp_path, separator):
-    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
     list(separate_files(tmp_path, separator=separator))
     no_model = Options(model="no-such-model")
     (skipped,) = separate_files(tmp_path, options=no_model)
@@ -84,19 +86,19 @@ def test_a_dry_run_returns_the_paths_and_writes_nothing(photo_folder, tmp_path):
 
 def test_a_photo_of_the_batch_is_never_overwritten(tmp_path, separator):
     for name in ("a.jpg", "a.transmission.jpg"):
-        (tmp_path / name).write_bytes(picture())
+        (tmp_path / name).write_bytes(image_bytes())
     sources = [tmp_path / "a.jpg", tmp_path / "a.transmission.jpg"]
     refused, separated = separate_files(sources, separator=separator, overwrite=True)
     assert "is itself a photo of the batch" in refused.error
     assert separated.status == "separated"
-    assert (tmp_path / "a.transmission.jpg").read_bytes() == picture()
+    assert (tmp_path / "a.transmission.jpg").read_bytes() == image_bytes()
 
 
 def test_names_and_sources_are_checked_before_the_first_photo_is_separated(tmp_path):
     for name in ("x", "y", "empty"):
         (tmp_path / name).mkdir()
     for name in ("x", "y"):
-        (tmp_path / name / "a.jpg").write_bytes(picture())
+        (tmp_path / name / "a.jpg").write_bytes(image_bytes())
     with pytest.raises(TargetError, match="would both be written"):
         separate_files([tmp_path / "x/a.jpg", tmp_path / "y/a.jpg"], tmp_path / "out")
     with pytest.raises(PhotoError, match="there is no photo in"):
@@ -107,7 +109,7 @@ def test_a_photo_is_separated_when_its_result_is_requested(photo_folder, tmp_pat
     batch = separate_files(photo_folder, tmp_path / "out", separator=separator)
     assert not (tmp_path / "out").exists()
     assert next(batch).status == "separated"
-    assert tree(tmp_path / "out") == results("a")
+    assert list_files(tmp_path / "out") == layer_files("a")
 
 
 def test_a_model_that_does_not_exist_ends_the_batch(photo_folder, tmp_path):
@@ -128,7 +130,7 @@ def test_an_unexpected_exception_is_raised_again_after_the_last_photo(
     monkeypatch.setattr(Separator, "__call__", fail_on_first)
     with pytest.raises(ZeroDivisionError, match="a bug"):
         list(separate_files(photo_folder, tmp_path / "out", separator=separator))
-    assert tree(tmp_path / "out") == [f"c/{name}" for name in results("d")]
+    assert list_files(tmp_path / "out") == [f"c/{name}" for name in layer_files("d")]
 
 
 def test_progress_names_the_file_and_grows_and_keyboard_interrupt_stops(photo_folder, tmp_path, separator):
@@ -153,7 +155,7 @@ def test_progress_names_the_file_and_grows_and_keyboard_interrupt_stops(photo_fo
 
 def test_photos_and_layers_may_be_streams(separator):
     layer = io.BytesIO()
-    task = SeparationTask(io.BytesIO(picture(container="png")), {"transmission": layer})
+    task = SeparationTask(io.BytesIO(image_bytes(container="png")), {"transmission": layer})
     (result,) = separate_tasks([task], separator=separator)
     assert (result.source, result.status, result.outputs) == ("-", "separated", {"transmission": "-"})
     assert Photo.open(layer.getvalue()).file_info.container == "png"

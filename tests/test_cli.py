@@ -22,7 +22,7 @@ from brewster.image_formats import WRITABLE
 from brewster.inference import QUALITIES
 from brewster.inference.onnx_backend import DEVICES
 from brewster.options import Options
-from cli_helpers import as_user, lines, picture, tree
+from cli_helpers import image_bytes, json_lines, list_files, run_process
 
 ROOT = Path(__file__).parents[1]
 
@@ -58,8 +58,8 @@ def test_the_reference_names_every_command_and_every_option():
             assert option.opts[-1] in text
 
 
-def test_the_version_is_that_of_the_package(bare):
-    assert bare("--version") == (0, f"brewster {brewster.__version__}\n".encode(), "")
+def test_the_version_is_that_of_the_package(run_without_model):
+    assert run_without_model("--version") == (0, f"brewster {brewster.__version__}\n".encode(), "")
 
 
 # --- the options are those of the library
@@ -74,8 +74,8 @@ def test_the_options_offer_the_values_that_the_library_accepts():
 
 
 def test_every_option_of_a_separation_is_an_option_of_the_command():
-    offered = {param.name for param in cli.commands["separate"].params}
-    assert {field.name for field in fields(Options)} <= offered
+    option_names = {param.name for param in cli.commands["separate"].params}
+    assert {field.name for field in fields(Options)} <= option_names
 
 
 def test_a_web_form_can_be_made_from_the_same_options():
@@ -97,20 +97,20 @@ def test_additive_layers_are_rejected_in_containers_without_floats():
 
 
 def test_without_a_command_the_photo_is_separated_and_the_layers_are_next_to_it(run, tmp_path):
-    (tmp_path / "photo.jpg").write_bytes(picture())
+    (tmp_path / "photo.jpg").write_bytes(image_bytes())
     code, out, err = run("photo.jpg")
     assert (code, out) == (0, b"")
-    assert tree(tmp_path) == ["photo.jpg", "photo.reflection.jpg", "photo.transmission.jpg"]
+    assert list_files(tmp_path) == ["photo.jpg", "photo.reflection.jpg", "photo.transmission.jpg"]
     assert "photo.transmission.jpg, photo.reflection.jpg" in err
 
 
 @pytest.mark.parametrize(
-    "words", [["separate", "a.png", "-o", "x"], ["a.png", "-o", "x"], ["-o", "x", "a.png"]]
+    "arguments", [["separate", "a.png", "-o", "x"], ["a.png", "-o", "x"], ["-o", "x", "a.png"]]
 )
-def test_the_word_separate_is_optional_and_options_may_come_first(run, tmp_path, words):
-    (tmp_path / "a.png").write_bytes(picture(container="png"))
-    assert run(*words)[0] == 0
-    assert tree(tmp_path / "x") == ["a.reflection.png", "a.transmission.png"]
+def test_the_command_name_separate_is_optional_and_options_may_come_first(run, tmp_path, arguments):
+    (tmp_path / "a.png").write_bytes(image_bytes(container="png"))
+    assert run(*arguments)[0] == 0
+    assert list_files(tmp_path / "x") == ["a.reflection.png", "a.transmission.png"]
 
 
 def test_the_layers_are_the_output_of_the_model(run, tmp_path):
@@ -125,53 +125,53 @@ def test_the_layers_are_the_output_of_the_model(run, tmp_path):
 
 
 def test_strength_zero_returns_the_photo_bit_by_bit(run, tmp_path):
-    (tmp_path / "a.png").write_bytes(picture(container="png"))
+    (tmp_path / "a.png").write_bytes(image_bytes(container="png"))
     assert run("a.png", "--strength", 0)[0] == 0
-    same = Photo.open(tmp_path / "a.transmission.png").pixels == Photo.open(tmp_path / "a.png").pixels
-    assert same.all()
+    is_equal = Photo.open(tmp_path / "a.transmission.png").pixels == Photo.open(tmp_path / "a.png").pixels
+    assert is_equal.all()
 
 
 def test_only_the_requested_layers_are_written(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
     assert run("a.jpg", "--layers", "confidence,reflection", "-o", "x")[0] == 0
-    assert tree(tmp_path / "x") == ["a.confidence.png", "a.reflection.jpg"]
+    assert list_files(tmp_path / "x") == ["a.confidence.png", "a.reflection.jpg"]
 
 
 def test_another_container_can_be_requested(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
     assert run("a.jpg", "--format", "webp", "--layers", "transmission,confidence", "-o", "x")[0] == 0
-    assert tree(tmp_path / "x") == ["a.confidence.png", "a.transmission.webp"]
+    assert list_files(tmp_path / "x") == ["a.confidence.png", "a.transmission.webp"]
     assert Photo.open(tmp_path / "x" / "a.transmission.webp").file_info.container == "webp"
 
 
 def test_the_suffix_of_the_photo_is_kept_if_its_container_is_requested(run, tmp_path):
-    (tmp_path / "A.JPEG").write_bytes(picture())
+    (tmp_path / "A.JPEG").write_bytes(image_bytes())
     assert run("A.JPEG", "--format", "jpeg", "--layers", "transmission", "-o", "x")[0] == 0
-    assert tree(tmp_path / "x") == ["A.transmission.JPEG"]
+    assert list_files(tmp_path / "x") == ["A.transmission.JPEG"]
 
 
 @pytest.mark.parametrize(("format_", "suffix"), [(None, "tiff"), ("exr", "exr")])
 def test_additive_layers_are_floats_that_sum_to_the_photo(run, tmp_path, format_, suffix):
-    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
     assert run("a.jpg", "--additive", *(["--format", format_] if format_ else []))[0] == 0
     layers = [Photo.open(tmp_path / f"a.{layer}.{suffix}") for layer in ("transmission", "reflection")]
     assert all(layer.pixels.dtype == np.float32 for layer in layers)
     assert (layers[0].linear() + layers[1].linear() == Photo.open(tmp_path / "a.jpg").linear()).all()
 
 
-def test_a_picture_named_as_the_output_takes_the_transmission(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(picture())
+def test_an_image_file_as_the_output_gets_the_transmission(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
     assert run("a.jpg", "-o", "new/clear.png")[0] == 0
-    assert tree(tmp_path / "new") == ["clear.png"]
+    assert list_files(tmp_path / "new") == ["clear.png"]
     assert Photo.open(tmp_path / "new" / "clear.png").file_info.container == "png"
 
 
-def test_a_folder_may_have_the_name_of_a_picture(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(picture())
+def test_an_output_folder_may_have_an_image_suffix(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
     (tmp_path / "old.png").mkdir()
     for folder in ("old.png", "new.png/"):
         assert run("a.jpg", "-o", folder, "--layers", "reflection")[0] == 0
-        assert tree(tmp_path / folder) == ["a.reflection.jpg"]
+        assert list_files(tmp_path / folder) == ["a.reflection.jpg"]
 
 
 # --- standard input and output
@@ -179,30 +179,30 @@ def test_a_folder_may_have_the_name_of_a_picture(run, tmp_path):
 
 @pytest.mark.parametrize("container", ["jpeg", "png", "tiff", "webp"])
 def test_standard_input_goes_to_standard_output_in_its_container(run, container):
-    code, out, err = run("-", stdin=picture(container=container))
+    code, out, err = run("-", stdin=image_bytes(container=container))
     assert (code, Photo.open(out).file_info.container) == (0, container)
     assert "- -> -" in err
 
 
 def test_standard_output_accepts_another_layer_and_container(run):
-    confidence = run("-", "--layers", "confidence", "--quiet", stdin=picture())
+    confidence = run("-", "--layers", "confidence", "--quiet", stdin=image_bytes())
     assert confidence[0] == 0
     assert confidence[2] == ""
     assert Photo.open(confidence[1]).pixels.shape == (40, 60, 1)
-    exr = Photo.open(run("-", "--additive", "--format", "exr", stdin=picture())[1])
+    exr = Photo.open(run("-", "--additive", "--format", "exr", stdin=image_bytes())[1])
     assert exr.file_info.container == "exr"
 
 
 def test_a_file_can_go_to_standard_output_and_standard_input_to_a_file(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
     code, out, _ = run("a.jpg", "-o", "-")
     assert code == 0
-    assert run("-", "-o", "b.jpg", "--json", stdin=picture())[0] == 0
+    assert run("-", "-o", "b.jpg", "--json", stdin=image_bytes())[0] == 0
     assert (tmp_path / "b.jpg").read_bytes() == out
 
 
 @pytest.mark.parametrize("stdin", [b"", b"hello"])
-def test_standard_input_without_a_picture_is_an_error_and_gives_no_output(run, stdin):
+def test_standard_input_without_an_image_is_an_error_and_gives_no_output(run, stdin):
     code, out, err = run("-", stdin=stdin)
     assert (code, out) == (1, b"")
     assert err.startswith("error: -: ")
@@ -211,52 +211,52 @@ def test_standard_input_without_a_picture_is_an_error_and_gives_no_output(run, s
 
 def test_a_full_standard_output_gives_one_error_line(model, tmp_path):
     with Path("/dev/full").open("wb") as full:
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-m", "brewster", "-", "--model", model],
-            input=picture(),
+            input=image_bytes(),
             stdout=full,
             stderr=subprocess.PIPE,
             check=False,
         )
-    assert done.returncode == 1
+    assert process.returncode == 1
     assert (
-        done.stderr.decode()
+        process.stderr.decode()
         .splitlines()[-1]
         .startswith("error: -: standard output was not written (No space")
     )
 
 
-def test_no_picture_is_written_to_a_terminal(run, tmp_path, monkeypatch):
+def test_no_image_is_written_to_a_terminal(run, tmp_path, monkeypatch):
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
-    code, out, err = run("-", stdin=picture())
+    code, out, err = run("-", stdin=image_bytes())
     assert (code, out) == (2, b"")
     assert "terminal" in err
 
 
-NOISY = """
+PRINTING_CLI = """
 import ctypes, os, sys
 from brewster.cli import main
 from brewster.photo import Photo
 
 original = Photo.open.__func__
-def noisy(cls, *args, **options):
+def print_and_open(cls, *args, **options):
     print("printed in Python")
     ctypes.CDLL(None).puts(b"printed in C")
     os.system("echo printed by a child")
     return original(cls, *args, **options)
-Photo.open = classmethod(noisy)
+Photo.open = classmethod(print_and_open)
 sys.exit(main(sys.argv[1:]))
 """
 
 
 def test_output_of_libraries_does_not_reach_standard_output(model, tmp_path):
     """C code has its own buffer, which is written when the process exits: after any temporary redirection."""
-    command = [sys.executable, "-c", NOISY, "-", "--model", model]
-    done = subprocess.run(command, input=picture(), capture_output=True, check=False)
-    plain = as_user("-", "--model", model, input=picture())
-    assert (done.returncode, done.stdout) == (0, plain.stdout)
-    for place in (b"in Python", b"in C", b"by a child"):
-        assert done.stderr.count(b"printed " + place) == 1
+    command = [sys.executable, "-c", PRINTING_CLI, "-", "--model", model]
+    process = subprocess.run(command, input=image_bytes(), capture_output=True, check=False)
+    expected = run_process("-", "--model", model, input=image_bytes())
+    assert (process.returncode, process.stdout) == (0, expected.stdout)
+    for origin in (b"in Python", b"in C", b"by a child"):
+        assert process.stderr.count(b"printed " + origin) == 1
 
 
 def test_a_damaged_exr_does_not_corrupt_the_json(model, tmp_path):
@@ -265,26 +265,26 @@ def test_a_damaged_exr_does_not_corrupt_the_json(model, tmp_path):
     data = bytearray(Photo.from_array(light, encoding="linear").encode("exr"))
     data[-1] ^= 0xFF
     (tmp_path / "a.exr").write_bytes(data)
-    done = as_user(tmp_path / "a.exr", "--model", model, "--json")
-    assert done.returncode == 1
-    assert [line["status"] for line in lines(done.stdout)] == ["failed"]
-    assert b"Warning: " in done.stderr
-    done = as_user("-", "--model", model, input=bytes(data))
-    assert (done.returncode, done.stdout) == (1, b"")
+    process = run_process(tmp_path / "a.exr", "--model", model, "--json")
+    assert process.returncode == 1
+    assert [line["status"] for line in json_lines(process.stdout)] == ["failed"]
+    assert b"Warning: " in process.stderr
+    process = run_process("-", "--model", model, input=bytes(data))
+    assert (process.returncode, process.stdout) == (1, b"")
 
 
 def test_help_goes_to_standard_output():
-    for words in (["--help"], ["separate", "--help"], ["models", "list", "--help"], ["--version"]):
-        done = as_user(*words)
-        assert (done.returncode, done.stderr) == (0, b"")
-        assert done.stdout
+    for arguments in (["--help"], ["separate", "--help"], ["models", "list", "--help"], ["--version"]):
+        process = run_process(*arguments)
+        assert (process.returncode, process.stderr) == (0, b"")
+        assert process.stdout
 
 
 # --- usage
 
 
 @pytest.mark.parametrize(
-    "words",
+    "arguments",
     [
         [],
         ["separate"],
@@ -293,7 +293,7 @@ def test_help_goes_to_standard_output():
         ["a.jpg", "--quality", "superb"],
         ["a.jpg", "--layers", "background"],
         ["a.jpg", "--layers", ""],
-        ["a.jpg", "--device", "toaster"],
+        ["a.jpg", "--device", "tpu"],
         ["a.jpg", "--max-pixels", "0"],
         ["a.jpg", "--sharpen"],
         ["a.jpg", "--additive", "--format", "jpeg"],
@@ -306,27 +306,29 @@ def test_help_goes_to_standard_output():
         ["a.jpg", "-o", "clear.jpg", "--additive"],
         ["a.jpg", "-o", "clear.gif"],
         ["modles"],
-        ["models", "burn"],
+        ["models", "delete"],
     ],
     ids=" ".join,
 )
-def test_contradictory_or_invalid_arguments_are_a_wrong_usage(bare, tmp_path, words):
-    (tmp_path / "a.jpg").write_bytes(picture())
-    code, out, err = bare(*words)
+def test_contradictory_or_invalid_arguments_give_exit_code_2(run_without_model, tmp_path, arguments):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    code, out, err = run_without_model(*arguments)
     assert (code, out) == (2, b"")
     assert "Traceback" not in err
-    assert tree(tmp_path) == ["a.jpg"]
+    assert list_files(tmp_path) == ["a.jpg"]
 
 
-def test_a_misspelled_command_gives_a_suggestion_unless_a_photo_has_that_name(run, bare, tmp_path):
-    assert "Did you mean models?" in bare("modles")[2]
-    (tmp_path / "modles").write_bytes(picture())
+def test_a_misspelled_command_gives_a_suggestion_unless_a_photo_has_that_name(
+    run, run_without_model, tmp_path
+):
+    assert "Did you mean models?" in run_without_model("modles")[2]
+    (tmp_path / "modles").write_bytes(image_bytes())
     assert run("modles")[0] == 0
     assert (tmp_path / "modles.transmission.png").exists()
 
 
 @pytest.mark.parametrize(
-    ("words", "reason"),
+    ("arguments", "message"),
     [
         (["a.jpg", "--model", "compcat"], "did you mean compact?"),
         (["a.jpg", "--model", "a.jpg"], "is not a model"),
@@ -335,39 +337,39 @@ def test_a_misspelled_command_gives_a_suggestion_unless_a_photo_has_that_name(ru
         (["empty"], "there is no photo in empty"),
     ],
 )
-def test_an_error_is_one_line_with_exit_code_1(run, bare, tmp_path, words, reason):
-    (tmp_path / "a.jpg").write_bytes(picture())
+def test_an_error_is_one_line_with_exit_code_1(run, run_without_model, tmp_path, arguments, message):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
     (tmp_path / "empty").mkdir()
-    code, out, err = (bare if "--model" in words else run)(*words)
+    code, out, err = (run_without_model if "--model" in arguments else run)(*arguments)
     assert (code, out) == (1, b"")
     assert err.startswith("error: ")
     assert err.count("\n") == 1
-    assert reason in err
+    assert message in err
 
 
 # --- progress
 
 
 def test_a_terminal_shows_progress_and_standard_output_stays_clean(model, tmp_path):
-    """The bar is drawn on a pseudo terminal; nothing of it goes to standard output."""
+    """Standard error is a pseudo terminal, where the bar is drawn; standard output is a pipe, and stays empty."""
     for index in range(3):
-        (tmp_path / f"{index}.jpg").write_bytes(picture())
-    terminal, end = pty.openpty()
+        (tmp_path / f"{index}.jpg").write_bytes(image_bytes())
+    controller, terminal = pty.openpty()
     command = [sys.executable, "-m", "brewster", tmp_path, "--model", model]
-    done = subprocess.run(
+    process = subprocess.run(
         command,
         stdout=subprocess.PIPE,
-        stderr=end,
+        stderr=terminal,
         check=False,
         env=os.environ | {"TERM": "xterm", "COLUMNS": "200"},
     )
-    os.close(end)
-    shown = os.read(terminal, 1 << 16).decode(errors="replace")  # a read may end within a character
     os.close(terminal)
-    assert (done.returncode, done.stdout) == (0, b"")
-    assert "\x1b[" in shown
-    assert "/3" in shown
-    assert "0.transmission.jpg" in shown
+    output = os.read(controller, 1 << 16).decode(errors="replace")  # a read may end within a character
+    os.close(controller)
+    assert (process.returncode, process.stdout) == (0, b"")
+    assert "\x1b[" in output
+    assert "/3" in output
+    assert "0.transmission.jpg" in output
 
 
 # --- Python

@@ -13,28 +13,28 @@ import pyvips
 
 from brewster import Photo
 from brewster.inference import Separator
-from cli_helpers import LAYERS, errors, lines, picture, results, tree
+from cli_helpers import LAYERS, error_lines, image_bytes, json_lines, layer_files, list_files
 
 # --- damaged photos
 
 
-def truncated():
-    data = picture(600, 400)
+def truncated_jpeg():
+    data = image_bytes(600, 400)
     return data[: len(data) // 2]
 
 
-def animated(suffix):
+def animation(suffix):
     black = pyvips.Image.black(8, 8, bands=3)
     pages = black.join(black + 255, "vertical").cast("uchar").copy(interpretation="srgb")
     pages.set_type(pyvips.GValue.gint_type, "page-height", 8)
     return pages.write_to_buffer(suffix)
 
 
-def five_channels():
+def five_channel_tiff():
     return pyvips.Image.black(8, 8, bands=5).tiffsave_buffer()
 
 
-def cmyk():
+def cmyk_jpeg():
     return pyvips.Image.black(8, 8, bands=4).copy(interpretation="cmyk").jpegsave_buffer()
 
 
@@ -49,56 +49,56 @@ def write_exr_with_nan(folder):
 def test_damaged_photos_are_named_at_the_end_and_the_others_are_separated(run, tmp_path):
     folder = tmp_path / "in"
     folder.mkdir()
-    bad = {
-        "animated.gif": animated(".gif"),
-        "animated.webp": animated(".webp"),
-        "cmyk.jpg": cmyk(),
+    damaged = {
+        "animated.gif": animation(".gif"),
+        "animated.webp": animation(".webp"),
+        "cmyk.jpg": cmyk_jpeg(),
         "empty.jpg": b"",
-        "five.tiff": five_channels(),
-        "half.jpg": truncated(),
-        "text.jpg": b"This is not a picture.",
+        "five.tiff": five_channel_tiff(),
+        "half.jpg": truncated_jpeg(),
+        "text.jpg": b"This is not an image.",
     }
-    for name, data in bad.items():
+    for name, data in damaged.items():
         (folder / name).write_bytes(data)
     write_exr_with_nan(folder)
     for name in ("a", "good", "zebra"):
-        (folder / f"{name}.jpg").write_bytes(picture())
+        (folder / f"{name}.jpg").write_bytes(image_bytes())
     code, out, err = run("in", "-o", "out", "--quiet")
     assert (code, out) == (1, b"")
-    assert tree(tmp_path / "out") == results("a", "good", "zebra")
-    assert len(err.splitlines()) == len(errors(err)) == len(bad) + 1
-    for name in (*bad, "nan.exr"):
-        assert sum(f"in/{name}" in line for line in errors(err)) == 1, name
-    assert len(tree(folder)) == len(bad) + 4
+    assert list_files(tmp_path / "out") == layer_files("a", "good", "zebra")
+    assert len(err.splitlines()) == len(error_lines(err)) == len(damaged) + 1
+    for name in (*damaged, "nan.exr"):
+        assert sum(f"in/{name}" in line for line in error_lines(err)) == 1, name
+    assert len(list_files(folder)) == len(damaged) + 4
 
 
-def test_a_picture_of_one_pixel_is_separated(run, tmp_path):
-    (tmp_path / "a.png").write_bytes(picture(1, 1, "png"))
+def test_an_image_of_one_pixel_is_separated(run, tmp_path):
+    (tmp_path / "a.png").write_bytes(image_bytes(1, 1, "png"))
     assert run("a.png")[0] == 0
     assert Photo.open(tmp_path / "a.transmission.png").size == (1, 1)
 
 
 def test_a_long_panorama_keeps_its_size(run, tmp_path):
-    (tmp_path / "wide.jpg").write_bytes(picture(20_000, 300))
+    (tmp_path / "wide.jpg").write_bytes(image_bytes(20_000, 300))
     assert run("wide.jpg", "--quality", "draft", "--layers", "transmission")[0] == 0
     assert Photo.open(tmp_path / "wide.transmission.jpg").size == (20_000, 300)
 
 
 def test_a_photo_above_the_pixel_limit_is_rejected_and_one_at_the_limit_is_not(run, tmp_path):
-    (tmp_path / "large.jpg").write_bytes(picture(61, 40))
-    (tmp_path / "small.jpg").write_bytes(picture(60, 40))
+    (tmp_path / "large.jpg").write_bytes(image_bytes(61, 40))
+    (tmp_path / "small.jpg").write_bytes(image_bytes(60, 40))
     code, _, err = run("large.jpg", "small.jpg", "--max-pixels", 2400, "-o", "out")
     assert code == 1
-    assert len(errors(err)) == 1
-    assert "large.jpg" in errors(err)[0]
-    assert tree(tmp_path / "out") == results("small")
+    assert len(error_lines(err)) == 1
+    assert "large.jpg" in error_lines(err)[0]
+    assert list_files(tmp_path / "out") == layer_files("small")
 
 
 def test_an_unexpected_exception_is_raised_after_the_other_photos_are_separated(
     run, tmp_path, monkeypatch, capfdbinary
 ):
     for name in ("a", "b", "c"):
-        (tmp_path / f"{name}.jpg").write_bytes(picture())
+        (tmp_path / f"{name}.jpg").write_bytes(image_bytes())
     separate = Separator.__call__
 
     def fail(self, source, **options):
@@ -109,7 +109,7 @@ def test_an_unexpected_exception_is_raised_after_the_other_photos_are_separated(
     monkeypatch.setattr(Separator, "__call__", fail)
     with pytest.raises(ZeroDivisionError):
         run(".", "-o", "out")
-    assert tree(tmp_path / "out") == results("b", "c")
+    assert list_files(tmp_path / "out") == layer_files("b", "c")
     assert (
         "error: a.jpg: internal error in brewster (ZeroDivisionError: a bug)"
         in capfdbinary.readouterr().err.decode()
@@ -118,74 +118,74 @@ def test_an_unexpected_exception_is_raised_after_the_other_photos_are_separated(
 
 def test_a_photo_that_does_not_fit_into_memory_does_not_stop_the_others(run, tmp_path, monkeypatch):
     for name in ("a", "b"):
-        (tmp_path / f"{name}.jpg").write_bytes(picture())
+        (tmp_path / f"{name}.jpg").write_bytes(image_bytes())
     separate = Separator.__call__
 
-    def fill(self, source, **options):
+    def run_out_of_memory(self, source, **options):
         if source.name == "a.jpg":
             raise MemoryError
         return separate(self, source, **options)
 
-    monkeypatch.setattr(Separator, "__call__", fill)
+    monkeypatch.setattr(Separator, "__call__", run_out_of_memory)
     code, _, err = run(".", "-o", "out")
     assert code == 1
     assert "error: a.jpg: the photo does not fit into memory" in err
-    assert tree(tmp_path / "out") == results("b")
+    assert list_files(tmp_path / "out") == layer_files("b")
 
 
 # --- names and folders
 
 
-def test_two_pictures_that_differ_in_suffix_only_give_two_results(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(picture())
-    (tmp_path / "a.png").write_bytes(picture(container="png"))
+def test_two_images_that_differ_only_in_suffix_get_separate_layers(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    (tmp_path / "a.png").write_bytes(image_bytes(container="png"))
     assert run(".", "-o", "out")[0] == 0
-    assert tree(tmp_path / "out") == sorted(results("a.jpg") + results("a.png", suffix="png"))
+    assert list_files(tmp_path / "out") == sorted(layer_files("a.jpg") + layer_files("a.png", suffix="png"))
 
 
 def test_the_tree_below_a_folder_is_mirrored(run, tmp_path):
-    for place in ("in/x", "in/y/z"):
-        (tmp_path / place).mkdir(parents=True)
-        (tmp_path / place / "a.jpg").write_bytes(picture())
+    for folder in ("in/x", "in/y/z"):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "a.jpg").write_bytes(image_bytes())
     assert run("in", "-o", "out")[0] == 0
-    assert tree(tmp_path / "out") == sorted(
-        f"{place}/{name}" for place in ("x", "y/z") for name in results("a")
+    assert list_files(tmp_path / "out") == sorted(
+        f"{folder}/{name}" for folder in ("x", "y/z") for name in layer_files("a")
     )
 
 
-NAMES = ["with space", "Schöne Fenster é", "two\nlines", "[bold]red", "-dash", b"\xff\xfe not text"]
+FILE_NAMES = ["with space", "Schöne Fenster é", "two\nlines", "[bold]red", "-dash", b"\xff\xfe not text"]
 
 
 def test_any_file_name_works_and_each_error_is_one_line(run, tmp_path):
-    names = [os.fsdecode(name) for name in NAMES]
+    names = [os.fsdecode(name) for name in FILE_NAMES]
     for name in names:
-        (tmp_path / f"{name}.jpg").write_bytes(picture())
+        (tmp_path / f"{name}.jpg").write_bytes(image_bytes())
     (tmp_path / "bad\nname.jpg").write_bytes(b"")
     code, out, err = run(".", "-o", "out", "--json")
     assert code == 1
-    assert tree(tmp_path / "out") == results(*names)
-    assert {line["source"] for line in lines(out)} == {f"{name}.jpg" for name in (*names, "bad\nname")}
-    assert len(errors(err)) == 1
-    assert r"bad\nname.jpg" in errors(err)[0]
+    assert list_files(tmp_path / "out") == layer_files(*names)
+    assert {line["source"] for line in json_lines(out)} == {f"{name}.jpg" for name in (*names, "bad\nname")}
+    assert len(error_lines(err)) == 1
+    assert r"bad\nname.jpg" in error_lines(err)[0]
 
 
 def test_a_name_that_looks_like_an_option_comes_after_two_dashes(run, tmp_path, model):
-    (tmp_path / "-dash.jpg").write_bytes(picture())
+    (tmp_path / "-dash.jpg").write_bytes(image_bytes())
     assert run("--quiet", "--model", model, "--", "-dash.jpg", with_model=False)[0] == 0
-    assert tree(tmp_path) == ["-dash.jpg", *results("-dash")]
+    assert list_files(tmp_path) == ["-dash.jpg", *layer_files("-dash")]
 
 
 def test_link_loops_end(run, tmp_path):
     folder = tmp_path / "in"
     folder.mkdir()
-    (folder / "a.jpg").write_bytes(picture())
-    (folder / "round").symlink_to(folder)
+    (folder / "a.jpg").write_bytes(image_bytes())
+    (folder / "loop").symlink_to(folder)
     (folder / "self.jpg").symlink_to("self.jpg")
     code, _, err = run("in", "-o", "out")
     assert code == 1
-    assert len(errors(err)) == 1
-    assert "self.jpg" in errors(err)[0]
-    assert tree(tmp_path / "out") == results("a")
+    assert len(error_lines(err)) == 1
+    assert "self.jpg" in error_lines(err)[0]
+    assert list_files(tmp_path / "out") == layer_files("a")
 
 
 # --- targets
@@ -193,18 +193,18 @@ def test_link_loops_end(run, tmp_path):
 
 def test_a_target_that_cannot_be_written_is_an_error(run, tmp_path):
     """The target is below a regular file: unlike permission bits, this is an error for root too."""
-    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
     (tmp_path / "file").write_bytes(b"kept")
     code, _, err = run("a.jpg", "-o", "file/below")
     assert code == 1
-    assert len(errors(err)) == 1
-    assert "file/below/a.transmission.jpg was not written" in errors(err)[0]
+    assert len(error_lines(err)) == 1
+    assert "file/below/a.transmission.jpg was not written" in error_lines(err)[0]
     assert (tmp_path / "file").read_bytes() == b"kept"
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write to read-only folders")
 def test_a_read_only_folder_is_an_error(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
     (tmp_path / "out").mkdir(mode=0o500)
     code, _, err = run("a.jpg", "-o", "out")
     assert code == 1
@@ -214,63 +214,63 @@ def test_a_read_only_folder_is_an_error(run, tmp_path):
 def test_a_full_disk_leaves_no_partial_file_and_the_next_photo_is_tried(run, tmp_path, monkeypatch):
     """fsync reports the full disk; it is the last call at which the kernel can report it."""
     for name in ("a", "b"):
-        (tmp_path / f"{name}.jpg").write_bytes(picture())
+        (tmp_path / f"{name}.jpg").write_bytes(image_bytes())
     fsync, calls = os.fsync, []
 
-    def full_for_a_while(file):
+    def fail_at_the_second_call(file):
         calls.append(file)
         if len(calls) == 2:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         fsync(file)
 
-    monkeypatch.setattr(os, "fsync", full_for_a_while)
+    monkeypatch.setattr(os, "fsync", fail_at_the_second_call)
     code, out, err = run(".", "-o", "out", "--json")
     assert code == 1
-    assert errors(err)[0].startswith(
+    assert error_lines(err)[0].startswith(
         "error: a.jpg: out/a.reflection.jpg was not written (No space left on device)"
     )
-    assert tree(tmp_path / "out") == ["a.transmission.jpg", *results("b")]
-    assert lines(out)[0]["outputs"] == {"transmission": "out/a.transmission.jpg"}
+    assert list_files(tmp_path / "out") == ["a.transmission.jpg", *layer_files("b")]
+    assert json_lines(out)[0]["outputs"] == {"transmission": "out/a.transmission.jpg"}
 
 
 def test_a_real_limit_on_file_size_leaves_no_partial_file(model, tmp_path):
     resource = pytest.importorskip("resource")
-    (tmp_path / "a.png").write_bytes(picture(400, 300, "png"))
+    (tmp_path / "a.png").write_bytes(image_bytes(400, 300, "png"))
 
     def limit():
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (500, 500))
 
     command = [sys.executable, "-m", "brewster", "a.png", "--format", "tiff", "--model", model]
-    done = subprocess.run(command, cwd=tmp_path, preexec_fn=limit, capture_output=True, check=False)
-    assert done.returncode == 1
-    assert done.stderr.startswith(b"error: a.png: a.transmission.tiff was not written (File too large)")
-    assert tree(tmp_path) == ["a.png"]
+    process = subprocess.run(command, cwd=tmp_path, preexec_fn=limit, capture_output=True, check=False)
+    assert process.returncode == 1
+    assert process.stderr.startswith(b"error: a.png: a.transmission.tiff was not written (File too large)")
+    assert list_files(tmp_path) == ["a.png"]
 
 
-@pytest.mark.parametrize("make", ["same", "symlink", "hardlink"])
-def test_a_photo_is_never_overwritten_by_its_own_layer(run, tmp_path, make):
-    data = picture()
+@pytest.mark.parametrize("link", ["same", "symlink", "hardlink"])
+def test_a_photo_is_never_overwritten_by_its_own_layer(run, tmp_path, link):
+    data = image_bytes()
     (tmp_path / "a.jpg").write_bytes(data)
-    target = "a.jpg" if make == "same" else "b.jpg"
-    if make == "symlink":
+    target = "a.jpg" if link == "same" else "b.jpg"
+    if link == "symlink":
         (tmp_path / "b.jpg").symlink_to("a.jpg")
-    if make == "hardlink":
+    if link == "hardlink":
         (tmp_path / "b.jpg").hardlink_to(tmp_path / "a.jpg")
     for overwrite in ([], ["--overwrite"]):
         code, _, err = run("a.jpg", "-o", target, *overwrite)
         assert code == 1
-        assert "is itself a photo" in errors(err)[0]
+        assert "is itself a photo" in error_lines(err)[0]
     assert (tmp_path / "a.jpg").read_bytes() == data
 
 
 def test_no_photo_of_the_batch_is_overwritten(run, tmp_path):
     for name in ("a.jpg", "a.transmission.jpg"):
-        (tmp_path / name).write_bytes(picture())
+        (tmp_path / name).write_bytes(image_bytes())
     before = (tmp_path / "a.transmission.jpg").read_bytes()
     code, _, err = run("a.jpg", "a.transmission.jpg", "--overwrite")
     assert code == 1
-    assert len(errors(err)) == 1
+    assert len(error_lines(err)) == 1
     assert (tmp_path / "a.transmission.jpg").read_bytes() == before
     assert (tmp_path / "a.transmission.transmission.jpg").exists()
 
@@ -278,7 +278,7 @@ def test_no_photo_of_the_batch_is_overwritten(run, tmp_path):
 def test_two_photos_with_the_same_target_are_rejected_before_any_is_separated(run, tmp_path):
     for folder in ("x", "y"):
         (tmp_path / folder).mkdir()
-        (tmp_path / folder / "a.jpg").write_bytes(picture())
+        (tmp_path / folder / "a.jpg").write_bytes(image_bytes())
     code, _, err = run("x/a.jpg", "y/a.jpg", "-o", "out")
     assert code == 1
     assert "x/a.jpg and y/a.jpg" in err
@@ -289,43 +289,43 @@ def test_two_photos_with_the_same_target_are_rejected_before_any_is_separated(ru
 
 
 def test_finished_photos_are_skipped_without_loading_the_model(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
     assert run("a.jpg")[0] == 0
     times = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
     code, out, err = run("a.jpg", "--json", "--model", "no-such-model", with_model=False)
     assert code == 0
     assert "a.jpg: skipped" in err
-    assert lines(out)[0]["status"] == "skipped"
+    assert json_lines(out)[0]["status"] == "skipped"
     assert times == {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
 
 
 def test_a_missing_layer_is_added_and_the_existing_one_is_kept(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
     (tmp_path / "a.transmission.jpg").write_bytes(b"mine")
     code, out, _ = run("a.jpg", "--json")
-    assert (code, lines(out)[0]["outputs"]) == (0, {"reflection": "a.reflection.jpg"})
+    assert (code, json_lines(out)[0]["outputs"]) == (0, {"reflection": "a.reflection.jpg"})
     assert (tmp_path / "a.transmission.jpg").read_bytes() == b"mine"
 
 
 def test_overwrite_replaces_existing_layers(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
     (tmp_path / "a.transmission.jpg").write_bytes(b"old")
     assert run("a.jpg", "--overwrite")[0] == 0
     assert Photo.open(tmp_path / "a.transmission.jpg").size == (60, 40)
 
 
 def test_a_folder_run_twice_does_not_separate_its_own_results(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
     run(".")
     assert run(".")[0] == 0
-    assert tree(tmp_path) == ["a.jpg", *results("a")]
+    assert list_files(tmp_path) == ["a.jpg", *layer_files("a")]
 
 
 def test_the_same_photo_gives_the_same_bytes_twice(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(picture(300, 200))
+    (tmp_path / "a.jpg").write_bytes(image_bytes(300, 200))
     for folder in ("one", "two"):
         assert run("a.jpg", "-o", folder, "--layers", "transmission,reflection,confidence")[0] == 0
-    for name in tree(tmp_path / "one"):
+    for name in list_files(tmp_path / "one"):
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
 
 
@@ -333,54 +333,54 @@ def test_the_same_photo_gives_the_same_bytes_twice(run, tmp_path):
 
 
 def test_a_dry_run_prints_the_planned_files_and_writes_nothing(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(picture())
-    (tmp_path / "b.jpg").write_bytes(picture())
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    (tmp_path / "b.jpg").write_bytes(image_bytes())
     (tmp_path / "a.reflection.jpg").write_bytes(b"")
-    before = tree(tmp_path)
+    before = list_files(tmp_path)
     code, out, _ = run(".", "--dry-run", "--model", "no-such-model", with_model=False)
     assert (code, out) == (
         0,
         b"a.jpg -> a.transmission.jpg\nb.jpg -> b.transmission.jpg, b.reflection.jpg\n",
     )
-    planned = lines(run(".", "--dry-run", "--json")[1])
+    planned = json_lines(run(".", "--dry-run", "--json")[1])
     assert [line["status"] for line in planned] == ["planned", "planned"]
-    assert tree(tmp_path) == before
+    assert list_files(tmp_path) == before
 
 
 def test_json_has_the_result_of_each_photo(run, tmp_path, model):
-    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
     (tmp_path / "b.jpg").write_bytes(b"")
     code, out, err = run(".", "--json", "--quiet")
-    done, failed = lines(out)
+    separated, failed = json_lines(out)
     assert code == 1
     assert len(err.splitlines()) == 1
-    made_by = {"model", "sha256", "device", "seconds", "residual", "reconstruction_error", "doubtful"}
-    keys = {"source", "status", "outputs", "error"} | made_by
-    assert keys == set(done) == set(failed)
-    assert done["outputs"] == {layer: f"a.{layer}.jpg" for layer in LAYERS}
-    assert (done["source"], done["status"], done["model"], done["error"]) == (
+    model_keys = {"model", "sha256", "device", "seconds", "residual", "reconstruction_error", "doubtful"}
+    keys = {"source", "status", "outputs", "error"} | model_keys
+    assert keys == set(separated) == set(failed)
+    assert separated["outputs"] == {layer: f"a.{layer}.jpg" for layer in LAYERS}
+    assert (separated["source"], separated["status"], separated["model"], separated["error"]) == (
         "a.jpg",
         "separated",
         "pane",
         None,
     )
-    assert len(done["sha256"]) == 64
-    assert done["device"]
-    assert set(done["seconds"]) == {"decode", "network", "detail", "encode"}
-    assert done["residual"] == pytest.approx(0, abs=0.01)
+    assert len(separated["sha256"]) == 64
+    assert separated["device"]
+    assert set(separated["seconds"]) == {"decode", "network", "detail", "encode"}
+    assert separated["residual"] == pytest.approx(0, abs=0.01)
     assert (failed["source"], failed["status"], failed["outputs"]) == ("b.jpg", "failed", {})
     assert failed["error"]
 
 
 def test_a_batch_ends_with_a_summary(run, tmp_path):
     for name in ("a", "b", "c"):
-        (tmp_path / f"{name}.jpg").write_bytes(picture())
+        (tmp_path / f"{name}.jpg").write_bytes(image_bytes())
     run("a.jpg")
     (tmp_path / "b.jpg").write_bytes(b"")
     assert "1 separated, 1 skipped, 1 failed" in run(".")[2].splitlines()
 
 
 def test_quiet_prints_nothing_if_no_photo_fails(run, tmp_path):
-    (tmp_path / "a.jpg").write_bytes(picture())
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
     assert run("a.jpg", "--quiet") == (0, b"", "")
     assert run("a.jpg", "--quiet") == (0, b"", "")

@@ -1,4 +1,4 @@
-"""`brewster evaluate`, as a user calls it."""
+"""The command `brewster evaluate`."""
 
 import json
 import signal
@@ -12,11 +12,12 @@ from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from benchmark_folders import paint, picture, write
-from cli_helpers import errors
+from cli_helpers import error_lines
 
 
 @pytest.fixture
-def pairs(tmp_path):
+def benchmark(tmp_path):
+    """Writes three pairs and the predictions of a method named "theirs". Returns the value of --benchmark."""
     for name in ("1", "2", "3"):
         paint(tmp_path / "pairs" / "blended" / f"{name}.png", int(name), noise=20)
         paint(tmp_path / "pairs" / "transmission" / f"{name}.png", int(name))
@@ -24,12 +25,21 @@ def pairs(tmp_path):
     return "real20=pairs"
 
 
-QUICK = ("--metrics", "psnr,ssim", "-o", "out")
+QUICK_OPTIONS = ("--metrics", "psnr,ssim", "-o", "out")
 
 
-def test_tables_go_to_standard_output_and_all_results_into_a_folder(bare, pairs, model, tmp_path):
-    code, out, err = bare(
-        "evaluate", "--benchmark", pairs, "--model", f"pane={model}", "--predictions", "theirs=theirs", *QUICK
+def test_tables_go_to_standard_output_and_all_results_into_a_folder(
+    run_without_model, benchmark, model, tmp_path
+):
+    code, out, err = run_without_model(
+        "evaluate",
+        "--benchmark",
+        benchmark,
+        "--model",
+        f"pane={model}",
+        "--predictions",
+        "theirs=theirs",
+        *QUICK_OPTIONS,
     )
     assert code == 0, err
     text = out.decode()
@@ -40,45 +50,51 @@ def test_tables_go_to_standard_output_and_all_results_into_a_folder(bare, pairs,
     assert (tmp_path / "out" / "predictions" / "pane" / "real20" / "3.reflection.png").is_file()
 
 
-def test_json_prints_the_results(bare, pairs, tmp_path):
-    code, out, _ = bare("evaluate", "--benchmark", pairs, "--json", *QUICK)
+def test_json_prints_the_results(run_without_model, benchmark, tmp_path):
+    code, out, _ = run_without_model("evaluate", "--benchmark", benchmark, "--json", *QUICK_OPTIONS)
     assert code == 0
     assert json.loads(out) == json.loads((tmp_path / "out" / "results.json").read_text())
 
 
-def test_quiet_prints_nothing(bare, pairs):
-    assert bare("evaluate", "--benchmark", pairs, "--quiet", *QUICK) == (0, b"", "")
+def test_quiet_prints_nothing(run_without_model, benchmark):
+    assert run_without_model("evaluate", "--benchmark", benchmark, "--quiet", *QUICK_OPTIONS) == (0, b"", "")
 
 
-def test_a_dry_run_scores_nothing(bare, pairs, tmp_path):
-    code, out, err = bare("evaluate", "--benchmark", pairs, "--dry-run", *QUICK)
+def test_a_dry_run_scores_nothing(run_without_model, benchmark, tmp_path):
+    code, out, err = run_without_model("evaluate", "--benchmark", benchmark, "--dry-run", *QUICK_OPTIONS)
     assert (code, out.decode().split()) == (0, ["real20/1", "real20/2", "real20/3"])
     assert "Real20: 3 pictures" in err
     assert not (tmp_path / "out").exists()
 
 
-def test_pictures_without_partner_are_named_and_the_others_are_scored(bare, pairs, tmp_path):
+def test_photos_without_ground_truth_are_listed_and_the_others_are_scored(
+    run_without_model, benchmark, tmp_path
+):
     paint(tmp_path / "pairs" / "blended" / "4.png", 4)
     paint(tmp_path / "pairs" / "blended" / "5.png", 5, size=(48, 32))
     paint(tmp_path / "pairs" / "transmission" / "5.png", 5)
-    code, out, err = bare("evaluate", "--benchmark", pairs, "--json", *QUICK)
+    code, out, err = run_without_model("evaluate", "--benchmark", benchmark, "--json", *QUICK_OPTIONS)
     assert code == 1
     assert len(json.loads(out)["pictures"]) == 3
-    messages = errors(err)
+    messages = error_lines(err)
     assert any("4.png" in line for line in messages)
     assert any("blended/5:" in line and "resized by the factor 0.5" in line for line in messages)
 
 
-def test_a_method_that_fails_on_a_picture_is_named_and_the_exit_code_is_one(bare, pairs, tmp_path):
-    (tmp_path / "theirs" / "2.png").write_bytes(b"not a picture")
-    code, out, err = bare("evaluate", "--benchmark", pairs, "--predictions", "theirs=theirs", *QUICK)
+def test_a_method_that_fails_on_a_photo_is_listed_and_the_exit_code_is_one(
+    run_without_model, benchmark, tmp_path
+):
+    (tmp_path / "theirs" / "2.png").write_bytes(b"not an image")
+    code, out, err = run_without_model(
+        "evaluate", "--benchmark", benchmark, "--predictions", "theirs=theirs", *QUICK_OPTIONS
+    )
     assert code == 1
     assert "(2 of 3)" in out.decode()
-    assert any("1 prediction could not be scored" in line for line in errors(err))
+    assert any("1 prediction could not be scored" in line for line in error_lines(err))
 
 
 @pytest.mark.parametrize(
-    ("wrong", "message"),
+    ("options", "message"),
     [
         (("--benchmark", "real2=pairs"), "real20"),
         (("--benchmark", "real20=nowhere"), "nowhere"),
@@ -89,17 +105,19 @@ def test_a_method_that_fails_on_a_picture_is_named_and_the_exit_code_is_one(bare
         (("--benchmark", "real20=pairs", "--predictions", "theirs=others"), "has the name of a case"),
     ],
 )
-def test_invalid_benchmarks_metrics_and_methods_give_a_clear_error(wrong, message, bare, pairs, tmp_path):
+def test_invalid_benchmarks_metrics_and_methods_give_a_clear_error(
+    options, message, run_without_model, benchmark, tmp_path
+):
     (tmp_path / "empty").mkdir()
     write(tmp_path / "others", "a.png", data=picture())
-    for dry in ((), ("--dry-run",)):
-        code, out, err = bare("evaluate", "--metrics", "psnr", *wrong, *dry)
+    for dry_run in ((), ("--dry-run",)):
+        code, out, err = run_without_model("evaluate", "--metrics", "psnr", *options, *dry_run)
         assert (code, out) == (1, b"")
-        assert message in errors(err)[-1]
+        assert message in error_lines(err)[-1]
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "options",
     [
         (),
         ("--benchmark", "pairs"),
@@ -111,23 +129,25 @@ def test_invalid_benchmarks_metrics_and_methods_give_a_clear_error(wrong, messag
         ("--benchmark", "real20=pairs", "--workers", "0"),
     ],
 )
-def test_a_wrong_usage_has_exit_code_two(wrong, bare, pairs):
-    assert bare("evaluate", *wrong)[0] == 2
+def test_invalid_options_give_exit_code_2(options, run_without_model, benchmark):
+    assert run_without_model("evaluate", *options)[0] == 2
 
 
-def test_several_thresholds_and_a_smaller_size_are_evaluated(bare, pairs):
+def test_several_thresholds_and_a_smaller_size_are_evaluated(run_without_model, benchmark):
     options = ("--metrics", "psnr,psnr_region", "--region-threshold", "0.01,0.03", "--size", "12")
-    code, out, _ = bare("evaluate", "--benchmark", pairs, "--json", "-o", "out", *options)
+    code, out, _ = run_without_model("evaluate", "--benchmark", benchmark, "--json", "-o", "out", *options)
     results = json.loads(out)
     assert code == 0
     assert list(results["metrics"]) == ["psnr", "psnr_region@0.01", "psnr_region@0.03"]
     assert {(row["width"], row["height"]) for row in results["pictures"]} == {(18, 12)}
 
 
-def test_the_dev_pairs_score_what_scikit_image_says(bare, data, tmp_path):
+def test_scores_of_the_development_pairs_equal_those_of_scikit_image(run_without_model, data, tmp_path):
     """The unprocessed input on the ten Nature pairs, compared with scikit-image and PIL, and with the published value."""
     folder = data / "real/dev/nature"
-    code, out, _ = bare("evaluate", "--benchmark", f"nature20={folder}", "--json", *QUICK)
+    code, out, _ = run_without_model(
+        "evaluate", "--benchmark", f"nature20={folder}", "--json", *QUICK_OPTIONS
+    )
     assert code == 0
     table = json.loads(out)["tables"]["nature20"]["input (unprocessed)"]
     pairs = [
@@ -157,7 +177,7 @@ def test_ctrl_c_with_two_workers_stops_soon_and_keeps_finished_scores(tmp_path, 
         f"pane={model}",
         "--workers",
         "2",
-        *QUICK,
+        *QUICK_OPTIONS,
     ]
     command = [sys.executable, "-m", "brewster", *options]
     run = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, stdout=subprocess.PIPE)
@@ -169,6 +189,6 @@ def test_ctrl_c_with_two_workers_stops_soon_and_keeps_finished_scores(tmp_path, 
     assert run.returncode == 130, err
     assert b"Traceback" not in err
     scored = len(log.read_text().splitlines())
-    answered = len(list((tmp_path / "out" / "predictions").rglob("*.transmission.png")))
-    assert answered <= scored / 2 + 1
+    predicted = len(list((tmp_path / "out" / "predictions").rglob("*.transmission.png")))
+    assert predicted <= scored / 2 + 1
     assert scored < 120

@@ -1,3 +1,5 @@
+"""`brewster doctor`: the checks for large models."""
+
 import huggingface_hub
 
 from brewster.cli import doctor

@@ -1,4 +1,4 @@
-"""Rules of the code base: imports, fast start, documented names, a correct README."""
+"""The code base follows its rules: import order, fast imports, documented names, a correct README."""
 
 import ast
 import importlib
@@ -25,10 +25,11 @@ ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "brewster"
 README = (ROOT / "README.md").read_text()
 FILES = sorted(SOURCE.rglob("*.py"))
-HEAVY = {"torch", "diffusers", "transformers", "mitsuba", "fastapi", "ray", "onnxruntime", "pyvips"}
+HEAVY_LIBRARIES = {"torch", "diffusers", "transformers", "mitsuba", "fastapi", "ray", "onnxruntime", "pyvips"}
 
 
-def functions():
+def all_functions():
+    """Yields (path, node) for each function in the source files."""
     for path in FILES:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.FunctionDef):
@@ -36,32 +37,32 @@ def functions():
 
 
 def test_packages_import_only_from_lower_layers():
-    done = subprocess.run(
+    process = subprocess.run(
         [Path(sys.executable).with_name("lint-imports")],
         cwd=ROOT,
         capture_output=True,
         text=True,
         check=False,
     )
-    assert done.returncode == 0, done.stdout
+    assert process.returncode == 0, process.stdout
 
 
 @pytest.mark.parametrize("command", [["-c", "import brewster"], ["-m", "brewster", "--help"]])
 def test_import_and_help_load_no_heavy_library(command):
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-X", "importtime", *command], capture_output=True, text=True, check=True
     )
-    imported = {line.split("|")[-1].strip().split(".")[0] for line in done.stderr.splitlines()}
-    assert not imported & HEAVY
+    imported = {line.split("|")[-1].strip().split(".")[0] for line in process.stderr.splitlines()}
+    assert not imported & HEAVY_LIBRARIES
 
 
 def test_array_shapes_are_checked_against_annotations_in_tests():
     """Without the import hook of shape_checks.py, these annotations have no effect."""
-    flat = np.zeros((8, 8), np.float32)
+    grey = np.zeros((8, 8), np.float32)
     with pytest.raises(jaxtyping.TypeCheckError, match="image"):
-        run_tiled(lambda tile: (tile, tile), flat, tile_px=16, overlap_px=2)
+        run_tiled(lambda tile: (tile, tile), grey, tile_px=16, overlap_px=2)
     with pytest.raises(jaxtyping.TypeCheckError, match="return value"):
-        run_tiled(lambda tile: (tile[..., 0],), flat[..., None].repeat(3, 2), tile_px=16, overlap_px=2)
+        run_tiled(lambda tile: (tile[..., 0],), grey[..., None].repeat(3, 2), tile_px=16, overlap_px=2)
 
 
 def test_libraries_of_large_models_are_loaded_in_one_package_only():
@@ -71,8 +72,8 @@ def test_libraries_of_large_models_are_loaded_in_one_package_only():
         for path in FILES
         for library in re.findall(r'\b(?:import_library|diffusers_class)\("?(\w+)', path.read_text())
     }
-    outside = {library for package, library in loaded if package != ("models", "diffusion")}
-    assert outside == {"accelerate"}  # training/distributed
+    other_libraries = {library for package, library in loaded if package != ("models", "diffusion")}
+    assert other_libraries == {"accelerate"}  # training/distributed
 
 
 def test_inference_imports_no_torch():
@@ -81,10 +82,10 @@ def test_inference_imports_no_torch():
 
 
 def test_the_signature_of_separate_shows_the_source_and_every_option():
-    shown = inspect.signature(brewster.separate)
-    assert shown == inspect.signature(brewster.inference.separate)
-    assert list(shown.parameters)[:3] == ["source", "model", "device"]
-    assert set(Options.__dataclass_fields__) - {"layers", "format"} <= set(shown.parameters)
+    signature = inspect.signature(brewster.separate)
+    assert signature == inspect.signature(brewster.inference.separate)
+    assert list(signature.parameters)[:3] == ["source", "model", "device"]
+    assert set(Options.__dataclass_fields__) - {"layers", "format"} <= set(signature.parameters)
 
 
 def test_type_checkers_accept_every_public_name_and_no_other(tmp_path):
@@ -95,7 +96,7 @@ separator: brewster.Separator = brewster.Separator.load("compact")
 brewster.Separater.load("compact")
 brewster.separate()
 """)
-    done = subprocess.run(
+    process = subprocess.run(
         [Path(sys.executable).with_name("mypy"), "--follow-imports=silent", "--strict", "user.py"],
         cwd=tmp_path,
         env=os.environ | {"MYPYPATH": str(SOURCE.parent)},
@@ -103,14 +104,14 @@ brewster.separate()
         text=True,
         check=False,
     )
-    errors = [line.partition("error: ")[2] for line in done.stdout.splitlines() if "error: " in line]
-    assert len(errors) == 2, done.stdout
+    errors = [line.partition("error: ")[2] for line in process.stdout.splitlines() if "error: " in line]
+    assert len(errors) == 2, process.stdout
     assert errors[0].startswith('Module has no attribute "Separater"')
     assert errors[1].startswith('Missing positional argument "source"')
 
 
 def test_every_public_name_is_exported_and_documented():
-    """All public names that a package defines are in its `__all__`."""
+    """`__all__` of a package contains all public names that the package defines."""
     for module in (brewster.photo, brewster.inference):
         assert module.__all__ == sorted(module.__all__, key=lambda name: (not name.isupper(), name))
         defined = {
@@ -130,14 +131,14 @@ def test_every_module_and_every_public_function_has_a_docstring():
             assert importlib.import_module(module.name).__doc__, module.name
     undocumented = [
         f"{path.name}:{node.name}"
-        for path, node in functions()
+        for path, node in all_functions()
         if not node.name.startswith("_") and not ast.get_docstring(node) and is_public(path, node)
     ]
     assert not undocumented
 
 
 def is_public(path, node):
-    """Whether it is a function of a module or a method of a public class, and not an inner function."""
+    """Whether the node is a function of the module or a method of a public class, not an inner function."""
     tree = ast.parse(path.read_text())
     public = [
         *tree.body,
@@ -148,8 +149,8 @@ def is_public(path, node):
             for child in item.body
         ),
     ]
-    known = {(item.name, item.lineno) for item in public if isinstance(item, ast.FunctionDef)}
-    return (node.name, node.lineno) in known and node.name not in {"forward"}
+    public_functions = {(item.name, item.lineno) for item in public if isinstance(item, ast.FunctionDef)}
+    return (node.name, node.lineno) in public_functions and node.name not in {"forward"}
 
 
 def test_every_error_is_in_the_tree_of_the_docstring():
@@ -162,7 +163,7 @@ def test_every_error_is_in_the_tree_of_the_docstring():
 def test_files_and_signatures_stay_small():
     for path in FILES:
         assert len(path.read_text().splitlines()) <= 400, path
-    for path, node in functions():
+    for path, node in all_functions():
         positional = [argument.arg for argument in node.args.args if argument.arg not in {"self", "cls"}]
         assert len(positional) <= 5, f"{path}:{node.name}"
 
@@ -170,16 +171,16 @@ def test_files_and_signatures_stay_small():
 def test_the_tree_in_the_readme_equals_the_tree_on_disk():
     block = re.search(r"```\n(src/brewster/.*?)```", README, re.S)[1]
     rows = re.findall(r"^  (\S+)", block, re.M)
-    drawn = {row.rstrip("/") for row in rows}
+    listed = {row.rstrip("/") for row in rows}
     on_disk = {
         path.relative_to(SOURCE).with_suffix("").as_posix().split("/")[0]
         for path in FILES
         if not path.name.startswith("__")
     }
-    assert drawn == on_disk
+    assert listed == on_disk
 
 
-def test_the_python_in_the_readme_runs(tmp_path, monkeypatch):
+def test_the_python_examples_in_the_readme_run(tmp_path, monkeypatch):
     blocks = re.findall(r"```python\n(.*?)```", README, re.S)
     assert blocks
     picture = next((ROOT / "tests" / "pictures").glob("mixture*.jpg"))
@@ -202,8 +203,8 @@ def test_every_test_file_is_named_after_a_module_or_a_package():
     names = {path.stem for path in FILES} | {path.parent.name for path in FILES} | {"house", "report"}
     for path in (ROOT / "tests").glob("test_*.py"):
         words = path.stem.removeprefix("test_").split("_")
-        beginnings = {"_".join(words[:count]) for count in range(1, len(words) + 1)}
-        assert beginnings & names, path.name
+        prefixes = {"_".join(words[:count]) for count in range(1, len(words) + 1)}
+        assert prefixes & names, path.name
 
 
 def test_public_class_names_are_unique():

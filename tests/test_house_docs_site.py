@@ -1,4 +1,4 @@
-"""The documentation site builds without a network, without a warning, and with every public name of the Python API."""
+"""The documentation site builds offline and without warnings, and contains every public name of the Python API."""
 
 import os
 import subprocess
@@ -15,8 +15,9 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
+    """Builds the site. Returns its folder."""
     out = tmp_path_factory.mktemp("site")
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(out)],
         cwd=ROOT,
         env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
@@ -24,14 +25,14 @@ def site(tmp_path_factory):
         text=True,
         check=False,
     )
-    assert (done.returncode, done.stderr) == (0, "")
+    assert (process.returncode, process.stderr) == (0, "")
     return out
 
 
 def test_every_page_is_in_the_navigation(site):
-    start = (site / "index.html").read_text("utf-8")
+    home = (site / "index.html").read_text("utf-8")
     pages = {path.stem for path in (ROOT / "docs").glob("*.md")} - {"index"}
-    assert {page for page in pages if f'href="{page}/"' not in start} == set()
+    assert {page for page in pages if f'href="{page}/"' not in home} == set()
 
 
 def test_the_python_reference_has_every_public_name(site):

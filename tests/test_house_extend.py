@@ -12,16 +12,13 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PLACE = re.compile(r"# (?:new file )?(\S+)(?:, (among the imports|(?:in|before) [\w.]+))?\n")
+FIRST_LINE = re.compile(r"# (?:new file )?(\S+)(?:, (among the imports|(?:in|before) [\w.]+))?\n")
 
 
 def sections():
     """The code blocks of each section, by its heading."""
-    chapters = re.split(r"^## ", (ROOT / "docs/how-to-extend.md").read_text(), flags=re.M)[1:]
-    return {
-        chapter.partition("\n")[0]: re.findall(r"^```\w+\n(.*?)^```", chapter, re.M | re.S)
-        for chapter in chapters
-    }
+    parts = re.split(r"^## ", (ROOT / "docs/how-to-extend.md").read_text(), flags=re.M)[1:]
+    return {part.partition("\n")[0]: re.findall(r"^```\w+\n(.*?)^```", part, re.M | re.S) for part in parts}
 
 
 @pytest.fixture
@@ -35,31 +32,31 @@ def checkout(tmp_path):
 
 
 def apply(block, root):
-    """Inserts a block at the place that its first line names."""
-    path, place = PLACE.match(block).groups()
+    """Inserts a block at the position that its first line gives."""
+    path, position = FIRST_LINE.match(block).groups()
     body, path = block.partition("\n")[2], root / path
     if block.startswith("# new file"):
         assert not path.exists(), f"{path} exists already"
         path.write_text(body)
         return
     lines = path.read_text().splitlines(keepends=True)
-    line, indent = find(ast.parse("".join(lines)), place)
+    line, indent = find(ast.parse("".join(lines)), position)
     path.write_text("".join([*lines[:line], textwrap.indent(body, " " * indent), *lines[line:]]))
 
 
-def find(tree, place):
-    """The number of lines before the place, and the indentation there."""
-    if place == "among the imports":
+def find(tree, position):
+    """Returns the number of lines before the position, and the indentation there."""
+    if position == "among the imports":
         return max(node.end_lineno for node in tree.body if isinstance(node, ast.Import | ast.ImportFrom)), 0
-    side, name = place.split(" ")
+    relation, name = position.split(" ")
     node = tree
-    for part in name.split("."):
-        node = next(child for child in node.body if part in names(child))
-    if side == "before":
+    for attribute in name.split("."):
+        node = next(child for child in node.body if attribute in names(child))
+    if relation == "before":
         return node.lineno - 1, 0
     if isinstance(node, ast.ClassDef):
         return node.end_lineno, 4
-    if isinstance(node, ast.FunctionDef):  # before it returns
+    if isinstance(node, ast.FunctionDef):  # before its last statement, the return
         return node.body[-1].lineno - 1, node.body[-1].col_offset
     return node.end_lineno - 1, 4  # before the bracket that ends a table
 
@@ -85,7 +82,7 @@ def test_the_example_of_each_section_works(section, checkout):
         apply(block, checkout)
     kind, _, code = check.partition("\n")
     assert kind == "# try it"
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code],
         cwd=checkout,
         env=os.environ | {"PYTHONPATH": str(checkout / "src"), "HF_HUB_OFFLINE": "1"},
@@ -93,4 +90,4 @@ def test_the_example_of_each_section_works(section, checkout):
         text=True,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
+    assert process.returncode == 0, process.stderr

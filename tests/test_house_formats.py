@@ -31,7 +31,7 @@ from brewster.scene.sampler import draw
 from picture_files import smooth
 from synthetic_scenes import ASSETS, make_scene, map_side, plane_side
 
-ANSWERS = {
+PREDICTIONS = {
     1: {
         "draft": [
             7,
@@ -147,7 +147,7 @@ SAMPLES = {
         "mirror": [0.6659, 0.6653, 0.6679, 0.6292, 0.6274, 0.6306, 0.596, 0.5935, 0.5984],
     },
 }
-MAPS = {
+ENVIRONMENT_MAPS = {
     2: {
         "room": [
             -1.134,
@@ -167,30 +167,30 @@ MAPS = {
 }
 
 
-def same(name, number, pinned, made, tolerance=0.0):
-    """Compares an output (lists of numbers by name) with the one that is stored for this format number."""
-    print(f"{number}: {made!r},")
-    assert number in pinned, f"{name} is {number}, but no output is stored for it"
-    for part, values in pinned[number].items():
+def check_output(name, number, stored, output, tolerance=0.0):
+    """Compares an output (name -> numbers) with the output that is stored for this format number."""
+    print(f"{number}: {output!r},")
+    assert number in stored, f"{name} is {number}, but no output is stored for it"
+    for part, values in stored[number].items():
         expected = pytest.approx(values, abs=tolerance) if tolerance else values
-        assert made[part] == expected, (
+        assert output[part] == expected, (
             f"{part} changed: increase {name} ({number}) by one, and store the new output"
         )
 
 
-def picture(seed, height=40, width=56):
-    """Smooth colours with some hard edges."""
+def make_image(seed, height=40, width=56):
+    """An image with smooth colours and hard edges."""
     blocks = np.random.default_rng(seed).integers(0, 120, (height // 8, width // 8, 3))
     return (smooth(height, width) // 2 + np.kron(blocks, np.ones((8, 8, 1)))).astype(np.uint8)
 
 
-def case(rendered=False):
+def make_case(rendered=False):
     return Case("pairs", "a", "a", "a", *[None] * 3, rendered)
 
 
 @pytest.fixture(scope="module")
-def asymmetric(tmp_path_factory):
-    """A model that depends on the pixels to the left and above, so that rotated, flipped or shifted input changes its output."""
+def asymmetric_model(tmp_path_factory):
+    """A model that weights the pixels to the left and above, so that it predicts other layers for a flipped or shifted photo."""
     shares = {"transmission": 0.7, "reflection": 0.2}
     kernels = {name: np.zeros((3, 1, 3, 3), np.float32) for name in shares}
     for name, kernel in kernels.items():
@@ -211,50 +211,56 @@ def asymmetric(tmp_path_factory):
     return path
 
 
-def test_a_changed_prediction_needs_a_new_prediction_format(asymmetric, tmp_path):
-    photo, made = Photo.from_array(picture(1, 720, 960), encoding="srgb"), {}
+def test_a_changed_prediction_needs_a_new_prediction_format(asymmetric_model, tmp_path):
+    photo, output = Photo.from_array(make_image(1, 720, 960), encoding="srgb"), {}
     for quality in QUALITIES:
-        answer = ModelMethod("asymmetric", str(asymmetric), tmp_path, quality=quality).predict(case(), photo)
-        layers = np.concatenate(
-            [layer.pixels[7::240, 9::240, 1] for layer in (answer.transmission, answer.reflection)]
+        prediction = ModelMethod("asymmetric", str(asymmetric_model), tmp_path, quality=quality).predict(
+            make_case(), photo
         )
-        made[quality] = layers.ravel().tolist()
-    same("evaluate.methods.PREDICTION_FORMAT_VERSION", PREDICTION_FORMAT_VERSION, ANSWERS, made, 1)
+        layers = np.concatenate(
+            [layer.pixels[7::240, 9::240, 1] for layer in (prediction.transmission, prediction.reflection)]
+        )
+        output[quality] = layers.ravel().tolist()
+    check_output(
+        "evaluate.methods.PREDICTION_FORMAT_VERSION", PREDICTION_FORMAT_VERSION, PREDICTIONS, output, 1
+    )
 
 
-def scores(names):
-    photo = picture(1)
+def compute_scores(names):
+    photo = make_image(1)
     behind, mirrored = (photo * 0.85).astype(np.uint8), photo // 2
     behind[:, :20], mirrored[:, :20] = photo[:, :20], 0  # no reflection at the left
-    behind[:16, :16] = 220  # something white
+    behind[:16, :16] = 220  # a white object
     pictures = {"photo": photo, "transmission": behind, "reflection": mirrored}
-    truth = GroundTruth(case(rendered=True), Photo.from_array(photo, encoding="srgb"), pictures)
-    moved = np.roll(behind, 1, axis=1) // 2 + photo // 2
-    layers = (Photo.from_array(layer, encoding="srgb") for layer in (moved, photo // 7))
+    truth = GroundTruth(make_case(rendered=True), Photo.from_array(photo, encoding="srgb"), pictures)
+    prediction = np.roll(behind, 1, axis=1) // 2 + photo // 2
+    layers = (Photo.from_array(layer, encoding="srgb") for layer in (prediction, photo // 7))
     return Scorer(truth, EvaluationConfig(metrics=names)).score(MethodOutput(*layers))
 
 
 def test_a_changed_score_needs_a_new_score_format():
     names = tuple(name for name in METRICS if not name.startswith("lpips"))
-    made = scores(names)
-    assert None not in made.values()
-    same("evaluate.runner.SCORE_FORMAT_VERSION", SCORE_FORMAT_VERSION, SCORES, made, 2e-6)
+    output = compute_scores(names)
+    assert None not in output.values()
+    check_output("evaluate.runner.SCORE_FORMAT_VERSION", SCORE_FORMAT_VERSION, SCORES, output, 2e-6)
 
 
 def test_a_changed_lpips_needs_a_new_score_format(data, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(data))
     names = tuple(name for name in METRICS if name.startswith("lpips"))
-    same("evaluate.runner.SCORE_FORMAT_VERSION", SCORE_FORMAT_VERSION, LPIPS, scores(names), 1e-4)
+    check_output(
+        "evaluate.runner.SCORE_FORMAT_VERSION", SCORE_FORMAT_VERSION, LPIPS, compute_scores(names), 1e-4
+    )
 
 
 def test_a_changed_scene_needs_a_new_sample_format():
-    made = {}
+    output = {}
     for name in ("tiny", "window"):
         recipe = read_scene_recipe(name)
         text = "".join(draw(recipe, BUILTIN_CATALOG, 7, index).to_toml() for index in range(20))
         text = re.sub(r'^version = ".*"\n', "", text, flags=re.MULTILINE)
-        made[name] = hashlib.sha256(text.encode()).hexdigest()[:16]
-    same("rendered.store.SAMPLE_FORMAT", SAMPLE_FORMAT, SCENES, made)
+        output[name] = hashlib.sha256(text.encode()).hexdigest()[:16]
+    check_output("rendered.store.SAMPLE_FORMAT", SAMPLE_FORMAT, SCENES, output)
 
 
 def test_a_changed_rendering_needs_a_new_sample_format():
@@ -267,13 +273,17 @@ def test_a_changed_rendering_needs_a_new_sample_format():
         seed=5,
     )
     sample = render(scene, ASSETS)
-    made = {f"{name}, light": layer[:, 5, 17].tolist() for name, layer in sample.layers().items()}
-    made |= {name: layer[1, 3::9, 4::9].ravel().tolist() for name, layer in develop(sample).layers().items()}
-    rounded = {name: [round(value, 4) for value in values] for name, values in made.items()}
-    same("rendered.store.SAMPLE_FORMAT", SAMPLE_FORMAT, SAMPLES, rounded, 2e-3)
+    output = {f"{name}, light": layer[:, 5, 17].tolist() for name, layer in sample.layers().items()}
+    output |= {
+        name: layer[1, 3::9, 4::9].ravel().tolist() for name, layer in develop(sample).layers().items()
+    }
+    rounded = {name: [round(value, 4) for value in values] for name, values in output.items()}
+    check_output("rendered.store.SAMPLE_FORMAT", SAMPLE_FORMAT, SAMPLES, rounded, 2e-3)
 
 
-def test_a_changed_world_raises_the_format_of_samples():
-    world = ENVIRONMENTS["room"](3, 32)
-    made = {"room": [round(float(value), 3) for value in np.log(world[5::11, 7::17, 1] + 0.01).ravel()]}
-    same("rendered.store.SAMPLE_FORMAT", SAMPLE_FORMAT, MAPS, made, 0.05)
+def test_a_changed_environment_needs_a_new_sample_format():
+    environment = ENVIRONMENTS["room"](3, 32)
+    output = {
+        "room": [round(float(value), 3) for value in np.log(environment[5::11, 7::17, 1] + 0.01).ravel()]
+    }
+    check_output("rendered.store.SAMPLE_FORMAT", SAMPLE_FORMAT, ENVIRONMENT_MAPS, output, 0.05)

@@ -237,13 +237,13 @@ def test_a_missing_network_connection_is_explained(write_lora, monkeypatch):
 # --- the command
 
 
-def test_a_dry_run_of_the_command_prints_the_plan_and_sends_nothing(bare, write_lora, hub):
+def test_a_dry_run_of_the_command_prints_the_plan_and_sends_nothing(run_without_model, write_lora, hub):
     folder = write_lora()
-    code, out, err = bare("models", "push", folder, REPO, "--dry-run")
+    code, out, err = run_without_model("models", "push", folder, REPO, "--dry-run")
     assert (code, hub.requests) == (0, [])
     assert out.decode().splitlines()[-1] == "nothing was sent"
     assert "not for commercial use" in err
-    code, out, _ = bare(
+    code, out, _ = run_without_model(
         "models", "push", folder, REPO, "--dry-run", "--json", "--public", "--message", "Hello"
     )
     plan = json.loads(out)
@@ -251,25 +251,25 @@ def test_a_dry_run_of_the_command_prints_the_plan_and_sends_nothing(bare, write_
     assert [file["name"] for file in plan["files"]] == list(FILES)
 
 
-def test_the_command_sends_and_prints_the_address(bare, write_lora, hub):
-    code, out, _ = bare("models", "push", write_lora(), REPO)
+def test_the_command_sends_and_prints_the_address(run_without_model, write_lora, hub):
+    code, out, _ = run_without_model("models", "push", write_lora(), REPO)
     assert code == 0
     assert out.decode().splitlines()[-1] == f"sent: {hub.url}/{REPO}/commit/1"
     assert set(hub.repos[REPO]) == set(FILES)
     hub.token = "hf_changed"
-    code, _, err = bare("models", "push", write_lora(), REPO)
+    code, _, err = run_without_model("models", "push", write_lora(), REPO)
     assert code == 1
     assert "error: the hub refused the token" in err
 
 
-def test_the_card_of_a_folder_is_printed_and_scores_are_added(bare, write_lora, tmp_path):
+def test_the_card_of_a_folder_is_printed_and_scores_are_added(run_without_model, write_lora, tmp_path):
     folder = write_lora()
-    code, out, _ = bare("models", "card", folder)
+    code, out, _ = run_without_model("models", "card", folder)
     assert (code, out.decode()) == (0, (folder / "README.md").read_text() + "\n")
     (tmp_path / "half.json").write_text('{"metrics": {}}')
-    assert bare("models", "card", folder, "--scores", tmp_path / "half.json")[0] == 1
+    assert run_without_model("models", "card", folder, "--scores", tmp_path / "half.json")[0] == 1
     shutil.rmtree(folder)
     folder.mkdir()
-    code, _, err = bare("models", "card", folder)
+    code, _, err = run_without_model("models", "card", folder)
     assert code == 1
     assert "README.md cannot be read" in err

@@ -13,7 +13,7 @@ from brewster.training.compact.trainer import CompactTrainer, train
 from brewster.training.data.image_loading import read_photos
 from brewster.training.loop import run
 from brewster.training.recipe import with_value
-from cli_helpers import picture
+from cli_helpers import image_bytes
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 
@@ -138,7 +138,7 @@ def test_folders_with_equal_last_names_have_unique_log_keys(recipe, tmp_path):
         for layer in ("blended", "transmission"):
             folder = tmp_path / "data" / place / layer
             folder.mkdir(parents=True)
-            (folder / "a.jpg").write_bytes(picture())
+            (folder / "a.jpg").write_bytes(image_bytes())
     folders = [Path("one/real"), Path("two/real"), Path("one/real")]
     train(with_value(recipe, "data.validate_on", folders), tmp_path / "run", silent)
     logged = json.loads((tmp_path / "run" / "log.jsonl").read_text().splitlines()[0])
@@ -219,5 +219,5 @@ def test_a_damaged_checkpoint_is_named(tmp_path):
 
 def test_a_photo_is_read_with_every_known_suffix(tmp_path):
     for name in ("a.jpg", "b.JFIF", "c.txt"):
-        (tmp_path / name).write_bytes(picture())
+        (tmp_path / name).write_bytes(image_bytes())
     assert len(read_photos([tmp_path])) == 2

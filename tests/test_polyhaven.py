@@ -18,7 +18,7 @@ from brewster.cli import cli
 from brewster.environments import polyhaven
 from brewster.environments.polyhaven import DownloadRequest, maps_folder, pull
 from brewster.errors import DownloadError, TargetError
-from cli_helpers import errors, lines, tree
+from cli_helpers import error_lines, json_lines, list_files
 from file_server import loopback_only
 
 INDOOR, OUTDOOR = {"categories": ["indoor", "urban"]}, {"categories": ["outdoor", "night"]}
@@ -223,7 +223,7 @@ def test_an_id_cannot_write_outside_the_folder(haven, fetch, tmp_path):
     }
     found = fetch(indoor=9)
     assert [result.status for result in found] == ["failed"] * 4 + ["downloaded"]
-    assert tree(tmp_path) == ["maps/a_room_4k.hdr", "maps/manifest.csv"]
+    assert list_files(tmp_path) == ["maps/a_room_4k.hdr", "maps/manifest.csv"]
     assert {path for path, *_ in haven.requests} == {"/assets", "/files/a_room", "/file/a_room"}
 
 
@@ -239,7 +239,7 @@ def test_a_broken_download_is_resumed(haven, fetch, maps):
     haven.faults["/file/a_room"] = ["cut", "cut"]
     assert statuses(fetch()) == [("a_room", "downloaded")]
     assert haven.ranges("a_room") == [None, "bytes=25000-", "bytes=50000-"]
-    assert tree(maps) == ["a_room_4k.hdr", "manifest.csv"]
+    assert list_files(maps) == ["a_room_4k.hdr", "manifest.csv"]
 
 
 def test_a_partial_download_is_resumed_by_the_next_call(haven, fetch, maps, monkeypatch):
@@ -247,7 +247,7 @@ def test_a_partial_download_is_resumed_by_the_next_call(haven, fetch, maps, monk
     haven.faults["/file/a_room"] = ["cut"]
     [result] = fetch()
     assert "ended after 25000 of 100000 bytes" in result.error
-    assert tree(maps) == ["a_room_4k.hdr.part"]
+    assert list_files(maps) == ["a_room_4k.hdr.part"]
     assert statuses(fetch()) == [("a_room", "downloaded")]
     assert haven.ranges("a_room")[-1] == "bytes=25000-"
 
@@ -290,7 +290,7 @@ def test_a_map_with_a_wrong_sum_is_deleted_and_reported_and_the_others_are_downl
     found = fetch(indoor=2)
     assert statuses(found) == [("a_room", "failed"), ("atrium", "downloaded")]
     assert "MD5" in found[0].error
-    assert tree(maps) == ["atrium_4k.hdr", "manifest.csv"]
+    assert list_files(maps) == ["atrium_4k.hdr", "manifest.csv"]
 
 
 def test_a_retry_waits_as_long_as_a_busy_server_requests(haven, fetch, retry_delays):
@@ -373,7 +373,7 @@ def test_only_http_urls_are_opened(haven, fetch, url, maps, retry_delays):
     with pytest.raises(DownloadError):
         fetch(server=url)
     assert retry_delays == []
-    assert tree(maps) == []
+    assert list_files(maps) == []
 
 
 def test_redirections_are_followed_to_http_urls_only(haven, fetch):
@@ -420,8 +420,8 @@ def test_maps_are_stored_in_the_cache_folder(monkeypatch):
 
 
 @pytest.fixture
-def command(bare, haven):
-    return lambda *args: bare("assets", "pull", "polyhaven", "--server", haven.url, *args)
+def command(run_without_model, haven):
+    return lambda *args: run_without_model("assets", "pull", "polyhaven", "--server", haven.url, *args)
 
 
 def test_the_command_has_an_option_for_every_field_of_a_request():
@@ -438,22 +438,22 @@ def test_the_command_prints_results_and_how_many_maps_are_missing(command, tmp_p
     assert messages[4] == "4 downloaded"
     assert messages[5].startswith("2 of 5 outdoor maps found: the server has no more")
     assert messages[6].startswith("powered by Poly Haven")
-    assert len(tree(tmp_path / "maps")) == 5
+    assert len(list_files(tmp_path / "maps")) == 5
 
 
 def test_failed_maps_are_listed_at_the_end_and_the_exit_code_is_1(command, haven):
     haven.faults["/file/a_room"] = [b"wrong"] * 5
     code, out, err = command("maps", "--indoor", 2, "--outdoor", 0, "--quiet")
     assert (code, out) == (1, b"")
-    assert [line.split(": ")[1] for line in errors(err)] == ["a_room"]
-    assert errors(err) == err.splitlines()
+    assert [line.split(": ")[1] for line in error_lines(err)] == ["a_room"]
+    assert error_lines(err) == err.splitlines()
 
 
 def test_json_has_a_line_for_each_asset(command, haven):
     haven.resolutions["a_room"] = "1k"
     code, out, _ = command("maps", "--json", "--indoor", 1, "--outdoor", 0)
     assert code == 0
-    assert [(row["asset"], row["status"], row["bytes"]) for row in lines(out)] == [
+    assert [(row["asset"], row["status"], row["bytes"]) for row in json_lines(out)] == [
         ("a_room", "missing", None),
         ("atrium", "downloaded", SIZE),
     ]
@@ -462,20 +462,20 @@ def test_json_has_a_line_for_each_asset(command, haven):
 def test_a_dry_run_prints_what_would_be_downloaded_and_writes_nothing(command, haven, tmp_path):
     code, out, _ = command("maps", "--dry-run", "--indoor", 1, "--outdoor", 0)
     assert (code, out.decode()) == (0, f"{haven.url}/file/a_room -> maps/a_room_4k.hdr\n")
-    assert tree(tmp_path) == []
+    assert list_files(tmp_path) == []
 
 
 def test_maps_go_to_the_cache_folder_by_default(command, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     assert command("--indoor", 1, "--outdoor", 0)[0] == 0
-    assert "a_room_4k.hdr" in tree(tmp_path / "cache" / "brewster" / "maps")
+    assert "a_room_4k.hdr" in list_files(tmp_path / "cache" / "brewster" / "maps")
 
 
 def test_a_failing_server_gives_a_single_line(command, haven):
     haven.faults["/assets"] = [404]
     code, out, err = command("maps")
     assert (code, out, len(err.splitlines())) == (1, b"", 1)
-    assert errors(err)
+    assert error_lines(err)
 
 
 def test_downloading_imports_no_torch():

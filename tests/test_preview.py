@@ -12,7 +12,7 @@ from brewster.inference import Separator
 from brewster.options import Options
 from brewster.srgb import to_encoded, to_linear
 from brewster.web.preview import MAX_PREVIEW_PIXELS, preview
-from cli_helpers import picture
+from cli_helpers import image_bytes
 from picture_files import exif_block, file_of, smooth
 from web_servers import form, make_app, pane, request
 
@@ -74,7 +74,7 @@ def out_of_range(tile):
 
 @pytest.mark.parametrize("strength", [0.1, 0.5, 0.9])
 def test_layers_that_are_clipped_at_full_strength_are_correct_below_it(strength):
-    data = picture(120, 90, "png")
+    data = image_bytes(120, 90, "png")
     separation = Separator(out_of_range)(data, strength=strength)
     for layer, ours in zip(
         (separation.transmission, separation.reflection),
@@ -101,7 +101,7 @@ def test_the_preview_of_a_large_photo_matches_its_reduced_separation(compact_sep
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 900), (3000, 2)])
 def test_unusual_sizes_work(size):
-    maps = maps_of(picture(*size, "png"))
+    maps = maps_of(image_bytes(*size, "png"))
     assert [maps.head["width"], maps.head["height"]] == maps.head["full"] == list(size)
 
 
@@ -139,13 +139,13 @@ def test_a_photo_brighter_than_white_is_clipped_to_the_range():
 
 def test_progress_reaches_the_end():
     progress = []
-    preview(Separator(pane), Photo.open(picture(60, 40, "png")), Options(), progress.append)
+    preview(Separator(pane), Photo.open(image_bytes(60, 40, "png")), Options(), progress.append)
     assert progress == sorted(progress)
     assert progress[-1] == 1
 
 
 def test_the_preview_route_returns_the_maps_and_refuses_invalid_files():
-    response = request(make_app(), "POST", "/preview", **form(picture(60, 40, "png"), quality="draft"))
+    response = request(make_app(), "POST", "/preview", **form(image_bytes(60, 40, "png"), quality="draft"))
     assert Maps(response.content).head["full"] == [60, 40]
     refused = request(make_app(), "POST", "/preview", **form(b"no picture"))
     assert refused.status_code == 422

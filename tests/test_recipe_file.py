@@ -96,9 +96,9 @@ def test_an_error_with_several_problems_survives_another_process(problems, tmp_p
     assert len(caught.value.sentences()) == 2
 
 
-def test_the_command_prints_a_line_for_each_problem(bare, tmp_path):
+def test_the_command_prints_a_line_for_each_problem(run_without_model, tmp_path):
     (tmp_path / "mine.toml").write_text("samples = 0")
-    code, out, err = bare("render", "out", "--recipe", "mine.toml")
+    code, out, err = run_without_model("render", "out", "--recipe", "mine.toml")
     assert (code, out) == (1, b"")
     assert [line.split(";")[0] for line in err.splitlines()] == [
         "error: mine.toml: name is missing",
@@ -132,19 +132,19 @@ def test_every_key_is_printed_below_its_meaning():
         assert key.meaning.split()[0] in text
 
 
-def test_the_commands_show_recipes(bare, tmp_path):
-    code, out, _ = bare("render", "--show-recipe", "office")
+def test_the_commands_show_recipes(run_without_model, tmp_path):
+    code, out, _ = run_without_model("render", "--show-recipe", "office")
     assert (code, out.decode()) == (0, commented_toml(read_scene_recipe("office")))
     (tmp_path / "mine.toml").write_bytes(out)
-    assert bare("render", "--show-recipe", "mine.toml")[1] == out
-    code, out, _ = bare("train", "--show-recipe", "compact")
+    assert run_without_model("render", "--show-recipe", "mine.toml")[1] == out
+    code, out, _ = run_without_model("train", "--show-recipe", "compact")
     assert (code, out.decode()) == (0, commented_toml(read_template("compact")))
     (tmp_path / "compact.toml").write_bytes(out)
-    assert bare("train", "--show-recipe", "compact.toml")[1] == out
+    assert run_without_model("train", "--show-recipe", "compact.toml")[1] == out
 
 
-def test_an_unknown_recipe_cannot_be_shown(bare):
-    code, _, err = bare("train", "--show-recipe", "compat")
+def test_an_unknown_recipe_cannot_be_shown(run_without_model):
+    code, _, err = run_without_model("train", "--show-recipe", "compat")
     assert (code, err) == (
         1,
         (
@@ -152,4 +152,4 @@ def test_an_unknown_recipe_cannot_be_shown(bare):
             " choose one of them, or a .toml file.\n"
         ),
     )
-    assert bare("train")[0] == 2
+    assert run_without_model("train")[0] == 2

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from brewster.errors import DeviceError, ModelError
-from brewster.training.lora.resource_estimate import CARDS, GraphicsCard, estimate_resources, find_card
+from brewster.training.lora.resource_estimate import CARDS, GraphicsCard, estimate_resources, find_gpu
 from brewster.training.recipe import read_recipe, with_value
 
 RECIPES = Path(__file__).parents[1] / "recipes" / "train"
@@ -73,11 +73,11 @@ def test_a_recipe_that_does_not_fit_is_refused_with_a_change_that_fits(klein):
 
 
 def test_cards_are_found_by_name_and_the_papers_is_the_default_without_a_gpu(monkeypatch):
-    assert find_card("rtx 4090") == CARD
+    assert find_gpu("rtx 4090") == CARD
     with pytest.raises(DeviceError, match=r"no card 'rtx 4099' .*; did you mean RTX 4090"):
-        find_card("rtx 4099")
+        find_gpu("rtx 4099")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert find_card() == CARD
+    assert find_gpu() == CARD
 
 
 def test_an_unknown_backbone_has_no_estimate():
@@ -85,11 +85,11 @@ def test_an_unknown_backbone_has_no_estimate():
         estimate_resources(with_value(read_recipe(RECIPES / "klein.toml"), "backbone", "somebody/else"), CARD)
 
 
-def test_the_command_prints_the_estimate_and_trains_nothing(bare, tmp_path):
-    code, out, _ = bare("train", RECIPES / "large-tiny.toml", "--plan", "--card", "A100")
+def test_the_command_prints_the_estimate_and_trains_nothing(run_without_model, tmp_path):
+    code, out, _ = run_without_model("train", RECIPES / "large-tiny.toml", "--plan", "--gpu", "A100")
     assert code == 0
     assert b"A100" in out
     assert list(tmp_path.iterdir()) == []
-    code, _, err = bare("train", RECIPES / "tiny.toml", "--plan")
+    code, _, err = run_without_model("train", RECIPES / "tiny.toml", "--plan")
     assert code != 0
     assert "train it without --plan" in err

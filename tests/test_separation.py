@@ -21,12 +21,12 @@ from brewster.web.job_queue import JobQueue
 from brewster.web.middleware import RequestLimits
 from brewster.web.model_cache import ModelCache
 from brewster.web.separation import separation_router
-from cli_helpers import picture
+from cli_helpers import image_bytes
 from picture_files import exif_block, file_of, smooth
 from web_servers import BlockingBackend, client, form, make_app, pane, request
 
 MIXTURE = Path(__file__).parent / "pictures" / "mixture-coffee-rocket.jpg"
-SMALL = picture(40, 30, "png")
+SMALL = image_bytes(40, 30, "png")
 
 
 @pytest.fixture
@@ -46,12 +46,12 @@ def error_of(response):
 # --- responses
 
 
-def test_the_server_returns_the_bytes_of_the_command_line(bare, tmp_path):
+def test_the_server_returns_the_bytes_of_the_command_line(run_without_model, tmp_path):
     app = create_app(
         separation_router(ModelCache(device="cpu"), JobQueue(), max_pixels=10**8), limits=RequestLimits()
     )
     response = separate(app, MIXTURE.read_bytes(), MIXTURE.name, quality="draft", strength="0.7")
-    bare(MIXTURE, "-o", tmp_path, "--quality", "draft", "--strength", "0.7", "--device", "cpu")
+    run_without_model(MIXTURE, "-o", tmp_path, "--quality", "draft", "--strength", "0.7", "--device", "cpu")
     with zipfile.ZipFile(io.BytesIO(response.content)) as archive:
         assert archive.testzip() is None
         files = {name: archive.read(name) for name in archive.namelist()}

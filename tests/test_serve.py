@@ -53,8 +53,8 @@ def served_apps(monkeypatch, model):
     return calls
 
 
-def test_another_address_prints_a_warning_and_gets_a_token(bare, served_apps):
-    code, _, err = bare("serve", "--host", "0.0.0.0")
+def test_another_address_prints_a_warning_and_gets_a_token(run_without_model, served_apps):
+    code, _, err = run_without_model("serve", "--host", "0.0.0.0")
     ((limits, kwargs),) = served_apps
     assert code == 0
     assert "warning: everybody who can reach 0.0.0.0" in err
@@ -63,8 +63,8 @@ def test_another_address_prints_a_warning_and_gets_a_token(bare, served_apps):
     assert kwargs["host"] == "0.0.0.0"
 
 
-def test_a_loopback_address_needs_no_token(bare, served_apps):
-    code, _, err = bare("serve", "--max-bytes", "1000")
+def test_a_loopback_address_needs_no_token(run_without_model, served_apps):
+    code, _, err = run_without_model("serve", "--max-bytes", "1000")
     ((limits, kwargs),) = served_apps
     assert (code, limits.token, limits.max_bytes, kwargs["host"], kwargs["port"]) == (
         0,
@@ -77,26 +77,30 @@ def test_a_loopback_address_needs_no_token(bare, served_apps):
 
 
 @pytest.mark.parametrize("token", ["short", "with space and more", "semi;colon;semi;colon", ""])
-def test_a_short_token_or_one_with_forbidden_characters_is_a_wrong_argument(bare, served_apps, token):
-    code, _, err = bare("serve", "--token", token)
+def test_a_short_token_or_one_with_forbidden_characters_is_a_wrong_argument(
+    run_without_model, served_apps, token
+):
+    code, _, err = run_without_model("serve", "--token", token)
     assert code == 2
     assert "16 to 200 characters" in err
     assert not served_apps
 
 
-def test_models_that_are_missing_or_share_a_name_are_refused_at_the_start(bare, served_apps, model, tmp_path):
-    assert bare("serve", "--model", "missing.onnx")[0] == 1
+def test_models_that_are_missing_or_share_a_name_are_refused_at_the_start(
+    run_without_model, served_apps, model, tmp_path
+):
+    assert run_without_model("serve", "--model", "missing.onnx")[0] == 1
     twin = tmp_path / "compact.onnx"
     twin.write_bytes(model.read_bytes())
-    code, _, err = bare("serve", "--model", twin)
+    code, _, err = run_without_model("serve", "--model", twin)
     assert code == 1
     assert "have the same name compact" in err
     assert not served_apps
 
 
-def test_a_port_in_use_is_an_error_without_a_traceback(bare, reachable):
+def test_a_port_in_use_is_an_error_without_a_traceback(run_without_model, reachable):
     with reachable.create_server(("127.0.0.1", 0)) as taken:
-        code, _, err = bare("serve", "--port", taken.getsockname()[1])
+        code, _, err = run_without_model("serve", "--port", taken.getsockname()[1])
     assert code == 1
     assert err.startswith("error: 127.0.0.1 port")
 
@@ -104,8 +108,8 @@ def test_a_port_in_use_is_an_error_without_a_traceback(bare, reachable):
 def test_the_page_opens_in_the_browser_only_if_requested(monkeypatch, capsys):
     opened = []
     monkeypatch.setattr(command.webbrowser, "open", opened.append)
-    command.print_link("http://127.0.0.1:1/", None, opens=False)
-    command.print_link("http://127.0.0.1:1/", "token", opens=True)
+    command.print_link("http://127.0.0.1:1/", None, open_browser=False)
+    command.print_link("http://127.0.0.1:1/", "token", open_browser=True)
     assert opened == ["http://127.0.0.1:1/?token=token"]
     assert capsys.readouterr().out.splitlines() == ["http://127.0.0.1:1/", "http://127.0.0.1:1/?token=token"]
     assert serve.name == "serve"

@@ -11,7 +11,7 @@ import pytest
 from brewster import Photo
 from brewster.photo.file_info import FileInfo
 from brewster.srgb import to_encoded, to_linear
-from cli_helpers import picture
+from cli_helpers import image_bytes
 from picture_files import exif_block, file_of, smooth
 from web_servers import serve_process
 
@@ -90,7 +90,7 @@ def share(page):
 
 
 def test_a_photo_is_uploaded_compared_and_downloaded_with_the_bytes_of_the_command_line(
-    open_page, bare, tmp_path
+    open_page, run_without_model, tmp_path
 ):
     whole = Photo.open(MIXTURE)
     photo = tmp_path / "window.jpg"
@@ -111,7 +111,7 @@ def test_a_photo_is_uploaded_compared_and_downloaded_with_the_bytes_of_the_comma
     page.get_by_label("Strength").fill("0.6")
     settle(page)
     assert page.locator("#amount").inner_text() == "60 %"
-    bare(photo, "--strength", "0.6", "--device", "cpu", "--layers", "transmission,confidence")
+    run_without_model(photo, "--strength", "0.6", "--device", "cpu", "--layers", "transmission,confidence")
     for layer in ("transmission", "confidence"):
         page.get_by_label(layer.capitalize(), exact=True).check()
         settle(page)
@@ -123,7 +123,7 @@ def test_a_photo_is_uploaded_compared_and_downloaded_with_the_bytes_of_the_comma
 
 
 def test_the_layers_on_the_page_are_those_of_the_server_to_two_code_values(open_page, run):
-    data = picture(90, 60, "png")
+    data = image_bytes(90, 60, "png")
     page = open_page()
     upload(page, ("window.png", data))
     for strength in (0.3, 1):
@@ -153,7 +153,7 @@ def test_wide_gamut_and_rotated_photos_have_the_right_colours_and_orientation(op
 
 
 def test_the_page_works_with_the_keyboard_only(open_page, run):
-    data = picture(90, 60, "png")
+    data = image_bytes(90, 60, "png")
     file = {"name": "window.png", "mimeType": "image/png", "buffer": data}
     page = open_page()
     page.on("filechooser", lambda choosing: choosing.set_files(file))
@@ -200,7 +200,7 @@ def test_a_phone_shows_everything_without_horizontal_scrolling(open_page):
     page = open_page(viewport={"width": 390, "height": 844}, has_touch=True)
     assert page.evaluate("document.documentElement.scrollWidth") == 390
     long = "a very long name of a photo taken through a window " * 3
-    upload(page, *((f"{number} {long}.png", picture(300, 200, "png", number)) for number in range(4)))
+    upload(page, *((f"{number} {long}.png", image_bytes(300, 200, "png", number)) for number in range(4)))
     assert page.evaluate("document.documentElement.scrollWidth") == 390
     for control in page.locator("button:visible, select:visible").all():
         box = control.bounding_box()
@@ -250,7 +250,7 @@ def row(page):
 
 def test_a_file_that_is_not_a_photo_shows_an_error_and_can_be_retried_or_removed(open_page):
     page = open_page()
-    upload(page, ("holiday.jpg", b"not a picture"), ("window.png", picture(90, 60, "png")))
+    upload(page, ("holiday.jpg", b"not a picture"), ("window.png", image_bytes(90, 60, "png")))
     assert page.get_by_role("heading", name="holiday.jpg could not be separated").is_visible()
     assert "no known image format" in page.get_by_role("alert").inner_text()
     assert page.get_by_role("button", name="Download transmission").is_disabled()
@@ -266,9 +266,9 @@ def test_a_file_that_is_not_a_photo_shows_an_error_and_can_be_retried_or_removed
 
 def test_many_photos_are_downloaded_as_one_zip_with_unique_names(open_page, run):
     photos = [
-        ("a.png", picture(90, 60, "png", 1)),
-        ("a.png", picture(90, 60, "png", 2)),
-        ("ä.jpg", picture(60, 50)),
+        ("a.png", image_bytes(90, 60, "png", 1)),
+        ("a.png", image_bytes(90, 60, "png", 2)),
+        ("ä.jpg", image_bytes(60, 50)),
     ]
     page = open_page()
     upload(page, *photos)
@@ -298,7 +298,7 @@ def test_photos_can_be_pasted_and_dropped(open_page):
         document.body.dispatchEvent(event);
     }"""
     for kind in ("paste", "drop"):
-        page.evaluate(send_event, [kind, list(picture(60, 40, "png"))])
+        page.evaluate(send_event, [kind, list(image_bytes(60, 40, "png"))])
         page.get_by_role("button", name=f"{kind}.png").first.wait_for()
     page.wait_for_selector("li.done >> nth=1")
     assert "2 of 2 are done" in page.locator("#announcement").inner_text()
@@ -306,7 +306,7 @@ def test_photos_can_be_pasted_and_dropped(open_page):
 
 def test_a_change_of_quality_repeats_the_preview(open_page):
     page = open_page()
-    upload(page, ("a.png", picture(90, 60, "png")))
+    upload(page, ("a.png", image_bytes(90, 60, "png")))
     with page.expect_request("**/preview?*") as request:
         page.get_by_label("Draft", exact=True).check()
     assert request.value.method == "POST"
@@ -328,7 +328,7 @@ def focused(page):
 
 def test_the_previous_quality_shows_the_previous_maps_again(open_page):
     page = open_page()
-    upload(page, ("a.png", picture(90, 60, "png")), ("b.png", picture(80, 60, "png")))
+    upload(page, ("a.png", image_bytes(90, 60, "png")), ("b.png", image_bytes(80, 60, "png")))
     hold_requests(page, "**/preview?*")
     page.get_by_label("Best", exact=True).check()
     page.get_by_role("button", name="Cancel").click()
@@ -347,7 +347,7 @@ def test_the_previous_quality_shows_the_previous_maps_again(open_page):
 def test_the_focus_moves_to_the_next_button_when_its_button_disappears(open_page):
     page = open_page()
     hold_requests(page, "**/preview?*")
-    page.set_input_files("#files", [{"name": "a.png", "mimeType": "", "buffer": picture(90, 60, "png")}])
+    page.set_input_files("#files", [{"name": "a.png", "mimeType": "", "buffer": image_bytes(90, 60, "png")}])
     page.get_by_role("button", name="Cancel").focus()
     for successor in ("retry", "cancel", "retry"):
         page.keyboard.press("Enter")
@@ -375,17 +375,17 @@ def test_the_focus_moves_to_the_next_button_when_its_button_disappears(open_page
 
 def test_a_photo_that_is_not_done_shows_its_own_strength(open_page):
     page = open_page()
-    upload(page, ("a.png", picture(90, 60, "png")))
+    upload(page, ("a.png", image_bytes(90, 60, "png")))
     page.get_by_label("Strength").fill("0.3")
     hold_requests(page, "**/preview?*")
-    page.set_input_files("#files", [{"name": "b.png", "mimeType": "", "buffer": picture(90, 60, "png")}])
+    page.set_input_files("#files", [{"name": "b.png", "mimeType": "", "buffer": image_bytes(90, 60, "png")}])
     page.locator(".pick").nth(1).click()
     assert page.locator("#amount").inner_text() == "100 %"
 
 
 def test_a_photo_that_fails_is_left_out_of_the_zip_and_its_error_is_shown(open_page):
     page = open_page()
-    upload(page, *((f"{name}.png", picture(90, 60, "png", seed)) for seed, name in enumerate("abc")))
+    upload(page, *((f"{name}.png", image_bytes(90, 60, "png", seed)) for seed, name in enumerate("abc")))
 
     def refuse(route):
         if b'"b.png"' in route.request.post_data_buffer:
@@ -407,7 +407,7 @@ def test_a_photo_that_fails_is_left_out_of_the_zip_and_its_error_is_shown(open_p
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_text_has_contrast_in_light_and_dark_and_every_control_has_a_name(open_page, scheme):
     page = open_page(color_scheme=scheme, reduced_motion="reduce")
-    upload(page, ("a.png", picture(90, 60, "png")), ("b.png", b"none"))
+    upload(page, ("a.png", image_bytes(90, 60, "png")), ("b.png", b"none"))
     contrast = page.evaluate("""() => {
         const canvas = document.createElement("canvas").getContext("2d", { willReadFrequently: true });
         const light = (colours) => {

@@ -12,11 +12,11 @@ from fastapi import APIRouter, Response
 from brewster.web import server
 from brewster.web.application import create_app
 from brewster.web.middleware import RequestLimits
-from cli_helpers import picture
+from cli_helpers import image_bytes
 from file_server import loopback_only
 from web_servers import BlockingBackend, make_app, raw_exchange, running_server, served_port
 
-PHOTO = picture(40, 30, "png")
+PHOTO = image_bytes(40, 30, "png")
 FORM = b'--x\r\nContent-Disposition: form-data; name="photo"; filename="a.png"\r\n\r\n%b\r\n--x--\r\n' % PHOTO
 GET = b"GET /health HTTP/1.1\r\nHost: localhost\r\n\r\n"
 POST = (

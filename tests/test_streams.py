@@ -15,7 +15,7 @@ from brewster.training.data.online import OnlineRendered
 from brewster.training.data.rendered import RenderedSets
 from brewster.training.recipe import read_recipe, with_value
 from brewster.training.streams import open_stream, validation_pairs
-from cli_helpers import picture
+from cli_helpers import image_bytes
 from set_folders import render_set
 
 TINY = Path(__file__).parents[1] / "recipes/ablations/tiny.toml"
@@ -45,7 +45,7 @@ def root(tmp_path, monkeypatch):
     for name in ("photos", "real/blended", "real/transmission", "empty/blended"):
         (tmp_path / name).mkdir(parents=True)
     for name in ("photos/a.jpg", "real/blended/a.jpg", "real/transmission/a.jpg"):
-        (tmp_path / name).write_bytes(picture())
+        (tmp_path / name).write_bytes(image_bytes())
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
     return tmp_path
 

@@ -34,8 +34,8 @@ def folders(tmp_path):
 
 
 @pytest.fixture
-def study(bare, folders, tmp_path):
-    assert bare("study", "create", "study", *folders, "--seed", 4)[0] == 0
+def study(run_without_model, folders, tmp_path):
+    assert run_without_model("study", "create", "study", *folders, "--seed", 4)[0] == 0
     return read_study(tmp_path / "study")
 
 
@@ -49,30 +49,34 @@ def add_answers(study, participants, rng):
     store.close()
 
 
-def test_create_prints_a_summary_and_the_next_command(bare, folders):
-    code, out, err = bare("study", "create", "study", *folders, "--seed", 4, "--pairs", 3, "--catches", 2)
+def test_create_prints_a_summary_and_the_next_command(run_without_model, folders):
+    code, out, err = run_without_model(
+        "study", "create", "study", *folders, "--seed", 4, "--pairs", 3, "--catch-trials", 2
+    )
     assert (code, out) == (0, b"")
     assert "4 comparisons of 2 methods; a participant sees 3 of them and 2 catch trials (seed 4)" in err
     assert "next: brewster study serve study" in err
 
 
-def test_create_accepts_a_consent_text(bare, folders, tmp_path):
+def test_create_accepts_a_consent_text(run_without_model, folders, tmp_path):
     (tmp_path / "consent.txt").write_text("A consent text.\n")
-    bare("study", "create", "study", *folders, "--consent", "consent.txt")
+    run_without_model("study", "create", "study", *folders, "--consent", "consent.txt")
     assert read_study(tmp_path / "study").description.consent == "A consent text."
 
 
-def test_create_exits_with_1_for_wrong_files_and_with_2_for_wrong_arguments(bare, folders, tmp_path):
-    assert bare("study", "create", "study", *folders[:4])[0] == 1
-    code, _, err = bare("study", "create", "study", *folders, "--method", "ours=rdnet")
+def test_create_exits_with_1_for_wrong_files_and_with_2_for_wrong_arguments(
+    run_without_model, folders, tmp_path
+):
+    assert run_without_model("study", "create", "study", *folders[:4])[0] == 1
+    code, _, err = run_without_model("study", "create", "study", *folders, "--method", "ours=rdnet")
     assert (code, "share a name" in err) == (1, True)
-    assert bare("study", "create", "study", *folders, "--method", "nameless")[0] == 2
+    assert run_without_model("study", "create", "study", *folders, "--method", "nameless")[0] == 2
     assert not (tmp_path / "study").exists()
 
 
-def test_report_prints_tables_and_writes_all_files(bare, study, random):
+def test_report_prints_tables_and_writes_all_files(run_without_model, study, random):
     add_answers(study, 12, random)
-    code, out, err = bare("study", "report", "study")
+    code, out, err = run_without_model("study", "report", "study")
     assert code == 0
     assert "### ours and RDNet" in out.decode()
     assert "12 participants (12 complete), 48 answers; 0 of 48 catch trials failed." in out.decode()
@@ -80,23 +84,25 @@ def test_report_prints_tables_and_writes_all_files(bare, study, random):
     names = {path.name for path in (study.folder / "report").iterdir()}
     assert names == {"report.json", "report.md", "table.tex", "table.csv", "answers.csv", "plot.png"}
     # replaces the first report
-    code, out, _ = bare("study", "report", "study", "--json", "--least-seconds", 99)
+    code, out, _ = run_without_model("study", "report", "study", "--json", "--min-seconds", 99)
     assert json.loads(out)["excluded"] == {"failed": 0, "fast": 12}
 
 
-def test_report_without_answers_or_without_a_study_is_an_error(bare, study):
-    code, _, err = bare("study", "report", "study")
+def test_report_without_answers_or_without_a_study_is_an_error(run_without_model, study):
+    code, _, err = run_without_model("study", "report", "study")
     assert (code, "has no answers yet" in err) == (1, True)
-    code, _, err = bare("study", "report", "nowhere")
+    code, _, err = run_without_model("study", "report", "nowhere")
     assert (code, "cannot be read" in err) == (1, True)
 
 
-def test_plan_prints_text_or_json(bare):
-    code, out, _ = bare("study", "plan", "--difference", 0.1)
+def test_plan_prints_text_or_json(run_without_model):
+    code, out, _ = run_without_model("study", "plan", "--difference", 0.1)
     assert (code, out.decode().startswith("45 participants (1800 answers)")) == (0, True)
-    assert json.loads(bare("study", "plan", "--difference", 0.1, "--json")[1])["participants"] == 45
-    assert bare("study", "plan")[0] == 2
-    assert bare("study", "plan", "--difference", 0.9)[0] == 1
+    assert (
+        json.loads(run_without_model("study", "plan", "--difference", 0.1, "--json")[1])["participants"] == 45
+    )
+    assert run_without_model("study", "plan")[0] == 2
+    assert run_without_model("study", "plan", "--difference", 0.9)[0] == 1
 
 
 ON_LOOPBACK = """
@@ -130,7 +136,7 @@ def test_a_server_continues_after_a_kill_and_stops_with_ctrl_c(study):
         link = post(f"{url}participants", json={"agreed": True}).json()["link"]
         given = {"trial": 0, "choice": "right", "seconds": 3}
         assert post(f"{url}{link[1:]}/answers", json=given).json()["kept"] == "right"
-    with serve_study(study.folder, "--called", "study.example") as second:
+    with serve_study(study.folder, "--host-name", "study.example") as second:
         url = second.stdout.readline().strip()
         state = get(f"{url}{link[1:]}/trial", headers={"Host": "study.example"}).json()
         assert state["trial"] == 1
@@ -138,9 +144,9 @@ def test_a_server_continues_after_a_kill_and_stops_with_ctrl_c(study):
     assert second.returncode == 0
 
 
-def test_serving_a_study_whose_pictures_changed_is_refused(bare, study):
+def test_serving_a_study_whose_pictures_changed_is_refused(run_without_model, study):
     next((study.folder / "pictures").iterdir()).unlink()
-    code, _, err = bare("study", "serve", "study")
+    code, _, err = run_without_model("study", "serve", "study")
     assert (code, "missing or changed" in err) == (1, True)
 
 
@@ -167,22 +173,22 @@ def test_an_automatic_token_is_stored_for_its_owner_only_and_links_survive_a_res
         stop_server(second)
 
 
-def test_an_invalid_token_file_is_refused(bare, study):
+def test_an_invalid_token_file_is_refused(run_without_model, study):
     (study.folder / "token").write_text("short\n")
-    code, _, err = bare("study", "serve", "study", "--token", "auto")
+    code, _, err = run_without_model("study", "serve", "study", "--token", "auto")
     assert (code, "contains no valid token" in err) == (1, True)
 
 
 @pytest.mark.parametrize(
     "name", ["study.example.org:443", "https://study.example.org", "study.example.org/", "", "bücher.example"]
 )
-def test_a_name_that_cannot_be_in_a_host_header_is_a_wrong_argument(bare, study, name):
-    code, _, err = bare("study", "serve", "study", "--called", name, "--port", 0)
+def test_a_name_that_cannot_be_in_a_host_header_is_a_wrong_argument(run_without_model, study, name):
+    code, _, err = run_without_model("study", "serve", "study", "--host-name", name, "--port", 0)
     assert (code, "is not a bare host name" in err) == (2, True)
 
 
-def test_report_without_answers_creates_no_database(bare, study):
-    bare("study", "report", "study")
+def test_report_without_answers_creates_no_database(run_without_model, study):
+    run_without_model("study", "report", "study")
     assert sorted(path.name for path in study.folder.iterdir()) == ["pictures", "study.json"]
 
 
@@ -204,14 +210,14 @@ def test_a_read_only_study_is_reported_into_another_folder(study, random, tmp_pa
     assert refused.returncode == 1  # checks that the folder was read-only
 
 
-def test_create_limits_the_number_of_catch_trials(bare, tmp_path):
+def test_create_limits_the_number_of_catch_trials(run_without_model, tmp_path):
     names = [f"{i}" for i in range(26)]
     for seed, name in enumerate(("inputs", "ours", "rdnet")):
         write_pictures(tmp_path / name, names, size=(4, 3), seed=seed)
-    args = ["--inputs", "inputs", "--method", "ours=ours", "--method", "RDNet=rdnet", "--catches"]
-    code, _, err = bare("study", "create", "study", *args, 25)
+    args = ["--inputs", "inputs", "--method", "ours=ours", "--method", "RDNet=rdnet", "--catch-trials"]
+    code, _, err = run_without_model("study", "create", "study", *args, 25)
     assert (code, "25 catch trials for each participant were requested; at most 24 are available" in err) == (
         1,
         True,
     )
-    assert "26 of them and 24 catch trials" in bare("study", "create", "study", *args, 24)[2]
+    assert "26 of them and 24 catch trials" in run_without_model("study", "create", "study", *args, 24)[2]

@@ -24,16 +24,16 @@ class _DefaultCommandGroup(click.Group):
     """A click group that treats an unknown command as a photo."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Changes `PHOTO...` to `separate PHOTO...`."""
+        """Inserts `separate` in front of the arguments if they begin with no command."""
         if args and args[0] not in self.commands and args[0] not in _GROUP_OPTIONS:
             self._reject_misspelled_command(ctx, args[0])
             args = ["separate", *args]
         return super().parse_args(ctx, args)
 
-    def _reject_misspelled_command(self, ctx: click.Context, word: str) -> None:
-        close = difflib.get_close_matches(word, self.commands, n=1, cutoff=0.7)
-        if close and word.isalpha() and not Path(word).exists():
-            ctx.fail(f"There is neither a photo nor a command {word!r}. Did you mean {close[0]}?")
+    def _reject_misspelled_command(self, ctx: click.Context, argument: str) -> None:
+        close = difflib.get_close_matches(argument, self.commands, n=1, cutoff=0.7)
+        if close and argument.isalpha() and not Path(argument).exists():
+            ctx.fail(f"{argument!r} is neither a photo nor a command. Did you mean {close[0]}?")
 
 
 def _print_version(context: click.Context, _parameter: click.Parameter, requested: bool) -> None:
@@ -75,7 +75,7 @@ for _command in (
 
 
 def _leaf_commands(group: click.Group) -> Iterator[click.Command]:
-    """All commands that are not groups, also those in nested groups."""
+    """Yields all commands that are not groups, including those in nested groups."""
     for command in group.commands.values():
         if isinstance(command, click.Group):
             yield from _leaf_commands(command)
@@ -92,7 +92,7 @@ def main(args: Sequence[str] | None = None) -> int:
     """Runs the command line.
 
     Returns:
-        The exit code: 0 success, 1 error, 2 wrong usage, 130 interrupted by Ctrl-C.
+        The exit code: 0 success, 1 error, 2 invalid arguments, 130 interrupted by Ctrl-C.
     """
     standard_output.redirect_descriptor()
     try:
@@ -102,7 +102,7 @@ def main(args: Sequence[str] | None = None) -> int:
         error.show()
         return error.exit_code
     except click.Abort:
-        print_status("stopped: finished work is kept, and the same command resumes")
+        print_status("stopped: finished work is kept; run the same command again to resume")
         return _EXIT_INTERRUPTED
     except BrewsterError as error:
         for sentence in error.sentences():

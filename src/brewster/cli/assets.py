@@ -28,10 +28,20 @@ def assets() -> None:
 @click.argument("source", type=click.Choice(["polyhaven"]))
 @click.argument("out", required=False, type=click.Path(path_type=Path))
 @click.option(
-    "--indoor", type=_COUNT, default=140, show_default=True, metavar="NUMBER", help="Number of indoor maps."
+    "--indoor",
+    type=_COUNT,
+    default=140,
+    show_default=True,
+    metavar="NUMBER",
+    help="The number of indoor maps.",
 )
 @click.option(
-    "--outdoor", type=_COUNT, default=30, show_default=True, metavar="NUMBER", help="Number of outdoor maps."
+    "--outdoor",
+    type=_COUNT,
+    default=30,
+    show_default=True,
+    metavar="NUMBER",
+    help="The number of outdoor maps.",
 )
 @click.option(
     "--resolution",
@@ -45,7 +55,7 @@ def assets() -> None:
     type=click.Choice(["hdr", "exr"]),
     default="hdr",
     show_default=True,
-    help="The file format of the maps; reading exr needs the extra brewster[exr].",
+    help="The file format of the maps; exr files need the extra brewster[exr].",
 )
 @click.option(
     "--server",
@@ -64,7 +74,7 @@ def pull(
     context: click.Context,
     /,
     *,
-    source: str,  # noqa: ARG001  (there is only one)
+    source: str,  # noqa: ARG001  (polyhaven is the only choice)
     out: Path | None,
     as_json: bool,
     quiet: bool,
@@ -75,15 +85,15 @@ def pull(
     OUT is brewster/maps in the user's cache folder by default. The maps are chosen in the order of their ids.
     manifest.csv lists the maps, their authors and their MD5 checksums.
 
-    Existing maps are skipped, and interrupted downloads resume. If a map fails, the other maps are still downloaded,
-    the failed map is named at the end, and the exit code is 1.
+    Existing maps are skipped, and interrupted downloads are resumed. If the download of a map fails, the other maps are
+    still downloaded, the failed map is listed at the end, and the exit code is 1.
     """
     from brewster.environments.polyhaven import DownloadRequest, maps_folder  # noqa: PLC0415  (imports urllib)
 
     request = DownloadRequest(**options)
     results = _fetch(request, out or maps_folder(), as_json=as_json, quiet=quiet)
     if not quiet:
-        _print_shortfall(request, results)
+        _print_missing_counts(request, results)
         print_status(
             "powered by Poly Haven, polyhaven.com"
         )  # the terms of service of Poly Haven require these words
@@ -91,17 +101,19 @@ def pull(
 
 
 def _fetch(request: DownloadRequest, folder: Path, *, as_json: bool, quiet: bool) -> list[DownloadResult]:
-    """Downloads the maps and prints each result. Failed maps are listed at the end, also after an interruption."""
+    """Downloads the maps, and prints each result and a summary. The summary is printed after an interruption too."""
     from brewster.environments.polyhaven import pull as fetch  # noqa: PLC0415
 
     results: list[DownloadResult] = []
     shares_terminal = as_json and standard_output.stream.isatty()
     try:
-        with progress(request.indoor + request.outdoor, shown=not quiet and not shares_terminal) as advance:
+        with progress(
+            request.indoor + request.outdoor, shown=not quiet and not shares_terminal
+        ) as update_progress:
             for result in fetch(request, folder):
                 results.append(result)
                 _print_result(result, as_json=as_json, quiet=quiet)
-                advance(sum(result.status != "missing" for result in results), result.asset)
+                update_progress(sum(result.status != "missing" for result in results), result.asset)
     finally:
         _print_summary(results, quiet=quiet)
     return results
@@ -115,7 +127,7 @@ def _print_result(result: DownloadResult, *, as_json: bool, quiet: bool) -> None
     if quiet:
         return
     if result.status == "missing":
-        print_status(f"{result.asset}: not used, it has no file in this resolution and format")
+        print_status(f"{result.asset}: left out, the server has no file of it in this resolution and format")
     elif result.status == "skipped":
         print_status(f"{result.file}: skipped, it exists")
     elif result.status == "downloaded":
@@ -131,11 +143,12 @@ def _print_summary(results: Sequence[DownloadResult], *, quiet: bool) -> None:
             print_error(f"{result.asset}: {result.error}")
 
 
-def _print_shortfall(request: DownloadRequest, results: Sequence[DownloadResult]) -> None:
-    """Prints a line if the server has fewer maps than requested."""
+def _print_missing_counts(request: DownloadRequest, results: Sequence[DownloadResult]) -> None:
+    """Prints one line for each category of which the server has fewer maps than requested."""
     for category, requested in (("indoor", request.indoor), ("outdoor", request.outdoor)):
         found = sum(result.category == category and result.status != "missing" for result in results)
         if found < requested:
             print_status(
-                f"{found} of {requested} {category} maps found: the server has no more in {request.resolution} {request.format}"
+                f"{found} of {requested} {category} maps found: the server has no more {category} maps in "
+                f"{request.resolution} {request.format}"
             )

@@ -1,4 +1,7 @@
-"""The output of `brewster separate`: progress, one line for each photo, a summary. `inference/batch.py` does the work."""
+"""Runs `brewster separate` and prints its output: progress, one line for each photo, a summary.
+
+The photos are separated by `brewster.inference.batch`.
+"""
 
 from __future__ import annotations
 
@@ -30,17 +33,17 @@ if TYPE_CHECKING:
 
 
 def is_single_output(photos: Sequence[str], output: str | None) -> bool:
-    """Whether only one layer can be written: to standard output, or to a picture named with -o."""
-    return "-" in photos or output == "-" or _is_picture_name(output)
+    """Whether only one layer can be written, because its target is standard output or one image file (-o)."""
+    return "-" in photos or output == "-" or _is_image_file(output)
 
 
 def plan(photos: Sequence[str], output: str | None, options: Options) -> list[SeparationTask]:
-    """The photos in the files and folders given, each with the targets of its layers.
+    """Lists the photos in files and folders, each with the targets of its layers.
 
     Raises:
         click.UsageError: the arguments contradict each other.
         TargetError: two photos would be written under the same name.
-        PhotoError: there is no photo.
+        PhotoError: the files and folders contain no photo.
     """
     from brewster.inference import plan_files  # noqa: PLC0415  (imports ONNX Runtime and pyvips)
 
@@ -53,10 +56,12 @@ def _plan_single_output(photos: Sequence[str], output: str | None, options: Opti
     from brewster.inference import SeparationTask  # noqa: PLC0415
 
     if len(photos) > 1 or Path(photos[0]).is_dir():
-        raise click.UsageError("Standard input, standard output and a picture named with -o take one photo.")
+        raise click.UsageError(
+            "With standard input, standard output or an image file as the target (-o), give exactly one photo."
+        )
     if len(options.layers) > 1:
         raise click.UsageError(
-            "Standard output and a picture named with -o take one layer: choose it with --layers."
+            "Standard output and an image file as the target (-o) take one layer: choose it with --layers."
         )
     if output not in (None, "-"):
         _check_format(format_of(Path(output)), options)
@@ -66,21 +71,25 @@ def _plan_single_output(photos: Sequence[str], output: str | None, options: Opti
 
 
 def _check_format(image_format: ImageFormat | None, options: Options) -> None:
-    """The suffix of a picture named with -o decides its format; --format and --additive must agree with it."""
+    """Checks that the format of the image file given with -o can be written, and that --format and --additive match it.
+
+    Raises:
+        click.UsageError: the format is unknown or cannot be written, or the options require another format.
+    """
     if image_format is None:
         raise click.UsageError(
-            "With standard input, -o must name a picture (such as clear.jpg) or be left out."
+            "With standard input, -o takes an image file such as clear.jpg, or is left out."
         )
     name = image_format.name
     if not image_format.is_writable:
         raise click.UsageError(f"brewster cannot write {name.upper()}: choose another suffix for -o.")
     if options.layers != ("confidence",) and options.container(options.layers[0], name) != name:
         raise click.UsageError(
-            f"-o names a {name} picture, but --format or --additive requires another format."
+            f"The target of -o is a {name} file, but --format or --additive requires another format."
         )
 
 
-def _is_picture_name(output: str | None) -> bool:
+def _is_image_file(output: str | None) -> bool:
     return (
         output is not None
         and not output.endswith(("/", os.sep))
@@ -109,7 +118,7 @@ class _StandardStream:
 @final
 @dataclass(frozen=True)
 class BatchCommand:
-    """Settings of a batch on the command line."""
+    """The options of a batch. `run` separates the photos and prints the results."""
 
     options: Options
     overwrite: bool = False
@@ -131,26 +140,28 @@ class BatchCommand:
         try:
             self._separate(tasks, results)
         finally:
-            if len(results) == len(tasks):  # also when the batch ends by raising the exception of a bug
+            if len(results) == len(
+                tasks
+            ):  # true also if `separate_tasks` raises an unexpected exception after the last photo
                 self._print_summary(results)
         return all(result.error is None for result in results)
 
     def _separate(self, tasks: Sequence[SeparationTask], results: list[FileResult]) -> None:
-        """Appends a result for each photo, until an error ends the batch."""
+        """Separates the photos in order, appends the result of each to `results`, and prints it."""
         from brewster.inference.batch import separate_tasks  # noqa: PLC0415
 
         shares_terminal = self.as_json and standard_output.stream.isatty()
-        with progress(len(tasks), shown=not self.quiet and not shares_terminal) as advance:
+        with progress(len(tasks), shown=not self.quiet and not shares_terminal) as update_progress:
 
-            def update(done: int, name: str, share: float) -> None:
+            def on_progress(done: int, name: str, fraction: float) -> None:
                 interrupts.raise_pending()
-                advance(done + share, name)
+                update_progress(done + fraction, name)
 
             for result in separate_tasks(
-                tasks, self.options, overwrite=self.overwrite, dry_run=self.dry_run, on_progress=update
+                tasks, self.options, overwrite=self.overwrite, dry_run=self.dry_run, on_progress=on_progress
             ):
                 if result.error:
-                    interrupts.raise_pending()  # a lost Ctrl-C may be the cause of the error
+                    interrupts.raise_pending()  # a Ctrl-C that Python dropped may have caused the error
                 results.append(result)
                 self._print_result(result)
                 interrupts.raise_pending()
@@ -164,13 +175,13 @@ class BatchCommand:
         if self.quiet or result.error:
             return
         if result.status == "skipped":
-            print_status(f"{result.source}: skipped, its layers exist (--overwrite replaces them)")
+            print_status(f"{result.source}: skipped, all of its layers exist (--overwrite replaces them)")
         elif result.status == "separated":
             print_status(f"{result.source} -> {outputs} ({sum(result.seconds.values()):.1f} s)")
             if result.doubtful:
                 print_status(
-                    f"{result.source}: doubtful, the model redrew the photo "
-                    f"(reconstruction_error {result.reconstruction_error:.2f}): check the result"
+                    f"{result.source}: doubtful, the generated photo differs from the input "
+                    f"(reconstruction error {result.reconstruction_error:.2f}): check the layers"
                 )
 
     def _print_summary(self, results: Sequence[FileResult]) -> None:
@@ -180,8 +191,8 @@ class BatchCommand:
             print_status(", ".join(f"{counts[status]} {status}" for status in order if counts[status]))
         for result in results:
             if result.error:
-                is_named = result.error.startswith(f"{result.source} ")
-                print_error(result.error if is_named else f"{result.source}: {result.error}")
+                has_source = result.error.startswith(f"{result.source} ")
+                print_error(result.error if has_source else f"{result.source}: {result.error}")
 
 
 def _json_line(result: FileResult) -> bytes:

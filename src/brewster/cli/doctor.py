@@ -1,4 +1,4 @@
-"""`brewster doctor`: what works on this machine, what is missing, and the command that installs it."""
+"""`brewster doctor`: checks what works on this machine, what is missing, and which command installs it."""
 
 from __future__ import annotations
 
@@ -25,22 +25,23 @@ _MIN_PYTHON: Final = (3, 11)
 _GIF: Final = bytes.fromhex(
     "47494638396101000100800000ffffff00000021f90401000000002c00000000010001000002024401003b"
 )
+"""A GIF of one pixel; brewster reads GIF but cannot write it."""
 _SYMBOLS: Final = {"ok": "ok", "missing": "--", "broken": "!!"}
 
 
 @final
 @dataclass(frozen=True)
 class Check:
-    """The result of one check: one line of the output."""
+    """The result of one check, printed as one line."""
 
     area: str
     name: str
     status: Literal["ok", "missing", "broken"]
     detail: str
     cure: str | None = None
-    """The command or action that repairs it."""
+    """The command or action that repairs the part, if it does not work."""
     needed: bool = True
-    """False for optional parts: their status does not change the exit code."""
+    """Whether the part is required. An optional part does not change the exit code."""
 
 
 @click.command
@@ -49,8 +50,7 @@ class Check:
 def doctor(context: click.Context, *, as_json: bool) -> None:
     """Check what works on this machine and what is missing.
 
-    For each missing part, the output has the command that installs it. The exit code is 1 if a required part does not
-    work.
+    The command that installs a missing part is printed below it. The exit code is 1 if a required part does not work.
     """
     checks = list(run_checks())
     is_healthy = all(check.status == "ok" for check in checks if check.needed)
@@ -67,7 +67,7 @@ def doctor(context: click.Context, *, as_json: bool) -> None:
 
 
 def run_checks() -> Iterator[Check]:
-    """Runs all checks; each part is checked after the parts that it depends on."""
+    """Runs all checks, and yields their results. Each part is checked after the parts that it depends on."""
     version = platform.python_version()
     if sys.version_info >= _MIN_PYTHON:
         yield Check("python", "python", "ok", f"{version}, {platform.platform()}")
@@ -100,7 +100,7 @@ def _package(package: str, module: str) -> Check:
         return Check("packages", package, "missing", "not installed", cure)
     try:
         importlib.import_module(module)
-    except (ImportError, OSError) as error:  # a shared library is missing, or is built for another machine
+    except (ImportError, OSError) as error:  # a shared library is missing, or was built for another machine
         return Check("packages", package, "broken", f"{version}: {error}", f"{cure} --force-reinstall")
     return Check("packages", package, "ok", version)
 
@@ -128,7 +128,7 @@ def _devices() -> Iterator[Check]:
             "devices",
             "cuda",
             "missing",
-            "an NVIDIA driver is installed, but onnxruntime has no CUDA",
+            "an NVIDIA driver is installed, but the package onnxruntime does not support CUDA",
             cure,
             needed=False,
         )
@@ -137,18 +137,19 @@ def _devices() -> Iterator[Check]:
 
 
 def _formats() -> Iterator[Check]:
-    """Writes and reads a small picture in each file format."""
+    """Writes and reads a small image in each file format."""
     try:
-        importlib.import_module("brewster.photo")  # wakes pyvips
+        importlib.import_module("brewster.photo")  # loads libvips
     except (ImportError, OSError) as error:
         yield Check("formats", "formats", "broken", str(error), "repair the packages above")
         return
     for container in WRITABLE:
-        yield _try_format(container, "reads and writes", lambda name=container: _sample(name))  # type: ignore[misc]
+        yield _try_format(container, "reads and writes", lambda name=container: _encode_sample(name))  # type: ignore[misc]
     yield _try_format("gif", "reads", lambda: _GIF)
 
 
-def _sample(container: str) -> bytes:
+def _encode_sample(container: str) -> bytes:
+    """Returns a grey image of 64x64 pixels as a file of this format."""
     import numpy as np  # noqa: PLC0415  (slow to import)
 
     from brewster.photo import Photo  # noqa: PLC0415  (imports pyvips)
@@ -157,19 +158,20 @@ def _sample(container: str) -> bytes:
     return Photo.from_array(grey, encoding="srgb").encode(container)
 
 
-def _try_format(container: str, verbs: str, sample: Callable[[], bytes]) -> Check:
+def _try_format(container: str, detail: str, encode_sample: Callable[[], bytes]) -> Check:
+    """Decodes a sample file. `detail` describes the format if this succeeds."""
     from brewster.photo import Photo  # noqa: PLC0415  (imports pyvips)
 
     extra = FORMATS[container].extra
     try:
-        Photo.open(sample())
+        Photo.open(encode_sample())
     except MissingExtra as error:
         cure = f"pip install 'brewster[{extra}]'"
         return Check("formats", container, "missing", str(error), cure, needed=False)
     except BrewsterError as error:
         cure = "pip install --force-reinstall pyvips-binary"
         return Check("formats", container, "broken", str(error), cure, needed=extra is None)
-    return Check("formats", container, "ok", verbs)
+    return Check("formats", container, "ok", detail)
 
 
 def _models() -> Iterator[Check]:
@@ -182,7 +184,7 @@ def _models() -> Iterator[Check]:
 
 
 def _mitsuba() -> Iterator[Check]:
-    """Whether Mitsuba can be imported, and whether it finds LLVM, which compiles its kernels."""
+    """Checks whether Mitsuba can be imported, and whether it finds LLVM, which compiles its kernels."""
     version = _version("mitsuba")
     if version is None:
         return
@@ -191,7 +193,7 @@ def _mitsuba() -> Iterator[Check]:
     try:
         with warnings.catch_warnings(
             action="ignore", category=RuntimeWarning
-        ):  # about LLVM, which the second check reports
+        ):  # about LLVM; the second check reports it
             variant.load()
     except MissingExtra as error:
         yield Check(
@@ -208,7 +210,7 @@ def _mitsuba() -> Iterator[Check]:
 
 
 def _large() -> Iterator[Check]:
-    """What large image models may need in addition to the extra `large`."""
+    """Checks what large image models may need in addition to the extra `large`."""
     if _version("diffusers") is None:
         return
     version = _version("bitsandbytes")

@@ -1,4 +1,4 @@
-"""`brewster evaluate`: score methods on benchmarks; writes tables, a report, and the scores of every picture."""
+"""`brewster evaluate`: score methods on benchmarks, and write tables, a report and the scores of every image."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class NamedValue(click.ParamType[tuple[str, str]]):
         if not equals and not self.needs_name:
             return "", name
         if not (name and rest):
-            self.fail(f"{value!r} is not NAME=VALUE, such as {self.example}.", param, ctx)
+            self.fail(f"{value!r} is not NAME=VALUE. An example is {self.example}.", param, ctx)
         return name, rest
 
 
@@ -68,7 +68,7 @@ class _NumberList(click.ParamType[tuple[float, ...]]):
         try:
             return tuple(float(number) for number in str(value).split(","))
         except ValueError:
-            self.fail(f"{value!r} is not a list of numbers, such as 0.05,0.1.", param, ctx)
+            self.fail(f"{value!r} is not a list of numbers. An example is 0.05,0.1.", param, ctx)
 
 
 @final
@@ -81,12 +81,12 @@ class _Size(click.ParamType[int]):
         """The number of pixels, or None for `native`.
 
         Raises:
-            click.BadParameter: the value is neither.
+            click.BadParameter: the value is neither `native` nor a positive integer.
         """
         if value == "native":
             return None
         if not str(value).isdecimal() or int(str(value)) < 1:
-            self.fail(f"{value!r} is neither native nor a number of pixels.", param, ctx)
+            self.fail(f"{value!r} is neither native nor a positive number of pixels.", param, ctx)
         return int(str(value))
 
 
@@ -94,12 +94,12 @@ class _Size(click.ParamType[int]):
 @click.option(
     "--benchmark",
     "benchmarks",
-    metavar="NAME=DIR",
+    metavar="NAME=FOLDER",
     type=NamedValue("real20=data/real20"),
     multiple=True,
     required=True,
-    help="A benchmark and the folder of your copy; repeatable. NAME is a benchmark of docs/evaluation.md, such as real20, "
-    "sir2, pairs (any folder of pairs) or rendered (a set of brewster render). For an unknown NAME, all names are listed.",
+    help="The name of a benchmark and the folder of your copy; repeatable. docs/evaluation.md lists the names, such as real20, "
+    "sir2, pairs (any folder of pairs) or rendered (a set of brewster render). An unknown NAME gives an error that lists all names.",
 )
 @click.option(
     "--model",
@@ -107,14 +107,14 @@ class _Size(click.ParamType[int]):
     metavar="[NAME=]MODEL",
     type=NamedValue("ours=model.onnx", needs_name=False),
     multiple=True,
-    help="A model to run, in the form that `brewster --model` takes; repeatable.",
+    help="A model to run, given in the same way as for `brewster --model`; NAME is its name in the tables; repeatable.",
 )
 @click.option(
     "--predictions",
-    metavar="NAME=DIR",
+    metavar="NAME=FOLDER",
     type=NamedValue("RDNet=out/rdnet"),
     multiple=True,
-    help="A folder with the predictions of another method, named like the photos of the benchmark; repeatable.",
+    help="The name of another method and the folder of its predictions, named like the photos of the benchmark; repeatable.",
 )
 @click.option(
     "-o",
@@ -129,26 +129,26 @@ class _Size(click.ParamType[int]):
 @click.option(
     "--metrics",
     metavar="NAME,...",
-    help="The metrics; by default all except ssim_gaussian, as far as the benchmark has the ground truth.",
+    help="The metrics to compute; by default, all except ssim_gaussian. A metric is skipped if the benchmark has no ground truth for it.",
 )
 @click.option(
     "--size",
     type=_Size(),
     default="native",
     show_default=True,
-    help="Reduce larger pictures to this shorter side first, in pixels, photo and ground truth alike.",
+    help="First downscale larger images, both photo and ground truth, so that their shorter side has this number of pixels.",
 )
 @click.option(
     "--paper",
     is_flag=True,
-    help="Also report the paper's protocol: one picture per scene of Postcard and SolidObject, drawn with a published seed.",
+    help="Also report the paper's protocol, with one image per scene of Postcard and SolidObject, chosen at random with a fixed seed.",
 )
 @click.option(
     "--region-threshold",
     "thresholds",
     type=_NumberList(),
     metavar="NUMBER,...",
-    help="The least difference of photo and ground truth inside the reflection region, as a share of the full scale; several values are evaluated separately.",
+    help="The smallest difference between photo and ground truth inside the reflection region, as a fraction of the full range, such as 0.08; several values are evaluated separately.",
 )
 @click.option(
     "--quality",
@@ -169,7 +169,7 @@ class _Size(click.ParamType[int]):
     type=click.IntRange(min=1),
     default=1,
     show_default=True,
-    help="Number of processes that compute scores.",
+    help="The number of processes that compute scores.",
 )
 @click.option(
     "--pictures",
@@ -177,24 +177,24 @@ class _Size(click.ParamType[int]):
     default=50,
     show_default=True,
     metavar="NUMBER",
-    help="Number of pictures per benchmark in the report, sorted by the score of the first method, worst first.",
+    help="The number of images of each benchmark that the report shows: those with the worst scores of the first method.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the results as JSON instead of the tables.")
 @click.option("--quiet", is_flag=True, help="Print only errors, and no tables.")
 @click.option(
     "--dry-run",
     is_flag=True,
-    help="Check benchmarks and methods, print the names of the pictures, and score nothing.",
+    help="Check benchmarks and methods, print the names of the images, and score nothing.",
 )
 @click.pass_context
 def evaluate(context: click.Context, /, *, dry_run: bool, **options: Any) -> None:  # noqa: ANN401  (the fields of _EvaluateCommand)
     """Score methods on benchmarks, with the unprocessed input as baseline.
 
-    The tables go to standard output. The output folder gets results.json (every picture), tables.md, table.tex,
-    table.csv and report.html. The same command resumes an interrupted run.
+    The tables are printed on standard output. The output folder gets results.json (the scores of every image),
+    tables.md, table.tex, table.csv and report.html. To resume an interrupted run, run the same command again.
 
-    Pictures are paired by name. If a picture has no partner, or if a method fails on it, the picture is listed, all
-    others are scored, and the exit code is 1.
+    Photos and ground truth are paired by file name. If a photo has no ground truth, or if a method fails on it, it is
+    listed, all other photos are scored, and the exit code is 1.
     """
     require_extra("evaluate", "evaluating")
     command = _EvaluateCommand(**options)
@@ -222,14 +222,14 @@ class _EvaluateCommand:
     quiet: bool
 
     def list_cases(self) -> bool:
-        """Prints pictures and methods without scoring them; returns whether every picture has its ground truth."""
+        """Prints the names of images and methods. Returns whether no image was left out of a benchmark."""
         from brewster.evaluate.evaluation import check  # noqa: PLC0415
 
         benchmarks, methods = self._read_benchmarks(), self._methods()
         is_complete = print_remarks(benchmarks, quiet=self.quiet)
         check(benchmarks, methods, self._config())
         for benchmark in benchmarks:
-            print_status(f"{benchmark.title}: {len(benchmark.cases)} pictures")
+            print_status(f"{benchmark.title}: {len(benchmark.cases)} images")
             write_out(
                 "".join(f"{benchmark.name}/{case.name}\n" for case in benchmark.cases).encode(
                     errors=_ENCODE_ERRORS
@@ -240,18 +240,18 @@ class _EvaluateCommand:
         return is_complete
 
     def run(self) -> bool:
-        """Scores and prints the tables; returns whether no picture was left out and no method failed."""
+        """Scores all methods and prints the tables. Returns whether no image was left out and no method failed."""
         from brewster.evaluate.evaluation import REPORT_FILE  # noqa: PLC0415
         from brewster.evaluate.evaluation import evaluate as measure  # noqa: PLC0415
 
         config, benchmarks, methods = self._config(), self._read_benchmarks(), self._methods()
         is_complete = print_remarks(benchmarks, quiet=self.quiet)
         total = len(methods) * sum(len(benchmark.cases) for benchmark in benchmarks)
-        with progress(total, shown=not self.quiet) as advance:
+        with progress(total, shown=not self.quiet) as update_progress:
 
-            def on_progress(done: int, _of: int, row: ScoreRow) -> None:
+            def on_progress(done: int, _total: int, row: ScoreRow) -> None:
                 interrupts.raise_pending()
-                advance(done, f"{row.benchmark}/{row.case} {row.method}")
+                update_progress(done, f"{row.benchmark}/{row.case} {row.method}")
 
             results = measure(
                 benchmarks,
@@ -266,7 +266,7 @@ class _EvaluateCommand:
             write_out(f"{json.dumps(results)}\n".encode())
         elif not self.quiet:
             print_tables(results)
-            print_status(f"results are in {self.out}; {self.out / REPORT_FILE} shows the pictures")
+            print_status(f"the results are in {self.out}; {self.out / REPORT_FILE} shows the images")
         return print_failures(results, quiet=self.quiet) and is_complete
 
     def _read_benchmarks(self) -> list[Benchmark]:
@@ -303,11 +303,11 @@ class _EvaluateCommand:
 
 
 _ENCODE_ERRORS: Final = "backslashreplace"
-"""How file names with bytes that are not valid text are printed."""
+"""The error handler for file names with bytes that are not valid text: these bytes are printed as escapes."""
 
 
 def print_remarks(benchmarks: Sequence[Benchmark], *, quiet: bool) -> bool:
-    """Prints remarks and errors about benchmarks; returns whether no picture was left out."""
+    """Prints remarks and errors about benchmarks. Returns whether no image was left out."""
     for benchmark in benchmarks:
         for remark in () if quiet else benchmark.remarks:
             print_status(f"{benchmark.title}: {remark}")
@@ -324,13 +324,13 @@ def print_tables(results: Results) -> None:
 
 
 def print_failures(results: Results, *, quiet: bool) -> bool:
-    """Prints remarks about methods and the predictions that could not be scored; returns whether there were none of these."""
+    """Prints remarks about methods, metrics without scores, and errors. Returns whether all predictions were scored."""
     from brewster.evaluate.report.tables import failures, remarks  # noqa: PLC0415
 
     for remark in () if quiet else remarks(results):
         print_status(remark)
     for name in results["unmeasured"]:
-        print_status(f"{name} was not computed: no picture has the ground truth that it needs")
+        print_status(f"{name} was not computed: no image has the ground truth that it needs")
     for error in failures(results):
         print_error(error)
     count = sum(len(picture["errors"]) for picture in results["pictures"])

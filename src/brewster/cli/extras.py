@@ -1,4 +1,4 @@
-"""The extras of brewster: the packages of each, and a clear error if one is missing."""
+"""The packages of the core and of each extra, and the error for a missing extra."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CORE: Final = {
     "pyvips-binary": "_libvips",
     "rich": "rich",
 }
-"""The required packages, with the module that each installs."""
+"""Required package -> the module that it installs."""
 
 EXTRAS: Final = {
     "exr": {"OpenEXR": "OpenEXR"},
@@ -58,16 +58,16 @@ EXTRAS: Final = {
         "uvicorn": "uvicorn",
     },
 }
-"""The packages of each extra, with the module that each installs."""
+"""Extra -> package -> the module that the package installs."""
 
 
-def require_extra(name: str, work: str, *, without: frozenset[str] = frozenset()) -> None:
+def require_extra(name: str, purpose: str, *, without: frozenset[str] = frozenset()) -> None:
     """Checks that the packages of an extra are installed, except those in `without`.
 
     Args:
         name: the name of the extra.
-        work: what needs it, for the error message, such as "training".
-        without: packages of the extra that this work does not use.
+        purpose: what needs the extra, for the error message: "training".
+        without: packages of the extra that are not needed for this purpose.
 
     Raises:
         MissingExtra: a package is missing.
@@ -79,7 +79,7 @@ def require_extra(name: str, work: str, *, without: frozenset[str] = frozenset()
     ]
     if missing:
         raise MissingExtra(
-            f"{work} needs {', '.join(missing)}",
-            f"the extra brewster[{name}]",
+            f"{purpose} needs packages that are not installed: {', '.join(missing)}",
+            f"expected the extra brewster[{name}]",
             f"run: pip install 'brewster[{name}]'",
         )

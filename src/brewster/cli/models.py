@@ -1,4 +1,4 @@
-"""`brewster models`: list models, print cards, verify files, and upload a LoRA to the Hugging Face hub."""
+"""`brewster models`: list models, print their cards, verify their files, and upload a LoRA to the Hugging Face hub."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from brewster.models import zoo
 
 _JSON = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 _NAME = click.argument("name", default="compact")
-_CARD = "README.md"
+_CARD_FILE = "README.md"
 
 
 @click.group
@@ -43,10 +43,10 @@ def list_models(*, as_json: bool) -> None:
     "--scores",
     metavar="FILE",
     type=click.Path(path_type=Path),
-    help="First write the tables of this results.json of brewster evaluate into the card of the LoRA folder.",
+    help="Before printing, write the scores of this results.json of brewster evaluate into the card of the LoRA folder.",
 )
 def card(*, name: str, scores: Path | None) -> None:
-    """Print the card of a model or of a LoRA folder: licence, training data, scores, where it fails."""
+    """Print the model card of a model or of a LoRA folder: licence, training data, scores, limitations."""
     if scores:
         _update_scores(Path(name), scores)
     is_folder = name not in zoo.MODELS and Path(name).is_dir()
@@ -84,7 +84,10 @@ def verify(context: click.Context, *, names: tuple[str, ...], as_json: bool) -> 
 @click.argument("repo_id", metavar="OWNER/NAME")
 @click.option("--public", is_flag=True, help="Make the repository public; by default it is private.")
 @click.option(
-    "--message", metavar="TEXT", default="", help="The commit message; by default it names base and rank."
+    "--message",
+    metavar="TEXT",
+    default="",
+    help="The commit message; by default, one with the base model and the rank.",
 )
 @click.option(
     "--dry-run", is_flag=True, help="Check the folder, print the planned upload, and upload nothing."
@@ -93,10 +96,10 @@ def verify(context: click.Context, *, names: tuple[str, ...], as_json: bool) -> 
 def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: bool, as_json: bool) -> None:
     """Upload the LoRA in FOLDER to the Hugging Face hub as OWNER/NAME, in one commit.
 
-    The upload has the weights, the prompt embedding, the recipe and the card. It has no paths of this machine. The
-    token is HF_TOKEN, or the one of `hf auth login`.
+    The weights, the prompt embedding, the recipe and the model card are uploaded. Local paths in them are shortened to
+    their last part. The access token is the environment variable HF_TOKEN, or the token that `hf auth login` stored.
     """
-    require_extra("large", "pushing")
+    require_extra("large", "uploading a LoRA")
     from brewster.models.diffusion.adapter import hub  # noqa: PLC0415  (imports torch)
 
     plan = hub.plan_push(folder, repo_id, message=message, public=public)
@@ -111,7 +114,7 @@ def push(*, folder: Path, repo_id: str, public: bool, message: str, dry_run: boo
 
 
 def describe(model: zoo.ModelFile) -> dict[str, Any]:
-    """A model as JSON values; `error` is the problem with its file, or None."""
+    """Returns the properties of a model as JSON values. `error` is the problem with its file, or None."""
     row = {"name": model.name, "path": str(model.path), "licence": model.licence, "sha256": model.sha256}
     try:
         return row | {"sha256": model.verify(), "bytes": model.path.stat().st_size, "error": None}
@@ -120,20 +123,20 @@ def describe(model: zoo.ModelFile) -> dict[str, Any]:
 
 
 def _read_card(folder: Path) -> str:
-    path = folder / _CARD
+    path = folder / _CARD_FILE
     try:
         return path.read_text("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ModelError(
             f"{path} cannot be read ({error})",
             "expected the card that brewster train writes into the folder lora",
-            "give the path of that folder",
+            "give the path of the folder lora",
         ) from error
 
 
 def _update_scores(folder: Path, scores: Path) -> None:
-    """Replaces the scores in the card of this folder."""
-    require_extra("train", "writing a card")
+    """Replaces the benchmark tables in the model card of a LoRA folder."""
+    require_extra("train", "writing a model card")
     from brewster.evaluate.report.tables import overview  # noqa: PLC0415  (imports torch)
     from brewster.training.lora.model_card import with_benchmark_tables  # noqa: PLC0415
 
@@ -144,7 +147,7 @@ def _update_scores(folder: Path, scores: Path) -> None:
         raise ModelError(
             f"{scores} cannot be read ({error!r})",
             "expected the results.json of brewster evaluate",
-            "give the path of that file",
+            "give the path of that file with --scores",
         ) from error
     text = with_benchmark_tables(_read_card(folder), "\n".join(lines))
-    write_atomically(folder / _CARD, text.encode(), overwrite=True)
+    write_atomically(folder / _CARD_FILE, text.encode(), overwrite=True)

@@ -1,4 +1,4 @@
-"""The reference of all recipe keys, made from their pydantic models: `make docs` writes docs/recipes.md.
+"""Generates the reference of all recipe keys from their pydantic models: `make docs` writes docs/recipes.md.
 
 .venv/bin/python -m brewster.cli.recipe_reference > docs/recipes.md
 """
@@ -22,8 +22,8 @@ _BEGINNING: Final = """# Recipe keys
 `make docs` generates this page from the recipe models; a test checks that it is up to date.
 
 Recipes are TOML files. `brewster render --show-recipe window` and `brewster train --show-recipe compact` (or `lora`)
-print a complete recipe with all defaults and a comment for each key, ready to be edited. Both take the path of a recipe
-file, too. A wrong recipe is refused with one line for each problem."""
+print a complete recipe with all defaults and a comment for each key; edit this text to write your own recipe. Both
+options also take the path of a recipe file. The error for an invalid recipe has one line for each problem."""
 
 RECIPE_KINDS: Final[dict[str, tuple[type[FrozenModel], str]]] = {
     "Scene recipes": (
@@ -37,11 +37,11 @@ RECIPE_KINDS: Final[dict[str, tuple[type[FrozenModel], str]]] = {
     "Training recipes of a LoRA": (LoraRecipe, "For `brewster train`, with the key `backbone`."),
     "Ablations": (AblationStudy, "For `brewster ablate`."),
 }
-"""Title of a section of the page -> the model of its recipes, and what they are for."""
+"""Title of a section -> the pydantic model of its recipes, and their purpose."""
 
 
 def recipe_reference() -> str:
-    """The page, in Markdown: a table of keys for each table of each kind of recipe."""
+    """Returns the page in Markdown, with a table of keys for each TOML table of each kind of recipe."""
     return "\n\n".join([_BEGINNING, *_sections()]) + "\n"
 
 
@@ -69,9 +69,9 @@ def _row(key: RecipeKey) -> str:
 
 
 def _default(key: RecipeKey) -> str:
-    words = default_of(key)
-    value = words.removeprefix("default ")
-    return words if value == words else f"`{value}`"
+    text = default_of(key)
+    value = text.removeprefix("default ")
+    return text if value == text else f"`{value}`"
 
 
 if __name__ == "__main__":

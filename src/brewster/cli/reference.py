@@ -1,4 +1,4 @@
-"""The reference of the command line, generated from the commands: `make docs` writes docs/reference.md.
+"""Generates the reference of the command line from the commands: `make docs` writes docs/reference.md.
 
 .venv/bin/python -m brewster.cli.reference > docs/reference.md
 """
@@ -14,18 +14,18 @@ from brewster.cli import cli
 
 _BEGINNING = """# The command line
 
-Generated from the commands by `make docs`; a test checks that it is up to date.
+`make docs` generates this page from the commands; a test checks that it is up to date.
 
-Exit codes: 0 success, 1 error (standard error has one line `error: ...` for each), 2 wrong usage, 130 interrupted by
-Ctrl-C."""
+Exit codes: 0 success, 1 error (one line `error: ...` on standard error for each), 2 invalid arguments, 130 interrupted
+by Ctrl-C."""
 
 
 def reference() -> str:
-    """Every command with its options, as Markdown."""
-    return "\n\n".join([_BEGINNING, *_chapters(cli, click.Context(cli, info_name="brewster"))]) + "\n"
+    """Returns the page in Markdown, with a section for each command and its options."""
+    return "\n\n".join([_BEGINNING, *_sections(cli, click.Context(cli, info_name="brewster"))]) + "\n"
 
 
-def _chapters(command: click.Command, context: click.Context) -> Iterator[str]:
+def _sections(command: click.Command, context: click.Context) -> Iterator[str]:
     yield f"## {context.command_path}"
     yield f"    {context.command_path} {' '.join(command.collect_usage_pieces(context))}"
     yield inspect.cleandoc(command.help or "")
@@ -34,15 +34,15 @@ def _chapters(command: click.Command, context: click.Context) -> Iterator[str]:
         yield "\n".join(["| option | meaning |", "|---|---|", *rows])
     if isinstance(command, click.Group):
         for name, child in sorted(command.commands.items()):
-            yield from _chapters(child, click.Context(child, info_name=name, parent=context))
+            yield from _sections(child, click.Context(child, info_name=name, parent=context))
 
 
 def _row(option: click.Option) -> str:
     context = click.Context(cli)
     value = "" if option.is_flag else f" {option.make_metavar(context)}"
     default = f" Default: `{option.default}`." if option.show_default else ""
-    words = f"{', '.join(option.opts)}{value}".replace("|", "\\|")
-    return f"| `{words}` | {option.help}{default} |"
+    usage = f"{', '.join(option.opts)}{value}".replace("|", "\\|")
+    return f"| `{usage}` | {option.help}{default} |"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""`brewster render`: render a set of samples from a recipe, or one sample again from its scene.toml."""
+"""`brewster render`: render a set of samples from a recipe, or render one sample again from its scene.toml."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ class _Size(click.ParamType[tuple[int, int]]):
     def convert(
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[int, int]:
-        """Width and height.
+        """The width and the height in pixels.
 
         Raises:
-            click.BadParameter: the value is not two numbers in the range.
+            click.BadParameter: the value is not two integers from 16 to 16384 with an x between them.
         """
         if isinstance(value, tuple):
             return value
@@ -53,7 +53,11 @@ class _Size(click.ParamType[tuple[int, int]]):
         if not all(
             side.isascii() and side.isdigit() and 16 <= int(side) <= 16384 for side in (width, height)
         ):
-            self.fail(f"{value!r} is not a size; 512x384 is one, and sides go from 16 to 16384.", param, ctx)
+            self.fail(
+                f"{value!r} is not a size. Give width and height in pixels, from 16 to 16384, such as 512x384.",
+                param,
+                ctx,
+            )
         return int(width), int(height)
 
 
@@ -64,7 +68,7 @@ class _Size(click.ParamType[tuple[int, int]]):
     "--output",
     metavar="FOLDER",
     type=click.Path(path_type=Path),
-    help="The folder of the set; the same as OUT.",
+    help="The folder of the set, as an alternative to OUT.",
 )
 @click.option(
     "--recipe",
@@ -76,9 +80,11 @@ class _Size(click.ParamType[tuple[int, int]]):
 @click.option(
     "--show-recipe",
     metavar="NAME|FILE",
-    help="Print this recipe as TOML with all defaults and a comment for each key, and do not render.",
+    help="Do not render; print this recipe as TOML with all defaults and a comment for each key.",
 )
-@click.option("--count", type=click.IntRange(min=0), default=10, show_default=True, help="Number of samples.")
+@click.option(
+    "--count", type=click.IntRange(min=0), default=10, show_default=True, help="The number of samples."
+)
 @click.option(
     "--first", type=click.IntRange(min=0), default=0, show_default=True, help="The index of the first sample."
 )
@@ -87,45 +93,45 @@ class _Size(click.ParamType[tuple[int, int]]):
     type=click.IntRange(0, 2**32 - 1),
     default=0,
     show_default=True,
-    help="The random seed; a set is reproducible from its recipe and seed.",
+    help="The random seed. The same recipe and seed give the same set.",
 )
 @click.option(
     "--size",
     type=_Size(),
-    help="The size of the pictures in pixels, such as 512x384; by default the recipe's.",
+    help="The size of the images in pixels, such as 512x384; by default, the size in the recipe.",
 )
 @click.option(
     "--orders",
     type=click.Choice(["all", "paper"]),
-    help="The light paths in T and R: all, so that I = T + R, or only the single paths of the paper; by default the recipe's.",
+    help="The light paths in T and R: all of them (then I = T + R), or only the one path per layer that the paper uses; by default, the value in the recipe.",
 )
 @click.option(
     "--renderer",
     type=click.Choice(["analytic", "mitsuba"]),
-    help="The renderer: analytic for flat glass only, or mitsuba, a path tracer for all glass; by default analytic, or the renderer that --scene names.",
+    help="The renderer: analytic (flat glass only) or mitsuba (a path tracer for all kinds of glass); by default analytic, and with --scene the renderer in scene.toml.",
 )
 @click.option(
     "--maps",
-    metavar="DIR",
+    metavar="FOLDER",
     type=_FOLDER,
     multiple=True,
     help="A folder of HDR environment maps; repeatable. By default the built-in environments.",
 )
 @click.option(
     "--photos",
-    metavar="DIR",
+    metavar="FOLDER",
     type=_FOLDER,
     multiple=True,
     help="A folder of photos that are placed in front of the environment maps; repeatable.",
 )
 @click.option(
-    "--shards", is_flag=True, help="Pack each hundred samples into a tar file in the WebDataset layout."
+    "--shards", is_flag=True, help="Pack every 100 samples into a shard, a tar file in the WebDataset layout."
 )
-@click.option("--preview", is_flag=True, help="Also write preview.png, a sheet of the first 40 samples.")
+@click.option("--preview", is_flag=True, help="Also write preview.png, which shows the first 40 samples.")
 @click.option(
     "--workers",
     type=click.IntRange(min=0),
-    help="Number of processes that render; 0 renders in this process. By default one per core, at most 8.",
+    help="The number of worker processes; 0 renders in the main process. By default, one per CPU core, but at most 8.",
 )
 @click.option(
     "--cluster", metavar="local|ADDRESS", help="Render on a Ray cluster; its nodes must share the folder OUT."
@@ -133,7 +139,7 @@ class _Size(click.ParamType[tuple[int, int]]):
 @click.option(
     "--scene",
     type=click.Path(path_type=Path),
-    help="Render only the sample of this scene.toml again, directly into OUT.",
+    help="Render only the sample that this scene.toml describes, and write its files directly into OUT.",
 )
 @click.option(
     "--json", "as_json", is_flag=True, help="Print one line of JSON for each sample on standard output."
@@ -152,18 +158,19 @@ def render(
 ) -> None:
     """Render photographs through glass with their ground truth into the folder OUT.
 
-    Each sample is a folder: photo.jpg, its layers transmission.jpg and reflection.jpg, background.jpg (without
-    glass), mirror.jpg (with a mirror in place of the glass), all five in linear light in layers.exr, and scene.toml,
-    from which `brewster render --scene` writes the same bytes again. index.parquet lists all samples.
+    Each sample is a folder. It has five images: photo.jpg, its layers transmission.jpg and reflection.jpg,
+    background.jpg (without glass) and mirror.jpg (with a mirror in place of the glass). layers.exr has all five in
+    linear light. scene.toml describes the scene; `brewster render --scene` renders the same bytes from it.
+    index.parquet lists all samples.
 
-    Existing samples are kept: the same command resumes an interrupted run, and a larger --count adds samples. If a
-    sample fails, the others are still rendered, the failed sample is named, and the exit code is 1.
+    Existing samples are kept: to resume an interrupted run, run the same command again; to add samples, increase
+    --count. If a sample fails, the others are still rendered, the failed sample is listed, and the exit code is 1.
     """
     if show_recipe:
         _show_recipe(show_recipe)
         return
     if (out is None) == (output is None):
-        raise click.UsageError("Name one folder to render into: brewster render OUT.")
+        raise click.UsageError("Give one output folder, either as OUT or with -o: brewster render OUT.")
     require_extra("render", "rendering", without=_MITSUBA_PACKAGES)
     command = _RenderCommand(out or output or Path(), **options)
     if scene:
@@ -204,21 +211,21 @@ class _RenderCommand:
             print_status(f"{scene} -> {self.out}")
 
     def render_set(self) -> bool:
-        """Renders a set and prints each result; returns whether no sample failed."""
+        """Renders a set and prints each result. Returns whether no sample failed."""
         from brewster.rendered.generation.job import build  # noqa: PLC0415
         from brewster.rendered.generation.preview import write_preview  # noqa: PLC0415
 
         job, printer = self._job(), _RenderPrinter(self.as_json, self.quiet)
         shares_terminal = self.as_json and standard_output.stream.isatty()
-        with progress(self.count, shown=not self.quiet and not shares_terminal) as advance:
+        with progress(self.count, shown=not self.quiet and not shares_terminal) as update_progress:
 
-            def report(result: RenderResult) -> None:
+            def on_result(result: RenderResult) -> None:
                 printer.print_result(result)
-                advance(printer.counts.total(), f"sample {result.index}")
+                update_progress(printer.counts.total(), f"sample {result.index}")
                 interrupts.raise_pending()
 
             indices = range(self.first, self.first + self.count)
-            build(job, indices, self._executor(job), shards=self.shards, report=report)
+            build(job, indices, self._executor(job), shards=self.shards, report=on_result)
         if self.preview:
             write_preview(self.out)
         printer.print_summary(self.out)
@@ -236,7 +243,7 @@ class _RenderCommand:
         return RenderJob(self.out.resolve(), recipe, catalog, self.seed, self.renderer or "analytic", folders)
 
     def _recipe(self) -> SceneRecipe:
-        """The recipe, with --size and --orders in place of its own values."""
+        """Reads the recipe, and replaces its size and orders with the options --size and --orders if they are given."""
         from brewster.scene.recipe import read_scene_recipe  # noqa: PLC0415
 
         recipe = read_scene_recipe(self.recipe)
@@ -259,7 +266,7 @@ class _RenderCommand:
 
 @final
 class _RenderPrinter:
-    """Prints results as they arrive, and counts them. Memory does not grow with the number of samples."""
+    """Prints each result and counts the results by status. It does not store them, so that memory stays constant."""
 
     def __init__(self, as_json: bool, quiet: bool) -> None:
         self._as_json, self._quiet = as_json, quiet
@@ -292,9 +299,13 @@ def _show_recipe(name: str) -> None:
 
 
 def _reject_set_options(context: click.Context) -> None:
-    """With --scene, options that describe a set are a wrong usage: the scene defines the whole sample."""
+    """Checks that no option of a set is given together with --scene, which defines the whole sample.
+
+    Raises:
+        click.UsageError: such an option is given on the command line.
+    """
     for name in context.params.keys() - _SCENE_OPTIONS:
         if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
             raise click.UsageError(
-                f"--scene renders one existing sample; --{name} belongs to a set: leave it out."
+                f"--scene renders one sample, and --{name} belongs to a set: leave out --{name}."
             )

@@ -1,4 +1,4 @@
-"""`brewster separate`: the command, with one option for each field of `Options`."""
+"""`brewster separate`: separate photos; the command has one option for each field of `Options`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
 class _RangedNumber(click.FloatRange):
-    """A number in a range. It rejects `nan`, which comparisons with the limits do not."""
+    """A number in a range. NaN is rejected, which `click.FloatRange` accepts."""
 
     def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """The number.
@@ -34,13 +34,13 @@ class _RangedNumber(click.FloatRange):
         return number
 
 
-class _WordList(click.ParamType[tuple[str, ...]]):
-    """Words from a fixed list, separated by commas."""
+class _ChoiceList(click.ParamType[tuple[str, ...]]):
+    """One or more of a fixed list of choices, separated by commas."""
 
-    name = "words"
+    name = "choices"
 
-    def __init__(self, known: tuple[str, ...]) -> None:
-        self.known = known
+    def __init__(self, choices: tuple[str, ...]) -> None:
+        self.choices = choices
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context) -> str:  # noqa: ARG002
         """The placeholder for the value in the help text."""
@@ -49,16 +49,16 @@ class _WordList(click.ParamType[tuple[str, ...]]):
     def convert(
         self, value: object, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[str, ...]:
-        """The words without duplicates, in the order of the list.
+        """The given choices without duplicates, in the order of the list.
 
         Raises:
-            click.BadParameter: a word is not in the list.
+            click.BadParameter: a part of the value is not in the list.
         """
-        words = str(value).split(",")
-        unknown = [word for word in words if word not in self.known]
+        given = str(value).split(",")
+        unknown = [choice for choice in given if choice not in self.choices]
         if unknown:
-            self.fail(f"{unknown[0]!r} is not one of {', '.join(self.known)}.", param, ctx)
-        return tuple(word for word in self.known if word in words)
+            self.fail(f"{unknown[0]!r} is not one of {', '.join(self.choices)}.", param, ctx)
+        return tuple(choice for choice in self.choices if choice in given)
 
 
 def _with_options(command: _Command) -> _Command:
@@ -93,7 +93,7 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
     if hint is int:
         return click.IntRange(low, high)
     if get_origin(hint) is tuple:
-        return _WordList(get_args(get_args(hint)[0]))
+        return _ChoiceList(get_args(get_args(hint)[0]))
     return click.Choice(get_args(hint)) if get_origin(hint) is Literal else click.STRING
 
 
@@ -102,8 +102,8 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
 @click.option(
     "-o",
     "--output",
-    metavar="FOLDER|PICTURE|-",
-    help="The target of the layers: a folder, the name of a picture for one layer, or - for standard output.",
+    metavar="FOLDER|IMAGE|-",
+    help="The target of the layers: a folder, an image file for a single layer, or - for standard output.",
 )
 @_with_options
 @click.option(
@@ -127,12 +127,12 @@ def separate(
 ) -> None:
     """Separate photographs taken through glass into transmission and reflection.
 
-    PHOTO is a picture, a folder of pictures, or - for standard input. The layers of photo.jpg are written next to it
-    as photo.transmission.jpg and photo.reflection.jpg, or into the output folder, which mirrors the tree below a
-    source folder. Standard output and a picture named with -o take one layer: by default the transmission, or the one
-    named with --layers.
+    PHOTO is an image file, a folder of image files, or - for standard input. The layers of photo.jpg are written next
+    to it as photo.transmission.jpg and photo.reflection.jpg, or into the output folder, which mirrors the tree below an
+    input folder. If the target is standard output or an image file, only one layer is written: by default the
+    transmission, else the one that --layers selects.
 
-    Photos whose layers exist are skipped. If a photo fails, the others are still separated, the failed photo is named
+    Photos whose layers exist are skipped. If a photo fails, the others are still separated, the failed photo is listed
     at the end, and the exit code is 1.
     """
     single_output = is_single_output(photos, output)
@@ -150,10 +150,16 @@ def separate(
 
 
 def _reject_shared_output(*, as_json: bool) -> None:
-    """Checks that a picture on standard output mixes neither with JSON nor with the text of a terminal."""
+    """Checks that standard output is used for the image only: it is not a terminal, and --json is off.
+
+    Raises:
+        click.UsageError: standard output is also used for JSON or is a terminal.
+    """
     if as_json:
-        raise click.UsageError("--json and a picture cannot share standard output: name the picture with -o.")
+        raise click.UsageError(
+            "--json and an image cannot both be written to standard output: give the image a file name with -o."
+        )
     if standard_output.stream.isatty():
         raise click.UsageError(
-            "A picture would go to the terminal: redirect it with > or |, or name it with -o."
+            "Standard output is a terminal, and an image cannot be written to it: redirect it with > or |, or give the image a file name with -o."
         )

@@ -1,4 +1,4 @@
-"""`brewster study`: a user study of which of two results people prefer: create, plan, serve and report it."""
+"""`brewster study`: create, plan, serve and report a user study that asks which of two results people prefer."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from brewster.cli.serve import AUTO, address_options, print_link
 from brewster.cli.terminal import print_out, print_status, progress, write_out
 from brewster.errors import BrewsterError
 
-_NAME: Final = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)*", re.IGNORECASE)
-_MAX_BYTES: Final = 10_000  # an answer has eighty bytes
+_HOST_NAME: Final = re.compile(r"[a-z0-9_-]+(\.[a-z0-9_-]+)*", re.IGNORECASE)
+_MAX_BYTES: Final = 10_000  # an answer has about 80 bytes
 _FOLDER: Final = click.Path(path_type=Path, file_okay=False)
 _WARNING: Final = (
     "warning: everybody who can reach {host} can take part, and the connection is not encrypted; "
-    "behind a proxy that encrypts, keep 127.0.0.1 and give the name of the proxy with --called"
+    "for an encrypted connection, keep --host 127.0.0.1, run an HTTPS proxy in front, and give its name with --host-name"
 )
 
 
 @click.group
 def study() -> None:
-    """Run a user study of which of two results people prefer: blind, random pairs with catch trials.
+    """Run a user study that asks which of two results people prefer: blind, random pairs with catch trials.
 
-    `create` makes a study from folders of outputs, `plan` computes the number of participants, `serve` runs the page for
-    participants, and `report` evaluates their answers. docs/study.md has the definitions.
+    `create` makes a study from folders of outputs, `plan` computes the required number of participants, `serve` serves
+    the page for participants, and `report` evaluates their answers. docs/study.md defines all terms.
     """
 
 
@@ -42,8 +42,8 @@ def study() -> None:
     "--inputs",
     type=_FOLDER,
     required=True,
-    metavar="DIR",
-    help="The photos, or a folder of photos for each dataset.",
+    metavar="FOLDER",
+    help="The folder of the photos. It has either photos or one subfolder of photos for each dataset.",
 )
 @click.option(
     "--method",
@@ -51,40 +51,40 @@ def study() -> None:
     type=NamedValue("RDNet=out/rdnet"),
     multiple=True,
     required=True,
-    metavar="NAME=DIR",
-    help="The outputs of a method, named like the inputs; give two or more. The first method is compared with each other method.",
+    metavar="NAME=FOLDER",
+    help="The name of a method and the folder of its outputs, named like the inputs; give two or more methods. The first method is compared with each other method.",
 )
 @click.option(
     "--dataset",
     "datasets",
     multiple=True,
     metavar="NAME",
-    help="Use only this dataset; repeatable, the order is kept.",
+    help="Use only this dataset; repeatable. The report lists the datasets in this order.",
 )
 @click.option("--all-pairs", is_flag=True, help="Compare each method with every other method.")
 @click.option(
     "--pairs",
     type=click.IntRange(1),
     metavar="NUMBER",
-    help="Number of pairs per participant; by default 40, or all if there are fewer.",
+    help="The number of pairs per participant; by default 40, or all pairs if the study has fewer.",
 )
 @click.option(
-    "--catches",
+    "--catch-trials",
     type=click.IntRange(0),
     metavar="NUMBER",
-    help="Number of catch trials per participant, alternately two equal pictures and a degraded one; by default 4.",
+    help="The number of catch trials per participant, by default 4. They alternate between two kinds: an output next to itself, and an output next to a degraded copy of it.",
 )
 @click.option(
     "--seed",
     type=click.IntRange(0),
     metavar="NUMBER",
-    help="The random seed of the assignment; by default a random one, which the study stores.",
+    help="The random seed of the assignment; by default a random number. The study stores the seed.",
 )
 @click.option(
     "--consent",
     type=click.Path(path_type=Path, dir_okay=False, exists=True),
     metavar="FILE",
-    help="The consent text: plain text with empty lines between paragraphs; by default the text of brewster.",
+    help="A file with the consent text: plain text with empty lines between paragraphs; by default, brewster uses its own text.",
 )
 def create(
     out: Path,
@@ -94,15 +94,16 @@ def create(
     datasets: tuple[str, ...],
     all_pairs: bool,
     pairs: int | None,
-    catches: int | None,
+    catch_trials: int | None,
     seed: int | None,
     consent: Path | None,
 ) -> None:
     """Create a study in the folder OUT from folders of outputs.
 
-    Pictures are paired by name, independent of their format: DIR/real/12.png and DIR/nature/3.jpg belong to the datasets
-    real and nature; DIR/12.png belongs to the only dataset. If a picture is missing, duplicate, unreadable or of another
-    size, it is named, and nothing is written. The study has copies of all pictures, and can be moved.
+    Inputs and outputs are paired by dataset and file name, whatever their format. FOLDER/real/12.png and
+    FOLDER/nature/3.jpg belong to the datasets real and nature; without subfolders, FOLDER/12.png belongs to a single
+    dataset without a name. If an image is missing, duplicate, unreadable or of another size, the error lists it, and
+    nothing is written. The study folder contains copies of all images and can be moved.
     """
     from brewster.user_study.create import CATCH_POOL_SIZE, DEFAULT_CONSENT, StudyOptions  # noqa: PLC0415  (imports pyvips)
     from brewster.user_study.create import create as freeze  # noqa: PLC0415
@@ -111,17 +112,19 @@ def create(
     folders = {name: Path(folder) for name, folder in methods}
     if len(folders) < len(methods):
         raise BrewsterError(
-            f"two methods share a name of {', '.join(name for name, _ in methods)}",
-            "each method needs a name of its own",
-            "choose different names",
+            f"two methods share a name; the names are {', '.join(name for name, _ in methods)}",
+            "expected a different name for each method",
+            "rename one of the methods",
         )
     text = DEFAULT_CONSENT if consent is None else _read_consent(consent)
-    chosen = StudyOptions(
-        datasets=datasets, pairs=pairs, catches=catches, all_pairs=all_pairs, seed=seed, consent=text
+    options = StudyOptions(
+        datasets=datasets, pairs=pairs, catches=catch_trials, all_pairs=all_pairs, seed=seed, consent=text
     )
     total = len(find_pictures(inputs, datasets)) * (1 + len(folders)) + CATCH_POOL_SIZE
-    with progress(total, shown=True) as advance:
-        description = freeze(out, inputs, folders, chosen, lambda done: advance(done, "copying")).description
+    with progress(total, shown=True) as update_progress:
+        description = freeze(
+            out, inputs, folders, options, lambda done: update_progress(done, "copying")
+        ).description
     print_status(
         f"{out}: {len(description.comparisons)} comparisons of {len(description.methods)} methods; a participant sees "
         f"{description.pairs} of them and {description.catches} catch trials (seed {description.seed})"
@@ -134,42 +137,62 @@ def _read_consent(path: Path) -> str:
         return path.read_text("utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
         raise BrewsterError(
-            f"{path} cannot be read ({error})", "expected plain text in UTF-8", "save it in that encoding"
+            f"{path} cannot be read ({error})", "expected plain text in UTF-8", "save the file as UTF-8"
         ) from error
 
 
-def _read_names(_context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]) -> list[str]:
-    """Names as they appear in the Host header, in lower case. The middleware compares them without the port."""
+def _read_host_names(
+    _context: click.Context, _parameter: click.Parameter, names: tuple[str, ...]
+) -> list[str]:
+    """Checks the host names, and returns them in lower case. The middleware compares them with the Host header.
+
+    Raises:
+        click.BadParameter: a name is neither a host name nor an IP address.
+    """
     for name in names:
-        if not _NAME.fullmatch(name):
+        if not _HOST_NAME.fullmatch(name):
             try:
                 ipaddress.ip_address(name)
             except ValueError as error:
                 raise click.BadParameter(
                     f"{name!r} is not a bare host name, such as study.example.org: "
-                    "leave out https://, the port and the path, and write letters other than a-z as xn--."
+                    "leave out https://, the port and the path, and encode letters other than a-z as Punycode (xn--...)."
                 ) from error
     return [name.lower() for name in names]
 
 
 @study.command
 @click.argument("folder", metavar="STUDY", type=_FOLDER)
-@address_options(8420, "Require this token in each request; auto generates one and stores it in STUDY/token.")
-@click.option(
-    "--called",
-    multiple=True,
-    callback=_read_names,
-    metavar="NAME",
-    help="Another host name of this server, such as that of a proxy in front of it: study.example.org; repeatable.",
+@address_options(
+    8420, "The token that each request must contain; auto generates one and stores it in STUDY/token."
 )
-@click.option("--most", type=click.IntRange(1), metavar="NUMBER", help="The largest number of participants.")
+@click.option(
+    "--host-name",
+    "host_names",
+    multiple=True,
+    callback=_read_host_names,
+    metavar="NAME",
+    help="Another host name of this server, such as study.example.org, the name of a proxy in front of it; repeatable.",
+)
+@click.option(
+    "--max-participants",
+    type=click.IntRange(1),
+    metavar="NUMBER",
+    help="The maximum number of participants.",
+)
 def serve(
-    folder: Path, *, host: str, port: int, called: list[str], token: str | None, most: int | None
+    folder: Path,
+    *,
+    host: str,
+    port: int,
+    host_names: list[str],
+    token: str | None,
+    max_participants: int | None,
 ) -> None:
     """Serve the page for participants until Ctrl-C.
 
-    Each answer is stored on the disk before it is acknowledged. The same command resumes a study after the server was
-    stopped or killed.
+    Each answer is stored on the disk before it is acknowledged. After the server was stopped or killed, run the same
+    command again to continue the study.
     """
     require_extra("web", "serving", without=frozenset({"matplotlib"}))
     from brewster.user_study.access_token import load_or_create_token  # noqa: PLC0415
@@ -185,10 +208,10 @@ def serve(
         print_status(_WARNING.format(host=host))
     token = load_or_create_token(folder) if token == AUTO else token
     limits = RequestLimits.for_host(host, token=token, max_bytes=_MAX_BYTES)
-    limits = replace(limits, hosts=limits.hosts | {*called})
+    limits = replace(limits, hosts=limits.hosts | {*host_names})
     store = AnswerStore(frozen_study)
     app = web.create_app(
-        study_router(frozen_study, store, max_participants=most, token=token),
+        study_router(frozen_study, store, max_participants=max_participants, token=token),
         limits=limits,
         index="study.html",
     )
@@ -204,35 +227,33 @@ def serve(
     "--output",
     "out",
     type=_FOLDER,
-    metavar="DIR",
+    metavar="FOLDER",
     help="The folder for the report; by default STUDY/report.",
 )
 @click.option(
-    "--most-failed",
+    "--max-failed",
     type=click.FloatRange(0, 1),
     default=0.25,
     show_default=True,
-    metavar="SHARE",
-    help="Exclude participants who fail a larger share of the catch trials.",
+    metavar="FRACTION",
+    help="The maximum fraction of failed catch trials; participants who fail more are excluded.",
 )
 @click.option(
-    "--least-seconds",
+    "--min-seconds",
     type=click.FloatRange(0),
     default=1.5,
     show_default=True,
     metavar="SECONDS",
-    help="Exclude participants who need less time for half of all trials.",
+    help="The minimum median time per trial; participants with a shorter one are excluded.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the results as JSON instead of the tables.")
-def report(
-    folder: Path, *, out: Path | None, most_failed: float, least_seconds: float, as_json: bool
-) -> None:
-    """Evaluate the answers, with and without the exclusion of unreliable participants.
+def report(folder: Path, *, out: Path | None, max_failed: float, min_seconds: float, as_json: bool) -> None:
+    """Evaluate the answers, both without the excluded participants and with all participants.
 
-    The tables go to standard output. The folder gets report.md, report.json, table.tex (in the layout of the paper's
-    Table 3), table.csv, answers.csv and plot.png. The server may run at the same time.
+    The tables are printed on standard output. The output folder gets report.md, report.json, table.tex
+    (in the layout of the paper's Table 3), table.csv, answers.csv and plot.png. The server may run at the same time.
     """
-    require_extra("web", "reporting", without=frozenset({"fastapi", "python-multipart", "uvicorn"}))
+    require_extra("web", "the report", without=frozenset({"fastapi", "python-multipart", "uvicorn"}))
     from brewster.user_study.report.participants import ExclusionRule, collect_answers  # noqa: PLC0415
     from brewster.user_study.report.results import summarise, write  # noqa: PLC0415
     from brewster.user_study.report.tables import overview  # noqa: PLC0415
@@ -241,10 +262,10 @@ def report(
 
     frozen_study = read_study(folder)
     with contextlib.closing(AnswerStore(frozen_study, read_only=True)) as store:
-        answered = collect_answers(store.all_answers())
-    results = summarise(frozen_study, answered, ExclusionRule(most_failed, least_seconds))
+        answers = collect_answers(store.all_answers())
+    results = summarise(frozen_study, answers, ExclusionRule(max_failed, min_seconds))
     out = folder / "report" if out is None else out
-    write(results, frozen_study, answered, out)
+    write(results, frozen_study, answers, out)
     write_out((json.dumps(results) + "\n" if as_json else overview(results)).encode())
     print_status(f"the report is in {out}")
 
@@ -254,17 +275,17 @@ def report(
     "--difference",
     type=click.FloatRange(0, 1, min_open=True),
     required=True,
-    metavar="SHARE",
-    help="The difference of win rate and loss rate to detect, such as 0.1.",
+    metavar="FRACTION",
+    help="The difference between win rate and loss rate to detect, such as 0.1.",
 )
-@click.option("--tie", type=click.FloatRange(0, 1, max_open=True), default=0.25, show_default=True, metavar="SHARE", help='The share of the answer "similar".')  # fmt: skip
+@click.option("--tie", type=click.FloatRange(0, 1, max_open=True), default=0.25, show_default=True, metavar="FRACTION", help='The expected fraction of the answer "similar".')  # fmt: skip
 @click.option(
     "--pairs",
     type=click.IntRange(1),
     default=40,
     show_default=True,
     metavar="NUMBER",
-    help="Number of pairs of these two methods per participant.",
+    help="The number of pairs of these two methods per participant.",
 )
 @click.option(
     "--correlation",
@@ -272,14 +293,14 @@ def report(
     default=0.05,
     show_default=True,
     metavar="NUMBER",
-    help="The correlation of the answers of one participant; `report` estimates it.",
+    help="The intraclass correlation of the answers of one participant; `brewster study report` estimates it.",
 )
-@click.option("--power", type=click.FloatRange(0.5, 1, max_open=True), default=0.8, show_default=True, metavar="SHARE", help="The probability of detecting the difference if it exists.")  # fmt: skip
+@click.option("--power", type=click.FloatRange(0.5, 1, max_open=True), default=0.8, show_default=True, metavar="FRACTION", help="The probability of detecting the difference if it exists.")  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def plan(
     *, difference: float, tie: float, pairs: int, correlation: float, power: float, as_json: bool
 ) -> None:
-    """Compute the number of participants that detect a difference at the 5 % level."""
+    """Compute the number of participants needed to detect a difference at the 5 % significance level."""
     from brewster.user_study.power_analysis import required_participants  # noqa: PLC0415
 
     estimate = required_participants(
@@ -289,10 +310,11 @@ def plan(
         print_out(json.dumps(asdict(estimate)))
         return
     print_out(
-        f"{estimate.participants} participants ({estimate.answers} answers) show {estimate.win:.1%} wins to {estimate.lose:.1%} "
-        f"losses with {power:.0%} power at the 5 % level."
+        f"{estimate.participants} participants ({estimate.answers} answers) are needed to detect {estimate.win:.1%} wins against "
+        f"{estimate.lose:.1%} losses with {power:.0%} power at the 5 % significance level."
     )
     print_out(
-        f"{pairs} pairs each, correlation {correlation:g}: {estimate.design_effect:.2f} answers have the information of one "
-        f"independent answer; the differences of single participants have a standard deviation of {estimate.deviation:.0%}."
+        f"With {pairs} pairs each and correlation {correlation:g}, the design effect is {estimate.design_effect:.2f}: this number of "
+        f"answers carries as much information as one independent answer. Between participants, the difference of wins and "
+        f"losses has a standard deviation of {estimate.deviation:.0%}."
     )

@@ -1,4 +1,7 @@
-"""Output and Ctrl-C: results go to standard output; status lines, errors and progress bars go to standard error."""
+"""Standard output, standard error and Ctrl-C.
+
+Results are written to standard output. Status lines, errors and progress bars are written to standard error.
+"""
 
 from __future__ import annotations
 
@@ -13,16 +16,16 @@ from brewster.errors import TargetError
 if TYPE_CHECKING:
     from sys import UnraisableHookArgs
 
-Advance = Callable[[float, str], None]
-"""Called with the number of items that are done, which may be fractional, and a text about the current item."""
+ProgressUpdater = Callable[[float, str], None]
+"""Called with the number of finished items, which may be fractional, and a text about the current item."""
 
 
 @final
 class _DeferredInterrupts:
-    """Ctrl-C that Python has dropped, to be raised later.
+    """Remembers a KeyboardInterrupt that Python has dropped, and raises it later.
 
-    If Ctrl-C is pressed while C code calls Python (libvips does, to write its log), the KeyboardInterrupt cannot pass
-    through the C code. Python drops it, and the work would continue.
+    libvips calls Python to write its log. If Ctrl-C is pressed during such a call, the KeyboardInterrupt cannot pass
+    through the C code, so Python drops it. Without this class, the command would continue.
     """
 
     def __init__(self) -> None:
@@ -56,7 +59,7 @@ interrupts = _DeferredInterrupts()
 
 
 def one_line(text: object) -> str:
-    """The text in one line, with unprintable characters escaped: file names may have newlines and invalid bytes."""
+    """Returns the text with unprintable characters escaped: file names may contain newlines and invalid bytes."""
     return "".join(
         letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in str(text)
     )
@@ -75,7 +78,7 @@ def print_error(text: object) -> None:
 
 @final
 class _Output:
-    """Standard output, reserved for the results of the command: output of libraries is redirected to standard error.
+    """Standard output, reserved for the results of the command. The output of libraries is redirected to standard error.
 
     Libraries print in two ways, and each needs its own redirection. C code and child processes write to file
     descriptor 1. Python code writes to `sys.stdout`, as OpenEXR does for a damaged file.
@@ -86,23 +89,23 @@ class _Output:
 
     @property
     def stream(self) -> TextIO:
-        """The stream that results are written to."""
+        """The stream to which results are written."""
         return self._stream or sys.stdout
 
     def redirect_descriptor(self) -> None:
-        """Points file descriptor 1 to standard error for the rest of this process; `sys.stdout` gets a copy of the original.
+        """Redirects file descriptor 1 to standard error. `sys.stdout` writes to a copy of the original descriptor.
 
-        The descriptor is not restored, because C code buffers its output until the process ends.
+        The redirection lasts until the process ends, because C code may write its buffered output that late.
         """
         try:
             if sys.stdout.fileno() != _STDOUT:  # a test or a notebook has replaced it
                 return
             sys.stdout.flush()
-            own = os.dup(_STDOUT)
+            fd = os.dup(_STDOUT)
             os.dup2(_STDERR, _STDOUT)
         except (AttributeError, OSError):  # standard output or standard error is closed
             return
-        sys.stdout = open(own, "w", encoding=sys.stdout.encoding, errors=sys.stdout.errors, closefd=False)  # noqa: SIM115
+        sys.stdout = open(fd, "w", encoding=sys.stdout.encoding, errors=sys.stdout.errors, closefd=False)  # noqa: SIM115
 
     @contextmanager
     def reserved(self) -> Iterator[None]:
@@ -141,22 +144,22 @@ def write_out(data: bytes) -> None:
         stream.buffer.write(data)
         stream.flush()
     except OSError as error:
-        # Python flushes the buffer again when it exits: that must not fail a second time.
+        # Python flushes the buffer again when it exits. With /dev/null as the target, this cannot fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
         raise TargetError(
             f"standard output was not written ({error.strerror})",
-            "the receiver must accept all of it",
-            "write to a file with -o",
+            "expected a destination that accepts all of the output",
+            "write to a file with -o instead",
         ) from error
 
 
 @contextmanager
-def progress(total: int, *, shown: bool) -> Iterator[Advance]:
-    """A progress bar on standard error, if `shown` is set and standard error is a terminal."""
+def progress(total: int, *, shown: bool) -> Iterator[ProgressUpdater]:
+    """Shows a progress bar on standard error if `shown` is set and standard error is a terminal; yields its updater."""
     if not (shown and sys.stderr.isatty()):
         yield lambda _done, _text: None
         return
-    from rich.console import Console  # noqa: PLC0415  (slow to import, and needed on a terminal only)
+    from rich.console import Console  # noqa: PLC0415  (slow to import; only used on a terminal)
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn  # noqa: PLC0415
 
     columns = (

@@ -1,4 +1,4 @@
-"""`brewster train`: train a model from a recipe; the run can be resumed."""
+"""`brewster train`: train a model from a recipe. An interrupted run can be resumed."""
 
 from __future__ import annotations
 
@@ -24,22 +24,23 @@ if TYPE_CHECKING:
     "out",
     metavar="FOLDER",
     type=click.Path(path_type=Path),
-    help="The folder for checkpoint, log, samples and, at the end, model.onnx or the folder lora. By default out/NAME for NAME.toml.",
+    help="The folder for the checkpoint, the log, sample images and the trained model (model.onnx or the folder lora); by default out/NAME for NAME.toml.",
 )
 @click.option(
     "--plan",
     is_flag=True,
-    help="Estimate memory and time for the recipe of a large backbone, check whether they fit, and do not train.",
+    help="Do not train; estimate the memory and time that a recipe with a large backbone needs, and check that the memory of the GPU suffices.",
 )
 @click.option(
-    "--card",
+    "--gpu",
+    "gpu_name",
     metavar="NAME",
-    help='Estimate for this graphics card, such as "RTX 4090", instead of the one in this machine; implies --plan.',
+    help='Estimate for this GPU, such as "RTX 4090", instead of the GPU of this machine; implies --plan.',
 )
 @click.option(
     "--show-recipe",
     metavar="NAME|FILE",
-    help="Print a recipe as TOML with all defaults and a comment for each key, and do not train: compact, lora, or a file.",
+    help="Do not train; print a recipe as TOML with all defaults and a comment for each key. NAME is compact or lora; FILE is a recipe.",
 )
 @click.option("--quiet", is_flag=True, help="Print only errors.")
 def train(
@@ -47,28 +48,29 @@ def train(
     recipe: Path | None,
     out: Path | None,
     plan: bool,
-    card: str | None,
+    gpu_name: str | None,
     show_recipe: str | None,
     quiet: bool,
 ) -> None:
     """Train a model with the settings of RECIPE, a TOML file.
 
-    The environment variable BREWSTER_DATA names the data folder. The same command resumes an interrupted run from its
-    last checkpoint, and ends with the same weights. Under torchrun, several GPUs train a large backbone together.
+    The environment variable BREWSTER_DATA is the path of the data folder. To resume an interrupted run from its last
+    checkpoint, run the same command again: the final weights are the same. With torchrun, a large backbone is trained
+    on several GPUs (data parallel).
     """
     require_extra("train", "training")
     if show_recipe:
         _show_recipe(show_recipe)
         return
     if recipe is None:
-        raise click.UsageError("Name a recipe: brewster train RECIPE.")
+        raise click.UsageError("The recipe is missing. Usage: brewster train RECIPE.")
     from brewster.training.recipe import LoraRecipe, read_recipe  # noqa: PLC0415  (imports torch, two seconds)
 
     parsed, out = read_recipe(recipe), out or Path("out") / recipe.stem
     if isinstance(parsed, LoraRecipe):
-        require_extra("large", "a large backbone")
-    if plan or card:
-        _print_plan(parsed, card)
+        require_extra("large", "training a large backbone")
+    if plan or gpu_name:
+        _print_plan(parsed, gpu_name)
         return
     _make_folder(out)
     from brewster.training.distributed import is_main_process  # noqa: PLC0415
@@ -77,20 +79,20 @@ def train(
 
     trainer = open_trainer(parsed)
     quiet = quiet or not is_main_process()
-    with progress(parsed.steps, shown=not quiet) as advance:
+    with progress(parsed.steps, shown=not quiet) as update_progress:
 
-        def report(step: int, steps: int, metrics: Mapping[str, float], logged: bool) -> None:
+        def on_progress(step: int, steps: int, metrics: Mapping[str, float], is_logged: bool) -> None:
             interrupts.raise_pending()
-            advance(step, f"loss {metrics['loss']:.4f}")
-            if logged and not quiet:
+            update_progress(step, f"loss {metrics['loss']:.4f}")
+            if is_logged and not quiet:
                 line = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
                 print_status(f"step {step} of {steps}: {line}")
 
-        run(trainer, out, report)
+        run(trainer, out, on_progress)
     if is_main_process():
         model = trainer.export(out)
         if not quiet:
-            print_status(f"the model is {model}")
+            print_status(f"the model is in {model}")
 
 
 def _show_recipe(name: str) -> None:
@@ -100,20 +102,20 @@ def _show_recipe(name: str) -> None:
     print_out(commented_toml(read_template(name)).rstrip())
 
 
-def _print_plan(recipe: CompactRecipe | LoraRecipe, card: str | None) -> None:
-    from brewster.training.lora.resource_estimate import estimate_resources, find_card, is_local_gpu  # noqa: PLC0415
+def _print_plan(recipe: CompactRecipe | LoraRecipe, gpu_name: str | None) -> None:
+    from brewster.training.lora.resource_estimate import estimate_resources, find_gpu, is_local_gpu  # noqa: PLC0415
     from brewster.training.recipe import LoraRecipe  # noqa: PLC0415
 
     if not isinstance(recipe, LoraRecipe):
         raise RecipeError(
             "the recipe trains the compact network",
-            "--plan needs the recipe of a large backbone",
+            "expected a recipe with the key backbone for --plan",
             "train it without --plan",
         )
-    gpu = find_card(card)
-    if card is None and not is_local_gpu(gpu):
+    gpu = find_gpu(gpu_name)
+    if gpu_name is None and not is_local_gpu(gpu):
         print_status(
-            f"no graphics card found: the plan is for {gpu.name}, the paper's card; choose another with --card"
+            f"no GPU found: the estimate is for the {gpu.name} of the paper; choose another GPU with --gpu"
         )
     estimate = estimate_resources(recipe, gpu)
     print_out(estimate.table())
@@ -126,6 +128,6 @@ def _make_folder(folder: Path) -> None:
     except OSError as error:
         raise TargetError(
             f"{folder} cannot be created ({error.strerror})",
-            "the run needs a folder that can be written",
-            "choose another with -o",
+            "expected a writable folder for the run",
+            "choose another folder with -o",
         ) from error

@@ -139,7 +139,7 @@ def _pair_pictures(inputs: Path, methods: Mapping[str, Path], datasets: Sequence
         raise BrewsterError(
             f"the number of methods is {len(methods)}",
             "expected two or more methods",
-            "add another --method NAME=DIR",
+            "add another --method NAME=FOLDER",
         )
     files = _StudyFiles(
         find_pictures(inputs, datasets),

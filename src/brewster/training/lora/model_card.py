@@ -38,7 +38,7 @@ _PANELS: Final = {
 _SQUARE_PHOTO_PX: Final = (4096, 4096)
 """A large square photo: its panels fill the pixel budget best."""
 _BENCHMARK_HEADING: Final = "## Measured"
-_NO_BENCHMARKS: Final = """No benchmark yet. `brewster evaluate --benchmark NAME=DIR --model lora` scores the model, and
+_NO_BENCHMARKS: Final = """No benchmark yet. `brewster evaluate --benchmark NAME=FOLDER --model lora` scores the model, and
 `brewster models card lora --scores out/evaluate/results.json` writes the tables here."""
 
 _LIMITS: Final = """## Limits

@@ -128,7 +128,7 @@ class ResourceEstimate:
         return "lower budget_px or rank, take a smaller backbone (klein) or a larger card"
 
 
-def find_card(name: str | None = None) -> GraphicsCard:
+def find_gpu(name: str | None = None) -> GraphicsCard:
     """Returns the card of this name; without a name, the local GPU, or the RTX 4090 if there is none.
 
     Raises:

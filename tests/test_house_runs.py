@@ -1,4 +1,4 @@
-"""The experiments in runs/ work: the tiny one completely, the large ones as far as possible on a CPU."""
+"""The scripts in runs/ work: the tiny experiment completely, the large ones as far as possible on a CPU."""
 
 import json
 import os
@@ -21,20 +21,20 @@ BIN = Path(sys.executable).parent
 
 
 def run_script(name, *args, path=BIN, **variables):
-    """Runs a script of runs/ offline in a process of its own, and returns its output."""
-    done = subprocess.run(
+    """Runs a script of runs/ in its own process. Returns its output."""
+    process = subprocess.run(
         [RUNS / name, *map(str, args)],
         env=os.environ | {"PATH": f"{path}:{os.environ['PATH']}"} | variables,
         capture_output=True,
         text=True,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    assert process.returncode == 0, process.stderr
+    return process.stdout
 
 
-def cells(table):
-    """The rows of a Markdown table by their first cell."""
+def rows_by_first_cell(table):
+    """Returns the rows of a Markdown table: first cell -> the other cells."""
     rows = [
         [cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines() if "|" in line
     ]
@@ -44,7 +44,7 @@ def cells(table):
 def test_the_tiny_experiment_renders_trains_separates_and_evaluates(tmp_path):
     output = run_script("tiny.sh", tmp_path)
     scores = {
-        method: [float(score) for score in cells(output)[method][0].split(" / ")]
+        method: [float(score) for score in rows_by_first_cell(output)[method][0].split(" / ")]
         for method in ("input (unprocessed)", "compact", "lora")
     }
     assert all(psnr > 5 and ssim > 0 for psnr, ssim in scores.values())
@@ -55,7 +55,7 @@ def test_the_tiny_experiment_renders_trains_separates_and_evaluates(tmp_path):
         assert made.size == Photo.open(ROOT / "tests/pictures/mixture-coffee-rocket.jpg").size
     card = (tmp_path / "card.md").read_text()
     assert "**This is a toy.**" in card
-    assert cells(card.partition("## Measured")[2])["lora"] == cells(output)["lora"]
+    assert rows_by_first_cell(card.partition("## Measured")[2])["lora"] == rows_by_first_cell(output)["lora"]
     assert {path.name for path in (tmp_path / "lora").iterdir()} == set(FILES)
     assert output.splitlines()[-1] == "nothing was sent"
 
@@ -64,17 +64,17 @@ def test_the_full_size_check_runs_on_tiny_models(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["full_size_check.py", "--tiny", "--out", str(tmp_path)])
     with pytest.raises(SystemExit, match="0"):
         runpy.run_path(str(RUNS / "full_size_check.py"), run_name="__main__")
-    output = cells(capsys.readouterr().out)
+    output = rows_by_first_cell(capsys.readouterr().out)
     rows = json.loads((tmp_path / "full_size.json").read_text())["rows"]
     assert [(row["backbone"], row["quantise"]) for row in rows] == [("kontext", "int8"), ("klein", None)]
     assert all(row["step_s"] > 0 and row["picture_s"] > 0 and row["fits"] for row in rows)
     assert output["measured or estimated"] == ["toy twin, not full size"] * 2
-    assert cells((tmp_path / "full_size.md").read_text()) == output
+    assert rows_by_first_cell((tmp_path / "full_size.md").read_text()) == output
 
 
 @pytest.mark.slow
 def test_without_a_gpu_the_full_size_check_prints_estimates(tmp_path):
-    output = cells(run_script("full_size_check.sh", OUT=str(tmp_path), CUDA_VISIBLE_DEVICES=""))
+    output = rows_by_first_cell(run_script("full_size_check.sh", OUT=str(tmp_path), CUDA_VISIBLE_DEVICES=""))
     assert all(kind.startswith("ESTIMATED") for kind in output["measured or estimated"])
     assert float(output["parameters, billions"][0]) == 11.9
     assert all(float(peak) < 24 for peak in output["peak during training, GiB"])
@@ -84,30 +84,30 @@ def test_every_command_of_the_paper_experiment_is_valid(tmp_path):
     """A stub records the arguments of each call. The command line then parses them, and runs nothing."""
     calls, stub = tmp_path / "calls", tmp_path / "bin" / "brewster"
     stub.parent.mkdir()
-    note = f"import json, sys\nopen({str(calls)!r}, 'a').write(json.dumps(sys.argv[1:]) + chr(10))\n"
-    stub.write_text(f"#!{sys.executable}\n{note}")
+    recorder = f"import json, sys\nopen({str(calls)!r}, 'a').write(json.dumps(sys.argv[1:]) + chr(10))\n"
+    stub.write_text(f"#!{sys.executable}\n{recorder}")
     stub.chmod(0o755)
     for folder in ("hdri", "out"):
         (tmp_path / folder).mkdir()
     run_script("paper.sh", tmp_path / "out", path=stub.parent, BREWSTER_DATA=str(tmp_path))
     commands = [json.loads(line) for line in calls.read_text().splitlines()]
-    assert [words[0] for words in commands] == [
+    assert [arguments[0] for arguments in commands] == [
         "assets", "render", "train", "train", "tests/pictures/mixture-coffee-rocket.jpg", "evaluate", "models", "models",
     ]  # fmt: skip
-    for words in commands:
-        read(words)
+    for arguments in commands:
+        parse(arguments)
     with pytest.raises(click.UsageError):
-        read([*commands[1], "--no-such-option"])
+        parse([*commands[1], "--no-such-option"])
     recipe = ROOT / "recipes/train/kontext.toml"
-    assert all((ROOT / words[1]).samefile(recipe) for words in commands if words[0] == "train")
+    assert all((ROOT / arguments[1]).samefile(recipe) for arguments in commands if arguments[0] == "train")
 
 
-def read(words):
-    """Parses a command line completely, without running it."""
-    command, context = cli, cli.make_context("brewster", list(words))
+def parse(arguments):
+    """Parses the arguments of a command line, including those of subcommands, without running the command."""
+    command, context = cli, cli.make_context("brewster", list(arguments))
     while isinstance(command, click.Group):
-        _, command, words = command.resolve_command(context, [*context._protected_args, *context.args])
-        context = command.make_context(command.name, words, parent=context)
+        _, command, arguments = command.resolve_command(context, [*context._protected_args, *context.args])
+        context = command.make_context(command.name, arguments, parent=context)
 
 
 def test_scripts_stop_at_the_first_error_and_begin_with_a_comment():
@@ -119,5 +119,5 @@ def test_scripts_stop_at_the_first_error_and_begin_with_a_comment():
         assert "\nset -euo pipefail\n" in text
         assert os.access(path, os.X_OK)
         subprocess.run(["bash", "-n", path], check=True)
-        named = re.findall(r"(?:runs|recipes|docs|tests)/[\w/.-]+\.(?:sh|py|toml|md|jpg)", text)
-        assert all((ROOT / name).exists() for name in named)
+        files = re.findall(r"(?:runs|recipes|docs|tests)/[\w/.-]+\.(?:sh|py|toml|md|jpg)", text)
+        assert all((ROOT / name).exists() for name in files)

@@ -1,4 +1,4 @@
-"""CI workflows and documents for contributors are correct: paths, make targets, versions."""
+"""CI workflows and documents for contributors are up to date: paths, make targets, versions."""
 
 import re
 import tomllib
@@ -18,10 +18,10 @@ def commands(workflow):
 
 
 @pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda path: path.stem)
-def test_a_workflow_names_only_files_that_exist(workflow):
-    named = re.findall(r"(?:tests|runs|\.ci)/[\w/*.]+|[\w.]+\.(?:txt|toml)", commands(workflow))
-    assert named
-    for name in named:
+def test_every_file_in_a_workflow_exists(workflow):
+    files = re.findall(r"(?:tests|runs|\.ci)/[\w/*.]+|[\w.]+\.(?:txt|toml)", commands(workflow))
+    assert files
+    for name in files:
         assert list(ROOT.glob(name)), name
 
 
