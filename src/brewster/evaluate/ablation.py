@@ -166,7 +166,7 @@ def _plot(study: AblationStudy, numbers: Sequence[float], results: Results) -> b
                 panel.fill_between(numbers, *ends, color=line.get_color(), alpha=0.12, linewidth=0)
         entry = results["metrics"][metric]
         panel.set_title(f"{entry['title']}{', ' + entry['unit'] if entry['unit'] else ''}")
-        panel.set_xlabel(study.value)
+        panel.set_xlabel(study.key)
         # Values such as 0, 10, ... 1000 need a logarithmic axis that is linear near 0.
         if len(numbers) > 2 and max(numbers) > 20 * max(1, sorted(numbers)[1]):
             panel.set_xscale("symlog", linthresh=max(1, sorted(numbers)[1]))
