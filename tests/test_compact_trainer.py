@@ -68,7 +68,7 @@ def test_training_lowers_the_loss_on_a_repeated_batch(recipe):
     assert losses[-1] < 0.8 * losses[0]
 
 
-def test_shards_of_a_batch_on_two_cores_give_the_step_of_plain_adamw(recipe):
+def test_chunks_of_a_batch_on_two_cores_give_the_step_of_plain_adamw(recipe):
     batch = open_stream(recipe)(0, 3, 64)
     with two_threads():
         trainer = CompactTrainer(recipe, lambda step, count, size: batch)
@@ -120,4 +120,4 @@ def test_a_run_starts_from_the_mean_of_the_averaged_weights_of_others(recipe, tm
         trainer = CompactTrainer(recipe.model_copy(update={"start_from": start_from}))
         trainer.initialize()
         assert all((value == mean).all() for value in trainer.network.state_dict().values())
-        assert all((value == mean).all() for value in trainer.average.values())
+        assert all((value == mean).all() for value in trainer.ema_weights.values())

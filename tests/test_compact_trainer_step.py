@@ -93,18 +93,18 @@ def test_a_large_gradient_is_clipped_to_norm_one(trainer):
 def test_the_moving_average_has_the_decay_of_the_recipe_and_a_smaller_one_at_first(trainer, step, decay):
     """After n steps the decay is (n + 1) / (n + 10), at most `average_decay`."""
     one = trainer(average_decay=0.75, decay_share=0.0, learning_rate=0.1, encoder_learning_rate=0.1)
-    before = {name: value.clone() for name, value in one.average.items()}
+    before = {name: value.clone() for name, value in one.ema_weights.items()}
     one.training_step(step)
     for name, new in copy_of(one.network).items():
         expected = decay * before[name] + (1 - decay) * new
-        torch.testing.assert_close(one.average[name], expected, atol=1e-6, rtol=1e-6)
+        torch.testing.assert_close(one.ema_weights[name], expected, atol=1e-6, rtol=1e-6)
 
 
 def test_the_exported_network_has_the_averaged_weights(trainer):
     one = trainer(learning_rate=0.1, encoder_learning_rate=0.1)
     one.training_step(0)
-    exported, trained = copy_of(one.averaged_network()), copy_of(one.network)
-    assert all(value.equal(one.average[name]) for name, value in exported.items())
+    exported, trained = copy_of(one.ema_network()), copy_of(one.network)
+    assert all(value.equal(one.ema_weights[name]) for name, value in exported.items())
     assert not any(value.equal(trained[name]) for name, value in exported.items() if "head" in name)
 
 

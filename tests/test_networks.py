@@ -73,7 +73,7 @@ def test_a_run_of_one_network_does_not_start_from_a_checkpoint_of_another(recipe
     other = with_value(recipe, "network", small).model_copy(update={"start_from": (tmp_path / "start.pt",)})
     with pytest.raises(
         ModelError,
-        match=r"start.pt contains the network lite2-unet; a checkpoint of small, .*; train the recipe",
+        match=r"start.pt contains the network lite2-unet; expected a checkpoint of small, .*; train the recipe",
     ):
         CompactTrainer(other).initialize()
 
@@ -90,7 +90,7 @@ def test_checkpoints_older_than_the_choice_of_network_hold_the_default_one(recip
     trainer = CompactTrainer(recipe)
     older = recipe.model_dump_json(exclude={"network"})
     assert "network" not in older
-    average = {name: torch.full_like(value, 2.0) for name, value in trainer.average.items()}
+    average = {name: torch.full_like(value, 2.0) for name, value in trainer.ema_weights.items()}
     checkpoint = replace(
         Checkpoint(0, older, trainer.state_dict()), state=trainer.state_dict() | {"average": average}
     )
