@@ -96,7 +96,7 @@ def test_the_path_of_a_scene_recipe_is_relative_to_the_recipe(tmp_path):
         (("steps = 6", "steps = 0"), "steps"),
         (
             ("steps = 6", 'steps = 6\nnetwork = "lite3"'),
-            "network is \"lite3\"; there is no network 'lite3': one of lite2-unet",
+            "network is \"lite3\"; expected one of lite2-unet",
         ),
         (("weight_decay = 1e-4", "weight_decay = inf"), "weight_decay"),
         (("[[0.0, 64], [0.5, 96]]", "[]"), "sizes"),

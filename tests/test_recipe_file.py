@@ -145,8 +145,8 @@ def test_an_unknown_recipe_cannot_be_shown(bare):
     assert (code, err) == (
         1,
         (
-            "error: there is no training recipe 'compat'; the packaged recipes are compact, lora;"
-            " name one of them, or a .toml file.\n"
+            "error: there is no training recipe 'compat'; expected one of compact, lora, or a file that ends in .toml;"
+            " choose a packaged recipe or a recipe file.\n"
         ),
     )
     assert bare("train")[0] == 2

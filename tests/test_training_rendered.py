@@ -104,14 +104,14 @@ def test_sets_follow_one_another(folder, tmp_path):
 
 
 def test_a_count_above_the_number_of_samples_is_refused(folder):
-    with pytest.raises(RecipeError, match=r"set: 3 rendered samples; at least 4, .*; .* lower"):
+    with pytest.raises(RecipeError, match=r"set: 3 rendered samples; expected at least 4, .*; .* lower"):
         RenderedSets([folder], seed=1, count=4)
 
 
 def test_a_folder_that_is_missing_empty_or_no_set_is_named(tmp_path):
     with pytest.raises(RecipeError, match=r"gone cannot be read \(No such"):
         RenderedSets([tmp_path / "gone"], seed=1)
-    with pytest.raises(RecipeError, match=r"0 rendered samples; at least 1"):
+    with pytest.raises(RecipeError, match=r"0 rendered samples; expected at least 1"):
         RenderedSets([tmp_path], seed=1)
     (tmp_path / "shard-000000.tar").write_bytes(b"no tar" * 200)
     with pytest.raises(RecipeError, match="cannot be read"):

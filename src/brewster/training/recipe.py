@@ -1,6 +1,6 @@
 """Training recipes: the settings of one training run. TOML in, frozen values out.
 
-Paths of data in a recipe are relative to the folder that the environment variable BREWSTER_DATA names.
+Paths of data in a recipe are relative to the folder in the environment variable BREWSTER_DATA.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from brewster.scene.values import (
 from brewster.training.data.data_recipe import DataRecipe
 from brewster.training.data.mixtures import MixRecipe
 
-_COMPARE: Final = "docs/recipes.md"
+_RECIPE_DOCS: Final = "docs/recipes.md"
 
 _TEMPLATE_FOLDER: Final = Path(__file__).parent / "recipes"
 TEMPLATES: Final = tuple(sorted(path.stem for path in _TEMPLATE_FOLDER.glob("*.toml")))
@@ -54,7 +54,7 @@ def _ascending_from_0(sizes: list[tuple[float, int]]) -> list[tuple[float, int]]
 
 def _known_network(name: str) -> str:
     if name not in NETWORKS:
-        raise ValueError(f"there is no network {name!r}: one of {', '.join(NETWORKS)}")
+        raise ValueError(f"expected one of {', '.join(NETWORKS)}")
     return name
 
 
@@ -102,17 +102,19 @@ class CompactRecipe(TrainingRecipe):
     ] = DEFAULT_NETWORK
     """The network, a name in the table of `brewster.models.networks`."""
     sizes: Sizes
-    """Side of the training images from each share of the run on. Small images first make training faster."""
+    """Side of the training images. An entry applies from its share of the steps until the next entry. Training is faster
+    if the first steps use small images."""
     encoder_learning_rate: PositiveFloat
     """Peak learning rate of the pretrained encoder."""
     average_decay: Share
     """Decay per step of the exponential moving average (EMA) of the weights, which is exported."""
     decay_share: Share = 1.0
-    """Last share of the run, over which the learning rate falls to zero along a cosine. Before, it is constant."""
+    """Share of the steps at the end of the run in which the learning rate falls to zero along a cosine. In the steps before,
+    after the warm-up, it is constant."""
     precision: Literal["float32", "auto"] = "float32"
-    """auto: bfloat16 where the processor supports it. Depthwise convolutions and the head stay in float32."""
+    """auto: bfloat16 if the processor supports it, but float32 for depthwise convolutions and the head."""
     start_from: tuple[Path, ...] = ()
-    """Checkpoints, relative to this recipe. The run starts from the mean of their averaged weights."""
+    """Checkpoints, relative to this recipe. The run starts from the mean of their EMA weights."""
     mix: MixRecipe = MixRecipe()
 
     @model_validator(mode="after")
@@ -122,15 +124,15 @@ class CompactRecipe(TrainingRecipe):
         return self
 
     def size_at(self, step: int) -> int:
-        """Side of the training images at this step in px, a multiple of 32."""
+        """Returns the side of the training images at this step in px, a multiple of 32."""
         return [size for start, size in self.sizes if step >= start * self.steps][-1]
 
 
 class LoraRecipe(TrainingRecipe):
-    """A training run of a LoRA on a large backbone. Defaults are the paper's, or common values where it gives none.
+    """A training run of a LoRA on a large backbone. Defaults are the paper's, or common values if the paper gives none.
 
-    Each sample of a batch is a real pair with probability `data.pairs_share`, else a rendered one, uncropped and in
-    its own aspect ratio. Mixtures and scenes rendered during training are square, and are not supported.
+    Each sample of a batch is a real pair with probability `data.pairs_share`, else a rendered sample. A sample
+    has its own aspect ratio. Mixtures and scenes rendered during training are square, and are not supported.
     """
 
     backbone: str
@@ -142,7 +144,7 @@ class LoraRecipe(TrainingRecipe):
     quantise: Quantisation | None = None
     """Quantisation of the frozen backbone. Not set: none."""
     panels: tuple[Panel, ...] = ("I", "T", "R")
-    """The images that the model generates side by side: photo I, transmission T, reflection R. T is required."""
+    """The images that the model generates in one composite image: photo I, transmission T, reflection R. T is required."""
     direction: Direction = "side by side"
     """How the panels are arranged in the composite image."""
     budget_px: PositiveInt = PAPER_PX
@@ -155,11 +157,11 @@ class LoraRecipe(TrainingRecipe):
     objective: Objective = "flow"
     """flow: flow matching, from noise to panels in many steps. one_step: from the photo to the panels in one step."""
     guidance: NonNegativeFloat = 1.0
-    """Guidance scale during training. 1 means none for backbones with classifier-free guidance."""
+    """Guidance scale during training. With 1, backbones with classifier-free guidance use no guidance."""
     logit_mean: float = 0.0
     """Mean of the logit-normal distribution of training times (Esser et al. 2024), before the resolution shift."""
     logit_deviation: PositiveFloat = 1.0
-    """Standard deviation of that distribution."""
+    """Standard deviation of the logit-normal distribution of training times."""
     flip: bool = True
     """Whether every sample is also used mirrored left to right."""
     crops: Annotated[int, Field(ge=0)] = 0
@@ -167,7 +169,7 @@ class LoraRecipe(TrainingRecipe):
     reflections: Literal["given", "difference"] = "given"
     """R of real pairs. given: pairs without a reflection image are refused. difference: R = photo - transmission, linear."""
     prompt: str = "paper"
-    """A prompt by name, encoded with the text encoder of the backbone, or an encoded one: a .safetensors file,
+    """The name of a prompt, which the text encoder of the backbone encodes; or a .safetensors file with an encoded prompt,
     relative to this recipe."""
 
     @property
@@ -177,7 +179,7 @@ class LoraRecipe(TrainingRecipe):
 
     @property
     def task(self) -> DecompositionTask:
-        """The task of the trained adapter. Inference uses the paper's guidance, or in one step that of training."""
+        """The task of the trained adapter. Its guidance is the paper's for flow, and that of training for one_step."""
         guidance = GUIDANCE if self.objective == "flow" else self.guidance
         return DecompositionTask(self.layout, self.budget_px, self.objective, guidance)
 
@@ -205,7 +207,11 @@ AnyRecipe = TypeVar("AnyRecipe", bound=TrainingRecipe)
 
 
 def _share_of(samples: int, name: str, share: float) -> int:
-    """The number of samples of a share. A share between 0 and 1 must give at least one, and leave at least one."""
+    """Returns the number of samples that a share of them gives.
+
+    Raises:
+        ValueError: a share between 0 and 1 gives no sample, or all samples.
+    """
     part = round(samples * share)
     if samples and 0 < share < 1 and part in (0, samples):
         raise ValueError(
@@ -217,10 +223,11 @@ def _share_of(samples: int, name: str, share: float) -> int:
 def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
     """Reads and checks a recipe, and resolves its paths that are relative to the file.
 
-    Returns: a LoraRecipe if the file has the key `backbone`, else a CompactRecipe.
+    Returns:
+        A LoraRecipe if the file has the key `backbone`, else a CompactRecipe.
 
     Raises:
-        RecipeError: the file is missing or not TOML, or keys are missing, unknown or have impossible values.
+        RecipeError: the file is missing or not TOML, a key is missing or unknown, or a value is not allowed.
     """
     recipe = _read_unresolved(path)
     changes: dict[str, Any] = {}
@@ -236,24 +243,25 @@ def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
 
 
 def read_template(name: str) -> CompactRecipe | LoraRecipe:
-    """A packaged recipe to start from (one of TEMPLATES), or a recipe file. Paths stay as they are written.
+    """Reads a packaged recipe (one of TEMPLATES) or a recipe file. Relative paths in it are not resolved.
 
     Raises:
-        RecipeError: the name is unknown, or what `read_recipe` raises.
+        RecipeError: the name is unknown, the file is missing or not TOML, a key is missing or unknown, or a value is not
+            allowed.
     """
     if name in TEMPLATES:
         return _read_unresolved(_TEMPLATE_FOLDER / f"{name}.toml")
     if not name.endswith(".toml"):
         raise RecipeError(
             f"there is no training recipe {name!r}",
-            f"the packaged recipes are {', '.join(TEMPLATES)}",
-            "name one of them, or a .toml file",
+            f"expected one of {', '.join(TEMPLATES)}, or a file that ends in .toml",
+            "choose a packaged recipe or a recipe file",
         )
     return _read_unresolved(Path(name))
 
 
 def _read_unresolved(path: Path) -> CompactRecipe | LoraRecipe:
-    return read_toml(_recipe_class(path), path, compare=_COMPARE)
+    return read_toml(_recipe_class(path), path, compare=_RECIPE_DOCS)
 
 
 def _recipe_class(path: Path) -> type[CompactRecipe] | type[LoraRecipe]:
@@ -264,7 +272,7 @@ def _recipe_class(path: Path) -> type[CompactRecipe] | type[LoraRecipe]:
 
 
 def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
-    """A copy of the recipe with one value changed, checked again as a whole.
+    """Returns a copy of the recipe with one value changed. The whole copy is checked again.
 
     Args:
         recipe: the recipe to change.
@@ -272,14 +280,14 @@ def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
         value: the new value.
 
     Raises:
-        RecipeError: the recipe has no such key, or the value is impossible there.
+        RecipeError: the recipe has no such key, or the value is not allowed.
     """
     if key_path not in _key_paths(recipe):
-        close = similar_key(type(recipe), key_path.split("."))
+        suggestion = similar_key(type(recipe), key_path.split("."))
         raise RecipeError(
             f"the recipe has no key {key_path}",
             "expected a key with its tables, such as data.pairs_share",
-            f"did you mean {close}?" if close else f"see {_COMPARE}",
+            f"did you mean {suggestion}?" if suggestion else f"see {_RECIPE_DOCS}",
         )
     values = target = recipe.model_dump(exclude_unset=True)
     *tables, last = key_path.split(".")
@@ -287,11 +295,11 @@ def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
         target = target.setdefault(name, {})
     target[last] = value
     owner = f"the recipe with {key_path} = {value!r}"
-    return validated(type(recipe), values, owner=owner, compare=_COMPARE)
+    return validated(type(recipe), values, owner=owner, compare=_RECIPE_DOCS)
 
 
 def _key_paths(values: FrozenModel, prefix: str = "") -> Iterator[str]:
-    """The paths of all keys and tables that the recipe has; those of an optional table only if it is set."""
+    """Yields the paths of all keys and tables of the recipe. The keys of an optional table are included if it is set."""
     for name in type(values).model_fields:
         yield prefix + name
         inner = getattr(values, name)
@@ -300,7 +308,7 @@ def _key_paths(values: FrozenModel, prefix: str = "") -> Iterator[str]:
 
 
 def data_folder() -> Path:
-    """The folder that the environment variable BREWSTER_DATA names.
+    """Returns the folder in the environment variable BREWSTER_DATA.
 
     Raises:
         RecipeError: the variable is not set, or the folder does not exist.
@@ -309,7 +317,7 @@ def data_folder() -> Path:
     if not Path(folder or "/nowhere").is_dir():
         raise RecipeError(
             f"BREWSTER_DATA is {folder!r}",
-            "expected the folder that the paths in a recipe are relative to",
+            "expected an existing folder: the paths in a recipe are relative to it",
             "export BREWSTER_DATA=/path/to/data",
         )
     return Path(folder)

@@ -1,4 +1,4 @@
-"""The part of a training recipe that says what a model is trained on: photos, real pairs and rendered samples."""
+"""The part of a training recipe that selects the training data: photos, real pairs and rendered samples."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class RenderedRecipe(FrozenModel):
     recipe: str | None = None
     """A packaged scene recipe by its name, or a TOML file, relative to this recipe."""
     count: Annotated[int, Field(ge=0)] | None = None
-    """Number of different samples. Not set: all of the sets, or no limit with `recipe`. 0: no rendered samples."""
+    """Number of different samples. Not set: all samples of `sets`, or no limit with `recipe`. 0: no rendered samples."""
     share: Share = 1.0
-    """Share of rendered samples in each batch, after real pairs are taken off; the rest are mixtures of photos."""
+    """Share of rendered samples among the samples of a batch that are not real pairs. The others are mixtures of photos."""
     mixing: Mixing = "light"
-    """How a photo is composed. light: T + R in linear light. 8-bit: a blend of 8-bit images, for comparison."""
+    """How the photo is composed. light: T + R in linear light. 8-bit: a blend of 8-bit images, for comparison."""
     target: Target = "background"
     """What the network predicts behind the glass: the background B without glass, or the transmission T."""
     orders: Literal["all", "paper"] | None = None
@@ -40,7 +40,7 @@ class RenderedRecipe(FrozenModel):
     def _check_source(self) -> Self:
         if bool(self.sets) == bool(self.recipe):
             raise ValueError(
-                "rendered samples come either from sets on disk or from a recipe during training: set one of the two"
+                "rendered samples come either from sets on disk or from a scene recipe: set one of the two"
             )
         unused = [
             name for name in ("orders", "seed", "maps", "photos") if getattr(self, name) not in (None, ())
@@ -53,8 +53,8 @@ class RenderedRecipe(FrozenModel):
 class DataRecipe(FrozenModel):
     """Training data: folders relative to BREWSTER_DATA.
 
-    Each batch has a share `pairs_share` of real pairs. Of the rest, a share `rendered.share` is rendered, and the
-    remaining samples are mixtures of photos and maps. A source with a share of 0 is not read.
+    In each batch, `pairs_share` is the share of real pairs. `rendered.share` is the share of rendered samples among the
+    others. The remaining samples are mixtures of photos and maps. A source with a share of 0 is not read.
     """
 
     photos: tuple[Path, ...] = ()
@@ -67,27 +67,28 @@ class DataRecipe(FrozenModel):
     """Share of real pairs in each batch. Required with `pairs`."""
     rendered: RenderedRecipe | None = None
     exclude: tuple[str, ...] = ()
-    """File names of photos and maps to leave out; * and ? match as in a shell."""
+    """File names of photos and maps that are not used; * and ? match as in a shell."""
     held_out: tuple[str, ...] = ()
-    """Further file names to leave out of training. The compact model is validated on mixtures of them."""
+    """File names of further photos and maps that are not used for training. The compact model is validated on mixtures of
+    them."""
     validate_on: tuple[Path, ...] = ()
     """Folders of real pairs to validate on."""
     validate_at_most: PositiveInt = 40
-    """Largest number of pairs from each folder in `validate_on`, evenly spaced in the order of their names."""
+    """Largest number of pairs from each folder in `validate_on`. They are evenly spaced in the order of their names."""
 
     @property
     def excluded_files(self) -> tuple[str, ...]:
-        """File names and patterns that training leaves out."""
+        """File names and patterns of the photos and maps that are not used for training."""
         return self.exclude + self.held_out
 
     @property
     def rendered_share(self) -> float:
-        """The share of rendered samples after real pairs are taken off; 0 if there are none."""
+        """The share of rendered samples among the samples that are not real pairs; 0 without rendered samples."""
         return self.rendered.share if self.rendered and self.rendered.count != 0 else 0.0
 
     @property
     def is_empty(self) -> bool:
-        """Whether every source has a share, or a count, of 0."""
+        """Whether there is no training data: every source has a share or a count of 0."""
         return not (self.photos or self.pairs_share or self.rendered_share)
 
     @model_validator(mode="after")
@@ -100,10 +101,10 @@ class DataRecipe(FrozenModel):
             raise ValueError("pairs needs pairs_share, their share of each batch; it may be 0")
         if self.photos and self.rendered and "share" not in self.rendered.model_fields_set:
             raise ValueError(
-                "photos and rendered together need rendered.share, the share that is rendered; it may be 0 or 1"
+                "photos and rendered together need rendered.share, the share of rendered samples; it may be 0 or 1"
             )
         if not (self.photos or self.is_empty or self.pairs_share == 1 or self.rendered_share == 1):
             raise ValueError(
-                "pairs and rendered samples fill a part of each batch only, and there are no photos for the rest"
+                "pairs and rendered samples fill only a part of each batch, and there are no photos for the rest"
             )
         return self
