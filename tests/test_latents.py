@@ -190,7 +190,7 @@ def test_a_sample_that_is_smaller_than_a_panel_is_refused_with_the_budget_that_f
 
 
 def test_too_few_rendered_samples_are_refused(recipe):
-    with pytest.raises(RecipeError, match="3 rendered samples; at least 9"):
+    with pytest.raises(RecipeError, match="3 rendered samples; expected at least 9"):
         open_samples(recipe({"rendered": {"sets": ["set"], "count": 9}}))
 
 

@@ -18,7 +18,7 @@ from brewster.models.compact import LinearSeparator
 
 _OPSET = 18
 _MIN_HALF_SIZE = 16
-"""Smaller tensors are not stored in half precision: they are constants of the graph, such as the coefficients of the sRGB curve."""
+"""Tensors with fewer values stay float32: they are constants of the graph, such as the coefficients of the sRGB curve."""
 
 
 def export_onnx(network: nn.Module, path: Path, stride: int) -> None:
@@ -68,7 +68,7 @@ def with_half_weights(model: ModelProto) -> ModelProto:
 
 @contextmanager
 def _without_warnings() -> Iterator[None]:
-    """Hides two warnings of the exporter: that torchvision, which is not needed, is missing, and that it calls deprecated functions."""
+    """Hides warnings of the exporter: torchvision, which is not needed, is missing; the exporter calls deprecated functions."""
     logger = logging.getLogger("torch.onnx")
     before = logger.level
     logger.setLevel(logging.ERROR)

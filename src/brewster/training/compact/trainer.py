@@ -1,4 +1,4 @@
-"""Trains the compact network with AdamW, and keeps an exponential moving average (EMA) of the weights. Uses a GPU if there is one.
+"""Trains the compact network with AdamW and an exponential moving average (EMA) of the weights, on a GPU if there is one.
 
 network = train(read_recipe(Path("recipes/train/compact.toml")), Path("out/compact"), on_step)
 """

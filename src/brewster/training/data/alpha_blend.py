@@ -1,7 +1,7 @@
 """8-bit mixtures of the layers of a rendered sample: the baseline of the paper's ablation (Table 4, Figure 7).
 
-RDNet blends two tone-mapped images, I = alpha T + beta R - T o R, where o is the element-wise product. Here T is the background and
-R the mirror image of a rendered sample, so that both kinds of data show the same two scenes.
+RDNet blends two tone-mapped images, I = alpha T + beta R - T o R, where o is the element-wise product. Here T is the
+background and R the mirror image of a rendered sample, so that both kinds of data show the same two scenes.
 """
 
 from __future__ import annotations
