@@ -39,7 +39,7 @@ def main(data: Path, recipes: list[Path]) -> None:
 
 
 def print_row(name: str, pairs: Iterable[tuple[Tensor, Tensor]]) -> None:
-    """Prints the quantiles of all pairs, including those without reflection, as in training."""
+    """Prints the quantiles over all pairs. Mixtures without a reflection are included, as in training."""
     rows = [statistics(to_linear(photo), to_linear(truth)) for photo, truth in pairs]
     cells = [
         " ".join(f"{value:.2f}" for value in np.nanquantile([row[key] for row in rows], QUANTILES))
@@ -53,14 +53,14 @@ def fit(pair: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     scale = SIZE_PX / max(pair[0].shape[:2])
     size = [round(side * scale) for side in pair[0].shape[:2]]
     photo, truth = (
-        functional.interpolate(picture.permute(2, 0, 1)[None] / 255, size, mode="bilinear", antialias=True)[0]
-        for picture in pair
+        functional.interpolate(image.permute(2, 0, 1)[None] / 255, size, mode="bilinear", antialias=True)[0]
+        for image in pair
     )
     return photo, truth
 
 
 def statistics(photo: Tensor, truth: Tensor) -> dict[str, float]:
-    """The statistics of one pair in linear light, (3, h, w) each."""
+    """Returns the statistics of one pair in linear light, (3, h, w) each. docs/training.md defines them."""
     ratio = (truth / (photo + 1e-3)).flatten()[::3]
     change = photo - truth
     gain = (photo * truth).sum((1, 2)) / (photo * photo).sum((1, 2)).clamp(min=1e-9)
@@ -83,7 +83,7 @@ def statistics(photo: Tensor, truth: Tensor) -> dict[str, float]:
 
 
 def psnr(one: Tensor, other: Tensor) -> float:
-    """PSNR of encoded values, at most 58.9 dB, which is that of rounding to 8 bits."""
+    """Returns the PSNR of encoded values, at most 58.9 dB, the PSNR of rounding to 8 bits."""
     error = (to_encoded(one.clamp(0, 1)) - to_encoded(other)).square().mean().item()
     return -10 * np.log10(max(error, 1 / (12 * 255**2)))
 
