@@ -60,7 +60,7 @@ def fit(pair: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
 
 
 def statistics(photo: Tensor, truth: Tensor) -> dict[str, float]:
-    """The statistics of one pair in linear light, (3, h, w) each."""
+    """Returns the statistics of one pair in linear light, (3, h, w) each. docs/training.md defines them."""
     ratio = (truth / (photo + 1e-3)).flatten()[::3]
     change = photo - truth
     gain = (photo * truth).sum((1, 2)) / (photo * photo).sum((1, 2)).clamp(min=1e-9)
@@ -83,7 +83,7 @@ def statistics(photo: Tensor, truth: Tensor) -> dict[str, float]:
 
 
 def psnr(one: Tensor, other: Tensor) -> float:
-    """PSNR of encoded values, at most 58.9 dB, which is that of rounding to 8 bits."""
+    """Returns the PSNR of encoded values, at most 58.9 dB, the PSNR of rounding to 8 bits."""
     error = (to_encoded(one.clamp(0, 1)) - to_encoded(other)).square().mean().item()
     return -10 * np.log10(max(error, 1 / (12 * 255**2)))
 

@@ -21,12 +21,12 @@ def main(source: Path) -> int:
     separator = Separator.load("compact")
     OUT.mkdir(parents=True, exist_ok=True)
     rows, failures = [], 0
-    for job in find([source], output_folder=OUT):
+    for paths in find([source], output_folder=OUT):
         try:
-            rows.append(separate(separator, job))
+            rows.append(separate(separator, paths))
         except BrewsterError as error:
             failures += 1
-            print(f"error: {job.source}: {error}", file=sys.stderr)
+            print(f"error: {paths.source}: {error}", file=sys.stderr)
     if rows:
         width = max(row.shape[1] for row in rows)
         padded = [np.pad(row, [(0, 8), (0, width - row.shape[1]), (0, 0)], constant_values=1) for row in rows]
@@ -36,14 +36,14 @@ def main(source: Path) -> int:
     return 1 if failures or not rows else 0
 
 
-def separate(separator: Separator, job: SeparationPaths) -> np.ndarray:
+def separate(separator: Separator, paths: SeparationPaths) -> np.ndarray:
     """Separates one photo and saves its layers. Returns its row of the sheet."""
     started = time.perf_counter()
-    result = separator(job.source)
-    targets = [job.target(layer) for layer in ("transmission", "reflection")]
+    result = separator(paths.source)
+    targets = [paths.target(layer) for layer in ("transmission", "reflection")]
     for layer, target in zip((result.transmission, result.reflection), targets, strict=True):
         layer.save(target, overwrite=True)
-    print(f"{job.source}: {time.perf_counter() - started:.2f} s")
+    print(f"{paths.source}: {time.perf_counter() - started:.2f} s")
     print(*(f"  {target}" for target in targets), sep="\n")
     return side_by_side(result)
 
@@ -51,8 +51,8 @@ def separate(separator: Separator, job: SeparationPaths) -> np.ndarray:
 def side_by_side(result: Separation) -> np.ndarray:
     width, height = result.photo.size
     size = max(1, round(width * ROW_PX / height)), ROW_PX
-    pictures = (result.photo, result.transmission, result.reflection)
-    return np.concatenate([np.clip(picture.resized(*size), 0, 1) for picture in pictures], axis=1)
+    photos = (result.photo, result.transmission, result.reflection)
+    return np.concatenate([np.clip(photo.resized(*size), 0, 1) for photo in photos], axis=1)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""Writes the figures of docs/rendering.md: samples of every recipe, and 8-bit mixtures above rendered photos.
+"""Writes the figures of docs/rendering.md: samples of every scene recipe, and 8-bit mixtures above rendered photos.
 
     BREWSTER_DATA=../shared/data .venv/bin/python runs/figures.py   # with the CC0 maps in hdri/
 
-Without BREWSTER_DATA, the built-in environments light all scenes.
+Without BREWSTER_DATA, all scenes have built-in environments.
 """
 
 import os
@@ -25,7 +25,7 @@ DOCS = Path(__file__).parent.parent / "docs"
 WIDTH, HEIGHT = 256, 192
 
 
-def developed(name, seed, index):
+def render_sample(name, seed, index):
     recipe = read_scene_recipe(name)
     camera = recipe.camera.model_copy(update={"width": WIDTH, "height": HEIGHT})
     catalog, _ = read_catalog(MAPS, [])
@@ -38,21 +38,32 @@ def save(rows, name):
     Photo.from_array(to_uint8(sheet), encoding="srgb").save(DOCS / name, overwrite=True)
 
 
-def scenes():
+def save_scenes():
     save(
-        [list(developed(name, 3, i).layers().values()) for name in RECIPES if name != "tiny" for i in (0, 1)],
+        [
+            list(render_sample(name, 3, i).layers().values())
+            for name in RECIPES
+            if name != "tiny"
+            for i in (0, 1)
+        ],
         "scenes.jpg",
     )
 
 
-def mixtures():
+def save_mixtures():
     rendered = [
-        developed(name, 5, i)
+        render_sample(name, 5, i)
         for name, i in (("window", 0), ("window", 3), ("office", 1), ("shopfront", 2), ("window", 5))
     ]
-    save([[blended(d).photo_encoded for d in rendered], [d.photo_encoded for d in rendered]], "mixtures.jpg")
+    save(
+        [
+            [blended(sample).photo_encoded for sample in rendered],
+            [sample.photo_encoded for sample in rendered],
+        ],
+        "mixtures.jpg",
+    )
 
 
 if __name__ == "__main__":
-    scenes()
-    mixtures()
+    save_scenes()
+    save_mixtures()

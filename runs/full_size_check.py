@@ -1,7 +1,7 @@
 """Measures memory and time of training and inference at the paper's size on the local GPU; estimates them without a GPU.
 
 The architectures are real and the weights random: nothing is downloaded, and only memory and time are meaningful. The base is
-filled and quantised layer by layer, so that it is never on the card in 16 bits as a whole. On larger cards memory is limited
+filled and quantised layer by layer, so that the card never holds the whole base in 16 bits. On larger cards, memory is limited
 to that of the paper's 24 GB card. full_size_check.sh runs this script.
 """
 
@@ -88,7 +88,7 @@ def measure(name, quantise, device, *, is_tiny):
 
 
 def random_backbone(name, quantise, device, *, is_tiny):
-    """Creates a backbone with random weights on the device; peak memory is its final size."""
+    """Creates a backbone with random weights on the device. The peak memory is its final size."""
     size = find_family(name).tiny if is_tiny else None
     dtype = torch.float32 if device == "cpu" else torch.bfloat16
     backbone = build(name, size, device="meta", dtype=dtype)
@@ -110,17 +110,17 @@ def fill_randomly(part, device, quantise):
 
 
 def random_prompt(backbone, count):
-    """A random prompt with the number of tokens of the real one."""
-    few = backbone.random_prompt(backbone.transformer, 0)
+    """Returns a random prompt with `count` tokens, the number of the real prompt."""
+    short = backbone.random_prompt(backbone.transformer, 0)
     tensors = {
         name: tensor[:, :1].expand(1, count, -1) if tensor.ndim == 3 else tensor
-        for name, tensor in few.tensors.items()
+        for name, tensor in short.tensors.items()
     }
-    return PromptEmbedding(few.backbone, few.text, **tensors).to(backbone.device, backbone.dtype)
+    return PromptEmbedding(short.backbone, short.text, **tensors).to(backbone.device, backbone.dtype)
 
 
 def train(backbone, prompt, photo, rank, row):
-    """The training steps of training/lora/trainer.py, without its files: encode once, then flow matching on the LoRA."""
+    """Runs training steps as training/lora/trainer.py does, but without its files: encoding, then flow matching on the LoRA."""
     parameters = add_lora(backbone, rank=rank, alpha=rank)
     backbone.transformer.enable_gradient_checkpointing()
     optimizer = torch.optim.AdamW(parameters, lr=1e-4)
@@ -162,10 +162,10 @@ def separate(backbone, prompt, photo, row):
     row.picture_gib, _ = peak(backbone.device)
 
 
-def timed(work):
+def timed(function):
     synchronize()
     started = time.perf_counter()
-    work()
+    function()
     synchronize()
     return time.perf_counter() - started
 
@@ -181,7 +181,7 @@ def reset_peak(device):
 
 
 def peak(device):
-    """Peak memory in GiB, allocated and reserved; None on a CPU."""
+    """Returns the peak memory in GiB, allocated and reserved, or None on a CPU."""
     if torch.device(device).type != "cuda":
         return None, None
     return torch.cuda.max_memory_allocated() / GIB, torch.cuda.max_memory_reserved() / GIB
@@ -200,7 +200,7 @@ def gpu_name(device):
 
 
 def cap_memory():
-    """Limits GPU memory to that of the paper's card."""
+    """Limits the GPU memory to that of the paper's card."""
     total = torch.cuda.get_device_properties(0).total_memory / GIB
     torch.cuda.set_per_process_memory_fraction(min(1.0, CAP_GIB / total))
 
@@ -209,7 +209,7 @@ def cap_memory():
 
 
 def estimate(name, quantise):
-    """The estimate of `brewster train --plan` for the recipe of this name, on the paper's card."""
+    """Returns the estimate of `brewster train --plan` for the recipe of this name on the paper's card."""
     from brewster.training.lora.resource_estimate import CARDS, estimate_resources  # noqa: PLC0415  (its libraries may be missing)
     from brewster.training.recipe import read_recipe  # noqa: PLC0415
 

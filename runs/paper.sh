@@ -5,8 +5,8 @@
 #
 # First: pip install -c constraints.txt '.[render,train,large,evaluate]' bitsandbytes; agree to the licence at
 # https://huggingface.co/black-forest-labs/FLUX.1-Kontext-dev (not for commercial use), and run `hf auth login`.
-# The benchmarks are your own copies; docs/evaluation.md describes their layouts. real/dev/nature in BREWSTER_DATA is any folder
-# of pairs (blended/, transmission/) for validation during training; recipes/train/kontext.toml names it.
+# The benchmarks are your own copies; docs/evaluation.md describes their layouts. recipes/train/kontext.toml validates on
+# real/dev/nature in BREWSTER_DATA, which can be any folder of pairs (blended/, transmission/).
 #
 # "est." marks estimates that were not measured: from `brewster train recipes/train/kontext.toml --plan`, or arithmetic.
 # runs/full_size_check.sh measures memory and time per step on your card.
@@ -41,11 +41,11 @@ brewster train recipes/train/kontext.toml -o "$out"
 # 5. Separate a photo.   est. 35 s per prediction of 20 steps
 brewster tests/pictures/mixture-coffee-rocket.jpg --model "$out/lora" -o "$out/separated" --overwrite
 
-# 6. Evaluate on 540 pictures, est. 5-6 hours, with the unprocessed input and the compact model for comparison.
+# 6. Evaluate on 540 photos, est. 5-6 hours, with the unprocessed input and the compact model for comparison.
 brewster evaluate --benchmark "real20=$real20" --benchmark "nature20=$nature20" --benchmark "sir2=$sir2" \
     --model compact --model "lora=$out/lora" --paper -o "$out/evaluate"
 
-# 7. Write the model card with these scores, and list the files that would be uploaded to the hub, 350 MB. Without --dry-run
-#    they are uploaded as a private repository; --public makes it public, under the licence of the base.
+# 7. Write the model card with these scores, and list the files for the hub, 350 MB. Without --dry-run, the command uploads
+#    them as a private repository; with --public the repository is public, under the licence of the base.
 brewster models card "$out/lora" --scores "$out/evaluate/results.json" > "$out/card.md"
 brewster models push "$out/lora" "${REPO:-somebody/sees-through-glass}" --dry-run

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# The paper's method from beginning to end on a toy backbone: one or two minutes on two CPU cores, without a network.
+# The paper's method from beginning to end on a toy backbone: one or two minutes on two CPU cores, offline.
 #     runs/tiny.sh [FOLDER]        writes to FOLDER, by default out/tiny
-# The toy twin has random weights and is trained for six steps: all parts are tested, but the generated panels are noise.
+# The toy twin has random weights, and its LoRA is trained for six steps. All parts are tested, but the generated panels are noise.
 # runs/paper.sh is the same experiment at the paper's size.
 set -euo pipefail
 root="$(realpath "$(dirname "$0")/..")"
@@ -24,6 +24,6 @@ brewster tests/pictures/mixture-coffee-rocket.jpg --model "$out/lora" --quality 
 brewster evaluate --benchmark "rendered=$out/sets/test" --model compact --model "lora=$out/lora" \
     --quality draft --metrics psnr,ssim -o "$out/evaluate"
 
-# 5. Write the model card with these scores, and list the four files that would be uploaded to the hub.
+# 5. Write the model card with these scores, and list the four files that an upload to the hub would contain.
 brewster models card "$out/lora" --scores "$out/evaluate/results.json" > "$out/card.md"
 brewster models push "$out/lora" somebody/sees-through-toy-glass --dry-run

@@ -27,17 +27,17 @@ def two_threads():
         torch.set_num_threads(before)
 
 
-def silent(step, steps, metrics, logged):
+def ignore_step(step, steps, metrics, logged):
     pass
 
 
-def checkpoint(recipe):
-    """The initial checkpoint of a run."""
+def initial_checkpoint(recipe):
+    """Returns the checkpoint before the first step."""
     return Checkpoint(0, recipe.model_dump_json(), CompactTrainer(recipe).state_dict())
 
 
 def test_without_training_data_the_network_keeps_its_initial_weights(rendered, tmp_path):
-    network = train(with_value(rendered, "data.rendered.count", 0), tmp_path, silent)
+    network = train(with_value(rendered, "data.rendered.count", 0), tmp_path, ignore_step)
     photo = torch.rand(1, 3, 64, 64)
     torch.testing.assert_close(network(photo)[:, :3], photo, atol=1e-5, rtol=0)
 
@@ -68,14 +68,14 @@ def test_training_lowers_the_loss_on_a_repeated_batch(recipe):
     assert losses[-1] < 0.8 * losses[0]
 
 
-def test_shards_of_a_batch_on_two_cores_give_the_step_of_plain_adamw(recipe):
+def test_chunks_of_a_batch_on_two_cores_give_the_step_of_plain_adamw(recipe):
     batch = open_stream(recipe)(0, 3, 64)
     with two_threads():
         trainer = CompactTrainer(recipe, lambda step, count, size: batch)
     torch.nn.init.normal_(trainer.network.head.weight, std=0.1)
-    plain = copy.deepcopy(trainer.network)
-    encoder = list(plain.encoder.parameters())
-    rest = list(plain.parameters())[len(encoder) :]
+    reference = copy.deepcopy(trainer.network)
+    encoder = list(reference.encoder.parameters())
+    rest = list(reference.parameters())[len(encoder) :]
     warm = 1 / recipe.warmup_steps
     rates = (recipe.encoder_learning_rate * warm, recipe.learning_rate * warm)
     optimizer = torch.optim.AdamW(
@@ -85,12 +85,14 @@ def test_shards_of_a_batch_on_two_cores_give_the_step_of_plain_adamw(recipe):
         fused=False,
     )
     trainer.optimizer.param_groups[0]["eps"] = trainer.optimizer.param_groups[1]["eps"] = 1e-3
-    sum(separation_loss(plain(batch.photo_encoded), batch).values()).backward()
-    torch.nn.utils.clip_grad_norm_(plain.parameters(), 1.0)
+    sum(separation_loss(reference(batch.photo_encoded), batch).values()).backward()
+    torch.nn.utils.clip_grad_norm_(reference.parameters(), 1.0)
     optimizer.step()
     trainer.training_step(0)
-    for (name, ours), theirs in zip(trainer.network.named_parameters(), plain.parameters(), strict=True):
-        torch.testing.assert_close(ours, theirs, atol=1e-6, rtol=1e-4, msg=name)
+    for (name, actual), expected in zip(
+        trainer.network.named_parameters(), reference.parameters(), strict=True
+    ):
+        torch.testing.assert_close(actual, expected, atol=1e-6, rtol=1e-4, msg=name)
 
 
 def test_a_nan_loss_stops_the_run_and_keeps_the_weights(recipe):
@@ -111,8 +113,8 @@ def test_a_batch_whose_gradient_is_infinite_is_skipped(recipe):
     assert all(torch.equal(value, before[name]) for name, value in trainer.network.state_dict().items())
 
 
-def test_a_run_starts_from_the_mean_of_the_averaged_weights_of_others(recipe, tmp_path):
-    given, starts = checkpoint(recipe), (tmp_path / "one.pt", tmp_path / "three.pt")
+def test_a_run_starts_from_the_mean_of_the_ema_weights_of_its_checkpoints(recipe, tmp_path):
+    given, starts = initial_checkpoint(recipe), (tmp_path / "one.pt", tmp_path / "three.pt")
     for path, value in zip(starts, (1.0, 3.0), strict=True):
         same = {name: torch.full_like(weights, value) for name, weights in given.state["average"].items()}
         replace(given, state=given.state | {"average": same}).write(path)
@@ -120,4 +122,4 @@ def test_a_run_starts_from_the_mean_of_the_averaged_weights_of_others(recipe, tm
         trainer = CompactTrainer(recipe.model_copy(update={"start_from": start_from}))
         trainer.initialize()
         assert all((value == mean).all() for value in trainer.network.state_dict().values())
-        assert all((value == mean).all() for value in trainer.average.values())
+        assert all((value == mean).all() for value in trainer.ema_weights.values())

@@ -20,14 +20,14 @@ def _not_launched(monkeypatch):
         monkeypatch.delenv(name, raising=False)
 
 
-def python(code, *launcher, **variables):
-    """Runs a program, with or without a launcher: stdout, stderr and exit code."""
-    here = {
+def run_python(code, *launcher, **variables):
+    """Runs Python code, with or without a launcher. Returns stdout, stderr and exit code."""
+    environment = {
         name: value for name, value in os.environ.items() if name not in {"WORLD_SIZE", *LAUNCHER_VARIABLES}
     }
     done = subprocess.run(
         [sys.executable, *launcher, *([] if launcher else ["-c"]), str(code)],
-        env=here | {"OMP_NUM_THREADS": "1"} | variables,
+        env=environment | {"OMP_NUM_THREADS": "1"} | variables,
         capture_output=True,
         text=True,
         check=False,
@@ -46,7 +46,7 @@ alone = torch.ones(3)
 distributed.all_reduce_sum([alone])
 print(distributed.world_size(), distributed.rank(), distributed.is_main_process(), alone.tolist())
 """
-    assert python(code) == ("1 0 True [1.0, 1.0, 1.0]\n", "", 0)
+    assert run_python(code) == ("1 0 True [1.0, 1.0, 1.0]\n", "", 0)
 
 
 @pytest.mark.slow
@@ -65,14 +65,14 @@ pathlib.Path(__file__).with_name(f"rank {distributed.rank()}").touch()
 """
     )
     torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
-    _, stderr, code = python(tmp_path / "two.py", *torchrun)
+    _, stderr, code = run_python(tmp_path / "two.py", *torchrun)
     assert code == 0, stderr
     assert sorted(path.name for path in tmp_path.glob("rank *")) == ["rank 0", "rank 1"]
 
 
 def test_a_world_size_without_launcher_variables_is_refused(monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
-    with pytest.raises(DeviceError, match=r"WORLD_SIZE is 2, and RANK, .* not set; .*torchrun"):
+    with pytest.raises(DeviceError, match=r"WORLD_SIZE is 2, but .* not set: RANK, .*; .*torchrun"):
         distributed.initialize()
 
 
@@ -81,7 +81,7 @@ def test_missing_processes_are_reported(monkeypatch):
     for name, value in (LAUNCHER_VARIABLES | {"WORLD_SIZE": "2"}).items():
         monkeypatch.setenv(name, value)
     with pytest.raises(
-        DeviceError, match=r"1 processes have joined; 2 processes, as WORLD_SIZE states; .*torchrun"
+        DeviceError, match=r"1 processes have joined; expected 2 processes, .* WORLD_SIZE; .*torchrun"
     ):
         distributed.initialize()
     accelerate.PartialState._reset_state()
@@ -90,6 +90,6 @@ def test_missing_processes_are_reported(monkeypatch):
 def test_a_launcher_that_started_only_one_of_several_processes_is_reported(tmp_path):
     (tmp_path / "one.py").write_text("from brewster.training import distributed\ndistributed.initialize()\n")
     launch = ["-m", "accelerate.commands.launch", "--cpu", "--num_processes", "2"]
-    _, stderr, code = python(tmp_path / "one.py", *launch)
+    _, stderr, code = run_python(tmp_path / "one.py", *launch)
     assert code == 1
     assert "accelerate launch started one process instead of several" in stderr

@@ -13,7 +13,7 @@ from brewster.training.data.sample_rng import SampleRng
 
 @pytest.fixture
 def scene(random):
-    """Smooth blobs and a hard edge, (3, 64, 64), encoded."""
+    """Returns an encoded image of smooth blobs and a hard edge, (3, 64, 64)."""
     coarse = torch.from_numpy(random.random((1, 3, 5, 5), np.float32))
     smooth = torch.nn.functional.interpolate(coarse, (64, 64), mode="bicubic")[0].clamp(0, 1)
     smooth[:, :, 40:] *= 0.4
@@ -26,10 +26,10 @@ def test_the_simulated_jpeg_has_the_loss_of_a_codec(scene, quality):
     levels = (scene * 255).round().to(torch.uint8).permute(1, 2, 0).numpy()
     Image.fromarray(levels).save(file, "JPEG", quality=quality, subsampling=0)
     decoded = torch.from_numpy(np.array(Image.open(file))).permute(2, 0, 1) / 255
-    ours = effects.jpeg(scene, quality)
-    lost = (decoded - scene).abs().mean()
-    assert (ours - scene).abs().mean().item() == pytest.approx(lost.item(), rel=0.1)
-    assert (ours - decoded).abs().mean() < 0.5 * lost
+    simulated = effects.jpeg(scene, quality)
+    codec_error = (decoded - scene).abs().mean()
+    assert (simulated - scene).abs().mean().item() == pytest.approx(codec_error.item(), rel=0.1)
+    assert (simulated - decoded).abs().mean() < 0.5 * codec_error
 
 
 @given(st.integers(0, 10**6), st.sampled_from(["falloff", "edge", "window", "shadow"]))
@@ -39,12 +39,12 @@ def test_every_mask_is_between_zero_and_one(slot, name):
     assert 0 <= mask.min() <= mask.max() <= 1
 
 
-def test_a_window_covers_a_part_of_the_picture():
+def test_a_window_covers_a_part_of_the_image():
     shares = [effects.window(SampleRng(1, 0, slot), 64).mean().item() for slot in range(60)]
     assert 0.2 < sum(shares) / 60 < 0.8
 
 
-def test_a_ghost_keeps_the_mean_of_a_flat_picture():
+def test_a_ghost_keeps_the_mean_of_a_flat_image():
     flat = torch.full((3, 32, 32), 0.3)
     torch.testing.assert_close(effects.ghost(SampleRng(1, 0, 0), flat, 0.7, 5.0), flat)
 
@@ -63,7 +63,7 @@ def test_lamps_are_far_brighter_than_their_glow():
         assert light.max() > 20 * light.median()
 
 
-def test_a_sign_changes_only_a_part_of_the_picture(scene):
+def test_a_sign_changes_only_a_part_of_the_image(scene):
     changes = [(effects.sign(SampleRng(1, 0, slot), scene) - scene).abs() for slot in range(40)]
     changed = [(change > 0.02).float().mean().item() for change in changes]
     assert 0.02 < sum(changed) / 40 < 0.8

@@ -42,7 +42,7 @@ def root(tmp_path_factory):
     render_set(root / "set", count=3)
     for folder, roles in (
         ("pairs", ["blended", "transmission"]),
-        ("trios", ["blended", "transmission", "reflection"]),
+        ("triplets", ["blended", "transmission", "reflection"]),
     ):
         for number, role in enumerate(roles):
             pixels = torch.full((40, 60, 3), 200 - 70 * number, dtype=torch.uint8)
@@ -151,17 +151,17 @@ def test_a_crop_has_the_aspect_ratio_of_the_sample_and_is_never_smaller_than_the
 
 
 def test_real_pairs_are_drawn_with_the_probability_pairs_share(recipe, root):
-    samples = open_samples(recipe({**RENDERED, "pairs": ["trios"], "pairs_share": 0.25}))
+    samples = open_samples(recipe({**RENDERED, "pairs": ["triplets"], "pairs_share": 0.25}))
     assert len(samples) == 4
     chosen = [samples.draw_index(SampleRng(1, step, 0)) for step in range(200)]
     assert set(chosen) == {0, 1, 2, 3}
     assert 30 < chosen.count(3) < 70
 
 
-def test_data_with_probability_0_is_not_read(recipe):
-    absent = {"sets": ["absent"]}
-    assert len(open_samples(recipe({**RENDERED, "pairs": ["absent"], "pairs_share": 0.0}))) == 3
-    assert len(open_samples(recipe({"rendered": absent, "pairs": ["trios"], "pairs_share": 1.0}))) == 1
+def test_data_without_a_share_is_not_read(recipe):
+    gone = {"sets": ["gone"]}
+    assert len(open_samples(recipe({**RENDERED, "pairs": ["gone"], "pairs_share": 0.0}))) == 3
+    assert len(open_samples(recipe({"rendered": gone, "pairs": ["triplets"], "pairs_share": 1.0}))) == 1
 
 
 def test_pairs_without_reflections_are_refused_where_r_is_a_panel(recipe):
@@ -176,7 +176,7 @@ def test_pairs_without_reflections_are_refused_where_r_is_a_panel(recipe):
 
 
 def test_a_given_reflection_has_weight_one_and_a_missing_one_is_the_difference_in_light(recipe):
-    (given,) = open_samples(recipe({"pairs": ["trios"], "pairs_share": 1.0}))
+    (given,) = open_samples(recipe({"pairs": ["triplets"], "pairs_share": 1.0}))
     assert given.reflection_weight == 1
     assert [given.layers[0, 0, channel].item() for channel in (0, 3, 6)] == [200, 130, 60]
     both = (torch.full((2, 2, 3), value, dtype=torch.uint8) for value in (188, 137))
@@ -188,19 +188,19 @@ def test_a_sample_that_is_smaller_than_a_panel_is_refused_with_the_budget_that_f
     lora_recipe = recipe(RENDERED, budget_px=10**6)
     with pytest.raises(PhotoError, match="lower budget_px to 768"):
         LatentEncoder(open_samples(lora_recipe), backbone, lora_recipe)
-    pair = recipe({"pairs": ["trios"], "pairs_share": 1.0}, budget_px=10**6)
+    pair = recipe({"pairs": ["triplets"], "pairs_share": 1.0}, budget_px=10**6)
     with pytest.raises(PhotoError, match="lower budget_px to"):
         LatentEncoder(open_samples(pair), backbone, pair)
 
 
 def test_too_few_rendered_samples_are_refused(recipe):
-    with pytest.raises(RecipeError, match="3 rendered samples; at least 9"):
+    with pytest.raises(RecipeError, match="3 rendered samples; expected at least 9"):
         open_samples(recipe({"rendered": {"sets": ["set"], "count": 9}}))
 
 
 def test_the_sides_of_crops_are_0_5_to_1_times_those_of_the_sample():
     fit = fit_panel((300, 200), PanelLayout(), budget_px=3 * 48 * 32, multiple=16)
     whole = torch.zeros(200, 300, 9, dtype=torch.uint8)
-    shares = [crop_sample(SampleRng(seed, -1, 1), whole, fit).shape[0] / 200 for seed in range(200)]
-    assert 0.5 <= min(shares) < 0.52
-    assert 0.98 < max(shares) <= 1
+    ratios = [crop_sample(SampleRng(seed, -1, 1), whole, fit).shape[0] / 200 for seed in range(200)]
+    assert 0.5 <= min(ratios) < 0.52
+    assert 0.98 < max(ratios) <= 1

@@ -18,7 +18,7 @@ from cli_helpers import image_bytes
 RECIPES = Path(__file__).parents[1] / "recipes"
 
 
-def silent(step, steps, metrics, logged):
+def ignore_step(step, steps, metrics, logged):
     pass
 
 
@@ -60,8 +60,8 @@ class CountingTrainer:
         return folder
 
 
-def checkpoint(recipe):
-    """The initial checkpoint of a run."""
+def initial_checkpoint(recipe):
+    """Returns the checkpoint before the first step."""
     return Checkpoint(0, recipe.model_dump_json(), CompactTrainer(recipe).state_dict())
 
 
@@ -79,13 +79,13 @@ def test_the_loop_runs_any_trainer(recipe, tmp_path):
         "step", "loss", "gain", "seconds",
     }  # fmt: skip
     again = CountingTrainer(recipe)
-    run(again, tmp_path, silent)
+    run(again, tmp_path, ignore_step)
     assert not again.initialized
     assert again.steps == trainer.steps
 
 
 def test_tensorboard_gets_the_values_of_the_log(recipe, tmp_path):
-    run(CountingTrainer(recipe), tmp_path, silent)
+    run(CountingTrainer(recipe), tmp_path, ignore_step)
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     events = EventAccumulator(str(tmp_path)).Reload()
     assert set(events.Tags()["scalars"]) == lines[0].keys() - {"step"}
@@ -93,25 +93,25 @@ def test_tensorboard_gets_the_values_of_the_log(recipe, tmp_path):
         logged = [(event.step, event.value) for event in events.Scalars(name)]
         assert logged == [(line["step"], pytest.approx(line[name], abs=1e-5)) for line in lines]
     assert [event.step for event in events.Images("samples")] == [3, 6]
-    run(CountingTrainer(recipe), tmp_path, silent)
+    run(CountingTrainer(recipe), tmp_path, ignore_step)
     assert len(list(tmp_path.glob("events.out.tfevents.*"))) == 1
 
 
 def test_a_killed_and_resumed_run_ends_with_bit_identical_weights(recipe, tmp_path):
-    undisturbed = train(recipe, tmp_path / "one", silent)
+    uninterrupted = train(recipe, tmp_path / "one", ignore_step)
     with pytest.raises(Killed):
         train(recipe, tmp_path / "two", kill_after(5))
-    resumed = train(recipe, tmp_path / "two", silent)
-    for name, value in undisturbed.state_dict().items():
+    resumed = train(recipe, tmp_path / "two", ignore_step)
+    for name, value in uninterrupted.state_dict().items():
         assert torch.equal(value, resumed.state_dict()[name]), name
 
 
 def test_a_killed_run_on_rendered_samples_ends_with_bit_identical_weights(rendered, tmp_path):
-    undisturbed = train(rendered, tmp_path / "one", silent)
+    uninterrupted = train(rendered, tmp_path / "one", ignore_step)
     with pytest.raises(Killed):
         train(rendered, tmp_path / "two", kill_after(3))
-    resumed = train(rendered, tmp_path / "two", silent)
-    for name, value in undisturbed.state_dict().items():
+    resumed = train(rendered, tmp_path / "two", ignore_step)
+    for name, value in uninterrupted.state_dict().items():
         assert torch.equal(value, resumed.state_dict()[name]), name
 
 
@@ -122,25 +122,25 @@ def test_a_run_resumes_after_a_key_was_added_to_the_recipe_schema(recipe, tmp_pa
     old = json.loads(saved.recipe)
     del old["data"]["rendered"]
     replace(saved, recipe=json.dumps(old)).write(tmp_path / "checkpoint.pt")
-    train(recipe, tmp_path, silent)
+    train(recipe, tmp_path, ignore_step)
     assert logged_steps(tmp_path) == [3, 6]
 
 
 def test_a_run_with_an_invalid_stored_recipe_is_not_resumed(recipe, tmp_path):
-    fresh = checkpoint(recipe)
-    replace(fresh, recipe='{"sparkle": 1}').write(tmp_path / "checkpoint.pt")
+    fresh = initial_checkpoint(recipe)
+    replace(fresh, recipe='{"unknown_key": 1}').write(tmp_path / "checkpoint.pt")
     with pytest.raises(RecipeError, match="another recipe"):
-        train(recipe, tmp_path, silent)
+        train(recipe, tmp_path, ignore_step)
 
 
 def test_folders_with_equal_last_names_have_unique_log_keys(recipe, tmp_path):
-    for place in ("one/real", "two/real"):
+    for parent in ("one/real", "two/real"):
         for layer in ("blended", "transmission"):
-            folder = tmp_path / "data" / place / layer
+            folder = tmp_path / "data" / parent / layer
             folder.mkdir(parents=True)
             (folder / "a.jpg").write_bytes(image_bytes())
     folders = [Path("one/real"), Path("two/real"), Path("one/real")]
-    train(with_value(recipe, "data.validate_on", folders), tmp_path / "run", silent)
+    train(with_value(recipe, "data.validate_on", folders), tmp_path / "run", ignore_step)
     logged = json.loads((tmp_path / "run" / "log.jsonl").read_text().splitlines()[0])
     assert {name for name in logged if name.startswith("gain")} == {
         "gain_db_one/real",
@@ -148,21 +148,21 @@ def test_folders_with_equal_last_names_have_unique_log_keys(recipe, tmp_path):
     }
 
 
-def test_a_run_writes_a_log_and_sample_pictures(recipe, tmp_path):
-    train(recipe, tmp_path / "run", silent)
+def test_a_run_writes_a_log_and_an_image_of_samples(recipe, tmp_path):
+    train(recipe, tmp_path / "run", ignore_step)
     assert logged_steps(tmp_path / "run") == [3, 6]
     assert Photo.open(tmp_path / "run" / "samples.png").size[0] == 960
 
 
 def test_a_run_of_another_recipe_is_not_resumed(recipe, tmp_path):
-    train(recipe.model_copy(update={"steps": 1, "learning_rate": 1e-4}), tmp_path, silent)
+    train(recipe.model_copy(update={"steps": 1, "learning_rate": 1e-4}), tmp_path, ignore_step)
     with pytest.raises(RecipeError, match="another recipe"):
-        train(recipe, tmp_path, silent)
+        train(recipe, tmp_path, ignore_step)
 
 
 def test_a_run_can_be_made_longer(recipe, tmp_path):
-    train(recipe.model_copy(update={"steps": 1}), tmp_path, silent)
-    train(recipe.model_copy(update={"steps": 2, "report_every": 1}), tmp_path, silent)
+    train(recipe.model_copy(update={"steps": 1}), tmp_path, ignore_step)
+    train(recipe.model_copy(update={"steps": 2, "report_every": 1}), tmp_path, ignore_step)
     assert logged_steps(tmp_path) == [1, 2]
 
 
@@ -172,23 +172,25 @@ def test_a_resumed_run_logs_every_step_once(recipe, tmp_path):
         train(often, tmp_path, kill_after(3))
     with (tmp_path / "log.jsonl").open("a") as log:
         log.write('{"step": 4, "lo')
-    train(often, tmp_path, silent)
+    train(often, tmp_path, ignore_step)
     assert logged_steps(tmp_path) == [1, 2, 3, 4]
 
 
 def test_a_run_resumes_when_the_checkpoint_that_it_started_from_is_missing(recipe, tmp_path):
     start = tmp_path / "start.pt"
-    checkpoint(recipe).write(start)
+    initial_checkpoint(recipe).write(start)
     with pytest.raises(Killed):
         train(recipe.model_copy(update={"start_from": (start,)}), tmp_path / "run", kill_after(5))
     start.unlink()
-    train(recipe.model_copy(update={"start_from": (Path("elsewhere.pt"),)}), tmp_path / "run", silent)
+    train(recipe.model_copy(update={"start_from": (Path("elsewhere.pt"),)}), tmp_path / "run", ignore_step)
     assert logged_steps(tmp_path / "run") == [3, 6]
 
 
 def test_a_missing_checkpoint_in_start_from_is_named_with_its_cure(recipe, tmp_path):
     with pytest.raises(ModelError, match=r"gone\.pt cannot be read .* correct start_from"):
-        train(recipe.model_copy(update={"start_from": (tmp_path / "gone.pt",)}), tmp_path / "run", silent)
+        train(
+            recipe.model_copy(update={"start_from": (tmp_path / "gone.pt",)}), tmp_path / "run", ignore_step
+        )
 
 
 def test_a_checkpoint_is_written_every_checkpoint_every_steps_and_at_the_end(recipe, tmp_path):
@@ -202,13 +204,13 @@ def test_a_checkpoint_is_written_every_checkpoint_every_steps_and_at_the_end(rec
 
 
 def test_a_checkpoint_of_another_network_is_named(recipe, tmp_path):
-    other = replace(checkpoint(recipe), state={"network": {}, "average": {}})
+    other = replace(initial_checkpoint(recipe), state={"network": {}, "average": {}})
     other.write(tmp_path / "checkpoint.pt")
     with pytest.raises(ModelError, match=r"checkpoint\.pt contains another network; .* with -o"):
-        train(recipe, tmp_path, silent)
+        train(recipe, tmp_path, ignore_step)
     started = recipe.model_copy(update={"start_from": (tmp_path / "checkpoint.pt",)})
     with pytest.raises(ModelError, match=r"checkpoint\.pt contains another network; .* correct start_from"):
-        train(started, tmp_path / "run", silent)
+        train(started, tmp_path / "run", ignore_step)
 
 
 def test_a_damaged_checkpoint_is_named(tmp_path):

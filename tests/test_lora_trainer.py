@@ -11,7 +11,7 @@ import pytest
 import tomli_w
 import torch
 
-import brewster.training.lora.trainer as module
+import brewster.training.lora.trainer as trainer_module
 from brewster.errors import ModelError, RecipeError
 from brewster.models.diffusion.adapter.lora import LORA_FILE, load_lora, lora_state
 from brewster.models.diffusion.backbones import tiny
@@ -36,21 +36,21 @@ RECIPE = {
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def rendered_set(tmp_path_factory):
     render_set(tmp_path_factory.mktemp("sets") / "tiny", count=3)
     return next(tmp_path_factory.getbasetemp().glob("sets*/tiny"))
 
 
 @pytest.fixture
-def recipe(folder, monkeypatch):
-    monkeypatch.setattr(module, "_VALIDATION_SAMPLES", 1)
+def recipe(rendered_set, monkeypatch):
+    monkeypatch.setattr(trainer_module, "_VALIDATION_SAMPLES", 1)
     return lambda **changes: LoraRecipe.model_validate(
-        RECIPE | {"data": {"rendered": {"sets": [folder], "target": "transmission"}}} | changes
+        RECIPE | {"data": {"rendered": {"sets": [rendered_set], "target": "transmission"}}} | changes
     )
 
 
 @pytest.fixture
-def initialized(recipe):
+def make_trainer(recipe):
     def initialize(**changes):
         trainer = LoraTrainer(recipe(**changes))
         trainer.initialize()
@@ -81,19 +81,19 @@ def photo(width=48, height=32):
     return torch.rand(1, 3, height, width, generator=torch.Generator().manual_seed(3)) * 2 - 1
 
 
-def test_a_killed_and_resumed_run_ends_with_a_bit_identical_lora(recipe, folder, tmp_path):
+def test_a_killed_and_resumed_run_ends_with_a_bit_identical_lora(recipe, rendered_set, tmp_path):
     pairs = tmp_path / "pairs"
     for role in ("blended", "transmission", "reflection"):
         (pairs / role).mkdir(parents=True)
         pixels = np.random.default_rng(len(role)).integers(0, 256, (32, 48, 3), dtype=np.uint8)
         Photo.from_array(pixels, encoding="srgb").save(pairs / role / "a.png")
-    rendered = {"sets": [folder], "target": "transmission"}
-    wanted = recipe(crops=2, data={"pairs": [pairs], "pairs_share": 0.5, "rendered": rendered})
-    undisturbed = train(wanted, tmp_path / "one").export(tmp_path / "one")
+    rendered = {"sets": [rendered_set], "target": "transmission"}
+    paired_recipe = recipe(crops=2, data={"pairs": [pairs], "pairs_share": 0.5, "rendered": rendered})
+    uninterrupted = train(paired_recipe, tmp_path / "one").export(tmp_path / "one")
     with pytest.raises(Killed):
-        train(wanted, tmp_path / "two", last=5)
-    resumed = train(wanted, tmp_path / "two").export(tmp_path / "two")
-    assert (undisturbed / LORA_FILE).read_bytes() == (resumed / LORA_FILE).read_bytes()
+        train(paired_recipe, tmp_path / "two", last=5)
+    resumed = train(paired_recipe, tmp_path / "two").export(tmp_path / "two")
+    assert (uninterrupted / LORA_FILE).read_bytes() == (resumed / LORA_FILE).read_bytes()
     ends = [Checkpoint.read(tmp_path / name / "checkpoint.pt").state for name in ("one", "two")]
     moments = [state["optimizer"]["state"] for state in ends]
     for index, values in moments[0].items():
@@ -113,24 +113,24 @@ def test_a_run_writes_a_log_pictures_and_a_folder_for_diffusers(recipe, tmp_path
     assert Photo.open(tmp_path / "samples.png").size == (6 * 240, 160)
 
 
-def test_a_checkpoint_contains_the_lora_and_no_weights_of_the_base(initialized):
-    state = initialized().state_dict()
+def test_a_checkpoint_contains_the_lora_and_no_weights_of_the_base(make_trainer):
+    state = make_trainer().state_dict()
     assert state.keys() == {"lora", "optimizer", "prompt"}
     assert all("lora_" in name and tensor.dtype == torch.float32 for name, tensor in state["lora"].items())
 
 
 @pytest.mark.parametrize("backbone", ["kontext", "klein", "qwen"])
 @pytest.mark.parametrize("objective", ["flow", "one_step"])
-def test_training_lowers_the_loss_of_a_repeated_step(initialized, backbone, objective):
-    trainer = initialized(
+def test_training_lowers_the_loss_of_a_repeated_step(make_trainer, backbone, objective):
+    trainer = make_trainer(
         backbone=f"tiny:{backbone}", objective=objective, batch_size=1, rank=4, learning_rate=5e-2
     )
     losses = [trainer.training_step(0)["loss"] for _ in range(15)]
     assert losses[-1] < 0.9 * losses[0]
 
 
-def test_the_exported_lora_generates_the_same_picture_in_another_backbone(initialized, tmp_path):
-    trainer = initialized(warmup_steps=1)
+def test_the_exported_lora_generates_the_same_panels_in_another_backbone(make_trainer, tmp_path):
+    trainer = make_trainer(warmup_steps=1)
     for step in range(3):
         trainer.training_step(step)
     panels = trainer.separate(photo())
@@ -147,8 +147,8 @@ def test_the_exported_lora_generates_the_same_picture_in_another_backbone(initia
         assert not torch.allclose(plain[name], panel, atol=1e-3)
 
 
-def test_one_step_starts_from_the_photo_in_every_panel_and_subtracts_the_velocity(initialized):
-    trainer = initialized(objective="one_step", panels=["T", "R"])
+def test_one_step_starts_from_the_photo_in_every_panel_and_subtracts_the_velocity(make_trainer):
+    trainer = make_trainer(objective="one_step", panels=["T", "R"])
     encode, prompt = trainer.backbone.encode, trainer.prompt
     start = encode(torch.cat([photo(), photo()], dim=3))
     with torch.no_grad():
@@ -158,22 +158,22 @@ def test_one_step_starts_from_the_photo_in_every_panel_and_subtracts_the_velocit
     torch.testing.assert_close(torch.cat([panels["T"], panels["R"]], dim=3), expected)
 
 
-def test_small_validation_pictures_get_small_panels(initialized, tmp_path, monkeypatch):
+def test_small_validation_photos_get_small_panels(make_trainer, tmp_path, monkeypatch):
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
     for role in ("blended", "transmission"):
         (tmp_path / "small" / role).mkdir(parents=True)
         Photo.from_array(np.full((16, 16, 3), 99, np.uint8), encoding="srgb").save(
             tmp_path / "small" / role / "a.png"
         )
-    trainer = initialized()
+    trainer = make_trainer()
     data = trainer.recipe.data.model_copy(update={"validate_on": (Path("small"),)})
-    scores, picture = initialized(data=data, panels=["T", "R"], budget_px=2 * 32 * 16).validate()
+    scores, image = make_trainer(data=data, panels=["T", "R"], budget_px=2 * 32 * 16).validate()
     assert scores.keys() == {"gain_db_small"}
-    assert picture.shape == (160, 5 * 240, 3)
+    assert image.shape == (160, 5 * 240, 3)
 
 
-def test_a_panel_of_weight_zero_has_no_loss_and_the_others_share_its_weight(initialized):
-    equal, uneven = initialized(), initialized(panel_weights={"I": 0, "T": 3, "R": 1})
+def test_a_panel_of_weight_zero_has_no_loss_and_the_others_share_its_weight(make_trainer):
+    equal, uneven = make_trainer(), make_trainer(panel_weights={"I": 0, "T": 3, "R": 1})
     before, after = equal.training_step(0), uneven.training_step(0)
     assert after["panel_I"] == 0
     assert after["panel_T"] == pytest.approx(before["panel_T"] * 3 * 3 / 4)
@@ -181,8 +181,8 @@ def test_a_panel_of_weight_zero_has_no_loss_and_the_others_share_its_weight(init
     assert after["loss"] == pytest.approx(after["panel_T"] + after["panel_R"])
 
 
-def test_the_loss_of_a_batch_is_the_mean_of_its_samples(initialized):
-    trainer = initialized(batch_size=2)
+def test_the_loss_of_a_batch_is_the_mean_of_its_samples(make_trainer):
+    trainer = make_trainer(batch_size=2)
     alone = [trainer._losses(SampleRng(1, 0, slot)) for slot in range(2)]
     expected = sum(part.item() for parts in alone for part in parts.values()) / 2
     assert trainer.training_step(0)["loss"] == pytest.approx(expected)
@@ -192,8 +192,8 @@ TORCHRUN = ["torch.distributed.run", "--standalone", "--nproc_per_node", "2"]
 ACCELERATE = ["accelerate.commands.launch", "--multi_gpu", "--num_processes", "2", "--main_process_port", "0"]
 
 
-def as_two(launcher, path, out):
-    """Runs the command line under a launcher: exit code and stderr."""
+def run_two_processes(launcher, path, out):
+    """Runs the command line under a launcher with two processes. Returns exit code and stderr."""
     done = subprocess.run(
         [sys.executable, "-m", *launcher, "-m", "brewster", "train", str(path), "-o", str(out)],
         env=os.environ | {"OMP_NUM_THREADS": "1"},
@@ -209,7 +209,7 @@ def as_two(launcher, path, out):
 @pytest.mark.parametrize("launcher", [TORCHRUN, ACCELERATE], ids=["torchrun", "accelerate launch"])
 def test_two_processes_train_the_lora_of_one_process_with_the_whole_batch(recipe, tmp_path, launcher):
     (tmp_path / "recipe.toml").write_text(tomli_w.dumps(recipe().model_dump(mode="json", exclude_none=True)))
-    code, stderr = as_two(launcher, tmp_path / "recipe.toml", tmp_path / "two")
+    code, stderr = run_two_processes(launcher, tmp_path / "recipe.toml", tmp_path / "two")
     assert code == 0, stderr
     assert stderr.count("step 6 of 6") == 1
     alone = train(recipe(), tmp_path / "one").export(tmp_path / "one")
@@ -243,7 +243,9 @@ def test_a_nan_loss_stops_the_run_and_keeps_the_last_valid_checkpoint(recipe, tm
     def break_after_2(step, steps, metrics, logged):
         trainer.broken = step == 2
 
-    with pytest.raises(ModelError, match="the loss is nan at step 2; a finite loss; resume from the last"):
+    with pytest.raises(
+        ModelError, match="the loss is nan at step 2; expected a finite loss; resume from the last"
+    ):
         run(trainer, tmp_path, break_after_2)
     saved = Checkpoint.read(tmp_path / "checkpoint.pt")
     assert saved.step == 2
@@ -251,8 +253,8 @@ def test_a_nan_loss_stops_the_run_and_keeps_the_last_valid_checkpoint(recipe, tm
         assert torch.equal(tensor, saved.state["lora"][name])
 
 
-def test_an_infinite_gradient_does_not_change_the_lora(initialized):
-    trainer = initialized()
+def test_an_infinite_gradient_does_not_change_the_lora(make_trainer):
+    trainer = make_trainer()
     before = {name: tensor.clone() for name, tensor in lora_state(trainer.backbone).items()}
     trainer._parameters[0].register_hook(lambda gradient: gradient * float("inf"))
     with pytest.raises(ModelError, match=r"the gradient is (inf|nan) at step 0"):

@@ -10,15 +10,16 @@ from toy_world import SIDE_PX, STRONG, pretrain, psnr, scenes, write_pairs
 
 
 def transmissions(trainer, photos):
-    """The generated T of each photo."""
+    """Returns the generated T of each photo."""
     return torch.cat([trainer.separate(photo[None])["T"] for photo in photos])
 
 
-def scores(tmp_path, name, *, vae_steps, pretraining, steps, held=96):
-    """PSNR of T in dB on unseen toy scenes, for four predictions: the photo ("copy"), the mean T of the training scenes
-    ("mean"), the base, and the base with the LoRA."""
+def scores(tmp_path, name, *, vae_steps, pretraining, steps, unseen_count=96):
+    """Returns the mean PSNR of T in dB on unseen toy scenes for four predictions: the photo ("copy"), the mean T of the training
+    scenes ("mean"), the result of the base, and that of the base with the LoRA.
+    """
     prompt = pretrain(name, tmp_path / "base", vae_steps=vae_steps, steps=pretraining)
-    training, unseen = scenes(2, 64, "blob", STRONG), scenes(3, held, "blob", STRONG)
+    training, unseen = scenes(2, 64, "blob", STRONG), scenes(3, unseen_count, "blob", STRONG)
     write_pairs(tmp_path / "pairs", training)
     recipe = LoraRecipe.model_validate({
         "backbone": str(tmp_path / "base"), "prompt": str(prompt), "objective": "one_step", "seed": 1,
@@ -33,11 +34,11 @@ def scores(tmp_path, name, *, vae_steps, pretraining, steps, held=96):
     predictions["base"] = transmissions(trainer, unseen["I"])
     run(trainer, tmp_path / "run", lambda *_: None)
     predictions["LoRA"] = transmissions(trainer, unseen["I"])
-    return {key: psnr(pictures, unseen["T"]) for key, pictures in predictions.items()}
+    return {key: psnr(images, unseen["T"]) for key, images in predictions.items()}
 
 
-def test_a_lora_improves_a_pretrained_twin_on_unseen_toys(tmp_path):
-    """A minute of training. The slow test below compares the LoRA with copying the photo."""
+def test_a_lora_improves_a_pretrained_toy_backbone_on_unseen_scenes(tmp_path):
+    """This takes a minute. The slow test below also compares the LoRA with the photo."""
     found = scores(tmp_path, "kontext", vae_steps=110, pretraining=100, steps=60)
     assert found["LoRA"] > found["base"] + 0.1, found
 

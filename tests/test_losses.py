@@ -10,15 +10,15 @@ from brewster.training.data.mixtures import TrainingBatch
 from brewster.training.losses import check_finite, psnr_gain_db, separation_loss, tone_ratio
 
 
-def truth(level=0.4, weight=1.0):
-    """Two samples of 32 px: photo, transmission and reflection of one grey."""
+def make_batch(level=0.4, weight=1.0):
+    """Returns two samples of 32 px. Photo, transmission and reflection have the same grey."""
     grey = torch.full((2, 3, 32, 32), level)
     return TrainingBatch(grey, grey, grey, torch.full((2,), weight))
 
 
 def loss_of(transmission_error=0.0, reflection_error=0.0, *, weight=1.0):
-    """The parts of the loss of a prediction with constant errors."""
-    batch = truth(weight=weight)
+    """Returns the parts of the loss of a prediction with constant errors."""
+    batch = make_batch(weight=weight)
     zero = torch.zeros_like(batch.photo_encoded)
     layers = [batch.transmission_encoded + transmission_error, batch.reflection_encoded + reflection_error]
     parts = separation_loss(torch.cat([layer + zero for layer in layers], dim=1), batch)
@@ -60,19 +60,20 @@ def test_the_loss_has_four_parts():
 
 
 def test_a_tenth_of_the_error_is_a_gain_of_twenty_decibels():
-    wanted = torch.full((1, 3, 8, 8), 0.5)
-    assert psnr_gain_db(wanted + 0.02, wanted + 0.2, wanted) == pytest.approx(20, abs=1e-3)
-    assert psnr_gain_db(wanted + 0.2, wanted + 0.02, wanted) == pytest.approx(-20, abs=1e-3)
+    ground_truth = torch.full((1, 3, 8, 8), 0.5)
+    assert psnr_gain_db(ground_truth + 0.02, ground_truth + 0.2, ground_truth) == pytest.approx(20, abs=1e-3)
+    assert psnr_gain_db(ground_truth + 0.2, ground_truth + 0.02, ground_truth) == pytest.approx(-20, abs=1e-3)
 
 
 def test_tone_is_the_ratio_of_light_where_the_glass_added_none():
     """A white spot was added to one corner; elsewhere the prediction has half of the photo's light."""
-    wanted = torch.full((1, 3, 8, 8), 0.5)
-    photo, prediction = wanted.clone(), torch.full_like(wanted, 0.3611)  # half the linear light of 0.5
+    ground_truth = torch.full((1, 3, 8, 8), 0.5)
+    photo = ground_truth.clone()
+    prediction = torch.full_like(ground_truth, 0.3611)  # half the linear light of 0.5
     photo[..., :2, :2] = 1
     prediction[..., :2, :2] = 1
-    assert tone_ratio(prediction, photo, wanted) == pytest.approx(0.5, abs=1e-3)
-    assert tone_ratio(prediction, torch.ones_like(wanted), wanted) == 1
+    assert tone_ratio(prediction, photo, ground_truth) == pytest.approx(0.5, abs=1e-3)
+    assert tone_ratio(prediction, torch.ones_like(ground_truth), ground_truth) == 1
 
 
 @pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])

@@ -10,7 +10,7 @@ from brewster.srgb import to_linear
 from brewster.training.data.mixtures import InterleavedStream, MixRecipe, Mixtures, Pairs, TrainingBatch
 from brewster.training.data.sample_rng import SampleRng
 
-QUIET = MixRecipe(
+NO_EFFECTS = MixRecipe(
     crop=(1, 1), temperature=(0, 0), background_map_probability=0, background_level_log=(0.1, 0.1),
     highlight_boost=(0, 0), shadow_probability=0, no_glass_probability=0, partial_probability=0, transmittance=(1, 1),
     veil_probability=0, reflection_map_probability=0, reflection_ratio_log=(0.5, 0.5),
@@ -18,7 +18,7 @@ QUIET = MixRecipe(
     ghost_probability=0, falloff_probability=0, edge_probability=0, exposure=(1, 1), overexposed_probability=0,
     gamma_log=(1, 1), contrast=(0, 0), noise=(0, 0), jpeg_probability=0,
 )  # fmt: skip
-WILD = MixRecipe(
+MANY_EFFECTS = MixRecipe(
     background_map_probability=0.5, shadow_probability=0.5, partial_probability=0.5, veil_probability=0.5,
     reflection_map_probability=0.5, lamp_probability=0.5, sign_probability=0.5, sharp_probability=0.3,
     ghost_probability=0.5, falloff_probability=0.5, edge_probability=0.5, overexposed_probability=0.5, jpeg_probability=0.5,
@@ -27,8 +27,8 @@ WILD = MixRecipe(
 
 @pytest.fixture
 def photos(random):
-    smooth = [np.kron(random.integers(20, 200, (6, 8, 3)), np.ones((16, 16, 1))) for _ in range(4)]
-    return [torch.from_numpy(picture.astype(np.uint8)) for picture in smooth]
+    coarse = [np.kron(random.integers(20, 200, (6, 8, 3)), np.ones((16, 16, 1))) for _ in range(4)]
+    return [torch.from_numpy(image.astype(np.uint8)) for image in coarse]
 
 
 @pytest.fixture
@@ -37,24 +37,24 @@ def maps(random):
 
 
 def test_light_adds_up_in_linear_light(photos):
-    batch = Mixtures(photos, [], QUIET, seed=1)(0, 4, 64)
+    batch = Mixtures(photos, [], NO_EFFECTS, seed=1)(0, 4, 64)
     photo, transmission, reflection = (
         to_linear(layer)
         for layer in (batch.photo_encoded, batch.transmission_encoded, batch.reflection_encoded)
     )
-    inside = photo < 0.95
-    torch.testing.assert_close((transmission + reflection)[inside], photo[inside], atol=0.02, rtol=0)
+    unclipped = photo < 0.95
+    torch.testing.assert_close((transmission + reflection)[unclipped], photo[unclipped], atol=0.02, rtol=0)
 
 
 def test_the_reflection_has_the_strength_of_the_recipe(photos):
-    recipe = QUIET.model_copy(update={"reflection_ratio_log": (0.25, 0.25)})
+    recipe = NO_EFFECTS.model_copy(update={"reflection_ratio_log": (0.25, 0.25)})
     batch = Mixtures(photos, [], recipe, seed=1)(0, 8, 64)
     ratio = to_linear(batch.reflection_encoded).mean() / to_linear(batch.transmission_encoded).mean()
     assert ratio.item() == pytest.approx(0.25, rel=0.15)
 
 
 def test_a_veil_adds_uniform_light_relative_to_the_photos_mean(photos):
-    recipe = QUIET.model_copy(update={"veil_probability": 1.0, "veil": (0.3, 0.3)})
+    recipe = NO_EFFECTS.model_copy(update={"veil_probability": 1.0, "veil": (0.3, 0.3)})
     batch = Mixtures(photos, [], recipe, seed=1)(0, 4, 64)
     photo, transmission, reflection = (
         to_linear(layer)
@@ -62,14 +62,14 @@ def test_a_veil_adds_uniform_light_relative_to_the_photos_mean(photos):
     )
     both = transmission + reflection
     veil = 0.3 * both.mean(dim=(2, 3), keepdim=True).expand_as(photo)
-    inside = photo < 0.95
-    torch.testing.assert_close((photo - both)[inside], veil[inside], atol=0.02, rtol=0)
+    unclipped = photo < 0.95
+    torch.testing.assert_close((photo - both)[unclipped], veil[unclipped], atol=0.02, rtol=0)
     assert veil.mean() > 0.03
 
 
 def layers_of(photos, maps=(), **changes):
-    """Photo, transmission and reflection of four samples, encoded; the random numbers do not depend on the changes."""
-    batch = Mixtures(photos, list(maps), QUIET.model_copy(update=changes), seed=1)(0, 4, 64)
+    """Returns photo, transmission and reflection of four samples, encoded. The random numbers do not depend on the changes."""
+    batch = Mixtures(photos, list(maps), NO_EFFECTS.model_copy(update=changes), seed=1)(0, 4, 64)
     return batch.photo_encoded, batch.transmission_encoded, batch.reflection_encoded
 
 
@@ -121,9 +121,9 @@ def test_shadows_and_highlights_change_the_background(photos, changes):
 def test_a_warmer_light_has_more_red_and_less_blue(photos):
     _, plain, _ = layers_of(photos, reflection_ratio_log=(1e-6, 1e-6))
     _, warm, _ = layers_of(photos, reflection_ratio_log=(1e-6, 1e-6), temperature=(0.3, 0.3))
-    inside = (warm < 0.95).all(dim=1) & (plain > 0.05).all(dim=1)
+    unclipped = (warm < 0.95).all(dim=1) & (plain > 0.05).all(dim=1)
     for channel, gain in enumerate((math.exp(0.3), 1, math.exp(-0.3))):
-        ratio = to_linear(warm[:, channel][inside]) / to_linear(plain[:, channel][inside])
+        ratio = to_linear(warm[:, channel][unclipped]) / to_linear(plain[:, channel][unclipped])
         torch.testing.assert_close(ratio, torch.full_like(ratio, gain), atol=0.01, rtol=0)
 
 
@@ -172,7 +172,10 @@ def test_the_target_is_the_transmission_or_the_background(photos):
     light = {
         target: to_linear(
             Mixtures(
-                photos, [], QUIET.model_copy(update={"transmittance": (0.8, 0.8), "target": target}), seed=1
+                photos,
+                [],
+                NO_EFFECTS.model_copy(update={"transmittance": (0.8, 0.8), "target": target}),
+                seed=1,
             )(0, 4, 64).transmission_encoded
         ).mean()
         for target in ("transmission", "background")
@@ -181,7 +184,7 @@ def test_the_target_is_the_transmission_or_the_background(photos):
 
 
 def test_glass_that_covers_a_part_does_not_change_the_rest(photos):
-    recipe = QUIET.model_copy(update={"partial_probability": 1.0, "transmittance": (0.5, 0.5)})
+    recipe = NO_EFFECTS.model_copy(update={"partial_probability": 1.0, "transmittance": (0.5, 0.5)})
     batch = Mixtures(photos, [], recipe, seed=1)(0, 8, 64)
     same = (batch.photo_encoded - batch.transmission_encoded).abs().amax(dim=1) < 2 / 255
     assert (batch.reflection_encoded.amax(dim=1)[same] < 0.1).all()
@@ -189,7 +192,7 @@ def test_glass_that_covers_a_part_does_not_change_the_rest(photos):
 
 
 def test_an_overexposed_background_is_white_in_photo_and_target(photos):
-    recipe = QUIET.model_copy(update={"overexposed_probability": 1.0, "overexposed_share": (0.2, 0.2)})
+    recipe = NO_EFFECTS.model_copy(update={"overexposed_probability": 1.0, "overexposed_share": (0.2, 0.2)})
     batch = Mixtures(photos, [], recipe, seed=1)(0, 8, 64)
     white = batch.transmission_encoded.amax(dim=1) > 0.99
     assert white.float().mean().item() == pytest.approx(0.2, abs=0.07)
@@ -197,14 +200,14 @@ def test_an_overexposed_background_is_white_in_photo_and_target(photos):
 
 
 def test_photos_are_drawn_in_proportion_to_their_weights(photos):
-    stream = Mixtures(photos, [], QUIET, seed=1, weights=[0, 1, 0, 3])
+    stream = Mixtures(photos, [], NO_EFFECTS, seed=1, weights=[0, 1, 0, 3])
     drawn = [stream._choose_photo(SampleRng(1, 0, slot)) for slot in range(400)]
     assert set(drawn) == {1, 3}
     assert drawn.count(3) == pytest.approx(300, abs=40)
 
 
 def test_samples_without_glass_have_no_reflection(photos):
-    recipe = QUIET.model_copy(update={"no_glass_probability": 1.0})
+    recipe = NO_EFFECTS.model_copy(update={"no_glass_probability": 1.0})
     batch = Mixtures(photos, [], recipe, seed=1)(0, 4, 64)
     assert not batch.reflection_encoded.any()
     rounding = 0.5 / 255 + 1e-6
@@ -213,17 +216,17 @@ def test_samples_without_glass_have_no_reflection(photos):
 
 @settings(max_examples=15)
 @given(st.integers(0, 10**6), st.sampled_from([32, 64, 96]))
-def test_every_sample_is_a_picture_and_depends_on_seed_and_step_alone(step, size):
+def test_every_sample_has_values_in_0_to_1_and_depends_on_seed_and_step_only(step, size):
     generator = np.random.default_rng(3)
     photos = [torch.from_numpy(generator.integers(0, 256, (70, 90, 3), np.uint8)) for _ in range(3)]
     maps = [torch.from_numpy(generator.random((3, 16, 32), np.float32) * 50).half()]
-    first, again = (Mixtures(photos, maps, WILD, seed=5)(step, 3, size) for _ in range(2))
+    first, again = (Mixtures(photos, maps, MANY_EFFECTS, seed=5)(step, 3, size) for _ in range(2))
     for name in TrainingBatch.__dataclass_fields__:
         values = getattr(first, name)
         assert torch.equal(values, getattr(again, name))
         assert values.isfinite().all()
         assert 0 <= values.min() <= values.max() <= 1
-    other = Mixtures(photos, maps, WILD, seed=5)(step + 1, 3, size)
+    other = Mixtures(photos, maps, MANY_EFFECTS, seed=5)(step + 1, 3, size)
     assert not torch.equal(first.photo_encoded, other.photo_encoded)
 
 
@@ -235,17 +238,18 @@ def test_real_pairs_stay_aligned(photos):
 
 
 def test_an_interleaved_stream_takes_its_share_of_each_stream(photos):
-    mixtures, pairs = Mixtures(photos, [], QUIET, seed=1), Pairs([(photos[0], photos[0])], (1, 1), seed=1)
+    mixtures = Mixtures(photos, [], NO_EFFECTS, seed=1)
+    pairs = Pairs([(photos[0], photos[0])], (1, 1), seed=1)
     batch = InterleavedStream(pairs, mixtures, 0.25)(0, 8, 32)
     assert (batch.reflection_weight < 1).sum() == 2
     assert batch.photo_encoded.shape == (8, 3, 32, 32)
 
 
 def test_an_interleaved_stream_does_not_call_a_stream_without_samples(photos):
-    def never(step, count, size):
+    def fail_if_called(step, count, size):
         raise AssertionError
 
-    batch = InterleavedStream(never, Mixtures(photos, [], QUIET, seed=1), 0.25)(0, 1, 32)
+    batch = InterleavedStream(fail_if_called, Mixtures(photos, [], NO_EFFECTS, seed=1), 0.25)(0, 1, 32)
     assert batch.photo_encoded.shape == (1, 3, 32, 32)
 
 

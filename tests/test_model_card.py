@@ -102,7 +102,7 @@ def test_benchmark_tables_replace_earlier_ones():
     assert "\n## Measured\n\n| a | 1 |\n\n## Limits\n" in once
     assert "\n## Measured\n\n### Real20\n\n| b | 2 |\n\n## Limits\n" in twice
     assert twice.partition("## Measured")[0] == card().partition("## Measured")[0]
-    with pytest.raises(ModelError, match="has no section for benchmarks; the heading '## Measured'"):
+    with pytest.raises(ModelError, match="has no section for benchmarks; expected the heading '## Measured'"):
         with_benchmark_tables("# somebody else's", "| a | 1 |")
 
 

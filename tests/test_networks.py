@@ -75,7 +75,7 @@ def test_a_run_of_one_network_does_not_start_from_a_checkpoint_of_another(recipe
     )
     with pytest.raises(
         ModelError,
-        match=r"start.pt contains the network lite2-unet; a checkpoint of small, .*; train the recipe",
+        match=r"start.pt contains the network lite2-unet; expected a checkpoint of small, .*; train the recipe",
     ):
         CompactTrainer(other).initialize()
 
@@ -93,7 +93,7 @@ def test_a_checkpoint_with_an_older_recipe_contains_the_default_network(recipe, 
     older = recipe.model_dump_json(exclude={"network"}).replace('"batch_size"', '"batch"')
     assert "network" not in older
     assert "batch_size" not in older
-    average = {name: torch.full_like(value, 2.0) for name, value in trainer.average.items()}
+    average = {name: torch.full_like(value, 2.0) for name, value in trainer.ema_weights.items()}
     checkpoint = replace(
         Checkpoint(0, older, trainer.state_dict()),
         state=trainer.state_dict() | {"average": average},

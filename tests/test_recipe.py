@@ -13,8 +13,8 @@ KONTEXT = TINY.with_stem("kontext")
 BASES = [FOLDER / "ablations/base.toml", FOLDER / "ablations/tiny.toml"]
 
 
-def learning_from(tmp_path, data):
-    """The tiny recipe with other data."""
+def read_with_data(tmp_path, data):
+    """Returns the tiny recipe with other data."""
     head = TINY.read_text().split("[data]")[0]
     (tmp_path / "recipe.toml").write_text(f"{head}[data]\n{data}")
     return read_recipe(tmp_path / "recipe.toml")
@@ -26,7 +26,7 @@ def test_there_are_recipes_and_all_of_them_can_be_read():
         assert read_recipe(path).steps > 0
 
 
-def test_mixtures_default_to_those_of_the_shipped_model():
+def test_recipes_without_a_mix_table_have_the_default_mixtures():
     assert read_recipe(TINY.with_stem("compact")).mix == MixRecipe()
     assert read_recipe(TINY).mix == MixRecipe(reflection_map_probability=0, background_map_probability=0)
 
@@ -40,7 +40,7 @@ def test_a_changed_value_leaves_the_rest_of_a_recipe_as_it_was():
 
 
 @pytest.mark.parametrize(
-    ("dotted", "value", "complaint"),
+    ("key_path", "value", "message"),
     [
         ("data.rendered.mixng", "light", "no key data.rendered.mixng; .*; did you mean data.rendered.mixing"),
         ("data.rendered.mixing.more", 1, "no key data.rendered.mixing.more; .*; see docs/recipes.md"),
@@ -60,12 +60,12 @@ def test_a_changed_value_leaves_the_rest_of_a_recipe_as_it_was():
         ("steps", 0, "steps = 0: steps is 0; expected an integer, above 0; compare"),
     ],
 )
-def test_a_value_that_cannot_be_changed_so_is_refused_by_name(dotted, value, complaint):
-    with pytest.raises(RecipeError, match=complaint):
-        with_value(read_recipe(BASES[0]), dotted, value)
+def test_a_change_that_is_not_allowed_is_refused_and_the_key_named(key_path, value, message):
+    with pytest.raises(RecipeError, match=message):
+        with_value(read_recipe(BASES[0]), key_path, value)
 
 
-def test_pictures_grow_at_the_shares_of_the_run_that_the_recipe_names():
+def test_training_images_grow_at_the_shares_of_the_run_in_the_recipe():
     recipe = read_recipe(FOLDER / "train/tiny.toml")
     assert (recipe.steps, recipe.sizes) == (6, [(0.0, 64), (0.5, 96)])
     assert [recipe.size_at(step) for step in range(6)] == [64, 64, 64, 96, 96, 96]
@@ -74,23 +74,23 @@ def test_pictures_grow_at_the_shares_of_the_run_that_the_recipe_names():
 def test_sources_with_a_share_of_0_may_be_listed(tmp_path):
     no_pairs = 'pairs = ["real"]\npairs_share = 0.0\n'
     rendered = '[data.rendered]\nrecipe = "tiny"\n'
-    assert not learning_from(tmp_path, f"{no_pairs}{rendered}").data.is_empty
-    assert not learning_from(tmp_path, f'photos = ["a"]\n{no_pairs}').data.is_empty
-    assert not learning_from(tmp_path, f'photos = ["a"]\n{rendered}share = 0.0\n').data.is_empty
-    assert not learning_from(tmp_path, 'pairs = ["real"]\npairs_share = 1.0\n').data.is_empty
-    assert learning_from(tmp_path, f"{no_pairs}{rendered}count = 0\n").data.is_empty
+    assert not read_with_data(tmp_path, f"{no_pairs}{rendered}").data.is_empty
+    assert not read_with_data(tmp_path, f'photos = ["a"]\n{no_pairs}').data.is_empty
+    assert not read_with_data(tmp_path, f'photos = ["a"]\n{rendered}share = 0.0\n').data.is_empty
+    assert not read_with_data(tmp_path, 'pairs = ["real"]\npairs_share = 1.0\n').data.is_empty
+    assert read_with_data(tmp_path, f"{no_pairs}{rendered}count = 0\n").data.is_empty
 
 
 def test_the_path_of_a_scene_recipe_is_relative_to_the_recipe(tmp_path):
-    data = learning_from(tmp_path, '[data.rendered]\nrecipe = "mine.toml"').data
+    data = read_with_data(tmp_path, '[data.rendered]\nrecipe = "mine.toml"').data
     assert data.rendered.recipe == str(tmp_path / "mine.toml")
 
 
 @pytest.mark.parametrize(
-    ("change", "complaint"),
+    ("change", "message"),
     [
         (("seed = 1", "seed ="), "not TOML"),
-        (("# A run of seconds", "# Une durée de secondes"), "not TOML .*utf-8"),
+        (("# A test of every part", "# Un test complété"), "not TOML .*utf-8"),
         (("seed = 1", ""), "seed is missing; expected an integer, at least 0, below 4294967296; add it"),
         (("seed = 1", "seed = -1"), "seed"),
         (("steps = 6", "steps = 0"), "steps"),
@@ -167,11 +167,11 @@ def test_the_path_of_a_scene_recipe_is_relative_to_the_recipe(tmp_path):
         (("[mix]", "[mix]\nveil_probability = -0.1"), r"mix\.veil_probability"),
     ],
 )
-def test_a_wrong_recipe_is_refused_and_the_key_named(tmp_path, change, complaint):
+def test_a_wrong_recipe_is_refused_and_the_key_named(tmp_path, change, message):
     text = TINY.read_text()
     assert change[0] in text
     (tmp_path / "wrong.toml").write_bytes(text.replace(*change).encode("latin-1"))
-    with pytest.raises(RecipeError, match=f"wrong.toml.*{complaint}"):
+    with pytest.raises(RecipeError, match=f"wrong.toml.*{message}"):
         read_recipe(tmp_path / "wrong.toml")
 
 
@@ -205,7 +205,7 @@ def test_the_path_of_a_prompt_is_relative_to_the_recipe(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "complaint"),
+    ("change", "message"),
     [
         (("rank = 16", "rank = 0"), "rank is 0"),
         (("rank = 16", "rnk = 16"), "no key rnk .*; did you mean rank"),
@@ -234,9 +234,9 @@ def test_the_path_of_a_prompt_is_relative_to_the_recipe(tmp_path):
         ),
     ],
 )
-def test_a_wrong_lora_recipe_is_refused_and_the_key_named(tmp_path, change, complaint):
+def test_a_wrong_lora_recipe_is_refused_and_the_key_named(tmp_path, change, message):
     text = KONTEXT.read_text()
     assert change[0] in text
     (tmp_path / "wrong.toml").write_text(text.replace(*change, 1))
-    with pytest.raises(RecipeError, match=f"wrong.toml.*{complaint}"):
+    with pytest.raises(RecipeError, match=f"wrong.toml.*{message}"):
         read_recipe(tmp_path / "wrong.toml")

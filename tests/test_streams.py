@@ -27,21 +27,21 @@ def recipe():
 
 
 @pytest.fixture(scope="module")
-def worlds():
+def assets():
     return Assets()
 
 
 @pytest.fixture
-def builtin(worlds, monkeypatch):
-    """Built-in environments that all tests share, and no data folder."""
-    monkeypatch.setattr("brewster.training.streams.Assets", lambda folders: worlds)
+def builtin(assets, monkeypatch):
+    """Built-in environments, which all tests share, without a data folder."""
+    monkeypatch.setattr("brewster.training.streams.Assets", lambda folders: assets)
     monkeypatch.delenv("BREWSTER_DATA", raising=False)
-    return worlds
+    return assets
 
 
 @pytest.fixture
 def root(tmp_path, monkeypatch):
-    """A data folder: photos, pairs and an empty one."""
+    """A data folder with photos, pairs and an empty folder."""
     for name in ("photos", "real/blended", "real/transmission", "empty/blended"):
         (tmp_path / name).mkdir(parents=True)
     for name in ("photos/a.jpg", "real/blended/a.jpg", "real/transmission/a.jpg"):
@@ -59,13 +59,13 @@ def same(one, other):
 
 
 @pytest.mark.parametrize("kind", ["photos", "maps", "pairs"])
-def test_a_folder_that_is_missing_or_without_pictures_is_named(recipe, root, kind):
-    for folder, complaint in (
-        ("empty", "no pictures in .*empty"),
+def test_a_folder_that_is_missing_or_without_images_is_named(recipe, root, kind):
+    for folder, message in (
+        ("empty", "no (images|pictures) in .*empty"),
         ("gone", r"gone.* cannot be read \(No such"),
     ):
         data = {"photos": ["photos"], "pairs_share": float(kind == "pairs"), kind: [folder]}
-        with pytest.raises(RecipeError, match=complaint):
+        with pytest.raises(RecipeError, match=message):
             open_stream(with_data(recipe, **data))
 
 
@@ -106,8 +106,8 @@ def test_orders_and_seed_of_a_recipe_reach_the_scenes(recipe, builtin):
 def test_each_batch_is_divided_by_the_shares(recipe, root):
     render_set(root / "set", count=2)
     data = {"photos": ["photos"], "pairs": ["real"], "rendered": {"sets": ["set"], "share": 0.25}}
-    blend = open_stream(with_data(recipe, **data, pairs_share=0.5))
-    batch = blend(0, 8, 32)
+    stream = open_stream(with_data(recipe, **data, pairs_share=0.5))
+    batch = stream(0, 8, 32)
     assert batch.photo_encoded.shape == (8, 3, 32, 32)
     assert (batch.reflection_weight < 1).tolist() == 4 * [True] + 4 * [False]
     rendered = open_stream(with_data(recipe, rendered={"sets": ["set"]}))(0, 1, 32)
@@ -141,10 +141,10 @@ def test_a_map_that_cannot_light_a_scene_is_refused_unless_it_is_excluded(recipe
     (root / "hdri").mkdir()
     for name, texels in (("good.exr", good), ("clipped.exr", clipped)):
         Photo.from_array(texels, encoding="linear").save(root / "hdri" / name)
-    wanted = {"rendered": {"recipe": "tiny", "maps": ["hdri"]}}
+    data = {"rendered": {"recipe": "tiny", "maps": ["hdri"]}}
     with pytest.raises(UnsupportedPhoto, match=r"clipped\.exr"):
-        open_stream(with_data(recipe, **wanted))
-    open_stream(with_data(recipe, **wanted, exclude=["clip*"]))
+        open_stream(with_data(recipe, **data))
+    open_stream(with_data(recipe, **data, exclude=["clip*"]))
 
 
 def test_the_total_weight_of_a_source_is_the_square_root_of_its_number_of_photos(recipe, root):

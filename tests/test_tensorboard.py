@@ -15,10 +15,10 @@ def read(folder):
     return events.Reload()
 
 
-def test_numbers_and_the_picture_are_read_back_at_their_steps(tmp_path):
-    board = TensorBoardLog(tmp_path, 0)
+def test_metrics_and_the_image_are_read_back_at_their_steps(tmp_path):
+    event_log = TensorBoardLog(tmp_path, 0)
     for step in (3, 6):
-        board.log(step, {"loss": 1 / step, "gain_db_real/dev": -2.5}, torch.full((4, 6, 3), 0.5))
+        event_log.log(step, {"loss": 1 / step, "gain_db_real/dev": -2.5}, torch.full((4, 6, 3), 0.5))
     events = read(tmp_path)
     assert [(event.step, event.value) for event in events.Scalars("loss")] == [
         (3, pytest.approx(1 / 3)),
@@ -30,14 +30,14 @@ def test_numbers_and_the_picture_are_read_back_at_their_steps(tmp_path):
 
 
 def test_a_resumed_run_discards_events_of_later_steps(tmp_path):
-    picture = torch.zeros(4, 6, 3)
+    image = torch.zeros(4, 6, 3)
     killed = TensorBoardLog(tmp_path, 0)
     for step in (1, 2, 3):
-        killed.log(step, {"loss": 10.0}, picture)
+        killed.log(step, {"loss": 10.0}, image)
     time.sleep(1.1)  # event files are named and sorted by the second of their creation
     resumed = TensorBoardLog(tmp_path, 1)
     for step in (2, 3, 4):
-        resumed.log(step, {"loss": 5.0}, picture)
+        resumed.log(step, {"loss": 5.0}, image)
     events = read(tmp_path)
     assert [(event.step, event.value) for event in events.Scalars("loss")] == [
         (1, 10.0), (2, 5.0), (3, 5.0), (4, 5.0),

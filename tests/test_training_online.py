@@ -40,10 +40,10 @@ def test_a_batch_has_square_encoded_pictures(assets):
 
 
 def test_iterating_gives_the_samples_in_order_at_the_recipes_size(assets):
-    live = stream(assets)
-    first = next(iter(live))
+    samples = stream(assets)
+    first = next(iter(samples))
     assert first.photo_encoded.shape == (3, 64, 96)
-    assert torch.equal(first.photo_encoded, live.sample(0).photo_encoded)
+    assert torch.equal(first.photo_encoded, samples.sample(0).photo_encoded)
 
 
 @pytest.mark.parametrize("mixing", ["light", "8-bit"])
@@ -72,8 +72,8 @@ def test_both_kinds_of_mixing_have_the_same_background(assets):
 
 
 def test_layers_are_photo_target_and_reflection_of_the_batch(assets):
-    live = stream(assets)
-    batch, layers = live(0, 2, 32), live.layers(1, 32)
+    samples = stream(assets)
+    batch, layers = samples(0, 2, 32), samples.layers(1, 32)
     pictures = batch.photo_encoded[1], batch.transmission_encoded[1], batch.reflection_encoded[1]
     assert torch.equal(layers, torch.cat(pictures))
 

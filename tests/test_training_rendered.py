@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 import torch
 
-import brewster.training.data.rendered as module
+import brewster.training.data.rendered as rendered_module
 from brewster.errors import PhotoError, RecipeError
 from brewster.photo import Photo
 from brewster.render.camera_response import encode_jpeg
@@ -74,11 +74,11 @@ def test_crops_of_photo_and_ground_truth_are_aligned(folder):
 
 def test_a_batch_from_disk_depends_on_seed_and_step_alone(folder):
     one, other = RenderedSets([folder], seed=1), RenderedSets([folder], seed=1)
-    late = one(7, 4, 32)
+    batch = one(7, 4, 32)
     other(0, 2, 64)
-    assert same(late, other(7, 4, 32))
-    assert not torch.equal(late.photo_encoded, one(8, 4, 32).photo_encoded)
-    assert not torch.equal(late.photo_encoded, RenderedSets([folder], seed=2)(7, 4, 32).photo_encoded)
+    assert same(batch, other(7, 4, 32))
+    assert not torch.equal(batch.photo_encoded, one(8, 4, 32).photo_encoded)
+    assert not torch.equal(batch.photo_encoded, RenderedSets([folder], seed=2)(7, 4, 32).photo_encoded)
 
 
 def test_shards_and_folders_hold_the_same_samples(folder, tmp_path):
@@ -104,14 +104,14 @@ def test_sets_follow_one_another(folder, tmp_path):
 
 
 def test_a_count_above_the_number_of_samples_is_refused(folder):
-    with pytest.raises(RecipeError, match=r"set: 3 rendered samples; at least 4, .*; .* lower"):
+    with pytest.raises(RecipeError, match=r"set: 3 rendered samples; expected at least 4, .*; .* lower"):
         RenderedSets([folder], seed=1, count=4)
 
 
 def test_a_folder_that_is_missing_empty_or_no_set_is_named(tmp_path):
     with pytest.raises(RecipeError, match=r"gone cannot be read \(No such"):
         RenderedSets([tmp_path / "gone"], seed=1)
-    with pytest.raises(RecipeError, match=r"0 rendered samples; at least 1"):
+    with pytest.raises(RecipeError, match=r"0 rendered samples; expected at least 1"):
         RenderedSets([tmp_path], seed=1)
     (tmp_path / "shard-000000.tar").write_bytes(b"no tar" * 200)
     with pytest.raises(RecipeError, match="cannot be read"):
@@ -134,7 +134,7 @@ def test_a_damaged_picture_is_named_with_its_sample(folder):
 
 def test_samples_that_were_read_are_cached_within_the_memory_limit(folder, monkeypatch):
     large = RenderedSets([folder], seed=1)
-    monkeypatch.setattr(module, "CACHE_BYTES", 16 * 24 * 9)
+    monkeypatch.setattr(rendered_module, "CACHE_BYTES", 16 * 24 * 9)
     small = RenderedSets([folder], seed=1)
     first = [stream(0, 20, 32) for stream in (large, small)]
     assert same(*first)
@@ -155,10 +155,10 @@ def test_a_cached_sample_is_rendered_once_per_size():
 
 def test_a_batch_from_memory_depends_on_seed_and_step_alone():
     one, other = (CachedRendered(FakeOnline(), 3, seed=1) for _ in range(2))
-    late = one(7, 4, 16)
+    batch = one(7, 4, 16)
     other(0, 9, 16)
-    assert same(late, other(7, 4, 16))
-    assert same(late, one(7, 4, 16))
+    assert same(batch, other(7, 4, 16))
+    assert same(batch, one(7, 4, 16))
 
 
 def test_a_cached_sample_is_mirrored_at_random():

@@ -1,8 +1,8 @@
-"""A world of toys behind glass, and twins that have seen something like it: what the tests of learning share.
+"""Toy scenes behind glass, and toy backbones that are pretrained on similar scenes, for the tests of LoRA training.
 
-What is behind the glass is a soft gradient; what is mirrored in it is a bright shape; in linear light the photo is
-their sum. A twin is first pretrained, in full: its VAE on bars of any strength, the transformer on taking faint bars
-away. So it has never met what its LoRA is to learn: strong blobs.
+The transmission is a smooth gradient, the reflection is a bright shape. In linear light, the photo is their sum. All weights of
+a toy backbone are pretrained first: its VAE on bars of any strength, its transformer on the removal of faint bars. The LoRA is
+then trained to remove strong blobs, which are not in the data of pretraining.
 """
 
 import math
@@ -20,12 +20,15 @@ from brewster.srgb import to_encoded, to_linear
 SIDE_PX = 32
 LAYOUT = PanelLayout()
 ANY, FAINT, STRONG = (0.1, 1.5), (0.1, 0.8), (0.7, 1.5)
-"""Light of the shapes; white is 1."""
+"""Ranges of the linear light of the shapes. White is 1."""
 FOLDERS = {"I": "blended", "T": "transmission", "R": "reflection"}
 
 
 def scenes(seed, count, shape, strength):
-    """I, T and R of so many scenes, (count, 3, 32, 32) each, encoded, in [-1, 1]; `strength` is the shapes' light."""
+    """Returns I, T and R of `count` scenes, (count, 3, 32, 32) each, encoded, in [-1, 1].
+
+    `strength` is the range of the linear light of the shapes.
+    """
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(low, high, *size):
@@ -46,68 +49,74 @@ def scenes(seed, count, shape, strength):
 
 
 def write_pairs(folder, layers):
-    """The scenes as a folder of real pairs, with their reflections."""
+    """Writes the scenes as a folder of real pairs with reflections."""
     for name, role in FOLDERS.items():
         (folder / role).mkdir(parents=True)
-        for number, picture in enumerate(layers[name]):
-            pixels = ((picture + 1) * 127.5).round().byte().permute(1, 2, 0).numpy()
+        for number, image in enumerate(layers[name]):
+            pixels = ((image + 1) * 127.5).round().byte().permute(1, 2, 0).numpy()
             Photo.from_array(np.ascontiguousarray(pixels), encoding="srgb").save(
                 folder / role / f"{number:03}.png"
             )
 
 
-def psnr(made, truth):
-    """Mean over the pictures, in dB, of pictures in [-1, 1]."""
-    errors = ((made - truth) / 2).square().mean(dim=(1, 2, 3))
+def psnr(predictions, ground_truth):
+    """Returns the mean PSNR in dB of images in [-1, 1]."""
+    errors = ((predictions - ground_truth) / 2).square().mean(dim=(1, 2, 3))
     return (-10 * errors.log10()).mean().item()
 
 
 def pretrain(name, folder, *, vae_steps, steps):
-    """A twin that can see and show toys and takes faint bars away in one step; saved with its prompt, whose path is returned."""
+    """Pretrains a toy backbone on the removal of faint bars in one step, and saves it with its prompt.
+
+    Returns:
+        The path of the prompt.
+    """
     backbone, prompt = tiny(name)
-    seen = scenes(1, 128, "bar", FAINT)
+    training = scenes(1, 128, "bar", FAINT)
     generator = torch.Generator().manual_seed(0)
-    _learn_to_see(backbone, scenes(4, 128, "bar", ANY), vae_steps)
-    shown, target, start = (
-        torch.cat([backbone.encode(part) for part in pictures.split(32)])
-        for pictures in (
-            conditioning_image(seen["I"], LAYOUT),
-            compose(seen, LAYOUT),
-            compose(dict.fromkeys("ITR", seen["I"]), LAYOUT),
+    _train_vae(backbone, scenes(4, 128, "bar", ANY), vae_steps)
+    condition, target, start = (
+        torch.cat([backbone.encode(part) for part in images.split(32)])
+        for images in (
+            conditioning_image(training["I"], LAYOUT),
+            compose(training, LAYOUT),
+            compose(dict.fromkeys("ITR", training["I"]), LAYOUT),
         )
     )
 
     def loss(step):
-        some = torch.randint(len(target), (16,), generator=generator)
-        # A real base has learnt an empty prompt, and other guidance, too.
-        odd = step % 2
-        told = replace(prompt, embeds=prompt.negative) if prompt.negative is not None and odd else prompt
-        guidance = 4.0 if backbone.guided_by_embedding and odd else 1.0
-        velocity = backbone.predict(start[some], shown[some], torch.ones(16), told, guidance)
-        return (velocity - (start[some] - target[some])).square().mean()
+        batch = torch.randint(len(target), (16,), generator=generator)
+        # Real bases are also trained with an empty prompt and with other guidance: here, every second step is.
+        is_odd = step % 2
+        step_prompt = (
+            replace(prompt, embeds=prompt.negative) if prompt.negative is not None and is_odd else prompt
+        )
+        guidance = 4.0 if backbone.guided_by_embedding and is_odd else 1.0
+        velocity = backbone.predict(start[batch], condition[batch], torch.ones(16), step_prompt, guidance)
+        return (velocity - (start[batch] - target[batch])).square().mean()
 
-    _minimise(loss, backbone.transformer, steps, peak=3e-3)
+    _minimize(loss, backbone.transformer, steps, peak=3e-3)
     backbone.save(folder)
     prompt.save(folder / "prompt.safetensors")
     return folder / "prompt.safetensors"
 
 
-def _learn_to_see(backbone, seen, steps):
-    """The VAE, on composites and on what the model is shown and starts from."""
+def _train_vae(backbone, layers, steps):
+    """Trains the VAE on composite images, conditioning images, and composites with the photo in every panel."""
     generator = torch.Generator().manual_seed(0)
 
     def loss(step):
-        some = torch.randint(len(seen["I"]), (4,), generator=generator)
-        layers = {name: pictures[some] for name, pictures in seen.items()}
-        kinds = [compose(layers, LAYOUT), conditioning_image(layers["I"], LAYOUT)]
-        kinds += [kinds[0], compose(dict.fromkeys("ITR", layers["I"]), LAYOUT)]
-        picture = kinds[step % 4]
-        return (backbone._vae_decode(backbone._vae_encode(picture)) - picture).square().mean()
+        indices = torch.randint(len(layers["I"]), (4,), generator=generator)
+        batch = {name: images[indices] for name, images in layers.items()}
+        kinds = [compose(batch, LAYOUT), conditioning_image(batch["I"], LAYOUT)]
+        kinds += [kinds[0], compose(dict.fromkeys("ITR", batch["I"]), LAYOUT)]
+        image = kinds[step % 4]
+        return (backbone._vae_decode(backbone._vae_encode(image)) - image).square().mean()
 
-    _minimise(loss, backbone.vae, steps, peak=4e-3)
+    _minimize(loss, backbone.vae, steps, peak=4e-3)
 
 
-def _minimise(loss, network, steps, peak):
+def _minimize(loss, network, steps, peak):
     network.requires_grad_(True)
     optimizer = torch.optim.AdamW(network.parameters(), peak)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, peak, total_steps=steps, pct_start=0.1)

@@ -1,4 +1,4 @@
-"""Checkpoints of training runs: written atomically, restored bit for bit."""
+"""Checkpoints of training runs. They are written atomically and restored bit for bit."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Checkpoint:
     state: Mapping[str, Any]
 
     def write(self, path: Path) -> None:
-        """Replaces the file atomically: a killed process leaves either the old or the new checkpoint.
+        """Writes or replaces the file atomically: a killed process leaves either the old or the new checkpoint.
 
         Raises:
             TargetError: the file cannot be written.
@@ -61,14 +61,14 @@ class Checkpoint:
         ) as error:
             raise ModelError(
                 f"{path} cannot be read ({type(error).__name__})",
-                "a checkpoint written by brewster train",
+                "expected a checkpoint written by brewster train",
                 cure,
             ) from error
 
 
 @contextmanager
 def mismatch_as_model_error(path: Path, cure: str) -> Iterator[None]:
-    """Turns the errors of `load_state_dict` into one that names the checkpoint.
+    """Replaces an error of `load_state_dict` in its block by a ModelError with the path of the checkpoint.
 
     Raises:
         ModelError: the state does not match the network.
@@ -77,5 +77,7 @@ def mismatch_as_model_error(path: Path, cure: str) -> Iterator[None]:
         yield
     except (RuntimeError, ValueError, KeyError) as error:
         raise ModelError(
-            f"{path} contains another network", "a checkpoint of the network that the recipe trains", cure
+            f"{path} contains another network",
+            "expected a checkpoint of the network that the recipe trains",
+            cure,
         ) from error

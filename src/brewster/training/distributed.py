@@ -4,8 +4,8 @@ torchrun --standalone --nproc_per_node 2 -m brewster train recipes/train/klein.t
 accelerate launch --multi_gpu --num_processes 2 -m brewster train recipes/train/klein.toml
 
 Each process computes the gradients of its part of the batch; the sum equals the gradient of one process with the whole
-batch. A run can therefore be resumed with another number of processes. Only rank 0 writes files and logs. Several processes
-need accelerate.
+batch. A run can therefore be resumed with another number of processes. Only rank 0 writes files and logs. The package
+accelerate is needed for several processes.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ def initialize() -> None:
         # NotImplementedError: accelerate refuses RTX 40 GPUs until NCCL_P2P_DISABLE and NCCL_IB_DISABLE are set.
         raise DeviceError(
             f"the process group could not be created: {error}",
-            f"{_expected_world_size()} processes that can connect to each other",
+            f"expected {_expected_world_size()} processes that can connect to each other",
             _CURE,
         ) from error
     if world_size() != _expected_world_size():
         raise DeviceError(
             f"{world_size()} processes have joined",
-            f"{_expected_world_size()} processes, as WORLD_SIZE states",
+            f"expected {_expected_world_size()} processes, the value of WORLD_SIZE",
             _CURE,
         )
     if state:
@@ -54,13 +54,13 @@ def initialize() -> None:
 
 
 def world_size() -> int:
-    """Number of processes."""
+    """Returns the number of processes."""
     state = _partial_state()
     return int(state.num_processes) if state else 1
 
 
 def rank() -> int:
-    """Number of this process, from 0."""
+    """Returns the number of this process, from 0."""
     state = _partial_state()
     return int(state.process_index) if state else 0
 
@@ -71,7 +71,7 @@ def is_main_process() -> bool:
 
 
 def best_device() -> torch.device:
-    """The GPU of this process, or the CPU if torch finds no GPU."""
+    """Returns the GPU of this process, or the CPU if torch finds no GPU."""
     if not torch.cuda.is_available():
         return torch.device("cpu")
     state = _partial_state()
@@ -89,7 +89,7 @@ def all_reduce_sum(tensors: Sequence[Tensor]) -> None:
 
 
 def _partial_state() -> Any | None:  # noqa: ANN401 - accelerate's state
-    """accelerate's state, a singleton; None for a single process."""
+    """Returns the state of accelerate, a singleton, or None for a single process."""
     if _expected_world_size() == 1:
         return None
     # Without cpu=True and without a GPU, accelerate creates no process group, and each process trains alone.
@@ -101,18 +101,18 @@ def _expected_world_size() -> int:
 
 
 def _check_launch_variables() -> None:
-    """Refuses an environment in which a launcher started only one process, or did not set its variables."""
+    """Raises DeviceError if variables of the launcher are missing, or if it started only one process."""
     missing = [name for name in _LAUNCHER_VARIABLES if name not in os.environ]
     if _expected_world_size() > 1 and missing:
         raise DeviceError(
-            f"WORLD_SIZE is {_expected_world_size()}, and {', '.join(missing)} not set",
-            "all variables that a launcher sets",
+            f"WORLD_SIZE is {_expected_world_size()}, but these variables are not set: {', '.join(missing)}",
+            "expected all variables that a launcher sets",
             _CURE,
         )
     # `accelerate launch --cpu --num_processes 2` sets these variables, but starts only one process, without a warning.
     if "WORLD_SIZE" not in os.environ and {"ACCELERATE_MIXED_PRECISION", "MASTER_ADDR"} <= os.environ.keys():
         raise DeviceError(
             "accelerate launch started one process instead of several",
-            "several processes",
+            "expected several processes",
             f"{_CURE}, or accelerate launch --multi_gpu",
         )

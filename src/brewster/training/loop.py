@@ -28,9 +28,9 @@ from brewster.training.tensorboard import TensorBoardLog
 StepCallback = Callable[[int, int, Mapping[str, float], bool], None]
 """Called after every step with (step, steps, metrics, logged); `logged` is true if the metrics were written to the log."""
 
-CHECKPOINT: Final = "checkpoint.pt"
-LOG: Final = "log.jsonl"
-SAMPLES: Final = "samples.png"
+CHECKPOINT_FILE: Final = "checkpoint.pt"
+LOG_FILE: Final = "log.jsonl"
+SAMPLES_FILE: Final = "samples.png"
 _NOT_COMPARED: Final = {"start_from", "steps", "report_every", "checkpoint_every"}
 """Recipe values that may change when a run is resumed."""
 
@@ -44,7 +44,7 @@ class Trainer(Protocol):
         ...
 
     def initialize(self) -> None:
-        """Loads what the recipe starts from. Called once, when a new run starts, not when a run is resumed."""
+        """Loads the initial state that the recipe selects. Called when a new run starts, not when a run is resumed."""
         ...
 
     def training_step(self, step: int) -> dict[str, float]:
@@ -60,7 +60,7 @@ class Trainer(Protocol):
         ...
 
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """Returns the validation metrics by name, and a picture of sample predictions: (H, W, 3), sRGB-encoded, in 0..1."""
+        """Returns the validation metrics by name, and an image of sample predictions: (H, W, 3), sRGB-encoded, in 0..1."""
         ...
 
     def export(self, folder: Path) -> Path:
@@ -73,8 +73,8 @@ def run(trainer: Trainer, out: Path, on_step: StepCallback) -> None:
 
     Every `checkpoint_every` steps it writes `checkpoint.pt` into `out`. Every `report_every` steps it validates, appends a
     line to `log.jsonl`, replaces `samples.png`, and writes both as TensorBoard events if tensorboard is installed. With
-    several processes, only rank 0 writes files. A recipe without data (a count of 0) takes no step: the trainer keeps its
-    initial weights.
+    several processes, only rank 0 writes files. If the recipe has no data (a count of 0), `run` takes no step, and the
+    trainer keeps its initial weights.
 
     Raises:
         RecipeError: `out` contains a run of another recipe.
@@ -83,34 +83,38 @@ def run(trainer: Trainer, out: Path, on_step: StepCallback) -> None:
     """
     out.mkdir(parents=True, exist_ok=True)
     recipe = trainer.recipe
-    completed_steps = _resume_or_initialize(trainer, out / CHECKPOINT)
+    completed_steps = _resume_or_initialize(trainer, out / CHECKPOINT_FILE)
     if is_main_process():
-        _truncate_log(completed_steps, out / LOG)
+        _truncate_log(completed_steps, out / LOG_FILE)
     started, steps = time.monotonic(), 0 if recipe.data.is_empty else recipe.steps
     with closing(TensorBoardLog(out, completed_steps)) as event_log:
         for step in range(completed_steps + 1, 1 + steps):
             metrics, is_last = trainer.training_step(step - 1), step == recipe.steps
             logged = is_main_process() and (is_last or step % recipe.report_every == 0)
             if logged:
-                scores, picture = trainer.validate()
+                scores, image = trainer.validate()
                 metrics |= scores | {"seconds": time.monotonic() - started}
-                _append_log(out / LOG, {"step": step, **metrics})
-                _write_picture(out / SAMPLES, picture)
-                event_log.log(step, metrics, picture)
+                _append_log(out / LOG_FILE, {"step": step, **metrics})
+                _write_image(out / SAMPLES_FILE, image)
+                event_log.log(step, metrics, image)
             if is_main_process() and (is_last or step % recipe.checkpoint_every == 0):
-                Checkpoint(step, recipe.model_dump_json(), trainer.state_dict()).write(out / CHECKPOINT)
+                Checkpoint(step, recipe.model_dump_json(), trainer.state_dict()).write(out / CHECKPOINT_FILE)
             on_step(step, recipe.steps, metrics, logged)
 
 
 def read_last_metrics(folder: Path) -> dict[str, float]:
     """Returns the last line of the log in `folder`, or an empty dict if there is no log."""
-    log = folder / LOG
+    log = folder / LOG_FILE
     lines = log.read_text().splitlines() if log.exists() else []
     return dict(json.loads(lines[-1])) if lines else {}
 
 
 def _resume_or_initialize(trainer: Trainer, path: Path) -> int:
-    """Restores the checkpoint at `path`, or initializes the trainer if there is none. Returns the number of completed steps."""
+    """Restores the checkpoint at `path`, or initializes the trainer if there is none.
+
+    Returns:
+        The number of completed steps.
+    """
     if not path.exists():
         trainer.initialize()
         return 0
@@ -121,24 +125,23 @@ def _resume_or_initialize(trainer: Trainer, path: Path) -> int:
 
 
 def _check_recipe(checkpoint: Checkpoint, recipe: TrainingRecipe, path: Path) -> Checkpoint:
-    before, now = (
-        _compared_values(checkpoint.recipe, recipe),
-        _compared_values(recipe.model_dump_json(), recipe),
-    )
+    before = _compared_values(checkpoint.recipe, recipe)
+    now = _compared_values(recipe.model_dump_json(), recipe)
     if before == now:
         return checkpoint
     changed = ", ".join(name for name in now if before and before.get(name) != now[name])
     raise RecipeError(
         f"{path} belongs to a run of another recipe{f' (different values: {changed})' if changed else ''}",
-        "a run is resumed with the recipe that it started with",
+        "expected the recipe with which the run started",
         "choose another folder with -o",
     )
 
 
 def _compared_values(text: str, recipe: TrainingRecipe) -> dict[str, object]:
-    """Returns the values that must be equal for a run to resume: all but `_NOT_COMPARED`.
+    """Returns the values of a stored recipe that must be equal for a run to resume: all but `_NOT_COMPARED`.
 
-    A value that the stored recipe lacks, because it was added to the schema later, counts as its default.
+    A value that the stored recipe lacks, because it was added to the schema later, has its default. The result is empty if
+    the stored recipe is not valid.
     """
     try:
         return type(recipe).model_validate_json(text).model_dump(exclude=_NOT_COMPARED)
@@ -154,11 +157,11 @@ def _append_log(path: Path, metrics: Mapping[str, float]) -> None:
 def _truncate_log(step: int, log: Path) -> None:
     """Removes the lines that a killed run wrote after its last checkpoint. The last line may be incomplete."""
     lines = log.read_text().splitlines() if log.exists() else []
-    kept = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= step]
-    if kept != lines:
-        write_atomically(log, "".join(f"{line}\n" for line in kept).encode(), overwrite=True)
+    valid = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= step]
+    if valid != lines:
+        write_atomically(log, "".join(f"{line}\n" for line in valid).encode(), overwrite=True)
 
 
-def _write_picture(path: Path, encoded: Tensor) -> None:
-    light = to_linear(encoded.clamp(0, 1)).numpy()
-    Photo.from_array(light, encoding="linear").save(path, depth=8, overwrite=True)
+def _write_image(path: Path, encoded: Tensor) -> None:
+    linear = to_linear(encoded.clamp(0, 1)).numpy()
+    Photo.from_array(linear, encoding="linear").save(path, depth=8, overwrite=True)

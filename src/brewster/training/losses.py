@@ -16,26 +16,28 @@ if TYPE_CHECKING:
     from jaxtyping import Float
 
 _QUANTIZATION_MSE: Final = 1 / (12 * 255**2)
-"""The mean squared error of rounding to 8 bits, 58.9 dB: smaller errors count as this one, so that no score is infinite."""
+"""The mean squared error of rounding to 8 bits (58.9 dB). Smaller errors are raised to it, so that no PSNR is infinite."""
 _SCALES = (1, 4, 16)
 """Side of the averaging windows of the loss, in pixels."""
 _MAX_ADDED_SHARE = 0.05
-"""Pixels where the glass added less light than this share of the photo's light count as unchanged."""
+"""A pixel counts as unchanged if the glass added less light than about this fraction of the photo's light."""
 _MSE_FLOOR = 1e-3
-"""Added to the mean squared error in the logarithm: below it, 30 dB, the gradient of a picture fades out."""
+"""Added to the mean squared error before the logarithm. For an image with a PSNR above 30 dB, the gradient decreases to 0."""
 
 
 def separation_loss(layers: Float[Tensor, "n 6 h w"], batch: TrainingBatch) -> dict[str, Tensor]:
-    """The loss of transmission and reflection, the channels of `layers`, on sRGB-encoded values as benchmarks measure them.
+    """Computes the loss of predicted layers: channels 0-2 are the transmission, 3-5 the reflection.
 
-    - transmission, reflection: mean absolute error at three scales, so that a wrong overall tone weighs as much as wrong
+    It is computed on sRGB-encoded values, as benchmarks do:
+
+    - transmission, reflection: mean absolute error at three scales, so that a wrong overall tone counts as much as wrong
       detail.
     - edges: mean absolute error of the transmission's gradients, so that edges of the reflection are removed
       (Zhang et al. 2018).
-    - psnr: logarithm of each picture's squared error, so that easy pictures count as much as hard ones.
+    - psnr: logarithm of each image's mean squared error, so that easy images count as much as hard ones.
 
     Returns:
-        The parts by name, scalars; the loss is their sum.
+        The parts of the loss by name, each a scalar. The loss is their sum.
     """
     transmission, reflection = layers[:, :3], layers[:, 3:]
     edges = sum(
@@ -59,26 +61,26 @@ def _multiscale_error(error: Tensor) -> Float[Tensor, " n"]:
 
 
 def psnr_gain_db(prediction: Tensor, photo: Tensor, ground_truth: Tensor) -> float:
-    """PSNR of the prediction minus PSNR of the photo, in dB; pictures of one shape, encoded in 0..1."""
-    errors = [functional.mse_loss(picture, ground_truth).item() for picture in (photo, prediction)]
+    """Returns the PSNR of the prediction minus the PSNR of the photo, in dB. Images have one shape and are encoded, in 0..1."""
+    errors = [functional.mse_loss(image, ground_truth).item() for image in (photo, prediction)]
     before, after = (max(error, _QUANTIZATION_MSE) for error in errors)
     return 10 * math.log10(before / after)
 
 
 def tone_ratio(prediction: Tensor, photo: Tensor, ground_truth: Tensor) -> float:
-    """Linear light of the prediction divided by that of the photo, over the pixels where the glass added almost no light.
+    """Returns the linear light of the prediction divided by that of the photo, over the pixels that the glass did not change.
 
-    It is 1 for a network that keeps the exposure, and 1 if there is no such pixel. Pictures are (..., 3, h, w), encoded in
-    0..1; the added light is photo - ground truth, and less than a twentieth of the photo's light in every channel.
+    These are the pixels where photo - ground truth < 0.05 photo + 0.0025 in every channel, in linear light. The ratio is 1 if
+    prediction and photo have the same exposure, and 1 if there is no such pixel. Images are (..., 3, h, w), encoded in 0..1.
     """
-    before, after, wanted = (to_linear(picture) for picture in (photo, prediction, ground_truth))
-    untouched = (
-        (before - wanted < _MAX_ADDED_SHARE * before + _MAX_ADDED_SHARE**2)
+    before, after, target = (to_linear(image) for image in (photo, prediction, ground_truth))
+    unchanged = (
+        (before - target < _MAX_ADDED_SHARE * before + _MAX_ADDED_SHARE**2)
         .all(dim=-3, keepdim=True)
         .expand_as(before)
     )
-    light = before[untouched].sum()
-    return (after[untouched].sum() / light).item() if light > 0 else 1.0
+    light = before[unchanged].sum()
+    return (after[unchanged].sum() / light).item() if light > 0 else 1.0
 
 
 def check_finite(value: Tensor, step: int, name: str = "loss") -> Tensor:
@@ -91,6 +93,6 @@ def check_finite(value: Tensor, step: int, name: str = "loss") -> Tensor:
         return value
     raise ModelError(
         f"the {name} is {value.item()} at step {step}",
-        f"a finite {name}",
+        f"expected a finite {name}",
         "resume from the last checkpoint with a lower learning rate",
     )

@@ -123,7 +123,7 @@ class CompactRecipe(TrainingRecipe):
         return self
 
     def size_at(self, step: int) -> int:
-        """Side of the training images at this step in px, a multiple of 32."""
+        """Returns the side of the training images at this step in px, a multiple of 32."""
         return [size for start, size in self.sizes if step >= start * self.steps][-1]
 
 
@@ -144,7 +144,7 @@ class LoraRecipe(TrainingRecipe):
     quantise: Quantisation | None = None
     """Quantisation of the frozen backbone. Not set: no quantisation."""
     panels: tuple[Panel, ...] = ("I", "T", "R")
-    """The images that the model generates side by side: photo I, transmission T, reflection R. T is required."""
+    """The images that the model generates in one composite image: photo I, transmission T, reflection R. T is required."""
     direction: Direction = "side by side"
     """Arrangement of the panels in the composite image."""
     budget_px: PositiveInt = PAPER_PX
@@ -163,7 +163,7 @@ class LoraRecipe(TrainingRecipe):
     logit_mean: float = 0.0
     """Mean of the logit-normal distribution of training times (Esser et al. 2024), before the resolution shift."""
     logit_deviation: PositiveFloat = 1.0
-    """Standard deviation of that distribution."""
+    """Standard deviation of the logit-normal distribution of training times."""
     flip: bool = True
     """Whether each sample is also used with left and right exchanged."""
     crops: Annotated[int, Field(ge=0)] = 0
@@ -228,10 +228,11 @@ def _share_of(samples: int, name: str, share: float) -> int:
 def read_recipe(path: Path) -> CompactRecipe | LoraRecipe:
     """Reads and validates a recipe, and resolves the paths in it that are relative to the file.
 
-    Returns: a LoraRecipe if the file has the key `backbone`, else a CompactRecipe.
+    Returns:
+        A LoraRecipe if the file has the key `backbone`, else a CompactRecipe.
 
     Raises:
-        RecipeError: the file is missing or not TOML, or keys are missing, unknown or have impossible values.
+        RecipeError: the file is missing or not TOML, a key is missing or unknown, or a value is not allowed.
     """
     recipe = _read_unresolved(path)
     changes: dict[str, Any] = {}
@@ -286,11 +287,11 @@ def with_value(recipe: AnyRecipe, key_path: str, value: object) -> AnyRecipe:
         RecipeError: the recipe has no such key, or the value is not allowed for it.
     """
     if key_path not in _key_paths(recipe):
-        close = similar_key(type(recipe), key_path.split("."))
+        suggestion = similar_key(type(recipe), key_path.split("."))
         raise RecipeError(
             f"the recipe has no key {key_path}",
             "expected a key with its tables, such as data.pairs_share",
-            f"did you mean {close}?" if close else f"see {_REFERENCE}",
+            f"did you mean {suggestion}?" if suggestion else f"see {_REFERENCE}",
         )
     values = target = recipe.model_dump(exclude_unset=True)
     *tables, last = key_path.split(".")
@@ -320,7 +321,7 @@ def data_folder() -> Path:
     if not Path(folder or "/nowhere").is_dir():
         raise RecipeError(
             f"BREWSTER_DATA is {folder!r}",
-            "expected the folder that the paths in a recipe are relative to",
+            "expected an existing folder: the paths in a recipe are relative to it",
             "export BREWSTER_DATA=/path/to/data",
         )
     return Path(folder)

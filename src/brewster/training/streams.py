@@ -1,4 +1,4 @@
-"""Opens the training data of a recipe. Photos, maps and pairs are read into memory; rendered samples are not.
+"""Opens the training data of a recipe. Photos, maps and pairs are read into memory at once, rendered samples when needed.
 
 stream = open_stream(read_recipe(Path("recipes/train/tiny.toml")))
 batch = stream(step=0, count=2, size=64)
@@ -30,7 +30,7 @@ def open_stream(recipe: CompactRecipe, device: torch.device | str = "cpu") -> St
 
     Raises:
         RecipeError: a folder is missing or empty, pairs do not match, or there are too few rendered samples.
-        PhotoError: a picture cannot be read, or a map cannot light a scene.
+        PhotoError: an image cannot be read, or a map cannot light a scene.
     """
     return _interleave(
         recipe.data.pairs_share, partial(_open_pairs, recipe), partial(_open_unpaired, recipe, device)
@@ -45,7 +45,7 @@ def validation_pairs(data: DataRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]
 
     Raises:
         RecipeError: a folder is missing or empty, or pairs do not match.
-        PhotoError: a picture cannot be read.
+        PhotoError: an image cannot be read.
     """
     folders = tuple(dict.fromkeys(data.validate_on))
     root = data_folder() if folders else Path()
@@ -56,10 +56,10 @@ def validation_pairs(data: DataRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]
 
 
 def held_out_mixtures(recipe: CompactRecipe) -> Stream | None:
-    """Opens mixtures of the recipe's held-out photos and maps, distributed as in training.
+    """Opens mixtures of the recipe's held-out photos and maps, with the distributions of training.
 
     Returns:
-        The stream, or None if the recipe holds out nothing.
+        The stream, or None if the recipe has no `held_out` or no photos.
 
     Raises:
         RecipeError: no photo matches `held_out`.
@@ -74,7 +74,7 @@ def held_out_mixtures(recipe: CompactRecipe) -> Stream | None:
 
 
 def _unique_names(folders: Sequence[Path]) -> list[str]:
-    """The shortest ends of the paths that are unique, with an equal number of parts."""
+    """Returns the last n parts of each path, with the smallest n for which the results are unique."""
     for length in range(1, max((len(folder.parts) for folder in folders), default=0)):
         names = ["/".join(folder.parts[-length:]) for folder in folders]
         if len(set(names)) == len(names):
@@ -89,7 +89,7 @@ def _open_unpaired(recipe: CompactRecipe, device: torch.device | str) -> Stream:
 
 
 def _interleave(share: float, first: Callable[[], Stream], second: Callable[[], Stream]) -> Stream:
-    """Opens only the streams with a share above 0."""
+    """Returns both streams interleaved. A stream with a share of 0 is not opened; the other one is returned."""
     if share in (0, 1):
         return first() if share else second()
     return InterleavedStream(first(), second(), share)
@@ -134,9 +134,8 @@ def _open_online(
 ) -> OnlineRendered:
     maps, photos = resolve_folders(rendered.maps), resolve_folders(rendered.photos)
     catalog, refused = read_catalog(maps, photos, recipe.data.excluded_files)
-    if (
-        refused
-    ):  # a warning in a log of hours would be overlooked, and the run would train on less data than listed
+    if refused:
+        # A warning in the log of a long run would be overlooked, and the run would use less data than the recipe lists.
         raise refused[0]
     return OnlineRendered(
         _scene_recipe(rendered),
@@ -157,13 +156,13 @@ def _scene_recipe(rendered: RenderedRecipe) -> SceneRecipe:
 def _empty_stream(step: int, count: int, size: int) -> TrainingBatch:  # noqa: ARG001  (a Stream)
     raise RecipeError(
         "the recipe has no training data: every share or count is 0",
-        "a share above 0, and a count of rendered samples above 0",
+        "expected a share above 0, and a count of rendered samples above 0",
         "raise data.rendered.count, data.rendered.share or data.pairs_share",
     )
 
 
 def resolve_folders(folders: Sequence[Path]) -> list[Path]:
-    """Resolves the folders of a recipe: relative paths start from BREWSTER_DATA.
+    """Returns the folders of a recipe as paths. Relative folders are in the folder BREWSTER_DATA.
 
     Raises:
         RecipeError: a path is relative, and BREWSTER_DATA is unset or not a folder.

@@ -19,17 +19,17 @@ IMAGE_TAG = "samples"
 
 @final
 class TensorBoardLog:
-    """Event files in a folder. Events after `completed_steps`, from an earlier interrupted run, are discarded."""
+    """Writes event files to a folder. Events of an interrupted run after `completed_steps` are discarded."""
 
     def __init__(self, folder: Path, completed_steps: int) -> None:
         self._folder, self._completed_steps = folder, completed_steps
 
-    def log(self, step: int, metrics: Mapping[str, float], picture_encoded: Float[Tensor, "h w 3"]) -> None:
-        """Writes each metric as a scalar, and the picture, sRGB-encoded in 0..1, as an image."""
+    def log(self, step: int, metrics: Mapping[str, float], image_encoded: Float[Tensor, "h w 3"]) -> None:
+        """Writes each metric as a scalar, and the image, sRGB-encoded in 0..1."""
         if self._writer:
             for name, value in metrics.items():
                 self._writer.add_scalar(name, value, step)
-            self._writer.add_image(IMAGE_TAG, picture_encoded.clamp(0, 1), step, dataformats="HWC")
+            self._writer.add_image(IMAGE_TAG, image_encoded.clamp(0, 1), step, dataformats="HWC")
             self._writer.flush()
 
     def close(self) -> None:
@@ -39,7 +39,9 @@ class TensorBoardLog:
 
     @cached_property
     def _writer(self) -> SummaryWriter | None:
-        """Opened at the first event, so that resuming a completed run creates no empty file."""
+        """The event file, or None without tensorboard. It is opened at the first event, so that resuming a completed run
+        creates no empty file.
+        """
         if not importlib.util.find_spec("tensorboard"):
             return None
         from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415  (imports tensorboard)

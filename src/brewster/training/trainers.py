@@ -1,4 +1,4 @@
-"""Selects and creates the trainer for a recipe."""
+"""Creates the trainer that a recipe needs."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def open_trainer(recipe: CompactRecipe | LoraRecipe) -> Trainer:
         return LoraTrainer(recipe)
     if distributed.world_size() > 1:
         raise RecipeError(
-            f"the compact network was started with {distributed.world_size()} processes",
-            "one process",
+            f"training of a compact network was started with {distributed.world_size()} processes",
+            "expected one process",
             "start it without torchrun",
         )
     from brewster.training.compact.trainer import CompactTrainer  # noqa: PLC0415

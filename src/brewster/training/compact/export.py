@@ -17,14 +17,15 @@ from brewster.files import write_atomically
 from brewster.models.compact import LinearSeparator
 
 _OPSET = 18
-_SMALLEST_WEIGHT = 16
+_MIN_HALF_SIZE = 16
+"""Tensors with fewer values stay float32: they are constants of the graph, such as the coefficients of the sRGB curve."""
 
 
 def export_onnx(network: nn.Module, path: Path, stride: int) -> None:
     """Writes the network as an ONNX file: input `photo`, outputs `transmission` and `reflection`.
 
-    All are linear light, (1, 3, H, W), H and W multiples of `stride`. The weights are stored in half precision, which halves
-    the file; the network still computes in float32.
+    Input and outputs are linear light, (1, 3, H, W), with H and W multiples of `stride`. The weights are stored in half
+    precision, which halves the size of the file. The network still computes in float32.
 
     Raises:
         TargetError: the file cannot be written.
@@ -47,16 +48,15 @@ def export_onnx(network: nn.Module, path: Path, stride: int) -> None:
 
 
 def with_half_weights(model: ModelProto) -> ModelProto:
-    """Changes the graph in place: weights are stored as float16 and cast to float32 before use. Returns `model`.
+    """Stores the weights as float16, with casts to float32 before use. Changes `model` in place and returns it.
 
-    ONNX Runtime folds the casts when it loads the file, so inference takes no extra time. Small tensors are not changed:
-    they are constants of the graph, such as the coefficients of the sRGB curve.
+    ONNX Runtime folds the casts when it loads the file, so that inference takes no extra time.
     """
     graph = model.graph
     casts = []
     for index, weight in enumerate(graph.initializer):
         values = numpy_helper.to_array(weight)
-        if values.dtype == np.float32 and values.size >= _SMALLEST_WEIGHT:
+        if values.dtype == np.float32 and values.size >= _MIN_HALF_SIZE:
             half = f"{weight.name}_half"
             casts.append(helper.make_node("Cast", [half], [weight.name], to=TensorProto.FLOAT))
             graph.initializer[index].CopyFrom(numpy_helper.from_array(values.astype(np.float16), half))
@@ -68,7 +68,7 @@ def with_half_weights(model: ModelProto) -> ModelProto:
 
 @contextmanager
 def _without_warnings() -> Iterator[None]:
-    """Hides the exporter's warnings about a missing torchvision, which is not needed, and about its own deprecated calls."""
+    """Hides warnings of the exporter: torchvision, which is not needed, is missing; the exporter calls deprecated functions."""
     logger = logging.getLogger("torch.onnx")
     before = logger.level
     logger.setLevel(logging.ERROR)

@@ -1,4 +1,4 @@
-"""The trainer of the compact network: AdamW, an exponential moving average (EMA) of the weights, on a GPU if there is one.
+"""Trains the compact network with AdamW and an exponential moving average (EMA) of the weights, on a GPU if there is one.
 
 network = train(read_recipe(Path("recipes/train/compact.toml")), Path("out/compact"), on_step)
 """
@@ -33,39 +33,39 @@ from brewster.worker_setup import single_torch_thread
 ValidationPairs = Mapping[str, list[tuple[Tensor, Tensor]]]
 """folder -> pairs of photo and ground truth, each float (1, 3, h, w), sRGB-encoded."""
 
-MODEL: Final = "model.onnx"
+MODEL_FILE: Final = "model.onnx"
 _VALIDATION_SIDE_PX: Final = 384
 _HELD_OUT_MIXTURES: Final = 128
 _HELD_OUT_SIDE_PX: Final = 192
-_VISIBLE: Final = 1e-4
-"""Mean squared difference of encoded values: at more than 40 dB, photo and transmission show no visible reflection."""
+_MIN_VISIBLE_MSE: Final = 1e-4
+"""Smallest mean squared difference of encoded photo and transmission with a visible reflection: a PSNR of 40 dB."""
 _MAX_GRADIENT_NORM: Final = 1.0
 _START_FROM_CURE: Final = "train the recipe that writes it first, or correct start_from in this recipe"
 
 
 def train(recipe: CompactRecipe, out: Path, on_step: StepCallback) -> nn.Module:
-    """Trains or resumes the recipe in folder `out`, as `loop.run` does.
+    """Trains a recipe in the folder `out`, or resumes its run if `out` contains one.
 
     Returns:
-        The network with the averaged weights, which `export` would write.
+        The network with the EMA of the weights, in evaluation mode.
 
     Raises:
         RecipeError: data is missing, or `out` contains a run of another recipe.
-        PhotoError: a picture cannot be read.
-        ModelError, TargetError: as `loop.run`.
+        PhotoError: an image cannot be read.
+        ModelError: a checkpoint is missing, damaged or of another network, or the loss is NaN or infinite.
+        TargetError: `out` cannot be written to.
     """
     trainer = CompactTrainer(recipe)
-    with (
-        single_torch_thread()
-    ):  # for this thread; the threads of the trainer's pools are limited by their initializer
+    # This limits the current thread. The initializer of the trainer's thread pools limits their threads.
+    with single_torch_thread():
         run(trainer, out, on_step)
-    return trainer.averaged_network()
+    return trainer.ema_network()
 
 
 class CompactTrainer:
-    """The `Trainer` of a compact network: the network, the EMA of its weights, and AdamW.
+    """The `Trainer` of a compact network. It holds the network, the EMA of its weights, and the optimiser AdamW.
 
-    `stream` replaces the recipe's data.
+    A `stream` replaces the training data of the recipe.
 
     Raises:
         RecipeError, PhotoError: the data is missing or damaged.
@@ -80,21 +80,21 @@ class CompactTrainer:
             validation_pairs(recipe.data), self._entry.stride
         ) | _held_out_pairs(recipe)
         self._data_workers = 1 if self.device.type == "cpu" else os.cpu_count() or 1
-        self._shard_count = torch.get_num_threads() if self.device.type == "cpu" else 1
-        self._shard_pool = _single_thread_pool(self._shard_count)
+        self._chunk_count = torch.get_num_threads() if self.device.type == "cpu" else 1
+        self._chunk_pool = _single_thread_pool(self._chunk_count)
         self._data_pool = _single_thread_pool(self._data_workers)
         self._prefetched: dict[int, Future[TrainingBatch]] = {}
         torch.manual_seed(recipe.seed)
         network = self._entry.pretrained()
         self.network = network.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._reset_average()
+        self._reset_ema()
         encoder = list(self.network.get_submodule("encoder").parameters())
-        known = set(map(id, encoder))
-        rest = [parameter for parameter in self.network.parameters() if id(parameter) not in known]
+        encoder_ids = set(map(id, encoder))
+        others = [parameter for parameter in self.network.parameters() if id(parameter) not in encoder_ids]
         self.optimizer = torch.optim.AdamW(
             [
                 {"params": encoder, "peak": recipe.encoder_learning_rate},
-                {"params": rest, "peak": recipe.learning_rate},
+                {"params": others, "peak": recipe.learning_rate},
             ],
             weight_decay=recipe.weight_decay,
             fused=True,
@@ -102,34 +102,35 @@ class CompactTrainer:
 
     @torch.no_grad()
     def initialize(self) -> None:
-        """Loads the EMA weights of the checkpoints in `start_from`; the mean, if there are several.
+        """Loads the mean of the EMA weights of all checkpoints in `start_from`.
 
-        The mean of runs with one starting point is often better than each of them (Wortsman et al. 2022, model soups).
+        The mean of the weights of several runs with a common start is often better than each of them (model soups,
+        Wortsman et al. 2022).
 
         Raises:
             ModelError: a checkpoint is missing, damaged or of another network.
         """
         for count, path in enumerate(self.recipe.start_from, start=1):
-            other, checkpoint = self._entry.build(), Checkpoint.read(path, _START_FROM_CURE)
+            loaded, checkpoint = self._entry.build(), Checkpoint.read(path, _START_FROM_CURE)
             with mismatch_as_model_error(path, _START_FROM_CURE):
                 _check_network(path, checkpoint, self.recipe.network)
-                other.load_state_dict(checkpoint.state.get("average", {}))
-            for parameter, start in zip(self.network.parameters(), other.parameters(), strict=True):
+                loaded.load_state_dict(checkpoint.state.get("average", {}))
+            for parameter, start in zip(self.network.parameters(), loaded.parameters(), strict=True):
                 parameter.lerp_(start.to(self.device), 1 / count)
-        self._reset_average()
+        self._reset_ema()
 
     def state_dict(self) -> dict[str, Any]:
         """Returns the weights, their EMA, and the state of the optimiser."""
         return {
             "network": self.network.state_dict(),
-            "average": self.average,
+            "average": self.ema_weights,
             "optimizer": self.optimizer.state_dict(),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores a state that `state_dict` returned."""
         self.network.load_state_dict(state["network"])
-        self.average = {name: value.to(self.device) for name, value in state["average"].items()}
+        self.ema_weights = {name: value.to(self.device) for name, value in state["average"].items()}
         self.optimizer.load_state_dict(state["optimizer"])
 
     def training_step(self, step: int) -> dict[str, float]:
@@ -144,30 +145,30 @@ class CompactTrainer:
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), _MAX_GRADIENT_NORM)
         if norm.isfinite():  # otherwise skip the batch: one infinite gradient would destroy the weights
             self.optimizer.step()
-            self._update_average(step + 1)
+            self._update_ema(step + 1)
         return {"loss": loss.item(), **{name: part.item() for name, part in parts.items()}}
 
     def _compute_gradients(self, batch: TrainingBatch) -> dict[str, Tensor]:
-        """Sets the gradient of the mean loss of the batch on each parameter. Returns the parts of the loss.
+        """Computes the gradient of the batch's mean loss for each parameter. Returns the parts of the loss.
 
-        On a CPU the batch is split into one shard per core, each computed by a single thread: measured 1.2-1.3 times faster
-        than splitting each operation over all cores (16 x 128 px, two cores).
+        On a CPU, the batch is split into one chunk per core, and one thread computes each chunk. Measured on two cores with
+        16 x 128 px, this is 1.2-1.3 times as fast as splitting each operation over all cores.
         """
         count = len(batch.photo_encoded)
-        shards = list(
-            self._shard_pool.map(self._shard_gradients, batch.split(-(-count // self._shard_count)))
+        results = list(
+            self._chunk_pool.map(self._chunk_gradients, batch.split(-(-count // self._chunk_count)))
         )
         for parameter in self.network.parameters():
             # The fused optimiser ignores strides: a gradient needs its parameter's memory layout (docs/training.md).
             parameter.grad = torch.zeros_like(parameter)
-        for n, _, gradients in shards:
+        for n, _, gradients in results:
             for parameter, gradient in zip(self.network.parameters(), gradients, strict=True):
                 assert parameter.grad is not None
                 parameter.grad.add_(gradient, alpha=n / count)
-        names = shards[0][1]
-        return {name: torch.stack([part[name] * n / count for n, part, _ in shards]).sum() for name in names}
+        names = results[0][1]
+        return {name: torch.stack([part[name] * n / count for n, part, _ in results]).sum() for name in names}
 
-    def _shard_gradients(self, batch: TrainingBatch) -> tuple[int, dict[str, Tensor], tuple[Tensor, ...]]:
+    def _chunk_gradients(self, batch: TrainingBatch) -> tuple[int, dict[str, Tensor], tuple[Tensor, ...]]:
         with torch.autocast(
             self.device.type, torch.bfloat16, enabled=self._uses_bfloat16, cache_enabled=False
         ):
@@ -178,31 +179,31 @@ class CompactTrainer:
         return len(batch.photo_encoded), {name: part.detach() for name, part in parts.items()}, gradients
 
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """Returns the metrics of the averaged network on the recipe's pairs, and a picture of four predictions per folder."""
-        network = self.averaged_network()
-        metrics = validate(network, self._validation_pairs, self._shard_pool.map)
+        """Returns the metrics of the EMA network on the validation pairs, and an image of up to four predictions per folder."""
+        network = self.ema_network()
+        metrics = validate(network, self._validation_pairs, self._chunk_pool.map)
         return metrics, _contact_sheet(network, self._validation_pairs or self._training_pairs())
 
     def export(self, folder: Path) -> Path:
-        """Writes the averaged network to model.onnx in `folder`. Returns the path of the file.
+        """Writes the EMA network to model.onnx in `folder`. Returns the path of the file.
 
         Raises:
             TargetError: the file cannot be written.
         """
-        export_onnx(self.averaged_network(), folder / MODEL, self._entry.stride)
-        return folder / MODEL
+        export_onnx(self.ema_network(), folder / MODEL_FILE, self._entry.stride)
+        return folder / MODEL_FILE
 
-    def averaged_network(self) -> nn.Module:
+    def ema_network(self) -> nn.Module:
         """Returns a copy of the network with the EMA of the weights, in evaluation mode."""
         network = self._entry.build().eval()
-        network.load_state_dict(self.average)
+        network.load_state_dict(self.ema_weights)
         return network
 
-    def _reset_average(self) -> None:
-        self.average = {name: value.clone() for name, value in self.network.state_dict().items()}
+    def _reset_ema(self) -> None:
+        self.ema_weights = {name: value.clone() for name, value in self.network.state_dict().items()}
 
     def _batch(self, step: int) -> TrainingBatch:
-        """Returns the batch of this step, and starts making the next batches in background threads."""
+        """Returns the batch of this step, and starts to compute the next batches in background threads."""
         for ahead in range(step, step + 1 + self._data_workers):
             if ahead not in self._prefetched:
                 size = self.recipe.size_at(ahead)
@@ -213,16 +214,16 @@ class CompactTrainer:
 
     def _set_learning_rates(self, step: int) -> None:
         warm = min(1.0, (step + 1) / self.recipe.warmup_steps)
-        left = (1 - step / self.recipe.steps) / max(self.recipe.decay_share, 1e-9)
-        cosine = 0.5 - 0.5 * math.cos(math.pi * min(1.0, left))
+        remaining = (1 - step / self.recipe.steps) / max(self.recipe.decay_share, 1e-9)
+        cosine = 0.5 - 0.5 * math.cos(math.pi * min(1.0, remaining))
         for group in self.optimizer.param_groups:
             group["lr"] = group["peak"] * warm * cosine
 
     @torch.no_grad()
-    def _update_average(self, steps: int) -> None:
+    def _update_ema(self, steps: int) -> None:
         decay = min(self.recipe.average_decay, (steps + 1) / (steps + 10))
         for name, value in self.network.state_dict().items():
-            self.average[name].lerp_(value, 1 - decay)
+            self.ema_weights[name].lerp_(value, 1 - decay)
 
     def _training_pairs(self) -> ValidationPairs:
         batch = self.stream(0, self.recipe.batch_size, self.recipe.size_at(0)).to(torch.device("cpu"))
@@ -233,11 +234,12 @@ class CompactTrainer:
 def validate(
     network: Callable[[Tensor], Tensor], pairs: ValidationPairs, map_: Callable[..., Iterable[Any]] = map
 ) -> dict[str, float]:
-    """Validates a network on pairs, at the size of the given pairs. `map_` may be the `map` of a thread pool.
+    """Computes the validation metrics of a network. Pairs are not resized. `map_` may be the `map` of a thread pool.
 
     Returns:
-        For each folder: gain_db_NAME, the mean PSNR gain over the input in dB; worse_NAME, the share of pairs whose
-        prediction is worse than the input; tone_NAME, the mean `tone_ratio`, which is 1 if the exposure is kept.
+        For each folder: gain_db_NAME, the mean PSNR gain over the input in dB; worse_NAME, the fraction of pairs whose
+        prediction is worse than the input; tone_NAME, the mean `tone_ratio`, which is 1 if prediction and photo have the same
+        exposure.
     """
 
     @torch.no_grad()
@@ -256,7 +258,10 @@ def validate(
 
 @torch.no_grad()
 def _contact_sheet(network: nn.Module, pairs: ValidationPairs) -> Tensor:
-    """Rows of photo, ground truth, transmission and reflection, four rows per folder: (H, 960, 3), sRGB-encoded."""
+    """Returns an image, (H, 960, 3), sRGB-encoded, with one row for each of the first four pairs of every folder.
+
+    A row contains photo, ground truth, predicted transmission and predicted reflection.
+    """
     rows = []
     for photo, ground_truth in (pair for folder in pairs.values() for pair in folder[:4]):
         layers = network(photo)
@@ -273,36 +278,39 @@ def _resize_pairs(folders: ValidationPairs, stride: int) -> dict[str, list[tuple
 
 
 def _check_network(path: Path, checkpoint: Checkpoint, expected: str) -> None:
-    """Checkpoints older than the recipe key `network` contain the default network."""
+    """Checks that the checkpoint contains the expected network.
+
+    A checkpoint without the recipe key `network` was written before the key existed, and contains the default network.
+    """
     found = json.loads(checkpoint.recipe).get("network", DEFAULT_NETWORK)
     if found != expected:
         raise ModelError(
             f"{path} contains the network {found}",
-            f"a checkpoint of {expected}, the network that the recipe trains",
+            f"expected a checkpoint of {expected}, the network that the recipe trains",
             _START_FROM_CURE,
         )
 
 
 def _single_thread_pool(count: int) -> ThreadPoolExecutor:
-    """A pool whose threads run each torch operation on one core, so that they never wait at a barrier."""
+    """Returns a thread pool in which each torch operation uses one core, so that threads do not wait at barriers."""
     return ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(1,))
 
 
 def _has_bfloat16(device: torch.device) -> bool:
-    """Whether the device computes bfloat16 natively. Emulation is 20 to 50 times slower than float32."""
+    """Whether the device computes bfloat16 natively. Emulated bfloat16 is 20 to 50 times slower than float32."""
     if device.type != "cpu":
         return bool(torch.cuda.is_bf16_supported(including_emulation=False))
     return bool(torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported())
 
 
 def _held_out_pairs(recipe: CompactRecipe) -> dict[str, list[tuple[Tensor, Tensor]]]:
-    """Fixed mixtures of the held-out photos: "mixtures" with a visible reflection, "plain" without."""
+    """Returns fixed mixtures of the held-out photos: "mixtures" have a visible reflection, "plain" have none."""
     stream = held_out_mixtures(recipe)
     if stream is None:
         return {}
     batch = stream(0, _HELD_OUT_MIXTURES, _HELD_OUT_SIDE_PX)
     pairs = list(zip(batch.photo_encoded[:, None], batch.transmission_encoded[:, None], strict=True))
-    visible = [functional.mse_loss(*pair).item() > _VISIBLE for pair in pairs]
+    visible = [functional.mse_loss(*pair).item() > _MIN_VISIBLE_MSE for pair in pairs]
     return {
         name: [
             pair for pair, has_reflection in zip(pairs, visible, strict=True) if has_reflection is expected
@@ -311,14 +319,14 @@ def _held_out_pairs(recipe: CompactRecipe) -> dict[str, list[tuple[Tensor, Tenso
     }
 
 
-def _resize(picture: Tensor, stride: int) -> Tensor:
-    """Resizes uint8 (H, W, 3) to float (1, 3, h, w) in 0..1, multiples of `stride`, longest side about 384 px."""
-    height, width, _ = picture.shape
+def _resize(image: Tensor, stride: int) -> Tensor:
+    """Resizes uint8 (H, W, 3) to float (1, 3, h, w) in 0..1. h and w are multiples of `stride`, the larger is about 384 px."""
+    height, width, _ = image.shape
     scale = _VALIDATION_SIDE_PX / max(height, width)
     size = [max(1, round(side * scale / stride)) * stride for side in (height, width)]
-    planes = picture.permute(2, 0, 1)[None] / 255
+    planes = image.permute(2, 0, 1)[None] / 255
     return functional.interpolate(planes, size, mode="bilinear", antialias=True)
 
 
-def _channels_last(pictures: Tensor) -> Tensor:
-    return pictures.contiguous(memory_format=torch.channels_last)
+def _channels_last(images: Tensor) -> Tensor:
+    return images.contiguous(memory_format=torch.channels_last)

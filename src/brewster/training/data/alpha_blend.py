@@ -1,7 +1,7 @@
-"""8-bit mixtures of a rendered sample's layers: the baseline of the paper's ablation (Table 4, Figure 7).
+"""8-bit mixtures of the layers of a rendered sample: the baseline of the paper's ablation (Table 4, Figure 7).
 
-RDNet blends two tone-mapped pictures, I = alpha T + beta R - T o R. Here T is the background and R the mirror image of a
-rendered sample, so that both kinds of data show the same two scenes.
+RDNet blends two tone-mapped images, I = alpha T + beta R - T o R, where o is the element-wise product. Here T is the
+background and R the mirror image of a rendered sample, so that both kinds of data show the same two scenes.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ BETA: Final = (0.4, 1.0)
 
 
 def blend(transmission_encoded: Tensor, reflection_encoded: Tensor, alpha: float, beta: float) -> Tensor:
-    """Returns I = alpha T + beta R - T o R (RDNet) of encoded pictures of one shape, rounded to 8 bits, in 0..1."""
+    """Returns I = alpha T + beta R - T o R (RDNet) of encoded images of one shape, rounded to 8 bits, in 0..1."""
     t, r = (_eight_bits(layer) for layer in (transmission_encoded, reflection_encoded))
     return _eight_bits(alpha * t + beta * r - t * r)
 
 
 def blended(developed: DevelopedSample) -> DevelopedSample:
-    """Returns the sample as an 8-bit mixture: T is the background, R is beta times the mirror image, I is their blend."""
+    """Returns the sample as an 8-bit mixture: T is the background, R is beta times the mirror image, and I is their blend."""
     photo, transmission, reflection = blended_layers(
         developed.background_encoded, developed.mirror_encoded, developed.scene
     )
@@ -40,9 +40,9 @@ def blended_layers(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Returns I, T and R of an 8-bit mixture, each (3, H, W) in 0..1, from encoded background and mirror image.
 
-    alpha is uniform in 0.8..1, beta in 0.4..1; both are functions of the scene's seed and index.
+    alpha is uniform in 0.8..1, beta is uniform in 0.4..1. Both depend on the seed and the index of the scene only.
     """
-    rng = Random(f"blend/{scene.seed}/{scene.index}")  # noqa: S311  (data, not secrets)
+    rng = Random(f"blend/{scene.seed}/{scene.index}")  # noqa: S311  (not for secrets)
     alpha, beta = rng.uniform(*ALPHA), rng.uniform(*BETA)
     background, mirror = _eight_bits(background_encoded), _eight_bits(mirror_encoded)
     return blend(background, mirror, alpha, beta), background, _eight_bits(beta * mirror)

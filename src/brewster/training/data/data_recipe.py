@@ -24,7 +24,7 @@ class RenderedRecipe(FrozenModel):
     share: Share = 1.0
     """Share of rendered samples among the samples of a batch that are not real pairs; the others are mixtures of photos."""
     mixing: Mixing = "light"
-    """How a photo is composed. light: T + R in linear light. 8-bit: a blend of 8-bit images, for comparison."""
+    """How the photo is composed. light: T + R in linear light. 8-bit: a blend of 8-bit images, for comparison."""
     target: Target = "background"
     """What the network predicts behind the glass: the background B without glass, or the transmission T."""
     orders: Literal["all", "paper"] | None = None

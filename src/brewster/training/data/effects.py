@@ -1,6 +1,6 @@
 """Optical effects of mixtures: defocus, ghost images, lamps, signs, shadows, windows, and JPEG.
 
-Pictures are (3, H, W) in linear light, masks (1, size, size) in 0..1. All random numbers come from the `SampleRng` argument.
+Images are (3, H, W) in linear light, masks (1, size, size) in 0..1. All random numbers come from the `SampleRng` argument.
 """
 
 from __future__ import annotations
@@ -17,34 +17,34 @@ from brewster.training.data.sample_rng import SampleRng
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-    Picture = Float[Tensor, "3 h w"]
+    Image = Float[Tensor, "3 h w"]
     Mask = Float[Tensor, "1 s s"]
 
 
-def blur(picture: Picture, radius_px: float, *, disc: bool) -> Picture:
-    """Defocus: a Gaussian with this standard deviation, or the disc of a lens aperture with the same spread.
+def blur(image: Image, sigma_px: float, *, disc: bool) -> Image:
+    """Blurs by defocus: with a Gaussian of this standard deviation, or with a disc, the shape of a lens aperture.
 
-    The variance of a disc along an axis is a quarter of its squared radius; radii above 6 px are cut to 6 px.
+    The disc has the same standard deviation along an axis, half of its radius. Its radius is at most 6 px.
     """
     if disc:
-        return _filter(picture, _disc(min(2 * radius_px, 6.0)))
-    reach = max(1, round(3 * radius_px))
-    line = torch.exp(-((torch.arange(-reach, reach + 1) / max(radius_px, 0.1)) ** 2) / 2)
+        return _filter(image, _disc(min(2 * sigma_px, 6.0)))
+    reach = max(1, round(3 * sigma_px))
+    line = torch.exp(-((torch.arange(-reach, reach + 1) / max(sigma_px, 0.1)) ** 2) / 2)
     line = line / line.sum()
-    return _filter(_filter(picture, line[:, None]), line[None])
+    return _filter(_filter(image, line[:, None]), line[None])
 
 
-def ghost(rng: SampleRng, picture: Picture, weight: float, reach_px: float) -> Picture:
-    """Adds the ghost image of the pane's second surface, displaced by whole pixels; the mean is kept."""
+def ghost(rng: SampleRng, image: Image, weight: float, reach_px: float) -> Image:
+    """Adds a ghost image, the reflection of the second surface of the pane, displaced by whole pixels. Keeps the mean."""
     reach = max(1, round(reach_px))
     down, right = rng.randint(2 * reach + 1), rng.randint(2 * reach + 1)
-    padded = functional.pad(picture[None], (reach,) * 4, mode="replicate")[0]
-    copy = padded[:, down : down + picture.shape[1], right : right + picture.shape[2]]
-    return (picture + weight * copy) / (1 + weight)
+    padded = functional.pad(image[None], (reach,) * 4, mode="replicate")[0]
+    copy = padded[:, down : down + image.shape[1], right : right + image.shape[2]]
+    return (image + weight * copy) / (1 + weight)
 
 
-def lamps(rng: SampleRng, size: int) -> Picture:
-    """One to six small lamps on black, (3, size, size): each is a disc with the glow that the lens scatters around it."""
+def lamps(rng: SampleRng, size: int) -> Image:
+    """Returns one to six small lamps on black, (3, size, size). A lamp is a disc with a glow, which the lens scatters."""
     count = 1 + rng.randint(6)
     x, y = rng.uniform_tensor(2, count, 1, 1) * size
     rows, columns = _pixels(size)
@@ -57,9 +57,9 @@ def lamps(rng: SampleRng, size: int) -> Picture:
     return torch.einsum("nc,nhw->chw", colour, light)
 
 
-def sign(rng: SampleRng, picture: Picture) -> Picture:
+def sign(rng: SampleRng, image: Image) -> Image:
     """Adds rows of random glyphs with sharp edges: luminous letters, or dark letters on a luminous panel."""
-    size = picture.shape[-1]
+    size = image.shape[-1]
     rows, columns = 1 + rng.randint(3), 3 + rng.randint(9)
     glyphs = (rng.uniform_tensor(rows, 5, columns, 3) < 0.55).float()
     lines = functional.pad(functional.pad(glyphs, (0, 1)).flatten(2), (1, 0, 1, 1)).flatten(0, 1)
@@ -74,29 +74,29 @@ def sign(rng: SampleRng, picture: Picture) -> Picture:
     letters, panel = (torch.sigmoid(20 * (mask - 0.5)) for mask in (letters, panel))
     lit = letters if rng.bernoulli(0.6) else panel * (1 - letters)
     colour = (0.8 * rng.normal(3, 1, 1)).exp()
-    return picture * (1 - 0.7 * panel) + rng.log_uniform((0.8, 6.0)) * colour * lit
+    return image * (1 - 0.7 * panel) + rng.log_uniform((0.8, 6.0)) * colour * lit
 
 
 def falloff(rng: SampleRng, size: int) -> Mask:
-    """A smooth mask of the reflection: parts of the mirrored scene are unlit."""
+    """Returns a smooth mask of the reflection, because some parts of the mirrored scene are dark."""
     return torch.sigmoid(
         rng.uniform((1, 6)) * (_noise(rng, size, 2 + rng.randint(4)) + rng.uniform((-0.5, 0.5)))
     )
 
 
 def edge(rng: SampleRng, size: int) -> Mask:
-    """A half-plane: the reflection ends at a line, such as a frame or a dark person in front of the glass."""
+    """Returns a half-plane as mask of the reflection, which ends at a line such as a frame."""
     return torch.sigmoid(rng.log_uniform((4, 100)) * _line(rng, size))
 
 
 def window(rng: SampleRng, size: int) -> Mask:
-    """The area of the glass: the intersection of one to four half-planes, with edges of about a pixel."""
+    """Returns the area of the glass: the intersection of one to four half-planes, with edges of about one pixel."""
     inside = torch.stack([_line(rng, size) + 0.3 for _ in range(1 + rng.randint(4))]).amin(dim=0)
     return torch.sigmoid(size * inside)
 
 
 def shadow(rng: SampleRng, size: int) -> Mask:
-    """A factor on light: hard shadows with straight edges, or shadows of leaves."""
+    """Returns a mask for the light of a scene: hard shadows with straight edges, or shadows of leaves."""
     if rng.bernoulli(0.5):
         lit = torch.stack([_line(rng, size) for _ in range(1 + rng.randint(3))]).amin(dim=0)
     else:
@@ -106,11 +106,12 @@ def shadow(rng: SampleRng, size: int) -> Mask:
     return darkest + (1 - darkest) * lit
 
 
-def jpeg(encoded: Picture, quality: int) -> Picture:
-    """Returns an encoded picture with the loss of JPEG at a quality of 1..100: 8x8 cosine transform, quantisation, 8 bits.
+def jpeg(encoded: Image, quality: int) -> Image:
+    """Simulates JPEG compression of an encoded image at a quality of 1..100.
 
-    Wallace, The JPEG still picture compression standard, CACM 34 (1991), tables K.1 and K.2, colour at full resolution. It
-    skips the lossless coding and takes a tenth of a codec's time. Sides are multiples of 8.
+    The steps are a cosine transform of blocks of 8 x 8 px, quantisation (tables K.1 and K.2 of Wallace, "The JPEG still
+    picture compression standard", CACM 34, 1991) and rounding to 8 bits. Colour has full resolution. Without the lossless
+    coding, this takes a tenth of the time of a codec. Both sides are multiples of 8.
     """
     scale = 50 / quality if quality < 50 else 2 - quality / 50
     luma, chroma = (_JPEG_TABLES * scale + 0.5).floor().clamp(1, 255)
@@ -143,20 +144,20 @@ _COSINES: Final = torch.cat([torch.full((1, 8), math.sqrt(1 / 8)), 0.5 * torch.c
 
 
 def _pixels(size: int) -> tuple[Tensor, Tensor]:
-    """Row and column coordinates of pixel centres, (size, 1) and (1, size)."""
+    """Returns row and column coordinates of pixel centres, (size, 1) and (1, size)."""
     centres = torch.arange(size) + 0.5
     return centres[:, None], centres[None]
 
 
 def _line(rng: SampleRng, size: int) -> Mask:
-    """Signed distance to a random line, in units of half the picture's side."""
+    """Returns the signed distance to a random line, in units of half the side of the image."""
     angle, offset = rng.uniform((0, 2 * math.pi)), rng.uniform((-0.5, 0.5))
     rows, columns = (2 * centres / size - 1 for centres in _pixels(size))
     return (columns * math.cos(angle) + rows * math.sin(angle) + offset)[None]
 
 
 def _noise(rng: SampleRng, size: int, cells: int) -> Mask:
-    """Normal noise on a grid of `cells` x `cells` nodes, bicubically interpolated."""
+    """Returns normal noise on a grid of `cells` x `cells` nodes, bicubically interpolated."""
     return functional.interpolate(rng.normal(1, 1, cells, cells), (size, size), mode="bicubic")[0]
 
 
@@ -167,7 +168,7 @@ def _disc(radius_px: float) -> Tensor:
     return disc / disc.sum()
 
 
-def _filter(picture: Picture, kernel: Tensor) -> Picture:
+def _filter(image: Image, kernel: Tensor) -> Image:
     rows, columns = (side // 2 for side in kernel.shape)
-    padded = functional.pad(picture[None], (columns, columns, rows, rows), mode="replicate")
+    padded = functional.pad(image[None], (columns, columns, rows, rows), mode="replicate")
     return functional.conv2d(padded.transpose(0, 1), kernel[None, None]).transpose(0, 1)[0]

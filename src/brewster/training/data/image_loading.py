@@ -1,4 +1,4 @@
-"""Reads folders of photos, HDR maps and aligned pairs into memory, at reduced size, for the streams in `mixtures`."""
+"""Reads folders of photos, HDR maps and aligned pairs into memory, for the streams in `mixtures`. Large images are reduced."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from brewster.photo import Photo
 from brewster.srgb import to_encoded
 
 _MAPS = {suffix for suffix, image_format in SUFFIXES.items() if image_format.is_linear}
-_PICTURES = SUFFIXES.keys() - _MAPS
+_PHOTOS = SUFFIXES.keys() - _MAPS
 _PHOTO_SIDE_PX = 640
 _MAP_HEIGHT_PX = 512
-_LARGEST_HALF = 65504.0
+_MAX_FLOAT16 = 65504.0
 _WORD_END = re.compile(r"[^0-9A-Za-z]")
-_FOLDER_CURE = "name another folder in the recipe, or set BREWSTER_DATA to the folder of the data"
+_FOLDER_CURE = "choose another folder in the recipe, or set BREWSTER_DATA to the folder of the data"
 
 
 def read_photos(
@@ -39,19 +39,19 @@ def read_photos(
         RecipeError: a folder cannot be read, or none of the folders contains a photo.
         PhotoError: a photo cannot be decoded.
     """
-    return [_read_photo(path, _PHOTO_SIDE_PX) for path in _list_pictures(folders, _PICTURES, exclude, only)]
+    return [_read_photo(path, _PHOTO_SIDE_PX) for path in _list_images(folders, _PHOTOS, exclude, only)]
 
 
 def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list[float]:
     """Returns sampling weights for the photos of `read_photos`, so that no single source dominates.
 
-    Photos whose file names start with the same word (letters and digits) belong to one source. The n photos of a source have
-    the total weight sqrt(n).
+    Photos whose file names start with the same word (letters and digits) belong to one source. The n photos of a source
+    have the total weight sqrt(n).
 
     Raises:
         RecipeError: a folder cannot be read, or none of the folders contains a photo.
     """
-    sources = [_WORD_END.split(path.name)[0] for path in _list_pictures(folders, _PICTURES, exclude)]
+    sources = [_WORD_END.split(path.name)[0] for path in _list_images(folders, _PHOTOS, exclude)]
     counts = Counter(sources)
     return [counts[source] ** -0.5 for source in sources]
 
@@ -59,7 +59,7 @@ def source_weights(folders: Sequence[Path], exclude: Sequence[str] = ()) -> list
 def read_maps(
     folders: Sequence[Path], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
 ) -> list[Tensor]:
-    """Reads every lat-long map of the folders: half precision (3, H, 2 H), at most 512 px high, linear light.
+    """Reads every lat-long map of the folders: float16 (3, H, 2 H), at most 512 px high, linear light.
 
     `exclude` and `only` are patterns of file names, as in `fnmatch`.
 
@@ -67,22 +67,20 @@ def read_maps(
         RecipeError: a folder cannot be read, or none of the folders contains a map.
         PhotoError: a map cannot be decoded.
     """
-    return [_read_map(path) for path in _list_pictures(folders, _MAPS, exclude, only)]
+    return [_read_map(path) for path in _list_images(folders, _MAPS, exclude, only)]
 
 
 def read_pairs(folders: Sequence[Path], max_pairs: int | None = None) -> list[tuple[Tensor, Tensor]]:
     """Reads aligned pairs (photo, transmission), uint8 sRGB (H, W, 3), sorted by path.
 
-    `pairing.read_folders` matches the files. At most `max_pairs` are read from each folder, evenly spaced.
+    `pairing.read_folders` matches the files by name. At most `max_pairs` pairs are read from each folder, evenly spaced.
 
     Raises:
-        RecipeError: a folder cannot be read or is empty, or a photo has no transmission of its name and size.
-        PhotoError: a picture cannot be decoded.
+        RecipeError: a folder cannot be read or is empty, or a photo has no transmission with its name and size.
+        PhotoError: an image cannot be decoded.
     """
     return [
-        _read_pair(group)
-        for folder in folders
-        for group in _evenly_spaced(_picture_groups(folder), max_pairs)
+        _read_pair(group) for folder in folders for group in _evenly_spaced(_image_groups(folder), max_pairs)
     ]
 
 
@@ -91,13 +89,13 @@ def _evenly_spaced(groups: list[ImageGroup], max_pairs: int | None) -> list[Imag
     return [groups[number * len(groups) // count] for number in range(count)]
 
 
-def _picture_groups(folder: Path) -> list[ImageGroup]:
+def _image_groups(folder: Path) -> list[ImageGroup]:
     try:
         found = read_folders(folder)
     except PhotoError as error:
         raise RecipeError(
             error.happened,
-            "a folder that contains blended/ and transmission_layer/",
+            "expected a folder that contains blended/ and transmission_layer/",
             _FOLDER_CURE,
         ) from error
     if found.excluded:
@@ -116,14 +114,14 @@ def _read_pair(group: ImageGroup) -> tuple[Tensor, Tensor]:
     if photo.shape != transmission.shape:
         raise RecipeError(
             f"{group.photo} and {group.transmission} differ in size",
-            "pairs that are aligned pixel by pixel",
+            "expected pairs that are aligned pixel by pixel",
             "crop one to the size of the other",
         )
     return photo, transmission
 
 
 def _read_map(path: Path) -> Tensor:
-    linear = np.clip(_downscaled(Photo.open(path), 2 * _MAP_HEIGHT_PX), 0, _LARGEST_HALF)
+    linear = np.clip(_downscaled(Photo.open(path), 2 * _MAP_HEIGHT_PX), 0, _MAX_FLOAT16)
     return torch.from_numpy(linear.astype(np.float16)).permute(2, 0, 1).contiguous()
 
 
@@ -138,7 +136,7 @@ def _downscaled(photo: Photo, max_side_px: int) -> NDArray[np.float32]:
     return photo.resized(width, height)
 
 
-def _list_pictures(
+def _list_images(
     folders: Iterable[Path], suffixes: set[str], exclude: Sequence[str] = (), only: Sequence[str] = ("*",)
 ) -> list[Path]:
     found = sorted(
@@ -149,8 +147,8 @@ def _list_pictures(
     )
     if folders and not found:
         raise RecipeError(
-            f"no pictures in {', '.join(map(str, folders))}",
-            f"files ending in {', '.join(sorted(suffixes))}",
+            f"no images in {', '.join(map(str, folders))}",
+            f"expected files ending in {', '.join(sorted(suffixes))}",
             _FOLDER_CURE,
         )
     return found
@@ -166,6 +164,6 @@ def _list_folder(folder: Path) -> list[Path]:
     except OSError as error:
         raise RecipeError(
             f"{folder} cannot be read ({error.strerror})",
-            "a folder with pictures",
+            "expected a folder with images",
             _FOLDER_CURE,
         ) from error

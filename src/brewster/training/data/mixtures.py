@@ -3,8 +3,8 @@
     stream = Mixtures(read_photos([Path("photos")]), read_maps([Path("hdri")]), MixRecipe(), seed=7)
     batch = stream(step=0, count=8, size=192)
 
-Each sample is a function of (seed, step, slot) only. In linear light, photo = T + R + veil with T = t B: the
-transmission T is the background B behind a pane of transmittance t.
+Each sample depends on (seed, step, slot) only. In linear light, photo = T + R + veil with T = t B: the transmission T is the
+background B behind a pane of transmittance t.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from brewster.training.data.sample_rng import SampleRng
 if TYPE_CHECKING:
     from jaxtyping import Float
 
-    Picture = Float[Tensor, "3 h w"]
+    Image = Float[Tensor, "3 h w"]
 
 _REFERENCE_SIZE: Final = 256
-"""Lengths in a recipe are in pixels of a picture with this side, and are scaled to the side of the batch."""
+"""Side of an image in px. Lengths in a recipe refer to it, and are scaled to the side of the images of the batch."""
 
 
 @dataclass(frozen=True)
 class TrainingBatch:
-    """Encoded pictures, each (N, 3, S, S) in 0..1, and the weights of the reflections in the loss, (N,)."""
+    """Encoded images, each (N, 3, S, S) in 0..1, and the weights of the reflections in the loss, (N,)."""
 
     photo_encoded: Tensor
     transmission_encoded: Tensor
@@ -58,7 +58,7 @@ class TrainingBatch:
 
 
 class Stream(Protocol):
-    """A source of training data. A batch is a function of the step, so that a resumed run sees the same data."""
+    """A source of training data. A batch depends on the step, count and size only, so that a resumed run uses the same data."""
 
     def __call__(self, step: int, count: int, size: int) -> TrainingBatch:
         """Returns the batch of this step: `count` samples with sides of `size` px."""
@@ -73,14 +73,14 @@ that the pane lets through: photo = T + R in linear light."""
 class MixRecipe(FrozenModel):
     """Distributions of mixtures of photos: a background behind glass plus a reflection, in linear light.
 
-    The defaults are those of the shipped model. Luminances are linear. Lengths in pixels refer to an image of 256 px
+    `recipes/train/compact-stage1.toml` uses the defaults. Luminances are linear. Lengths in pixels refer to an image of 256 px
     and scale with the size of the training images.
     """
 
     target: Target = "transmission"
     """What the network predicts behind the glass: the transmission T, or the background B without glass."""
     crop: Range = (0.35, 1.0)
-    """Side of the crop over the shorter side of the photo."""
+    """Side of the crop divided by the shorter side of the photo."""
     temperature: Range = (-0.35, 0.35)
     """Colour temperature t of the light: the gains of red and blue are about exp(t) and exp(-t)."""
     background_map_probability: Share = 0.2
@@ -88,7 +88,7 @@ class MixRecipe(FrozenModel):
     background_level_log: LogRange = (0.03, 0.5)
     """Mean luminance of the background before the camera's exposure."""
     highlight_boost: Range = (0.0, 6.0)
-    """Extra brightness of the white parts of a photo, whose true luminance was clipped: factor minus 1."""
+    """White parts of a photo are multiplied by up to 1 + this value, because their true luminance was clipped."""
     shadow_probability: Share = 0.15
     """Probability of a hard shadow on the background."""
 
@@ -101,14 +101,14 @@ class MixRecipe(FrozenModel):
     veil_probability: Share = 0.1
     """Probability of a veil: uniform light that the pane scatters."""
     veil: Range = (0.0, 0.1)
-    """Luminance of the veil over the mean of the photo."""
+    """Luminance of the veil divided by the mean luminance of the photo."""
 
     reflection_map_probability: Share = 0.4
     """Probability that the reflection is a view of an environment map instead of a photo."""
     reflection_ratio_log: LogRange = (0.04, 2.0)
-    """Mean luminance of the reflection, without its lamps, over that of the background."""
+    """Mean luminance of the reflection without its lamps, divided by that of the background."""
     reflection_contrast_log: LogRange = (0.8, 1.8)
-    """Exponent on the luminance of the reflected scene. Above 1, its lights stand out from dark surroundings."""
+    """Exponent on the luminance of the reflected scene. Values above 1 increase the contrast of its light sources."""
     lamp_probability: Share = 0.15
     """Probability of small lamps in the reflection."""
     sign_probability: Share = 0.08
@@ -116,7 +116,7 @@ class MixRecipe(FrozenModel):
     sharp_probability: Share = 0.45
     """Probability of a reflection without defocus blur."""
     blur_px_log: LogRange = (0.3, 5.0)
-    """Radius of the defocus blur of the other reflections."""
+    """Standard deviation of the defocus blur of the other reflections."""
     ghost_probability: Share = 0.4
     """Probability of a ghost: a displaced copy of the reflection from the second surface of the pane."""
     ghost_weight: Range = (0.4, 0.95)
@@ -129,11 +129,11 @@ class MixRecipe(FrozenModel):
     """Probability of a reflection that ends at a straight edge, such as a frame."""
 
     exposure: Range = (0.2, 0.55)
-    """Largest mean luminance of the photo after exposure."""
+    """Mean luminance of the photo after exposure. A photo with a smaller mean is not brightened."""
     overexposed_probability: Share = 0.2
     """Probability of an overexposed photo, in which a part of the background is white."""
     overexposed_share: Range = (0.005, 0.15)
-    """Share of white pixels in such a photo."""
+    """Share of white pixels in an overexposed photo."""
     gamma_log: LogRange = (0.8, 1.25)
     """Exponent on the encoded values."""
     contrast: Range = (-0.3, 0.5)
@@ -147,9 +147,9 @@ class MixRecipe(FrozenModel):
 
 
 class Mixtures:
-    """A `Stream` of mixtures of photos, uint8 (H, W, 3) sRGB, and HDR maps, half (3, H, 2 H) linear.
+    """A `Stream` of mixtures of photos, uint8 (H, W, 3) sRGB, and HDR maps, float16 (3, H, 2 H) linear.
 
-    `weights` are the relative sampling frequencies of the photos; by default all are equal.
+    `weights` are the relative sampling frequencies of the photos. By default, all are equal.
     """
 
     def __init__(
@@ -185,7 +185,7 @@ class Mixtures:
         target = transmission if recipe.target == "transmission" else background
         return _expose_and_develop(rng, recipe, photo, target, reflection)
 
-    def _background(self, rng: SampleRng, size: int) -> Picture:
+    def _background(self, rng: SampleRng, size: int) -> Image:
         recipe = self._recipe
         view = self._view(rng, size, recipe.background_map_probability)
         if rng.bernoulli(recipe.shadow_probability):
@@ -193,8 +193,8 @@ class Mixtures:
         level = rng.log_uniform(recipe.background_level_log)
         return view * _temperature(rng, recipe.temperature) * (level / _mean_without_highlights(view))
 
-    def _reflection(self, rng: SampleRng, size: int) -> Picture:
-        """A reflection in linear light for a background with mean 1: blurred, with ghost image, falloff and edge."""
+    def _reflection(self, rng: SampleRng, size: int) -> Image:
+        """Returns a reflection in linear light for a background with mean 1, with random blur, lamps, ghost image and falloff."""
         recipe, scale = self._recipe, size / _REFERENCE_SIZE
         view = self._view(rng, size, recipe.reflection_map_probability)
         view = view / _mean_without_highlights(view)
@@ -214,7 +214,7 @@ class Mixtures:
             view = view * effects.edge(rng, size)
         return view * rng.log_uniform(recipe.reflection_ratio_log)
 
-    def _view(self, rng: SampleRng, size: int, map_probability: float) -> Picture:
+    def _view(self, rng: SampleRng, size: int, map_probability: float) -> Image:
         if self._maps and rng.bernoulli(map_probability):
             return _perspective_view(rng, self._maps[rng.randint(len(self._maps))], size)
         crop = random_crop(rng, self._photos[self._choose_photo(rng)], self._recipe.crop, size)
@@ -261,7 +261,7 @@ class InterleavedStream:
         """Returns the batch of this step: `count` samples with sides of `size` px."""
         first_count = round(count * self._share)
         counts = (self._first, first_count), (self._second, count - first_count)
-        parts = [stream(step, some, size) for stream, some in counts if some]
+        parts = [stream(step, part_count, size) for stream, part_count in counts if part_count]
         device = max((part.photo_encoded.device for part in parts), key=lambda device: device.type != "cpu")
         names = TrainingBatch.__dataclass_fields__
         return TrainingBatch(
@@ -269,17 +269,18 @@ class InterleavedStream:
         )
 
 
-def _expose_and_develop(
-    rng: SampleRng, recipe: MixRecipe, *layers: Picture
-) -> tuple[Picture, Picture, Picture]:
-    """Applies one exposure and one tone curve to photo, target and reflection; and noise, JPEG and 8 bits to the photo."""
+def _expose_and_develop(rng: SampleRng, recipe: MixRecipe, *layers: Image) -> tuple[Image, Image, Image]:
+    """Applies one exposure and one tone curve to photo, target and reflection, in this order.
+
+    The photo is also given noise, rounded to 8 bits, and compressed as JPEG with the probability in the recipe.
+    """
     exposure = min(1.0, rng.uniform(recipe.exposure) / layers[0].clamp(max=1).mean().item())
     if rng.bernoulli(recipe.overexposed_probability):
         white = _quantile(layers[1].amax(dim=0), 1 - rng.uniform(recipe.overexposed_share))
         exposure = max(exposure, 1 / (white + 1e-3))
     gamma, contrast = rng.log_uniform(recipe.gamma_log), rng.uniform(recipe.contrast)
 
-    def develop(linear: Picture) -> Picture:
+    def develop(linear: Image) -> Image:
         encoded = to_encoded((linear * exposure).clamp(0, 1)) ** gamma
         return encoded + contrast * (encoded * encoded * (3 - 2 * encoded) - encoded)
 
@@ -292,18 +293,18 @@ def _expose_and_develop(
     return photo, target, reflection
 
 
-def random_crop(rng: SampleRng, picture: Tensor, fraction: Range, size: int) -> Tensor:
+def random_crop(rng: SampleRng, image: Tensor, fraction: Range, size: int) -> Tensor:
     """Returns a random crop, mirrored with probability 0.5, in linear light: (H, W, C) sRGB uint8 to (C, size, size).
 
-    `fraction` is the range of the crop's side relative to the picture's shorter side.
+    `fraction` is the range of the side of the crop divided by the shorter side of the image.
     """
-    height, width, _ = picture.shape
+    height, width, _ = image.shape
     side = min(height, width) * rng.uniform(fraction)
     stretch = math.sqrt(rng.log_uniform((0.85, 1.18)))
     rows, columns = (max(8, min(limit, round(length))) for limit, length in (
         (height, side * stretch), (width, side / stretch)))  # fmt: skip
     top, left = rng.randint(height - rows + 1), rng.randint(width - columns + 1)
-    window = _linear_from_bytes(picture[top : top + rows, left : left + columns]).permute(2, 0, 1)
+    window = _linear_from_bytes(image[top : top + rows, left : left + columns]).permute(2, 0, 1)
     if rng.bernoulli(0.5):
         window = window.flip(2)
     return functional.interpolate(window[None], (size, size), mode="bilinear", antialias=True)[0].clamp(min=0)
@@ -313,12 +314,15 @@ _LINEAR_OF_BYTE: Final = to_linear(torch.arange(256) / 255)
 
 
 def _linear_from_bytes(encoded: Tensor) -> Tensor:
-    """Linear light of sRGB bytes by a lookup table. Flattened, because torch indexes a vector much faster than a picture."""
+    """Converts sRGB bytes to linear light by a lookup table. Flattened, because torch indexes a vector faster than an image."""
     return _LINEAR_OF_BYTE.index_select(0, encoded.reshape(-1).int()).view(encoded.shape)
 
 
-def _perspective_view(rng: SampleRng, lat_long: Tensor, size: int) -> Picture:
-    """A perspective view of a lat-long map (3, H, 2 H): field of view 50..100 degrees, any heading, pitch within 20 degrees."""
+def _perspective_view(rng: SampleRng, lat_long: Tensor, size: int) -> Image:
+    """Returns a random perspective view of a lat-long map (3, H, 2 H).
+
+    The field of view is 50 to 100 degrees, the heading is any, the pitch is -20 to 20 degrees.
+    """
     half = math.tan(math.radians(rng.uniform((50, 100))) / 2)
     heading, pitch = rng.uniform((-math.pi, math.pi)), math.radians(rng.uniform((-20, 20)))
     down, right = torch.meshgrid(*[torch.linspace(-half, half, size)] * 2, indexing="ij")
@@ -331,19 +335,19 @@ def _perspective_view(rng: SampleRng, lat_long: Tensor, size: int) -> Picture:
     return view[0].clamp(min=0)
 
 
-def _mean_without_highlights(picture: Picture) -> Tensor:
-    """The mean after clipping at the 95th percentile, so that a lamp does not determine the exposure."""
-    return picture.clamp(max=_quantile(picture, 0.95)).mean() + 1e-4
+def _mean_without_highlights(image: Image) -> Tensor:
+    """Returns the mean after clipping at the 95th percentile, so that a lamp does not determine the exposure."""
+    return image.clamp(max=_quantile(image, 0.95)).mean() + 1e-4
 
 
-def _quantile(picture: Tensor, share: float) -> float:
-    """A quantile, estimated from every 29th value: a full sort would take as long as the rest of the sample."""
-    values = picture.flatten()[::29]
-    return values.kthvalue(max(1, round(share * len(values)))).values.item()
+def _quantile(image: Tensor, fraction: float) -> float:
+    """Returns a quantile of every 29th value. A quantile of all values would take as long as the rest of the sample."""
+    values = image.flatten()[::29]
+    return values.kthvalue(max(1, round(fraction * len(values)))).values.item()
 
 
 def _temperature(rng: SampleRng, bounds: Range) -> Tensor:
-    """Random gains of warmer or colder light, (3, 1, 1)."""
+    """Returns random gains of the colour channels for warmer or colder light, (3, 1, 1)."""
     warmth = rng.uniform(bounds)
     gains = torch.tensor([warmth, 0, -warmth]) + 0.05 * rng.normal(3)
     return gains.exp()[:, None, None]

@@ -1,4 +1,4 @@
-"""An endless stream of samples that are rendered during training, on any device. A sample is a function of (seed, index).
+"""An endless stream of samples that are rendered during training, on any device. A sample depends on (seed, index) only.
 
 stream = OnlineRendered(read_scene_recipe("window"), catalog, Assets(folders), seed=7, device="cuda")
 batch = stream(step=0, count=16, size=256)
@@ -8,7 +8,7 @@ for developed in stream: ...
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import count as numbers
+from itertools import count as integers_from
 from threading import Lock
 from typing import Literal
 
@@ -24,13 +24,13 @@ from brewster.training.data.alpha_blend import blended
 from brewster.training.data.mixtures import Target, TrainingBatch
 
 Mixing = Literal["light", "8-bit"]
-"""How the layers of a photo are added: as light at the glass, or as an 8-bit blend like RDNet's."""
+"""How the layers of a photo are added: in linear light, or as a blend of 8-bit images, as in RDNet."""
 
 
 class OnlineRendered:
-    """A `Stream` of samples of the analytic renderer; also an iterable of single samples. It is thread-safe.
+    """A `Stream` of samples of the analytic renderer, and an iterable of single samples. It is thread-safe.
 
-    Threads render one sample at a time, because `Assets` is not thread-safe; all other work runs in parallel.
+    Only one thread renders at a time, because `Assets` is not thread-safe. Camera response and JPEG run in parallel.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class OnlineRendered:
         self._render_lock = Lock()
 
     def __iter__(self) -> Iterator[DevelopedSample]:
-        return (self.sample(index) for index in numbers())
+        return (self.sample(index) for index in integers_from(0))
 
     def sample(self, index: int) -> DevelopedSample:
         """Renders the sample of this index at the recipe's size; the photo has JPEG artefacts.

@@ -3,7 +3,7 @@
     stream = RenderedSets([Path("out/window")], seed=7, count=300)
     stream = CachedRendered(OnlineRendered(...), 300, seed=7)
 
-The sample in a slot, its crop and its mirroring are functions of (seed, step, slot) only.
+The sample in a slot, its crop and whether it is mirrored depend on (seed, step, slot) only.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ from brewster.training.data.online import Mixing, OnlineRendered
 from brewster.training.data.sample_rng import SampleRng
 
 CACHE_BYTES: Final = 1 << 30
-"""Memory for cached samples, 9 bytes per pixel: 600 of 512x384, 1,800 of 256x256, 7,200 of 128x128. When it is full, the
-oldest are dropped, and read or rendered again when they are drawn: slower, with the same result."""
+"""Memory for cached samples, 9 bytes per pixel: 600 samples of 512x384, 1,800 of 256x256 or 7,200 of 128x128. When it is full,
+the oldest samples are dropped. They are read or rendered again when they are drawn, which is slower, with the same result."""
 
 
 class RenderedSets:
-    """A `Stream` of random crops, mirrored at random, of the first `count` samples of rendered sets. It is thread-safe.
+    """A `Stream` of random crops of the first `count` samples of rendered sets, mirrored at random. It is thread-safe.
 
-    With `mixing` "8-bit", the photo is a blend of the sample's background and mirror image. Like the sample's photo, the blend
-    is compressed as JPEG at the sample's quality.
+    With `mixing` "8-bit", the photo is a blend of the sample's background and mirror image. The blend is compressed
+    as JPEG, with the quality of the sample's photo.
 
     Raises:
         RecipeError: a set cannot be read, or all sets together have fewer than `count` samples.
@@ -68,9 +68,9 @@ class RenderedSets:
         Raises:
             RecipeError, PhotoError: a file of a sample is missing or damaged.
         """
-        rng = (SampleRng(self._seed, step, slot) for slot in range(count))
-        windows = [random_crop(each, self.sample(each.randint(len(self))), self._crop, size) for each in rng]
-        return TrainingBatch.from_layers(to_encoded(torch.stack(windows)))
+        rngs = (SampleRng(self._seed, step, slot) for slot in range(count))
+        crops = [random_crop(each, self.sample(each.randint(len(self))), self._crop, size) for each in rngs]
+        return TrainingBatch.from_layers(to_encoded(torch.stack(crops)))
 
     def sample(self, number: int) -> Tensor:
         """Returns photo, target and reflection of a whole sample as channels: (H, W, 9) sRGB uint8.
@@ -83,7 +83,7 @@ class RenderedSets:
     def _read(self, entry: StoredSample) -> Tensor:
         if self._mixing == "8-bit":
             return _blended_sample(entry)
-        return torch.cat([_picture(entry, name) for name in ("photo", self._target, "reflection")], dim=2)
+        return torch.cat([_read_image(entry, name) for name in ("photo", self._target, "reflection")], dim=2)
 
 
 class CachedRendered:
@@ -104,8 +104,8 @@ class CachedRendered:
             RecipeError: no valid scene can be drawn from the recipe, or a file is missing.
             PhotoError: a file cannot be decoded.
         """
-        rng = (SampleRng(self._seed, step, slot) for slot in range(count))
-        return TrainingBatch.from_layers(torch.stack([self._sample(each, size) for each in rng]) / 255)
+        rngs = (SampleRng(self._seed, step, slot) for slot in range(count))
+        return TrainingBatch.from_layers(torch.stack([self._sample(each, size) for each in rngs]) / 255)
 
     def _sample(self, rng: SampleRng, size: int) -> Tensor:
         index = rng.randint(self._count)
@@ -113,12 +113,12 @@ class CachedRendered:
         return layers.flip(2) if rng.bernoulli(0.5) else layers
 
     def _render(self, index: int, size: int) -> Tensor:
-        """Renders (9, size, size) uint8. The first use is quantised too, so that a sample is the same each time."""
+        """Renders a sample as (9, size, size) uint8. The first use is quantised too, so that all uses are equal."""
         return (self._source.layers(index, size).clamp(0, 1) * 255).round().to(torch.uint8)
 
 
 class _TensorCache:
-    """A thread-safe cache of tensors, limited by their size in bytes; the oldest are dropped first."""
+    """A thread-safe cache of tensors with a limit in bytes. The oldest tensors are dropped first."""
 
     def __init__(self, max_bytes: int) -> None:
         self._tensors: dict[Hashable, Tensor] = {}
@@ -145,7 +145,7 @@ def _first_entries(folders: Sequence[Path], count: int | None) -> list[StoredSam
     if len(entries) < (count or 1):
         raise RecipeError(
             f"{', '.join(map(str, folders))}: {len(entries)} rendered samples",
-            f"at least {count or 1}, as the recipe states",
+            f"expected at least {count or 1}, the count of the recipe",
             "render more with a larger --count, or lower data.rendered.count",
         )
     return entries[:count]
@@ -157,21 +157,23 @@ def _entries(folder: Path) -> list[StoredSample]:
     except (OSError, ValueError, tarfile.TarError) as error:
         raise RecipeError(
             f"{folder} cannot be read ({getattr(error, 'strerror', None) or error})",
-            "a folder that brewster render wrote",
-            "name another folder in data.rendered.sets, or set BREWSTER_DATA to the folder of the data",
+            "expected a folder that brewster render wrote",
+            "choose another folder in data.rendered.sets, or set BREWSTER_DATA to the folder of the data",
         ) from error
 
 
 def _blended_sample(entry: StoredSample) -> Tensor:
     with _file_errors(entry, SCENE_FILE):
         scene = read_scene_of(entry)
-    background, mirror = (_picture(entry, name).permute(2, 0, 1) / 255 for name in ("background", "mirror"))
+    background, mirror = (
+        _read_image(entry, name).permute(2, 0, 1) / 255 for name in ("background", "mirror")
+    )
     photo, *layers = blended_layers(background, mirror, scene)
-    seen = Photo.open(encode_jpeg(photo, scene.camera_response.jpeg_quality)).pixels.copy()
-    return torch.cat([torch.from_numpy(picture) for picture in (seen, *map(to_uint8, layers))], dim=2)
+    compressed = Photo.open(encode_jpeg(photo, scene.camera_response.jpeg_quality)).pixels.copy()
+    return torch.cat([torch.from_numpy(image) for image in (compressed, *map(to_uint8, layers))], dim=2)
 
 
-def _picture(entry: StoredSample, layer: str) -> Tensor:
+def _read_image(entry: StoredSample, layer: str) -> Tensor:
     """Reads a layer of a sample, (H, W, 3) sRGB uint8."""
     name = f"{layer}.jpg"
     with _file_errors(entry, name), naming_file(f"{name} of sample {key(entry.index)} in {entry.path}"):
@@ -185,6 +187,6 @@ def _file_errors(entry: StoredSample, name: str) -> Iterator[None]:
     except (OSError, KeyError) as error:
         raise RecipeError(
             f"{name} of sample {key(entry.index)} in {entry.path} cannot be read",
-            "a sample with five pictures and a scene",
+            "expected a sample with five images and a scene",
             "delete the sample and render the set again",
         ) from error

@@ -1,4 +1,4 @@
-"""Seeded random numbers of a training sample, so that a resumed run sees the same data."""
+"""Seeded random numbers of a training sample, so that a resumed run uses the same data."""
 
 from __future__ import annotations
 
@@ -11,32 +11,32 @@ from brewster.scene.values import Range
 
 
 class SampleRng:
-    """A random number generator that is a function of (seed, step, slot); `slot` is the index in the batch."""
+    """A random number generator seeded with (seed, step, slot). `slot` is the index of the sample in the batch."""
 
     def __init__(self, seed: int, step: int, slot: int) -> None:
         self.generator = Generator().manual_seed((seed * 1_000_003 + step) * 1_009 + slot)
 
     def uniform(self, bounds: Range) -> float:
-        """A uniform number between the bounds."""
+        """Returns a uniform number between the bounds."""
         low, high = bounds
         return low + (high - low) * torch.rand((), generator=self.generator).item()
 
     def log_uniform(self, bounds: Range) -> float:
-        """A number between the bounds whose logarithm is uniform."""
+        """Returns a number between the bounds. Its logarithm is uniform."""
         return math.exp(self.uniform((math.log(bounds[0]), math.log(bounds[1]))))
 
     def bernoulli(self, probability: float) -> bool:
-        """True with this probability."""
+        """Returns True with this probability."""
         return self.uniform((0, 1)) < probability
 
     def randint(self, count: int) -> int:
-        """A uniform integer in 0..count - 1."""
+        """Returns a uniform integer in 0..count - 1."""
         return int(torch.randint(count, (), generator=self.generator).item())
 
     def uniform_tensor(self, *shape: int) -> Tensor:
-        """A tensor of uniform numbers in 0..1."""
+        """Returns a tensor of uniform numbers in 0..1."""
         return torch.rand(shape, generator=self.generator)
 
     def normal(self, *shape: int) -> Tensor:
-        """A tensor of standard normal numbers."""
+        """Returns a tensor of standard normal numbers."""
         return torch.randn(shape, generator=self.generator)

@@ -1,10 +1,10 @@
-"""Training samples of a large backbone: composed of panels in their own aspect ratio, and encoded by its VAE.
+"""Training samples of a large backbone: panels with the aspect ratio of the sample, encoded by the VAE of the backbone.
 
     samples = open_samples(recipe)
     encoded = LatentEncoder(samples, backbone, recipe)(SampleRng(seed, step, slot))
 
-Latents are cached by (sample, flip, crop). They also depend on the VAE and on the size of the panels, which are not part of
-the key: a run has one frozen VAE and one pixel budget, so all crops of a sample have panels of one size.
+Latents are cached with the key (sample, mirrored, crop). They also depend on the VAE and on the size of the panels. These are
+not in the key, because a run has one frozen VAE, and all crops of a sample have panels of one size.
 """
 
 from __future__ import annotations
@@ -38,10 +38,11 @@ if TYPE_CHECKING:
     from jaxtyping import Float, UInt8
 
 CACHE_SIZE: Final = 2048
-"""Number of cached latents: 3 GiB at the paper's size, enough for 1,000 samples and their mirror images without crops. The
-least recently used are dropped, and encoded again when they are drawn: slower, with the same result."""
+"""Largest number of cached samples: 3 GiB at the paper's size, enough for 1,000 samples and their mirrored versions without
+crops. The least recently used ones are dropped. They are encoded again when they are drawn, which is slower, with the same
+result."""
 _MIN_CROP_SIDE: Final = 0.5
-"""Smallest side of a crop, relative to the side of the sample."""
+"""Smallest side of a crop divided by the side of the sample."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,9 +55,9 @@ class TrainingSample:
 
 @dataclass(frozen=True, eq=False)
 class EncodedSample:
-    """Latents of a sample, float32, on the CPU: the composite of all panels, and the condition that the model sees.
+    """Latents of a sample, float32, on the CPU: the composite of all panels, and the conditioning image.
 
-    `start` is the photo in every panel, for the objective one_step; None for flow, which starts from noise.
+    `start` contains the photo in every panel for the objective one_step. It is None for flow, which starts from noise.
     """
 
     composite: Float[Tensor, "1 c h w"]
@@ -89,14 +90,14 @@ class SampleSequence:
         yield from (pair.layers for pair in self._pairs)
 
     def draw_index(self, rng: SampleRng) -> int:
-        """Draws the index of a sample: a pair with the probability `pairs_share`."""
+        """Draws the index of a sample. With the probability `pairs_share` it is a pair."""
         if rng.bernoulli(self._pairs_share):
             return self._first_pair + rng.randint(len(self._pairs))
         return rng.randint(self._first_pair)
 
 
 class LatentEncoder:
-    """Draws samples and encodes them.
+    """Draws samples and encodes them. The encoded samples are cached.
 
     Raises:
         PhotoError: a pair, or the first rendered sample, is smaller than a panel.
@@ -104,12 +105,12 @@ class LatentEncoder:
 
     def __init__(self, samples: SampleSequence, backbone: Backbone, recipe: LoraRecipe) -> None:
         self._samples, self._backbone, self._recipe = samples, backbone, recipe
-        for layers in samples.preloaded():  # fail before training, not after an hour
+        for layers in samples.preloaded():  # report small samples before training, not after an hour
             fit_sample(layers, backbone, recipe)
         self._encoded = lru_cache(CACHE_SIZE)(self._encode)
 
     def __call__(self, rng: SampleRng) -> EncodedSample:
-        """Draws a sample, its mirroring and its crop, and encodes it.
+        """Draws a sample, whether it is mirrored, and its crop. Returns the encoded sample.
 
         Raises:
             RecipeError, PhotoError: a file of the sample is missing or damaged, or the sample is smaller than a panel.
@@ -124,7 +125,7 @@ class LatentEncoder:
         fit = fit_sample(sample.layers, self._backbone, self._recipe)
         layers = sample.layers
         if crop:
-            # A negative step: no training step draws these random numbers.
+            # The step is negative, so that these random numbers differ from those of every training step.
             layers = crop_sample(SampleRng(self._recipe.seed, -1 - number, crop), layers, fit)
         panels = make_panels(layers.flip(1) if mirrored else layers, fit)
         return EncodedSample(
@@ -138,27 +139,34 @@ class LatentEncoder:
 
 
 def crop_sample(rng: SampleRng, layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> UInt8[Tensor, "p q 9"]:
-    """Returns a random window with the sample's aspect ratio and 0.5 to 1 of its sides, at least as large as `fit.content`."""
+    """Returns a random crop with the aspect ratio of the sample. Its sides are 0.5 to 1 of those of the sample, and at least
+    those of `fit.content`.
+    """
     height, width, _ = layers.shape
     min_side = max(_MIN_CROP_SIDE, fit.content[0] / width, fit.content[1] / height)
     side = rng.uniform((min_side, 1.0))
     columns, rows = (
-        max(shown, round(side * whole)) for shown, whole in zip(fit.content, (width, height), strict=True)
+        max(smallest, round(side * whole))
+        for smallest, whole in zip(fit.content, (width, height), strict=True)
     )
     top, left = rng.randint(height - rows + 1), rng.randint(width - columns + 1)
     return layers[top : top + rows, left : left + columns]
 
 
 def make_panels(layers: UInt8[Tensor, "h w 9"], fit: PanelFit) -> dict[str, Float[Tensor, "1 3 p q"]]:
-    """Resizes photo, transmission and reflection in linear light and pads them. Returns the panels I, T and R, sRGB in [-1, 1]."""
-    light = to_linear(layers.permute(2, 0, 1)[None] / 255)
-    small = functional.interpolate(light, fit.content[::-1], mode="bilinear", antialias=True)
+    """Resizes photo, transmission and reflection in linear light and pads them.
+
+    Returns:
+        The panels I, T and R, sRGB-encoded in [-1, 1].
+    """
+    linear = to_linear(layers.permute(2, 0, 1)[None] / 255)
+    small = functional.interpolate(linear, fit.content[::-1], mode="bilinear", antialias=True)
     padded = fit.pad(2 * to_encoded(small.clamp(0, 1)) - 1)
     return dict(zip("ITR", padded.chunk(3, dim=1), strict=True))
 
 
 def fit_sample(layers: Tensor, backbone: Backbone, recipe: LoraRecipe) -> PanelFit:
-    """Returns the size of a sample's panels and its place in them.
+    """Returns the size of the panels of a sample, and the position of the sample in them.
 
     Raises:
         PhotoError: the sample is smaller than a panel.
@@ -172,7 +180,7 @@ def open_samples(recipe: LoraRecipe) -> SampleSequence:
 
     Raises:
         RecipeError: a folder is missing, empty or without reflections, or there are too few rendered samples.
-        PhotoError: a picture cannot be read.
+        PhotoError: an image cannot be read.
     """
     data, rendered, sets = recipe.data, recipe.data.rendered, None
     if rendered and data.pairs_share < 1 and data.rendered_share:
@@ -189,11 +197,11 @@ def open_samples(recipe: LoraRecipe) -> SampleSequence:
 
 
 def _read_pairs(folder: Path, recipe: LoraRecipe) -> list[TrainingSample]:
-    pictures = read_pairs([folder])
+    pairs = read_pairs([folder])
     groups = sorted(read_folders(folder).groups, key=lambda group: group.photo)
     if "R" in recipe.panels and recipe.reflections == "given":
         _check_reflections(folder, groups)
-    return [_read_sample(group, *pair) for group, pair in zip(groups, pictures, strict=True)]
+    return [_read_sample(group, *pair) for group, pair in zip(groups, pairs, strict=True)]
 
 
 def _check_reflections(folder: Path, groups: Sequence[ImageGroup]) -> None:
@@ -201,7 +209,7 @@ def _check_reflections(folder: Path, groups: Sequence[ImageGroup]) -> None:
     if missing:
         raise RecipeError(
             f"{folder} has no reflection for {missing[0]} (photos without one: {len(missing)})",
-            "a reflection for each photo, as R is a panel",
+            "expected a reflection for each photo, because R is a panel",
             'add a folder reflection_layer, set reflections = "difference", or leave R out of panels',
         )
 
@@ -209,24 +217,27 @@ def _check_reflections(folder: Path, groups: Sequence[ImageGroup]) -> None:
 def _read_sample(group: ImageGroup, photo: Tensor, transmission: Tensor) -> TrainingSample:
     if group.reflection is None:
         return TrainingSample(layers_from_pair(photo, transmission), Pairs.reflection_weight)
-    reflection = _read_picture(group.reflection)
+    reflection = _read_image(group.reflection)
     if reflection.shape != photo.shape:
         raise RecipeError(
             f"{group.photo} and {group.reflection} differ in size",
-            "layers that are aligned pixel by pixel",
+            "expected layers that are aligned pixel by pixel",
             "crop one to the size of the other",
         )
     return TrainingSample(torch.cat([photo, transmission, reflection], dim=2))
 
 
 def layers_from_pair(photo: Tensor, transmission: Tensor) -> Tensor:
-    """Returns photo, transmission and reflection as (H, W, 9) sRGB uint8; the reflection is photo - transmission in linear light."""
-    light = to_linear(photo / 255) - to_linear(transmission / 255)
-    reflection = (to_encoded(light.clamp(0, 1)) * 255).round().to(torch.uint8)
+    """Returns photo, transmission and reflection as (H, W, 9) sRGB uint8.
+
+    The reflection is photo - transmission in linear light, at least 0.
+    """
+    difference = to_linear(photo / 255) - to_linear(transmission / 255)
+    reflection = (to_encoded(difference.clamp(0, 1)) * 255).round().to(torch.uint8)
     return torch.cat([photo, transmission, reflection], dim=2)
 
 
-def _read_picture(path: Path) -> Tensor:
+def _read_image(path: Path) -> Tensor:
     photo = Photo.open(path)
     encoded = to_encoded(np.clip(photo.resized(*photo.size), 0, 1))
     return torch.from_numpy(np.rint(encoded * 255).astype(np.uint8))

@@ -1,8 +1,8 @@
-"""The model card of a LoRA, a README.md for the hub: base, licence, prompt, use, data, settings, scores, limits.
+"""Writes the model card of a LoRA, a README.md for the hub: base, licence, prompt, use, data, settings, scores, limits.
 
     write_card(Path("out/kontext/lora"), recipe, {"gain_db_nature": 1.2}, Kontext)
 
-The card depends only on the recipe and the log, not on the machine: the same run gives the same bytes.
+The card depends only on the recipe and the log. It contains no paths of the machine, so that equal runs give equal bytes.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _LIMITS: Final = """## Limits
 
 - **Not for evidence.** The model generates the transmission and the reflection; it does not recover recorded light. Where a
   reflection hides the scene, the result is invented.
-- **It redraws the whole picture**, at the size of a panel. Faces can become other faces, and small text other text. `brewster`
+- **It generates the whole image**, at the size of a panel. Faces can become other faces, and small text other text. `brewster`
   takes fine detail from the photo instead, where the reflection allows it.
 - **Reconstruction error.** Colours and edges of the generated photo can differ from the input. `brewster` measures this error,
   uses it for the confidence, and flags a result with a large error.
@@ -97,8 +97,8 @@ def with_benchmark_tables(card: str, tables: str) -> str:
     if not (heading and after):
         raise ModelError(
             "the card has no section for benchmarks",
-            f"the heading {_BENCHMARK_HEADING!r} and a section after it",
-            "train again",
+            f"expected the heading {_BENCHMARK_HEADING!r} and a section after it",
+            "train again to write a new card",
         )
     return f"{before}{heading}\n{tables.strip()}\n\n{rest[after.start() :]}"
 
@@ -149,29 +149,29 @@ separation = Separator.load("lora")("photo.jpg")
 separation.transmission.save("clear.jpg")
 ```
 
-{_stock_usage(recipe, base)}"""
+{_diffusers_usage(recipe, base)}"""
 
 
-def _stock_usage(recipe: LoraRecipe, base: type[Backbone]) -> str:
-    """How to generate the same picture with diffusers alone, if that is possible."""
+def _diffusers_usage(recipe: LoraRecipe, base: type[Backbone]) -> str:
+    """Explains how to generate the same image with diffusers alone, if that is possible."""
     if _is_toy(recipe):
         return "diffusers alone can load the LoRA into the twin that `brewster.models.diffusion.backbones.tiny` builds."
     loads = 'diffusers alone can load it with `pipe.load_lora_weights("lora")`'
     if recipe.objective == "one_step":
         return f"{loads}, but starts from noise; this LoRA starts from the photo and takes one step."
-    stock = base.diffusers_usage
-    if isinstance(stock, str):
-        return f"{loads}, {stock}."
+    usage = base.diffusers_usage
+    if isinstance(usage, str):
+        return f"{loads}, {usage}."
     return f"""{loads}.
-With the same input of the same size, it generates the same composite: small, and without brewster's processing of detail and
-colour. Both sides of a panel are multiples of {base.multiple}. {stock.caution}
+With the same input of the same size, it generates the same composite image. It is small, and has no fine detail of the photo and no colour
+processing of brewster. Both sides of a panel are multiples of {base.multiple}. {usage.caution}
 
 ```python
-{_stock_code(recipe, base, stock)}
+{_diffusers_code(recipe, base, usage)}
 ```"""
 
 
-def _stock_code(recipe: LoraRecipe, base: type[Backbone], stock: DiffusersUsage) -> str:
+def _diffusers_code(recipe: LoraRecipe, base: type[Backbone], usage: DiffusersUsage) -> str:
     fit = fit_panel(_SQUARE_PHOTO_PX, recipe.layout, budget_px=recipe.budget_px, multiple=base.multiple)
     (width, height), (full_width, full_height) = fit.panel, recipe.layout.composite_size(fit.panel)
     corners = {
@@ -191,7 +191,7 @@ from safetensors.torch import load_file
 
 pipe = {base.classes["pipeline"]}.from_pretrained(
     "{_base_id(recipe, base)}",
-    dtype=torch.bfloat16, {stock.parts},
+    dtype=torch.bfloat16, {usage.parts},
 ).to("cuda")
 pipe.load_lora_weights("lora")
 prompt = load_file("lora/{PROMPT_FILE}", device="cuda")
@@ -199,7 +199,7 @@ photo = Image.open("photo.jpg").convert("RGB").resize(({width}, {height}))  # fo
 {make_input}
 composite = pipe(
     image=condition, prompt_embeds=prompt["embeds"], width={full_width}, height={full_height},
-    {stock.options.format(area=full_width * full_height)}
+    {usage.options.format(area=full_width * full_height)}
     num_inference_steps={STEPS}, guidance_scale={GUIDANCE}, generator=torch.Generator().manual_seed(0),
 ).images[0]
 transmission = composite.crop(({x}, {y}, {x + width}, {y + height}))"""
@@ -257,7 +257,7 @@ def _scores(scores: Mapping[str, float]) -> str:
         if name not in {"step", "seconds"}
     }
     table = _table(("metric", "value"), rows) if rows else "No scores were logged."
-    return f"## Scores\n\nAt the last training step, on a few pictures:\n\n{table}"
+    return f"## Scores\n\nAt the last training step, on a few validation photos:\n\n{table}"
 
 
 def _metric_title(name: str) -> str:
@@ -287,10 +287,10 @@ def _is_toy(recipe: LoraRecipe) -> bool:
 
 
 def _base_id(recipe: LoraRecipe, base: type[Backbone]) -> str:
-    """The hub id of the base. A local folder counts as a copy of its family's model on the hub."""
-    named = recipe.backbone
-    is_hub_id = re.fullmatch(r"[\w.-]+/[\w.-]+", named) and not Path(named).exists()
-    return named if is_hub_id and named not in BACKBONES else base.hub_id
+    """Returns the hub id of the base. A local folder counts as a copy of its family's model on the hub."""
+    name = recipe.backbone
+    is_hub_id = re.fullmatch(r"[\w.-]+/[\w.-]+", name) and not Path(name).exists()
+    return name if is_hub_id and name not in BACKBONES else base.hub_id
 
 
 def _base_title(recipe: LoraRecipe, base: type[Backbone]) -> str:
@@ -300,15 +300,15 @@ def _base_title(recipe: LoraRecipe, base: type[Backbone]) -> str:
 
 
 def _set_description(folder: Path) -> str:
-    """The name of a set; and, if the set can be read, its number of samples and their scene recipe."""
+    """Returns the name of a set and, if the set can be read, its number of samples and their scene recipe."""
     with suppress(BrewsterError, OSError, ValueError, KeyError):
-        (place,) = resolve_folders([folder])
-        recipe = tomllib.loads((place / RECORD_FILE).read_text())["recipe"]
-        count = sum(1 for _ in read_set(place))
+        (path,) = resolve_folders([folder])
+        recipe = tomllib.loads((path / RECORD_FILE).read_text())["recipe"]
+        count = sum(1 for _ in read_set(path))
         return f"`{_folder_name(folder)}` ({count} samples of the scenes `{recipe['name']}`, orders {recipe['orders']})"
     return f"`{_folder_name(folder)}`"
 
 
 def _folder_name(folder: Path) -> str:
-    """The name of a folder, without absolute paths of this machine."""
+    """Returns the relative path of a folder, or only the last part of an absolute path, which depends on the machine."""
     return folder.name if folder.is_absolute() else folder.as_posix()

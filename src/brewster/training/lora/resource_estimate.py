@@ -29,17 +29,19 @@ _SQUARE_PHOTO_PX: Final = (4096, 4096)
 """A large square photo: its panels fill the pixel budget best."""
 _PROMPT_TOKENS: Final = 512
 _BYTES_PER_WEIGHT: Final = {None: 2.0, "int8": 1.01, "float8": 1.01, "nf4": 0.52}
-"""Including the quantisation scales: FLUX.1 Kontext has 22.2, 11.2 (8 bits) and 5.8 GiB (4 bits)."""
+"""Bytes with the quantisation scales. The weights of FLUX.1 Kontext need 22.2, 11.2 (8 bits) and 5.8 GiB (4 bits)."""
 _BYTES_PER_LORA_WEIGHT: Final = 16
-"""Weight, gradient and two moments of AdamW, all float32. With 8-bit moments it is 10."""
+"""Weight, gradient and two moments of AdamW, all float32. With 8-bit moments, a weight needs 10 bytes."""
 _HIDDEN_STATES_PER_BLOCK: Final = 36
-"""Activations of one block while gradient checkpointing recomputes it. Each block also stores its input, one hidden state."""
+"""Activations of one block, in hidden states, while gradient checkpointing recomputes it. Each block also stores its input,
+one hidden state."""
 _OVERHEAD_GIB: Final = 1.5
 """The CUDA context, and the activations of the VAE."""
 _FORWARD_PASSES_PER_STEP: Final = 3
-"""Forward, recomputation for gradient checkpointing, and backward, which costs one pass as the base has no weight gradients."""
+"""Forward pass, recomputation for gradient checkpointing, and backward pass. The backward pass costs as much as one forward
+pass, because the base has no weight gradients."""
 _EFFICIENCY: Final = 0.4
-"""Assumed share of the peak speed of a card."""
+"""Assumed speed of training divided by the peak speed of the card."""
 
 
 @final
@@ -67,7 +69,7 @@ CARDS: Final = {
 class ResourceEstimate:
     """The estimated resources of a recipe on a card.
 
-    `panel` is (width, height) in px, `memory_gib` is by part, `tflop` is for one training step.
+    `panel` is (width, height) in px, `memory_gib` contains the memory of each part, `tflop` is for one training step.
     """
 
     recipe: LoraRecipe
@@ -109,23 +111,23 @@ class ResourceEstimate:
         """Checks that the recipe fits into the memory of the card.
 
         Raises:
-            DeviceError: it does not fit. The message names a change that makes it fit.
+            DeviceError: the recipe does not fit. The message contains a change that makes it fit.
         """
         if self.total_gib <= self.card.memory_gib:
             return
         raise DeviceError(
             f"{self.recipe.backbone} needs about {self.total_gib:.1f} GiB",
-            f"at most the {self.card.memory_gib:g} GiB of {self.card.name}",
+            f"expected at most the {self.card.memory_gib:g} GiB of {self.card.name}",
             self._cure(),
         )
 
     def _cure(self) -> str:
         for quantise in ("int8", "nf4"):
             weights = self.parameters * _BYTES_PER_WEIGHT[quantise] / _GIB
-            spared = self.memory_gib["base"] - weights
-            if spared > 0 and self.total_gib - spared <= self.card.memory_gib:
-                return f'set quantise = "{quantise}", which needs {self.total_gib - spared:.1f} GiB'
-        return "lower budget_px or rank, take a smaller backbone (klein) or a larger card"
+            saved = self.memory_gib["base"] - weights
+            if saved > 0 and self.total_gib - saved <= self.card.memory_gib:
+                return f'set quantise = "{quantise}", which needs {self.total_gib - saved:.1f} GiB'
+        return "lower budget_px or rank, or choose a smaller backbone (klein) or a larger card"
 
 
 def find_gpu(name: str | None = None) -> GraphicsCard:
@@ -139,11 +141,11 @@ def find_gpu(name: str | None = None) -> GraphicsCard:
     known = {other.lower(): card for other, card in CARDS.items()}
     if name.lower() in known:
         return known[name.lower()]
-    close = get_close_matches(name.lower(), known, n=1)
+    matches = get_close_matches(name.lower(), known, n=1)
     raise DeviceError(
         f"there is no card {name!r} in the table",
-        f"one of {', '.join(CARDS)}",
-        f"did you mean {known[close[0]].name}?" if close else "choose the most similar card",
+        f"expected one of {', '.join(CARDS)}",
+        f"did you mean {known[matches[0]].name}?" if matches else "choose the most similar card",
     )
 
 
@@ -153,7 +155,7 @@ def is_local_gpu(card: GraphicsCard) -> bool:
 
 
 def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstimate:
-    """Estimates the resources of a recipe on a card. Takes a few seconds.
+    """Estimates the resources of a recipe on a card. This takes a few seconds.
 
     Raises:
         ModelError: the backbone is not in the table of backbones.
@@ -196,7 +198,7 @@ def estimate_resources(recipe: LoraRecipe, card: GraphicsCard) -> ResourceEstima
 
 
 def _local_gpu() -> GraphicsCard:
-    """The local GPU. Its speed is that of the card in `CARDS` with its name, or of the RTX 4090 if there is none."""
+    """Returns the local GPU. Its speed is that of the card in `CARDS` with its name, or of the RTX 4090 if there is none."""
     found = torch.cuda.get_device_properties(0)
     speed = next(
         (card.tflops for name, card in CARDS.items() if name in found.name), CARDS["RTX 4090"].tflops
@@ -221,7 +223,7 @@ def _count_lora_parameters(backbone: Backbone, recipe: LoraRecipe) -> int:
 
 
 def _activation_bytes(backbone: Backbone, tokens: int) -> int:
-    """Memory in bytes of the inputs of all blocks and the activations of one block, in bf16."""
+    """Returns the memory in bytes of the inputs of all blocks and the activations of one block, in bf16."""
     transformer, config = backbone.transformer, backbone.transformer.config
     blocks = len(transformer.transformer_blocks) + len(getattr(transformer, "single_transformer_blocks", ()))
     hidden: int = config.num_attention_heads * config.attention_head_dim
@@ -229,9 +231,9 @@ def _activation_bytes(backbone: Backbone, tokens: int) -> int:
 
 
 def _forward_tflop(backbone: Backbone, generated_tokens: int, condition_tokens: int) -> float:
-    """TFLOP of one prediction, counted on the device "meta" without computing it."""
+    """Returns the TFLOP of one prediction. They are counted on the device "meta", which computes nothing."""
     prompt = backbone.random_prompt(backbone.transformer, 0)
-    words = {
+    prompt_tensors = {
         name: (tensor[:, :1].expand(1, _PROMPT_TOKENS, -1) if tensor.ndim == 3 else tensor).to("meta")
         for name, tensor in prompt.tensors.items()
     }
@@ -240,6 +242,6 @@ def _forward_tflop(backbone: Backbone, generated_tokens: int, condition_tokens: 
         for count in (generated_tokens, condition_tokens)
     )
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
-        embedding = PromptEmbedding(prompt.backbone, prompt.text, **words)
+        embedding = PromptEmbedding(prompt.backbone, prompt.text, **prompt_tensors)
         backbone.predict(latents, condition, torch.empty(1, device="meta"), embedding, 1.0)
     return float(counter.get_total_flops()) / 1e12

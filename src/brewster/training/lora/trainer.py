@@ -3,9 +3,9 @@
 trainer = LoraTrainer(read_recipe(Path("recipes/train/kontext.toml")))
 run(trainer, Path("out/kontext"), on_step)
 
-The gradients of a batch are accumulated one sample at a time, so that each sample keeps its aspect ratio and a batch needs no
-more memory than one sample. Sample, noise and time are functions of (seed, step, slot) only; several processes divide the
-slots.
+The gradients of a batch are accumulated one sample at a time. Each sample can therefore have its own aspect ratio, and a batch
+needs no more memory than one sample. Sample, noise and time depend on (seed, step, slot) only. If there are several processes,
+each computes some of the slots of a batch.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ LORA_FOLDER: Final = "lora"
 RECIPE_FILE: Final = "recipe.json"
 _MAX_GRADIENT_NORM: Final = 1.0
 _VALIDATION_SAMPLES: Final = 4
-"""Validation pictures per folder: generating one takes as long as several training steps."""
+"""Validation samples per folder. Their number is small, because generating one takes as long as several training steps."""
 _ROW_PX: Final = (160, 240)
-_MEMORY_CURE: Final = "lower budget_px or rank, quantise the base, or take a smaller backbone (klein)"
+_MEMORY_CURE: Final = "lower budget_px or rank, quantise the base, or choose a smaller backbone (klein)"
 
 
 class LoraTrainer:
@@ -84,7 +84,7 @@ class LoraTrainer:
         return self._prompt
 
     def initialize(self) -> None:
-        """Loads or encodes the recipe's prompt. The text encoder of a real backbone is loaded for this and released.
+        """Loads or encodes the prompt of the recipe. A text encoder is loaded only for this, and then released.
 
         Raises:
             DownloadError, ModelError, DeviceError, MissingExtra: the text encoder or the prompt cannot be loaded.
@@ -92,7 +92,7 @@ class LoraTrainer:
         self._prompt = _load_prompt(self.recipe, self.backbone)
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the LoRA, the state of the optimiser, and the prompt; no weights of the base."""
+        """Returns the LoRA, the state of the optimiser, and the prompt. The weights of the base are not included."""
         prompt = {"text": self.prompt.text, **self.prompt.tensors}
         return {
             "lora": lora_state(self.backbone), "optimizer": self._optimizer.state_dict(), "prompt": prompt,
@@ -109,7 +109,7 @@ class LoraTrainer:
 
         Raises:
             ModelError: the loss is NaN or infinite. The last checkpoint is still valid.
-            DeviceError: out of memory. The message says which values to lower.
+            DeviceError: the GPU is out of memory. The message lists the values to lower.
             RecipeError, PhotoError: a sample is missing, damaged, or smaller than a panel.
         """
         self._optimizer.zero_grad()
@@ -128,7 +128,7 @@ class LoraTrainer:
 
     @torch.no_grad()
     def validate(self) -> tuple[dict[str, float], Tensor]:
-        """Returns the mean PSNR gain of the generated T over the photo in dB, by folder, and a picture of the panels."""
+        """Returns the mean PSNR gain of the generated T over the photo in dB by folder, and an image of the panels."""
         gains, rows = {}, []
         for name, samples in self._validation_samples.items():
             results = [self._validate_sample(layers) for layers in samples]
@@ -137,20 +137,20 @@ class LoraTrainer:
         return gains, torch.cat(rows, dim=1).clamp(0, 1).permute(1, 2, 0)
 
     def export(self, folder: Path) -> Path:
-        """Writes the folder `lora`: LoRA, prompt, recipe and model card. diffusers can load it. Returns its path.
+        """Writes LoRA, prompt, recipe and model card to `lora` in `folder`. Returns the path. diffusers can load the LoRA.
 
         Raises:
             TargetError: the folder cannot be written.
         """
-        place = folder / LORA_FOLDER
+        target = folder / LORA_FOLDER
         base, quantise = self.recipe.backbone, self.recipe.quantise
         if Path(base).is_dir():
             base = str(Path(base).resolve())
-        save_lora(place, self.backbone, self.prompt, self.recipe.task, base=base, quantise=quantise)
+        save_lora(target, self.backbone, self.prompt, self.recipe.task, base=base, quantise=quantise)
         text = json.dumps(self.recipe.model_dump(mode="json"), indent=2)
-        write_atomically(place / RECIPE_FILE, f"{text}\n".encode(), overwrite=True)
-        write_card(place, self.recipe, read_last_metrics(folder), type(self.backbone))
-        return place
+        write_atomically(target / RECIPE_FILE, f"{text}\n".encode(), overwrite=True)
+        write_card(target, self.recipe, read_last_metrics(folder), type(self.backbone))
+        return target
 
     def separate(self, photo: Tensor, *, steps: int = STEPS, seed: int = 0) -> Mapping[str, Tensor]:
         """Generates the panels of a photo of the size of a panel, (1, 3, h, w) in [-1, 1].
@@ -158,24 +158,27 @@ class LoraTrainer:
         `steps` is ignored for the objective one_step.
 
         Raises:
-            DeviceError: out of memory. The message says which values to lower.
+            DeviceError: the GPU is out of memory. The message lists the values to lower.
         """
         return DecompositionPipeline(self.backbone, self.prompt, self.recipe.task)(
             photo, steps=steps, seeds=[seed]
         )
 
     def _compute_gradients(self, step: int) -> dict[str, Tensor]:
-        """Accumulates the gradients of this process's slots of the batch. Returns the parts of the loss."""
+        """Accumulates the gradients of the slots that this process computes. Returns the parts of the loss."""
         totals: dict[str, Tensor] = {}
         for slot in range(distributed.rank(), self.recipe.batch_size, distributed.world_size()):
             parts = self._losses(SampleRng(self.recipe.seed, step, slot))
-            share = {name: part / self.recipe.batch_size for name, part in parts.items()}
-            torch.stack(list(share.values())).sum().backward()  # type: ignore[no-untyped-call]
-            totals = {name: totals.get(name, 0) + part.detach() for name, part in share.items()}
+            scaled = {name: part / self.recipe.batch_size for name, part in parts.items()}
+            torch.stack(list(scaled.values())).sum().backward()  # type: ignore[no-untyped-call]
+            totals = {name: totals.get(name, 0) + part.detach() for name, part in scaled.items()}
         return totals
 
     def _losses(self, rng: SampleRng) -> dict[str, Tensor]:
-        """Returns the weighted mean squared error of the velocity, start - composite, of each panel; the loss is their sum."""
+        """Returns the weighted mean squared error of the velocity for each panel. The velocity is start - composite.
+
+        The loss is the sum of these values.
+        """
         encoded, device = self._latents(rng), self.backbone.device
         start, sigma = self._start_and_sigma(rng, encoded)
         noisy = (1 - sigma) * encoded.composite + sigma * start
@@ -195,7 +198,7 @@ class LoraTrainer:
         }
 
     def _start_and_sigma(self, rng: SampleRng, encoded: EncodedSample) -> tuple[Tensor, Tensor]:
-        """Returns the start of the sample's path, noise or the photo, and its time sigma in 0..1.
+        """Returns the start of the sample's path, which is noise or the photo, and its time sigma in 0..1.
 
         Times are logit-normal (Esser et al. 2024), then shifted for the resolution.
         """
@@ -207,12 +210,12 @@ class LoraTrainer:
         return rng.normal(*grid.shape), sigma
 
     def _panel_weights(self) -> dict[str, float]:
-        """Weights of the panels in the loss; their sum is 1."""
+        """Returns the weights of the panels in the loss. Their sum is 1."""
         named = {panel: self.recipe.panel_weights.get(panel, 1.0) for panel in self.recipe.panels}
         return {panel: weight / sum(named.values()) for panel, weight in named.items()}
 
     def _validation_panels(self, layers: Tensor) -> tuple[dict[str, Tensor], PanelFit]:
-        """Panels of a validation picture. Unlike in training, a picture smaller than a panel gets smaller panels."""
+        """Returns the panels of a validation sample. If the sample is small, the panels are smaller than in training."""
         height, width, _ = layers.shape
         fit = self.recipe.task.fit((width, height), self.backbone.multiple)
         return make_panels(layers, fit), fit
@@ -235,7 +238,7 @@ def _check_batch(recipe: LoraRecipe) -> None:
     if recipe.batch_size % distributed.world_size():
         raise RecipeError(
             f"batch_size = {recipe.batch_size} cannot be divided equally among {distributed.world_size()} processes",
-            "a batch size that is a multiple of the number of processes",
+            "expected a batch size that is a multiple of the number of processes",
             "raise batch_size to a multiple, or start fewer processes",
         )
 
@@ -247,17 +250,17 @@ def _load_prompt(recipe: LoraRecipe, backbone: Backbone) -> PromptEmbedding:
 
 
 def _create_optimizer(parameters: Sequence[nn.Parameter], recipe: LoraRecipe) -> torch.optim.Optimizer:
-    """AdamW; with 8-bit moments on CUDA, if bitsandbytes is installed."""
+    """Returns AdamW. Its moments have 8 bits on CUDA if bitsandbytes is installed."""
     options: dict[str, Any] = {"lr": recipe.learning_rate, "weight_decay": recipe.weight_decay}
     if parameters[0].is_cuda and importlib.util.find_spec("bitsandbytes"):
-        small = importlib.import_module("bitsandbytes.optim").AdamW8bit(parameters, **options)
-        assert isinstance(small, torch.optim.Optimizer)
-        return small
+        optimizer = importlib.import_module("bitsandbytes.optim").AdamW8bit(parameters, **options)
+        assert isinstance(optimizer, torch.optim.Optimizer)
+        return optimizer
     return torch.optim.AdamW(parameters, **options)
 
 
 def _validation_samples(recipe: LoraRecipe, samples: SampleSequence) -> dict[str, list[Tensor]]:
-    """The first validation pairs of each folder, (H, W, 9), or the first training samples if the recipe names no folder."""
+    """Returns the first validation pairs of each folder, (H, W, 9); the first training samples if there is no such folder."""
     folders = validation_pairs(recipe.data)
     if folders:
         return {
