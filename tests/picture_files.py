@@ -30,3 +30,40 @@ def exif_block(orientation: int = 6) -> bytes:
     exif.get_ifd(34665).update({33434: (1, 125), 37500: b"maker\0note\xff", 36867: "2020:01:02 03:04:05"})
     exif.get_ifd(34853).update({1: "N", 2: (48.0, 8.0, 0.0)})
     return exif.tobytes()
+
+
+XYZ_TO_CAMERA = ((0.9, -0.3, -0.1), (-0.5, 1.4, 0.1), (-0.1, 0.2, 0.7))
+CAMERA_NEUTRAL = (0.5, 1.0, 0.7)
+
+
+def dng_file(mosaic: np.ndarray, orientation: int = 1) -> bytes:
+    """Returns a DNG with this colour filter array, (H, W) uint16, in the pattern RGGB. Its camera is a Sextant One."""
+    import tifffile  # noqa: PLC0415  (few tests need it)
+
+    def rationals(values):
+        return [part for value in np.ravel(values) for part in (round(10000 * value), 10000)]
+
+    tags = [
+        (50706, 1, 4, bytes((1, 4, 0, 0)), True),  # DNGVersion
+        (50707, 1, 4, bytes((1, 1, 0, 0)), True),  # DNGBackwardVersion
+        (50708, 2, 0, "Sextant One", True),  # UniqueCameraModel
+        (33421, 3, 2, (2, 2), True),  # CFARepeatPatternDim
+        (33422, 1, 4, bytes((0, 1, 1, 2)), True),  # CFAPattern
+        (50714, 4, 1, 0, True),  # BlackLevel
+        (50717, 4, 1, 65535, True),  # WhiteLevel
+        (50721, 10, 9, rationals(XYZ_TO_CAMERA), True),  # ColorMatrix1
+        (50728, 5, 3, rationals(CAMERA_NEUTRAL), True),  # AsShotNeutral
+        (50778, 3, 1, 21, True),  # CalibrationIlluminant1: D65
+        (271, 2, 0, "Sextant", True),
+        (272, 2, 0, "One", True),
+        (274, 3, 1, orientation, True),
+    ]
+    file = io.BytesIO()
+    tifffile.imwrite(file, mosaic, photometric=32803, extratags=tags, metadata=None, rowsperstrip=32)
+    return file.getvalue()
+
+
+def mosaic(height: int = 96, width: int = 128) -> np.ndarray:
+    """Returns a colour filter array (H, W) uint16 with smooth gradients."""
+    down, across = np.mgrid[:height, :width]
+    return (1000 + 90 * down + 150 * across).astype(np.uint16)

@@ -20,7 +20,7 @@ from pathlib import Path
 import platformdirs
 
 from brewster.errors import TargetError
-from brewster.image_formats import format_of
+from brewster.image_formats import FORMATS, format_of
 
 DEFAULT_MAX_PIXELS = 200_000_000
 """The default limit. Larger images are refused before they are decoded: a small file can expand to a very large image."""
@@ -29,7 +29,8 @@ TEMPORARY_PREFIX = ".brewster-"
 """File name prefix of unfinished files."""
 
 LAYERS = ("transmission", "reflection", "confidence")
-_PNG_LAYERS = ("confidence",)  # grey maps are always PNG, whatever the format of the photo
+LAYER_FORMATS = {"confidence": "png"}
+"""The formats of the layers whose format does not depend on that of the photo."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +44,16 @@ class SeparationPaths:
     def target(self, layer: str, suffix: str | None = None) -> Path:
         """Returns the path of a layer.
 
-        The default suffix is that of the source, or .png if brewster does not write the format of the source.
+        The default suffix is that of the source. If brewster does not write the format of the source, it is the suffix
+        of the format that replaces it: .tiff for RAW files, .png for the others.
         """
-        image_format = format_of(self.source)
-        keeps_suffix = image_format is not None and image_format.is_writable and layer not in _PNG_LAYERS
-        return (
-            self.folder / f"{self.name}.{layer}{suffix or (self.source.suffix if keeps_suffix else '.png')}"
-        )
+        fixed, image_format = LAYER_FORMATS.get(layer), format_of(self.source)
+        if fixed is None and image_format is not None and image_format.is_writable:
+            default = self.source.suffix
+        else:
+            name = fixed or (image_format.written_as if image_format else "png")
+            default = FORMATS[name].suffixes[0]
+        return self.folder / f"{self.name}.{layer}{suffix or default}"
 
 
 def find(sources: Iterable[Path], output_folder: Path | None = None) -> list[SeparationPaths]:

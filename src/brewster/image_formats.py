@@ -23,14 +23,16 @@ class ImageFormat:
     """File name suffixes in lower case. The first one is used for new files."""
     mime_type: str
     signature: bytes
-    """A regular expression for the first bytes of a file."""
-    library: Literal["libvips", "OpenEXR", "pillow-heif", "built-in"] = "libvips"
+    """A regular expression for the first bytes of a file. Most RAW files begin like a TIFF, and are told by its tags."""
+    library: Literal["libvips", "OpenEXR", "pillow-heif", "rawpy", "built-in"] = "libvips"
     vips_loader: str | None = None
     vips_saver: str | None = None
     extra: str | None = None
     """The extra of brewster that installs the library, or None if the library is installed without an extra."""
     bit_depths: tuple[int, ...] = ()
     """The bit depths per channel that can be written. Empty for a format that is only read."""
+    replacement: str = "png"
+    """The format of the layers, if this format is only read."""
     has_float32: bool = False
     """Whether 32-bit floats are stored without loss. In HDR files the channels share an exponent, which loses precision."""
     is_linear: bool = False
@@ -46,6 +48,11 @@ class ImageFormat:
     def is_writable(self) -> bool:
         """Whether brewster writes this format."""
         return bool(self.bit_depths)
+
+    @property
+    def written_as(self) -> str:
+        """The name of the format in which the layers of a photo of this format are written."""
+        return self.name if self.is_writable else self.replacement
 
 
 _ROWS: Final = (
@@ -70,6 +77,15 @@ _ROWS: Final = (
         bit_depths=(8, 16),
         has_cicp=True,
         is_stored_rotated=True,
+    ),
+    ImageFormat(
+        name="raw",
+        suffixes=(".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"),
+        mime_type="image/x-dcraw",
+        signature=rb"II\*\0....CR|....ftypcrx |FUJIFILMCCD-RAW|II(RO|RS|U\0)|MMOR",
+        library="rawpy",
+        extra="raw",
+        replacement="tiff",
     ),
     ImageFormat(
         name="tiff",

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, TypeVar, final
 
 from brewster.errors import BrewsterError
-from brewster.files import DEFAULT_MAX_PIXELS
+from brewster.files import DEFAULT_MAX_PIXELS, LAYER_FORMATS
 from brewster.image_formats import FORMATS, FormatName, format_of
 
 Layer = Literal["transmission", "reflection", "confidence"]
@@ -137,8 +137,8 @@ class Options:
 
     def container(self, layer: str, source_format: str) -> str:
         """Returns the file format of a layer. `source_format` is the format of the photo. Confidence is always PNG."""
-        if layer == "confidence":
-            return "png"
+        if layer in LAYER_FORMATS:
+            return LAYER_FORMATS[layer]
         if self.additive and not (source_format in FORMATS and FORMATS[source_format].has_float32):
             source_format = "tiff"
         return self.format or source_format

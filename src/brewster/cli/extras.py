@@ -22,6 +22,7 @@ CORE: Final = {
 EXTRAS: Final = {
     "exr": {"OpenEXR": "OpenEXR"},
     "heic": {"pillow-heif": "pillow_heif"},
+    "raw": {"rawpy": "rawpy"},
     "render": {
         "OpenEXR": "OpenEXR",
         "filelock": "filelock",

@@ -23,6 +23,7 @@ from brewster.photo.colour import colour_space_of
 from brewster.photo.file_info import FileInfo
 from brewster.photo.hdr_formats import read_exr, read_hdr, too_large_error
 from brewster.photo.lut_profiles import has_only_tables
+from brewster.photo.raw import is_raw, read_raw, read_raw_size
 
 pyvips.cache_set_max(0)  # each image is read once, so the operation cache of libvips would only use memory
 logging.getLogger("pyvips").addHandler(logging.NullHandler())  # its warnings become brewster errors
@@ -44,9 +45,11 @@ def decode(data: bytes, max_pixels: int) -> Decoded:
 
     Raises:
         PhotoError: the image cannot be read, is not supported, or is too large (see `Photo.open`).
-        MissingExtra: the reader of EXR or HEIC is not installed.
+        MissingExtra: the reader of EXR, HEIC or RAW is not installed.
     """
     container = _detect_container(data)
+    if container == "raw":
+        return split_alpha(*read_raw(data, max_pixels))
     if container in _FLOAT_READERS:
         floats = _FLOAT_READERS[container](data, max_pixels)
         decoded = Decoded(floats.pixels, floats.alpha, floats.file_info)
@@ -73,6 +76,8 @@ def read_size(data: bytes) -> tuple[int, int]:
         PhotoError: an error of `Photo.open`.
     """
     container = _detect_container(data)
+    if container == "raw":
+        return read_raw_size(data)
     if container in _FLOAT_READERS:
         height, width = decode(data, DEFAULT_MAX_PIXELS).pixels.shape[:2]
         return width, height
@@ -104,7 +109,8 @@ def _detect_container(data: bytes) -> str:
         return "heic" if b"hvcC" in data[: 1 << 16] else "avif"
     for image_format in FORMATS.values():
         if re.match(image_format.signature, data, re.DOTALL):
-            return image_format.name
+            is_raw_tiff = image_format.name == "tiff" and is_raw(metadata.read_tags(data))
+            return "raw" if is_raw_tiff else image_format.name
     raise UnreadablePhoto(
         f"the file starts with {data[:12]!r}, which is no known image format",
         f"expected one of {', '.join(FORMATS)}",
@@ -186,17 +192,9 @@ def _check_supported(image: pyvips.Image, data: bytes, container: str, max_pixel
             "expected grey or RGB, with or without alpha, of 8 or 16 bits or 32-bit floats",
             "convert it to one of these",
         )
-    if container == "tiff":
-        _check_tiff(metadata.read_tags(data), len(data))
-
-
-def _check_tiff(tags: metadata.Tags, size: int) -> None:
-    if metadata.pixel_data_end(tags) > size:  # libvips reads missing tiles as black
-        raise _unreadable_error("tiff", "pixels are missing")
-    if _is_raw(tags):
-        raise UnsupportedPhoto(
-            "the file is the raw image of a camera", "expected a developed image", "develop it first"
-        )
+    is_tiff = container == "tiff"
+    if is_tiff and metadata.pixel_data_end(metadata.read_tags(data)) > len(data):
+        raise _unreadable_error("tiff", "pixels are missing")  # libvips reads missing tiles as black
 
 
 def _has_frames(image: pyvips.Image, data: bytes, container: str) -> bool:
@@ -207,21 +205,13 @@ def _has_frames(image: pyvips.Image, data: bytes, container: str) -> bool:
     return bool(image.get_typeof("n-pages")) and image.get("n-pages") > 1
 
 
-def _is_raw(tags: metadata.Tags) -> bool:
-    """Returns whether a TIFF is a raw file.
-
-    A DNG has the tag DNGVersion (50706). Other raw files begin with a reduced image (NewSubfileType, bit 0).
-    """
-    return 50706 in tags or metadata.number_of(tags, 254, 0) & 1 == 1
-
-
 def _file_info(image: pyvips.Image, data: bytes, container: str) -> FileInfo:
     names = ("icc-profile-data", "exif-data", "xmp-data", "iptc-data")
     icc, exif, xmp, iptc = (image.get(name) if image.get_typeof(name) else None for name in names)
     bits = {"float": 32, "uchar": 8}.get(image.format, 16)
     has_resolution = (image.xres, image.yres) != (1.0, 1.0)
     file_info = FileInfo(
-        container="png" if container == "gif" else container,
+        container=FORMATS[container].written_as,
         bits=image.get("bits-per-sample") if container == "avif" else bits,
         icc=icc or _profile_of(data, container),
         exif=metadata.upright_exif(exif) if exif else None,

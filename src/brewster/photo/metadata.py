@@ -35,6 +35,12 @@ def jpeg_segments(data: bytes) -> Iterator[tuple[int, int, bytes]]:
         position += 2 + size
 
 
+def jpeg_exif(data: bytes) -> bytes:
+    """Returns the EXIF block of a JPEG, or nothing if it has none."""
+    blocks = (payload for marker, _, payload in jpeg_segments(data) if marker == _APP1)
+    return next((block[len(_EXIF_NAME) :] for block in blocks if block.startswith(_EXIF_NAME)), b"")
+
+
 def jpeg_quantisation_sums(data: bytes) -> dict[int, int]:
     """Returns the sum of each quantisation table by its number (0: luma, 1: chroma). A larger sum is coarser."""
     sums = {}

@@ -1,0 +1,142 @@
+"""Develops the RAW files of cameras with LibRaw (package rawpy) to 16-bit Display P3.
+
+Pixels are the linear light that LibRaw computes with the white balance and the colour matrix of the camera, without
+automatic brightening. They are stored with the tone curve of Display P3, so that a TIFF of them looks right in all programs.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import types
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pyvips
+from numpy.typing import NDArray
+
+from brewster.errors import MissingExtra, UnreadablePhoto
+from brewster.image_formats import FORMATS
+from brewster.photo import metadata
+from brewster.photo.colour import colour_space_of
+from brewster.photo.file_info import FileInfo
+from brewster.photo.hdr_formats import too_large_error
+
+_MAKER_NOTE = 37500
+_EXIF_TAG, _GPS_TAG = 34665, 34853
+
+
+def is_raw(tags: metadata.Tags) -> bool:
+    """Returns whether the first directory of a TIFF is that of a RAW file.
+
+    A DNG has the tag DNGVersion (50706). Other RAW files begin with a reduced image (NewSubfileType, bit 0), or with the
+    colour filter array itself (PhotometricInterpretation 32803).
+    """
+    is_reduced = metadata.number_of(tags, 254, 0) & 1 == 1
+    return 50706 in tags or is_reduced or metadata.number_of(tags, 262, 0) == 32803
+
+
+def read_raw(data: bytes, max_pixels: int) -> tuple[NDArray[np.uint16], FileInfo]:
+    """Returns the pixels (H, W, 1|3) in Display P3, upright, and the metadata of a RAW file.
+
+    Raises:
+        MissingExtra: rawpy is not installed.
+        PhotoTooLarge: the image has more pixels than `max_pixels`.
+        UnreadablePhoto: the file is damaged or truncated, or LibRaw does not support the camera.
+    """
+    with _opened(data) as raw:
+        width, height = _upright_size(raw)
+        if width * height > max_pixels:
+            raise too_large_error(width, height, max_pixels)
+        linear = raw.postprocess(
+            use_camera_wb=True,
+            no_auto_bright=True,
+            gamma=(1, 1),
+            output_bps=16,
+            output_color=_rawpy().ColorSpace.P3D65,
+        )
+    icc = bytes(pyvips.Image.profile_load("p3"))
+    curve = colour_space_of(icc, None, is_float=False).curves[1]
+    encoded = np.rint(65535 * np.clip(curve.encode(np.arange(65536) / 65535), 0, 1)).astype(np.uint16)
+    return encoded[linear.reshape(*linear.shape[:2], -1)], FileInfo(
+        FORMATS["raw"].written_as, bits=16, icc=icc, exif=_exif(data)
+    )
+
+
+def read_raw_size(data: bytes) -> tuple[int, int]:
+    """Returns (width, height) of the upright image of a RAW file.
+
+    Raises:
+        MissingExtra: rawpy is not installed.
+        UnreadablePhoto: the file is damaged, or LibRaw does not support the camera.
+    """
+    with _opened(data) as raw:
+        return _upright_size(raw)
+
+
+def _rawpy() -> types.ModuleType:
+    try:
+        import rawpy  # noqa: PLC0415  (an extra: only RAW files need it)
+    except ImportError as error:
+        raise MissingExtra(
+            "the rawpy package is not installed",
+            "expected it to be installed, because RAW files need it",
+            "run: pip install 'brewster[raw]'",
+        ) from error
+    module: types.ModuleType = rawpy
+    return module
+
+
+@contextmanager
+def _opened(data: bytes) -> Iterator[Any]:
+    """Yields the file as a `rawpy.RawPy`. An error of LibRaw in the block becomes an `UnreadablePhoto`."""
+    rawpy = _rawpy()
+    try:
+        with rawpy.imread(io.BytesIO(data)) as raw:
+            yield raw
+    except rawpy.LibRawError as error:
+        reason = error.args[0].decode() if error.args and isinstance(error.args[0], bytes) else str(error)
+        raise UnreadablePhoto(
+            f"the RAW file cannot be read completely ({reason})",
+            f"expected a complete RAW file of a camera that LibRaw {'.'.join(map(str, rawpy.libraw_version))} supports",
+            "copy it again from the camera, or convert it to DNG or TIFF",
+        ) from error
+
+
+def _upright_size(raw: Any) -> tuple[int, int]:  # noqa: ANN401  (rawpy has no types)
+    sizes = raw.sizes
+    is_transposed = sizes.flip in (4, 5, 6, 7)  # LibRaw's code: bit 2 swaps rows and columns
+    return (sizes.iheight, sizes.iwidth) if is_transposed else (sizes.iwidth, sizes.iheight)
+
+
+# --- EXIF
+
+
+def _exif(data: bytes) -> bytes | None:
+    """Returns the camera tags of a RAW file as an EXIF block, without the maker note, whose offsets would be wrong."""
+    tags = _camera_tags(data)
+    exif = tags.get(_EXIF_TAG)
+    if isinstance(exif, dict):
+        exif.pop(_MAKER_NOTE, None)
+    return metadata.tiff_exif(tags)
+
+
+def _camera_tags(data: bytes) -> metadata.Tags:
+    if data[4:8] == b"ftyp":  # CR3: one TIFF block for each directory, in boxes of their own
+        blocks = {name: _box(data, name) for name in (b"CMT1", b"CMT2", b"CMT4")}
+        tags = metadata.read_tags(blocks[b"CMT1"])
+        subdirectories = {_EXIF_TAG: blocks[b"CMT2"], _GPS_TAG: blocks[b"CMT4"]}
+        return tags | {tag: metadata.read_tags(block) for tag, block in subdirectories.items() if block}
+    if data.startswith(b"FUJIFILM"):  # RAF: the position of a JPEG with EXIF is in the header
+        start, size = (int.from_bytes(data[at : at + 4], "big") for at in (84, 88))
+        return metadata.read_tags(metadata.jpeg_exif(data[start : start + size]))
+    byte_order = data[:2] + (b"*\0" if data[:2] == b"II" else b"\0*")
+    return metadata.read_tags(byte_order + data[4:])  # ORF and RW2 have another number in place of 42
+
+
+def _box(data: bytes, name: bytes) -> bytes:
+    """Returns the content of the first box with this name (ISO/IEC 14496-12 4.2), or nothing."""
+    found = re.search(rb"(....)" + name, data[: 1 << 20], re.DOTALL)
+    return data[found.end() : found.start() + int.from_bytes(found[1], "big")] if found else b""

@@ -1,0 +1,143 @@
+"""RAW files of cameras: light, colour, orientation, EXIF, and damaged files, on generated DNGs."""
+
+import io
+import struct
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from brewster.errors import MissingExtra, PhotoTooLarge, UnreadablePhoto
+from brewster.image_formats import FORMATS, format_of
+from brewster.photo import Photo, metadata, raw, read_size
+from brewster.photo.colour import colour_space_of
+from picture_files import CAMERA_NEUTRAL, dng_file, exif_block, file_of, mosaic, pil, smooth
+
+rawpy = pytest.importorskip("rawpy")
+
+
+def developed(data, space):
+    """The linear light that LibRaw computes, 0..1."""
+    with rawpy.imread(io.BytesIO(data)) as file:
+        options = {"gamma": (1, 1), "no_auto_bright": True, "use_camera_wb": True, "output_bps": 16}
+        return file.postprocess(output_color=space, **options) / 65535
+
+
+def test_the_light_of_a_raw_file_is_the_linear_output_of_libraw():
+    data = dng_file(mosaic())
+    photo = Photo.open(data)
+    space = colour_space_of(photo.file_info.icc, None, is_float=False)
+    stored = np.stack([space.curves[i].decode(photo.pixels[..., i] / 65535) for i in range(3)], axis=2)
+    assert np.abs(stored - developed(data, rawpy.ColorSpace.P3D65)).max() < 2 / 65535
+    in_gamut = developed(data, rawpy.ColorSpace.sRGB)
+    inside = (in_gamut > 0.001).all(axis=2) & (in_gamut < 0.99).all(axis=2)
+    assert inside.mean() > 0.2
+    assert np.abs(photo.linear() - in_gamut)[inside].max() < 2e-3  # two roundings of the primaries
+
+
+def test_what_is_neutral_for_the_camera_is_neutral_in_the_photo():
+    grey = np.empty((64, 64), np.uint16)
+    grey[::2, ::2], grey[1::2, 1::2] = 40000 * CAMERA_NEUTRAL[0], 40000 * CAMERA_NEUTRAL[2]
+    grey[::2, 1::2] = grey[1::2, ::2] = 40000
+    light = Photo.open(dng_file(grey)).linear()[8:-8, 8:-8]
+    assert np.ptp(light, axis=2).max() < 0.003
+    assert light.mean() == pytest.approx(40000 / 65535, rel=0.01)
+
+
+def test_a_raw_file_gives_sixteen_bit_tiff_with_the_tags_of_the_camera():
+    data = metadata.with_tiff_exif(dng_file(mosaic()), exif_block(1).removeprefix(b"Exif\0\0"))
+    photo = Photo.open(data)
+    assert (photo.file_info.container, photo.file_info.bits, photo.pixels.dtype) == ("tiff", 16, np.uint16)
+    image = pil(photo.encode())
+    assert image.format == "TIFF"
+    exif = image.getexif()
+    assert exif[271] == "Sextant"
+    assert exif.get_ifd(34665)[33434] == (1, 125)
+    assert 37500 not in exif.get_ifd(34665)  # the offsets in a maker note refer to the RAW file
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_a_raw_file_is_upright(orientation):
+    upright, turned = Photo.open(dng_file(mosaic())), Photo.open(dng_file(mosaic(), orientation))
+    turns = {1: 0, 3: 2, 6: 3, 8: 1}[orientation]
+    assert np.array_equal(turned.pixels, np.rot90(upright.pixels, turns))
+    assert turned.size == read_size(dng_file(mosaic(), orientation))
+    assert metadata.orientation_of(turned.file_info.exif) == 1
+
+
+@pytest.mark.parametrize("fraction", [0.05, 0.5, 0.95])
+def test_a_truncated_raw_file_is_refused(fraction):
+    data = dng_file(mosaic())
+    with pytest.raises(UnreadablePhoto, match="cannot be read completely"):
+        Photo.open(data[: int(fraction * len(data))])
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        b"FUJIFILMCCD-RAW ",
+        b"\0\0\0\x18ftypcrx ",
+        b"II*\0\x10\0\0\0CR\2",
+        b"IIRO\x08\0\0\0",
+        b"IIU\0\x18\0\0\0",
+    ],
+)
+def test_a_damaged_raw_file_of_any_maker_is_named_as_raw(head):
+    with pytest.raises(UnreadablePhoto, match="the RAW file"):
+        Photo.open(head + bytes(4000))
+
+
+def test_the_pixel_limit_is_that_of_the_image():
+    data = dng_file(mosaic(96, 128))
+    assert Photo.open(data, max_pixels=96 * 128).size == (128, 96)
+    with pytest.raises(PhotoTooLarge):
+        Photo.open(data, max_pixels=96 * 128 - 1)
+
+
+def test_the_missing_extra_names_the_command_that_installs_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "rawpy", None)
+    for read in (Photo.open, read_size):
+        with pytest.raises(MissingExtra, match=r"RAW files need it; run: pip install 'brewster\[raw\]'"):
+            read(dng_file(mosaic()))
+
+
+def test_a_tiff_of_a_photo_is_not_raw():
+    assert Photo.open(file_of(smooth(), "TIFF")).file_info.container == "tiff"
+    assert format_of(Path("a.NEF")) == FORMATS["raw"]
+
+
+# --- EXIF of other makers: the files are built here, because LibRaw is not needed for their tags
+
+
+def tiff_block(tags):
+    exif = Image.Exif()
+    exif.endian = "<"
+    exif.update(tags)
+    return exif.tobytes().removeprefix(b"Exif\0\0")
+
+
+def box(name, content):
+    return struct.pack(">I", len(content) + 8) + name + content
+
+
+def test_the_tags_of_a_cr3_are_those_of_its_boxes():
+    boxes = box(b"CMT1", tiff_block({271: "Sextant"})) + box(b"CMT2", tiff_block({33434: 0.5}))
+    tags = raw._camera_tags(box(b"ftyp", b"crx \0\0\0\1") + box(b"moov", box(b"uuid", bytes(16) + boxes)))
+    assert tags[271][2] == b"Sextant\0"
+    assert 33434 in tags[34665]
+
+
+def test_the_tags_of_a_raf_are_those_of_its_jpeg():
+    preview = file_of(smooth(), "JPEG", exif=exif_block())
+    header = (b"FUJIFILMCCD-RAW " + bytes(68) + struct.pack(">II", 160, len(preview))).ljust(160, b"\0")
+    tags = metadata.read_tags(raw._exif(header + preview))
+    assert tags[271][2] == b"Sextant\0"
+    assert 33434 in tags[34665]
+
+
+@pytest.mark.parametrize("magic", [b"IIRO", b"IIU\0", b"MMOR"])
+def test_the_tags_of_an_orf_and_of_an_rw2_are_those_of_a_tiff(magic):
+    block = exif_block().removeprefix(b"Exif\0\0") if magic[:2] == b"MM" else tiff_block({271: "Sextant"})
+    assert metadata.read_tags(raw._exif(magic + block[4:]))[271][2] == b"Sextant\0"
