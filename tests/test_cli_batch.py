@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -377,7 +378,13 @@ def test_a_batch_ends_with_a_summary(run, tmp_path):
         (tmp_path / f"{name}.jpg").write_bytes(image_bytes())
     run("a.jpg")
     (tmp_path / "b.jpg").write_bytes(b"")
-    assert "1 separated, 1 skipped, 1 failed" in run(".")[2].splitlines()
+    pattern = r"^1 separated, 1 skipped, 1 failed in \d+\.\d s; the layers are (.*)$"
+    assert re.search(pattern, run(".")[2], re.MULTILINE)[1] == "next to the photos"
+    (tmp_path / "b.jpg").write_bytes(b"")
+    err = run("a.jpg", "b.jpg", "c.jpg", "-o", "out")[2]
+    assert (
+        re.search(r"^2 separated, 1 failed in .* s; the layers are (.*)$", err, re.MULTILINE)[1] == "in out"
+    )
 
 
 def test_quiet_prints_nothing_if_no_photo_fails(run, tmp_path):

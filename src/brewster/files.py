@@ -20,7 +20,7 @@ from pathlib import Path
 import platformdirs
 
 from brewster.errors import TargetError
-from brewster.image_formats import FORMATS, format_of
+from brewster.image_formats import FORMATS, VIDEO_SUFFIXES, format_of
 
 DEFAULT_MAX_PIXELS = 200_000_000
 """The default limit. Larger images are refused before they are decoded: a small file can expand to a very large image."""
@@ -84,6 +84,12 @@ def find(sources: Iterable[Path], output_folder: Path | None = None) -> list[Sep
             found.setdefault(_absolute(image), paths)
     _check_unique_targets(found.values())
     return list(found.values())
+
+
+def find_videos(sources: Iterable[Path]) -> list[Path]:
+    """Returns the videos in folders, which `find` skips, in a stable order."""
+    folders = (source for source in sources if _is_folder(source))
+    return [path for folder in folders for path in walk(folder, _is_video) if _is_video(path)]
 
 
 def write_atomically(path: Path, data: bytes, *, overwrite: bool = False, source: Path | None = None) -> None:
@@ -240,6 +246,10 @@ def _is_input(path: Path) -> bool:
     """Returns whether a file has an image suffix, is not hidden, and is not a layer that brewster has written."""
     is_result = Path(path.stem).suffix.lstrip(".") in LAYERS
     return format_of(path) is not None and not path.name.startswith(".") and not is_result
+
+
+def _is_video(path: Path) -> bool:
+    return path.suffix.lower() in VIDEO_SUFFIXES and not path.name.startswith(".")
 
 
 def _check_unique_targets(found: Iterable[SeparationPaths]) -> None:

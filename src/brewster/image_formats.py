@@ -167,6 +167,16 @@ WRITABLE: Final = {name: row for name, row in FORMATS.items() if row.is_writable
 SUFFIXES: Final = {suffix: row for row in _ROWS for suffix in row.suffixes}
 """All formats by file name suffix, in lower case."""
 
+VIDEO_SUFFIXES: Final = frozenset(
+    (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".mpg", ".3gp")
+)
+"""File name suffixes of videos, in lower case. brewster reads no videos, and names those that it skips."""
+
+VIDEO_SIGNATURE: Final = (
+    rb"....ftyp(isom|iso[2-9]|mp4[12]|avc1|qt  |M4V |3gp.|MSNV)|RIFF....AVI |\x1aE\xdf\xa3|\0\0\x01\xba"
+)
+"""A regular expression for the first bytes of a video: MP4, QuickTime, AVI, Matroska or MPEG."""
+
 
 def format_of(path: Path) -> ImageFormat | None:
     """Returns the format for the suffix of a file name, or None if the suffix is unknown."""

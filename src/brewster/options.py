@@ -76,7 +76,8 @@ class Options:
     model: str = field(
         default="compact",
         metadata=_field_metadata(
-            "The model to use: a name from `brewster models list`, an .onnx file, or a LoRA's folder or hub id."
+            "The model to use: a name from `brewster models list`, an .onnx file, the folder of a training run, "
+            "or a LoRA's folder or hub id."
         ),
     )
     device: Device = field(

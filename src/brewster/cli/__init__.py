@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import click
+from click.shell_completion import CompletionItem
 
 import brewster
 from brewster.cli import ablate, assets, doctor, evaluate, models, render, separate, serve, study, train
@@ -17,7 +18,8 @@ from brewster.cli.terminal import interrupts, print_error, print_status, standar
 from brewster.errors import BrewsterError
 
 _EXIT_INTERRUPTED = 130  # what a shell expects after Ctrl-C: 128 + SIGINT
-_GROUP_OPTIONS = {"--help", "--version"}
+_HELP_OPTIONS = ["-h", "--help"]
+_GROUP_OPTIONS = {*_HELP_OPTIONS, "--version"}
 
 
 class _DefaultCommandGroup(click.Group):
@@ -26,9 +28,17 @@ class _DefaultCommandGroup(click.Group):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Inserts `separate` in front of the arguments if they begin with no command."""
         if args and args[0] not in self.commands and args[0] not in _GROUP_OPTIONS:
-            self._reject_misspelled_command(ctx, args[0])
+            if not ctx.resilient_parsing:  # shell completion
+                self._reject_misspelled_command(ctx, args[0])
             args = ["separate", *args]
         return super().parse_args(ctx, args)
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """Completes commands, and the photos and options of `separate`, whose name may be left out."""
+        separate_items = self.commands["separate"].shell_complete(ctx, incomplete)
+        items = [*super().shell_complete(ctx, incomplete), *separate_items]
+        files = [] if incomplete.startswith("-") else [CompletionItem(incomplete, type="file")]
+        return [*{item.value: item for item in items}.values(), *files]
 
     def _reject_misspelled_command(self, ctx: click.Context, argument: str) -> None:
         close = difflib.get_close_matches(argument, self.commands, n=1, cutoff=0.7)
@@ -42,7 +52,11 @@ def _print_version(context: click.Context, _parameter: click.Parameter, requeste
         context.exit()
 
 
-@click.group(cls=_DefaultCommandGroup, subcommand_metavar="PHOTO... | COMMAND [ARGS]...")
+@click.group(
+    cls=_DefaultCommandGroup,
+    subcommand_metavar="PHOTO... | COMMAND [ARGS]...",
+    context_settings={"help_option_names": _HELP_OPTIONS},
+)
 @click.option(
     "--version",
     is_flag=True,

@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
-from collections import Counter
-from collections.abc import Sequence
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, final
+from typing import TYPE_CHECKING, Final, final
+from urllib.request import url2pathname
 
 import click
 
@@ -25,11 +28,47 @@ from brewster.cli.terminal import (
     standard_output,
     write_out,
 )
-from brewster.image_formats import ImageFormat, format_of
+from brewster.errors import ModelError
+from brewster.files import find_videos
+from brewster.image_formats import WRITABLE, ImageFormat, format_of
+from brewster.models import zoo
 from brewster.options import Options
 
 if TYPE_CHECKING:
     from brewster.inference import FileResult, SeparationTask
+
+
+_MAX_NAMES: Final = 10
+"""In a message about several files, the number of files that are named."""
+
+
+def local_path(text: str) -> str:
+    """Returns the path in an argument that is a file:// address or has quotes around it.
+
+    File managers and some terminals pass a dropped file in this form. The name of an existing file is never changed.
+    """
+    if os.path.lexists(text):
+        return text
+    if len(text) > 2 and text[0] == text[-1] and text[0] in "'\"":
+        text = text[1:-1]
+    if text.startswith("file://"):
+        path = text.removeprefix("file://").removeprefix("localhost")
+        text = url2pathname(path if path.startswith("/") else f"//{path}")  # a share of a Windows server
+    return text
+
+
+def skipped_videos(photos: Sequence[str]) -> str | None:
+    """Returns a line about the videos in the folders, or None if there is none."""
+    videos = find_videos(map(Path, photos))
+    if not videos:
+        return None
+    return f"{_counted(videos, 'video')} skipped: brewster separates photos; extract single images first, for example with ffmpeg"
+
+
+def _counted(names: Sequence[object], kind: str) -> str:
+    """Returns `2 videos (a.mp4, b.mov)`; the names of a long list are cut."""
+    more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
+    return f"{len(names)} {kind}{'s' * (len(names) != 1)} ({', '.join(map(str, names[:_MAX_NAMES]))}{more})"
 
 
 def is_single_output(photos: Sequence[str], output: str | None) -> bool:
@@ -49,6 +88,7 @@ def plan(photos: Sequence[str], output: str | None, options: Options) -> list[Se
 
     if is_single_output(photos, output):
         return [_plan_single_output(photos, output, options)]
+    _check_output_folder(photos, output)
     return plan_files(photos, output, options)
 
 
@@ -89,6 +129,26 @@ def _check_format(image_format: ImageFormat | None, options: Options) -> None:
         )
 
 
+def _check_output_folder(photos: Sequence[str], output: str | None) -> None:
+    """Checks that -o for a single photo is not an image file of an unknown format.
+
+    Raises:
+        click.UsageError: -o ends in an unknown suffix, and is not an existing folder.
+    """
+    if output is None or output.endswith(("/", os.sep)) or len(photos) > 1:
+        return
+    suffix = Path(output).suffix
+    if (
+        re.fullmatch(r"\.[A-Za-z][A-Za-z0-9]{1,4}", suffix)
+        and not os.path.isdir(output)  # noqa: PTH112  (Path.is_dir raises for names that are too long)
+        and not os.path.isdir(photos[0])  # noqa: PTH112
+    ):
+        raise click.UsageError(
+            f"The suffix {suffix} of -o is that of no format that brewster writes. Choose one of "
+            f"{', '.join(row.suffixes[0] for row in WRITABLE.values())}, or end the name of a folder with {os.sep}"
+        )
+
+
 def _is_image_file(output: str | None) -> bool:
     return (
         output is not None
@@ -121,10 +181,12 @@ class BatchCommand:
     """The options of a batch. `run` separates the photos and prints the results."""
 
     options: Options
+    output: str | None = None
     overwrite: bool = False
     dry_run: bool = False
     as_json: bool = False
     quiet: bool = False
+    contact_sheet: Path | None = None
 
     def run(self, tasks: Sequence[SeparationTask]) -> bool:
         """Separates all photos and prints the results.
@@ -137,13 +199,16 @@ class BatchCommand:
             DeviceError: the requested device is not available.
         """
         results: list[FileResult] = []
+        started = time.perf_counter()
         try:
             self._separate(tasks, results)
+            if self.contact_sheet and not self.dry_run:
+                self._write_contact_sheet(self.contact_sheet, results)
         finally:
             if len(results) == len(
                 tasks
             ):  # true also if `separate_tasks` raises an unexpected exception after the last photo
-                self._print_summary(results)
+                self._print_summary(results, time.perf_counter() - started)
         return all(result.error is None for result in results)
 
     def _separate(self, tasks: Sequence[SeparationTask], results: list[FileResult]) -> None:
@@ -175,7 +240,11 @@ class BatchCommand:
         if self.quiet or result.error:
             return
         if result.status == "skipped":
-            print_status(f"{result.source}: skipped, all of its layers exist (--overwrite replaces them)")
+            other = self._other_options(result)
+            made = f", made with other options ({other})" if other else ""
+            print_status(
+                f"{result.source}: skipped, all of its layers exist{made} (--overwrite replaces them)"
+            )
         elif result.status == "separated":
             print_status(f"{result.source} -> {outputs} ({sum(result.seconds.values()):.1f} s)")
             if result.doubtful:
@@ -184,15 +253,79 @@ class BatchCommand:
                     f"(reconstruction error {result.reconstruction_error:.2f}): check the layers"
                 )
 
-    def _print_summary(self, results: Sequence[FileResult]) -> None:
+    def _other_options(self, result: FileResult) -> str:
+        """Returns the options with which the existing layers were made, where they differ from those of this batch."""
+        from brewster.inference.separator import PROGRAM, history_step  # noqa: PLC0415
+        from brewster.photo.history import recorded_parameters  # noqa: PLC0415
+
+        options = self.options
+        expected = history_step(
+            "", strength=options.strength, quality=options.quality, additive=options.additive
+        ) | {"model": _model_name(options.model)}
+        recorded = (recorded_parameters(Path(path), PROGRAM) for path in result.outputs.values())
+        made = next((parameters for parameters in recorded if parameters), {})
+        return ", ".join(
+            f"{name}={made[name]}"
+            for name, value in expected.items()
+            if value is not None and made.get(name, value) != value
+        )
+
+    def _print_summary(self, results: Sequence[FileResult], seconds: float) -> None:
         counts: Counter[str] = Counter(result.status for result in results)
         if len(results) > 1 and not self.quiet:
             order = ("separated", "planned", "skipped", "failed")
-            print_status(", ".join(f"{counts[status]} {status}" for status in order if counts[status]))
-        for result in results:
-            if result.error:
-                has_source = result.error.startswith(f"{result.source} ")
-                print_error(result.error if has_source else f"{result.source}: {result.error}")
+            totals = ", ".join(f"{counts[status]} {status}" for status in order if counts[status])
+            folder = f"in {self.output}" if self.output else "next to the photos"
+            print_status(
+                totals if self.dry_run else f"{totals} in {_duration(seconds)}; the layers are {folder}"
+            )
+        for message in _error_messages(results):
+            print_error(message)
+
+    def _write_contact_sheet(self, path: Path, results: Sequence[FileResult]) -> None:
+        """Writes the contact sheet of the photos whose layers are files."""
+        from brewster.photo.contact_sheet import write_contact_sheets  # noqa: PLC0415
+
+        rows = [
+            (Path(result.source), [Path(output) for output in result.outputs.values()])
+            for result in results
+            if result.error is None and result.source != "-" and "-" not in result.outputs.values()
+        ]
+        for sheet in write_contact_sheets(path, rows, self.options.max_pixels):
+            if not self.quiet:
+                print_status(f"contact sheet: {sheet}")
+
+
+def _model_name(model: str) -> str | None:
+    """Returns the name of a model as the metadata of its layers record it, or None if it is unknown without loading it."""
+    try:
+        return None if zoo.is_large(model) else zoo.find_model(model).name
+    except ModelError:
+        return None
+
+
+def _duration(seconds: float) -> str:
+    """Returns `4.2 s`, `3 min 5 s` or `2 h 40 min`."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def _error_messages(results: Iterable[FileResult]) -> list[str]:
+    """Returns a message for each failed photo. Photos that need the same missing extra share a message."""
+    messages, without_extra = [], defaultdict(list)
+    for result in results:
+        if result.error and "pip install 'brewster[" in result.error:
+            without_extra[result.error].append(result.source)
+        elif result.error:
+            has_source = result.error.startswith(f"{result.source} ")
+            messages.append(result.error if has_source else f"{result.source}: {result.error}")
+    grouped = (
+        f"{sources[0] if len(sources) == 1 else _counted(sources, 'photo')}: {error}"
+        for error, sources in without_extra.items()
+    )
+    return [*messages, *grouped]
 
 
 def _json_line(result: FileResult) -> bytes:

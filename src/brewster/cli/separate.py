@@ -5,15 +5,19 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import click
 from click.core import ParameterSource
+from click.shell_completion import CompletionItem
 
-from brewster.cli.batch import BatchCommand, is_single_output, plan
-from brewster.cli.terminal import standard_output
+from brewster.cli.batch import BatchCommand, is_single_output, local_path, plan, skipped_videos
+from brewster.cli.terminal import print_status, standard_output
 from brewster.errors import BrewsterError
+from brewster.image_formats import SUFFIXES, FormatName, format_of
+from brewster.models import zoo
 from brewster.options import Options
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
@@ -60,6 +64,49 @@ class _ChoiceList(click.ParamType[tuple[str, ...]]):
             self.fail(f"{unknown[0]!r} is not one of {', '.join(self.choices)}.", param, ctx)
         return tuple(choice for choice in self.choices if choice in given)
 
+    def shell_complete(
+        self,
+        ctx: click.Context,  # noqa: ARG002
+        param: click.Parameter,  # noqa: ARG002
+        incomplete: str,
+    ) -> list[CompletionItem]:
+        """Completes the last choice of the list."""
+        *given, last = incomplete.split(",")
+        return [
+            CompletionItem(",".join((*given, choice)))
+            for choice in self.choices
+            if choice.startswith(last) and choice not in given
+        ]
+
+
+class _FormatChoice(click.Choice[str]):
+    """The name of a file format, or one of its suffixes: jpg is jpeg."""
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """The name of the format.
+
+        Raises:
+            click.BadParameter: brewster does not write this format.
+        """
+        row = SUFFIXES.get(f".{str(value).lower().removeprefix('.')}")
+        return super().convert(row.name if row else value, param, ctx)
+
+
+class _ModelName(click.ParamType[str]):
+    """The name of a model, or the path of a file or folder."""
+
+    name = "text"
+
+    def shell_complete(
+        self,
+        ctx: click.Context,  # noqa: ARG002
+        param: click.Parameter,  # noqa: ARG002
+        incomplete: str,
+    ) -> list[CompletionItem]:
+        """Completes the names of the registered models, and file names."""
+        names = [name for name in (*zoo.MODELS, *zoo.LARGE_MODELS) if name.startswith(incomplete)]
+        return [*map(CompletionItem, names), CompletionItem(incomplete, type="file")]
+
 
 def _with_options(command: _Command) -> _Command:
     """Adds one option for each field of `Options` to a command."""
@@ -88,21 +135,24 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
     low, high = field.metadata.get("ge"), field.metadata.get("le")
     if NoneType in get_args(hint):
         return _param_type(get_args(hint)[0], field)
-    if hint is float:
-        return _RangedNumber(low, high)
-    if hint is int:
-        return click.IntRange(low, high)
+    if hint in (int, float):
+        return (_RangedNumber if hint is float else click.IntRange)(low, high)
+    if hint == FormatName:
+        return _FormatChoice(get_args(hint))
     if get_origin(hint) is tuple:
         return _ChoiceList(get_args(get_args(hint)[0]))
-    return click.Choice(get_args(hint)) if get_origin(hint) is Literal else click.STRING
+    if get_origin(hint) is Literal:
+        return click.Choice(get_args(hint))
+    return _ModelName() if field.name == "model" else click.STRING
 
 
 @click.command
-@click.argument("photos", nargs=-1, required=True, metavar="PHOTO...")
+@click.argument("photos", nargs=-1, required=True, metavar="PHOTO...", type=click.Path())
 @click.option(
     "-o",
     "--output",
     metavar="FOLDER|IMAGE|-",
+    type=click.Path(),
     help="The target of the layers: a folder, an image file for a single layer, or - for standard output.",
 )
 @_with_options
@@ -112,6 +162,12 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
 @click.option("--quiet", is_flag=True, help="Print only errors.")
 @click.option("--dry-run", is_flag=True, help="Print the planned files, and write nothing.")
 @click.option("--overwrite", is_flag=True, help="Replace existing layers.")
+@click.option(
+    "--contact-sheet",
+    metavar="IMAGE",
+    type=click.Path(path_type=Path),
+    help="Also write an overview of all photos and their layers as an image file, replacing an existing one.",
+)
 @click.pass_context
 def separate(
     context: click.Context,
@@ -123,6 +179,7 @@ def separate(
     quiet: bool,
     dry_run: bool,
     overwrite: bool,
+    contact_sheet: Path | None,
     **values: object,
 ) -> None:
     """Separate photographs taken through glass into transmission and reflection.
@@ -135,6 +192,7 @@ def separate(
     Photos whose layers exist are skipped. If a photo fails, the others are still separated, the failed photo is listed
     at the end, and the exit code is 1.
     """
+    photos, output = tuple(map(local_path, photos)), output and local_path(output)
     single_output = is_single_output(photos, output)
     if single_output and context.get_parameter_source("layers") is ParameterSource.DEFAULT:
         values["layers"] = ("transmission",)
@@ -145,8 +203,35 @@ def separate(
     tasks = plan(photos, output, options)
     if single_output and output in (None, "-") and not dry_run:
         _reject_shared_output(as_json=as_json)
-    batch = BatchCommand(options, overwrite=overwrite, dry_run=dry_run, as_json=as_json, quiet=quiet)
+    if contact_sheet:
+        _check_contact_sheet(contact_sheet, photos, output)
+    if not quiet and (videos := skipped_videos(photos)):
+        print_status(videos)
+    batch = BatchCommand(
+        options,
+        output=output,
+        overwrite=overwrite,
+        dry_run=dry_run,
+        as_json=as_json,
+        quiet=quiet,
+        contact_sheet=contact_sheet,
+    )
     context.exit(0 if batch.run(tasks) else 1)
+
+
+def _check_contact_sheet(path: Path, photos: tuple[str, ...], output: str | None) -> None:
+    """Checks that the contact sheet can be written before any photo is separated.
+
+    Raises:
+        click.UsageError: the photos or the layers are no files, or the format of the sheet cannot be written.
+    """
+    row = format_of(path)
+    if row is None or not row.is_writable:
+        raise click.UsageError(f"--contact-sheet takes an image file such as sheet.jpg, not {path}.")
+    if "-" in (*photos, output):
+        raise click.UsageError(
+            "--contact-sheet needs photos and layers that are files, not standard input or output."
+        )
 
 
 def _reject_shared_output(*, as_json: bool) -> None:

@@ -165,6 +165,7 @@ def progress(total: int, *, shown: bool) -> Iterator[ProgressUpdater]:
     columns = (
         BarColumn(),
         MofNCompleteColumn(),
+        TextColumn("time left"),
         TimeRemainingColumn(),
         TextColumn("{task.description}", markup=False),
     )

@@ -2,7 +2,8 @@
 
 from brewster.inference.batch import FileResult, SeparationTask, plan_files, separate_files, separate_tasks
 from brewster.inference.predictor import QUALITIES
-from brewster.inference.separator import Separation, Separator, separate
+from brewster.inference.separation import Separation
+from brewster.inference.separator import Separator, separate
 from brewster.options import Quality
 
 __all__ = [

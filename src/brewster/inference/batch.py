@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final, Literal, Protocol, final
 
 from brewster.errors import BrewsterError, PhotoError, TargetError
-from brewster.files import find, write_atomically
+from brewster.files import find, find_videos, write_atomically
 from brewster.image_formats import SUFFIXES, format_of
 from brewster.inference.separator import Separator
 from brewster.options import Options
@@ -154,8 +154,9 @@ def plan_files(
         for found in find(paths, None if output is None else Path(output))
     ]
     if not tasks:
+        videos = f" ({len(names)} videos)" if (names := find_videos(paths)) else ""
         raise PhotoError(
-            f"there is no photo in {', '.join(map(str, paths))}",
+            f"there is no photo in {', '.join(map(str, paths))}{videos}",
             f"expected files with one of the suffixes {' '.join(SUFFIXES)}",
             "pass the path of the file itself, or choose another folder",
         )

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, final
 import numpy as np
 from numpy.typing import NDArray
 
+from brewster.errors import ModelError
 from brewster.inference.guided_upsampling import Floats, GeneratedOverride, upsample_rows
 from brewster.inference.tiles import Backend, run_tiled
 from brewster.options import Quality
@@ -58,6 +59,10 @@ class Prediction:
     """A generated transmission, and where it replaces the result of guided upsampling."""
     reconstruction_error: float | None = None
     """Mean of |generated input - input|, sRGB-encoded, or None if the model does not generate the input."""
+
+
+_MAX_OUTPUT: Final = 16.0
+"""Larger outputs are refused: they are not linear light in which 1 is white."""
 
 
 class Predictor(ABC):
@@ -123,9 +128,44 @@ class MultiScalePredictor(Predictor):
 
     def _predict(self, scaled_input: Floats) -> tuple[Floats, Floats]:
         transmission, reflection = run_tiled(
-            self._backend, scaled_input, tile_px=_TILE_PX, overlap_px=_OVERLAP_PX
+            self._run_backend, scaled_input, tile_px=_TILE_PX, overlap_px=_OVERLAP_PX
         )
         return transmission, reflection
+
+    def _run_backend(self, tile: Floats) -> tuple[Floats, Floats]:
+        return checked_layers(self._backend(tile), tile)
+
+
+def checked_layers(outputs: object, tile: Floats) -> tuple[Floats, Floats]:
+    """Returns the two outputs of a backend for a tile (H, W, 3) as float32.
+
+    Raises:
+        ModelError: the outputs are not two float arrays with the shape of the tile, or are not linear light of about 0..1.
+    """
+    if not isinstance(outputs, tuple | list) or len(outputs) != 2:
+        count = f" of {len(outputs)}" if isinstance(outputs, tuple | list) else ""
+        raise ModelError(
+            f"the model returned a {type(outputs).__name__}{count}",
+            "expected a pair (transmission, reflection)",
+            "return both layers of the tile",
+        )
+    layers = [np.asarray(output) for output in outputs]
+    for name, layer in zip(("transmission", "reflection"), layers, strict=True):
+        if layer.shape != tile.shape or layer.dtype.kind != "f":
+            raise ModelError(
+                f"the model returned a {name} of shape {layer.shape} and dtype {layer.dtype}",
+                f"expected floats of shape {tile.shape}, as the tile",
+                "return (height, width, channels), and convert integers to floats in 0..1",
+            )
+        low, high = float(layer.min()), float(layer.max())  # NaN if one value is NaN
+        if not (low >= -_MAX_OUTPUT and high <= _MAX_OUTPUT):
+            raise ModelError(
+                f"the model returned a {name} with values in {low:g}..{high:g}",
+                "expected linear light of about 0..1, without NaN and infinity",
+                "divide values of 8 bits by 255, and decode sRGB to linear light",
+            )
+    transmission, reflection = (layer.astype(np.float32, copy=False) for layer in layers)
+    return transmission, reflection
 
 
 def confidence_from_spread(spread: Float32[Floats, "h w 3"]) -> Float32[Floats, "h w 1"]:

@@ -13,17 +13,19 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, Final, final
+from dataclasses import replace
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Final, final
 
 import numpy as np
 
+import brewster
 from brewster.errors import BrewsterError, MissingExtra, ModelError
-from brewster.inference.guided_upsampling import Floats, GuidedUpsampler, upsample_rows
+from brewster.inference.guided_upsampling import Floats, GuidedUpsampler
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.inference.predictor import (
     QUALITIES,
@@ -32,55 +34,23 @@ from brewster.inference.predictor import (
     Predictor,
     ProgressCallback,
 )
+from brewster.inference.separation import Separation
 from brewster.inference.tiles import Backend
 from brewster.models.zoo import find_model, is_large
 from brewster.options import Options, Quality, Quantisation, document_options
 from brewster.photo import Encoding, Photo, Source
+from brewster.photo.history import with_history
 
 if TYPE_CHECKING:
     from brewster.models.diffusion.pipeline import DecompositionPipeline
 
-RECONSTRUCTION_ERROR_LIMIT: Final = 0.06
-"""A separation with a larger reconstruction error is doubtful. The value is chosen, not measured: about three times the
-error of encoding and decoding with the VAE of a diffusion model."""
+PROGRAM: Final = "brewster"
+"""The name under which the metadata of layers record this program."""
 _WORKERS: Final = 2
 _WHITE_PERCENTILE: Final = 99.0
 """If this percentile of the photo is above 1, as in an EXR, the input of the network is divided by it."""
 _NETWORK_SHARE: Final = 0.6
 """Estimated fraction of the total time that the network takes, for the progress."""
-
-
-@final
-@dataclass(frozen=True)
-class Separation:
-    """The layers of a photo, each of the size of the photo, with the model, the device and the quality measures."""
-
-    photo: Photo
-    transmission: Photo
-    reflection: Photo
-    confidence_map: Floats = field(repr=False, compare=False)
-    """Confidence in 0..1, (h, w, 1), at the size of the largest input of the network."""
-    residual: float
-    """Mean of |photo - transmission - reflection| in linear light."""
-    reconstruction_error: float | None
-    """Mean of |generated input - input|, sRGB-encoded, or None if the model does not generate the input."""
-    model: str
-    sha256: str | None
-    device: str
-    seconds: dict[str, float] = field(compare=False)
-    """Wall time of the steps `decode`, `network` and `detail`."""
-
-    @property
-    def doubtful(self) -> bool:
-        """Whether the generated input differs so much from the photo that the layers may show another scene."""
-        return (
-            self.reconstruction_error is not None and self.reconstruction_error > RECONSTRUCTION_ERROR_LIMIT
-        )
-
-    @cached_property
-    def confidence(self) -> Photo:
-        """The confidence as a grey 8-bit image of the size of the photo: 255 is certain. Computed on first use."""
-        return _upsampled_confidence(self.confidence_map, self.photo)
 
 
 @final
@@ -153,6 +123,50 @@ class Separator:
         device = str(pipeline.backbone.device)
         return cls(predictor, name=pipeline.name, sha256=pipeline.sha256, device=device)
 
+    def many(
+        self,
+        sources: Iterable[Source],
+        *,
+        threads: int = 2,
+        **options: Any,  # noqa: ANN401  (those of __call__)
+    ) -> Iterator[Separation | BrewsterError]:
+        """Separates many photos with several threads, and yields the results in the order of the sources.
+
+        A photo that cannot be separated does not stop the others: its result is the error. At most `threads` + 1
+        photos are in memory, so that the sources may be an endless generator.
+
+        Args:
+            sources: photos, as for a call of the separator.
+            threads: the number of photos that are separated at the same time, at least 1.
+            options: the options of a call of the separator, such as `strength` and `quality`, for all photos.
+
+        Raises:
+            BrewsterError: `threads` is less than 1.
+        """
+        if threads < 1:
+            raise BrewsterError(f"threads is {threads}", "expected at least 1", "choose 1, 2 or more")
+        return self._many(iter(sources), threads, options)
+
+    def _many(
+        self, sources: Iterator[Source], threads: int, options: dict[str, Any]
+    ) -> Iterator[Separation | BrewsterError]:
+        def separate_one(source: Source) -> Separation | BrewsterError:
+            try:
+                return self(source, **options)
+            except BrewsterError as error:
+                return error
+
+        with ThreadPoolExecutor(threads) as pool:
+            running = deque(pool.submit(separate_one, source) for source in islice(sources, threads))
+            try:
+                while running:
+                    result = running.popleft().result()
+                    running.extend(pool.submit(separate_one, source) for source in islice(sources, 1))
+                    yield result
+            finally:  # the caller may stop early
+                for future in running:
+                    future.cancel()
+
     @document_options
     def __call__(
         self,
@@ -168,12 +182,15 @@ class Separator:
         """Separates a photo. Thread-safe.
 
         Args:
-            source: a path, the bytes of a file, a PIL image, a `Photo`, or an array (see `Photo.from_array`).
+            source: a path, the bytes of a file, an open binary file, a PIL image, a `Photo`, or an array (see
+                `Photo.from_array`).
             encoding: the encoding of an array, "srgb" or "linear"; for arrays only.
             on_progress: called with the completed fraction, 0 to 1. An exception raised in it stops the work.
 
         Raises:
             PhotoError: the source cannot be read, or is too large.
+            TypeError: the source has another type.
+            ModelError: the model returns an invalid output.
             BrewsterError: strength or quality is out of range.
         """
         _check_options(strength, quality)
@@ -191,10 +208,12 @@ class Separator:
             transmission, reflection, residual = _upsample(
                 photo, upsampler, additive=additive, on_progress=on_progress
             )
+        step = history_step(self.name, strength=strength, quality=quality, additive=additive)
+        step |= {"sha256": self.sha256[:12]} if self.sha256 else {}
         return Separation(
             photo,
-            transmission,
-            reflection,
+            _with_step(transmission, "transmission", step),
+            _with_step(reflection, "reflection", step),
             prediction.confidence_map,
             residual,
             prediction.reconstruction_error,
@@ -256,6 +275,21 @@ def _open_pipeline(
             "run: pip install 'brewster[large]'",
         ) from error
     return load_pipeline(model, device=device, base=base, quantise=quantise)
+
+
+def history_step(model: str, *, strength: float, quality: str, additive: bool) -> dict[str, str]:
+    """Returns the options of a separation as the metadata of its layers record them."""
+    return {
+        "model": model,
+        "strength": f"{strength:g}",
+        "quality": quality,
+        "additive": "yes" if additive else "no",
+    }
+
+
+def _with_step(photo: Photo, layer: str, step: dict[str, str]) -> Photo:
+    software = f"{PROGRAM} {brewster.__version__}"
+    return replace(photo, file_info=with_history(photo.file_info, software, {"layer": layer} | step))
 
 
 def _check_options(strength: float, quality: str) -> None:
@@ -328,15 +362,6 @@ def _exact_sum_layers(photo: Floats, transmission: Floats) -> list[Floats]:
     """
     reflection = photo - np.minimum(transmission, photo)
     return [photo - reflection, reflection]
-
-
-def _upsampled_confidence(map_: Floats, photo: Photo) -> Photo:
-    """Upsamples a map (h, w, 1) in 0..1 to a grey 8-bit image of the size of the photo."""
-    width, height = photo.size
-    canvas = np.empty((height, width, 1), np.uint8)
-    for rows in photo.strips():
-        canvas[rows] = np.rint(255 * upsample_rows(map_, rows.start, rows.stop - rows.start, (height, width)))
-    return Photo(canvas)
 
 
 @contextmanager

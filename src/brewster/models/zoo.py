@@ -80,13 +80,16 @@ LARGE_MODELS: Final = {
 """Large models: name -> import path of the `Backbone` class. The path is text, because the import needs torch."""
 
 
+MODEL_FILE: Final = "model.onnx"
+"""The name of the exported model in the folder of a training run."""
+
 TINY_PREFIX: Final = "tiny:"
 """The prefix for the tiny version of a backbone: the same classes with few, random weights, for tests and demos."""
 
 
 def is_large(name: str) -> bool:
     """Whether `name` is that of a large model or LoRA: a registered name, "tiny:" and a name, a folder, or a hub id."""
-    if name in MODELS or Path(name).is_file():
+    if name in MODELS or Path(name).is_file() or _run_model(name):
         return False
     return name in LARGE_MODELS or name.startswith(TINY_PREFIX) or Path(name).is_dir() or _is_hub_id(name)
 
@@ -100,6 +103,12 @@ def model_name(model: str) -> str:
     if is_large(model):
         return Path(model).resolve().name.replace(":", "-")
     return find_model(model).name
+
+
+def _run_model(name: str) -> Path | None:
+    """The ONNX file that `brewster train` has exported into this folder, or None."""
+    path = Path(name) / MODEL_FILE
+    return path if path.is_file() else None
 
 
 def _is_hub_id(name: str) -> bool:
@@ -125,10 +134,12 @@ def find_model(name: str) -> ModelFile:
     path = Path(name)
     if path.is_file():
         return ModelFile(path.stem, path, None, "unknown")
+    if exported := _run_model(name):
+        return ModelFile(path.resolve().name, exported, None, "unknown")
     close = difflib.get_close_matches(name, (*MODELS, *LARGE_MODELS), n=1) if path.name == name else []
     raise ModelError(
         f"there is no model {name!r}",
-        f"expected one of {', '.join((*MODELS, *LARGE_MODELS))}, an .onnx file, or the folder or hub id of a LoRA",
+        f"expected one of {', '.join((*MODELS, *LARGE_MODELS))}, an .onnx file, the folder of a training run, or the folder or hub id of a LoRA",
         f"did you mean {close[0]}?"
         if close
         else "check the path, or print all models with: brewster models list",

@@ -10,7 +10,8 @@ from brewster.files import DEFAULT_MAX_PIXELS
 from brewster.photo.decode import read_size
 from brewster.photo.file_info import FileInfo
 from brewster.photo.hdr_formats import read_layers, write_layers
-from brewster.photo.photo import Encoding, Photo, Source
+from brewster.photo.in_memory import Encoding
+from brewster.photo.photo import Photo, Source
 
 __all__ = [
     "DEFAULT_MAX_PIXELS",

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from brewster.errors import MissingExtra, PhotoError, UnreadablePhoto, UnsupportedPhoto
 from brewster.files import DEFAULT_MAX_PIXELS
-from brewster.image_formats import FORMATS
+from brewster.image_formats import FORMATS, VIDEO_SIGNATURE
 from brewster.photo import metadata
 from brewster.photo.colour import colour_space_of
 from brewster.photo.file_info import FileInfo
@@ -111,6 +111,10 @@ def _detect_container(data: bytes) -> str:
         if re.match(image_format.signature, data, re.DOTALL):
             is_raw_tiff = image_format.name == "tiff" and is_raw(metadata.read_tags(data))
             return "raw" if is_raw_tiff else image_format.name
+    if re.match(VIDEO_SIGNATURE, data, re.DOTALL):
+        raise UnsupportedPhoto(
+            "the file is a video", "expected a photo", "extract single images first, for example with ffmpeg"
+        )
     raise UnreadablePhoto(
         f"the file starts with {data[:12]!r}, which is no known image format",
         f"expected one of {', '.join(FORMATS)}",

@@ -37,6 +37,8 @@ class FileInfo:
     """Chromaticities of an EXR or HDR: x and y of red, green, blue and white. None if the file has none."""
     header: Mapping[str, Any] | None = None
     """The other attributes of an EXR or HDR."""
+    software: str | None = None
+    """The program that made the pixels, for EXR and HDR, which have neither EXIF nor XMP."""
 
 
 def container_of(path: Path) -> str:

@@ -132,6 +132,7 @@ def write_exr(image: HdrPixels) -> bytes:
     header = {
         "compression": exr.ZIP_COMPRESSION,
         **(image.file_info.header or {}),
+        **({"software": image.file_info.software} if image.file_info.software else {}),
         "type": exr.scanlineimage,
     }
     file = io.BytesIO()
@@ -309,7 +310,10 @@ def _to_rgbe(pixels: Float32) -> NDArray[np.uint8]:
 def write_hdr(image: HdrPixels) -> bytes:
     """Encodes a Radiance HDR image with flat lines, which all readers support. Grey becomes three equal channels."""
     height, width = image.pixels.shape[:2]
-    attributes = [f"{key}={value}" for key, value in (image.file_info.header or {}).items()]
+    header = dict(image.file_info.header or {})
+    if image.file_info.software:
+        header["SOFTWARE"] = image.file_info.software
+    attributes = [f"{key}={value}" for key, value in header.items()]
     lines = ["#?RADIANCE", "FORMAT=32-bit_rle_rgbe", *attributes]
     head = "\n".join(lines) + f"\n\n-Y {height} +X {width}\n"
     pixels = np.broadcast_to(image.pixels, (height, width, 3))

@@ -7,28 +7,39 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brewster import srgb
 from brewster.errors import PhotoError, UnreadablePhoto, UnsupportedPhoto
 from brewster.files import DEFAULT_MAX_PIXELS, write_atomically
-from brewster.image_formats import FORMATS, WRITABLE
-from brewster.photo import metadata
+from brewster.image_formats import FORMATS
 from brewster.photo.colour import SRGB, ColourSpace, colour_space_of
-from brewster.photo.decode import Decoded, apply_orientation, decode, split_alpha
+from brewster.photo.decode import Decoded, decode
 from brewster.photo.encode import encode
 from brewster.photo.file_info import FileInfo, container_of, depth_for
 from brewster.photo.hdr_formats import too_large_error
+from brewster.photo.in_memory import (
+    WHITE_LEVELS,
+    BinaryFile,
+    Encoding,
+    PilImage,
+    WritableFile,
+    check_encoding,
+    decode_array,
+    decode_pil,
+    pil_image,
+)
 from brewster.photo.lut_profiles import convert_to_display_p3, has_only_tables
 
 Float32 = NDArray[np.float32]
 Stored = NDArray[Any]
-Encoding = Literal["srgb", "linear"]
-Source = Any
-"""A path, the bytes of a file, a numpy array, a PIL image, or a `Photo`."""
+Source: TypeAlias = (
+    "str | os.PathLike[str] | bytes | bytearray | memoryview | BinaryFile | Stored | PilImage | Photo"
+)
+"""A path, the bytes of a file, an open binary file, a numpy array, a PIL image, or a `Photo`."""
+_PREVIEW_PX = 1024
 
 _STRIP_PIXELS = 1 << 18  # one strip has a few MB as floats; a whole photo may not fit into memory
 
@@ -59,7 +70,8 @@ class Photo:
         """Opens a photo.
 
         Args:
-            source: a path, the bytes of a file, a numpy array, a PIL image, or a `Photo`.
+            source: a path, the bytes of a file, a file opened for reading in binary mode, a numpy array, a PIL image, or
+                a `Photo`.
             encoding: the encoding of an array, "srgb" or "linear"; for arrays only.
             max_pixels: photos with more pixels are refused before they are decoded.
 
@@ -67,13 +79,14 @@ class Photo:
             UnreadablePhoto: the file is missing, empty, truncated, or not an image.
             UnsupportedPhoto: the image has CMYK colours, several frames, five channels, NaN values, or a damaged profile.
             PhotoTooLarge: the image has more pixels than `max_pixels`.
-            MissingExtra: the reader of EXR or HEIC is not installed.
+            MissingExtra: the reader of EXR, HEIC or RAW is not installed.
             PhotoError: the encoding is missing or unknown, or the source is not an array and has an encoding.
+            TypeError: the source has another type, such as None, a list or a file in text mode.
         """
         if isinstance(source, np.ndarray):
             height, width = (*source.shape, 1, 1)[:2]
             _check_pixel_count(width, height, max_pixels)
-            return cls.from_array(source, encoding=_check_encoding(encoding))
+            return cls.from_array(source, encoding=check_encoding(encoding))
         if encoding is not None:
             raise PhotoError(
                 f"encoding={encoding!r} was passed with a {type(source).__name__}",
@@ -82,13 +95,10 @@ class Photo:
             )
         if isinstance(source, Photo):
             return source
-        if hasattr(source, "getbands"):
+        if isinstance(source, PilImage):
             _check_pixel_count(source.width, source.height, max_pixels)
             return cls.from_pil(source)
-        data = (
-            bytes(source) if isinstance(source, bytes | bytearray | memoryview) else _read_file(Path(source))
-        )
-        return cls._from_decoded(decode(data, max_pixels))
+        return cls._from_decoded(decode(_read_source(source), max_pixels))
 
     @classmethod
     def _from_decoded(cls, decoded: Decoded) -> Photo:
@@ -106,76 +116,57 @@ class Photo:
         sRGB-encoded integers are stored unchanged. All other values are stored as linear float32.
 
         Raises:
-            UnsupportedPhoto: the array has another shape or dtype, or values that are not finite.
+            UnsupportedPhoto: the array has another shape or dtype, values that are not finite, sRGB-encoded floats or an
+                alpha channel outside 0..1.
             PhotoError: the encoding is neither "srgb" nor "linear".
         """
-        encoding = _check_encoding(encoding)
-        array = np.array(array)[..., None] if np.ndim(array) == 2 else np.array(array)
-        if array.ndim != 3 or array.shape[2] not in (1, 3, 4) or array.dtype.name not in _WHITE_LEVELS:
-            raise UnsupportedPhoto(
-                f"the array has the shape {array.shape} and the dtype {array.dtype}",
-                "expected (H, W) or (H, W, 1|3|4) of uint8, uint16 or float",
-                "reshape or convert it",
-            )
-        if not np.isfinite(array).all():
-            raise UnsupportedPhoto(
-                "the array contains infinity or NaN",
-                "expected finite values",
-                "replace them first",
-            )
-        colour_channels = array.shape[2] - (array.shape[2] == 4)
-        pixels, alpha = (
-            array[..., :colour_channels],
-            array[..., colour_channels] if array.shape[2] == 4 else None,
-        )
-        if encoding == "linear" or array.dtype.kind == "f":
-            pixels = pixels / np.float32(_WHITE_LEVELS[array.dtype.name])
-            pixels = srgb.to_linear(pixels) if encoding == "srgb" else pixels
-            alpha = None if alpha is None else alpha / np.float32(_WHITE_LEVELS[array.dtype.name])
-        is_float = pixels.dtype.kind == "f"
-        dtype = np.dtype(np.float32) if is_float else array.dtype
-        return cls(
-            np.ascontiguousarray(pixels, dtype),
-            None if alpha is None else np.ascontiguousarray(alpha, dtype),
-            FileInfo(bits=8 * dtype.itemsize),
-        )
+        decoded = decode_array(array, encoding)
+        return cls(decoded.pixels, decoded.alpha, decoded.file_info)
 
     @classmethod
-    def from_pil(cls, image: Source) -> Photo:
+    def from_pil(cls, image: PilImage) -> Photo:
         """Creates a photo from a PIL image with its profile and EXIF. A palette image becomes RGB.
 
         Raises:
             UnsupportedPhoto: the image has several frames, or another mode than RGB or grey, such as CMYK, LAB or floats.
         """
-        if (
-            getattr(image, "n_frames", 1) > 1 and image.format != "MPO"
-        ):  # an MPO is a JPEG followed by previews
-            raise UnsupportedPhoto(
-                f"the PIL image has {image.n_frames} frames",
-                "expected a single image",
-                "seek the frame and pass image.copy()",
-            )
-        if image.mode in ("P", "PA", "1"):
-            has_alpha = image.mode == "PA" or "transparency" in image.info
-            image = image.convert("L" if image.mode == "1" else "RGBA" if has_alpha else "RGB")
-        if image.mode not in ("L", "LA", "RGB", "RGBA", "I;16"):
-            raise UnsupportedPhoto(
-                f"the PIL image has mode {image.mode}",
-                "expected RGB or grey, with or without alpha",
-                'use image.convert("RGB")',
-            )
-        exif, icc = image.info.get("exif"), image.info.get("icc_profile")
-        container = (image.format or "png").lower()
-        array = np.asarray(image).reshape(image.height, image.width, -1)
-        file_info = FileInfo(
-            container=container if container in WRITABLE else "png",
-            bits=16 if image.mode == "I;16" else 8,
-            icc=icc or None,
-            exif=metadata.upright_exif(exif) if exif else None,
+        return cls._from_decoded(decode_pil(image))
+
+    def __repr__(self) -> str:
+        """A short description: `Photo(4000 x 3000, RGB, uint8, jpeg, ICC profile, EXIF)`."""
+        width, height = self.size
+        mode = ("grey" if self.pixels.shape[2] == 1 else "RGB") + (
+            " with alpha" if self.alpha is not None else ""
         )
-        return cls._from_decoded(
-            split_alpha(apply_orientation(array, metadata.orientation_of(exif or b"")), file_info)
-        )
+        info = self.file_info
+        present = {"ICC profile": info.icc, "EXIF": info.exif, "XMP": info.xmp}
+        parts = (f"{width} x {height}", mode, self.pixels.dtype.name, info.container)
+        return f"Photo({', '.join((*parts, *(name for name, block in present.items() if block)))})"
+
+    def __array__(self, dtype: np.dtype[Any] | None = None, copy: bool | None = None) -> Stored:
+        """For `np.asarray(photo)`: the stored pixels (H, W, 1|3), without alpha, in the encoding of the file.
+
+        For linear light use `linear()`, for sRGB values `srgb_8bit()`.
+        """
+        return np.array(self.pixels, dtype=dtype, copy=copy)
+
+    def to_pil(self) -> Any:  # noqa: ANN401  (Pillow is optional, so its types cannot be named)
+        """Returns a PIL image with the ICC profile and the EXIF of the photo: L, LA, RGB, RGBA, or I;16 for 16-bit grey.
+
+        Other 16-bit photos and floats are converted to 8 bits, because Pillow has no such colour images.
+
+        Raises:
+            MissingExtra: Pillow is not installed.
+        """
+        has_16_bit_mode = self.pixels.dtype == np.uint16 and self.pixels.shape[2] == 1 and self.alpha is None
+        stored = self if has_16_bit_mode else self._stored_as("png", 8)
+        return pil_image(stored.pixels, stored.alpha, stored.file_info)
+
+    def _repr_png_(self) -> bytes:
+        """For notebooks: a PNG of at most 1024 pixels a side, 8-bit sRGB."""
+        scale = min(1, _PREVIEW_PX / max(self.size))
+        linear = self.resized(*(max(1, round(scale * side)) for side in self.size))
+        return Photo.from_array(np.clip(linear, 0, 1), encoding="linear").encode("png", depth=8)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -281,16 +272,31 @@ class Photo:
         return encode(stored.pixels, stored.alpha, replace(stored.file_info, container=container, bits=bits))
 
     def save(
-        self, path: str | os.PathLike[str], *, depth: int | None = None, overwrite: bool = False
+        self,
+        target: str | os.PathLike[str] | WritableFile,
+        *,
+        format: str | None = None,  # noqa: A002  (as in Pillow)
+        depth: int | None = None,
+        overwrite: bool = False,
     ) -> None:
-        """Writes a file atomically, in the format for its suffix.
+        """Writes a file atomically, or to an open binary file such as an `io.BytesIO`.
+
+        Args:
+            target: a path, or a file opened for writing in binary mode.
+            format: the format, such as "png"; by default that of the suffix of the path, or, for an open file, that of the
+                photo.
+            depth: bits per channel; see `encode`.
+            overwrite: replace an existing file.
 
         Raises:
             TargetError: the file exists and `overwrite` is False, or the file cannot be written.
             UnsupportedPhoto: the format cannot store this photo, or not at this bit depth.
         """
-        data = self.encode(container_of(Path(path)), depth=depth)
-        write_atomically(Path(path), data, overwrite=overwrite)
+        if isinstance(target, WritableFile):
+            target.write(self.encode(format, depth=depth))
+            return
+        path = Path(target)
+        write_atomically(path, self.encode(format or container_of(path), depth=depth), overwrite=overwrite)
 
     def _stored_as(self, container: str, bits: int) -> Photo:
         """Returns the photo with the dtype for a format and bit depth. The light is unchanged."""
@@ -309,12 +315,9 @@ class Photo:
         return Photo(pixels, alpha, replace(self.file_info, icc=None, primaries=None, header=None))
 
 
-_WHITE_LEVELS = {"uint8": 255, "uint16": 65535, "float16": 1, "float32": 1, "float64": 1}
-
-
 def _rescaled(values: Stored, dtype: np.dtype[Any]) -> Stored:
     """Converts values to another dtype, scaled so that white stays white. The encoding is unchanged."""
-    white, new_white = _WHITE_LEVELS[values.dtype.name], _WHITE_LEVELS[dtype.name]
+    white, new_white = WHITE_LEVELS[values.dtype.name], WHITE_LEVELS[dtype.name]
     if dtype.kind == "f":
         return values.astype(dtype) / np.float32(white)
     if values.dtype.kind == "f":
@@ -328,16 +331,6 @@ def _area_means(row: Float32, width: int) -> Float32:
     edges = np.linspace(0, len(row), width + 1)
     sums_at_edges = np.column_stack([np.interp(edges, np.arange(len(sums)), sums[:, i]) for i in range(3)])
     return (np.diff(sums_at_edges, axis=0) * (width / len(row))).astype(np.float32)
-
-
-def _check_encoding(encoding: Encoding | None) -> Encoding:
-    if encoding not in ("srgb", "linear"):
-        raise PhotoError(
-            f"the encoding of the array is {encoding!r}",
-            'expected "srgb" or "linear", because an array has no metadata',
-            'pass encoding="srgb" or encoding="linear"',
-        )
-    return encoding
 
 
 def _check_pixel_count(width: int, height: int, max_pixels: int) -> None:
@@ -354,6 +347,21 @@ def _check_arrays(pixels: Stored, alpha: Stored | None) -> None:
             "expected (H, W, 1|3) pixels of uint8, uint16 or float32, and alpha (H, W) of the same dtype or None",
             "use Photo.from_array",
         )
+
+
+def _read_source(source: object) -> bytes:
+    if isinstance(source, bytes | bytearray | memoryview):
+        return bytes(source)
+    if isinstance(source, str | os.PathLike):
+        return _read_file(Path(source))
+    data = source.read() if isinstance(source, BinaryFile) else None
+    if isinstance(data, bytes):
+        return data
+    mode = " in text mode" if isinstance(data, str) else ""
+    raise TypeError(
+        f"the source of a photo is a {type(source).__name__}{mode}; expected a path, the bytes of a file, an open binary file, "
+        "a numpy array, a PIL image or a Photo; pass one of these"
+    )
 
 
 def _read_file(path: Path) -> bytes:

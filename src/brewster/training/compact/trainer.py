@@ -20,6 +20,7 @@ from torch.nn import functional
 
 from brewster.errors import ModelError
 from brewster.models.networks import DEFAULT_NETWORK, NETWORKS
+from brewster.models.zoo import MODEL_FILE
 from brewster.training.checkpoint import Checkpoint, mismatch_as_model_error
 from brewster.training.compact.export import export_onnx
 from brewster.training.data.mixtures import Stream, TrainingBatch
@@ -33,7 +34,6 @@ from brewster.worker_setup import single_torch_thread
 ValidationPairs = Mapping[str, list[tuple[Tensor, Tensor]]]
 """folder -> pairs of photo and ground truth, each float (1, 3, h, w), sRGB-encoded."""
 
-MODEL_FILE: Final = "model.onnx"
 _VALIDATION_SIDE_PX: Final = 384
 _HELD_OUT_MIXTURES: Final = 128
 _HELD_OUT_SIDE_PX: Final = 192

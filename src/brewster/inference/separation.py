@@ -1,0 +1,63 @@
+"""`Separation`: the layers of a photo, with the model, the device and the quality measures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Final, final
+
+import numpy as np
+
+from brewster.inference.guided_upsampling import Floats, upsample_rows
+from brewster.photo import Photo
+from brewster.photo.contact_sheet import side_by_side
+
+RECONSTRUCTION_ERROR_LIMIT: Final = 0.06
+"""A separation with a larger reconstruction error is doubtful. The value is chosen, not measured: about three times the
+error of encoding and decoding with the VAE of a diffusion model."""
+
+
+@final
+@dataclass(frozen=True)
+class Separation:
+    """The layers of a photo, each of the size of the photo, with the model, the device and the quality measures."""
+
+    photo: Photo
+    transmission: Photo
+    reflection: Photo
+    confidence_map: Floats = field(repr=False, compare=False)
+    """Confidence in 0..1, (h, w, 1), at the size of the largest input of the network."""
+    residual: float
+    """Mean of |photo - transmission - reflection| in linear light."""
+    reconstruction_error: float | None
+    """Mean of |generated input - input|, sRGB-encoded, or None if the model does not generate the input."""
+    model: str
+    sha256: str | None
+    device: str
+    seconds: dict[str, float] = field(compare=False)
+    """Wall time of the steps `decode`, `network` and `detail`."""
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the generated input differs so much from the photo that the layers may show another scene."""
+        return (
+            self.reconstruction_error is not None and self.reconstruction_error > RECONSTRUCTION_ERROR_LIMIT
+        )
+
+    def _repr_png_(self) -> bytes:
+        """For notebooks: photo, transmission and reflection side by side, as a PNG."""
+        return Photo(side_by_side((self.photo, self.transmission, self.reflection))).encode("png")
+
+    @cached_property
+    def confidence(self) -> Photo:
+        """The confidence as a grey 8-bit image of the size of the photo: 255 is certain. Computed on first use."""
+        return _upsample_confidence(self.confidence_map, self.photo)
+
+
+def _upsample_confidence(map_: Floats, photo: Photo) -> Photo:
+    """Upsamples a map (h, w, 1) in 0..1 to a grey 8-bit image of the size of the photo."""
+    width, height = photo.size
+    canvas = np.empty((height, width, 1), np.uint8)
+    for rows in photo.strips():
+        canvas[rows] = np.rint(255 * upsample_rows(map_, rows.start, rows.stop - rows.start, (height, width)))
+    return Photo(canvas)

@@ -1,0 +1,78 @@
+"""Contact sheets: one row for each photo, with the photo, its layers and its file name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pyvips
+from numpy.typing import NDArray
+
+from brewster import srgb
+from brewster.files import write_atomically
+from brewster.photo.file_info import container_of
+from brewster.photo.photo import Photo
+
+_ROW_PX = 240
+_LABEL_PX = 24
+_GAP_PX = 8
+_MAX_ROWS = 200  # 54,400 pixels; a JPEG has at most 65,535
+Encoded = NDArray[np.uint8]
+
+
+def write_contact_sheets(
+    path: Path, rows: Sequence[tuple[Path, Sequence[Path]]], max_pixels: int
+) -> Iterator[Path]:
+    """Writes the rows to `path`, or, if there are more than 200, to `sheet.jpg`, `sheet-2.jpg`, ... Yields each path.
+
+    Args:
+        path: the image file, which is replaced if it exists.
+        rows: the file of each photo, and the files of its layers. The label of a row is the path of the photo.
+        max_pixels: files with more pixels are refused.
+
+    Raises:
+        PhotoError: an image file cannot be read.
+        TargetError: the sheet cannot be written.
+    """
+    for number, first in enumerate(range(0, len(rows), _MAX_ROWS), 1):
+        images = [
+            _row([Photo.open(file, max_pixels=max_pixels) for file in (source, *layers)], str(source))
+            for source, layers in rows[first : first + _MAX_ROWS]
+        ]
+        width = max(image.shape[1] for image in images)
+        padded = [
+            np.pad(image, [(0, 0), (0, width - image.shape[1]), (0, 0)], constant_values=255)
+            for image in images
+        ]
+        sheet = path if number == 1 else path.with_stem(f"{path.stem}-{number}")
+        data = Photo(np.concatenate(padded)).encode(container_of(sheet))
+        write_atomically(sheet, data, overwrite=True)
+        yield sheet
+
+
+def side_by_side(photos: Sequence[Photo], height: int = _ROW_PX) -> Encoded:
+    """Returns the photos next to each other as 8-bit sRGB, (height, W, 3), with white gaps. Small photos are not enlarged."""
+    gap = np.full((height, _GAP_PX, 3), 255, np.uint8)
+    images = []
+    for photo in photos:
+        scale = min(height / photo.size[1], 1)
+        width, rows = (max(1, round(scale * side)) for side in photo.size)
+        linear = np.clip(photo.resized(width, rows), 0, 1)
+        image = np.rint(255 * srgb.to_encoded(linear)).astype(np.uint8)
+        images += [np.pad(image, [(0, height - rows), (0, 0), (0, 0)], constant_values=255), gap]
+    return np.concatenate(images[:-1], axis=1)
+
+
+def _row(photos: Sequence[Photo], label: str) -> Encoded:
+    """Returns a row with its label below, 8-bit sRGB, (272, W, 3)."""
+    images = side_by_side(photos)
+    canvas = np.full((_ROW_PX + _LABEL_PX + _GAP_PX, images.shape[1], 3), 255, np.uint8)
+    canvas[:_ROW_PX] = images
+    printable = "".join(letter if letter.isprintable() else "?" for letter in label)
+    escaped = printable.replace("&", "&amp;").replace("<", "&lt;")  # Pango reads markup
+    text = pyvips.Image.text(escaped, dpi=90).numpy()[
+        :_LABEL_PX, -images.shape[1] :
+    ]  # the end of a long path
+    canvas[_ROW_PX : _ROW_PX + text.shape[0], : text.shape[1]] = 255 - text[..., None]
+    return canvas

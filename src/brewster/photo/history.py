@@ -1,0 +1,129 @@
+"""Records in the metadata of a layer which program made it, and with which options: XMP history, EXIF Software.
+
+The block that a camera or an editor has written is kept; an entry is added to it. There is no date in the entry, so that the
+same input gives the same bytes. XMP: ISO 16684-1, and part 2 of the XMP specification (xmpMM:History, stEvt:*).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import html
+import re
+import struct
+import zlib
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+from brewster.photo.file_info import FileInfo
+from brewster.photo.metadata import png_chunks
+
+_EXIF_SOFTWARE = 305
+_MAX_EXIF_BYTES = 65527  # a JPEG segment of 65533 bytes, less the name of the block
+_SEARCHED_BYTES = 1 << 18
+_PACKET = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
+<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+<rdf:Description rdf:about="" xmlns:xmp="http://ns.adobe.com/xap/1.0/" xmp:CreatorTool={software}/>
+</rdf:RDF></x:xmpmeta>
+<?xpacket end="w"?>"""
+_HISTORY = """<rdf:Description rdf:about={about} xmlns:xmpMM="http://ns.adobe.com/xap/1.0/mm/"><xmpMM:History><rdf:Seq>
+{entry}</rdf:Seq></xmpMM:History></rdf:Description>
+"""
+_ENTRY = (
+    '<rdf:li xmlns:stEvt="http://ns.adobe.com/xap/1.0/sType/ResourceEvent#" stEvt:action="derived" '
+    "stEvt:softwareAgent={software} stEvt:parameters={parameters}/>"
+)
+
+
+def with_history(file_info: FileInfo, software: str, parameters: Mapping[str, str]) -> FileInfo:
+    """Returns the metadata with an entry about a processing step.
+
+    Args:
+        file_info: the metadata of the input.
+        software: the program with its version.
+        parameters: the options of the step by name. Names and values contain neither "; " nor "=".
+    """
+    text = "; ".join(f"{name}={value}" for name, value in parameters.items())
+    entry = _ENTRY.format(software=quoteattr(software), parameters=quoteattr(text)).encode()
+    packet = file_info.xmp or _PACKET.format(software=quoteattr(software)).encode()
+    exif = file_info.exif and _with_exif_software(file_info.exif, software)
+    return replace(file_info, xmp=_with_entry(packet, entry), exif=exif, software=software)
+
+
+def recorded_parameters(path: Path, program: str) -> dict[str, str] | None:
+    """Returns the parameters of the last step of a program in the history of a file, or None if it has none.
+
+    Only the first and the last 256 KiB are read, where all writers put the metadata.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(_SEARCHED_BYTES)
+            file.seek(max(path.stat().st_size - _SEARCHED_BYTES, len(head)))
+            data = head + file.read()
+    except OSError:
+        return None
+    data = _png_xmp(data) if data.startswith(b"\x89PNG") else data
+    agent = re.escape(program.encode())
+    found = re.findall(rb'stEvt:softwareAgent="' + agent + rb' [^"]*" stEvt:parameters="([^"]*)"', data)
+    if not found:
+        return None
+    text = html.unescape(found[-1].decode("utf-8", "replace"))
+    return dict(part.split("=", 1) for part in text.split("; ") if "=" in part)
+
+
+def _png_xmp(data: bytes) -> bytes:
+    """Returns the XMP block of a PNG, or nothing. libvips writes it as compressed text (PNG 11.3.3.3, zTXt)."""
+    name, _, text = png_chunks(data).get(b"zTXt", b"").partition(b"\0")
+    with contextlib.suppress(zlib.error):
+        return zlib.decompress(text[1:]) if name == b"XML:com.adobe.xmp" else b""
+    return b""
+
+
+def _with_entry(xmp: bytes, entry: bytes) -> bytes:
+    """Appends an entry to the history of an XMP block. A block without an RDF element is returned unchanged."""
+    history = re.search(rb"<xmpMM:History>.*?(?=</rdf:Seq>)", xmp, re.DOTALL)
+    if history:
+        return xmp[: history.end()] + entry + xmp[history.end() :]
+    end = xmp.rfind(b"</rdf:RDF>")
+    if end < 0:
+        return xmp
+    about = re.search(rb"""rdf:about=("[^"]*"|'[^']*')""", xmp)  # all descriptions are of the same resource
+    block = _HISTORY.encode().replace(b"{about}", about[1] if about else b'""').replace(b"{entry}", entry)
+    return xmp[:end] + block + xmp[end:]
+
+
+def _with_exif_software(exif: bytes, software: str) -> bytes:
+    """Sets the tag Software of an EXIF block. All bytes but the offset of the first directory stay where they are.
+
+    The directory with the new tag is appended, so that the offsets in maker notes stay valid. A damaged block, and one that
+    would become too large for a JPEG, is returned unchanged.
+    """
+    byte_order = {b"II*\0": "<", b"MM\0*": ">"}.get(exif[:4])
+    if byte_order is None or len(exif) < 10:
+        return exif
+    (position,) = struct.unpack_from(byte_order + "I", exif, 4)
+    (count,) = struct.unpack_from(byte_order + "H", exif, position) if position + 2 <= len(exif) else (0,)
+    end = position + 2 + 12 * count
+    if count == 0 or end + 4 > len(exif):
+        return exif
+    rows = [exif[row : row + 12] for row in range(position + 2, end, 12)]
+    value = software.encode("ascii", "replace") + b"\0"
+    start = len(exif) + len(exif) % 2
+    rows = [row for row in rows if struct.unpack_from(byte_order + "H", row) != (_EXIF_SOFTWARE,)]
+    rows.append(struct.pack(byte_order + "HHII", _EXIF_SOFTWARE, 2, len(value), start))
+    rows.sort(key=lambda row: struct.unpack_from(byte_order + "H", row))
+    directory = start + len(value) + len(value) % 2
+    changed = b"".join(
+        (
+            exif[:4],
+            struct.pack(byte_order + "I", directory),
+            exif[8:].ljust(start - 8, b"\0"),
+            value.ljust(directory - start, b"\0"),
+            struct.pack(byte_order + "H", len(rows)),
+            *rows,
+            exif[end : end + 4],
+        )
+    )
+    fits = len(changed) <= _MAX_EXIF_BYTES or len(exif) > _MAX_EXIF_BYTES
+    return changed if fits else exif

@@ -1,0 +1,166 @@
+"""Converts numpy arrays and PIL images to stored pixels, and stored pixels to PIL images."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, Protocol, cast, get_args, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brewster import srgb
+from brewster.errors import MissingExtra, PhotoError, UnsupportedPhoto
+from brewster.image_formats import WRITABLE
+from brewster.photo import metadata
+from brewster.photo.decode import Decoded, apply_orientation, split_alpha
+from brewster.photo.file_info import FileInfo
+
+Stored = NDArray[Any]
+Encoding = Literal["srgb", "linear"]
+WHITE_LEVELS = {"uint8": 255, "uint16": 65535, "float16": 1, "float32": 1, "float64": 1}
+"""The value of white for each supported dtype."""
+_ROUNDING = 1e-3
+"""Floats may be outside 0..1 by this much, less than half a level of 8 bits, because of rounding."""
+
+
+@runtime_checkable
+class BinaryFile(Protocol):
+    """A file opened for reading in binary mode."""
+
+    def read(self) -> bytes:
+        """Returns all bytes."""
+
+
+@runtime_checkable
+class WritableFile(Protocol):
+    """A file opened for writing in binary mode."""
+
+    def write(self, data: bytes, /) -> object:
+        """Writes all bytes."""
+
+
+@runtime_checkable
+class PilImage(Protocol):
+    """An image of the package Pillow, which brewster does not import to read it."""
+
+    width: int
+    height: int
+    mode: str
+    format: str | None
+    info: dict[Any, Any]
+
+    def getbands(self) -> tuple[str, ...]:
+        """Returns the names of the channels."""
+
+    def convert(self, mode: str, /) -> Any:  # noqa: ANN401
+        """Returns a converted image."""
+
+
+def check_encoding(encoding: str | None) -> Encoding:
+    """Returns the encoding.
+
+    Raises:
+        PhotoError: the encoding is neither "srgb" nor "linear".
+    """
+    if encoding in get_args(Encoding):
+        return cast("Encoding", encoding)
+    raise PhotoError(
+        f"the encoding of the array is {encoding!r}",
+        'expected "srgb" or "linear", because an array has no metadata',
+        'pass encoding="srgb" or encoding="linear"',
+    )
+
+
+def decode_array(array: Stored, encoding: Encoding) -> Decoded:
+    """Converts an array; see `Photo.from_array`."""
+    encoding = check_encoding(encoding)
+    array = np.array(array)[..., None] if np.ndim(array) == 2 else np.array(array)
+    _check_array(array, encoding)
+    decoded = split_alpha(array, FileInfo())
+    pixels, alpha = decoded.pixels, decoded.alpha
+    if encoding == "linear" or array.dtype.kind == "f":
+        white = np.float32(WHITE_LEVELS[array.dtype.name])
+        pixels = pixels / white
+        pixels = srgb.to_linear(pixels) if encoding == "srgb" else pixels
+        alpha = None if alpha is None else alpha / white
+    dtype = np.dtype(np.float32) if pixels.dtype.kind == "f" else array.dtype
+    return Decoded(
+        np.ascontiguousarray(pixels, dtype),
+        None if alpha is None else np.ascontiguousarray(alpha, dtype),
+        FileInfo(bits=8 * dtype.itemsize),
+    )
+
+
+def _check_array(array: Stored, encoding: Encoding) -> None:
+    if array.ndim != 3 or array.shape[2] not in (1, 3, 4) or array.dtype.name not in WHITE_LEVELS:
+        raise UnsupportedPhoto(
+            f"the array has the shape {array.shape} and the dtype {array.dtype}",
+            "expected (H, W) or (H, W, 1|3|4) of uint8, uint16 or float",
+            "reshape or convert it",
+        )
+    if not np.isfinite(array).all():
+        raise UnsupportedPhoto(
+            "the array contains infinity or NaN",
+            "expected finite values",
+            "replace them first",
+        )
+    if array.dtype.kind != "f" or array.size == 0:
+        return
+    bounded = array if encoding == "srgb" else array[..., 3:]  # linear light has no limits; alpha has
+    low, high = (float(bounded.min()), float(bounded.max())) if bounded.size else (0.0, 1.0)
+    if low < -_ROUNDING or high > 1 + _ROUNDING:
+        what = "sRGB-encoded floats" if encoding == "srgb" else "alpha values"
+        raise UnsupportedPhoto(
+            f"the {what} of the array are in {low:g}..{high:g}",
+            "expected 0..1, because 1.0 is white",
+            "divide values of 8 bits by 255, clip the others, or pass linear light",
+        )
+
+
+def decode_pil(image: Any) -> Decoded:  # noqa: ANN401  (Pillow is optional, so its types cannot be named)
+    """Converts a PIL image; see `Photo.from_pil`."""
+    if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":  # an MPO is a JPEG followed by previews
+        raise UnsupportedPhoto(
+            f"the PIL image has {image.n_frames} frames",
+            "expected a single image",
+            "seek the frame and pass image.copy()",
+        )
+    if image.mode in ("P", "PA", "1"):
+        has_alpha = image.mode == "PA" or "transparency" in image.info
+        image = image.convert("L" if image.mode == "1" else "RGBA" if has_alpha else "RGB")
+    if image.mode not in ("L", "LA", "RGB", "RGBA", "I;16"):
+        raise UnsupportedPhoto(
+            f"the PIL image has mode {image.mode}",
+            "expected RGB or grey, with or without alpha",
+            'use image.convert("RGB")',
+        )
+    exif, icc = image.info.get("exif"), image.info.get("icc_profile")
+    container = (image.format or "png").lower()
+    array = np.asarray(image).reshape(image.height, image.width, -1)
+    file_info = FileInfo(
+        container=container if container in WRITABLE else "png",
+        bits=16 if image.mode == "I;16" else 8,
+        icc=icc or None,
+        exif=metadata.upright_exif(exif) if exif else None,
+    )
+    return split_alpha(apply_orientation(array, metadata.orientation_of(exif or b"")), file_info)
+
+
+def pil_image(pixels: Stored, alpha: Stored | None, file_info: FileInfo) -> Any:  # noqa: ANN401
+    """Returns a PIL image of stored pixels (H, W, 1|3), uint8, or uint16 for grey without alpha.
+
+    Raises:
+        MissingExtra: Pillow is not installed.
+    """
+    try:
+        from PIL import Image  # noqa: PLC0415  (optional: only for users of Pillow)
+    except ImportError as error:
+        raise MissingExtra(
+            "the Pillow package is not installed",
+            "expected it to be installed, because to_pil returns its images",
+            "run: pip install pillow",
+        ) from error
+    array = pixels if alpha is None else np.concatenate([pixels, alpha[..., None]], axis=2)
+    image = Image.fromarray(array[..., 0] if array.shape[2] == 1 else array)
+    blocks = {"icc_profile": file_info.icc, "exif": file_info.exif and b"Exif\0\0" + file_info.exif}
+    image.info.update({name: block for name, block in blocks.items() if block})
+    return image

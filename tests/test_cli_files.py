@@ -1,0 +1,208 @@
+"""Files of the command line: names in other forms, suffixes, RAW, videos, hints, contact sheets, and completion."""
+
+import nturl2path
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.shell_completion import ShellComplete
+
+from brewster import Photo
+from brewster.cli import batch, cli
+from brewster.photo import contact_sheet
+from cli_helpers import error_lines, image_bytes, layer_files, list_files
+from picture_files import dng_file, mosaic
+
+# --- the names of photos
+
+
+@pytest.mark.parametrize("form", ["file://{}", "file://localhost{}", "'{}'", '"{}"', "'file://{}'"])
+def test_an_address_and_a_quoted_path_name_a_file(run, tmp_path, form):
+    (tmp_path / "a b#%.jpg").write_bytes(image_bytes())
+    path = str(tmp_path / "a b#%.jpg")
+    escaped = path.replace("%", "%25").replace(" ", "%20").replace("#", "%23")
+    assert run(form.format(escaped if "file:" in form else path))[0] == 0
+    assert set(layer_files("a b#%")) < set(list_files(tmp_path))
+
+
+def test_an_existing_file_keeps_its_name_even_if_it_has_quotes(tmp_path, monkeypatch):
+    (tmp_path / "'a.jpg'").write_bytes(image_bytes())
+    monkeypatch.chdir(tmp_path)
+    assert batch.local_path("'a.jpg'") == "'a.jpg'"
+    assert batch.local_path("'b.jpg'") == "b.jpg"
+
+
+@pytest.mark.parametrize(
+    ("address", "path"),
+    [
+        ("file:///C:/Users/A%20B/window.jpg", r"C:\Users\A B\window.jpg"),
+        ("file://localhost/D:/a.jpg", r"D:\a.jpg"),
+        ("file://server/share/a.jpg", r"\\server\share\a.jpg"),
+    ],
+)
+def test_addresses_of_windows_become_its_paths(address, path, monkeypatch):
+    monkeypatch.setattr(batch, "url2pathname", nturl2path.url2pathname)
+    assert batch.local_path(address).removeprefix("\\\\?\\") == path
+
+
+# --- suffixes
+
+
+@pytest.mark.parametrize("name", ["jpg", "JPG", ".jpeg", "jpeg"])
+def test_a_format_may_be_named_by_its_suffix(run, tmp_path, name):
+    (tmp_path / "a.png").write_bytes(image_bytes(container="png"))
+    assert run("a.png", "--format", name)[0] == 0
+    assert list_files(tmp_path) == ["a.png", *layer_files("a")]
+
+
+@pytest.mark.parametrize("name", ["bmp", "gif", "dng", "jpgg"])
+def test_a_format_that_is_not_written_is_refused(run_without_model, tmp_path, name):
+    (tmp_path / "a.png").write_bytes(image_bytes(container="png"))
+    code, _, err = run_without_model("a.png", "--format", name)
+    assert code == 2
+    assert "'jpeg', 'png'" in err
+
+
+@pytest.mark.parametrize("name", ["clear.bmp", "clear.jp2", "clear.psd", "clear.jpgg"])
+def test_an_output_with_an_unknown_suffix_is_refused(run_without_model, tmp_path, name):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    code, _, err = run_without_model("a.jpg", "-o", name)
+    assert code == 2
+    assert f"The suffix {Path(name).suffix} of -o" in " ".join(err.split())
+    assert list_files(tmp_path) == ["a.jpg"]
+
+
+@pytest.mark.parametrize("name", ["clear.bmp/", "2026.11", "v1.2", "made"])
+def test_a_folder_may_have_a_dot_in_its_name(run, tmp_path, name):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    assert run("a.jpg", "-o", name)[0] == 0
+    assert list_files(tmp_path / name) == layer_files("a")
+
+
+def test_the_short_option_for_help_works_everywhere(run_without_model):
+    for arguments in (["-h"], ["separate", "-h"], ["models", "list", "-h"]):
+        code, out, _ = run_without_model(*arguments)
+        assert code == 0
+        assert out.startswith(b"Usage: brewster")
+
+
+# --- RAW files and videos
+
+
+def test_a_raw_file_gives_tiff_layers(run, tmp_path):
+    pytest.importorskip("rawpy")
+    (tmp_path / "a.dng").write_bytes(dng_file(mosaic()))
+    assert run("a.dng")[0] == 0
+    assert list_files(tmp_path) == sorted(["a.dng", *layer_files("a", suffix="tiff")])
+    layer = Photo.open(tmp_path / "a.transmission.tiff")
+    assert (layer.file_info.bits, layer.size) == (16, (128, 96))
+
+
+def test_raw_files_without_the_extra_are_counted_and_named_once(run, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rawpy", None)
+    for name in ("a.dng", "b.dng", "c.dng"):
+        (tmp_path / name).write_bytes(dng_file(mosaic()))
+    (tmp_path / "d.jpg").write_bytes(image_bytes())
+    code, _, err = run(".")
+    assert code == 1
+    (line,) = error_lines(err)
+    assert "3 photos (a.dng, b.dng, c.dng): the rawpy package is not installed" in line
+    assert "pip install 'brewster[raw]'" in line
+    assert "1 separated, 3 failed" in err
+
+
+def test_videos_are_counted_and_named(run, run_without_model, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    for name in ("b.mp4", "c.MOV"):
+        (tmp_path / name).write_bytes(b"\0\0\0\x18ftypisom" + bytes(100))
+    code, _, err = run(".")
+    assert code == 0
+    assert "2 videos (b.mp4, c.MOV) skipped" in err
+    code, _, err = run("b.mp4")
+    assert code == 1
+    assert "the file is a video" in err
+    (tmp_path / "a.jpg").unlink()
+    for layer in layer_files("a"):
+        (tmp_path / layer).unlink()
+    assert "no photo in . (2 videos)" in run_without_model(".")[2]
+
+
+# --- existing layers
+
+
+def test_a_hint_names_the_other_options_of_existing_layers(run, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    run("a.jpg", "--strength", "0.5")
+    err = run("a.jpg")[2]
+    assert "made with other options (strength=0.5) (--overwrite replaces them)" in err
+    assert "other options" not in run("a.jpg", "--strength", "0.5")[2]
+    assert "model=pane" in run("a.jpg", "--strength", "0.5", "--model", "compact", with_model=False)[2]
+
+
+# --- contact sheets
+
+
+def test_a_contact_sheet_has_a_row_for_each_photo(run, tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.jpg").write_bytes(image_bytes())
+    (tmp_path / "c.jpg").write_bytes(b"")
+    code, _, err = run("a.jpg", "b.jpg", "c.jpg", "--contact-sheet", "sheet.png")
+    assert code == 1
+    assert "contact sheet: sheet.png" in err
+    sheet = Photo.open(tmp_path / "sheet.png").pixels
+    assert sheet.shape == (2 * 272, 3 * 60 + 2 * 8, 3)
+    photo = Photo.open(tmp_path / "a.jpg")
+    assert np.abs(sheet[:40, :60].astype(int) - photo.srgb_8bit()).max() <= 1
+    transmission = Photo.open(tmp_path / "a.transmission.jpg")
+    assert np.abs(sheet[272:312, 68:128].astype(int) - transmission.srgb_8bit()).max() <= 1
+    assert sheet[240:264].min() < 100  # the file name
+    assert run("a.jpg", "--contact-sheet", "sheet.png")[0] == 0  # of photos that are skipped, too
+    assert Photo.open(tmp_path / "sheet.png").size[1] == 272
+
+
+def test_many_rows_give_several_sheets(tmp_path, monkeypatch):
+    monkeypatch.setattr(contact_sheet, "_MAX_ROWS", 2)
+    (tmp_path / "<a&>.jpg").write_bytes(image_bytes())
+    rows = [(tmp_path / "<a&>.jpg", [])] * 5
+    sheets = list(contact_sheet.write_contact_sheets(tmp_path / "s.jpg", rows, 10**6))
+    assert [path.name for path in sheets] == ["s.jpg", "s-2.jpg", "s-3.jpg"]
+    assert [Photo.open(path).size[1] // 272 for path in sheets] == [2, 2, 1]
+
+
+@pytest.mark.parametrize(
+    "arguments", [["a.jpg", "--contact-sheet", "s.bmp"], ["-", "--contact-sheet", "s.jpg"]]
+)
+def test_an_impossible_contact_sheet_is_refused_before_any_work(run, tmp_path, arguments):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    assert run(*arguments)[0] == 2
+    assert list_files(tmp_path) == ["a.jpg"]
+
+
+# --- shell completion
+
+
+def completions(*words):
+    """The types and values that the shell is offered for the last of these words."""
+    *before, last = words
+    items = ShellComplete(cli, {}, "brewster", "_BREWSTER_COMPLETE").get_completions(list(before), last)
+    return {(item.type, item.value) for item in items}
+
+
+def test_completion_offers_commands_and_files():
+    assert ("plain", "separate") in completions("se")
+    assert ("file", "holi") in completions("holi")
+    assert ("file", "ho") in completions("a.jpg", "ho")
+    assert ("file", "ho") in completions("separate", "a.jpg", "ho")
+
+
+def test_completion_offers_the_options_of_a_separation_without_its_command():
+    for words in (["--stren"], ["a.jpg", "--stren"], ["serv.jpg", "--stren"]):
+        assert ("plain", "--strength") in completions(*words)
+
+
+def test_completion_offers_models_layers_and_formats():
+    assert {("plain", "compact"), ("file", "comp")} <= completions("a.jpg", "--model", "comp")
+    assert completions("a.jpg", "--layers", "transmission,c") == {("plain", "transmission,confidence")}
+    assert ("plain", "reflection") in completions("a.jpg", "--layers", "")
+    assert ("plain", "tiff") in completions("a.jpg", "--format", "t")

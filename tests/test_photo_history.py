@@ -1,0 +1,111 @@
+"""The metadata of a layer say which program made it, and with which options; all other metadata stay."""
+
+import struct
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from brewster import Photo, Separator
+from brewster.image_formats import WRITABLE
+from brewster.photo import FileInfo, metadata
+from brewster.photo.history import recorded_parameters, with_history
+from picture_files import exif_block, file_of, pil, smooth
+
+SEPARATOR = Separator(lambda tile: (0.8 * tile, 0.2 * tile), name="a & <b>", sha256="f" * 64)
+SOFTWARE = "brewster 1"
+XMP = (
+    b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+    b'<rdf:Description rdf:about=\'uuid:1\' xmlns:dc="http://purl.org/dc/elements/1.1/" dc:format="image/jpeg"/>'
+    b"</rdf:RDF></x:xmpmeta>"
+)
+LI = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}li"
+EVENT = "{http://ns.adobe.com/xap/1.0/sType/ResourceEvent#}"
+
+
+def events(xmp):
+    """The program and the parameters of each step in an XMP block, which must be valid XML."""
+    found = ET.fromstring(xmp.decode()).iter(LI)
+    return [(event.get(f"{EVENT}softwareAgent"), event.get(f"{EVENT}parameters")) for event in found]
+
+
+@pytest.mark.parametrize("container", [name for name in WRITABLE if name not in ("heic", "exr", "hdr")])
+def test_a_layer_records_the_program_and_the_options(container, tmp_path):
+    separation = SEPARATOR(file_of(smooth(), "JPEG", exif=exif_block(1)), strength=0.5, quality="draft")
+    path = tmp_path / f"a.{WRITABLE[container].suffixes[0]}"
+    path.write_bytes(separation.reflection.encode(container))
+    assert recorded_parameters(path, "brewster") == {
+        "layer": "reflection",
+        "model": "a & <b>",
+        "strength": "0.5",
+        "quality": "draft",
+        "additive": "no",
+        "sha256": "f" * 12,
+    }
+    exif = pil(path.read_bytes()).getexif()
+    assert exif[305].startswith("brewster ")
+    assert (exif[271], exif.get_ifd(34665)[37500]) == ("Sextant", b"maker\0note\xff")
+    assert recorded_parameters(path, "another program") is None
+
+
+@pytest.mark.parametrize("container", ["exr", "hdr"])
+def test_an_image_without_xmp_records_the_program(container):
+    if container == "exr":
+        pytest.importorskip("OpenEXR")
+    layer = SEPARATOR(np.full((8, 8, 3), 0.5, np.float32), encoding="linear").transmission
+    header = Photo.open(layer.encode(container)).file_info.header
+    assert next(value for key, value in header.items() if key.lower() == "software").startswith("brewster ")
+
+
+def test_the_history_of_a_photo_is_continued():
+    once = with_history(FileInfo(xmp=XMP), SOFTWARE, {"strength": "1"})
+    twice = with_history(once, SOFTWARE, {"strength": "0.5"})
+    assert events(twice.xmp) == [(SOFTWARE, "strength=1"), (SOFTWARE, "strength=0.5")]
+    assert twice.xmp.count(b"<xmpMM:History>") == 1
+    assert b"rdf:about='uuid:1' xmlns:xmpMM" in twice.xmp  # all descriptions must be about the same resource
+    assert XMP.removesuffix(b"</rdf:RDF></x:xmpmeta>") in twice.xmp
+
+
+def test_a_photo_without_xmp_gets_a_block_that_names_the_program():
+    xmp = with_history(FileInfo(), SOFTWARE, {"model": '"<&>'}).xmp
+    assert events(xmp) == [(SOFTWARE, 'model="<&>')]
+    assert b'xmp:CreatorTool="brewster 1"' in xmp
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_the_software_of_an_exif_block_is_replaced_and_no_offset_in_it_changes(order):
+    mark = b"II*\0" if order == "<" else b"MM\0*"
+    rows = struct.pack(f"{order}HHI4s", 271, 2, 4, b"abc\0") + struct.pack(
+        f"{order}HHI4s", 305, 2, 4, b"old\0"
+    )
+    block = mark + struct.pack(f"{order}IH", 8, 2) + rows + bytes(4) + b"the maker note"
+    changed = with_history(FileInfo(exif=block), SOFTWARE, {}).exif
+    assert changed[8 : len(block)] == block[8:]
+    tags = metadata.read_tags(changed)
+    assert {tag: value[2] for tag, value in tags.items()} == {271: b"abc\0", 305: b"brewster 1\0"}
+    assert with_history(FileInfo(exif=changed), SOFTWARE, {}).exif[8 : len(block)] == block[8:]
+
+
+def test_an_exif_block_that_fills_a_jpeg_segment_is_kept():
+    block = exif_block(1).removeprefix(b"Exif\0\0").ljust(65527, b"\0")
+    assert with_history(FileInfo(exif=block), SOFTWARE, {}).exif == block
+
+
+@given(
+    st.binary(max_size=60),
+    st.sampled_from([b"II*\0", b"MM\0*", b""]),
+    st.integers(0, 70),
+    st.binary(max_size=40),
+)
+def test_damaged_metadata_never_stop_a_separation(garbage, byte_order, offset, xmp):
+    exif = byte_order + struct.pack("<I", offset) + garbage
+    info = with_history(FileInfo(exif=exif, xmp=xmp), SOFTWARE, {})
+    assert metadata.orientation_of(info.exif) in range(1, 9)
+
+
+def test_a_file_without_history_or_without_a_name_has_no_parameters(tmp_path):
+    (tmp_path / "a.jpg").write_bytes(file_of(smooth(), "JPEG"))
+    assert recorded_parameters(tmp_path / "a.jpg", "brewster") is None
+    assert recorded_parameters(tmp_path / "missing.jpg", "brewster") is None

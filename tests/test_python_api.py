@@ -1,0 +1,202 @@
+"""The Python API: arrays, PIL images, open files, notebooks, many photos, and models of one's own."""
+
+import io
+import sys
+import threading
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import brewster
+from brewster import Photo, Separation, Separator
+from brewster.errors import BrewsterError, MissingExtra, ModelError, UnreadablePhoto, UnsupportedPhoto
+from brewster.models import zoo
+from brewster.photo import FileInfo
+from cli_helpers import image_bytes, write_pane
+from picture_files import exif_block, file_of, pil, smooth
+
+
+def pane(tile):
+    return 0.8 * tile, 0.2 * tile
+
+
+SEPARATOR = Separator(pane)
+
+# --- photos
+
+
+def test_a_photo_is_an_array_of_its_stored_pixels():
+    photo = Photo.from_array(smooth(), encoding="srgb")
+    assert np.array_equal(np.asarray(photo), smooth())
+    assert np.shares_memory(np.asarray(photo), photo.pixels)
+    copy = np.array(photo)
+    copy[:] = 0  # an array made with np.array may be changed
+    assert np.array_equal(photo.pixels, smooth())
+    assert np.asarray(photo, np.float32).dtype == np.float32
+
+
+@pytest.mark.parametrize("mode", ["L", "LA", "RGB", "RGBA", "I;16"])
+def test_a_pil_image_survives_the_way_there_and_back(mode):
+    wide = Image.fromarray(np.arange(64, dtype=np.uint16).reshape(8, 8) * 1000)
+    image = wide if mode == "I;16" else Image.fromarray(smooth()).convert(mode)
+    again = Photo.open(image).to_pil()
+    assert again.mode == mode
+    assert np.array_equal(np.asarray(again), np.asarray(image))
+
+
+def test_a_pil_image_has_profile_and_exif_and_is_upright():
+    photo = Photo.open(file_of(smooth(), "JPEG", exif=exif_block(6)))
+    photo = Photo(photo.pixels, None, FileInfo(**{**vars(photo.file_info), "icc": None}))
+    image = photo.to_pil()
+    assert image.getexif()[271] == "Sextant"
+    file = io.BytesIO()
+    image.save(file, "PNG", exif=image.info["exif"])
+    assert np.array_equal(Photo.open(file.getvalue()).pixels, photo.pixels)
+
+
+@pytest.mark.parametrize("dtype", [np.uint16, np.float32])
+def test_colours_of_more_than_eight_bits_become_a_pil_image_of_eight(dtype):
+    array = np.full((4, 4, 3), 0.5 * (65535 if dtype == np.uint16 else 1)).astype(dtype)
+    assert np.unique(np.asarray(Photo.from_array(array, encoding="srgb").to_pil())).tolist() == [128]
+
+
+def test_to_pil_without_pillow_names_the_command_that_installs_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "PIL", None)
+    with pytest.raises(MissingExtra, match="pip install pillow"):
+        Photo.from_array(smooth(), encoding="srgb").to_pil()
+
+
+def test_a_notebook_shows_a_photo_and_a_separation_as_small_png():
+    photo = Photo.from_array(np.tile(smooth(64, 64), (30, 40, 1)), encoding="srgb")
+    shown = pil(photo._repr_png_())
+    assert (shown.format, shown.size, shown.mode) == ("PNG", (1024, 768), "RGB")
+    small = Photo.from_array(smooth(), encoding="srgb")
+    assert np.abs(np.asarray(pil(small._repr_png_())).astype(int) - smooth()).max() <= 1
+    assert pil(SEPARATOR(small)._repr_png_()).size == (3 * 64 + 2 * 8, 240)
+
+
+def test_the_text_of_a_photo_names_size_kind_and_metadata():
+    photo = Photo.open(file_of(smooth(), "JPEG", exif=exif_block(1)))
+    assert repr(photo) == "Photo(64 x 48, RGB, uint8, jpeg, EXIF)"
+    grey = Photo.from_array(np.zeros((2, 3), np.uint16), encoding="srgb")
+    assert repr(grey) == "Photo(3 x 2, grey, uint16, png)"
+    assert len(repr(SEPARATOR(photo))) < 2000
+
+
+def test_open_files_are_read_and_written(tmp_path):
+    (tmp_path / "a.jpg").write_bytes(image_bytes())
+    with (tmp_path / "a.jpg").open("rb") as file:
+        photo = Photo.open(file)
+    assert np.array_equal(photo.pixels, Photo.open(tmp_path / "a.jpg").pixels)
+    for container, kind in ((None, "JPEG"), ("png", "PNG")):
+        file = io.BytesIO()
+        photo.save(file, format=container)
+        assert pil(file.getvalue()).format == kind
+    photo.save(tmp_path / "without-suffix", format="tiff", depth=16)
+    assert Photo.open(tmp_path / "without-suffix").file_info.bits == 16
+    separation = brewster.separate(io.BytesIO(image_bytes()), quality="draft")
+    assert separation.photo.size == photo.size
+
+
+@pytest.mark.parametrize("source", [None, 7, [1, 2], {}, io.StringIO("text")], ids=repr)
+def test_a_source_of_another_type_is_a_type_error_that_names_it(source):
+    with pytest.raises(TypeError, match=rf"is a {type(source).__name__}.*; expected a path, .*; pass"):
+        Photo.open(source)
+    with pytest.raises(TypeError):
+        SEPARATOR(source)
+
+
+@pytest.mark.parametrize(("low", "high"), [(0, 255), (-1, 1), (0, 1.01)])
+def test_encoded_floats_outside_their_range_are_refused(low, high):
+    array = np.linspace(low, high, 48).reshape(4, 4, 3)
+    with pytest.raises(UnsupportedPhoto, match=r"expected 0\.\.1"):
+        Photo.from_array(array, encoding="srgb")
+    assert Photo.from_array(array, encoding="linear").linear().max() == pytest.approx(high)
+
+
+def test_rounding_errors_of_encoded_floats_are_accepted_and_alpha_has_a_range():
+    Photo.from_array(np.full((2, 2, 3), 1 + 1e-6), encoding="srgb")
+    with pytest.raises(UnsupportedPhoto, match=r"alpha values of the array are in 200\.\.200"):
+        Photo.from_array(np.full((2, 2, 4), 200.0), encoding="linear")
+
+
+# --- many photos
+
+
+def test_many_photos_keep_their_order_and_errors_do_not_stop_the_others():
+    sources = [image_bytes(seed=seed) for seed in range(5)]
+    sources[2] = b"no image"
+    results = list(SEPARATOR.many(sources, threads=3, quality="draft"))
+    assert isinstance(results[2], UnreadablePhoto)
+    for source, result in zip(sources, results, strict=True):
+        if isinstance(result, Separation):
+            alone = SEPARATOR(source, quality="draft")
+            assert np.array_equal(result.transmission.pixels, alone.transmission.pixels)
+    assert sum(isinstance(result, Separation) for result in results) == 4
+
+
+def test_many_photos_are_read_only_as_they_are_needed():
+    read, lock = [], threading.Lock()
+
+    def endless():
+        while True:
+            with lock:
+                read.append(1)
+            yield image_bytes(20, 20)
+
+    results = SEPARATOR.many(endless(), threads=2)
+    for _ in range(3):
+        assert isinstance(next(results), Separation)
+    results.close()
+    assert len(read) <= 3 + 2
+
+
+def test_many_photos_need_a_thread_and_a_wrong_type_is_raised():
+    with pytest.raises(BrewsterError, match="threads is 0"):
+        SEPARATOR.many([], threads=0)
+    with pytest.raises(TypeError):
+        list(SEPARATOR.many([None]))
+    assert list(SEPARATOR.many([])) == []
+
+
+# --- models of one's own
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (lambda tile: tile, "returned a ndarray"),
+        (lambda tile: (tile,), "returned a tuple of 1; expected a pair"),
+        (lambda tile: (tile, tile[:-1]), "a reflection of shape"),
+        (lambda tile: (tile.transpose(2, 0, 1), tile), "a transmission of shape"),
+        (lambda tile: ((255 * tile).astype(np.uint8), tile), "dtype uint8"),
+        (lambda tile: (255 * tile, tile), r"values in .*; expected linear light of about 0\.\.1"),
+        (lambda tile: (tile, tile + np.nan), "a reflection with values in nan"),
+    ],
+)
+def test_an_invalid_output_of_a_model_is_an_error_that_says_what_is_wrong(model, message):
+    with pytest.raises(ModelError, match=message):
+        Separator(model)(smooth(), encoding="srgb")
+
+
+def test_a_model_may_return_other_floats_and_a_list():
+    result = Separator(lambda tile: [0.8 * tile.astype(np.float64), (0.2 * tile).astype(np.float16)])(
+        smooth(), encoding="srgb"
+    )
+    assert (
+        np.abs(result.transmission.pixels.astype(int) - SEPARATOR(result.photo).transmission.pixels).max()
+        <= 1
+    )
+
+
+def test_the_folder_of_a_training_run_is_a_model(tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    write_pane(folder / "model.onnx")
+    separator = Separator.load(str(folder))
+    assert (separator.name, separator.device) == ("run", "cpu")
+    assert zoo.model_name(str(folder)) == "run"
+    assert not zoo.is_large(str(folder))
+    (folder / "model.onnx").unlink()
+    assert zoo.is_large(str(folder))  # the folder of a LoRA
