@@ -12,7 +12,7 @@ import torch
 from brewster import Photo, Separator
 from brewster.errors import DeviceError, DownloadError, ModelError, PhotoError
 from brewster.inference.diffusion_predictor import DiffusionPredictor
-from brewster.inference.separator import RECONSTRUCTION_ERROR_LIMIT
+from brewster.inference.separation import RECONSTRUCTION_ERROR_LIMIT
 from brewster.models.diffusion.adapter.lora import LORA_FILE, add_lora, lora_parameters, save_lora
 from brewster.models.diffusion.backbones import TINY_PREFIX, tiny
 from brewster.models.diffusion.panels import PanelLayout

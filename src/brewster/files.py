@@ -28,8 +28,8 @@ DEFAULT_MAX_PIXELS = 200_000_000
 TEMPORARY_PREFIX = ".brewster-"
 """File name prefix of unfinished files."""
 
-LAYERS = ("transmission", "reflection", "confidence")
-LAYER_FORMATS = {"confidence": "png"}
+LAYERS = ("transmission", "reflection", "confidence", "layered")
+LAYER_FORMATS = {"confidence": "png", "layered": "ora"}
 """The formats of the layers whose format does not depend on that of the photo."""
 
 

@@ -30,7 +30,7 @@ class ImageFormat:
     extra: str | None = None
     """The extra of brewster that installs the library, or None if the library is installed without an extra."""
     bit_depths: tuple[int, ...] = ()
-    """The bit depths per channel that can be written. Empty for a format that is only read."""
+    """The bit depths per channel that can be written. Empty for a format that is only read, or only written with layers."""
     replacement: str = "png"
     """The format of the layers, if this format is only read."""
     has_float32: bool = False
@@ -148,6 +148,13 @@ _ROWS: Final = (
         bit_depths=(32,),
         is_linear=True,
         has_alpha=False,
+    ),
+    ImageFormat(
+        name="ora",
+        suffixes=(".ora",),
+        mime_type="image/openraster",
+        signature=rb"PK\x03\x04.{26}mimetypeimage/openraster",
+        library="built-in",
     ),
     ImageFormat(
         name="gif",

@@ -19,7 +19,7 @@ from brewster.errors import BrewsterError
 from brewster.files import DEFAULT_MAX_PIXELS, LAYER_FORMATS
 from brewster.image_formats import FORMATS, FormatName, format_of
 
-Layer = Literal["transmission", "reflection", "confidence"]
+Layer = Literal["transmission", "reflection", "confidence", "layered"]
 Quality = Literal["draft", "standard", "best"]
 Device = Literal["auto", "cuda", "rocm", "directml", "coreml", "cpu"]
 
@@ -48,7 +48,8 @@ class Options:
     layers: tuple[Layer, ...] = field(
         default=("transmission", "reflection"),
         metadata=_field_metadata(
-            "The layers to write, separated by commas: transmission, reflection, confidence."
+            "The layers to write, separated by commas: transmission, reflection, confidence; "
+            "layered is one OpenRaster file (.ora) with both layers, for image editors."
         ),
     )
     strength: float = field(

@@ -29,7 +29,7 @@ from brewster.cli.terminal import (
     write_out,
 )
 from brewster.errors import ModelError
-from brewster.files import find_videos
+from brewster.files import LAYER_FORMATS, find_videos
 from brewster.image_formats import WRITABLE, ImageFormat, format_of
 from brewster.models import zoo
 from brewster.options import Options
@@ -121,11 +121,12 @@ def _check_format(image_format: ImageFormat | None, options: Options) -> None:
             "With standard input, -o takes an image file such as clear.jpg, or is left out."
         )
     name = image_format.name
-    if not image_format.is_writable:
+    layer = options.layers[0]
+    if not image_format.is_writable and LAYER_FORMATS.get(layer) != name:
         raise click.UsageError(f"brewster cannot write {name.upper()}: choose another suffix for -o.")
-    if options.layers != ("confidence",) and options.container(options.layers[0], name) != name:
+    if layer != "confidence" and options.container(layer, name) != name:
         raise click.UsageError(
-            f"The target of -o is a {name} file, but --format or --additive requires another format."
+            f"The target of -o is a {name} file, but --format, --additive or --layers requires another format."
         )
 
 

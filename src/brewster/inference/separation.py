@@ -11,6 +11,7 @@ import numpy as np
 from brewster.inference.guided_upsampling import Floats, upsample_rows
 from brewster.photo import Photo
 from brewster.photo.contact_sheet import side_by_side
+from brewster.photo.open_raster import LayeredImage
 
 RECONSTRUCTION_ERROR_LIMIT: Final = 0.06
 """A separation with a larger reconstruction error is doubtful. The value is chosen, not measured: about three times the
@@ -47,6 +48,11 @@ class Separation:
     def _repr_png_(self) -> bytes:
         """For notebooks: photo, transmission and reflection side by side, as a PNG."""
         return Photo(side_by_side((self.photo, self.transmission, self.reflection))).encode("png")
+
+    @property
+    def layered(self) -> LayeredImage:
+        """Both layers as one OpenRaster file; its `encode` returns the bytes."""
+        return LayeredImage(self.photo, self.transmission)
 
     @cached_property
     def confidence(self) -> Photo:

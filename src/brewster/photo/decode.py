@@ -6,8 +6,11 @@ The first bytes determine the format; the file name is not used. The header is c
 from __future__ import annotations
 
 import bisect
+import io
 import logging
 import re
+import zipfile
+import zlib
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -48,6 +51,8 @@ def decode(data: bytes, max_pixels: int) -> Decoded:
         MissingExtra: the reader of EXR, HEIC or RAW is not installed.
     """
     container = _detect_container(data)
+    if container == "ora":
+        data, container = _merged_image(data, max_pixels), "png"
     if container == "raw":
         return split_alpha(*read_raw(data, max_pixels))
     if container in _FLOAT_READERS:
@@ -76,6 +81,8 @@ def read_size(data: bytes) -> tuple[int, int]:
         PhotoError: an error of `Photo.open`.
     """
     container = _detect_container(data)
+    if container == "ora":
+        data, container = _merged_image(data, DEFAULT_MAX_PIXELS), "png"
     if container == "raw":
         return read_raw_size(data)
     if container in _FLOAT_READERS:
@@ -288,6 +295,24 @@ def _avif_info(data: bytes) -> dict[str, Any]:
 
 
 _EXTRA_INFO = {"jpeg": _jpeg_info, "tiff": _tiff_info, "webp": _webp_info, "avif": _avif_info}
+
+
+# --- OpenRaster
+
+
+def _merged_image(data: bytes, max_pixels: int) -> bytes:
+    """Returns the PNG of the merged image in an OpenRaster file (baseline 0.0.6).
+
+    Raises:
+        PhotoError: the archive is damaged, has no merged image, or one that is larger than any PNG of `max_pixels`.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            if archive.getinfo("mergedimage.png").file_size > (1 << 20) + 16 * max_pixels:
+                raise _unreadable_error("ora", "its merged image is too large")
+            return archive.read("mergedimage.png")
+    except (zipfile.BadZipFile, KeyError, ValueError, OSError, NotImplementedError, zlib.error) as error:
+        raise _unreadable_error("ora", error) from error
 
 
 # --- HEIC

@@ -155,6 +155,7 @@ def _encode_heic(array: Stored, file_info: FileInfo) -> bytes:
         file,
         quality=_DEFAULT_AVIF_QUALITY,
         chroma=444,
+        enc_params={"preset": "ultrafast"},  # 1/7 of the time of the default, with files that are 1/10 larger
         **{key: value for key, value in metadata_items.items() if value},
     )
     return file.getvalue()

@@ -159,14 +159,18 @@ class Photo:
             MissingExtra: Pillow is not installed.
         """
         has_16_bit_mode = self.pixels.dtype == np.uint16 and self.pixels.shape[2] == 1 and self.alpha is None
-        stored = self if has_16_bit_mode else self._stored_as("png", 8)
+        stored = self if has_16_bit_mode else self.stored_as("png", 8)
         return pil_image(stored.pixels, stored.alpha, stored.file_info)
 
     def _repr_png_(self) -> bytes:
         """For notebooks: a PNG of at most 1024 pixels a side, 8-bit sRGB."""
-        scale = min(1, _PREVIEW_PX / max(self.size))
+        return self.thumbnail(_PREVIEW_PX).encode("png", depth=8)
+
+    def thumbnail(self, max_side: int) -> Photo:
+        """Returns a copy of at most `max_side` pixels a side, without metadata, clipped to the sRGB gamut."""
+        scale = min(1, max_side / max(self.size))
         linear = self.resized(*(max(1, round(scale * side)) for side in self.size))
-        return Photo.from_array(np.clip(linear, 0, 1), encoding="linear").encode("png", depth=8)
+        return Photo.from_array(np.clip(linear, 0, 1), encoding="linear")
 
     @property
     def size(self) -> tuple[int, int]:
@@ -268,7 +272,7 @@ class Photo:
         """
         container = container or self.file_info.container
         bits = depth_for(self.file_info, container, depth)
-        stored = self._stored_as(container, bits)
+        stored = self.stored_as(container, bits)
         return encode(stored.pixels, stored.alpha, replace(stored.file_info, container=container, bits=bits))
 
     def save(
@@ -298,7 +302,7 @@ class Photo:
         path = Path(target)
         write_atomically(path, self.encode(format or container_of(path), depth=depth), overwrite=overwrite)
 
-    def _stored_as(self, container: str, bits: int) -> Photo:
+    def stored_as(self, container: str, bits: int) -> Photo:
         """Returns the photo with the dtype for a format and bit depth. The light is unchanged."""
         was_linear, is_linear = (FORMATS[name].is_linear for name in (self.file_info.container, container))
         dtype = np.dtype(np.float32 if is_linear or bits == 32 else np.uint8 if bits == 8 else np.uint16)

@@ -1,0 +1,82 @@
+"""Writes transmission and reflection as one layered image for editors.
+
+OpenRaster (baseline 0.0.6, the format of Krita, GIMP and MyPaint): a zip archive with stack.xml and a PNG for each layer. The
+reflection lies above the transmission with the blend mode svg:plus, and the sum of both is the photo.
+
+Editors add the stored values: Krita always, GIMP because it reads svg:plus as its legacy mode. So the reflection layer is the
+difference of the stored values, not of linear light: only then the editor shows the photo. Layers whose light adds up are
+written with the option additive.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from dataclasses import dataclass, replace
+from typing import Final, final
+
+import numpy as np
+
+from brewster.errors import UnsupportedPhoto
+from brewster.photo.photo import Photo
+
+_FORMAT: Final = "ora"
+_MIME_TYPE: Final = "image/openraster"
+_EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # a fixed date makes the file reproducible
+_THUMBNAIL_PX: Final = 256  # the maximum of the specification
+_STACK: Final = """<?xml version="1.0" encoding="UTF-8"?>
+<image version="0.0.6" w="{width}" h="{height}">
+ <stack>
+  <layer name="reflection" src="data/reflection.png" composite-op="svg:plus" opacity="1.0" visibility="visible" x="0" y="0"/>
+  <layer name="transmission" src="data/transmission.png" composite-op="svg:src-over" opacity="1.0" visibility="visible" x="0" y="0"/>
+ </stack>
+</image>
+"""
+
+
+@final
+@dataclass(frozen=True)
+class LayeredImage:
+    """Transmission and reflection of a photo as the layers of one file."""
+
+    photo: Photo
+    transmission: Photo
+
+    def encode(self, container: str = _FORMAT) -> bytes:
+        """Returns the bytes of an OpenRaster file, with the profile and the bit depth of the photo, 8 or 16.
+
+        The stored values of both layers sum to those of the photo exactly. The reflection is never negative: where the
+        transmission is brighter than the photo, it is the photo.
+
+        Raises:
+            UnsupportedPhoto: `container` is not "ora".
+        """
+        if container != _FORMAT:
+            raise UnsupportedPhoto(
+                f"both layers in one file were requested as {container}",
+                f"expected {_FORMAT}, the only format with layers that brewster writes",
+                f"choose the suffix .{_FORMAT}",
+            )
+        bits = 8 if self.photo.pixels.dtype == np.uint8 else 16
+        photo, transmission = (layer.stored_as("png", bits) for layer in (self.photo, self._like_photo()))
+        behind = np.minimum(photo.pixels, transmission.pixels)
+        info = replace(photo.file_info, container="png", bits=bits, xmp=self.transmission.file_info.xmp)
+        width, height = photo.size
+        files = {
+            "mimetype": _MIME_TYPE.encode(),  # must be the first file, and not compressed
+            "stack.xml": _STACK.format(width=width, height=height).encode(),
+            "data/transmission.png": Photo(behind, photo.alpha, info).encode(),
+            "data/reflection.png": Photo(photo.pixels - behind, photo.alpha, info).encode(),
+            "mergedimage.png": Photo(photo.pixels, photo.alpha, info).encode(),
+            "Thumbnails/thumbnail.png": photo.thumbnail(_THUMBNAIL_PX).encode("png", depth=8),
+        }
+        file = io.BytesIO()
+        with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+            for name, data in files.items():
+                archive.writestr(zipfile.ZipInfo(name, _EPOCH), data)
+        return file.getvalue()
+
+    def _like_photo(self) -> Photo:
+        """Returns the transmission in the colour space of the photo; an additive one is stored as linear floats."""
+        is_like = self.transmission.pixels.dtype == self.photo.pixels.dtype
+        return self.transmission if is_like else self.photo.with_linear(self.transmission.linear())
