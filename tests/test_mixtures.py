@@ -12,10 +12,10 @@ from brewster.training.data.sample_rng import SampleRng
 
 NO_EFFECTS = MixRecipe(
     crop=(1, 1), temperature=(0, 0), background_map_probability=0, background_level_log=(0.1, 0.1),
-    highlight_boost=(0, 0), shadow_probability=0, no_glass_probability=0, partial_probability=0, transmittance=(1, 1),
+    highlight_boost=(0, 0), shadow_probability=0, background_blur_probability=0, no_glass_probability=0, partial_probability=0, transmittance=(1, 1),
     veil_probability=0, reflection_map_probability=0, reflection_ratio_log=(0.5, 0.5),
     reflection_contrast_log=(1, 1), lamp_probability=0, sign_probability=0, sharp_probability=1,
-    ghost_probability=0, falloff_probability=0, edge_probability=0, exposure=(1, 1), overexposed_probability=0,
+    ghost_probability=0, falloff_probability=0, edge_probability=0, softness_probability=0, exposure=(1, 1), overexposed_probability=0,
     gamma_log=(1, 1), contrast=(0, 0), noise=(0, 0), jpeg_probability=0,
 )  # fmt: skip
 MANY_EFFECTS = MixRecipe(
@@ -96,6 +96,23 @@ def test_a_reflection_that_is_not_sharp_is_blurred_and_keeps_its_light(photos):
     edges = [layer.diff(dim=3).square().mean() for layer in (mirrored, blurred)]
     assert edges[1] < edges[0] / 2
     assert to_linear(blurred).mean().item() == pytest.approx(to_linear(mirrored).mean().item(), rel=0.1)
+
+
+def test_a_soft_photo_is_blurred_like_its_layers(photos):
+    sharp = layers_of(photos)
+    soft = layers_of(photos, softness_probability=1.0, softness_px_log=(1.5, 1.5))
+    for before, after in zip(sharp, soft, strict=True):
+        assert after.diff(dim=3).abs().max() < before.diff(dim=3).abs().max() / 2
+    photo, transmission, reflection = map(to_linear, soft)
+    unclipped = photo < 0.95
+    torch.testing.assert_close((transmission + reflection)[unclipped], photo[unclipped], atol=0.02, rtol=0)
+
+
+def test_a_background_out_of_focus_is_blurred_and_its_reflection_is_not(photos):
+    _, behind, mirrored = layers_of(photos)
+    _, blurred, same = layers_of(photos, background_blur_probability=1.0, background_blur_px_log=(8.0, 8.0))
+    assert blurred.diff(dim=3).abs().max() < behind.diff(dim=3).abs().max() / 2
+    assert same.diff(dim=3).abs().max() > mirrored.diff(dim=3).abs().max() / 2
 
 
 @pytest.mark.parametrize(

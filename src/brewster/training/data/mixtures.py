@@ -91,8 +91,12 @@ class MixRecipe(FrozenModel):
     """White parts of a photo are multiplied by up to 1 + this value, because their true luminance was clipped."""
     shadow_probability: Share = 0.15
     """Probability of a hard shadow on the background."""
+    background_blur_probability: Share = 0.2
+    """Probability of a background that is out of focus. Without such backgrounds, a network takes all blur for a reflection."""
+    background_blur_px_log: LogRange = (0.5, 5.0)
+    """Standard deviation of the defocus blur of these backgrounds."""
 
-    no_glass_probability: Share = 0.12
+    no_glass_probability: Share = 0.15
     """Probability of a sample without glass, so that the network leaves plain photos unchanged."""
     partial_probability: Share = 0.12
     """Probability of glass that covers only a part of the image."""
@@ -115,7 +119,7 @@ class MixRecipe(FrozenModel):
     """Probability of a sign with letters in the reflection."""
     sharp_probability: Share = 0.45
     """Probability of a reflection without defocus blur."""
-    blur_px_log: LogRange = (0.3, 5.0)
+    blur_px_log: LogRange = (0.3, 9.0)
     """Standard deviation of the defocus blur of the other reflections."""
     ghost_probability: Share = 0.4
     """Probability of a ghost: a displaced copy of the reflection from the second surface of the pane."""
@@ -128,11 +132,15 @@ class MixRecipe(FrozenModel):
     edge_probability: Share = 0.3
     """Probability of a reflection that ends at a straight edge, such as a frame."""
 
+    softness_probability: Share = 0.6
+    """Probability of a soft photo: background and reflection are both blurred by the lens, or enlarged from a smaller photo."""
+    softness_px_log: LogRange = (0.3, 1.6)
+    """Standard deviation of this blur, in pixels of the training image at any size."""
     exposure: Range = (0.2, 0.55)
     """Mean luminance of the photo after exposure. A photo with a smaller mean is not brightened."""
-    overexposed_probability: Share = 0.2
+    overexposed_probability: Share = 0.3
     """Probability of an overexposed photo, in which a part of the background is white."""
-    overexposed_share: Range = (0.005, 0.15)
+    overexposed_share: Range = (0.005, 0.3)
     """Share of white pixels in an overexposed photo."""
     gamma_log: LogRange = (0.8, 1.25)
     """Exponent on the encoded values."""
@@ -175,7 +183,7 @@ class Mixtures:
         background = self._background(rng, size)
         reflection = self._reflection(rng, size) * background.mean()
         if rng.bernoulli(recipe.no_glass_probability):
-            return _expose_and_develop(rng, recipe, background, background, torch.zeros_like(background))
+            return self._take_photo(rng, background, background, torch.zeros_like(background))
         glass = effects.window(rng, size) if rng.bernoulli(recipe.partial_probability) else torch.ones(1)
         transmittance = rng.uniform(recipe.transmittance) * (1 + 0.02 * rng.normal(3, 1, 1))
         transmission, reflection = background * (1 + glass * (transmittance - 1)), reflection * glass
@@ -183,11 +191,21 @@ class Mixtures:
         if rng.bernoulli(recipe.veil_probability):
             photo = photo + glass * rng.uniform(recipe.veil) * photo.mean(dim=(1, 2), keepdim=True)
         target = transmission if recipe.target == "transmission" else background
-        return _expose_and_develop(rng, recipe, photo, target, reflection)
+        return self._take_photo(rng, photo, target, reflection)
+
+    def _take_photo(self, rng: SampleRng, *layers: Image) -> tuple[Image, Image, Image]:
+        """Applies the softness, the exposure and the tone curve of the camera to photo, target and reflection."""
+        if rng.bernoulli(self._recipe.softness_probability):
+            sigma_px = rng.log_uniform(self._recipe.softness_px_log)
+            layers = tuple(effects.blur(layer, sigma_px, disc=False) for layer in layers)
+        return _expose_and_develop(rng, self._recipe, *layers)
 
     def _background(self, rng: SampleRng, size: int) -> Image:
-        recipe = self._recipe
+        recipe, scale = self._recipe, size / _REFERENCE_SIZE
         view = self._view(rng, size, recipe.background_map_probability)
+        if rng.bernoulli(recipe.background_blur_probability):
+            sigma_px = rng.log_uniform(recipe.background_blur_px_log) * scale
+            view = effects.blur(view, sigma_px, disc=rng.bernoulli(0.5))
         if rng.bernoulli(recipe.shadow_probability):
             view = view * effects.shadow(rng, size)
         level = rng.log_uniform(recipe.background_level_log)
