@@ -63,7 +63,7 @@ def test_quiet_prints_nothing(run_without_model, benchmark):
 def test_a_dry_run_scores_nothing(run_without_model, benchmark, tmp_path):
     code, out, err = run_without_model("evaluate", "--benchmark", benchmark, "--dry-run", *QUICK_OPTIONS)
     assert (code, out.decode().split()) == (0, ["real20/1", "real20/2", "real20/3"])
-    assert "Real20: 3 pictures" in err
+    assert "Real20: 3 images" in err
     assert not (tmp_path / "out").exists()
 
 

@@ -194,9 +194,9 @@ class LoraRecipe(TrainingRecipe):
                 " remove photos, maps and rendered.recipe"
             )
         if "T" not in self.panels or len(set(self.panels)) < len(self.panels):
-            raise ValueError(f"panels is {list(self.panels)}; each panel may occur once, and T is required")
+            raise ValueError(f"expected panels with T, each at most once, but panels is {list(self.panels)}")
         if self.quantise and self.backbone.startswith(TINY_PREFIX):
-            raise ValueError("a toy backbone (tiny:) cannot be quantised; remove quantise")
+            raise ValueError("expected no quantise: a toy backbone (tiny:) cannot be quantised")
         if self.prompt not in PROMPTS and not self.prompt.endswith(ENCODED_SUFFIX):
             raise ValueError(
                 f"expected one of the prompts {', '.join(PROMPTS)}, or a {ENCODED_SUFFIX} file,"
