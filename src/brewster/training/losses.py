@@ -21,8 +21,8 @@ _SCALES = (1, 4, 16)
 """Side of the averaging windows of the loss, in pixels."""
 _MAX_ADDED_SHARE = 0.05
 """A pixel counts as unchanged if the glass added less light than about this fraction of the photo's light."""
-_MSE_FLOOR = 1e-3
-"""Added to the mean squared error before the logarithm. For an image with a PSNR above 30 dB, the gradient decreases to 0."""
+_MSE_FLOOR = 1e-4
+"""Added to the mean squared error before the logarithm. For an image with a PSNR above 40 dB, the gradient decreases to 0."""
 
 
 def separation_loss(layers: Float[Tensor, "n 6 h w"], batch: TrainingBatch) -> dict[str, Tensor]:
@@ -50,7 +50,7 @@ def separation_loss(layers: Float[Tensor, "n 6 h w"], batch: TrainingBatch) -> d
         "reflection": 0.3
         * (_multiscale_error(reflection - batch.reflection_encoded) * batch.reflection_weight).mean(),
         "edges": edges,  # type: ignore[dict-item]
-        "psnr": 0.02 * (squared + _MSE_FLOOR).log().mean(),
+        "psnr": 0.04 * (squared + _MSE_FLOOR).log().mean(),
     }
 
 
