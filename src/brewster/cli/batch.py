@@ -177,12 +177,10 @@ class BatchCommand:
         if result.status == "skipped":
             print_status(f"{result.source}: skipped, all of its layers exist (--overwrite replaces them)")
         elif result.status == "separated":
-            print_status(f"{result.source} -> {outputs} ({sum(result.seconds.values()):.1f} s)")
-            if result.doubtful:
-                print_status(
-                    f"{result.source}: doubtful, the generated photo differs from the input "
-                    f"(reconstruction error {result.reconstruction_error:.2f}): check the layers"
-                )
+            verdict = result.assessment.verdict if result.assessment else ""
+            hint = ": check the layers" if verdict == "doubtful" else ""
+            seconds = sum(result.seconds.values())
+            print_status(f"{result.source} -> {outputs} ({seconds:.1f} s, {verdict}{hint})")
 
     def _print_summary(self, results: Sequence[FileResult]) -> None:
         counts: Counter[str] = Counter(result.status for result in results)

@@ -21,6 +21,7 @@ from typing import Final, Literal, Protocol, final
 from brewster.errors import BrewsterError, PhotoError, TargetError
 from brewster.files import find, write_atomically
 from brewster.image_formats import SUFFIXES, format_of
+from brewster.inference.assessment import Assessment
 from brewster.inference.separator import Separator
 from brewster.options import Options
 
@@ -85,8 +86,8 @@ class FileResult:
     """See `Separation.residual`."""
     reconstruction_error: float | None = None
     """See `Separation.reconstruction_error`."""
-    doubtful: bool = False
-    """See `Separation.doubtful`."""
+    assessment: Assessment | None = None
+    """See `Separation.assessment`."""
     error: str | None = None
     """The error message, or None."""
 
@@ -268,7 +269,10 @@ class _Batch:
         photo = task.source if isinstance(task.source, Path) else task.source.read()
         separation = separator(photo, on_progress=on_progress, **self._options.call_options())
         result.seconds, result.residual = dict(separation.seconds), separation.residual
-        result.reconstruction_error, result.doubtful = separation.reconstruction_error, separation.doubtful
+        result.reconstruction_error, result.assessment = (
+            separation.reconstruction_error,
+            separation.assessment,
+        )
         started = time.perf_counter()
         for layer, target in task.targets.items():
             target_format = format_of(target) if isinstance(target, Path) else None

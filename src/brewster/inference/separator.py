@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Final, final
 import numpy as np
 
 from brewster.errors import BrewsterError, MissingExtra, ModelError
+from brewster.inference.assessment import Assessment, assess
 from brewster.inference.guided_upsampling import Floats, GuidedUpsampler, upsample_rows
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.inference.predictor import (
@@ -40,9 +41,6 @@ from brewster.photo import Encoding, Photo, Source
 if TYPE_CHECKING:
     from brewster.models.diffusion.pipeline import DecompositionPipeline
 
-RECONSTRUCTION_ERROR_LIMIT: Final = 0.06
-"""A separation with a larger reconstruction error is doubtful. The value is chosen, not measured: about three times the
-error of encoding and decoding with the VAE of a diffusion model."""
 _WORKERS: Final = 2
 _WHITE_PERCENTILE: Final = 99.0
 """If this percentile of the photo is above 1, as in an EXR, the input of the network is divided by it."""
@@ -64,18 +62,13 @@ class Separation:
     """Mean of |photo - transmission - reflection| in linear light."""
     reconstruction_error: float | None
     """Mean of |generated input - input|, sRGB-encoded, or None if the model does not generate the input."""
+    assessment: Assessment
+    """What the model found in the photo, at strength 1, and how reliable the result is."""
     model: str
     sha256: str | None
     device: str
     seconds: dict[str, float] = field(compare=False)
     """Wall time of the steps `decode`, `network` and `detail`."""
-
-    @property
-    def doubtful(self) -> bool:
-        """Whether the generated input differs so much from the photo that the layers may show another scene."""
-        return (
-            self.reconstruction_error is not None and self.reconstruction_error > RECONSTRUCTION_ERROR_LIMIT
-        )
 
     @cached_property
     def confidence(self) -> Photo:
@@ -186,6 +179,12 @@ class Separator:
         on_progress(0.0)
         with _timed(seconds, "network"):
             prediction = self._predictor(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
+        assessment = assess(
+            inputs[-1],
+            np.clip(inputs[-1] + prediction.change, 0, 1),
+            prediction.confidence_map,
+            prediction.reconstruction_error,
+        )
         with _timed(seconds, "detail"):
             upsampler = _fit_upsampler(inputs[-1], prediction, strength, white)
             transmission, reflection, residual = _upsample(
@@ -198,6 +197,7 @@ class Separator:
             prediction.confidence_map,
             residual,
             prediction.reconstruction_error,
+            assessment,
             self.name,
             self.sha256,
             self.device,

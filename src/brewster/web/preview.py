@@ -44,7 +44,7 @@ def preview(
         on_progress: called with the completed fraction, 0 to 1.
 
     Returns:
-        One line of JSON with `width`, `height`, `full` (the width and height of the photo), `range` and `doubtful`, and
+        One line of JSON with `width`, `height`, `full` (the width and height of the photo), `range` and `verdict`, and
         then four maps of width x height pixels, row by row: the photo (3 bytes for each pixel, sRGB), the transmission at strength 1 (3
         little-endian 16-bit values, linear over `range`), the reflection at strength 1 (3 bytes, sRGB), and the confidence
         (1 byte).
@@ -61,7 +61,7 @@ def preview(
     transmission = small + (layers.transmission.linear() - small) / np.float32(_SMALL_STRENGTH)
     reflection = layers.reflection.linear() / np.float32(_SMALL_STRENGTH)
     head = {"width": width, "height": height, "full": photo.size, "range": (RANGE_MIN, RANGE_MAX)}
-    head["doubtful"] = layers.doubtful
+    head["verdict"] = layers.assessment.verdict
     maps = (
         _to_srgb_bytes(small),
         _to_uint16(transmission),

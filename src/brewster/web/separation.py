@@ -146,13 +146,11 @@ def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: Pro
         "Brewster-SHA256": separation.sha256 or "",
         "Brewster-Device": separation.device,
         "Brewster-Residual": f"{separation.residual:.6f}",
+        "Brewster-Verdict": separation.assessment.verdict,
         "Brewster-Seconds": f"{time.perf_counter() - started:.4f}",
     }
     if separation.reconstruction_error is not None:
-        headers |= {
-            "Brewster-Reconstruction-Error": f"{separation.reconstruction_error:.6f}",
-            "Brewster-Doubtful": str(separation.doubtful).lower(),
-        }
+        headers["Brewster-Reconstruction-Error"] = f"{separation.reconstruction_error:.6f}"
     return Response(data, headers=headers, media_type=_media_type(name))
 
 

@@ -212,10 +212,17 @@ function enable(id, isEnabled) {
   byId(id).setAttribute("aria-disabled", !isEnabled);
 }
 
-function describeMaps({ full, width, height, doubtful }) {
+const VERDICTS = {
+  clear: "A reflection was found and removed.",
+  partial: "A reflection was found. Parts of it probably remain.",
+  "little found": "Little reflection was found.",
+  doubtful: "The layers may be wrong. Check them.",
+};
+
+function describeMaps({ full, width, height, verdict }) {
   const size = `${full.join(" × ")} pixels`;
   const preview = full[0] === width ? "." : `, shown at ${width} × ${height}.`;
-  return size + preview + (doubtful ? " The model has changed the photo so much that the layers may be wrong. Check them." : "");
+  return `${size}${preview} ${VERDICTS[verdict]}`;
 }
 
 function shortStatus({ state, share, error }) {
