@@ -61,6 +61,13 @@ def study() -> None:
     metavar="NAME",
     help="Use only this dataset; repeatable. The report lists the datasets in this order.",
 )
+@click.option(
+    "--list",
+    "list_file",
+    type=click.Path(path_type=Path, dir_okay=False, exists=True),
+    metavar="FILE",
+    help="Use only the inputs in this text file, one per line: real/12 for picture 12 of the dataset real, or 12 without datasets.",
+)
 @click.option("--all-pairs", is_flag=True, help="Compare each method with every other method.")
 @click.option(
     "--pairs",
@@ -92,6 +99,7 @@ def create(
     inputs: Path,
     methods: tuple[tuple[str, str], ...],
     datasets: tuple[str, ...],
+    list_file: Path | None,
     all_pairs: bool,
     pairs: int | None,
     catch_trials: int | None,
@@ -107,7 +115,7 @@ def create(
     """
     from brewster.user_study.create import CATCH_POOL_SIZE, DEFAULT_CONSENT, StudyOptions  # noqa: PLC0415  (imports pyvips)
     from brewster.user_study.create import create as freeze  # noqa: PLC0415
-    from brewster.user_study.folders import find_pictures  # noqa: PLC0415
+    from brewster.user_study.folders import find_pictures, select_pictures  # noqa: PLC0415
 
     folders = {name: Path(folder) for name, folder in methods}
     if len(folders) < len(methods):
@@ -116,11 +124,19 @@ def create(
             "expected a different name for each method",
             "rename one of the methods",
         )
-    text = DEFAULT_CONSENT if consent is None else _read_consent(consent)
+    text = DEFAULT_CONSENT if consent is None else _read_text(consent)
+    names = [] if list_file is None else _read_list(list_file)
     options = StudyOptions(
-        datasets=datasets, pairs=pairs, catches=catch_trials, all_pairs=all_pairs, seed=seed, consent=text
+        datasets=datasets,
+        names=names,
+        pairs=pairs,
+        catches=catch_trials,
+        all_pairs=all_pairs,
+        seed=seed,
+        consent=text,
     )
-    total = len(find_pictures(inputs, datasets)) * (1 + len(folders)) + CATCH_POOL_SIZE
+    pictures = select_pictures(find_pictures(inputs, datasets), options.names, inputs)
+    total = len(pictures) * (1 + len(folders)) + CATCH_POOL_SIZE
     with progress(total, shown=True) as update_progress:
         description = freeze(
             out, inputs, folders, options, lambda done: update_progress(done, "copying")
@@ -132,7 +148,14 @@ def create(
     print_status(f"next: brewster study serve {out}")
 
 
-def _read_consent(path: Path) -> str:
+def _read_list(path: Path) -> list[str]:
+    names = [line.strip() for line in _read_text(path).splitlines() if line.strip()]
+    if not names:
+        raise BrewsterError(f"{path} is empty", "expected one input per line", "add inputs to the list")
+    return names
+
+
+def _read_text(path: Path) -> str:
     try:
         return path.read_text("utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
