@@ -6,6 +6,7 @@ import contextlib
 import ipaddress
 import json
 import re
+from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Final
@@ -27,12 +28,33 @@ _WARNING: Final = (
 )
 
 
+def rule_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Adds the options of the exclusion rule to a command."""
+    seconds = click.option(
+        "--min-seconds",
+        type=click.FloatRange(0),
+        default=1.5,
+        show_default=True,
+        metavar="SECONDS",
+        help="The minimum median time per trial; participants with a shorter one are excluded.",
+    )
+    failed = click.option(
+        "--max-failed",
+        type=click.FloatRange(0, 1),
+        default=0.25,
+        show_default=True,
+        metavar="FRACTION",
+        help="The maximum fraction of failed catch trials; participants who fail more are excluded.",
+    )
+    return failed(seconds(command))
+
+
 @click.group
 def study() -> None:
     """Run a user study that asks which of two results people prefer: blind, random pairs with catch trials.
 
     `create` makes a study from folders of outputs, `plan` computes the required number of participants, `serve` serves
-    the page for participants, and `report` evaluates their answers. docs/study.md defines all terms.
+    the page for participants, `progress` shows how far they are, and `report` evaluates their answers. docs/study.md defines all terms.
     """
 
 
@@ -253,22 +275,7 @@ def serve(
     metavar="FOLDER",
     help="The folder for the report; by default STUDY/report.",
 )
-@click.option(
-    "--max-failed",
-    type=click.FloatRange(0, 1),
-    default=0.25,
-    show_default=True,
-    metavar="FRACTION",
-    help="The maximum fraction of failed catch trials; participants who fail more are excluded.",
-)
-@click.option(
-    "--min-seconds",
-    type=click.FloatRange(0),
-    default=1.5,
-    show_default=True,
-    metavar="SECONDS",
-    help="The minimum median time per trial; participants with a shorter one are excluded.",
-)
+@rule_options
 @click.option("--json", "as_json", is_flag=True, help="Print the results as JSON instead of the tables.")
 def report(folder: Path, *, out: Path | None, max_failed: float, min_seconds: float, as_json: bool) -> None:
     """Evaluate the answers, both without the excluded participants and with all participants.
@@ -291,6 +298,24 @@ def report(folder: Path, *, out: Path | None, max_failed: float, min_seconds: fl
     write(results, frozen_study, answers, out)
     write_out((json.dumps(results) + "\n" if as_json else overview(results)).encode())
     print_status(f"the report is in {out}")
+
+
+@study.command("progress")
+@click.argument("folder", metavar="STUDY", type=_FOLDER)
+@rule_options
+@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+def show_progress(folder: Path, *, max_failed: float, min_seconds: float, as_json: bool) -> None:
+    """Print how many trials each participant has answered, without any result. The server may run at the same time."""
+    from brewster.user_study.report.participants import ExclusionRule  # noqa: PLC0415
+    from brewster.user_study.report.progress import progress_text, summarise_progress  # noqa: PLC0415
+    from brewster.user_study.store import AnswerStore  # noqa: PLC0415
+    from brewster.user_study.study import read_study  # noqa: PLC0415
+
+    frozen_study = read_study(folder)
+    with contextlib.closing(AnswerStore(frozen_study, read_only=True)) as store:
+        records = list(store.all_answers())
+    found = summarise_progress(frozen_study.description, records, ExclusionRule(max_failed, min_seconds))
+    write_out((json.dumps(found) + "\n" if as_json else progress_text(found)).encode())
 
 
 @study.command
