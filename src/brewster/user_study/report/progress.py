@@ -62,12 +62,12 @@ def summarise_progress(
 def progress_text(progress: Mapping[str, Any]) -> str:
     """The progress as text for a terminal: a line of totals, and a table of participants."""
     low, high = progress["answers_per_comparison"]
-    lines = [
-        f"{progress['participants']} participants, {progress['complete']} complete, {progress['excluded']} excluded by the rule so far; "
-        f"{progress['answers']} answers, {low} to {high} for each comparison."
-    ]
+    total = (
+        f"{progress['participants']} participants, {progress['complete']} complete, {progress['excluded']} excluded by the rule "
+        f"so far; {progress['answers']} answers, {low} to {high} for each comparison."
+    )
     if not progress["rows"]:
-        return lines[0] + "\n"
+        return f"{total}\n"
     table = [
         ("participant", "answers", "catch trials failed", "median time", "last answer", "window", "excluded")
     ]
@@ -85,4 +85,4 @@ def progress_text(progress: Mapping[str, Any]) -> str:
     ]
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     cells = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in table)
-    return "\n".join([*lines, "", *(line.rstrip() for line in cells)]) + "\n"
+    return "\n".join([total, "", *(line.rstrip() for line in cells)]) + "\n"
