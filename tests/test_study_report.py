@@ -320,10 +320,9 @@ def test_the_files_of_a_report_agree_with_each_other(hundred_participants, tmp_p
     catches = [line for line in lines if line["kind"] == "catch"]
     assert len(lines) - len(catches) == results["everyone"]["answers"]
     assert sum(line["choice"] != line["expected"] for line in catches) == results["everyone"]["failed"]
-    won = {"left": "left", "right": "right"}
     for line in lines:
         if line["kind"] == "comparison" and line["outcome"] != "tie":
-            assert line[won[line["choice"]]] == line["first" if line["outcome"] == "win" else "second"]
+            assert line[line["choice"]] == line["first" if line["outcome"] == "win" else "second"]
     wins = [
         line["outcome"] for line in lines if line["second"] == "DSIT" and line["dataset"] == "real"
     ].count("win")
@@ -362,7 +361,7 @@ def test_without_answers_there_is_no_report(hundred_participants):
 
 
 def test_few_participants_are_named_and_rows_without_answers_are_left_out(hundred_participants):
-    study, participants, results = hundred_participants
+    study, _, results = hundred_participants
     one_answer = participant_answers(number=1, votes={0: 0}, seconds=9.0)
     text = to_markdown(summarise(study, [one_answer], ExclusionRule()))
     assert "| too few participants | 1 | 1" in re.sub(" +", " ", text)
