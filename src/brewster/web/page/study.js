@@ -98,13 +98,9 @@ byId("agreement").addEventListener("submit", async (event) => {
 // --- window and arrangement
 
 function warnIfNarrow() {
-  const text = innerWidth < MIN_WIDTH
-    ? `This window is ${innerWidth} pixels wide. The pictures are easier to compare in a window of at least ${MIN_WIDTH} pixels: enlarge it, turn the device, or use a computer.`
-    : "";
-  for (const id of ["narrow-page", "narrow-trial"]) {
-    byId(id).textContent = text;
-    byId(id).hidden = !text;
-  }
+  byId("narrow-page").textContent = `This window is ${innerWidth} pixels wide. The pictures are easier to compare in a window of at least ${MIN_WIDTH} pixels: enlarge it, turn the device, or use a computer.`;
+  byId("narrow-trial").textContent = `Small window (${innerWidth} px): enlarge it if you can.`; // short, because it takes space from the pictures
+  for (const id of ["narrow-page", "narrow-trial"]) byId(id).hidden = innerWidth >= MIN_WIDTH;
 }
 
 const view = () => byId("pictures").dataset.view;
