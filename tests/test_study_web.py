@@ -242,7 +242,10 @@ def test_all_assets_of_the_page_are_served_locally(app):
     page = request(app, "GET", "/").text
     links = re.findall(r'(?:src|href)="([^"]+)"', page)
     assert len(links) >= 4
-    assert all(link.startswith("/page/") and request(app, "GET", link).status_code == 200 for link in links)
+    assert all(
+        link.startswith(("/page/", "/privacy")) and request(app, "GET", link).status_code == 200
+        for link in links
+    )
 
 
 def test_an_answer_that_cannot_be_written_is_not_acknowledged_and_can_be_sent_again(app, store):
