@@ -147,8 +147,15 @@ def test_a_run_prints_its_progress_and_exports_a_model_that_separates(
         (folder / f"{index}.png").write_bytes(image_bytes(120, 90, "png", seed=index))
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "data"))
     recipe = ROOT / "recipes" / "train" / "tiny.toml"
-    code, out, err = run_without_model("train", recipe)
-    assert (code, out) == (0, b"")
+    code, out, err = run_without_model("train", recipe, "--json")
+    assert code == 0
+    events = [json.loads(line) for line in out.splitlines()]
+    assert [(event["event"], event.get("step")) for event in events] == [
+        ("start", 0), ("report", 3), ("report", 6), ("end", None),
+    ]  # fmt: skip
+    logged = [json.loads(line) for line in (tmp_path / "out" / "tiny" / "log.jsonl").read_text().splitlines()]
+    assert [event["metrics"].keys() | {"step"} for event in events[1:3]] == [line.keys() for line in logged]
+    assert events[-1]["model"] == "out/tiny/model.onnx"
     progress_lines = [
         line.split(",")[0].rsplit(maxsplit=1)[0] for line in err.splitlines() if line.startswith("step")
     ]
@@ -156,7 +163,10 @@ def test_a_run_prints_its_progress_and_exports_a_model_that_separates(
     run = tmp_path / "out" / "tiny"
     names = {path.name for path in run.iterdir()}
     file_names = {name for name in names if not name.startswith("events.out.tfevents.")}  # of TensorBoard
-    assert file_names == {"checkpoint.pt", "log.jsonl", "model.onnx", "samples.png"}
+    assert file_names == {"checkpoint.pt", "log.jsonl", "model.onnx", "results.png", "samples.png"}
+    _, out, err = run_without_model("train", recipe)
+    assert out == b""
+    assert err.startswith("the run in out/tiny is complete at step 6 of 6, after 0.")
     photo = Photo.from_array(np.full((50, 70, 3), 128, np.uint8), encoding="srgb")
     assert Separator.load(str(run / "model.onnx"))(photo).transmission.size == (70, 50)
 

@@ -112,9 +112,9 @@ def test_the_exported_network_has_the_ema_weights(make_trainer):
 
 def test_the_loss_is_the_sum_of_its_parts(make_trainer):
     metrics = make_trainer().training_step(0)
-    assert metrics["edges"] > 0
+    assert metrics["loss_edges"] > 0
     assert metrics["loss"] == pytest.approx(
-        sum(metrics[name] for name in ("transmission", "reflection", "edges", "psnr")), rel=1e-5
+        sum(metrics[f"loss_{name}"] for name in ("transmission", "reflection", "edges", "log_mse")), rel=1e-5
     )
 
 

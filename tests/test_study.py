@@ -171,7 +171,7 @@ def test_an_invalid_description_is_refused_with_the_key_of_the_error(tmp_path):
     for change, message in (
         ({"pairs": "many"}, "pairs: "),
         ({"unknown": 1}, "unknown: "),
-        ({"format": 2}, "format 2"),
+        ({"format": 1}, "format 1"),
     ):
         (study.folder / "study.json").write_text(json.dumps(text | change))
         with pytest.raises(BrewsterError, match=message):

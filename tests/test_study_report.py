@@ -30,6 +30,7 @@ from brewster.user_study.report.statistics import (
     intraclass_correlation,
     rates,
     resampled_counts,
+    sign_flip_test,
 )
 from brewster.user_study.report.tables import to_csv, to_latex, to_markdown
 from brewster.user_study.store import Participant, StoredAnswer
@@ -136,6 +137,24 @@ def test_the_simulated_intraclass_correlation_is_estimated():
     assert intraclass_correlation(counts) == pytest.approx(0.08, abs=0.01)
     assert intraclass_correlation(counts[:1]) is None
     assert intraclass_correlation(np.tile([0.0, 3, 0], (5, 1))) is None
+
+
+def test_the_sign_flip_test_rejects_equal_methods_in_5_percent_of_studies():
+    """400 studies of 12 participants whose probabilities of win and lose are equal on average: within three standard errors."""
+    rng, studies = np.random.default_rng(8), 400
+    probabilities = rng.dirichlet(np.array([0.4, 0.2, 0.4]) * 19, (12, studies))
+    counts = rng.multinomial(20, probabilities)[:, :, None].astype(float)
+    p_values = sign_flip_test(counts, np.ones((studies, 1)), resamples=1000)[:, 0]
+    assert abs((p_values <= 0.05).mean() - 0.05) < 3 * np.sqrt(0.05 * 0.95 / studies)
+
+
+def test_the_p_value_of_unanimous_participants_is_that_of_all_exchanges():
+    """Of the 2^n exchanges of n participants, two are as extreme: all or none exchanged."""
+    for participants in (6, 8):
+        counts = np.tile([5.0, 1, 0], (participants, 1, 1, 1))
+        (p_values,) = sign_flip_test(counts, np.ones((1, 1)))
+        assert p_values == pytest.approx([2 / 2**participants] * 4, abs=0.01)
+    assert sign_flip_test(np.tile([2.0, 1, 2], (6, 1, 1, 1)), np.ones((1, 1))).min() == 1
 
 
 # --- strengths
@@ -298,6 +317,12 @@ def test_the_files_of_a_report_agree_with_each_other(hundred_participants, tmp_p
     assert json.loads((tmp_path / "report.json").read_text()) == results
     assert Photo.open(tmp_path / "plot.png").size[0] > 800
     lines = list(csv.DictReader(io.StringIO((tmp_path / "answers.csv").read_text())))
+    catches = [line for line in lines if line["kind"] == "catch"]
+    assert len(lines) - len(catches) == results["everyone"]["answers"]
+    assert sum(line["choice"] != line["expected"] for line in catches) == results["everyone"]["failed"]
+    for line in lines:
+        if line["kind"] == "comparison" and line["outcome"] != "tie":
+            assert line[line["choice"]] == line["first" if line["outcome"] == "win" else "second"]
     wins = [
         line["outcome"] for line in lines if line["second"] == "DSIT" and line["dataset"] == "real"
     ].count("win")
@@ -333,6 +358,16 @@ def test_without_answers_there_is_no_report(hundred_participants):
     study, *_ = hundred_participants
     with pytest.raises(BrewsterError, match="no answers yet"):
         summarise(study, [], ExclusionRule())
+
+
+def test_few_participants_are_named_and_rows_without_answers_are_left_out(hundred_participants):
+    study, _, results = hundred_participants
+    one_answer = participant_answers(number=1, votes={0: 0}, seconds=9.0)
+    text = to_markdown(summarise(study, [one_answer], ExclusionRule()))
+    assert "| too few participants | 1 | 1" in re.sub(" +", " ", text)
+    assert "nature" not in text
+    assert "| -" not in text
+    assert re.search(r"\| Average .*\| p < 0\.001 +\| 90 ", to_markdown(results))
 
 
 def test_one_participant_gives_rates_without_intervals(hundred_participants):

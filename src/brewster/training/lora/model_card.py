@@ -264,7 +264,9 @@ def _metric_title(name: str) -> str:
     if name.startswith("gain_db_"):
         return f"PSNR gain over the input, {name.removeprefix('gain_db_')}, dB"
     return (
-        f"loss, panel {name.removeprefix('panel_')}" if name.startswith("panel_") else name.replace("_", " ")
+        f"loss, panel {name.removeprefix('loss_panel_')}"
+        if name.startswith("loss_panel_")
+        else name.replace("_", " ")
     )
 
 
