@@ -19,7 +19,7 @@ from brewster.environments.catalog import BUILTIN_CATALOG
 from brewster.environments.procedural.rooms import ENVIRONMENTS
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import PREDICTION_FORMAT_VERSION, MethodOutput, ModelMethod
-from brewster.evaluate.runner import SCORE_FORMAT_VERSION
+from brewster.evaluate.score_log import SCORE_FORMAT_VERSION
 from brewster.evaluate.scoring import GroundTruth, Scorer
 from brewster.inference import QUALITIES
 from brewster.metrics import METRICS

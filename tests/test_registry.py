@@ -17,15 +17,8 @@ from benchmark_folders import (
 )
 from brewster.benchmarks import registry
 from brewster.benchmarks.pairing import natural_key
-from brewster.benchmarks.registry import (
-    BENCHMARKS,
-    PAPER_SEED,
-    Benchmark,
-    Case,
-    ImageFile,
-    paper_draw,
-    read_benchmark,
-)
+from brewster.benchmarks.registry import BENCHMARKS, Benchmark, Case, ImageFile, read_benchmark
+from brewster.benchmarks.selection import PAPER_SEED, paper_draw
 from brewster.errors import PhotoError, UnreadablePhoto
 from brewster.photo import Photo
 from picture_files import exif_block, file_of, smooth
