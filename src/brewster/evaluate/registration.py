@@ -27,12 +27,15 @@ _FLIPS: Final = {
 }
 _MIN_FLIP_GAIN: Final = 0.1
 """A flip must raise the correlation with the photo by this much, because some photos are nearly symmetric."""
+_MIN_FLIP_CORRELATION: Final = 0.5
 
 _MIN_PEAK_RATIO: Final = 2.0
 """The peak of the phase correlation must exceed its value at zero shift by this factor."""
 
 _MIN_PEAK: Final = 0.1
-"""The peak of the phase correlation of two images that differ only by a shift is near 1, that of unrelated ones near 0."""
+_MIN_PEAK_DEVIATIONS: Final = 8.0
+"""The peak of the phase correlation of two images that differ only by a shift is near 1. That of unrelated images with n
+pixels is a few times 1 / sqrt(n)."""
 
 _Plane = NDArray[np.float64]
 
@@ -52,7 +55,7 @@ def find_misregistration(prediction: Image, photo: Image) -> str:
     direct = _correlation(one, other)
     flips = {name: _correlation(one[flip], other) for name, flip in _FLIPS.items()}
     best = max(flips, key=flips.__getitem__)
-    if flips[best] > direct + _MIN_FLIP_GAIN:
+    if flips[best] > max(direct + _MIN_FLIP_GAIN, _MIN_FLIP_CORRELATION):
         return best
     return _describe_shift(*_phase_shift(one, other), factor)
 
@@ -79,7 +82,8 @@ def _phase_shift(one: _Plane, other: _Plane) -> tuple[int, int]:
     correlation = np.fft.irfft2(product / np.maximum(np.abs(product), 1e-12), one.shape)
     at_zero = correlation[:2, :2].max()
     row, column = np.unravel_index(correlation.argmax(), correlation.shape)
-    if correlation[row, column] < max(_MIN_PEAK, _MIN_PEAK_RATIO * at_zero):
+    noise = _MIN_PEAK_DEVIATIONS / np.sqrt(correlation.size)
+    if correlation[row, column] < max(_MIN_PEAK, noise, _MIN_PEAK_RATIO * at_zero):
         return 0, 0
     height, width = one.shape
     return int((row + height // 2) % height - height // 2), int((column + width // 2) % width - width // 2)

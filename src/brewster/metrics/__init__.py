@@ -237,7 +237,7 @@ _ROWS: Final = (
         "",
         False,
         3,
-        "Distance of structure and texture of Ding et al. 2022 with VGG16, 8-bit sRGB scaled to 0..1, at the size of the"
+        "DISTS (Ding 2022): distance of structure and texture with VGG16, 8-bit sRGB scaled to 0..1, at the size of the"
         " ground truth.",
         "transmission",
         _dists,
@@ -249,7 +249,7 @@ _ROWS: Final = (
         "",
         False,
         2,
-        "Distance of Mittal et al. 2013 between the local statistics of the prediction and of undistorted photographs, in"
+        "NIQE (Mittal 2013): distance between the local statistics of the prediction and of undistorted photographs, in"
         " blocks of 96x96 pixels of the luma 0.299 R + 0.587 G + 0.114 B; the ground truth is not used.",
         "transmission",
         _niqe,
