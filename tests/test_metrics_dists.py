@@ -1,6 +1,7 @@
 """DISTS with random convolutions agrees with its definition; its weights are found and checked."""
 
 import hashlib
+import itertools
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ def metric():
     noise = torch.Generator().manual_seed(7)
     convolutions = tuple(
         (torch.randn(out, into, 3, 3, generator=noise) / (4.5 * into) ** 0.5, torch.zeros(out))
-        for into, out in zip(CHANNELS[:-1], CHANNELS[1:], strict=True)
+        for into, out in itertools.pairwise(CHANNELS)
     )
     texture, structure = (tuple(map(torch.from_numpy, part)) for part in read_channel_weights())
     return Dists(convolutions, texture, structure)

@@ -1,5 +1,7 @@
 """The scores of one case agree with scikit-image and with direct calls of the metrics."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
