@@ -42,7 +42,8 @@ def protocol_config(name: str, **changes: Any) -> EvaluationConfig:  # noqa: ANN
         raise BrewsterError(
             f"there is no protocol {name!r}", f"expected one of {', '.join(PROTOCOLS)}", "choose one of them"
         )
-    return EvaluationConfig(**{"protocol": name} | PROTOCOLS[name].settings() | changes)
+    settings: dict[str, Any] = {"protocol": name, **PROTOCOLS[name].settings(), **changes}
+    return EvaluationConfig(**settings)
 
 
 def describe_protocol(config: EvaluationConfig) -> list[str]:

@@ -75,9 +75,8 @@ def _correlation(one: _Plane, other: _Plane) -> float:
 
 def _phase_shift(one: _Plane, other: _Plane) -> tuple[int, int]:
     """The shift (rows, columns) of `one` against `other`; (0, 0) if the correlation has no clear peak elsewhere."""
-    window = np.outer(
-        *(np.hanning(side) for side in one.shape)
-    )  # hides the borders, which do not wrap around
+    # The window hides the borders, which do not wrap around.
+    window = np.outer(np.hanning(one.shape[0]), np.hanning(one.shape[1]))
     product = np.fft.rfft2(one * window) * np.conj(np.fft.rfft2(other * window))
     correlation = np.fft.irfft2(product / np.maximum(np.abs(product), 1e-12), one.shape)
     at_zero = correlation[:2, :2].max()

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brewster.errors import MissingExtra
 from brewster.metrics.weights import load_vgg16
@@ -140,7 +141,7 @@ class Dists:
         return 1 - similarity
 
 
-def read_channel_weights() -> tuple[list[np.ndarray], list[np.ndarray]]:
+def read_channel_weights() -> tuple[list[NDArray[np.float32]], list[NDArray[np.float32]]]:
     """The published weights of texture and structure: six arrays (C,) each, all >= 0, which sum to 1."""
     with np.load(_WEIGHTS_FILE) as file:
         parts = [file[name] for name in ("texture", "structure")]
