@@ -125,6 +125,10 @@ SCORES = {
         "removed_content": 0.435374,
         "removed_white": 0.580899,
         "kept_reflection": 0.609849,
+        "linear_error": 0.131727,
+        "linear_error_reflection": 0.04864,
+        "psnr_channels": 20.658735,
+        "ssim_clipped": 0.876616,
     },
 }
 LPIPS = {
