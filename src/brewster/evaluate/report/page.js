@@ -207,6 +207,9 @@
     stage.classList.toggle("all", isOn("all") && !isOn("difference"));
     stage.classList.toggle("tinted", isOn("region"));
     const [width, height] = sides();
+    const wide = stage.clientWidth / width > stage.clientHeight / height;
+    const count = stage.querySelectorAll(".layer.same").length;
+    stage.style.setProperty("--columns", wide ? Math.ceil(Math.sqrt(count)) : Math.floor(Math.sqrt(count)) || 1);
     if (view.fits) Object.assign(view, {zoom: fitZoom(), x: width / 2, y: height / 2});
     Object.assign(view, {x: limit(view.x, 0, width), y: limit(view.y, 0, height)});
     for (const name of ["zoom", "x", "y"]) stage.style.setProperty(`--${name}`, view[name]);
