@@ -79,7 +79,7 @@ def _terminal_cell(
     if entry is None:
         return "-"
     mean = _number(results, metric, entry["mean"])
-    count = f" of {entry['count']}" if entry["count"] != image_count else ""
+    count = f" ({entry['count']} of {image_count})" if entry["count"] != image_count else ""
     return f"{mean}{_interval(results, metric, entry) if intervals else ''}{count}"
 
 
