@@ -43,7 +43,7 @@ brewster tests/pictures/mixture-coffee-rocket.jpg --model "$out/lora" -o "$out/s
 
 # 6. Evaluate on 540 photos, est. 5-6 hours, with the unprocessed input and the compact model for comparison.
 brewster evaluate --benchmark "real20=$real20" --benchmark "nature20=$nature20" --benchmark "sir2=$sir2" \
-    --model compact --model "lora=$out/lora" --paper -o "$out/evaluate"
+    --model compact --model "lora=$out/lora" --protocol paper -o "$out/evaluate"
 
 # 7. Write the model card with these scores, and list the files for the hub, 350 MB. Without --dry-run, the command uploads
 #    them as a private repository; with --public the repository is public, under the licence of the base.

@@ -92,6 +92,7 @@ def results(names=("a", "b"), method="compact", errors=None):
             "nature20": {"title": "Nature20", "pictures": len(names), "expected": [20]}
             | {"remarks": ["found 2 images, expected 20"], "refused": ["c.png has no partner"]}
         },
+        "unavailable": {},
         "unmeasured": [],
         "selections": {
             "nature20": {"title": "Nature20", "pictures": len(names)},

@@ -12,7 +12,8 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import brewster.metrics
 from brewster.errors import BrewsterError
-from brewster.metrics import METRICS, Metric, find_metric, psnr, ssim
+from brewster.metrics import METRICS, Metric, find_metric, linear_error, psnr, psnr_of_channels, ssim
+from brewster.srgb import to_linear
 
 GAUSSIAN = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 255}
 SCIKIT_ARGUMENTS = {"uniform": {"channel_axis": 2}, "gaussian": {"channel_axis": 2, **GAUSSIAN}}
@@ -146,6 +147,34 @@ def test_an_image_smaller_than_the_window_is_refused(window, side):
     with pytest.raises(ValueError, match=f"at least {side}x{side} pixels, not {side - 1}x20"):
         ssim(*np.zeros((2, side - 1, 20, 3), np.uint8), window=window)
     assert ssim(*np.zeros((2, side, side, 3), np.uint8), window=window) == 1
+
+
+# --- linear light and channels
+
+
+def test_the_linear_error_is_the_rms_of_the_light(random):
+    prediction, truth = random.integers(0, 256, (2, 9, 12, 3)).astype(np.uint8)
+    light, true_light = (to_linear(image / 255) for image in (prediction, truth))
+    assert linear_error(prediction, truth) == pytest.approx(
+        ((light - true_light) ** 2).mean() ** 0.5, rel=1e-5
+    )
+    black, white = np.zeros((2, 2, 3), np.uint8), np.full((2, 2, 3), 255, np.uint8)
+    assert linear_error(black, white) == pytest.approx(1)
+    assert linear_error(white, white) == 0
+    region = np.array([[True, False], [False, False]])
+    black[0, 0] = 255
+    assert linear_error(black, white, region=region) == 0
+    assert linear_error(black, white) == pytest.approx(0.75**0.5)
+
+
+def test_the_psnr_of_channels_is_the_mean_of_three_psnrs(random):
+    prediction, truth = random.integers(0, 256, (2, 9, 12, 3)).astype(np.uint8)
+    prediction[..., 0] = truth[..., 0] // 2
+    channels = [np.repeat(image[..., i : i + 1], 3, 2) for i in range(3) for image in (prediction, truth)]
+    expected = np.mean([psnr(*channels[i : i + 2]) for i in (0, 2, 4)])
+    assert psnr_of_channels(prediction, truth) == pytest.approx(expected)
+    assert psnr_of_channels(prediction, truth) >= psnr(prediction, truth)
+    assert psnr_of_channels(truth, truth) == float("inf")
 
 
 # --- the table

@@ -18,7 +18,8 @@ from brewster.benchmarks.registry import read_benchmark
 from brewster.errors import BrewsterError, PhotoError, TargetError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import IdentityBaseline, MethodOutput, ModelMethod, PredictionFolder
-from brewster.evaluate.runner import SCORES_FILE, score
+from brewster.evaluate.runner import score
+from brewster.evaluate.score_log import SCORES_FILE
 from other_processes import children, is_alive, wait_for
 
 QUICK = EvaluationConfig(metrics=("psnr", "ssim"))
