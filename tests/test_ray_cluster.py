@@ -54,7 +54,8 @@ nodes.shutdown()
 
 def run_in_process(code, *args):
     """Runs code in a process. The nodes of Ray import the fake renderer from PYTHONPATH."""
-    environment = {**os.environ, "PYTHONPATH": str(TESTS), "RAY_USAGE_STATS_ENABLED": "0"}
+    paths = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": paths, "RAY_USAGE_STATS_ENABLED": "0"}
     return subprocess.run(
         [sys.executable, "-c", code, *map(str, args)],
         env=environment,

@@ -8,6 +8,7 @@ Each process creates a runner once, and calls it with one task at a time.
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -237,6 +238,7 @@ def _interrupts_blocked() -> Iterator[None]:
 def _worker_main(pipe: Connection, create_runner: Callable[[], Runner[Any]]) -> None:
     """Main function of a worker: runs tasks until the pipe closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # one processor for each worker
     exit_with_parent()  # otherwise it and a resumed run could work on the same task
     runner: Runner[Any] | None = None
     with suppress(EOFError):
