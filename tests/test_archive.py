@@ -2,12 +2,14 @@
 
 import hashlib
 import os
+import re
 import subprocess
 import sys
 from functools import partial
 from pathlib import Path
 
 import fsspec
+import pyarrow
 import pytest
 from pyarrow import parquet
 
@@ -16,7 +18,7 @@ from brewster.executors import ProcessExecutor, SerialExecutor
 from brewster.files import discard
 from brewster.inference import FileResult, plan_files, separate_files
 from brewster.inference.archive import ArchiveRunner, separate_archive
-from brewster.inference.index import INDEX_FILE, PARTS_FOLDER, IndexWriter
+from brewster.inference.index import COLUMNS, INDEX_FILE, PARTS_FOLDER, IndexWriter
 from brewster.options import Options
 from brewster.remote_path import location
 from cli_helpers import image_bytes, json_lines, layer_files, list_files
@@ -93,9 +95,7 @@ def test_an_archive_has_the_bytes_of_a_batch_and_a_row_for_each_photo(root, opti
     (single,) = separate_files(photo, tmp_path / "plain", options)
     for written, output in zip(row["outputs"], single.outputs.values(), strict=True):
         assert location(written).read_bytes() == Path(output).read_bytes()
-    assert (
-        not list((root / "out" / PARTS_FOLDER).iterdir()) if (root / "out" / PARTS_FOLDER).exists() else True
-    )
+    assert not (root / "out" / PARTS_FOLDER).exists()
 
 
 def test_a_run_is_resumed_and_rows_of_finished_photos_are_kept(root, options):
@@ -223,6 +223,21 @@ def test_a_skipped_photo_replaces_the_row_of_a_failure_only(tmp_path):
     assert seen["status"] == "separated"
 
 
+def test_an_index_of_an_earlier_version_is_continued(tmp_path):
+    old = pyarrow.table({"path": ["a.jpg"], "status": ["separated"], "dropped": [1]})
+    parquet.write_table(old, tmp_path / INDEX_FILE)
+    with IndexWriter(tmp_path) as index:
+        index.append(FileResult("b.jpg"))
+    table = parquet.read_table(tmp_path / INDEX_FILE)
+    assert table.column_names == list(COLUMNS)
+    assert table.column("path").to_pylist() == ["a.jpg", "b.jpg"]
+
+
+def test_the_documentation_has_every_column_of_the_index():
+    section = (TESTS.parent / "docs/archives.md").read_text().split("## The index")[1].split("\n## ")[0]
+    assert re.findall(r"^\| `(\w+)`", section, re.M) == list(COLUMNS)
+
+
 def test_another_file_with_the_name_of_the_index_is_never_replaced(tmp_path):
     (tmp_path / INDEX_FILE).write_bytes(b"something else")
     with pytest.raises(TargetError, match=r"index\.parquet is not an index"):
@@ -293,7 +308,10 @@ def test_the_command_writes_the_index_and_separates_urls(run, tmp_path, store):
     (photos / "b.jpg").unlink()
     code, _, err = run("memory://bucket/in", "-o", "memory://bucket/out")
     assert code == 0, err
-    assert location("memory://bucket/out/a.reflection.jpg").read_bytes()
+    layer = location("memory://bucket/out/a.transmission.jpg").read_bytes()
+    for target in ("clear.jpg", "memory://bucket/clear.jpg"):
+        code, _, err = run("memory://bucket/in/a.jpg", "-o", target)
+        assert (code, location(target).read_bytes()) == (0, layer), err
 
 
 @pytest.mark.parametrize(

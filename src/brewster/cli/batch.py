@@ -27,6 +27,7 @@ from brewster.cli.terminal import (
 )
 from brewster.image_formats import ImageFormat, format_of
 from brewster.options import Options
+from brewster.remote_path import location
 
 if TYPE_CHECKING:
     from brewster.inference import FileResult, SeparationTask
@@ -65,8 +66,8 @@ def _plan_single_output(photos: Sequence[str], output: str | None, options: Opti
         )
     if output not in (None, "-"):
         _check_format(format_of(Path(output)), options)
-    source = _StandardStream() if photos[0] == "-" else Path(photos[0])
-    target = _StandardStream() if output in (None, "-") else Path(output)
+    source = _StandardStream() if photos[0] == "-" else location(photos[0])
+    target = _StandardStream() if output in (None, "-") else location(output)
     return SeparationTask(source, {options.layers[0]: target})
 
 

@@ -64,9 +64,7 @@ class IndexWriter:
         self._rows.append(result)
         is_due = time.monotonic() > self._written_at + _PART_INTERVAL_S
         if is_due or len(self._rows) % MAX_PART_ROWS == 0:
-            with contextlib.suppress(
-                TargetError
-            ):  # `close` raises it, if the folder still cannot be written to
+            with contextlib.suppress(TargetError):  # `close` raises it, if it remains
                 self._write_part()
 
     def close(self) -> None:
@@ -85,7 +83,7 @@ class IndexWriter:
                 "run the same command again: finished files are kept, and no other program may change this folder",
             )
         tables = [self._read(path) for path in [*([self._index] if exists(self._index) else []), *parts]]
-        table = self._arrow.concat_tables(tables, promote_options="default")
+        table = self._arrow.concat_tables(tables, promote_options="default").select(list(COLUMNS))
         self._write(self._index, table.take(self._arrow.array(_last_rows(table), "int64")).sort_by("path"))
         for part in parts:
             part.unlink()
@@ -120,7 +118,11 @@ class IndexWriter:
 
     def _read(self, path: Location) -> Any:  # noqa: ANN401
         try:
-            return self._parquet.read_table(io.BytesIO(path.read_bytes())).select(list(COLUMNS))
+            table = self._parquet.read_table(io.BytesIO(path.read_bytes()))
+            # An index of an earlier version may have fewer columns.
+            return table.select(
+                ["path", "status", *(COLUMNS.keys() & {*table.column_names} - {"path", "status"})]
+            )
         except (OSError, ValueError, KeyError) as error:  # the errors of pyarrow are subclasses
             raise TargetError(
                 f"{path} is not an index ({str(error).partition(chr(10))[0]})",

@@ -113,7 +113,8 @@ def _create_session(model: Path, data: bytes, device: str) -> ort.InferenceSessi
     options = ort.SessionOptions()
     options.log_severity_level = 3
     # The usual variable for a share of the processors: Ray and our workers set it. ONNX Runtime ignores it.
-    options.intra_op_num_threads = int(os.environ.get("OMP_NUM_THREADS", "0"))  # 0: one thread per core
+    threads = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0]
+    options.intra_op_num_threads = int(threads) if threads.isdigit() else 0  # 0: one thread per core
     providers = dict.fromkeys([_PROVIDERS[device][0], "CPUExecutionProvider"])
     try:
         return ort.InferenceSession(data, options, list(providers), enable_fallback=0)
