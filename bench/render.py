@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -20,11 +21,12 @@ from torch.nn.functional import avg_pool2d
 
 from brewster.environments.assets import Assets
 from brewster.environments.catalog import BUILTIN_CATALOG
+from brewster.executors import SerialExecutor
 from brewster.render.analytic import render
 from brewster.render.mitsuba.renderer import trace
 from brewster.render.sample import LAYERS, LightSample
 from brewster.rendered.generation.job import RenderJob, build
-from brewster.rendered.generation.workers import SerialExecutor
+from brewster.rendered.generation.workers import TaskRunner
 from brewster.scene.camera import Camera
 from brewster.scene.glass import Glazing
 from brewster.scene.recipe import read_scene_recipe
@@ -118,7 +120,13 @@ def cost_per_sample() -> None:
         with tempfile.TemporaryDirectory() as folder:
             job = RenderJob(Path(folder) / "set", recipe, BUILTIN_CATALOG, 7, "analytic", ())
             start = time.process_time()
-            build(job, range(count), SerialExecutor(job), shards=False, report=lambda _: None)
+            build(
+                job,
+                range(count),
+                SerialExecutor(partial(TaskRunner, job)),
+                shards=False,
+                report=lambda _: None,
+            )
             print(f"| {count} | {(time.process_time() - start) / count:.2f} |", flush=True)
 
 

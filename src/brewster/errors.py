@@ -5,6 +5,7 @@
     |   |-- UnreadablePhoto    the file is not an image, is empty or is truncated
     |   |-- UnsupportedPhoto   an unsupported kind of image (five channels, animation, NaN)
     |   `-- PhotoTooLarge      the image has more pixels than the limit
+    |-- ManifestError          a list of photos is not a table of paths
     |-- TargetError            an output file cannot be written, for example because it exists
     |-- ModelError             a model is unknown, damaged, or has the wrong inputs
     |-- DeviceError            the requested device is not available
@@ -57,6 +58,10 @@ class UnsupportedPhoto(PhotoError):
 
 class PhotoTooLarge(PhotoError):
     """The image has more pixels than the limit."""
+
+
+class ManifestError(BrewsterError):
+    """A manifest, which lists the photos of a batch, is not a CSV or Parquet table of paths."""
 
 
 class TargetError(BrewsterError):

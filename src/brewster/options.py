@@ -12,7 +12,7 @@ import inspect
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import PurePath
 from typing import Any, Final, Literal, TypeVar, final
 
 from brewster.errors import BrewsterError
@@ -143,7 +143,7 @@ class Options:
             source_format = "tiff"
         return self.format or source_format
 
-    def suffix(self, layer: str, source: Path) -> str | None:
+    def suffix(self, layer: str, source: PurePath) -> str | None:
         """Returns the suffix of a layer's file, or None if it is the suffix of the source."""
         image_format = format_of(source)
         source_format = image_format.name if image_format else ""

