@@ -109,7 +109,7 @@ def test_a_picture_behind_the_glass_fills_the_view():
 
 
 def test_the_camera_distance_is_within_the_range_of_the_recipe(fifty):
-    nearest, farthest = read_scene_recipe("window").camera.distance_mm_log
+    nearest, farthest = read_scene_recipe("window").camera.distance_mm
     for scene in fifty["window"]:
         assert 0.9 * nearest < scene.camera_above_glass_mm < 1.1 * farthest
 

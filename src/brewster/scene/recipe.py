@@ -1,7 +1,7 @@
 """Scene recipes: distributions of the parameters of random scenes, read from TOML into frozen models.
 
-A `Range` is sampled uniformly, a `LogRange` uniformly in the logarithm. A `_probability` is the share of scenes that have
-the feature. The packaged recipes are the TOML files in the folder `recipes` next to this file.
+A `Range` is sampled uniformly, a `LogRange` log-uniformly (uniformly in the logarithm). A `_probability` is the share
+of scenes that have the feature. The packaged recipes are the TOML files in the folder `recipes` next to this file.
 """
 
 from __future__ import annotations
@@ -53,15 +53,15 @@ class GlassRecipe(FrozenModel):
     ] = ((4.0, 1.5, 2.5),)
     """Absorption coefficients for red, green and blue, one of which is drawn. They are larger for red
     and blue than for green, because clear float glass is slightly green."""
-    tint_strength_log: LogRange = (0.3, 2.0)
+    tint_strength: LogRange = (0.3, 2.0)
     """Factor on the absorption coefficients."""
     rough_probability: Share = 0.0
     """Probability of rough glass."""
-    roughness_log: LogRange = (0.01, 0.1)
+    roughness: LogRange = (0.01, 0.1)
     """GGX width (alpha) of the surfaces of rough glass: 0.05 is satin, 0.2 frosted."""
     wedge_probability: Share = 0.0
     """Probability of wedged panes, whose two surfaces are not parallel."""
-    wedge_deg_log: LogRange = (0.01, 0.3)
+    wedge_deg: LogRange = (0.01, 0.3)
     """Angle between the two surfaces of a wedged pane."""
     pitch_deg: Range = (0.0, 0.0)
     """Elevation of the normal of the glass above the horizon; 0 for upright glass."""
@@ -86,7 +86,7 @@ class CameraRecipe(FrozenModel):
     """Width of the image."""
     height: Pixels = 384
     """Height of the image."""
-    distance_mm_log: LogRange = (300.0, 3000.0)
+    distance_mm: LogRange = (300.0, 3000.0)
     """Distance of the camera from the glass."""
     incidence_deg: Range = (-35.0, 35.0)
     """Horizontal angle between the optical axis and the normal of the glass."""
@@ -96,7 +96,7 @@ class CameraRecipe(FrozenModel):
     """Horizontal field of view. For maps of low resolution, the lower limit is raised as `max_px_per_texel` requires."""
     pinhole_probability: Share = 0.7
     """Probability of a pinhole camera, which has no defocus."""
-    aperture_mm_log: LogRange = (1.0, 15.0)
+    aperture_mm: LogRange = (1.0, 15.0)
     """Aperture diameter of a camera with a lens."""
     focus_on_front_probability: Share = 0.15
     """Probability that the camera is focused on the mirrored content instead of the content behind the glass."""
@@ -113,11 +113,11 @@ class SideRecipe(FrozenModel):
     """Largest width of a texel of the map in the image. It limits the choice of maps and the field of view."""
     dome_probability: Share = 0.0
     """Probability that the map is on a sphere (dome) of finite radius around the glass instead of at infinity."""
-    radius_mm_log: LogRange = (3000.0, 10_000.0)
+    radius_mm: LogRange = (3000.0, 10_000.0)
     """Radius of the dome."""
     picture_probability: Share = 0.0
     """Probability of a picture on a plane, in front of the map if there is one."""
-    distance_mm_log: LogRange = (1000.0, 8000.0)
+    distance_mm: LogRange = (1000.0, 8000.0)
     """Distance of the picture behind the last pane; in [front], behind the camera."""
     relative_width: Range = (1.05, 1.5)
     """Width of the picture, divided by the width that exactly covers the view."""
@@ -125,7 +125,7 @@ class SideRecipe(FrozenModel):
     """Rotation of the picture about the vertical axis. The rotation about the horizontal axis has half this range."""
     highlight_boost: Range = (0.0, 0.0)
     """Extra brightness of clipped whites in a picture: the light of white is multiplied by 1 + highlight_boost."""
-    luminance_log: LogRange = (1.0, 1.0)
+    luminance: LogRange = (1.0, 1.0)
     """Mean luminance of the content. Only the ratio between the two sides has an effect, because the exposure is automatic."""
 
 

@@ -115,8 +115,8 @@ def _draw_once(recipe: SceneRecipe, catalog: Catalog, rng: _SceneRng, seed: int,
 def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
     count = 2 if rng.bernoulli(recipe.double_probability) else 1
     structural = rng.bernoulli(recipe.structural_probability)
-    tint, strength = rng.choice(recipe.tints), rng.from_log_range(recipe.tint_strength_log)
-    rough = rng.from_log_range(recipe.roughness_log) if rng.bernoulli(recipe.rough_probability) else 0.0
+    tint, strength = rng.choice(recipe.tints), rng.from_log_range(recipe.tint_strength)
+    rough = rng.from_log_range(recipe.roughness) if rng.bernoulli(recipe.rough_probability) else 0.0
     wedged = rng.bernoulli(recipe.wedge_probability)
     red, green, blue = (_six_digits(colour * strength) for colour in tint)
     index = rng.from_range(recipe.index)
@@ -129,7 +129,7 @@ def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
             index=index,
             absorption_per_m=(red, green, blue),
             roughness=rough,
-            wedge_deg=rng.from_log_range(recipe.wedge_deg_log) * rng.choice((-1, 1)) if wedged else 0.0,
+            wedge_deg=rng.from_log_range(recipe.wedge_deg) * rng.choice((-1, 1)) if wedged else 0.0,
         )
 
     return Glazing(
@@ -168,7 +168,7 @@ def _draw_camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]
     )
     heading, pitch = rng.from_range(ranges.incidence_deg), rng.from_range(ranges.pitch_deg)
     _, _, back = axes(heading, pitch)
-    distance_mm = rng.from_log_range(ranges.distance_mm_log) / max(back[2], 0.1)
+    distance_mm = rng.from_log_range(ranges.distance_mm) / max(back[2], 0.1)
     x, y, z = (_six_digits(distance_mm * part) for part in back)
     return Camera(
         position_mm=(x, y, z),
@@ -183,7 +183,7 @@ def _draw_camera(recipe: SceneRecipe, maps: list[tuple[SideRecipe, Asset | None]
 def _draw_side(recipe: SideRecipe, asset: Asset | None, partial: _PartialScene, base_mm: float) -> Side:
     """Draws a map, a picture, or both. The distance of the picture from the glass is `base_mm` plus the distance drawn."""
     rng = partial.rng
-    luminance = rng.from_log_range(recipe.luminance_log)
+    luminance = rng.from_log_range(recipe.luminance)
     environment_map = plane = None
     if asset:
         is_dome = rng.bernoulli(recipe.dome_probability)
@@ -191,10 +191,10 @@ def _draw_side(recipe: SideRecipe, asset: Asset | None, partial: _PartialScene, 
             source=asset.source,
             heading_deg=rng.from_range((0, 360)),
             luminance=luminance,
-            radius_mm=rng.from_log_range(recipe.radius_mm_log) if is_dome else math.inf,
+            radius_mm=rng.from_log_range(recipe.radius_mm) if is_dome else math.inf,
         )
     if rng.bernoulli(recipe.picture_probability) or not asset:
-        plane = _draw_plane(recipe, partial, luminance, base_mm + rng.from_log_range(recipe.distance_mm_log))
+        plane = _draw_plane(recipe, partial, luminance, base_mm + rng.from_log_range(recipe.distance_mm))
     return Side(map=environment_map, plane=plane)
 
 
@@ -254,7 +254,7 @@ def _focus_camera(recipe: CameraRecipe, partial: _PartialScene, behind: Side, fr
     focused_side = front if rng.bernoulli(recipe.focus_on_front_probability) else behind
     is_pinhole, aperture = (
         rng.bernoulli(recipe.pinhole_probability),
-        rng.from_log_range(recipe.aperture_mm_log),
+        rng.from_log_range(recipe.aperture_mm),
     )
     distance_mm = _camera_in_glass_frame(camera, partial.glass)[2] + focused_side.distance_mm
     cosine = _to_glass_frame(axes(camera.heading_deg, camera.pitch_deg)[2], partial.glass)[2]
