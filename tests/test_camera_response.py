@@ -26,7 +26,7 @@ PICTURES = arrays.arrays(np.float32, SHAPE, elements=LIGHT, fill=st.nothing()) |
 BALANCES = ["grey-world", "white-patch", "grey-edge"]
 RESPONSES = st.builds(
     CameraResponse,
-    exposure=st.floats(0.01, 1),
+    target_luminance=st.floats(0.01, 1),
     white_balance=st.sampled_from(["none", *BALANCES]),
     white_balance_strength=st.floats(0, 1),
     contrast=st.floats(-0.5, 0.9),
@@ -66,7 +66,7 @@ def mean_luminance(light):
 @some
 @given(PICTURES, st.floats(0.01, 1), st.sampled_from(["none", *BALANCES]))
 def test_the_mean_of_any_image_is_the_target_if_it_is_reachable(picture, target, balance):
-    sample = sample_of(picture, exposure=target, white_balance=balance)
+    sample = sample_of(picture, target_luminance=target, white_balance=balance)
     developed = develop(sample)
     layers = (("photo", developed.exposure_ev), ("mirror", developed.mirror_exposure_ev))
     for name, ev in layers:
@@ -87,14 +87,14 @@ def test_lamps_do_not_change_the_exposure():
     room = torch.full((3, 20, 20), 0.1)
     lit = room.clone()
     lit[:, 0, :4] = 1e6
-    exposures = [develop(sample_of(picture, exposure=0.4)).exposure_ev for picture in (room, lit)]
+    exposures = [develop(sample_of(picture, target_luminance=0.4)).exposure_ev for picture in (room, lit)]
     assert exposures == pytest.approx([2, 2], abs=0.03)
 
 
 def test_an_unreachable_target_does_not_raise_the_exposure_without_limit():
     half_black = torch.zeros(3, 4, 4)
     half_black[:, :2] = 0.5
-    developed = develop(sample_of(half_black, exposure=0.9))
+    developed = develop(sample_of(half_black, target_luminance=0.9))
     assert developed.exposure_ev == pytest.approx(1, abs=0.02)
 
 
@@ -102,7 +102,7 @@ def test_the_overexposed_share_counts_pixels_that_clip_in_any_channel():
     picture = torch.full((3, 10, 10), 0.01)
     picture[0, :2] = 100
     picture[1, 1:3] = 100
-    assert develop(sample_of(picture, exposure=0.25)).overexposed == 0.3
+    assert develop(sample_of(picture, target_luminance=0.25)).overexposed == 0.3
 
 
 # --- all layers alike
@@ -178,7 +178,7 @@ CAST = torch.tensor([1.4, 1.0, 0.6]).view(3, 1, 1)
 def test_grey_world_makes_the_means_equal_and_keeps_luminance(red, blue, seed):
     picture = torch.rand((3, 12, 12), generator=torch.Generator().manual_seed(seed)) * 0.5 + 0.25
     picture *= torch.tensor([red, 1, blue]).view(3, 1, 1)
-    sample = sample_of(picture, white_balance="grey-world", exposure=0.1)
+    sample = sample_of(picture, white_balance="grey-world", target_luminance=0.1)
     developed = develop(sample)
     assert max(developed.white_balance) < 3
     balanced = to_linear(developed.photo_encoded).mean((1, 2))
@@ -190,7 +190,7 @@ def test_grey_world_makes_the_means_equal_and_keeps_luminance(red, blue, seed):
 @pytest.mark.parametrize("balance", BALANCES)
 def test_every_white_balance_removes_a_colour_cast(balance):
     grey = random_image((1, 40, 56)).expand(3, 40, 56)
-    developed = develop(sample_of(grey * CAST, white_balance=balance, exposure=0.2))
+    developed = develop(sample_of(grey * CAST, white_balance=balance, target_luminance=0.2))
     gains = torch.tensor(developed.white_balance).view(3, 1, 1)
     torch.testing.assert_close(gains * CAST / (gains * CAST)[1], torch.ones(3, 1, 1), atol=1e-3, rtol=0)
 
@@ -199,7 +199,7 @@ def test_every_white_balance_removes_a_colour_cast(balance):
 def test_white_balance_of_any_strength_keeps_luminance(strength):
     picture = random_image((3, 40, 56)) * CAST
     developed = develop(
-        sample_of(picture, white_balance="grey-world", white_balance_strength=strength, exposure=0.01)
+        sample_of(picture, white_balance="grey-world", white_balance_strength=strength, target_luminance=0.01)
     )
     gains = torch.tensor(developed.white_balance).view(3, 1, 1)
     assert mean_luminance(picture * gains) == pytest.approx(mean_luminance(picture), rel=1e-3)
@@ -227,7 +227,8 @@ def test_clipped_lamps_do_not_affect_the_white_balance(balance):
     lit[2, 3:5, 3:5] = 1e5
     lit[:, 10:14, 10:20] = 1e5
     plain, with_lamps = (
-        develop(sample_of(each, white_balance=balance, exposure=0.3)).white_balance for each in (picture, lit)
+        develop(sample_of(each, white_balance=balance, target_luminance=0.3)).white_balance
+        for each in (picture, lit)
     )
     assert plain == pytest.approx(with_lamps, abs=0.01)
 
@@ -244,7 +245,7 @@ def test_gains_are_between_a_third_and_three(picture, balance, strength):
 
 
 def flat(level, **response):
-    return sample_of(torch.full((3, 200, 200), level), exposure=level, **response)
+    return sample_of(torch.full((3, 200, 200), level), target_luminance=level, **response)
 
 
 @pytest.mark.parametrize("level", [0.2, 0.6])

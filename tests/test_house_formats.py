@@ -131,10 +131,10 @@ LPIPS = {
     3: {"lpips": 0.033937, "lpips_region": 0.035948, "lpips_reflection": 0.283549},
 }
 SCENES = {
-    2: {"tiny": "b8473c2883ad1619", "window": "bd20ed9f789a3ff3"},
+    3: {"tiny": "7d49420486cdb652", "window": "a31d31ac2db96e55"},
 }
 SAMPLES = {
-    2: {
+    3: {
         "photo, light": [1.0143, 0.8571, 1.1205],
         "transmission, light": [0.7423, 0.6429, 0.8384],
         "background, light": [0.9394, 0.7656, 1.0188],
@@ -148,7 +148,7 @@ SAMPLES = {
     },
 }
 ENVIRONMENT_MAPS = {
-    2: {
+    3: {
         "room": [
             -1.134,
             -1.145,

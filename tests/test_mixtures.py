@@ -15,7 +15,7 @@ NO_EFFECTS = MixRecipe(
     highlight_boost=(0, 0), shadow_probability=0, background_blur_probability=0, no_glass_probability=0, partial_probability=0, transmittance=(1, 1),
     veil_probability=0, reflection_map_probability=0, reflection_ratio=(0.5, 0.5),
     reflection_contrast=(1, 1), lamp_probability=0, sign_probability=0, sharp_probability=1,
-    ghost_probability=0, falloff_probability=0, edge_probability=0, softness_probability=0, exposure=(1, 1), overexposed_probability=0,
+    ghost_probability=0, falloff_probability=0, edge_probability=0, softness_probability=0, target_luminance=(1, 1), overexposed_probability=0,
     gamma=(1, 1), contrast=(0, 0), noise=(0, 0), jpeg_probability=0,
 )  # fmt: skip
 MANY_EFFECTS = MixRecipe(
@@ -145,7 +145,7 @@ def test_a_warmer_light_has_more_red_and_less_blue(photos):
 
 
 def test_exposure_limits_the_photos_mean(photos):
-    photo, behind, mirrored = layers_of(photos, exposure=(0.05, 0.05))
+    photo, behind, mirrored = layers_of(photos, target_luminance=(0.05, 0.05))
     plain = layers_of(photos)
     assert to_linear(photo).mean(dim=(1, 2, 3)).tolist() == pytest.approx([0.05] * 4, rel=0.03)
     for dark, layer in zip((behind, mirrored), plain[1:], strict=True):

@@ -81,8 +81,8 @@ def develop(sample: LightSample) -> DevelopedSample:
     response = sample.scene.camera_response
     white_balance = _white_balance(sample.photo, response)
     gains = sample.photo.new_tensor(white_balance).view(3, 1, 1)
-    ev = _exposure_ev(sample.photo * gains, response.exposure)
-    mirror_ev = _exposure_ev(sample.mirror * gains, response.exposure)
+    ev = _exposure_ev(sample.photo * gains, response.target_luminance)
+    mirror_ev = _exposure_ev(sample.mirror * gains, response.target_luminance)
     exposed = sample.map(lambda light: light * (gains * math.exp2(ev))).layers()
     exposed["photo"] = _add_noise(exposed["photo"], sample.scene)
     exposed["mirror"] = sample.mirror * (gains * math.exp2(mirror_ev))
@@ -168,7 +168,7 @@ def _white_balance(photo: Tensor, response: CameraResponse) -> tuple[float, floa
     """
     if response.white_balance == "none":
         return 1.0, 1.0, 1.0
-    exposed = (photo * math.exp2(_exposure_ev(photo, response.exposure))).clamp(0, 1)
+    exposed = (photo * math.exp2(_exposure_ev(photo, response.target_luminance))).clamp(0, 1)
     valid = (exposed < 1).all(0)
     colour = _ILLUMINANT_ESTIMATORS[response.white_balance](exposed, valid if valid.any() else ~valid)
     return _gains(colour, response.white_balance_strength)

@@ -67,9 +67,9 @@ def statistics(sample: LightSample, developed: DevelopedSample) -> dict[str, flo
     return {name: float(f"{measure(sample, developed):.6g}") for name, measure in STATISTICS.items()}
 
 
-SAMPLE_FORMAT: Final = 2
+SAMPLE_FORMAT: Final = 3
 """Version of the files of a sample. Increase it if the same job gives other files, so that no set contains samples of two
-versions (tests/test_house_formats.py). 2: scene.toml has [camera_response] and `highlight_boost`."""
+versions (tests/test_house_formats.py). 3: the keys of scene.toml have other names (`refractive_index`, `target_luminance` ...)."""
 
 
 def encode_sample(sample: LightSample, renderer: str) -> dict[str, bytes]:

@@ -132,7 +132,7 @@ class SideRecipe(FrozenModel):
 class CameraResponseRecipe(FrozenModel):
     """The camera response: the conversion of linear light into an 8-bit photograph."""
 
-    exposure: LogRange = (0.2, 0.5)
+    target_luminance: LogRange = (0.2, 0.5)
     """Mean luminance of the photo I after exposure and clipping to 0..1."""
     white_balance: Annotated[tuple[WhiteBalance, ...], Field(min_length=1)] = (
         "none",

@@ -268,7 +268,7 @@ def _focus_camera(recipe: CameraRecipe, partial: _PartialScene, behind: Side, fr
 
 def _draw_camera_response(recipe: CameraResponseRecipe, rng: _SceneRng) -> CameraResponse:
     return CameraResponse(
-        exposure=rng.from_log_range(recipe.exposure),
+        target_luminance=rng.from_log_range(recipe.target_luminance),
         white_balance=rng.choice(recipe.white_balance),
         white_balance_strength=rng.from_range(recipe.white_balance_strength),
         contrast=rng.from_range(recipe.contrast),

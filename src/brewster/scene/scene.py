@@ -27,7 +27,7 @@ WhiteBalance = Literal["none", "grey-world", "white-patch", "grey-edge"]
 class CameraResponse(FrozenModel):
     """The camera response: from linear light to a photograph. Exposure and gains are computed on I and applied to all layers."""
 
-    exposure: Annotated[float, Field(gt=0, le=1)] = 0.4
+    target_luminance: Annotated[float, Field(gt=0, le=1)] = 0.4
     """Mean luminance of I after exposure and clipping to 0..1."""
     white_balance: WhiteBalance = "none"
     white_balance_strength: Share = 1.0

@@ -136,7 +136,7 @@ class MixRecipe(FrozenModel):
     """Probability of a soft photo: background and reflection are both blurred by the lens, or enlarged from a smaller photo."""
     softness_px: LogRange = (0.3, 1.6)
     """Standard deviation of this blur, in pixels of the training image at any size."""
-    exposure: Range = (0.2, 0.55)
+    target_luminance: Range = (0.2, 0.55)
     """Mean luminance of the photo after exposure. A photo with a smaller mean is not brightened."""
     overexposed_probability: Share = 0.3
     """Probability of an overexposed photo, in which a part of the background is white."""
@@ -292,7 +292,7 @@ def _expose_and_develop(rng: SampleRng, recipe: MixRecipe, *layers: Image) -> tu
 
     The photo is also given noise, rounded to 8 bits, and compressed as JPEG with the probability in the recipe.
     """
-    exposure = min(1.0, rng.uniform(recipe.exposure) / layers[0].clamp(max=1).mean().item())
+    exposure = min(1.0, rng.uniform(recipe.target_luminance) / layers[0].clamp(max=1).mean().item())
     if rng.bernoulli(recipe.overexposed_probability):
         white = _quantile(layers[1].amax(dim=0), 1 - rng.uniform(recipe.overexposed_share))
         exposure = max(exposure, 1 / (white + 1e-3))
