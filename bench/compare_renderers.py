@@ -23,7 +23,7 @@ from brewster.environments.assets import Assets
 from brewster.render.analytic import render
 from brewster.render.mitsuba.renderer import trace
 from brewster.render.rays import rough_glass
-from brewster.render.sample import LAYERS, LightSample
+from brewster.render.sample import LAYERS, LinearSample
 from brewster.scene.camera import Camera
 from brewster.scene.glass import Glazing, Pane
 from brewster.scene.scene import Scene
@@ -96,7 +96,7 @@ def compare(scene: Scene, assets: Assets, samples: int) -> list[str]:
     return [_row(name, ours, theirs) for name in LAYERS]
 
 
-def _row(name: str, ours: tuple[LightSample, ...], theirs: tuple[LightSample, ...]) -> str:
+def _row(name: str, ours: tuple[LinearSample, ...], theirs: tuple[LinearSample, ...]) -> str:
     """Ratio of the means - 1 with its standard error, PSNR, and squared error over that expected from noise."""
     a1, a2, b1, b2 = (getattr(sample, name).double() for sample in (*ours, *theirs))
     a, b = (a1 + a2) / 2, (b1 + b2) / 2

@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as arrays
 from brewster.errors import UnsupportedPhoto
 from brewster.photo import Photo
 from brewster.render.camera_response import develop, encode_jpeg, to_uint8, with_jpeg
-from brewster.render.sample import LAYERS, LightSample
+from brewster.render.sample import LAYERS, LinearSample
 from brewster.scene.scene import CameraResponse, Scene
 from brewster.srgb import REC709_LUMINANCE, to_encoded, to_linear
 
@@ -36,7 +36,7 @@ RESPONSES = st.builds(
 def sample_of(photo, reflection=None, mirror=None, seed=0, index=0, **response):
     photo = torch.as_tensor(photo, dtype=torch.float32)
     reflection = photo * 0.25 if reflection is None else torch.as_tensor(reflection)
-    return LightSample(
+    return LinearSample(
         Scene(seed=seed, index=index, camera_response=CameraResponse(**response)),
         photo=photo,
         transmission=photo - reflection,
@@ -112,7 +112,7 @@ def test_the_overexposed_share_counts_pixels_that_clip_in_any_channel():
 @given(PICTURES, RESPONSES)
 def test_the_same_light_has_the_same_value_in_every_layer(picture, response):
     sample = sample_of(picture, **response.model_dump())
-    alike = LightSample(sample.scene, *[sample.photo] * 5)
+    alike = LinearSample(sample.scene, *[sample.photo] * 5)
     layers = develop(alike).layers()
     assert list(layers) == list(LAYERS)
     for layer in layers.values():

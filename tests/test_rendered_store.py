@@ -12,7 +12,7 @@ from pyarrow import parquet
 from brewster import Photo
 from brewster.errors import RecipeError, TargetError
 from brewster.photo import read_layers
-from brewster.render.sample import LAYERS, LightSample
+from brewster.render.sample import LAYERS, LinearSample
 from brewster.rendered import store
 from brewster.rendered.generation import preview
 from brewster.scene.recipe import read_scene_recipe
@@ -56,7 +56,7 @@ def test_only_the_photo_has_the_quality_of_the_scene(scene):
 
 def test_statistics_compare_the_luminance_of_the_layers(scene):
     grey = render(scene, None).map(lambda layer: torch.full_like(layer, 0.5))
-    mirrored = LightSample(**{**vars(grey), "reflection": grey.reflection * 0.1})
+    mirrored = LinearSample(**{**vars(grey), "reflection": grey.reflection * 0.1})
     found = store.statistics(mirrored, store.develop(mirrored))
     assert found["reflection_to_transmission"] == pytest.approx(0.1)
     assert found["overexposed"] == 0

@@ -35,7 +35,7 @@ from brewster.render.rays.layered_glass import (
 from brewster.render.rays.rough_glass import trace_orders
 from brewster.render.rays.sobol import SobolPoints
 from brewster.render.rays.vectors import normalize
-from brewster.render.sample import LAYERS, LightSample
+from brewster.render.sample import LAYERS, LinearSample
 from brewster.scene.camera import axes, dot
 from brewster.scene.scene import Scene
 
@@ -72,7 +72,7 @@ class _PreparedScene:
     back: Tensor
 
 
-def render(scene: Scene, assets: Assets, device: Device = "cpu") -> LightSample:
+def render(scene: Scene, assets: Assets, device: Device = "cpu") -> LinearSample:
     """Renders the five images of a scene (the paper's section "Data Generation").
 
     Returns:
@@ -95,7 +95,7 @@ def render(scene: Scene, assets: Assets, device: Device = "cpu") -> LightSample:
             if _needs_monte_carlo(scene)
             else _render_deterministic(prepared)
         )
-    return LightSample(scene, **dict(zip(LAYERS, layers, strict=True)))
+    return LinearSample(scene, **dict(zip(LAYERS, layers, strict=True)))
 
 
 def ghost_distance_px(scene: Scene) -> float:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Generator, Tensor
 
 from brewster.photo import FileInfo, Photo
-from brewster.render.sample import LAYERS, LightSample
+from brewster.render.sample import LAYERS, LinearSample
 from brewster.scene.scene import CameraResponse, Scene
 from brewster.srgb import REC709_LUMINANCE, to_encoded
 
@@ -72,7 +72,7 @@ class DevelopedSample:
         }
 
 
-def develop(sample: LightSample) -> DevelopedSample:
+def develop(sample: LinearSample) -> DevelopedSample:
     """Applies exposure, white balance, noise and tone curve, as the scene's `camera_response` describes them.
 
     Exposure is rounded to a thousandth of a stop before it is applied, and gains to four decimals. So the recorded

@@ -24,7 +24,7 @@ from brewster.environments.assets import Assets
 from brewster.errors import DeviceError, MissingExtra
 from brewster.render.mitsuba.scene_builder import GlassMode, MitsubaSceneBuilder
 from brewster.render.mitsuba.variant import COMPILED, INSTALL_LLVM, load, probe
-from brewster.render.sample import LightSample
+from brewster.render.sample import LinearSample
 from brewster.scene.scene import Scene
 
 _POLARISED: Final = "llvm_ad_mono_polarized"
@@ -44,7 +44,7 @@ def trace(
     max_samples: int = 4096,
     denoise: bool = False,
     polarised: bool = False,
-) -> LightSample:
+) -> LinearSample:
     """Path-traces the five images of a scene in equal passes, until their noise is low enough.
 
     The error of an image is the mean over its pixels of standard error / (light + 1 % of the mean light); the standard
@@ -107,7 +107,7 @@ def _variant(polarised: bool) -> str:
 
 def _render_layers(
     builders: Sequence[MitsubaSceneBuilder], noise: float, max_samples: int, denoise: bool
-) -> LightSample:
+) -> LinearSample:
     scene = builders[0].scene
 
     def estimate(*images: tuple[bool, GlassMode]) -> list[_RunningEstimate]:
@@ -125,7 +125,7 @@ def _render_layers(
     layers = {name: image.light for name, image in estimates.items()}
     layers["photo"] = lit_from_behind.light + lit_from_front.light
     layers |= {"background": background.light, "mirror": mirror.light}
-    return LightSample(scene, **{name: _to_tensor(light, denoise) for name, light in layers.items()})
+    return LinearSample(scene, **{name: _to_tensor(light, denoise) for name, light in layers.items()})
 
 
 def _to_tensor(light: NDArray[np.float64], denoise: bool) -> Tensor:
