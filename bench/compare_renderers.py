@@ -56,12 +56,16 @@ SCENES = {
     "double, paper orders, near": Scene(
         camera=CAMERA, orders="paper", glass=Glazing(panes=(THICK, CLEAR), gap_mm=12), **NEAR
     ),
-    "wedge": Scene(camera=CAMERA, samples=64, glass=Glazing(panes=(Pane(wedge_deg=0.2),)), **FAR),
+    "wedge": Scene(camera=CAMERA, samples_per_pixel=64, glass=Glazing(panes=(Pane(wedge_deg=0.2),)), **FAR),
     "near planes on both sides": Scene(camera=CAMERA, glass=Glazing(panes=(THICK,)), **NEAR),
     "lens, far": Scene(camera=LENS, **FAR),
-    "lens, near": Scene(camera=LENS, samples=256, glass=Glazing(panes=(THICK,)), **NEAR),
-    "rough 0.05": Scene(camera=CAMERA, samples=256, glass=Glazing(panes=(Pane(roughness=0.05),)), **FAR),
-    "rough 0.2": Scene(camera=CAMERA, samples=256, glass=Glazing(panes=(Pane(roughness=0.2),)), **FAR),
+    "lens, near": Scene(camera=LENS, samples_per_pixel=256, glass=Glazing(panes=(THICK,)), **NEAR),
+    "rough 0.05": Scene(
+        camera=CAMERA, samples_per_pixel=256, glass=Glazing(panes=(Pane(roughness=0.05),)), **FAR
+    ),
+    "rough 0.2": Scene(
+        camera=CAMERA, samples_per_pixel=256, glass=Glazing(panes=(Pane(roughness=0.2),)), **FAR
+    ),
     "45 degrees": Scene(
         camera=CAMERA.model_copy(update={"heading_deg": 45.0, "position_mm": (-700.0, 0.0, 700.0)}), **FAR
     ),

@@ -147,7 +147,7 @@ def random_scenes(draw, **fixed):
     heading, pitch = draw(st.floats(-30, 30)), draw(st.floats(-15, 15))
     values = {
         "seed": draw(st.integers(0, 99)),
-        "samples": draw(st.integers(1, 5)),
+        "samples_per_pixel": draw(st.integers(1, 5)),
         "orders": draw(st.sampled_from(["all", "paper"])),
         "behind": draw(st.sampled_from(SIDES)),
         "front": draw(st.sampled_from(SIDES)),

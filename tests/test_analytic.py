@@ -107,7 +107,7 @@ def test_glass_with_index_one_is_invisible(side, count, aperture_mm):
         panes=[{"index": 1.0, "thickness_mm": 20.0}] * count,
         behind=sides[side],
         front=sides[side],
-        samples=4,
+        samples_per_pixel=4,
     )
     sample = render(scene, ASSETS)
     torch.testing.assert_close(sample.transmission, sample.background, rtol=1e-4, atol=1e-4)
@@ -130,7 +130,7 @@ def test_in_uniform_light_every_pixel_equals_the_closed_form(side, aperture_mm, 
         behind=UNIFORM_SIDES[side],
         front=UNIFORM_SIDES[side],
         orders=orders,
-        samples=16,
+        samples_per_pixel=16,
     )
     sample = render(scene, ASSETS)
     transmittance, reflectance = closed_form(scene, all_orders if orders == "all" else paper_orders)
@@ -148,7 +148,7 @@ def test_far_light_has_no_ghost_in_parallel_glass():
         panes=[{"thickness_mm": 30.0}, {}],
         front=map_side("mottled"),
         behind=map_side("mottled", heading_deg=90),
-        samples=1,
+        samples_per_pixel=1,
     )
     sample = render(scene, ASSETS)
     transmittance, reflectance = closed_form(scene)
@@ -172,7 +172,11 @@ def test_content_behind_a_thick_pane_appears_nearer_by_a_third_of_its_thickness(
 def test_a_wedge_deflects_rays_by_half_its_angle():
     light = SyntheticAssets(sun=map_with_bright_texel(256, 128, 0))
     scene = make_scene(
-        camera={"fov_deg": 10}, panes=[{"wedge_deg": 2.0}], behind=map_side("sun"), orders="paper", samples=64
+        camera={"fov_deg": 10},
+        panes=[{"wedge_deg": 2.0}],
+        behind=map_side("sun"),
+        orders="paper",
+        samples_per_pixel=64,
     )
     sample = render(scene, light)
     (deflected_x, _), (straight_x, _) = centroid(sample.transmission), centroid(sample.background)
@@ -186,7 +190,7 @@ def test_a_very_small_wedge_renders_like_parallel_glass():
             panes=[{"wedge_deg": wedge_deg}],
             behind=map_side("soft", heading_deg=40),
             front=map_side("soft"),
-            samples=256,
+            samples_per_pixel=256,
         )
         for wedge_deg in (0.0, 1e-6)
     )
@@ -216,7 +220,7 @@ def test_a_camera_that_turns_right_sees_a_map_move_left(heading_deg):
     for rotation_deg in (0, 5):
         camera = camera_towards_glass(heading_deg + rotation_deg, fov_deg=30)
         scene = make_scene(
-            camera=camera, glass=glass, behind=map_side("sun", heading_deg=heading_deg), samples=16
+            camera=camera, glass=glass, behind=map_side("sun", heading_deg=heading_deg), samples_per_pixel=16
         )
         positions.append(centroid(render(scene, light).background))
     half_texel = 360 / 128 / 2
@@ -326,7 +330,7 @@ def test_a_sun_of_one_texel_does_not_flicker(texels):
     for tenth in range(10):
         rotation_deg = tenth / 10 * fov_deg / 32
         camera = camera_towards_glass(rotation_deg, rotation_deg / 2, fov_deg=fov_deg, width=32, height=32)
-        sample = render(make_scene(camera=camera, behind=map_side("sun"), samples=36), light)
+        sample = render(make_scene(camera=camera, behind=map_side("sun"), samples_per_pixel=36), light)
         energies.append(float(sample.background.sum()))
     assert max(energies) / min(energies) < 1.01
 
@@ -342,16 +346,16 @@ GLASS_KINDS = {
 
 @pytest.mark.parametrize("kind", sorted(GLASS_KINDS))
 def test_the_same_scene_gives_the_same_bytes(kind):
-    one, other = (render(make_scene(**GLASS_KINDS[kind], samples=4), ASSETS) for _ in range(2))
+    one, other = (render(make_scene(**GLASS_KINDS[kind], samples_per_pixel=4), ASSETS) for _ in range(2))
     for first, second in zip(one.layers().values(), other.layers().values(), strict=True):
         assert first.numpy().tobytes() == second.numpy().tobytes()
 
 
 @pytest.mark.parametrize("kind", sorted(GLASS_KINDS))
 def test_the_result_does_not_depend_on_the_batch_size(kind, monkeypatch):
-    one_batch = render(make_scene(**GLASS_KINDS[kind], samples=4), ASSETS)
+    one_batch = render(make_scene(**GLASS_KINDS[kind], samples_per_pixel=4), ASSETS)
     monkeypatch.setattr(analytic, "_CPU_BATCH_RAYS", 100)
-    many_batches = render(make_scene(**GLASS_KINDS[kind], samples=4), ASSETS)
+    many_batches = render(make_scene(**GLASS_KINDS[kind], samples_per_pixel=4), ASSETS)
     for first, second in zip(one_batch.layers().values(), many_batches.layers().values(), strict=True):
         if kind == "rough":  # orders end by their mean weight over a batch
             assert float(first.mean()) == pytest.approx(float(second.mean()), rel=2e-3)
@@ -360,7 +364,7 @@ def test_the_result_does_not_depend_on_the_batch_size(kind, monkeypatch):
 
 
 def test_another_index_changes_the_random_numbers_and_not_the_means():
-    scene = make_scene(panes=[{"wedge_deg": 0.5}], behind=map_side("mottled"), samples=16)
+    scene = make_scene(panes=[{"wedge_deg": 0.5}], behind=map_side("mottled"), samples_per_pixel=16)
     one, other = (render(scene.model_copy(update={"index": index}), ASSETS).background for index in (0, 1))
     assert not torch.equal(one, other)
     assert float(one.mean()) == pytest.approx(float(other.mean()), rel=2e-3)

@@ -131,7 +131,7 @@ LPIPS = {
     3: {"lpips": 0.033937, "lpips_region": 0.035948, "lpips_reflection": 0.283549},
 }
 SCENES = {
-    3: {"tiny": "7d49420486cdb652", "window": "a31d31ac2db96e55"},
+    3: {"tiny": "6632827f5823f193", "window": "d1d3b9dd045146bd"},
 }
 SAMPLES = {
     3: {
@@ -269,7 +269,7 @@ def test_a_changed_rendering_needs_a_new_sample_format():
         panes=[{"absorption_per_m": (20.0, 5.0, 10.0)}, {}],
         behind=plane_side("soft"),
         front=map_side("soft", radius_mm=4000.0, luminance=2.0),
-        samples=4,
+        samples_per_pixel=4,
         seed=5,
     )
     sample = render(scene, ASSETS)

@@ -260,7 +260,9 @@ def render_mirrored_line(incidence_deg, thickness_mm):
         width_mm=20 / math.cos(slant) ** 2,
         offset_mm=(away * math.tan(slant) + 10 / 64 / math.cos(slant) ** 2, 0),
     )
-    scene = make_scene(camera=camera, panes=[{"thickness_mm": thickness_mm}], front=line, samples=25)
+    scene = make_scene(
+        camera=camera, panes=[{"thickness_mm": thickness_mm}], front=line, samples_per_pixel=25
+    )
     columns = render(scene, ASSETS).reflection.mean((0, 1)).numpy()
     return columns, scene.camera.pixel_rad * (before + away) / math.cos(slant)
 

@@ -32,7 +32,7 @@ def problems(tmp_path):
 def test_all_problems_are_reported_at_once_with_file_key_value_and_what_is_allowed(problems):
     text = """
 name = "mine"
-samples = 0
+samples_per_pixel = 0
 [glass]
 double_probability = 2
 thickness_mm = [5, 4]
@@ -43,7 +43,7 @@ contrast = [0, 1]
 """
     assert problems(text) == [
         "mine.toml: about is missing; expected a string; add it.",
-        "mine.toml: samples is 0; expected an integer, above 0; compare with docs/recipes.md.",
+        "mine.toml: samples_per_pixel is 0; expected an integer, above 0; compare with docs/recipes.md.",
         "mine.toml: glass.double_probability is 2; expected a number, from 0 to 1; compare with docs/recipes.md.",
         (
             "mine.toml: glass.thickness_mm is [5, 4]; expected low <= high, but low is 5 and high is 4; compare with"
@@ -97,13 +97,13 @@ def test_an_error_with_several_problems_survives_another_process(problems, tmp_p
 
 
 def test_the_command_prints_a_line_for_each_problem(run_without_model, tmp_path):
-    (tmp_path / "mine.toml").write_text("samples = 0")
+    (tmp_path / "mine.toml").write_text("samples_per_pixel = 0")
     code, out, err = run_without_model("render", "out", "--recipe", "mine.toml")
     assert (code, out) == (1, b"")
     assert [line.split(";")[0] for line in err.splitlines()] == [
         "error: mine.toml: name is missing",
         "error: mine.toml: about is missing",
-        "error: mine.toml: samples is 0",
+        "error: mine.toml: samples_per_pixel is 0",
     ]
 
 

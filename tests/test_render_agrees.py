@@ -15,7 +15,7 @@ SCENE = make_scene(
     panes=[{"thickness_mm": 12.0, "absorption_per_m": (20.0, 5.0, 30.0)}],
     behind=plane_side("mottled", width_mm=900),
     front=plane_side("mottled", width_mm=400, offset_mm=(420.0, 0.0)),
-    samples=64,
+    samples_per_pixel=64,
 )
 RUNS = 4
 

@@ -102,7 +102,7 @@ def test_a_picture_behind_the_glass_fills_the_view():
     for index in range(12):
         scene = drawn(recipe, index)
         white = SyntheticAssets(**{scene.behind.plane.source.file: ASSETS.pictures["white"][:, :24]})
-        scene = scene.model_copy(update={"front": Scene().front, "samples": 4})
+        scene = scene.model_copy(update={"front": Scene().front, "samples_per_pixel": 4})
         sample = render(scene, white)
         assert float(sample.background.min()) > 0.99 * scene.behind.plane.luminance
         assert float(sample.transmission.min()) > 0.4 * scene.behind.plane.luminance
@@ -115,8 +115,10 @@ def test_the_camera_distance_is_within_the_range_of_the_recipe(fifty):
 
 
 def test_rough_glass_gets_more_rays():
-    asked = changed("tiny", glass={"rough_probability": 1.0}).model_copy(update={"rough_samples": 77})
-    assert drawn(asked, 0).samples == 77
+    asked = changed("tiny", glass={"rough_probability": 1.0}).model_copy(
+        update={"rough_samples_per_pixel": 77}
+    )
+    assert drawn(asked, 0).samples_per_pixel == 77
     assert drawn(asked, 0).glass.is_rough
 
 

@@ -158,9 +158,9 @@ def _render_deterministic(prepared: _PreparedScene) -> list[Tensor]:
 
 
 def _grid_size(prepared: _PreparedScene) -> int:
-    """Rays per pixel and axis: ceil(3 * texels per pixel), at most sqrt(samples); textures are filtered to match."""
+    """Rays per pixel and axis: ceil(3 * texels per pixel), at most sqrt(samples_per_pixel); textures are filtered to match."""
     finest = max(side.emitters.texels_per_pixel() for side in (prepared.behind, prepared.front))
-    return min(max(1, math.ceil(3 * finest)), math.isqrt(prepared.scene.samples))
+    return min(max(1, math.ceil(3 * finest)), math.isqrt(prepared.scene.samples_per_pixel))
 
 
 def _pinhole_rays(
@@ -191,23 +191,23 @@ def _pinhole_rays(
 
 
 def _render_monte_carlo(prepared: _PreparedScene, device: Device) -> list[Tensor]:
-    """Traces `samples` random rays per pixel, over the pixel, the lens and the microfacets of rough glass.
+    """Traces `samples_per_pixel` random rays per pixel, over the pixel, the lens and the microfacets of rough glass.
 
     Returns:
         I, T, B, R and MR, (3, H, W) each.
     """
     scene, camera = prepared.scene, prepared.scene.camera
     count = camera.width * camera.height
-    sobol = SobolPoints(scene.seed, scene.index, count, scene.samples, device)
+    sobol = SobolPoints(scene.seed, scene.index, count, scene.samples_per_pixel, device)
     trace = _trace_rough if scene.glass.is_rough or scene.glass.is_wedged else _trace_smooth
     total = torch.zeros(5, 3, count, device=prepared.origin.device)
     for start in range(0, count, _CPU_BATCH_RAYS):
         pixels = slice(start, min(start + _CPU_BATCH_RAYS, count))
-        for sample in range(scene.samples):
+        for sample in range(scene.samples_per_pixel):
             sobol.start_sample(sample, pixels)
             rays = _thin_lens_rays(prepared, pixels, sobol)
             total[:, :, pixels] += torch.stack(trace(prepared, rays, sobol))
-    return list((total / scene.samples).view(5, 3, camera.height, camera.width))
+    return list((total / scene.samples_per_pixel).view(5, 3, camera.height, camera.width))
 
 
 def _thin_lens_rays(prepared: _PreparedScene, pixels: slice, sobol: SobolPoints) -> Rays:
@@ -224,7 +224,7 @@ def _thin_lens_rays(prepared: _PreparedScene, pixels: slice, sobol: SobolPoints)
         lens = _outer(prepared.right, x) + _outer(prepared.up, y)
         origin, direction = origin + lens, direction - lens / camera.focus_mm
     # Half the mean distance of the samples in a pixel: the average over the samples filters, too.
-    return Rays(origin, normalize(direction), 1 / (2 * math.sqrt(prepared.scene.samples)))
+    return Rays(origin, normalize(direction), 1 / (2 * math.sqrt(prepared.scene.samples_per_pixel)))
 
 
 def _outer(axis: Tensor, values: Tensor) -> Tensor:

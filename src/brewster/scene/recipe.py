@@ -163,10 +163,10 @@ class SceneRecipe(FrozenModel):
     orders: Literal["all", "paper"] = "all"
     """Light paths in T and R. all: all orders of reflection, so that I = T + R. paper: T contains only the
     path without a reflection, R only paths that do not enter the last pane."""
-    samples: PositiveInt = 8
+    samples_per_pixel: PositiveInt = 8
     """Rays per pixel of scenes that need Monte Carlo sampling (a wedged pane, or a lens and near content), and the maximum
     for other scenes without rough glass."""
-    rough_samples: PositiveInt = 16
+    rough_samples_per_pixel: PositiveInt = 16
     """Rays per pixel for scenes with rough glass."""
     glass: GlassRecipe = GlassRecipe()
     camera: CameraRecipe = CameraRecipe()

@@ -54,7 +54,7 @@ class Scene(FrozenModel):
     version: str = ""
     """The version of brewster that drew the scene."""
     orders: Literal["all", "paper"] = "all"
-    samples: PositiveInt = 16
+    samples_per_pixel: PositiveInt = 16
     """Rays per pixel of scenes with rough or wedged glass, or with a lens and near content; the maximum for others."""
     glass: Glazing = Glazing()
     camera: Camera = Camera()
