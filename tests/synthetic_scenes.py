@@ -153,7 +153,7 @@ def random_scenes(draw, **fixed):
         "front": draw(st.sampled_from(SIDES)),
         "panes": [
             {
-                "index": draw(st.floats(1.3, 2)),
+                "refractive_index": draw(st.floats(1.3, 2)),
                 "thickness_mm": draw(st.floats(1, 20)),
                 "absorption_per_m": tint,
                 "roughness": 0.1 if kind == "rough" else 0.0,

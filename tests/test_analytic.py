@@ -104,7 +104,7 @@ def test_glass_with_index_one_is_invisible(side, count, aperture_mm):
     }
     scene = make_scene(
         camera=camera_towards_glass(15, 5, aperture_mm=aperture_mm),
-        panes=[{"index": 1.0, "thickness_mm": 20.0}] * count,
+        panes=[{"refractive_index": 1.0, "thickness_mm": 20.0}] * count,
         behind=sides[side],
         front=sides[side],
         samples_per_pixel=4,
@@ -122,7 +122,7 @@ def test_glass_with_index_one_is_invisible(side, count, aperture_mm):
 def test_in_uniform_light_every_pixel_equals_the_closed_form(side, aperture_mm, orders):
     panes = [
         {"thickness_mm": 6.0, "absorption_per_m": (4.0, 1.5, 20.0)},
-        {"index": 1.7, "absorption_per_m": (2.0, 9.0, 1.0)},
+        {"refractive_index": 1.7, "absorption_per_m": (2.0, 9.0, 1.0)},
     ]
     scene = make_scene(
         camera=camera_towards_glass(30, aperture_mm=aperture_mm, focus_mm=800),

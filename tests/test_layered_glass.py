@@ -29,7 +29,7 @@ COSINES = st.floats(0.05, 1)
 INDICES = st.floats(1, 2)
 TINTS = st.tuples(*[st.floats(0, 100)] * 3)
 PANES = st.lists(
-    st.builds(Pane, index=INDICES, thickness_mm=st.floats(1, 50), absorption_per_m=TINTS),
+    st.builds(Pane, refractive_index=INDICES, thickness_mm=st.floats(1, 50), absorption_per_m=TINTS),
     min_size=1,
     max_size=3,
 )
@@ -57,7 +57,9 @@ def surface_reflectances(cosine, index_in, index_out):
 
 def pane_throughputs(pane, cosine):
     """T and R of one clear pane for s- and p-polarised light: all orders as a geometric series."""
-    return [((1 - r) / (1 + r), 2 * r / (1 + r)) for r in surface_reflectances(cosine, 1, pane.index)]
+    return [
+        ((1 - r) / (1 + r), 2 * r / (1 + r)) for r in surface_reflectances(cosine, 1, pane.refractive_index)
+    ]
 
 
 def test_a_pane_of_ordinary_glass_reflects_about_eight_percent():
@@ -121,7 +123,7 @@ def test_a_stack_has_the_same_transmittance_from_both_sides(panes, cosine):
 @examples_40
 @given(COSINES, st.floats(1.01, 2.5), st.floats(1.01, 2.5))
 def test_double_glazing_follows_the_adding_formula(cosine, first, second):
-    panes = [Pane(index=first), Pane(index=second)]
+    panes = [Pane(refractive_index=first), Pane(refractive_index=second)]
     transmittance = reflectance = 0.0
     for (t1, r1), (t2, r2) in zip(
         pane_throughputs(panes[0], cosine), pane_throughputs(panes[1], cosine), strict=True
@@ -155,7 +157,9 @@ def test_absorption_follows_the_beer_lambert_law():
 
 
 def orders_of(panes, cosine):
-    return enumerate_orders(tuple(float(sum(fresnel(float64(cosine), pane.index))) / 2 for pane in panes))
+    return enumerate_orders(
+        tuple(float(sum(fresnel(float64(cosine), pane.refractive_index))) / 2 for pane in panes)
+    )
 
 
 @settings(max_examples=40, phases=[Phase.generate], deadline=None, database=None)
@@ -235,12 +239,15 @@ def test_the_ghost_distance_matches_the_textbook_formula():
     assert ghost_distance_mm(Pane(thickness_mm=6), 45) == pytest.approx(expected, rel=1e-9)
     assert ghost_distance_mm(Pane(thickness_mm=6), 45) == pytest.approx(4.5356, abs=1e-4)
     assert ghost_distance_mm(Pane(), 0) == 0
-    assert ghost_distance_mm(Pane(index=1.0), 60) == pytest.approx(8 * math.sin(math.radians(60)), rel=1e-9)
+    assert ghost_distance_mm(Pane(refractive_index=1.0), 60) == pytest.approx(
+        8 * math.sin(math.radians(60)), rel=1e-9
+    )
 
 
 def test_lateral_shifts_follow_snells_law_in_glass_and_are_unrefracted_in_the_gap():
     first, gap, second = lateral_shifts_mm(
-        Glazing(panes=(Pane(thickness_mm=3), Pane(thickness_mm=8, index=2)), gap_mm=16), float64(0.5)
+        Glazing(panes=(Pane(thickness_mm=3), Pane(thickness_mm=8, refractive_index=2)), gap_mm=16),
+        float64(0.5),
     )
     sine = math.sin(math.radians(60))
     assert float(first) == pytest.approx(3 * math.tan(math.asin(sine / 1.5)), rel=1e-9)

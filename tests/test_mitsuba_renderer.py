@@ -81,7 +81,7 @@ def pane_reflectances(incidence_deg, index=1.5):
 
 
 def test_glass_with_index_one_is_invisible():
-    sample = traced(a_scene(behind=around("mottled"), glass=Glazing(panes=(Pane(index=1.0),))))
+    sample = traced(a_scene(behind=around("mottled"), glass=Glazing(panes=(Pane(refractive_index=1.0),))))
     assert sample.photo.shape == (3, 32, 32)
     assert float((sample.transmission - sample.background).abs().max()) < 0.02
     assert float(sample.reflection.abs().max()) == 0

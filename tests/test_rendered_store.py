@@ -150,7 +150,7 @@ def test_the_index_has_a_row_with_the_parameters_of_each_sample(four_samples, mo
     for row, entry in zip(table, store.read_set(four_samples), strict=True):
         _, scene = store.open_sample(entry)
         pane = scene.glass.panes[0]
-        assert (row["thickness_mm"], row["refractive_index"]) == (pane.thickness_mm, pane.index)
+        assert (row["thickness_mm"], row["refractive_index"]) == (pane.thickness_mm, pane.refractive_index)
         assert row["panes"] == len(scene.glass.panes)
         assert row["absorption_blue_per_m"] == pane.absorption_per_m[2]
         assert row["front_map_file"] == (scene.front.map and scene.front.map.source.file)

@@ -53,7 +53,10 @@ def test_the_outcome_of_a_scene_is_ignored(written):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("[[glass.panes]]\nindex = 0.9", r"glass\.panes\.0\.index is 0.9; expected a number, from 1 to 3"),
+        (
+            "[[glass.panes]]\nrefractive_index = 0.9",
+            r"glass\.panes\.0\.refractive_index is 0.9; expected a number, from 1 to 3",
+        ),
         ("[glass]\ngap_mm = -1", r"glass\.gap_mm is -1; .*at least 0"),
         ("[[glass.panes]]\n[[glass.panes]]", "expected a gap_mm above 0 between several panes"),
         ("glass.radii_mm = [100, 100]", "expected one pane, .* and a frame"),
@@ -99,10 +102,13 @@ def test_an_impossible_scene_is_refused_and_the_value_named(text, says, written)
     ("text", "says"),
     [
         (
-            "glass.index = [1.6, 1.5]",
-            r"glass\.index is \[1.6, 1.5\]; expected low <= high, but low is 1.6 and high is 1.5",
+            "glass.refractive_index = [1.6, 1.5]",
+            r"glass\.refractive_index is \[1.6, 1.5\]; expected low <= high, but low is 1.6 and high is 1.5",
         ),
-        ("glass.index = [0.9, 1.5]", "expected an index of at least 1, but it starts at 0.9"),
+        (
+            "glass.refractive_index = [0.9, 1.5]",
+            "expected a refractive_index of at least 1, but it starts at 0.9",
+        ),
         ("glass.gap_mm = [0, 1]\nglass.double_probability = 0.5", "expected a gap_mm above 0"),
         ("glass.thickness_mm = [0, 1]", r"glass\.thickness_mm\.0 is 0; .*above 0"),
         ("glass.tints = []", "at least one colour"),

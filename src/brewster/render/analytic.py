@@ -301,7 +301,7 @@ def _group_orders(scene: Scene, emitters: SideEmitters, *, behind: bool) -> list
     if not emitters.is_near:
         return []
     cosine = _min_cosine(scene)
-    reflectances = (float(sum(fresnel(cosine, pane.index))) / 2 for pane in scene.glass.panes)
+    reflectances = (float(sum(fresnel(cosine, pane.refractive_index))) / 2 for pane in scene.glass.panes)
     table = enumerate_orders(tuple(round(min(r, _MAX_TABLE_REFLECTANCE), 3) for r in reflectances))
     shifts = lateral_shifts_mm(scene.glass, cosine)
     pixel_mm = scene.camera.pixel_rad * (scene.camera_above_glass_mm + emitters.distance_mm)

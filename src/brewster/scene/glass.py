@@ -15,14 +15,14 @@ from brewster.scene.values import FrozenModel, NonNegativeFloat, PositiveFloat
 Point = tuple[float, float, float]
 """World coordinates in mm: x to the right, y up, -z forward."""
 
-DEFAULT_INDEX = 1.5
+DEFAULT_REFRACTIVE_INDEX = 1.5
 
 
 class Pane(FrozenModel):
     """One sheet of glass. Its far surface is rotated by `wedge_deg` about the vertical axis."""
 
     thickness_mm: Annotated[float, Field(gt=0, le=200)] = 4.0
-    index: Annotated[float, Field(ge=1, le=3)] = DEFAULT_INDEX
+    refractive_index: Annotated[float, Field(ge=1, le=3)] = DEFAULT_REFRACTIVE_INDEX
     absorption_per_m: tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat] = (0.0, 0.0, 0.0)
     """Beer-Lambert absorption coefficients for red, green and blue."""
     roughness: Annotated[float, Field(ge=0, le=1)] = 0.0

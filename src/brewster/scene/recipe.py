@@ -46,7 +46,7 @@ class GlassRecipe(FrozenModel):
     """Probability of thick structural glass."""
     structural_thickness_mm: LogRange = (10.0, 40.0)
     """Thickness of a pane of structural glass."""
-    index: Range = (1.45, 1.65)
+    refractive_index: Range = (1.45, 1.65)
     """Refractive index, the same for all panes of a scene; at least 1."""
     tints: Annotated[
         tuple[tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat], ...], KeyNote(unit="1/m")
@@ -68,8 +68,10 @@ class GlassRecipe(FrozenModel):
 
     @model_validator(mode="after")
     def _check_values(self) -> Self:
-        if self.index[0] < 1:
-            raise ValueError(f"expected an index of at least 1, but it starts at {self.index[0]:g}")
+        if self.refractive_index[0] < 1:
+            raise ValueError(
+                f"expected a refractive_index of at least 1, but it starts at {self.refractive_index[0]:g}"
+            )
         if self.gap_mm[0] <= 0 and self.double_probability:
             raise ValueError(
                 f"expected a gap_mm above 0 for double glazing, but it starts at {self.gap_mm[0]:g}"

@@ -119,14 +119,14 @@ def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
     rough = rng.from_log_range(recipe.roughness) if rng.bernoulli(recipe.rough_probability) else 0.0
     wedged = rng.bernoulli(recipe.wedge_probability)
     red, green, blue = (_six_digits(colour * strength) for colour in tint)
-    index = rng.from_range(recipe.index)
+    refractive_index = rng.from_range(recipe.refractive_index)
 
     def pane() -> Pane:
         return Pane(
             thickness_mm=rng.from_log_range(
                 recipe.structural_thickness_mm if structural else recipe.thickness_mm
             ),
-            index=index,
+            refractive_index=refractive_index,
             absorption_per_m=(red, green, blue),
             roughness=rough,
             wedge_deg=rng.from_log_range(recipe.wedge_deg) * rng.choice((-1, 1)) if wedged else 0.0,

@@ -185,13 +185,17 @@ class MitsubaSceneBuilder:
         """Whether light enters the pane, and the materials of its surfaces and its interior."""
         if glass == "mirror":
             return False, {"bsdf": {"type": "conductor", "material": "none"}}
-        rough = {"alpha": pane.roughness, "distribution": "ggx"} if pane.roughness and pane.index > 1 else {}
+        rough = (
+            {"alpha": pane.roughness, "distribution": "ggx"}
+            if pane.roughness and pane.refractive_index > 1
+            else {}
+        )
         kind = "rough" if rough else ""
         if glass == "paper_reflection" and pane is self._glass.panes[-1]:
             # A conductor with k = 0 has the reflectance of glass, and no ray is spent on transmission.
-            index = {"type": "spectrum", "value": pane.index}
+            index = {"type": "spectrum", "value": pane.refractive_index}
             return False, {"bsdf": {"type": kind + "conductor", "eta": index, "k": 0.0, **rough}}
-        bsdf = {"type": kind + "dielectric", "int_ior": pane.index, "ext_ior": 1.0, **rough}
+        bsdf = {"type": kind + "dielectric", "int_ior": pane.refractive_index, "ext_ior": 1.0, **rough}
         if glass == "paper_transmission":
             bsdf["specular_reflectance"] = 0.0
         return True, {"bsdf": bsdf, **self._interior_medium(pane)}

@@ -42,7 +42,7 @@ def fresnel(cosine: Tensor, index: float) -> tuple[Tensor, Tensor]:
 def internal_transmittance(pane: Pane, cosine: Tensor) -> Tensor:
     """Share of the light left after one traversal of the pane, (3, ...) for RGB (Beer-Lambert law)."""
     absorption = torch.tensor(pane.absorption_per_m, dtype=cosine.dtype, device=cosine.device)
-    path_m = pane.thickness_mm / 1000 / refracted_cosine(cosine, pane.index)
+    path_m = pane.thickness_mm / 1000 / refracted_cosine(cosine, pane.refractive_index)
     return torch.exp(-absorption.view(3, *[1] * cosine.ndim) * path_m)
 
 
@@ -76,7 +76,7 @@ def _by_polarisation(glazing: Glazing, cosine: Tensor) -> list[list[_SurfaceAndI
     interiors = [
         internal_transmittance(pane, cosine) if any(pane.absorption_per_m) else 1.0 for pane in glazing.panes
     ]
-    surfaces = [fresnel(cosine, pane.index) for pane in glazing.panes]
+    surfaces = [fresnel(cosine, pane.refractive_index) for pane in glazing.panes]
     return [[(r[which], a) for r, a in zip(surfaces, interiors, strict=True)] for which in (0, 1)]
 
 
@@ -220,7 +220,7 @@ def order_throughputs(glazing: Glazing, cosine: Tensor, table: Sequence[Reflecti
     ]
     polarised = [
         [(_powers(r), _powers(1 - r)) for r in surfaces]
-        for surfaces in zip(*(fresnel(cosine, pane.index) for pane in glazing.panes), strict=True)
+        for surfaces in zip(*(fresnel(cosine, pane.refractive_index) for pane in glazing.panes), strict=True)
     ]
     throughputs = []
     for order in table:
@@ -269,7 +269,7 @@ def lateral_shifts_mm(glazing: Glazing, cosine: Tensor) -> list[Tensor]:
     """Shift of a ray along the glass per traversal of each layer (pane, gap, pane...), in mm, (...) each."""
     shifts = []
     for pane in glazing.panes:
-        inside = refracted_cosine(cosine, pane.index)
+        inside = refracted_cosine(cosine, pane.refractive_index)
         shifts += [pane.thickness_mm * _tangent(inside), glazing.gap_mm * _tangent(cosine)]
     return shifts[:-1]
 
@@ -284,4 +284,4 @@ def ghost_distance_mm(pane: Pane, incidence_deg: float) -> float:
     2 t tan(theta_t) cos(theta_i), with the thickness t, the angle of incidence theta_i and that of refraction theta_t.
     """
     cosine = torch.tensor(math.cos(math.radians(incidence_deg)), dtype=torch.float64)
-    return float(2 * pane.thickness_mm * _tangent(refracted_cosine(cosine, pane.index)) * cosine)
+    return float(2 * pane.thickness_mm * _tangent(refracted_cosine(cosine, pane.refractive_index)) * cosine)

@@ -36,7 +36,7 @@ class Surface:
     height_mm: float
     normal: Tensor
     alpha: float
-    index: float
+    refractive_index: float
     glass_is_below: bool
     absorption: Tensor
     """Absorption of the pane that the surface belongs to, per mm, (3, 1)."""
@@ -79,8 +79,10 @@ def surfaces(glass: Glazing, like: Tensor) -> list[Surface]:
             wedge = torch.tensor(pane.wedge_deg if far else 0.0).deg2rad()
             normal = like.new_tensor([wedge.sin(), 0, wedge.cos()])[:, None]
             height -= pane.thickness_mm if far else 0.0
-            alpha = pane.roughness if pane.index > 1 else 0.0  # without refraction there is no scattering
-            stack.append(Surface(height, normal, alpha, pane.index, not far, absorption))
+            alpha = (
+                pane.roughness if pane.refractive_index > 1 else 0.0
+            )  # without refraction there is no scattering
+            stack.append(Surface(height, normal, alpha, pane.refractive_index, not far, absorption))
         height -= glass.gap_mm
     return stack
 
@@ -152,7 +154,7 @@ def _interact(
     normal = surface.normal if path.down else -surface.normal
     wi = -path.direction
     facet = sample_visible_normal(wi, normal, surface.alpha, sobol.next_2d()) if surface.alpha else normal
-    index_in, index_out = (surface.index, 1.0) if in_glass else (1.0, surface.index)
+    index_in, index_out = (surface.refractive_index, 1.0) if in_glass else (1.0, surface.refractive_index)
     for reflects in (True, False):
         interaction = _SurfaceInteraction(wi, normal, surface.alpha, index_in, index_out, reflects, before)
         direction = _scattered_direction(interaction, facet)
