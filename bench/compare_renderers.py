@@ -94,7 +94,7 @@ def compare(scene: Scene, assets: Assets, samples: int) -> list[str]:
         ours = render(scene, assets), render(_reseeded(scene, 1), assets)
     polarised = scene.camera.heading_deg > 30  # elsewhere, s and p hardly differ
     theirs = tuple(
-        trace(_reseeded(scene, seed), assets, noise=0, max_samples=samples, polarised=polarised)
+        trace(_reseeded(scene, seed), assets, noise_threshold=0, max_samples=samples, polarised=polarised)
         for seed in (2, 3)
     )
     return [_row(name, ours, theirs) for name in LAYERS]

@@ -74,10 +74,10 @@ def measure_mitsuba(
         CPU-seconds at TARGET_ERROR, the last error, the last rays per pixel, and whether the seconds are extrapolated.
     """
     samples = 4
-    trace(scene, assets, noise=0, max_samples=samples, denoise=denoise)  # compiles the kernels
+    trace(scene, assets, noise_threshold=0, max_samples=samples, denoise=denoise)  # compiles the kernels
     while True:
         start = time.process_time()
-        traced = trace(scene, assets, noise=0, max_samples=samples, denoise=denoise)
+        traced = trace(scene, assets, noise_threshold=0, max_samples=samples, denoise=denoise)
         spent, error = time.process_time() - start, relative_error(traced, reference)
         if error <= TARGET_ERROR:
             return spent, error, samples, False

@@ -51,7 +51,7 @@ def a_scene(**more):
 
 
 def traced(scene, **more):
-    return trace(scene, SyntheticAssets(), **{"noise": 0.01, "max_samples": 512, **more})
+    return trace(scene, SyntheticAssets(), **{"noise_threshold": 0.01, "max_samples": 512, **more})
 
 
 def render_image(scene, side, glass, samples=64):
@@ -88,7 +88,7 @@ def test_glass_with_index_one_is_invisible():
 
 
 def test_a_pane_of_ordinary_glass_reflects_about_eight_percent():
-    sample = traced(a_scene(camera=at(0)), noise=0.003, max_samples=4096)
+    sample = traced(a_scene(camera=at(0)), noise_threshold=0.003, max_samples=4096)
     s, _ = pane_reflectances(0)
     assert float(sample.reflection.mean()) == pytest.approx(s, rel=0.02)
     assert float(sample.transmission.mean()) == pytest.approx(1 - s, rel=0.002)
@@ -96,7 +96,7 @@ def test_a_pane_of_ordinary_glass_reflects_about_eight_percent():
 
 
 def test_the_papers_layers_are_the_first_reflection_and_the_path_without_reflection():
-    sample = traced(a_scene(camera=at(0), orders="paper"), noise=0.002)
+    sample = traced(a_scene(camera=at(0), orders="paper"), noise_threshold=0.002)
     assert float(sample.reflection.mean()) == pytest.approx(0.04, rel=0.001)
     assert float(sample.transmission.mean()) == pytest.approx(0.96**2, rel=0.003)
 
@@ -115,7 +115,7 @@ def test_absorption_in_tinted_panes_follows_the_beer_lambert_law():
 def test_polarised_light_follows_the_closed_form_at_brewsters_angle(compiled):
     """Mitsuba's colour variants average s and p at each surface, which is wrong by an eighth at this angle."""
     camera = {**at(56.31), "width": 16, "height": 16}
-    sample = traced(a_scene(camera=camera), polarised=True, noise=0.01)
+    sample = traced(a_scene(camera=camera), polarised=True, noise_threshold=0.01)
     s, p = pane_reflectances(56.31)
     assert float(sample.reflection.mean()) == pytest.approx((s + p) / 2, rel=0.02)
 
@@ -286,9 +286,10 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_gives_other_bytes()
 def test_the_noise_is_at_most_the_requested_one():
     scene = a_scene(behind=around("mottled"), front=around("mottled"))
     errors = []
-    for noise in (0.05, 0.005):
+    for noise_threshold in (0.05, 0.005):
         one, other = (
-            traced(scene.model_copy(update={"seed": n}), noise=noise, max_samples=4096) for n in (1, 2)
+            traced(scene.model_copy(update={"seed": n}), noise_threshold=noise_threshold, max_samples=4096)
+            for n in (1, 2)
         )
         difference = (one.photo - other.photo).mean(0).abs() / one.photo.mean(0)
         errors.append(float(difference.mean()) * math.sqrt(math.pi) / 2)  # E|a - b| = 2 sigma / sqrt(pi)

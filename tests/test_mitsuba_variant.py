@@ -17,7 +17,7 @@ from test_mitsuba_renderer import SyntheticAssets, a_scene
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     scene = a_scene(camera={"width": 16, "height": 16})
-    light = float(trace(scene, SyntheticAssets(), noise=0.01, max_samples=64).photo.mean())
+    light = float(trace(scene, SyntheticAssets(), noise_threshold=0.01, max_samples=64).photo.mean())
 assert abs(light - 1) < 0.01, light
 import mitsuba
 from brewster.errors import DeviceError

@@ -30,7 +30,10 @@ def traced_layers():
     ):
         patch.setattr(renderer, "_variant", lambda polarised: "scalar_rgb")
         try:
-            samples = [renderer.trace(scene, ASSETS, noise=0.02, max_samples=512).layers() for scene in seeds]
+            samples = [
+                renderer.trace(scene, ASSETS, noise_threshold=0.02, max_samples=512).layers()
+                for scene in seeds
+            ]
         except MissingExtra as error:
             pytest.skip(f"Mitsuba cannot be used: {error}")
     return {name: torch.stack([sample[name] for sample in samples]).double() for name in samples[0]}

@@ -1,6 +1,6 @@
 """The reference renderer: path-traces the five images of any scene with an unmodified Mitsuba 3.
 
-    sample = trace(scene, Assets([Path("hdri")]), noise=0.01)
+    sample = trace(scene, Assets([Path("hdri")]), noise_threshold=0.01)
 
 It shares no optics code with the analytic renderer, so that each validates the other. Each image is lit from one side of
 the glass only; objects on the other side are black. Light is additive: I is the sum of the image lit from behind and the
@@ -40,7 +40,7 @@ def trace(
     scene: Scene,
     assets: Assets,
     *,
-    noise: float = 0.02,
+    noise_threshold: float = 0.02,
     max_samples: int = 4096,
     denoise: bool = False,
     polarised: bool = False,
@@ -48,7 +48,7 @@ def trace(
     """Path-traces the five images of a scene in equal passes, until their noise is low enough.
 
     The error of an image is the mean over its pixels of standard error / (light + 1 % of the mean light); the standard
-    error comes from the variance between passes. An image is finished when its error is below `noise`, or after
+    error comes from the variance between passes. An image is finished when its error is below `noise_threshold`, or after
     `max_samples` rays per pixel. T and R are measured relative to I, their sum: the one that adds more error to I gets
     the next pass. With the paper's orders T and R are rendered separately.
 
@@ -59,7 +59,7 @@ def trace(
     Args:
         scene: what to render.
         assets: the source of its maps and pictures.
-        noise: the relative error below which an image is finished.
+        noise_threshold: the relative error below which an image is finished.
         max_samples: maximum number of rays per pixel and image.
         denoise: whether Intel Open Image Denoise filters the result.
         polarised: whether polarisation is traced.
@@ -79,7 +79,7 @@ def trace(
             MitsubaSceneBuilder(mi, scene, assets, channel)
             for channel in (range(3) if polarised else (None,))
         ]
-        return _render_layers(builders, noise, max_samples, denoise)
+        return _render_layers(builders, noise_threshold, max_samples, denoise)
 
 
 @contextmanager
@@ -106,13 +106,13 @@ def _variant(polarised: bool) -> str:
 
 
 def _render_layers(
-    builders: Sequence[MitsubaSceneBuilder], noise: float, max_samples: int, denoise: bool
+    builders: Sequence[MitsubaSceneBuilder], noise_threshold: float, max_samples: int, denoise: bool
 ) -> LinearSample:
     scene = builders[0].scene
 
     def estimate(*images: tuple[bool, GlassMode]) -> list[_RunningEstimate]:
         estimates = [_RunningEstimate(builders, behind, glass, max_samples) for behind, glass in images]
-        _converge(estimates, noise, max_samples)
+        _converge(estimates, noise_threshold, max_samples)
         return estimates
 
     lit_from_behind, lit_from_front = estimate((True, "full"), (False, "full"))
@@ -195,8 +195,8 @@ def _samples_per_pass(pixels: int, max_samples: int) -> int:
     return next((samples for samples in (64, 16, 4) if samples <= limit), 1)
 
 
-def _converge(estimates: Sequence[_RunningEstimate], noise: float, max_samples: int) -> None:
-    """Adds passes until the error of the sum is at most `noise`; each pass is for the image with the largest error."""
+def _converge(estimates: Sequence[_RunningEstimate], noise_threshold: float, max_samples: int) -> None:
+    """Adds passes until the error of the sum is at most `noise_threshold`; each pass is for the image with the largest error."""
     for estimate in estimates:
         for _ in range(_MIN_PASSES):
             estimate.add_pass()
@@ -204,6 +204,6 @@ def _converge(estimates: Sequence[_RunningEstimate], noise: float, max_samples: 
         light = np.sum([image.light.mean(axis=2) for image in estimates], axis=0)
         scale = light + _RELATIVE_FLOOR * light.mean() + np.finfo(np.float32).tiny
         variances = [image.variance for image in estimates]
-        if (np.sqrt(np.sum(variances, axis=0)) / scale).mean() <= noise:
+        if (np.sqrt(np.sum(variances, axis=0)) / scale).mean() <= noise_threshold:
             return
         max(pending, key=lambda image: float((np.sqrt(image.variance) / scale).mean())).add_pass()
