@@ -47,14 +47,14 @@ FAR = {"behind": Side(map=STREET), "front": Side(map=ROOM)}
 NEAR = {"behind": Side(map=STREET, plane=NEAR_PAINTING), "front": Side(map=DOME, plane=FAR_PAINTING)}
 SCENES = {
     "single, far": Scene(camera=CAMERA, **FAR),
-    "single, paper orders": Scene(camera=CAMERA, orders="paper", **FAR),
+    "single, truncated orders": Scene(camera=CAMERA, orders="truncated", **FAR),
     "tinted, dome": Scene(
         camera=CAMERA, glass=Glazing(panes=(TINTED,)), behind=Side(map=STREET), front=Side(map=DOME)
     ),
     "double": Scene(camera=CAMERA, glass=Glazing(panes=(CLEAR, CLEAR), gap_mm=12), **FAR),
     "double tinted, near": Scene(camera=CAMERA, glass=Glazing(panes=(TINTED, TINTED), gap_mm=12), **NEAR),
-    "double, paper orders, near": Scene(
-        camera=CAMERA, orders="paper", glass=Glazing(panes=(THICK, CLEAR), gap_mm=12), **NEAR
+    "double, truncated orders, near": Scene(
+        camera=CAMERA, orders="truncated", glass=Glazing(panes=(THICK, CLEAR), gap_mm=12), **NEAR
     ),
     "wedge": Scene(camera=CAMERA, samples_per_pixel=64, glass=Glazing(panes=(Pane(wedge_deg=0.2),)), **FAR),
     "near planes on both sides": Scene(camera=CAMERA, glass=Glazing(panes=(THICK,)), **NEAR),

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from brewster.errors import RecipeError
 from brewster.render import analytic
 from brewster.render.analytic import render
-from brewster.render.rays.layered_glass import all_orders, paper_orders
+from brewster.render.rays.layered_glass import total_throughput, truncated_throughput
 from brewster.scene.camera import axes
 from brewster.scene.glass import Glazing, Pane
 from brewster.scene.world import Side
@@ -34,7 +34,7 @@ examples_25, examples_10 = (settings(without_shrinking, max_examples=count) for 
 UNIFORM_SIDES = {"far": map_side(), "dome": map_side(radius_mm=3000.0), "near": plane_side()}
 
 
-def closed_form(scene, throughput_of=all_orders):
+def closed_form(scene, throughput_of=total_throughput):
     """Transmittance and reflectance at the centre of every pixel, (3, H, W) or (1, H, W)."""
     cosine = torch.from_numpy(-pixel_directions(scene.camera) @ np.array([0, 0, 1]))
     throughput = throughput_of(scene.glass, cosine)
@@ -63,15 +63,15 @@ def test_the_photo_is_the_sum_of_its_two_layers(scene):
 @examples_10
 @given(random_scenes(orders="all"))
 def test_the_choice_of_orders_changes_the_layers_and_not_the_photo(scene):
-    complete, paper = (
-        render(scene.model_copy(update={"orders": orders}), ASSETS) for orders in ("all", "paper")
+    complete, truncated = (
+        render(scene.model_copy(update={"orders": orders}), ASSETS) for orders in ("all", "truncated")
     )
     for name in ("photo", "background", "mirror"):
-        assert torch.equal(getattr(complete, name), getattr(paper, name))
+        assert torch.equal(getattr(complete, name), getattr(truncated, name))
     tolerance = 1e-6 * float(complete.photo.max()) + 1e-9
     for name in ("transmission", "reflection"):
-        assert (getattr(paper, name) <= getattr(complete, name) + tolerance).all()
-    assert paper.reflection.sum() < complete.reflection.sum() or (
+        assert (getattr(truncated, name) <= getattr(complete, name) + tolerance).all()
+    assert truncated.reflection.sum() < complete.reflection.sum() or (
         not scene.front.map and not scene.front.plane
     )
 
@@ -118,7 +118,7 @@ def test_glass_with_index_one_is_invisible(side, count, aperture_mm):
 
 @pytest.mark.parametrize("side", sorted(UNIFORM_SIDES))
 @pytest.mark.parametrize("aperture_mm", [0.0, 20.0])
-@pytest.mark.parametrize("orders", ["all", "paper"])
+@pytest.mark.parametrize("orders", ["all", "truncated"])
 def test_in_uniform_light_every_pixel_equals_the_closed_form(side, aperture_mm, orders):
     panes = [
         {"thickness_mm": 6.0, "absorption_per_m": (4.0, 1.5, 20.0)},
@@ -133,7 +133,9 @@ def test_in_uniform_light_every_pixel_equals_the_closed_form(side, aperture_mm, 
         samples_per_pixel=16,
     )
     sample = render(scene, ASSETS)
-    transmittance, reflectance = closed_form(scene, all_orders if orders == "all" else paper_orders)
+    transmittance, reflectance = closed_form(
+        scene, total_throughput if orders == "all" else truncated_throughput
+    )
     torch.testing.assert_close(sample.transmission, transmittance, rtol=2e-3, atol=0)
     torch.testing.assert_close(sample.reflection, reflectance, rtol=1e-2, atol=0)
     assert float(sample.reflection.mean() / reflectance.mean()) == pytest.approx(1, abs=2e-3)
@@ -162,7 +164,7 @@ def test_content_behind_a_thick_pane_appears_nearer_by_a_third_of_its_thickness(
         camera=camera_towards_glass(0, distance_mm=1000, fov_deg=10, width=48, height=48),
         panes=[{"thickness_mm": 90.0}],
         behind=plane_side("mottled", distance_mm=500, width_mm=100),
-        orders="paper",
+        orders="truncated",
     )
     sample = render(scene, ASSETS)
     area_ratio = float(sample.transmission.sum() / sample.background.sum()) / 0.96**2
@@ -175,7 +177,7 @@ def test_a_wedge_deflects_rays_by_half_its_angle():
         camera={"fov_deg": 10},
         panes=[{"wedge_deg": 2.0}],
         behind=map_side("sun"),
-        orders="paper",
+        orders="truncated",
         samples_per_pixel=64,
     )
     sample = render(scene, light)

@@ -95,8 +95,8 @@ def test_a_pane_of_ordinary_glass_reflects_about_eight_percent():
     assert float(sample.photo.mean()) == pytest.approx(1, abs=0.003)
 
 
-def test_the_papers_layers_are_the_first_reflection_and_the_path_without_reflection():
-    sample = traced(a_scene(camera=at(0), orders="paper"), noise_threshold=0.002)
+def test_truncated_layers_are_the_first_reflection_and_the_path_without_reflection():
+    sample = traced(a_scene(camera=at(0), orders="truncated"), noise_threshold=0.002)
     assert float(sample.reflection.mean()) == pytest.approx(0.04, rel=0.001)
     assert float(sample.transmission.mean()) == pytest.approx(0.96**2, rel=0.003)
 
@@ -107,7 +107,7 @@ def test_absorption_in_tinted_panes_follows_the_beer_lambert_law():
         Pane(thickness_mm=5, absorption_per_m=(0, 0, 20)),
     )
     light = render_image(
-        a_scene(camera=at(0), glass=Glazing(panes=panes, gap_mm=10)), "behind", "paper_transmission"
+        a_scene(camera=at(0), glass=Glazing(panes=panes, gap_mm=10)), "behind", "truncated_transmission"
     )
     np.testing.assert_allclose(light.mean((0, 1)), 0.96**4 * np.exp([-0.4, 0, -0.2]), rtol=0.01)
 
@@ -145,12 +145,12 @@ def test_the_right_half_of_a_plane_appears_on_the_right_of_the_image():
     scene = a_scene(behind=board("red right"), front=board("red right"))
     assert (
         red_half(render_image(scene, "behind", "none"))
-        == red_half(render_image(scene, "behind", "paper_transmission"))
+        == red_half(render_image(scene, "behind", "truncated_transmission"))
         == "right"
     )
     assert (
         red_half(render_image(scene, "front", "mirror"))
-        == red_half(render_image(scene, "front", "paper_reflection"))
+        == red_half(render_image(scene, "front", "truncated_reflection"))
         == "left"
     )
 
@@ -237,9 +237,9 @@ def test_a_lens_refracts_light_according_to_the_lensmakers_equation(radii_mm):
     scene = a_scene(glass=glass, behind=board("ramp", distance_mm=far, width_mm=100), camera=camera)
     r1, r2 = radii_mm
     power = 0.5 * (1 / r1 - 1 / r2 + 0.5 * 6 / (1.5 * r1 * r2))
-    assert slope(render_image(scene, "behind", "paper_transmission"), near) * 100 / 0.96**2 == pytest.approx(
-        1 + far / near - far * power, abs=0.02
-    )
+    assert slope(
+        render_image(scene, "behind", "truncated_transmission"), near
+    ) * 100 / 0.96**2 == pytest.approx(1 + far / near - far * power, abs=0.02)
 
 
 def test_the_mirror_image_of_a_lens_is_that_of_its_first_surface():

@@ -134,7 +134,7 @@ def test_the_path_of_a_scene_recipe_is_relative_to_the_recipe(tmp_path):
             r"\[data\.rendered\] are inconsistent; .* exactly one of the two",
         ),
         (
-            ("[mix]", '[data.rendered]\nsets = ["a"]\norders = "paper"\nseed = 0\n[mix]'),
+            ("[mix]", '[data.rendered]\nsets = ["a"]\norders = "truncated"\nseed = 0\n[mix]'),
             r"\[data\.rendered\] are inconsistent; expected no orders, seed: ",
         ),
         (

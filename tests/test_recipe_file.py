@@ -66,11 +66,13 @@ def test_a_key_in_the_wrong_table_is_named_with_its_own(problems):
 
 
 def test_a_misspelt_choice_is_corrected_and_an_unknown_key_lists_the_known_ones(problems):
-    lines = problems('name = "mine"\nabout = ""\norders = "papr"\n[glass]\nsparkle = true')
+    lines = problems('name = "mine"\nabout = ""\norders = "truncatd"\n[glass]\nsparkle = true')
     assert lines[1].endswith(
-        'orders is "papr"; expected a string, one of "all", "paper"; did you mean "paper"?'
+        'orders is "truncatd"; expected a string, one of "all", "truncated"; did you mean "truncated"?'
     ) or (
-        lines[0].endswith('orders is "papr"; expected a string, one of "all", "paper"; did you mean "paper"?')
+        lines[0].endswith(
+            'orders is "truncatd"; expected a string, one of "all", "truncated"; did you mean "truncated"?'
+        )
     )
     assert any("expected a key of [glass], one of double_probability, gap_mm" in line for line in lines)
 

@@ -7,7 +7,7 @@ import torch
 from brewster.render.analytic import render
 from brewster.render.rays import rough_glass
 from brewster.render.rays.ggx import sample_visible_normal, smith_g1, vndf_over_cosine
-from brewster.render.rays.layered_glass import all_orders
+from brewster.render.rays.layered_glass import total_throughput
 from brewster.render.rays.rough_glass import surfaces
 from brewster.scene.glass import Glazing, Pane
 from synthetic_scenes import ASSETS, camera_towards_glass, make_scene, map_side, smooth_map
@@ -42,7 +42,7 @@ def test_in_uniform_light_rough_glass_creates_no_light_and_loses_little(alpha, c
     sample = render(rough_scene(alpha, count, samples_per_pixel=2 if count == 2 else 16), ASSETS)
     total = mean(sample.transmission) + mean(sample.reflection)
     assert 0.985 < total < 1.003
-    smooth = all_orders(Glazing(panes=(Pane(),) * count, gap_mm=9), torch.tensor(0.94))
+    smooth = total_throughput(Glazing(panes=(Pane(),) * count, gap_mm=9), torch.tensor(0.94))
     assert mean(sample.reflection) == pytest.approx(float(smooth.reflected), rel=0.05)
 
 

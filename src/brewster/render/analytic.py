@@ -24,13 +24,13 @@ from brewster.render.rays.defocus import defocus_blur, margin_px
 from brewster.render.rays.emitters import CameraView, Device, Rays, SideEmitters
 from brewster.render.rays.layered_glass import (
     ReflectionOrder,
-    all_orders,
     enumerate_orders,
     fresnel,
     ghost_distance_mm,
     lateral_shifts_mm,
     order_throughputs,
-    paper_orders,
+    total_throughput,
+    truncated_throughput,
 )
 from brewster.render.rays.rough_glass import trace_orders
 from brewster.render.rays.sobol import SobolPoints
@@ -236,10 +236,10 @@ def _trace_smooth(prepared: _PreparedScene, rays: Rays, _: SobolPoints | None = 
     glass = prepared.scene.glass
     point, mirrored = _mirror_at_first_surface(rays)
     cosine = mirrored[2]
-    complete = all_orders(glass, cosine)
-    in_layers = paper_orders(glass, cosine) if prepared.scene.orders == "paper" else complete
+    complete = total_throughput(glass, cosine)
+    in_layers = truncated_throughput(glass, cosine) if prepared.scene.orders == "truncated" else complete
     layers = []
-    for side, origin, direction, total_throughput, layer_throughput in (
+    for side, origin, direction, total_ratio, layer_ratio in (
         (prepared.behind, rays.origin, rays.direction, complete.transmitted, in_layers.transmitted),
         (prepared.front, point, mirrored, complete.reflected, in_layers.reflected),
     ):
@@ -248,8 +248,8 @@ def _trace_smooth(prepared: _PreparedScene, rays: Rays, _: SobolPoints | None = 
         if len(side.groups) > 1:
             total, layer = _shifted_orders(prepared, side, Rays(point, direction, rays.footprint_px), far)
         else:
-            total = total_throughput * unattenuated
-            layer = layer_throughput * unattenuated if in_layers is not complete else total
+            total = total_ratio * unattenuated
+            layer = layer_ratio * unattenuated if in_layers is not complete else total
         layers.append((total, layer, unattenuated))
     (transmitted, transmission, background), (reflected, reflection, mirror) = layers
     return [transmitted + reflected, transmission, background, reflection, mirror]
@@ -278,8 +278,8 @@ def _shifted_orders(
         radiance = side.emitters.add_near(far, exit_point, direction, exiting.footprint_px)
         weights = list(zip(group, throughputs, strict=False))
         total += sum((weight for _, weight in weights), torch.zeros_like(cosine)) * radiance
-        if prepared.scene.orders == "paper":
-            in_layer = (weight for order, weight in weights if order.in_paper)
+        if prepared.scene.orders == "truncated":
+            in_layer = (weight for order, weight in weights if order.in_truncated_layers)
             layer += sum(in_layer, torch.zeros_like(cosine)) * radiance
     return total, total if prepared.scene.orders == "all" else layer
 
@@ -332,7 +332,9 @@ def _trace_rough(prepared: _PreparedScene, rays: Rays, sobol: SobolPoints) -> li
     emitters = prepared.behind.emitters, prepared.front.emitters
     for exiting in trace_orders(prepared.scene.glass, rays, *emitters, sobol):
         sides[exiting.behind][0] += exiting.light
-        sides[exiting.behind][1] += exiting.light * (prepared.scene.orders == "all" or exiting.in_paper)
+        sides[exiting.behind][1] += exiting.light * (
+            prepared.scene.orders == "all" or exiting.in_truncated_layers
+        )
     (transmitted, transmission), (reflected, reflection) = sides[True], sides[False]
     point, mirrored = _mirror_at_first_surface(rays)
     background = prepared.behind.emitters.radiance(rays.origin, rays.direction, rays.footprint_px)

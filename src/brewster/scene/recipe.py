@@ -162,8 +162,8 @@ class SceneRecipe(FrozenModel):
     """The name of the recipe. The scenes depend on it: recipes with different names give different scenes for the same seed."""
     about: str
     """A description of the scenes."""
-    orders: Literal["all", "paper"] = "all"
-    """Light paths in T and R. all: all orders of reflection, so that I = T + R. paper: T contains only the
+    orders: Literal["all", "truncated"] = "all"
+    """Light paths in T and R. all: all orders of reflection, so that I = T + R. truncated: T contains only the
     path without a reflection, R only paths that do not enter the last pane."""
     samples_per_pixel: PositiveInt = 8
     """Rays per pixel of scenes that need Monte Carlo sampling (a wedged pane, or a lens and near content), and the maximum

@@ -44,7 +44,7 @@ class CameraResponse(FrozenModel):
 class Scene(FrozenModel):
     """Everything that a sample depends on: the same scene and version give the same bytes.
 
-    `orders` "all": T and R contain all light paths, so that I = T + R. "paper": T contains only the path without a
+    `orders` "all": T and R contain all light paths, so that I = T + R. "truncated": T contains only the path without a
     reflection, and R only the paths that do not enter the last pane (for one pane: the reflection at its first surface).
     """
 
@@ -53,7 +53,7 @@ class Scene(FrozenModel):
     index: Annotated[int, Field(ge=0)] = 0
     version: str = ""
     """The version of brewster that drew the scene."""
-    orders: Literal["all", "paper"] = "all"
+    orders: Literal["all", "truncated"] = "all"
     samples_per_pixel: PositiveInt = 16
     """Rays per pixel of scenes with rough or wedged glass, or with a lens and near content; the maximum for others."""
     glass: Glazing = Glazing()

@@ -50,7 +50,7 @@ def trace(
     The error of an image is the mean over its pixels of standard error / (light + 1 % of the mean light); the standard
     error comes from the variance between passes. An image is finished when its error is below `noise_threshold`, or after
     `max_samples` rays per pixel. T and R are measured relative to I, their sum: the one that adds more error to I gets
-    the next pass. With the paper's orders T and R are rendered separately.
+    the next pass. With truncated orders T and R are rendered separately.
 
     Mitsuba's colour variants average s- and p-polarised light at every surface, which is wrong for glass with several
     surfaces. `polarised` traces each colour with the polarised variant, at several times the cost; rough surfaces in
@@ -117,9 +117,9 @@ def _render_layers(
 
     lit_from_behind, lit_from_front = estimate((True, "full"), (False, "full"))
     estimates = {"transmission": lit_from_behind, "reflection": lit_from_front}
-    if scene.orders == "paper":
-        [estimates["transmission"]] = estimate((True, "paper_transmission"))
-        [estimates["reflection"]] = estimate((False, "paper_reflection"))
+    if scene.orders == "truncated":
+        [estimates["transmission"]] = estimate((True, "truncated_transmission"))
+        [estimates["reflection"]] = estimate((False, "truncated_reflection"))
     [background] = estimate((True, "none"))
     [mirror] = estimate((False, "mirror"))
     layers = {name: image.light for name, image in estimates.items()}

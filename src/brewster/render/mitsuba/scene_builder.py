@@ -28,10 +28,10 @@ Doubles = NDArray[np.float64]
 Plugin = dict[str, Any]
 """A dictionary from which Mitsuba builds an object."""
 
-GlassMode = Literal["full", "paper_transmission", "paper_reflection", "mirror", "none"]
+GlassMode = Literal["full", "truncated_transmission", "truncated_reflection", "mirror", "none"]
 """How the glass is rendered.
 
-`full`: all orders; `paper_transmission`: without reflections (the paper's T); `paper_reflection`: no light enters the
+`full`: all orders; `truncated_transmission`: without reflections (the paper's T); `truncated_reflection`: no light enters the
 last pane (the paper's R); `mirror`: the first surface is a perfect mirror (MR); `none`: no glass (B).
 """
 
@@ -191,12 +191,12 @@ class MitsubaSceneBuilder:
             else {}
         )
         kind = "rough" if rough else ""
-        if glass == "paper_reflection" and pane is self._glass.panes[-1]:
+        if glass == "truncated_reflection" and pane is self._glass.panes[-1]:
             # A conductor with k = 0 has the reflectance of glass, and no ray is spent on transmission.
             index = {"type": "spectrum", "value": pane.refractive_index}
             return False, {"bsdf": {"type": kind + "conductor", "eta": index, "k": 0.0, **rough}}
         bsdf = {"type": kind + "dielectric", "int_ior": pane.refractive_index, "ext_ior": 1.0, **rough}
-        if glass == "paper_transmission":
+        if glass == "truncated_transmission":
             bsdf["specular_reflectance"] = 0.0
         return True, {"bsdf": bsdf, **self._interior_medium(pane)}
 

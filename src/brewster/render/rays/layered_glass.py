@@ -54,16 +54,16 @@ class Throughput:
     reflected: Tensor
 
 
-def all_orders(glazing: Glazing, cosine: Tensor) -> Throughput:
+def total_throughput(glazing: Glazing, cosine: Tensor) -> Throughput:
     """The sum of all orders in closed form; panes are combined by the adding method."""
     return _average_polarisations(
         [_combine([_slab(r, a) for r, a in panes]) for panes in _by_polarisation(glazing, cosine)]
     )
 
 
-def paper_orders(glazing: Glazing, cosine: Tensor) -> Throughput:
+def truncated_throughput(glazing: Glazing, cosine: Tensor) -> Throughput:
     """The paper's layers: T without any reflection, and R of all light that never enters the last pane."""
-    return _average_polarisations([_paper_layers(panes) for panes in _by_polarisation(glazing, cosine)])
+    return _average_polarisations([_truncated_layers(panes) for panes in _by_polarisation(glazing, cosine)])
 
 
 _TransmittanceReflectance = tuple[Tensor, Tensor]
@@ -104,7 +104,7 @@ def _combine(layers: list[_TransmittanceReflectance]) -> _TransmittanceReflectan
     return transmittance, reflectance
 
 
-def _paper_layers(panes: list[_SurfaceAndInterior]) -> _TransmittanceReflectance:
+def _truncated_layers(panes: list[_SurfaceAndInterior]) -> _TransmittanceReflectance:
     """Transmittance without any reflection, and reflectance without the light that enters the last pane."""
     transmittance: Tensor | float = 1.0
     for r, a in panes:
@@ -136,7 +136,7 @@ class ReflectionOrder:
     count: int
 
     @property
-    def in_paper(self) -> bool:
+    def in_truncated_layers(self) -> bool:
         """Whether the paper's T or R contains this order."""
         return sum(self.reflections) == 0 if self.behind else self.traversals[-1] == 0
 
@@ -211,7 +211,7 @@ def _weight(counts: tuple[_Counts, _Counts] | list[_Counts], reflectances: tuple
 def order_throughputs(glazing: Glazing, cosine: Tensor, table: Sequence[ReflectionOrder]) -> list[Tensor]:
     """The throughput of each order, (3, ...) or (...).
 
-    For each side they sum to `all_orders`: the last order of a side also gets the light of all fainter orders, so
+    For each side they sum to `total_throughput`: the last order of a side also gets the light of all fainter orders, so
     that no energy is lost.
     """
     interiors = [
@@ -230,7 +230,7 @@ def order_throughputs(glazing: Glazing, cosine: Tensor, table: Sequence[Reflecti
         for power, exponent in zip(interiors, order.traversals[::2], strict=True):
             throughput = throughput * power(exponent) if power and exponent else throughput
         throughputs.append(throughput)
-    closed_form = all_orders(glazing, cosine)
+    closed_form = total_throughput(glazing, cosine)
     for behind, total in ((True, closed_form.transmitted), (False, closed_form.reflected)):
         side = [i for i, order in enumerate(table) if order.behind == behind]
         if side:

@@ -60,10 +60,10 @@ class _PathState:
 
 @dataclass(frozen=True)
 class ExitingLight:
-    """The light of one order from one side, (3, N); `in_paper` says whether the paper's T or R contains it."""
+    """The light of one order from one side, (3, N); `in_truncated_layers` says whether the paper's T or R contains it."""
 
     behind: bool
-    in_paper: bool
+    in_truncated_layers: bool
     light: Tensor
 
 
@@ -108,8 +108,8 @@ def trace_orders(
             is_behind = branch.surface > 0
             emitters = behind if is_behind else front
             light = _exit_radiance(branch, interaction, emitters, rays.footprint_px, sobol)
-            in_paper = branch.reflections == 0 if is_behind else not branch.entered_last_pane
-            yield ExitingLight(is_behind, in_paper, light)
+            in_truncated_layers = branch.reflections == 0 if is_behind else not branch.entered_last_pane
+            yield ExitingLight(is_behind, in_truncated_layers, light)
 
 
 def _mean_weight(path: _PathState) -> float:
