@@ -38,7 +38,7 @@ def closed_form(scene, throughput_of=total_throughput):
     """Transmittance and reflectance at the centre of every pixel, (3, H, W) or (1, H, W)."""
     cosine = torch.from_numpy(-pixel_directions(scene.camera) @ np.array([0, 0, 1]))
     throughput = throughput_of(scene.glass, cosine)
-    layers = throughput.transmitted, throughput.reflected
+    layers = throughput.transmittance, throughput.reflectance
     return [layer.reshape(-1, *cosine.shape).float() for layer in layers]
 
 

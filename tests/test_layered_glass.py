@@ -13,8 +13,8 @@ from brewster.render.rays.layered_glass import (
     enumerate_orders,
     fresnel,
     ghost_distance_mm,
+    in_plane_shifts_mm,
     internal_transmittance,
-    lateral_shifts_mm,
     order_throughputs,
     refracted_cosine,
     total_throughput,
@@ -64,9 +64,9 @@ def pane_throughputs(pane, cosine):
 
 def test_a_pane_of_ordinary_glass_reflects_about_eight_percent():
     throughput = total_throughput(Glazing(), float64(1))
-    assert float(throughput.reflected) == pytest.approx(0.08 / 1.04, rel=1e-9)
-    assert float(throughput.reflected) == pytest.approx(0.0769, abs=5e-5)
-    assert float(throughput.transmitted) == pytest.approx(0.96 / 1.04, rel=1e-9)
+    assert float(throughput.reflectance) == pytest.approx(0.08 / 1.04, rel=1e-9)
+    assert float(throughput.reflectance) == pytest.approx(0.0769, abs=5e-5)
+    assert float(throughput.transmittance) == pytest.approx(0.96 / 1.04, rel=1e-9)
 
 
 @pytest.mark.parametrize("index", [1.1, 1.5, 2.4])
@@ -101,16 +101,16 @@ def test_beyond_the_critical_angle_all_light_inside_the_glass_is_reflected():
 def test_clear_glass_loses_no_light(panes, cosine):
     clear = glazing(pane.model_copy(update={"absorption_per_m": (0.0, 0.0, 0.0)}) for pane in panes)
     throughput = total_throughput(clear, float64(cosine))
-    assert float(throughput.transmitted + throughput.reflected) == pytest.approx(1, abs=1e-9)
+    assert float(throughput.transmittance + throughput.reflectance) == pytest.approx(1, abs=1e-9)
 
 
 @examples_40
 @given(PANES, COSINES)
 def test_tinted_glass_adds_no_light(panes, cosine):
     throughput = total_throughput(glazing(panes), float64(cosine))
-    assert (throughput.transmitted >= 0).all()
-    assert (throughput.reflected >= 0).all()
-    assert (throughput.transmitted + throughput.reflected <= 1 + 1e-9).all()
+    assert (throughput.transmittance >= 0).all()
+    assert (throughput.reflectance >= 0).all()
+    assert (throughput.transmittance + throughput.reflectance <= 1 + 1e-9).all()
 
 
 @examples_40
@@ -119,7 +119,7 @@ def test_a_stack_has_the_same_transmittance_from_both_sides(panes, cosine):
     from_front, from_behind = (
         total_throughput(glazing(stack), float64(cosine)) for stack in (panes, panes[::-1])
     )
-    torch.testing.assert_close(from_front.transmitted, from_behind.transmitted, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(from_front.transmittance, from_behind.transmittance, rtol=1e-9, atol=1e-12)
 
 
 @examples_40
@@ -133,8 +133,8 @@ def test_double_glazing_follows_the_adding_formula(cosine, first, second):
         transmittance += t1 * t2 / (1 - r1 * r2) / 2
         reflectance += (r1 + t1**2 * r2 / (1 - r1 * r2)) / 2
     throughput = total_throughput(glazing(panes), float64(cosine))
-    assert float(throughput.transmitted) == pytest.approx(transmittance, rel=1e-6)
-    assert float(throughput.reflected) == pytest.approx(reflectance, rel=1e-6)
+    assert float(throughput.transmittance) == pytest.approx(transmittance, rel=1e-6)
+    assert float(throughput.reflectance) == pytest.approx(reflectance, rel=1e-6)
 
 
 def test_absorption_follows_the_beer_lambert_law():
@@ -142,10 +142,10 @@ def test_absorption_follows_the_beer_lambert_law():
     internal = np.exp([-0.4, 0, -0.1])
     np.testing.assert_allclose(internal_transmittance(pane, float64(1)), internal, rtol=1e-9)
     np.testing.assert_allclose(
-        truncated_throughput(glazing([pane]), float64(1)).transmitted, 0.96**2 * internal, rtol=1e-9
+        truncated_throughput(glazing([pane]), float64(1)).transmittance, 0.96**2 * internal, rtol=1e-9
     )
     np.testing.assert_allclose(
-        total_throughput(glazing([pane]), float64(1)).transmitted,
+        total_throughput(glazing([pane]), float64(1)).transmittance,
         0.96**2 * internal / (1 - (0.04 * internal) ** 2),
         rtol=1e-9,
     )
@@ -177,7 +177,7 @@ def test_the_throughputs_of_the_orders_sum_to_the_closed_form(panes, cosine):
             6e-3,
         ),
     ):
-        for behind, expected in ((True, closed.transmitted), (False, closed.reflected)):
+        for behind, expected in ((True, closed.transmittance), (False, closed.reflectance)):
             total = sum(
                 throughput
                 for throughput, order in zip(throughputs, table, strict=True)
@@ -193,7 +193,7 @@ def test_little_light_is_added_to_the_last_order(count):
     panes = [Pane()] * count
     table = enumerate_orders((0.04,) * count)
     closed = total_throughput(glazing(panes), float64(1))
-    for behind, total in ((True, closed.transmitted), (False, closed.reflected)):
+    for behind, total in ((True, closed.transmittance), (False, closed.reflectance)):
         enumerated = sum(
             order.count * 0.04 ** sum(order.reflections) * 0.96 ** sum(order.transmissions)
             for order in table
@@ -250,8 +250,8 @@ def test_the_ghost_distance_matches_the_textbook_formula():
     )
 
 
-def test_lateral_shifts_follow_snells_law_in_glass_and_are_unrefracted_in_the_gap():
-    first, gap, second = lateral_shifts_mm(
+def test_in_plane_shifts_follow_snells_law_in_glass_and_are_unrefracted_in_the_gap():
+    first, gap, second = in_plane_shifts_mm(
         Glazing(panes=(Pane(thickness_mm=3), Pane(thickness_mm=8, refractive_index=2)), gap_mm=16),
         float64(0.5),
     )

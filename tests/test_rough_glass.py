@@ -43,7 +43,7 @@ def test_in_uniform_light_rough_glass_creates_no_light_and_loses_little(alpha, c
     total = mean(sample.transmission) + mean(sample.reflection)
     assert 0.985 < total < 1.003
     smooth = total_throughput(Glazing(panes=(Pane(),) * count, gap_mm=9), torch.tensor(0.94))
-    assert mean(sample.reflection) == pytest.approx(float(smooth.reflected), rel=0.05)
+    assert mean(sample.reflection) == pytest.approx(float(smooth.reflectance), rel=0.05)
 
 
 def test_rougher_glass_blurs_an_edge_behind_it_more():

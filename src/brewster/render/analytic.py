@@ -27,7 +27,7 @@ from brewster.render.rays.layered_glass import (
     enumerate_orders,
     fresnel,
     ghost_distance_mm,
-    lateral_shifts_mm,
+    in_plane_shifts_mm,
     order_throughputs,
     total_throughput,
     truncated_throughput,
@@ -240,8 +240,8 @@ def _trace_smooth(prepared: _PreparedScene, rays: Rays, _: SobolPoints | None = 
     in_layers = truncated_throughput(glass, cosine) if prepared.scene.orders == "truncated" else complete
     layers = []
     for side, origin, direction, total_ratio, layer_ratio in (
-        (prepared.behind, rays.origin, rays.direction, complete.transmitted, in_layers.transmitted),
-        (prepared.front, point, mirrored, complete.reflected, in_layers.reflected),
+        (prepared.behind, rays.origin, rays.direction, complete.transmittance, in_layers.transmittance),
+        (prepared.front, point, mirrored, complete.reflectance, in_layers.reflectance),
     ):
         far = side.emitters.far_radiance(direction, rays.footprint_px)
         unattenuated = side.emitters.add_near(far, origin, direction, rays.footprint_px)
@@ -267,14 +267,14 @@ def _shifted_orders(
     """
     glass, direction = prepared.scene.glass, exiting.direction
     cosine = direction[2].abs()
-    shifts = lateral_shifts_mm(glass, cosine)
+    shifts = in_plane_shifts_mm(glass, cosine)
     in_plane = normalize(direction * direction.new_tensor([1, 1, 0])[:, None])
     surface = exiting.origin.clone()
     surface[2] = -side.depth_mm
     throughputs = iter(order_throughputs(glass, cosine, [order for group in side.groups for order in group]))
     total, layer = torch.zeros_like(direction), torch.zeros_like(direction)
     for group in side.groups:
-        exit_point = surface + in_plane * _lateral_shift(group[0], shifts)
+        exit_point = surface + in_plane * _in_plane_shift(group[0], shifts)
         radiance = side.emitters.add_near(far, exit_point, direction, exiting.footprint_px)
         weights = list(zip(group, throughputs, strict=False))
         total += sum((weight for _, weight in weights), torch.zeros_like(cosine)) * radiance
@@ -284,7 +284,7 @@ def _shifted_orders(
     return total, total if prepared.scene.orders == "all" else layer
 
 
-def _lateral_shift(order: ReflectionOrder, shifts: list[Tensor]) -> Tensor:
+def _in_plane_shift(order: ReflectionOrder, shifts: list[Tensor]) -> Tensor:
     return sum(
         (n * shift for n, shift in zip(order.traversals, shifts, strict=True)), torch.zeros_like(shifts[0])
     )
@@ -303,13 +303,13 @@ def _group_orders(scene: Scene, emitters: SideEmitters, *, behind: bool) -> list
     cosine = _min_cosine(scene)
     reflectances = (float(sum(fresnel(cosine, pane.refractive_index))) / 2 for pane in scene.glass.panes)
     table = enumerate_orders(tuple(round(min(r, _MAX_TABLE_REFLECTANCE), 3) for r in reflectances))
-    shifts = lateral_shifts_mm(scene.glass, cosine)
+    shifts = in_plane_shifts_mm(scene.glass, cosine)
     pixel_mm = scene.camera.pixel_rad * (scene.camera_above_glass_mm + emitters.distance_mm)
     groups: list[tuple[float, list[ReflectionOrder]]] = []
     for order in table:
         if order.behind != behind:
             continue
-        shift_px = float(_lateral_shift(order, shifts) * cosine) / pixel_mm
+        shift_px = float(_in_plane_shift(order, shifts) * cosine) / pixel_mm
         for group_px, group in groups:
             if abs(shift_px - group_px) < _MERGE_DISTANCE_PX:
                 group.append(order)

@@ -50,8 +50,8 @@ def internal_transmittance(pane: Pane, cosine: Tensor) -> Tensor:
 class Throughput:
     """Transmittance and reflectance of a glazing along a camera ray; each (3, ...) if tinted, else (...)."""
 
-    transmitted: Tensor
-    reflected: Tensor
+    transmittance: Tensor
+    reflectance: Tensor
 
 
 def total_throughput(glazing: Glazing, cosine: Tensor) -> Throughput:
@@ -117,13 +117,13 @@ def _truncated_layers(panes: list[_SurfaceAndInterior]) -> _TransmittanceReflect
 
 
 def _average_polarisations(polarised: list[_TransmittanceReflectance]) -> Throughput:
-    (s_transmitted, s_reflected), (p_transmitted, p_reflected) = polarised
-    return Throughput((s_transmitted + p_transmitted) / 2, (s_reflected + p_reflected) / 2)
+    (s_transmittance, s_reflectance), (p_transmittance, p_reflectance) = polarised
+    return Throughput((s_transmittance + p_transmittance) / 2, (s_reflectance + p_reflectance) / 2)
 
 
 @dataclass(frozen=True)
 class ReflectionOrder:
-    """A set of `count` light paths through a parallel stack, with equal exit side, lateral shift and throughput.
+    """A set of `count` light paths through a parallel stack, with equal exit side, in-plane shift and throughput.
 
     `reflections` and `transmissions` at surfaces are counted per pane, `traversals` per layer: pane, gap, pane...
     `behind` is true for light that comes from behind the glass.
@@ -231,7 +231,7 @@ def order_throughputs(glazing: Glazing, cosine: Tensor, table: Sequence[Reflecti
             throughput = throughput * power(exponent) if power and exponent else throughput
         throughputs.append(throughput)
     closed_form = total_throughput(glazing, cosine)
-    for behind, total in ((True, closed_form.transmitted), (False, closed_form.reflected)):
+    for behind, total in ((True, closed_form.transmittance), (False, closed_form.reflectance)):
         side = [i for i, order in enumerate(table) if order.behind == behind]
         if side:
             throughputs[side[-1]] = throughputs[side[-1]] + (total - sum(throughputs[i] for i in side))
@@ -265,7 +265,7 @@ def _surface_throughput(
     return reduce(torch.mul, factors)
 
 
-def lateral_shifts_mm(glazing: Glazing, cosine: Tensor) -> list[Tensor]:
+def in_plane_shifts_mm(glazing: Glazing, cosine: Tensor) -> list[Tensor]:
     """Shift of a ray along the glass per traversal of each layer (pane, gap, pane...), in mm, (...) each."""
     shifts = []
     for pane in glazing.panes:
