@@ -52,7 +52,7 @@ def random_image(shape=(3, 40, 56), low=0.02, high=0.5):
 
 def exposed(light, developed, ev=None):
     """Light with the recorded exposure and white balance, before clipping."""
-    gains = torch.tensor(developed.white_balance).view(3, 1, 1)
+    gains = torch.tensor(developed.white_balance_gains).view(3, 1, 1)
     return light * gains * 2 ** (developed.exposure_ev if ev is None else ev)
 
 
@@ -79,7 +79,7 @@ def test_a_black_image_stays_black_and_is_not_exposed():
     for balance in ("none", *BALANCES):
         developed = develop(sample_of(torch.zeros(3, 4, 5), white_balance=balance))
         assert developed.exposure_ev == developed.mirror_exposure_ev == developed.overexposed == 0
-        assert developed.white_balance == (1, 1, 1)
+        assert developed.white_balance_gains == (1, 1, 1)
         assert not any(layer.any() for layer in developed.layers().values())
 
 
@@ -129,7 +129,7 @@ def test_the_recorded_settings_reproduce_the_pictures(picture, response):
     sample = sample_of(picture, **response.model_dump())
     developed = develop(sample)
     recorded = tomllib.loads(tomli_w.dumps(developed.camera_settings()))
-    assert recorded["white_balance"] == list(developed.white_balance)
+    assert recorded["white_balance_gains"] == list(developed.white_balance_gains)
     for name in LAYERS:
         ev = recorded["mirror_exposure_ev" if name == "mirror" else "exposure_ev"]
         encoded = to_encoded(exposed(getattr(sample, name), developed, ev).clamp(0, 1))
@@ -180,10 +180,10 @@ def test_grey_world_makes_the_means_equal_and_keeps_luminance(red, blue, seed):
     picture *= torch.tensor([red, 1, blue]).view(3, 1, 1)
     sample = sample_of(picture, white_balance="grey-world", target_luminance=0.1)
     developed = develop(sample)
-    assert max(developed.white_balance) < 3
+    assert max(developed.white_balance_gains) < 3
     balanced = to_linear(developed.photo_encoded).mean((1, 2))
     torch.testing.assert_close(balanced, balanced.mean().expand(3), atol=0, rtol=1e-3)
-    gains = torch.tensor(developed.white_balance).view(3, 1, 1)
+    gains = torch.tensor(developed.white_balance_gains).view(3, 1, 1)
     assert mean_luminance(picture / 4 * gains) == pytest.approx(mean_luminance(picture / 4), rel=1e-3)
 
 
@@ -191,7 +191,7 @@ def test_grey_world_makes_the_means_equal_and_keeps_luminance(red, blue, seed):
 def test_every_white_balance_removes_a_colour_cast(balance):
     grey = random_image((1, 40, 56)).expand(3, 40, 56)
     developed = develop(sample_of(grey * CAST, white_balance=balance, target_luminance=0.2))
-    gains = torch.tensor(developed.white_balance).view(3, 1, 1)
+    gains = torch.tensor(developed.white_balance_gains).view(3, 1, 1)
     torch.testing.assert_close(gains * CAST / (gains * CAST)[1], torch.ones(3, 1, 1), atol=1e-3, rtol=0)
 
 
@@ -201,7 +201,7 @@ def test_white_balance_of_any_strength_keeps_luminance(strength):
     developed = develop(
         sample_of(picture, white_balance="grey-world", white_balance_strength=strength, target_luminance=0.01)
     )
-    gains = torch.tensor(developed.white_balance).view(3, 1, 1)
+    gains = torch.tensor(developed.white_balance_gains).view(3, 1, 1)
     assert mean_luminance(picture * gains) == pytest.approx(mean_luminance(picture), rel=1e-3)
 
 
@@ -211,7 +211,7 @@ def test_half_the_strength_is_half_the_correction_in_stops(balance):
         np.log2(
             develop(
                 sample_of(random_image() * CAST, white_balance=balance, white_balance_strength=s)
-            ).white_balance
+            ).white_balance_gains
         )
         for s in (1, 0.5, 0)
     )
@@ -227,7 +227,7 @@ def test_clipped_lamps_do_not_affect_the_white_balance(balance):
     lit[2, 3:5, 3:5] = 1e5
     lit[:, 10:14, 10:20] = 1e5
     plain, with_lamps = (
-        develop(sample_of(each, white_balance=balance, target_luminance=0.3)).white_balance
+        develop(sample_of(each, white_balance=balance, target_luminance=0.3)).white_balance_gains
         for each in (picture, lit)
     )
     assert plain == pytest.approx(with_lamps, abs=0.01)
@@ -238,7 +238,7 @@ def test_clipped_lamps_do_not_affect_the_white_balance(balance):
 @example(np.array([0.001, 0.1, 0.1], np.float32).reshape(3, 1, 1), "grey-world", 1.0)
 def test_gains_are_between_a_third_and_three(picture, balance, strength):
     developed = develop(sample_of(picture, white_balance=balance, white_balance_strength=strength))
-    assert all(0.3333 <= gain <= 3 for gain in developed.white_balance)
+    assert all(0.3333 <= gain <= 3 for gain in developed.white_balance_gains)
 
 
 # --- noise

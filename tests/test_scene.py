@@ -42,7 +42,7 @@ def test_an_empty_file_is_the_plainest_scene_and_a_map_is_infinitely_far(written
 
 def test_the_outcome_of_a_scene_is_ignored(written):
     scene = draw(read_scene_recipe("window"), BUILTIN_CATALOG, 3, 1)
-    text = scene.to_toml(outcome={"exposure_ev": -1.5, "white_balance": [1.0, 1.1, 0.9]})
+    text = scene.to_toml(outcome={"exposure_ev": -1.5, "white_balance_gains": [1.0, 1.1, 0.9]})
     assert "[outcome]" in text
     found = read_scene(written(text))
     assert found == scene
