@@ -78,7 +78,7 @@ def test_the_mean_of_any_image_is_the_target_if_it_is_reachable(picture, target,
 def test_a_black_image_stays_black_and_is_not_exposed():
     for balance in ("none", *BALANCES):
         developed = develop(sample_of(torch.zeros(3, 4, 5), white_balance=balance))
-        assert developed.exposure_ev == developed.mirror_exposure_ev == developed.overexposed == 0
+        assert developed.exposure_ev == developed.mirror_exposure_ev == developed.overexposed_fraction == 0
         assert developed.white_balance_gains == (1, 1, 1)
         assert not any(layer.any() for layer in developed.layers().values())
 
@@ -102,7 +102,7 @@ def test_the_overexposed_share_counts_pixels_that_clip_in_any_channel():
     picture = torch.full((3, 10, 10), 0.01)
     picture[0, :2] = 100
     picture[1, 1:3] = 100
-    assert develop(sample_of(picture, target_luminance=0.25)).overexposed == 0.3
+    assert develop(sample_of(picture, target_luminance=0.25)).overexposed_fraction == 0.3
 
 
 # --- all layers alike
@@ -136,7 +136,7 @@ def test_the_recorded_settings_reproduce_the_pictures(picture, response):
         smooth = encoded**2 * (3 - 2 * encoded)
         expected = encoded + response.contrast * (smooth - encoded)
         torch.testing.assert_close(developed.layers()[name], expected, atol=2e-6, rtol=0)
-    assert recorded["overexposed"] == pytest.approx(
+    assert recorded["overexposed_fraction"] == pytest.approx(
         (exposed(sample.photo, developed) >= 1).any(0).float().mean().item(), abs=1e-6
     )
 

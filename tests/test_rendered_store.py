@@ -59,7 +59,7 @@ def test_statistics_compare_the_luminance_of_the_layers(scene):
     mirrored = LinearSample(**{**vars(grey), "reflection": grey.reflection * 0.1})
     found = store.statistics(mirrored, store.develop(mirrored))
     assert found["reflection_to_transmission"] == pytest.approx(0.1)
-    assert found["overexposed"] == 0
+    assert found["overexposed_fraction"] == 0
 
 
 def test_folders_and_shards_read_alike(four_samples, tmp_path):

@@ -55,7 +55,7 @@ class DevelopedSample:
     exposure_ev: float
     mirror_exposure_ev: float
     white_balance_gains: tuple[float, float, float]
-    overexposed: float
+    overexposed_fraction: float
     """The share of the pixels of I in which at least one channel clips, 0..1."""
 
     def layers(self) -> dict[str, Tensor]:
@@ -68,7 +68,7 @@ class DevelopedSample:
             "exposure_ev": self.exposure_ev,
             "mirror_exposure_ev": self.mirror_exposure_ev,
             "white_balance_gains": list(self.white_balance_gains),
-            "overexposed": self.overexposed,
+            "overexposed_fraction": self.overexposed_fraction,
         }
 
 
@@ -92,7 +92,7 @@ def develop(sample: LinearSample) -> DevelopedSample:
         exposure_ev=ev,
         mirror_exposure_ev=mirror_ev,
         white_balance_gains=white_balance_gains,
-        overexposed=round((exposed["photo"] >= 1).any(0).float().mean().item(), 6),
+        overexposed_fraction=round((exposed["photo"] >= 1).any(0).float().mean().item(), 6),
     )
 
 

@@ -55,7 +55,7 @@ def _reflection_to_transmission(sample: LinearSample, _: DevelopedSample) -> flo
 
 STATISTICS: Final[dict[str, Callable[[LinearSample, DevelopedSample], float]]] = {
     "reflection_to_transmission": _reflection_to_transmission,
-    "overexposed": lambda _, developed: developed.overexposed,
+    "overexposed_fraction": lambda _, developed: developed.overexposed_fraction,
     "ghost_px": lambda sample, _: ghost_distance_px(sample.scene),
 }
 """Statistics for the selection of samples, in every scene.toml and in the index: mean luminance of R / mean luminance of T;
