@@ -123,7 +123,7 @@ def test_rough_glass_gets_more_rays():
 
 
 def test_categories_are_respected_and_a_map_without_one_fits_everywhere():
-    asked = changed("window", behind={"map_probability": 1.0, "maps": ("indoor",)})
+    asked = changed("window", behind={"map_probability": 1.0, "map_categories": ("indoor",)})
     rooms = {drawn(asked, index).behind.map.source.file for index in range(20)}
     assert rooms <= {f"builtin:room:{number}" for number in range(8)}
     plain = Catalog(maps=(Asset(source=AssetSource(file="a.hdr"), width=4096, height=2048),))

@@ -109,7 +109,7 @@ class SideRecipe(FrozenModel):
 
     map_probability: Share = 1.0
     """Probability of an environment map. A side without a map has a picture."""
-    maps: tuple[str, ...] = ()
+    map_categories: tuple[str, ...] = ()
     """Categories of the maps, such as indoor, outdoor or night. Empty: all maps."""
     max_px_per_texel: PositiveFloat = 2.5
     """Largest width of a texel of the map in the image. It limits the choice of maps and the field of view."""

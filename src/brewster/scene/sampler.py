@@ -141,14 +141,18 @@ def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
 
 def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng: _SceneRng) -> Asset | None:
     """Draws a map with sufficient resolution for the widest view of the recipe. Returns None for a side without a map."""
-    candidates = [asset for asset in catalog.maps if not recipe.maps or asset.category in ("", *recipe.maps)]
+    candidates = [
+        asset
+        for asset in catalog.maps
+        if not recipe.map_categories or asset.category in ("", *recipe.map_categories)
+    ]
     sufficient = [asset for asset in candidates if _min_fov_deg(asset, recipe, camera) <= camera.fov_deg[1]]
     if not rng.bernoulli(recipe.map_probability) or (not sufficient and recipe.picture_probability > 0):
         return None
     if not sufficient:
         raise RecipeError(
             f"none of {len(catalog.maps)} maps is suitable for the recipe",
-            f"expected categories {', '.join(recipe.maps) or 'any'}, and texels of at most {recipe.max_px_per_texel:g} px"
+            f"expected categories {', '.join(recipe.map_categories) or 'any'}, and texels of at most {recipe.max_px_per_texel:g} px"
             f" for a field of view of {camera.fov_deg[1]:g} degrees",
             "choose other or larger --maps, or a smaller --size",
         )
