@@ -375,8 +375,8 @@ def test_another_index_changes_the_random_numbers_and_not_the_means():
 @pytest.mark.parametrize(
     "glass",
     [
-        Glazing(frame_mm=(500.0, 400.0)),
-        Glazing(panes=(Pane(thickness_mm=20),), radii_mm=(300.0, -300.0), frame_mm=(80.0, 80.0)),
+        Glazing(opening_mm=(500.0, 400.0)),
+        Glazing(panes=(Pane(thickness_mm=20),), radii_mm=(300.0, -300.0), opening_mm=(80.0, 80.0)),
     ],
     ids=["framed", "curved"],
 )

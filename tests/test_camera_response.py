@@ -98,7 +98,7 @@ def test_an_unreachable_target_does_not_raise_the_exposure_without_limit():
     assert developed.exposure_ev == pytest.approx(1, abs=0.02)
 
 
-def test_the_overexposed_share_counts_pixels_that_clip_in_any_channel():
+def test_the_overexposed_fraction_counts_pixels_that_clip_in_any_channel():
     picture = torch.full((3, 10, 10), 0.01)
     picture[0, :2] = 100
     picture[1, 1:3] = 100

@@ -220,7 +220,7 @@ def test_the_back_of_a_plane_between_camera_and_glass_is_black_in_the_light_of_b
 
 @pytest.mark.parametrize(("side", "glass"), [("behind", "full"), ("behind", "none"), ("front", "mirror")])
 def test_a_frame_is_an_opening_in_a_black_wall(side, glass):
-    scene = a_scene(glass=Glazing(frame_mm=(200, 44)), camera={"position_mm": (0, 0, 250)})
+    scene = a_scene(glass=Glazing(opening_mm=(200, 44)), camera={"position_mm": (0, 0, 250)})
     light = render_image(scene, side, glass)[..., 0]
     assert (light > 0.5).sum(axis=0).tolist() == [16] * 32
 
@@ -232,7 +232,7 @@ def test_a_lens_refracts_light_according_to_the_lensmakers_equation(radii_mm):
     a and b are the distances of the camera and of the plane from the lens, f is its focal length.
     """
     near, far = 400.0, 150.0
-    glass = Glazing(panes=(Pane(thickness_mm=6.0),), radii_mm=radii_mm, frame_mm=(40.0, 40.0))
+    glass = Glazing(panes=(Pane(thickness_mm=6.0),), radii_mm=radii_mm, opening_mm=(40.0, 40.0))
     camera = {"position_mm": (0, 0, near), "fov_deg": 2.0}
     scene = a_scene(glass=glass, behind=board("ramp", distance_mm=far, width_mm=100), camera=camera)
     r1, r2 = radii_mm
@@ -244,7 +244,7 @@ def test_a_lens_refracts_light_according_to_the_lensmakers_equation(radii_mm):
 
 def test_the_mirror_image_of_a_lens_is_that_of_its_first_surface():
     """A sphere's focal length is half its radius: a ray at height y meets a plane at y (1 + b / a + 2 b / r)."""
-    glass = Glazing(panes=(Pane(thickness_mm=20),), radii_mm=(300.0, 1000.0), frame_mm=(100.0, 100.0))
+    glass = Glazing(panes=(Pane(thickness_mm=20),), radii_mm=(300.0, 1000.0), opening_mm=(100.0, 100.0))
     scene = a_scene(glass=glass, front=board("ramp", distance_mm=1000, width_mm=4000), camera={"fov_deg": 2})
     assert -slope(render_image(scene, "front", "mirror"), 500) * 4000 == pytest.approx(
         1 + 1000 / 500 + 2000 / 300, rel=0.01
@@ -262,8 +262,8 @@ def slope(image, distance_mm):
     [
         Glazing(panes=(Pane(wedge_deg=5.0),)),
         Glazing(panes=(Pane(wedge_deg=1.0, thickness_mm=50), Pane()), gap_mm=1.0),
-        Glazing(radii_mm=(100.0, -100.0), frame_mm=(80.0, 80.0)),
-        Glazing(radii_mm=(50.0, 60.0), frame_mm=(80.0, 80.0)),
+        Glazing(radii_mm=(100.0, -100.0), opening_mm=(80.0, 80.0)),
+        Glazing(radii_mm=(50.0, 60.0), opening_mm=(80.0, 80.0)),
     ],
     ids=["knife's edge", "panes that touch", "lens without edge", "sphere too small"],
 )

@@ -59,7 +59,7 @@ def test_the_outcome_of_a_scene_is_ignored(written):
         ),
         ("[glass]\ngap_mm = -1", r"glass\.gap_mm is -1; .*at least 0"),
         ("[[glass.panes]]\n[[glass.panes]]", "expected a gap_mm above 0 between several panes"),
-        ("glass.radii_mm = [100, 100]", "expected one pane, .* and a frame"),
+        ("glass.radii_mm = [100, 100]", "expected one pane, .* and opening_mm"),
         ("[camera]\nfocus_mm = 1002\naperture_mm = 3", "the focus is 2 mm inside the glass"),
         (
             "camera.position_mm = [0, 0, -5]",
@@ -142,7 +142,7 @@ def test_files_that_are_missing_or_no_text_are_refused(tmp_path):
 
 
 def test_framed_glass_may_be_seen_at_any_angle_and_a_pinhole_has_no_focus_to_hit_glass(written):
-    read_scene(written("glass.frame_mm = [500, 400]\ncamera.heading_deg = 80"))
+    read_scene(written("glass.opening_mm = [500, 400]\ncamera.heading_deg = 80"))
     read_scene(written("camera.focus_mm = 1002"))
 
 

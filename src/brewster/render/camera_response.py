@@ -56,7 +56,7 @@ class DevelopedSample:
     mirror_exposure_ev: float
     white_balance_gains: tuple[float, float, float]
     overexposed_fraction: float
-    """The share of the pixels of I in which at least one channel clips, 0..1."""
+    """The fraction of the pixels of I in which at least one channel clips, 0..1."""
 
     def layers(self) -> dict[str, Tensor]:
         """The five encoded images by name."""

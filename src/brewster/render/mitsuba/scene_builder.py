@@ -139,8 +139,8 @@ class MitsubaSceneBuilder:
 
     def _first_surface_corners(self) -> Doubles:
         """Points (4, 2) on the first surface: the corners of its frame, or of the view."""
-        if self._glass.frame_mm:
-            return np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)]) * self._glass.frame_mm / 2
+        if self._glass.opening_mm:
+            return np.array([(-1, -1), (-1, 1), (1, -1), (1, 1)]) * self._glass.opening_mm / 2
         rays = np.array(self.scene.camera.corners()) @ self._to_glass.T
         corners: Doubles = (self._camera_position - rays * (self._camera_position[2] / rays[:, 2:]))[:, :2]
         return corners
@@ -155,8 +155,8 @@ class MitsubaSceneBuilder:
             yield from self._lens(*self._glass.radii_mm, glass)
             return
         height, max_half_size = 0.0, (self._half_extent_mm, self._half_extent_mm)
-        frame = self._glass.frame_mm
-        half_size = (frame[0] / 2, frame[1] / 2) if frame else max_half_size
+        opening = self._glass.opening_mm
+        half_size = (opening[0] / 2, opening[1] / 2) if opening else max_half_size
         for pane in self._glass.panes:
             is_entered, material = self._material(pane, glass)
             yield self._rectangle(np.eye(3), (0, 0, height), half_size, material)
@@ -218,9 +218,9 @@ class MitsubaSceneBuilder:
 
     def _wall(self) -> Iterator[Plugin]:
         """A black wall around the frame's opening, in the plane of the first surface: four rectangles."""
-        if not self._glass.frame_mm:
+        if not self._glass.opening_mm:
             return
-        right, top = self._glass.frame_mm[0] / 2, self._glass.frame_mm[1] / 2
+        right, top = self._glass.opening_mm[0] / 2, self._glass.opening_mm[1] / 2
         half_side, half_top = (_WALL_MM, _WALL_MM), (right, _WALL_MM)
         for sign in (-1, 1):
             yield self._rectangle(np.eye(3), (sign * (right + _WALL_MM), 0, 0), half_side, {"bsdf": _BLACK})
@@ -237,7 +237,7 @@ class MitsubaSceneBuilder:
         if depth.min() <= 0:
             raise RecipeError(
                 f"the lens is {depth.min():.3g} mm thick at its thinnest", "expected a thickness above 0 everywhere in the frame",
-                "increase thickness_mm or radii_mm, or reduce frame_mm",
+                "increase thickness_mm or radii_mm, or reduce opening_mm",
             )  # fmt: skip
         yield self._mesh(*near, material)
         if is_entered:
@@ -247,14 +247,14 @@ class MitsubaSceneBuilder:
 
     def _sphere(self, radius_mm: float, height: float) -> tuple[Doubles, Doubles]:
         """Points and normals towards the camera, (rows, columns, 3), of a surface whose centre is at z = `height`."""
-        half_width, half_height = np.array(self._glass.frame_mm) / 2
+        half_width, half_height = np.array(self._glass.opening_mm) / 2
         line = np.linspace(-1, 1, _LENS_GRID + 1)
         x, y = np.meshgrid(line * half_width, line * half_height)
         squared = radius_mm**2 - x**2 - y**2
         if squared.min() <= 0:
             raise RecipeError(
                 f"a sphere of {abs(radius_mm):g} mm does not fill the frame", "expected a radius above half the frame's diagonal",
-                "increase radii_mm or reduce frame_mm",
+                "increase radii_mm or reduce opening_mm",
             )  # fmt: skip
         rise = np.copysign(np.sqrt(squared), radius_mm)
         return np.stack([x, y, height - radius_mm + rise], axis=2), np.stack([x, y, rise], axis=2) / radius_mm
@@ -279,7 +279,7 @@ class MitsubaSceneBuilder:
 
     def _frame_sides(self, low: float, high: float) -> Iterator[Plugin]:
         """The frame's black inner sides, so that no light passes between frame and glass."""
-        right, top = np.array(self._glass.frame_mm) / 2
+        right, top = np.array(self._glass.opening_mm) / 2
         x, y, z = np.eye(3)
         middle, half = (low + high) / 2, (high - low) / 2
         for sign in (-1, 1):
