@@ -111,7 +111,7 @@ def test_an_impossible_scene_is_refused_and_the_value_named(text, says, written)
         ),
         ("glass.gap_mm = [0, 1]\nglass.double_probability = 0.5", "expected a gap_mm above 0"),
         ("glass.thickness_mm = [0, 1]", r"glass\.thickness_mm\.0 is 0; .*above 0"),
-        ("glass.tints = []", "at least one colour"),
+        ("glass.absorption_per_m = []", "at least one colour"),
         ("camera.fov_deg = [nan, 50]", r"camera\.fov_deg"),
         (
             "camera_response.jpeg_quality = [97, 60]",

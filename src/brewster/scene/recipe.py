@@ -17,7 +17,6 @@ from brewster.scene.scene import WhiteBalance
 from brewster.scene.values import (
     FrozenModel,
     JpegQualityRange,
-    KeyNote,
     LogRange,
     NonNegativeFloat,
     Pixels,
@@ -48,9 +47,9 @@ class GlassRecipe(FrozenModel):
     """Thickness of a pane of structural glass."""
     refractive_index: Range = (1.45, 1.65)
     """Refractive index, the same for all panes of a scene; at least 1."""
-    tints: Annotated[
-        tuple[tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat], ...], KeyNote(unit="1/m")
-    ] = ((4.0, 1.5, 2.5),)
+    absorption_per_m: tuple[tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat], ...] = (
+        (4.0, 1.5, 2.5),
+    )
     """Absorption coefficients for red, green and blue, one of which is drawn. They are larger for red
     and blue than for green, because clear float glass is slightly green."""
     tint_strength: LogRange = (0.3, 2.0)
@@ -76,8 +75,8 @@ class GlassRecipe(FrozenModel):
             raise ValueError(
                 f"expected a gap_mm above 0 for double glazing, but it starts at {self.gap_mm[0]:g}"
             )
-        if not self.tints:
-            raise ValueError("expected at least one colour, but tints is empty")
+        if not self.absorption_per_m:
+            raise ValueError("expected at least one colour, but absorption_per_m is empty")
         return self
 
 

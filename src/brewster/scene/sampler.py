@@ -115,7 +115,7 @@ def _draw_once(recipe: SceneRecipe, catalog: Catalog, rng: _SceneRng, seed: int,
 def _draw_glazing(recipe: GlassRecipe, rng: _SceneRng) -> Glazing:
     count = 2 if rng.bernoulli(recipe.double_probability) else 1
     structural = rng.bernoulli(recipe.structural_probability)
-    tint, strength = rng.choice(recipe.tints), rng.from_log_range(recipe.tint_strength)
+    tint, strength = rng.choice(recipe.absorption_per_m), rng.from_log_range(recipe.tint_strength)
     rough = rng.from_log_range(recipe.roughness) if rng.bernoulli(recipe.rough_probability) else 0.0
     wedged = rng.bernoulli(recipe.wedge_probability)
     red, green, blue = (_six_digits(colour * strength) for colour in tint)
