@@ -256,7 +256,7 @@ PLANE_POSITIONS = st.fixed_dictionaries(
     {
         "distance_mm": st.floats(100, 3000),
         "offset": st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4)),
-        "turn_deg": st.tuples(st.floats(-60, 60), st.floats(-20, 20)),
+        "angles_deg": st.tuples(st.floats(-60, 60), st.floats(-20, 20)),
         "glass_deg": st.tuples(st.floats(-180, 180), st.floats(-20, 20)),
         "camera_deg": st.tuples(st.floats(-30, 30), st.floats(-10, 10)),
         "is_behind": st.booleans(),
@@ -295,8 +295,8 @@ def test_a_plane_appears_where_pinhole_geometry_projects_it(drawn):
         "distance_mm": distance_mm,
         "width_mm": length * 0.06,
         "offset_mm": tuple(offset),
-        "heading_deg": drawn["turn_deg"][0],
-        "pitch_deg": drawn["turn_deg"][1],
+        "heading_deg": drawn["angles_deg"][0],
+        "pitch_deg": drawn["angles_deg"][1],
     }
     which = "behind" if drawn["is_behind"] else "front"
     scene = empty.model_copy(update={"behind": Side(), "front": Side(), which: plane_side("square", **plane)})

@@ -97,7 +97,7 @@ def test_a_picture_behind_the_glass_fills_the_view():
     recipe = changed(
         "vitrine",
         camera={"width": 24, "height": 16, "pinhole_probability": 1.0},
-        behind={"relative_width": (1.05, 1.5), "turn_deg": (0.0, 0.0)},
+        behind={"relative_width": (1.05, 1.5), "heading_deg": (0.0, 0.0)},
     )
     for index in range(12):
         scene = drawn(recipe, index)
@@ -136,7 +136,7 @@ def test_a_recipe_of_pictures_needs_pictures():
 
 
 def test_a_recipe_of_maps_needs_maps_that_are_sharp_enough():
-    asked = changed("window", behind={"map_probability": 1.0, "picture_probability": 0.0})
+    asked = changed("window", behind={"map_probability": 1.0, "plane_probability": 0.0})
     for catalog in (
         Catalog(pictures=BUILTIN_CATALOG.pictures),
         Catalog(maps=(Asset(source=AssetSource(file="a.hdr"), width=64, height=32),)),
@@ -169,8 +169,8 @@ def test_panes_pinholes_and_focus_come_as_often_as_their_probabilities_say(share
         "window",
         glass={"double_probability": share},
         camera={"pinhole_probability": share, "focus_on_front_probability": share},
-        behind={"map_probability": 1.0, "dome_probability": 0.0, "picture_probability": 0.0},
-        front={"picture_probability": 1.0},
+        behind={"map_probability": 1.0, "dome_probability": 0.0, "plane_probability": 0.0},
+        front={"plane_probability": 1.0},
     )
     scenes = [drawn(recipe, index) for index in range(12)]
     assert {len(scene.glass.panes) for scene in scenes} == {1 + share}

@@ -116,13 +116,13 @@ class SideRecipe(FrozenModel):
     """Probability that the map is on a sphere (dome) of finite radius around the glass instead of at infinity."""
     radius_mm: LogRange = (3000.0, 10_000.0)
     """Radius of the dome."""
-    picture_probability: Share = 0.0
+    plane_probability: Share = 0.0
     """Probability of a picture on a plane, in front of the map if there is one."""
     distance_mm: LogRange = (1000.0, 8000.0)
     """Distance of the picture behind the last pane; in [front], behind the camera."""
     relative_width: Range = (1.05, 1.5)
     """Width of the picture, divided by the width that exactly covers the view."""
-    turn_deg: Range = (0.0, 0.0)
+    heading_deg: Range = (0.0, 0.0)
     """Rotation of the picture about the vertical axis. The rotation about the horizontal axis has half this range."""
     highlight_boost: Range = (0.0, 0.0)
     """Extra brightness of clipped whites in a picture: the light of white is multiplied by 1 + highlight_boost."""

@@ -147,7 +147,7 @@ def _choose_map(recipe: SideRecipe, camera: CameraRecipe, catalog: Catalog, rng:
         if not recipe.map_categories or asset.category in ("", *recipe.map_categories)
     ]
     sufficient = [asset for asset in candidates if _min_fov_deg(asset, recipe, camera) <= camera.fov_deg[1]]
-    if not rng.bernoulli(recipe.map_probability) or (not sufficient and recipe.picture_probability > 0):
+    if not rng.bernoulli(recipe.map_probability) or (not sufficient and recipe.plane_probability > 0):
         return None
     if not sufficient:
         raise RecipeError(
@@ -197,7 +197,7 @@ def _draw_side(recipe: SideRecipe, asset: Asset | None, partial: _PartialScene, 
             luminance=luminance,
             radius_mm=rng.from_log_range(recipe.radius_mm) if is_dome else math.inf,
         )
-    if rng.bernoulli(recipe.picture_probability) or not asset:
+    if rng.bernoulli(recipe.plane_probability) or not asset:
         plane = _draw_plane(recipe, partial, luminance, base_mm + rng.from_log_range(recipe.distance_mm))
     return Side(map=environment_map, plane=plane)
 
@@ -218,8 +218,8 @@ def _draw_plane(recipe: SideRecipe, partial: _PartialScene, luminance: float, di
         distance_mm=_six_digits(distance_mm),
         offset_mm=(_six_digits((left + right) / 2), _six_digits((bottom + top) / 2)),
         width_mm=_six_digits(cover * rng.from_range(recipe.relative_width)),
-        heading_deg=rng.from_range(recipe.turn_deg),
-        pitch_deg=rng.from_range(recipe.turn_deg) / 2,
+        heading_deg=rng.from_range(recipe.heading_deg),
+        pitch_deg=rng.from_range(recipe.heading_deg) / 2,
         luminance=luminance,
         highlight_boost=rng.from_range(recipe.highlight_boost),
     )
