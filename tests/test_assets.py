@@ -25,9 +25,9 @@ def sphere_mean(values):
     return (values.mean(axis=1) * solid_angle).sum() / solid_angle.sum()
 
 
-def sky(random):
+def sky(rng):
     """A map without lamps: (32, 64, 3), with a maximum of about three times the mean in one texel."""
-    texels = random.uniform(0.2, 1.8, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    texels = rng.uniform(0.2, 1.8, (HEIGHT, WIDTH, 3)).astype(np.float32)
     texels[8, 9] = 3
     return texels
 
@@ -71,16 +71,16 @@ def check_message(error, name, *words):
 # --- maps
 
 
-def test_a_map_has_the_mean_luminance_of_the_scene(folder, random):
-    texels = sky(random)
+def test_a_map_has_the_mean_luminance_of_the_scene(folder, rng):
+    texels = sky(rng)
     light = map_light(folder, "sky.exr", exr_of(texels * 37), luminance=2.5)
     assert light.dtype == np.float32
     assert sphere_mean(luminance(light)) == pytest.approx(2.5, rel=1e-4)
     np.testing.assert_allclose(light / light.mean(), texels / texels.mean(), rtol=1e-4)
 
 
-def test_lamps_are_excluded_from_the_mean_but_not_from_the_light(folder, random):
-    texels = sky(random)
+def test_lamps_are_excluded_from_the_mean_but_not_from_the_light(folder, rng):
+    texels = sky(rng)
     plain = map_light(folder, "plain.exr", exr_of(texels))
     texels[20, 30] = 1e5
     lit = map_light(folder, "lamp.exr", exr_of(texels))
@@ -92,18 +92,18 @@ def test_lamps_are_excluded_from_the_mean_but_not_from_the_light(folder, random)
     assert np.median(lit / plain) < 1.01
 
 
-def test_negative_values_are_set_to_zero(folder, random):
-    texels = sky(random)
+def test_negative_values_are_set_to_zero(folder, rng):
+    texels = sky(rng)
     texels[3, 4] = -5
     light = map_light(folder, "gamut.exr", exr_of(texels))
     assert light.min() == 0
     assert not light[3, 4].any()
 
 
-def test_builtin_maps_need_no_folder(monkeypatch, random):
+def test_builtin_maps_need_no_folder(monkeypatch, rng):
     calls = []
     monkeypatch.setitem(
-        assets_module.ENVIRONMENTS, "street", lambda seed, height: calls.append((seed, height)) or sky(random)
+        assets_module.ENVIRONMENTS, "street", lambda seed, height: calls.append((seed, height)) or sky(rng)
     )
     light = Assets().map_light(EnvironmentMap(source=AssetSource(file="builtin:street:7"), luminance=3))
     assert sphere_mean(luminance(light)) == pytest.approx(3, rel=1e-4)
@@ -130,8 +130,8 @@ def test_a_missing_file_is_named_with_the_folders_that_were_searched(folder):
         Assets().map_light(EnvironmentMap(source=AssetSource(file="gone.hdr")))
 
 
-def test_another_file_of_the_same_name_is_refused(folder, random):
-    data = hdr_of(sky(random))
+def test_another_file_of_the_same_name_is_refused(folder, rng):
+    data = hdr_of(sky(rng))
     (folder / "sky.hdr").write_bytes(data)
     correct, wrong = hashlib.sha256(data).hexdigest(), hashlib.sha256(b"").hexdigest()
     assets = Assets([folder])
@@ -143,8 +143,8 @@ def test_another_file_of_the_same_name_is_refused(folder, random):
     check_message(error, str(folder / "sky.hdr"), wrong)
 
 
-def test_the_folder_with_the_right_file_is_found(tmp_path, folder, random):
-    first, second = (hdr_of(sky(random)) for _ in range(2))
+def test_the_folder_with_the_right_file_is_found(tmp_path, folder, rng):
+    first, second = (hdr_of(sky(rng)) for _ in range(2))
     (tmp_path / "sky.hdr").write_bytes(first)
     (folder / "sky.hdr").write_bytes(second)
     assets = Assets([tmp_path, folder])
@@ -156,7 +156,7 @@ def test_the_folder_with_the_right_file_is_found(tmp_path, folder, random):
     assert np.array_equal(lights[0], lights[2])
 
 
-def test_a_file_that_cannot_be_read_is_named(folder, random, monkeypatch):
+def test_a_file_that_cannot_be_read_is_named(folder, rng, monkeypatch):
     def refuse(_path):
         raise PermissionError(13, "Permission denied")
 
@@ -168,15 +168,15 @@ def test_a_file_that_cannot_be_read_is_named(folder, random, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", [hdr_of, exr_of])
-def test_a_map_that_is_not_twice_as_wide_as_high_is_refused(folder, random, kind):
+def test_a_map_that_is_not_twice_as_wide_as_high_is_refused(folder, rng, kind):
     with pytest.raises(UnsupportedPhoto, match="60 x 32") as error:
-        map_light(folder, "narrow.hdr", kind(sky(random)[:, :60]))
+        map_light(folder, "narrow.hdr", kind(sky(rng)[:, :60]))
     check_message(error, "narrow.hdr", "twice as wide")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_texels_that_are_not_finite_are_refused(folder, random, value):
-    texels = sky(random)
+def test_texels_that_are_not_finite_are_refused(folder, rng, value):
+    texels = sky(rng)
     texels[5, 6, 1] = value
     with pytest.raises(UnsupportedPhoto, match="infinite or NaN") as error:
         map_light(folder, "broken.exr", exr_of(texels))
@@ -189,33 +189,33 @@ def test_a_black_map_is_refused(folder):
     check_message(error, "night.hdr")
 
 
-def test_an_ordinary_photo_saved_as_a_map_is_refused(folder, random):
+def test_an_ordinary_photo_saved_as_a_map_is_refused(folder, rng):
     """The maximum of an HDR map is in few texels, but here it is in an eighth of them."""
-    encoded = (sky(random) / 2).clip(0, 1)
+    encoded = (sky(rng) / 2).clip(0, 1)
     encoded[:4] = 1
     with pytest.raises(UnsupportedPhoto, match="clipped") as error:
         map_light(folder, "photo.hdr", hdr_of(to_linear(encoded)))
     check_message(error, "photo.hdr", "use it as a picture")
 
 
-def test_a_map_with_one_sun_is_not_clipped(folder, random):
-    texels = sky(random)
+def test_a_map_with_one_sun_is_not_clipped(folder, rng):
+    texels = sky(rng)
     texels[10, 10:12] = 5000
     assert map_light(folder, "sun.hdr", hdr_of(texels)).max() > 1000
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "header", "other"])
-def test_a_corrupt_map_is_refused_by_name(folder, random, damage):
-    data = hdr_of(sky(random))
+def test_a_corrupt_map_is_refused_by_name(folder, rng, damage):
+    data = hdr_of(sky(rng))
     bad = {"empty": b"", "cut": data[:-900], "header": data.replace(b"-Y", b"?Y"), "other": b"<html>"}[damage]
     with pytest.raises(PhotoError) as error:
         map_light(folder, "bad.hdr", bad)
     check_message(error, "bad.hdr")
 
 
-def test_an_exr_that_ends_early_is_refused_by_name(folder, random):
+def test_an_exr_that_ends_early_is_refused_by_name(folder, rng):
     with pytest.raises(UnreadablePhoto) as error:
-        map_light(folder, "bad.exr", exr_of(sky(random))[:-900])
+        map_light(folder, "bad.exr", exr_of(sky(rng))[:-900])
     check_message(error, "bad.exr")
 
 
@@ -286,13 +286,13 @@ def test_builtin_paintings_and_no_others():
 # --- memory
 
 
-def test_the_cache_has_a_maximum_size_and_keeps_the_most_recently_used_maps(folder, random, monkeypatch):
-    one = sky(random).nbytes
+def test_the_cache_has_a_maximum_size_and_keeps_the_most_recently_used_maps(folder, rng, monkeypatch):
+    one = sky(rng).nbytes
     monkeypatch.setattr(assets_module, "_MAX_CACHE_BYTES", 2 * one)
     opened = []
     monkeypatch.setattr(Photo, "open", classmethod(lambda _cls, data: opened.append(data) or _original(data)))
     for name in "abc":
-        (folder / f"{name}.hdr").write_bytes(hdr_of(sky(random)))
+        (folder / f"{name}.hdr").write_bytes(hdr_of(sky(rng)))
     assets = Assets([folder])
 
     def read(name):
@@ -303,17 +303,17 @@ def test_the_cache_has_a_maximum_size_and_keeps_the_most_recently_used_maps(fold
     assert [read(name) for name in "ababacacb"] == [1, 1, 0, 0, 0, 1, 0, 0, 1]
 
 
-def test_a_map_larger_than_the_cache_is_cached_alone(folder, random, monkeypatch):
+def test_a_map_larger_than_the_cache_is_cached_alone(folder, rng, monkeypatch):
     monkeypatch.setattr(assets_module, "_MAX_CACHE_BYTES", 10)
-    (folder / "a.hdr").write_bytes(hdr_of(sky(random)))
+    (folder / "a.hdr").write_bytes(hdr_of(sky(rng)))
     assets = Assets([folder])
     first = assets.map_light(EnvironmentMap(source=AssetSource(file="a.hdr")))
     (folder / "a.hdr").unlink()
     assert np.array_equal(assets.map_light(EnvironmentMap(source=AssetSource(file="a.hdr"))), first)
 
 
-def test_the_luminance_of_the_scene_does_not_change_the_cached_map(folder, random):
-    (folder / "a.hdr").write_bytes(hdr_of(sky(random)))
+def test_the_luminance_of_the_scene_does_not_change_the_cached_map(folder, rng):
+    (folder / "a.hdr").write_bytes(hdr_of(sky(rng)))
     assets = Assets([folder])
     bright, dim = (
         assets.map_light(EnvironmentMap(source=AssetSource(file="a.hdr"), luminance=value))

@@ -177,13 +177,11 @@ def test_the_left_edge_of_a_map_is_at_its_heading_and_a_mirror_shows_the_map_beh
 
 @pytest.mark.parametrize("radius_mm", [math.inf, 3000])
 @pytest.mark.parametrize("behind", [True, False])
-def test_a_map_emits_the_light_of_its_texels_on_its_own_side_only(
-    radius_mm, behind, random, compiled, mitsuba
-):
+def test_a_map_emits_the_light_of_its_texels_on_its_own_side_only(radius_mm, behind, rng, compiled, mitsuba):
     side = around("mottled", heading_deg=37, radius_mm=radius_mm)
     glass = Glazing(heading_deg=-20, pitch_deg=10)
     scene = a_scene(behind=side, front=side, glass=glass, camera={"position_mm": (100, 0, 500)})
-    directions = random.normal(size=(3, 4000))
+    directions = rng.normal(size=(3, 4000))
     directions /= np.linalg.norm(directions, axis=0)
     to_glass = np.array(axes(glass.heading_deg, glass.pitch_deg))
     with renderer._active_variant(mitsuba, variant.COMPILED):

@@ -26,14 +26,14 @@ MANY_EFFECTS = MixRecipe(
 
 
 @pytest.fixture
-def photos(random):
-    coarse = [np.kron(random.integers(20, 200, (6, 8, 3)), np.ones((16, 16, 1))) for _ in range(4)]
+def photos(rng):
+    coarse = [np.kron(rng.integers(20, 200, (6, 8, 3)), np.ones((16, 16, 1))) for _ in range(4)]
     return [torch.from_numpy(image.astype(np.uint8)) for image in coarse]
 
 
 @pytest.fixture
-def maps(random):
-    return [torch.from_numpy(random.random((3, 32, 64), np.float32) * 4).half() for _ in range(2)]
+def maps(rng):
+    return [torch.from_numpy(rng.random((3, 32, 64), np.float32) * 4).half() for _ in range(2)]
 
 
 def test_light_adds_up_in_linear_light(photos):
