@@ -17,10 +17,10 @@ class SyntheticAssets:
     def __init__(self, **pictures):
         self.pictures = {"white": np.ones((16, 32, 3), np.float32), **pictures}
 
-    def map_light(self, environment):
+    def map_radiance(self, environment):
         return self.pictures[environment.source.file] * np.float32(environment.luminance)
 
-    def plane_light(self, plane):
+    def plane_radiance(self, plane):
         return self.pictures[plane.source.file] * np.float32(plane.luminance)
 
 

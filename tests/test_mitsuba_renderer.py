@@ -30,10 +30,10 @@ IMAGES = {"white": WHITE, "red right": RED_RIGHT, "red top": RED_TOP, "ramp": RA
 class SyntheticAssets:
     """Assets without files: the entry of `IMAGES` with the source's name."""
 
-    def map_light(self, lit):
+    def map_radiance(self, lit):
         return IMAGES[lit.source.file] * np.float32(lit.luminance)
 
-    def plane_light(self, plane):
+    def plane_radiance(self, plane):
         return IMAGES[plane.source.file] * np.float32(plane.luminance)
 
 

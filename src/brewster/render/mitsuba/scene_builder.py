@@ -299,7 +299,7 @@ class MitsubaSceneBuilder:
 
     def _plane(self, plane: Plane, behind: bool, *, is_lit: bool) -> Plugin:
         """A plane faces the glass; heading and pitch are those seen by an observer at the glass."""
-        picture = self._select_channel(self._assets.plane_light(plane))
+        picture = self._select_channel(self._assets.plane_radiance(plane))
         facing = 1 if behind else -1
         columns = np.array(axes(plane.heading_deg, plane.pitch_deg)) * (facing, 1, facing)
         half = plane.width_mm / 2, plane.width_mm / 2 * picture.shape[0] / picture.shape[1]
@@ -352,13 +352,13 @@ class MitsubaSceneBuilder:
 
     def _map_size(self, envmap: EnvironmentMap) -> tuple[int, int]:
         """Height and width of the map. A coarse one is enlarged by an odd factor: texel centres stay texel centres."""
-        height, width = self._assets.map_light(envmap).shape[:2]
+        height, width = self._assets.map_radiance(envmap).shape[:2]
         factor = math.ceil(_MIN_MAP_ROWS / height) // 2 * 2 + 1
         return factor * height, factor * width
 
     def _texels(self, envmap: EnvironmentMap, behind: bool, u: Doubles, v: Doubles) -> Floats:
         """The map's light at u and v, (rows, columns, 3); black on the other side of the glass."""
-        texels = sample_bilinear(self._select_channel(self._assets.map_light(envmap)), u, v)
+        texels = sample_bilinear(self._select_channel(self._assets.map_radiance(envmap)), u, v)
         azimuth, polar = 2 * math.pi * u + math.radians(envmap.heading_deg), math.pi * v[:, None]
         x, y, z = self._to_glass[2]
         above_glass = np.sin(polar) * (x * np.sin(azimuth) - z * np.cos(azimuth)) + y * np.cos(polar)
