@@ -84,7 +84,7 @@ def mitsuba():
     try:
         with warnings.catch_warnings(
             action="ignore", category=RuntimeWarning
-        ):  # about LLVM: see the fixture `compiled`
+        ):  # about LLVM: see the fixture `requires_llvm`
             mitsuba = variant.load()
     except MissingExtra as error:
         pytest.skip(str(error))
@@ -95,7 +95,7 @@ def mitsuba():
 
 
 @pytest.fixture
-def compiled(mitsuba):
+def requires_llvm(mitsuba):
     """Skips the test if Mitsuba's kernels cannot be compiled."""
     from brewster.render.mitsuba import variant  # noqa: PLC0415
 

@@ -111,7 +111,7 @@ def _render_layers(
     scene = builders[0].scene
 
     def estimate(*images: tuple[bool, GlassMode]) -> list[_RunningEstimate]:
-        estimates = [_RunningEstimate(builders, behind, glass, max_samples) for behind, glass in images]
+        estimates = [_RunningEstimate(builders, behind, mode, max_samples) for behind, mode in images]
         _converge(estimates, noise_threshold, max_samples)
         return estimates
 
@@ -150,14 +150,15 @@ class _RunningEstimate:
     """An image rendered in passes: the mean of the passes so far, and the variance of this mean per pixel."""
 
     def __init__(
-        self, builders: Sequence[MitsubaSceneBuilder], behind: bool, glass: GlassMode, max_samples: int
+        self, builders: Sequence[MitsubaSceneBuilder], behind: bool, glass_mode: GlassMode, max_samples: int
     ) -> None:
         scene = builders[0].scene
         self._mi = builders[0].mi
         self._scenes = [
-            self._mi.load_dict(builder.scene_dict(behind=behind, glass=glass)) for builder in builders
+            self._mi.load_dict(builder.scene_dict(behind=behind, glass_mode=glass_mode))
+            for builder in builders
         ]
-        self._seed_key = scene.seed, scene.index, int(behind), get_args(GlassMode).index(glass)
+        self._seed_key = scene.seed, scene.index, int(behind), get_args(GlassMode).index(glass_mode)
         self.samples = _samples_per_pass(scene.camera.width * scene.camera.height, max_samples)
         self.passes = 0
         self._sum = np.zeros((scene.camera.height, scene.camera.width, 3))

@@ -64,16 +64,16 @@ class MitsubaSceneBuilder:
         )
         _check_wedges(scene.glass, self._view_corners[:, 0])
 
-    def scene_dict(self, *, behind: bool, glass: GlassMode) -> Plugin:
+    def scene_dict(self, *, behind: bool, glass_mode: GlassMode) -> Plugin:
         """The whole scene, lit from one side of the glass; objects of the other side are black.
 
         Raises:
             RecipeError: a lens has no thickness somewhere in its frame.
         """
-        is_tinted = glass not in {"mirror", "none"} and any(
+        is_tinted = glass_mode not in {"mirror", "none"} and any(
             any(pane.absorption_per_m) for pane in self._glass.panes
         )
-        parts = [*self._surfaces(glass), *self._wall(), *self._emitters(behind)]
+        parts = [*self._surfaces(glass_mode), *self._wall(), *self._emitters(behind)]
         return {
             "type": "scene",
             "integrator": {
@@ -147,18 +147,18 @@ class MitsubaSceneBuilder:
 
     # The glass
 
-    def _surfaces(self, glass: GlassMode) -> Iterator[object]:
+    def _surfaces(self, glass_mode: GlassMode) -> Iterator[object]:
         """All surfaces, the one nearest to the camera first. A frame limits the first one; the others exceed the view."""
-        if glass == "none":
+        if glass_mode == "none":
             return
         if self._glass.radii_mm:
-            yield from self._lens(*self._glass.radii_mm, glass)
+            yield from self._lens(*self._glass.radii_mm, glass_mode)
             return
         height, max_half_size = 0.0, (self._half_extent_mm, self._half_extent_mm)
         opening = self._glass.opening_mm
         half_size = (opening[0] / 2, opening[1] / 2) if opening else max_half_size
         for pane in self._glass.panes:
-            is_entered, material = self._material(pane, glass)
+            is_entered, material = self._material(pane, glass_mode)
             yield self._rectangle(np.eye(3), (0, 0, height), half_size, material)
             if not is_entered:
                 return
@@ -181,9 +181,9 @@ class MitsubaSceneBuilder:
         columns = -across, np.array((0, 1, 0)), np.array((-sine, 0, -cosine))
         return self._rectangle(columns, middle, ((high - low) / 2, self._half_extent_mm), material)
 
-    def _material(self, pane: Pane, glass: GlassMode) -> tuple[bool, Plugin]:
+    def _material(self, pane: Pane, glass_mode: GlassMode) -> tuple[bool, Plugin]:
         """Whether light enters the pane, and the materials of its surfaces and its interior."""
-        if glass == "mirror":
+        if glass_mode == "mirror":
             return False, {"bsdf": {"type": "conductor", "material": "none"}}
         rough = (
             {"alpha": pane.roughness, "distribution": "ggx"}
@@ -191,12 +191,12 @@ class MitsubaSceneBuilder:
             else {}
         )
         kind = "rough" if rough else ""
-        if glass == "truncated_reflection" and pane is self._glass.panes[-1]:
+        if glass_mode == "truncated_reflection" and pane is self._glass.panes[-1]:
             # A conductor with k = 0 has the reflectance of glass, and no ray is spent on transmission.
             index = {"type": "spectrum", "value": pane.refractive_index}
             return False, {"bsdf": {"type": kind + "conductor", "eta": index, "k": 0.0, **rough}}
         bsdf = {"type": kind + "dielectric", "int_ior": pane.refractive_index, "ext_ior": 1.0, **rough}
-        if glass == "truncated_transmission":
+        if glass_mode == "truncated_transmission":
             bsdf["specular_reflectance"] = 0.0
         return True, {"bsdf": bsdf, **self._interior_medium(pane)}
 
@@ -228,10 +228,10 @@ class MitsubaSceneBuilder:
 
     # A lens
 
-    def _lens(self, near_mm: float, far_mm: float, glass: GlassMode) -> Iterator[object]:
+    def _lens(self, near_mm: float, far_mm: float, glass_mode: GlassMode) -> Iterator[object]:
         """Two spherical surfaces as fine meshes with interpolated normals, inside black frame sides."""
         pane = self._glass.panes[0]
-        is_entered, material = self._material(pane, glass)
+        is_entered, material = self._material(pane, glass_mode)
         near, far = self._sphere(near_mm, 0.0), self._sphere(far_mm, -pane.thickness_mm)
         depth = near[0][..., 2] - far[0][..., 2]
         if depth.min() <= 0:
