@@ -67,7 +67,7 @@ def test_a_change_that_is_not_allowed_is_refused_and_the_key_named(key_path, val
 
 def test_training_images_grow_at_the_shares_of_the_run_in_the_recipe():
     recipe = read_recipe(FOLDER / "train/tiny.toml")
-    assert (recipe.steps, recipe.sizes) == (6, [(0.0, 64), (0.5, 96)])
+    assert (recipe.steps, recipe.image_size_schedule) == (6, [(0.0, 64), (0.5, 96)])
     assert [recipe.size_at(step) for step in range(6)] == [64, 64, 64, 96, 96, 96]
 
 
@@ -99,11 +99,11 @@ def test_the_path_of_a_scene_recipe_is_relative_to_the_recipe(tmp_path):
             'network is "lite3"; expected one of the networks: lite2-unet',
         ),
         (("weight_decay = 1e-4", "weight_decay = inf"), "weight_decay"),
-        (("[[0.0, 64], [0.5, 96]]", "[]"), "sizes"),
-        (("[[0.0, 64], [0.5, 96]]", "[[0.1, 64]]"), "sizes is .*; .* start at 0"),
-        (("[[0.0, 64], [0.5, 96]]", "[[0.0, 64], [0.0, 96]]"), "sizes is .*; .* increase"),
-        (("[[0.0, 64], [0.5, 96]]", "[[0.0, 96], [0.5, 64]]"), "sizes is .*; .* increase"),
-        (("[[0.0, 64], [0.5, 96]]", "[[0.0, 50]]"), r"sizes\.0\.1 is 50; .* multiple of 32"),
+        (("[[0.0, 64], [0.5, 96]]", "[]"), "image_size_schedule"),
+        (("[[0.0, 64], [0.5, 96]]", "[[0.1, 64]]"), "image_size_schedule is .*; .* start at 0"),
+        (("[[0.0, 64], [0.5, 96]]", "[[0.0, 64], [0.0, 96]]"), "image_size_schedule is .*; .* increase"),
+        (("[[0.0, 64], [0.5, 96]]", "[[0.0, 96], [0.5, 64]]"), "image_size_schedule is .*; .* increase"),
+        (("[[0.0, 64], [0.5, 96]]", "[[0.0, 50]]"), r"image_size_schedule\.0\.1 is 50; .* multiple of 32"),
         (
             ('["photos/permissive"]', "[]"),
             r"\[data\] are inconsistent; expected at least one of photos, pairs and rendered",
@@ -209,7 +209,7 @@ def test_the_path_of_a_prompt_is_relative_to_the_recipe(tmp_path):
     [
         (("rank = 16", "rank = 0"), "rank is 0"),
         (("rank = 16", "rnk = 16"), "no key rnk .*; did you mean rank"),
-        (("rank = 16", "sizes = [[0.0, 64]]"), "no key sizes"),
+        (("rank = 16", "image_size_schedule = [[0.0, 64]]"), "no key image_size_schedule"),
         (('"int8"', '"int3"'), 'quantise is "int3"; .*; did you mean "int8"'),
         (('"kontext"', '"tiny:kontext"'), "are inconsistent; expected no quantise: a toy backbone"),
         (('["I", "T", "R"]', '["I", "T", "Q"]'), r"panels\.2"),

@@ -132,7 +132,7 @@ class LoraTrainer:
         gains, rows = {}, []
         for name, samples in self._validation_samples.items():
             results = [self._validate_sample(layers) for layers in samples]
-            gains[f"gain_db_{name}"] = sum(gain for gain, _ in results) / len(results)
+            gains[f"psnr_gain_db_{name}"] = sum(gain for gain, _ in results) / len(results)
             rows += [row for _, row in results]
         return gains, torch.cat(rows, dim=1).clamp(0, 1).permute(1, 2, 0)
 
@@ -205,7 +205,7 @@ class LoraTrainer:
         if encoded.start is not None:
             return encoded.start, torch.ones(1)
         recipe, grid = self.recipe, encoded.composite
-        normal = recipe.logit_mean + recipe.logit_deviation * rng.normal(1)
+        normal = recipe.logit_mean + recipe.logit_std * rng.normal(1)
         sigma = self.backbone.shifted(normal.sigmoid(), grid.shape[2] * grid.shape[3])
         return rng.normal(*grid.shape), sigma
 
