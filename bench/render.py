@@ -24,7 +24,7 @@ from brewster.environments.catalog import BUILTIN_CATALOG
 from brewster.executors import SerialExecutor
 from brewster.render.analytic import render
 from brewster.render.mitsuba.renderer import trace
-from brewster.render.sample import LAYERS, LightSample
+from brewster.render.sample import LAYERS, LinearSample
 from brewster.rendered.generation.job import RenderJob, build
 from brewster.rendered.generation.workers import TaskRunner
 from brewster.scene.camera import Camera
@@ -49,7 +49,7 @@ SCENES = {
 }
 
 
-def relative_error(sample: LightSample, reference: LightSample) -> float:
+def relative_error(sample: LinearSample, reference: LinearSample) -> float:
     """relMSE, averaged over the five images."""
     errors = []
     for name in LAYERS:
@@ -58,7 +58,7 @@ def relative_error(sample: LightSample, reference: LightSample) -> float:
     return float(sum(errors) / len(errors))
 
 
-def render_reference(scene: Scene, assets: Assets) -> LightSample:
+def render_reference(scene: Scene, assets: Assets) -> LinearSample:
     """Renders a scene at four times the width and height, and averages blocks of 4 x 4 pixels."""
     camera = scene.camera.model_copy(
         update={"width": 4 * scene.camera.width, "height": 4 * scene.camera.height}
@@ -68,7 +68,7 @@ def render_reference(scene: Scene, assets: Assets) -> LightSample:
 
 
 def measure_mitsuba(
-    scene: Scene, assets: Assets, reference: LightSample, *, denoise: bool
+    scene: Scene, assets: Assets, reference: LinearSample, *, denoise: bool
 ) -> tuple[float, float, int, bool]:
     """Doubles the rays until the error is at most TARGET_ERROR or the next run would exceed MAX_CPU_S.
 
@@ -76,10 +76,10 @@ def measure_mitsuba(
         CPU-seconds at TARGET_ERROR, the last error, the last rays per pixel, and whether the seconds are extrapolated.
     """
     samples = 4
-    trace(scene, assets, noise=0, max_samples=samples, denoise=denoise)  # compiles the kernels
+    trace(scene, assets, noise_threshold=0, max_samples=samples, denoise=denoise)  # compiles the kernels
     while True:
         start = time.process_time()
-        traced = trace(scene, assets, noise=0, max_samples=samples, denoise=denoise)
+        traced = trace(scene, assets, noise_threshold=0, max_samples=samples, denoise=denoise)
         spent, error = time.process_time() - start, relative_error(traced, reference)
         if error <= TARGET_ERROR:
             return spent, error, samples, False

@@ -62,7 +62,7 @@ def _network_off(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def random() -> np.random.Generator:
+def rng() -> np.random.Generator:
     return np.random.default_rng(7)
 
 
@@ -84,7 +84,7 @@ def mitsuba():
     try:
         with warnings.catch_warnings(
             action="ignore", category=RuntimeWarning
-        ):  # about LLVM: see the fixture `compiled`
+        ):  # about LLVM: see the fixture `requires_llvm`
             mitsuba = variant.load()
     except MissingExtra as error:
         pytest.skip(str(error))
@@ -95,7 +95,7 @@ def mitsuba():
 
 
 @pytest.fixture
-def compiled(mitsuba):
+def requires_llvm(mitsuba):
     """Skips the test if Mitsuba's kernels cannot be compiled."""
     from brewster.render.mitsuba import variant  # noqa: PLC0415
 
@@ -143,14 +143,14 @@ def run_without_model(run):
 
 
 @pytest.fixture
-def recipe(tmp_path, monkeypatch, random):
+def recipe(tmp_path, monkeypatch, rng):
     """The tiny training recipe, with three photos as training data."""
     from brewster.training.recipe import read_recipe  # noqa: PLC0415  (imports torch)
 
     folder = tmp_path / "data" / "photos" / "permissive"
     folder.mkdir(parents=True)
     for index in range(3):
-        picture = np.kron(random.integers(0, 256, (5, 7, 3)), np.ones((20, 20, 1))).astype(np.uint8)
+        picture = np.kron(rng.integers(0, 256, (5, 7, 3)), np.ones((20, 20, 1))).astype(np.uint8)
         Photo.from_array(picture, encoding="srgb").save(folder / f"{index}.png")
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "data"))
     return read_recipe(RECIPES / "train/tiny.toml")

@@ -12,9 +12,9 @@ from brewster.training.data.sample_rng import SampleRng
 
 
 @pytest.fixture
-def scene(random):
+def scene(rng):
     """Returns an encoded image of smooth blobs and a hard edge, (3, 64, 64)."""
-    coarse = torch.from_numpy(random.random((1, 3, 5, 5), np.float32))
+    coarse = torch.from_numpy(rng.random((1, 3, 5, 5), np.float32))
     smooth = torch.nn.functional.interpolate(coarse, (64, 64), mode="bicubic")[0].clamp(0, 1)
     smooth[:, :, 40:] *= 0.4
     return (smooth * 255).round() / 255

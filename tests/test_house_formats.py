@@ -135,10 +135,10 @@ LPIPS = {
     4: {"lpips": 0.033937, "lpips_region": 0.035948, "lpips_reflection": 0.283549},
 }
 SCENES = {
-    2: {"tiny": "b8473c2883ad1619", "window": "bd20ed9f789a3ff3"},
+    3: {"tiny": "cda0e22e03359745", "window": "2211837ba771cafc"},
 }
 SAMPLES = {
-    2: {
+    3: {
         "photo, light": [1.0143, 0.8571, 1.1205],
         "transmission, light": [0.7423, 0.6429, 0.8384],
         "background, light": [0.9394, 0.7656, 1.0188],
@@ -152,7 +152,7 @@ SAMPLES = {
     },
 }
 ENVIRONMENT_MAPS = {
-    2: {
+    3: {
         "room": [
             -1.134,
             -1.145,
@@ -274,7 +274,7 @@ def test_a_changed_rendering_needs_a_new_sample_format():
         panes=[{"absorption_per_m": (20.0, 5.0, 10.0)}, {}],
         behind=plane_side("soft"),
         front=map_side("soft", radius_mm=4000.0, luminance=2.0),
-        samples=4,
+        samples_per_pixel=4,
         seed=5,
     )
     sample = render(scene, ASSETS)

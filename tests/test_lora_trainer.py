@@ -108,7 +108,7 @@ def test_a_run_writes_a_log_pictures_and_a_folder_for_diffusers(recipe, tmp_path
     assert json.loads((place / "recipe.json").read_text())["backbone"] == "tiny:kontext"
     (line,) = (tmp_path / "log.jsonl").read_text().splitlines()
     assert json.loads(line).keys() == {
-        "step", "loss", "loss_panel_I", "loss_panel_T", "loss_panel_R", "gain_db_training", "seconds",
+        "step", "loss", "loss_panel_I", "loss_panel_T", "loss_panel_R", "psnr_gain_db_training", "seconds",
     }  # fmt: skip
     assert Photo.open(tmp_path / "samples.png").size == (6 * 240, 20 + 20 + 160)
 
@@ -168,7 +168,7 @@ def test_small_validation_photos_get_small_panels(make_trainer, tmp_path, monkey
     trainer = make_trainer()
     data = trainer.recipe.data.model_copy(update={"validate_on": (Path("small"),)})
     scores, image = make_trainer(data=data, panels=["T", "R"], budget_px=2 * 32 * 16).validate()
-    assert scores.keys() == {"gain_db_small"}
+    assert scores.keys() == {"psnr_gain_db_small"}
     assert image.shape == (20 + 20 + 160, 5 * 240, 3)
 
 

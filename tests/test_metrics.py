@@ -38,14 +38,14 @@ def test_ssim_equals_scikit_image_with_either_window(one, other, window):
 
 @pytest.mark.parametrize("window", SCIKIT_ARGUMENTS)
 @pytest.mark.parametrize("size", [(11, 11), (11, 40), (40, 12), (33, 47)])
-def test_ssim_equals_scikit_image_at_any_size_and_near_white(random, size, window):
-    one, other = random.integers(230, 256, (2, *size, 3), np.uint8)
+def test_ssim_equals_scikit_image_at_any_size_and_near_white(rng, size, window):
+    one, other = rng.integers(230, 256, (2, *size, 3), np.uint8)
     expected = structural_similarity(other, one, **SCIKIT_ARGUMENTS[window])
     assert ssim(one, other, window=window) == pytest.approx(expected, abs=1e-9)
 
 
-def test_equal_images_have_infinite_psnr_and_an_ssim_of_one(random):
-    image = random.integers(0, 256, (12, 12, 3), np.uint8)
+def test_equal_images_have_infinite_psnr_and_an_ssim_of_one(rng):
+    image = rng.integers(0, 256, (12, 12, 3), np.uint8)
     assert psnr(image, image) == float("inf")
     assert ssim(image, image) == ssim(image, image, window="gaussian") == pytest.approx(1)
 
@@ -64,8 +64,8 @@ def test_two_uniform_images_have_the_ssim_of_their_means():
         assert ssim(black, white, window=window) == pytest.approx(constant / (255**2 + constant))
 
 
-def test_images_may_have_any_memory_layout(random):
-    one, other = random.integers(0, 256, (2, 20, 26, 3), np.uint8)
+def test_images_may_have_any_memory_layout(rng):
+    one, other = rng.integers(0, 256, (2, 20, 26, 3), np.uint8)
     for a, b in ((one[::-1, ::2], other[::-1, ::2]), (one.transpose(1, 0, 2), other.transpose(1, 0, 2))):
         assert psnr(a, b) == psnr(a.copy(), b.copy())
         assert ssim(a, b) == pytest.approx(ssim(a.copy(), b.copy()), abs=1e-12)
@@ -94,8 +94,8 @@ def test_ssim_in_a_region_is_the_mean_of_the_map_of_scikit_image(one, other, mas
             ssim(one, other, window=window, region=mask)
 
 
-def test_psnr_in_a_region_ignores_all_other_pixels(random):
-    truth = random.integers(0, 200, (9, 9, 3), np.uint8)
+def test_psnr_in_a_region_ignores_all_other_pixels(rng):
+    truth = rng.integers(0, 200, (9, 9, 3), np.uint8)
     image, region = truth.copy(), np.zeros((9, 9), bool)
     image[:3] += np.uint8(10)
     region[:3, 2:5] = True

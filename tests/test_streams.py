@@ -96,7 +96,7 @@ def test_orders_and_seed_of_a_recipe_reach_the_scenes(recipe, builtin):
     endless = with_value(recipe, "data.rendered.count", None)
     whole, paper, other = (
         open_stream(with_value(endless, f"data.rendered.{name}", value))(0, 1, 32)
-        for name, value in (("orders", "all"), ("orders", "paper"), ("seed", 2))
+        for name, value in (("orders", "all"), ("orders", "truncated"), ("seed", 2))
     )
     assert torch.equal(whole.photo_encoded, paper.photo_encoded)
     assert paper.reflection_encoded.mean() < whole.reflection_encoded.mean()

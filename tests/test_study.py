@@ -191,7 +191,7 @@ def test_catch_pictures_are_clearly_degraded_outputs(tmp_path):
         assert catch.spoilt not in outputs
 
 
-def test_degrading_preserves_the_mean_of_dark_and_light_pictures(random):
+def test_degrading_preserves_the_mean_of_dark_and_light_pictures(rng):
     for level in (20, 128, 235):
         flat = np.full((60, 80, 3), level, np.uint8)
         spoilt = degrade(flat, 1)

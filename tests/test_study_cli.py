@@ -74,8 +74,8 @@ def test_create_exits_with_1_for_wrong_files_and_with_2_for_wrong_arguments(
     assert not (tmp_path / "study").exists()
 
 
-def test_report_prints_tables_and_writes_all_files(run_without_model, study, random):
-    add_answers(study, 12, random)
+def test_report_prints_tables_and_writes_all_files(run_without_model, study, rng):
+    add_answers(study, 12, rng)
     code, out, err = run_without_model("study", "report", "study")
     assert code == 0
     assert "### ours and RDNet" in out.decode()
@@ -223,8 +223,8 @@ def test_report_without_answers_creates_no_database(run_without_model, study):
 @pytest.mark.skipif(
     os.geteuid() == 0 and not shutil.which("setpriv"), reason="root writes to read-only folders"
 )
-def test_a_read_only_study_is_reported_into_another_folder(study, random, tmp_path):
-    add_answers(study, 3, random)
+def test_a_read_only_study_is_reported_into_another_folder(study, rng, tmp_path):
+    add_answers(study, 3, rng)
     study.folder.chmod(0o555)
     without_root_rights = ["setpriv", "--inh-caps=-all", "--bounding-set=-all"] if os.geteuid() == 0 else []
     command = [*without_root_rights, sys.executable, "-m", "brewster", "study", "report", str(study.folder)]

@@ -161,8 +161,8 @@ def test_the_p_value_of_unanimous_participants_is_that_of_all_exchanges():
 
 
 @pytest.mark.parametrize("methods", [2, 3, 5])
-def test_strengths_equal_those_of_choix(random, methods):
-    wins = random.integers(1, 30, (methods, methods)) + random.integers(0, 2, (methods, methods)) / 2
+def test_strengths_equal_those_of_choix(rng, methods):
+    wins = rng.integers(1, 30, (methods, methods)) + rng.integers(0, 2, (methods, methods)) / 2
     games = [
         (a, b) for a in range(methods) for b in range(methods) if a != b for _ in range(int(2 * wins[a, b]))
     ]
@@ -175,8 +175,8 @@ def test_the_difference_of_two_strengths_is_the_logit_of_the_win_rate():
     assert np.diff(strengths(np.array([[0, 30.0], [10, 0]]))) == pytest.approx([-np.log(3)])
 
 
-def test_strengths_of_many_tables_are_those_of_each(random):
-    tables = random.integers(1, 20, (6, 4, 4)).astype(float)
+def test_strengths_of_many_tables_are_those_of_each(rng):
+    tables = rng.integers(1, 20, (6, 4, 4)).astype(float)
     tables[2, 0] = 0  # the first method never wins
     together = strengths(tables)
     assert np.isnan(together[2]).all()
@@ -202,9 +202,9 @@ def test_alpha_of_the_example_of_krippendorff_is_reproduced():
     assert alpha(ratings) == pytest.approx(0.743, abs=5e-4)
 
 
-def test_alpha_is_1_for_agreement_0_for_chance_and_none_where_undefined(random):
+def test_alpha_is_1_for_agreement_0_for_chance_and_none_where_undefined(rng):
     assert alpha(np.array([[4.0, 0, 0], [0, 3, 0]])) == 1
-    assert alpha(random.multinomial(20, RATES, 2000).astype(float)) == pytest.approx(0, abs=0.01)
+    assert alpha(rng.multinomial(20, RATES, 2000).astype(float)) == pytest.approx(0, abs=0.01)
     assert alpha(np.array([[4.0, 0, 0], [5, 0, 0]])) is None
     assert alpha(np.array([[1.0, 0, 0], [0, 1, 0]])) is None
 

@@ -27,7 +27,7 @@ def test_captions_with_special_characters_are_drawn_literally():
 def test_metrics_of_one_kind_share_a_panel():
     """Three panels: the loss, its terms, and the gains of both folders."""
     lines = [
-        {"step": step, "loss": 1 / step, "loss_a": 0.1, "loss_b": -0.1, "gain_db_x": 1.0, "gain_db_y": 2.0, "seconds": 5.0}
+        {"step": step, "loss": 1 / step, "loss_a": 0.1, "loss_b": -0.1, "psnr_gain_db_x": 1.0, "psnr_gain_db_y": 2.0, "seconds": 5.0}
         for step in (1, 2)
     ]  # fmt: skip
     widths = [
@@ -40,5 +40,5 @@ def test_metrics_of_one_kind_share_a_panel():
 
 
 def test_a_metric_that_was_added_later_is_plotted_from_its_first_step():
-    before, after = {"step": 1, "loss": 0.5}, {"step": 2, "loss": 0.4, "gain_db_x": 1.0}
-    assert plot_log([before, after]) != plot_log([before | {"gain_db_x": 0.0}, after])
+    before, after = {"step": 1, "loss": 0.5}, {"step": 2, "loss": 0.4, "psnr_gain_db_x": 1.0}
+    assert plot_log([before, after]) != plot_log([before | {"psnr_gain_db_x": 0.0}, after])

@@ -104,7 +104,7 @@ class _Size(click.ParamType[tuple[int, int]]):
 )
 @click.option(
     "--orders",
-    type=click.Choice(["all", "paper"]),
+    type=click.Choice(["all", "truncated"]),
     help="The light paths in T and R: all of them (then I = T + R), or only the one path per layer that the paper uses; by default, the value in the recipe.",
 )
 @click.option(

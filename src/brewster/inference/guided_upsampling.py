@@ -30,7 +30,7 @@ _DETAIL_EPSILON: Final = 1e-6
 
 @final
 @dataclass(frozen=True)
-class _LocalLinearMap:
+class _LocalLinearModel:
     """A layer as a local linear function of the photo: layer = slope * photo + offset, at low resolution."""
 
     slope: Float32[Floats, "h w 3"]
@@ -81,8 +81,8 @@ class GeneratedOverride:
 class GuidedUpsampler:
     """A separation fitted at low resolution. It is applied to the full photo in strips of rows."""
 
-    change: _LocalLinearMap
-    reflection: _LocalLinearMap
+    change: _LocalLinearModel
+    reflection: _LocalLinearModel
     override: GeneratedOverride | None = None
 
     @classmethod
@@ -102,10 +102,10 @@ class GuidedUpsampler:
         mean = _box_mean(photo)
         variance = _box_mean(photo * photo) - mean**2 + _EPSILON
 
-        def fit_layer(layer: Floats) -> _LocalLinearMap:
+        def fit_layer(layer: Floats) -> _LocalLinearModel:
             """Fits a slope to each window and averages the slopes. The offset makes the fit exact at low resolution."""
             slope = _box_mean((_box_mean(photo * layer) - mean * _box_mean(layer)) / variance)
-            return _LocalLinearMap(slope, layer - slope * photo)
+            return _LocalLinearModel(slope, layer - slope * photo)
 
         return cls(fit_layer(change), fit_layer(reflection), override)
 

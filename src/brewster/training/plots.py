@@ -18,7 +18,7 @@ CAPTION_PX: Final = 20
 _PANELS: Final = {
     "loss": "loss of the batch",
     "loss_": "terms of the loss",
-    "gain_db_": "PSNR gain over the input, dB",
+    "psnr_gain_db_": "PSNR gain over the input, dB",
     "worse_": "share of pairs worse than the input",
     "tone_": "tone, prediction / photo",
 }

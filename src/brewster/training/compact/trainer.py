@@ -228,7 +228,7 @@ class CompactTrainer:
 
     @torch.no_grad()
     def _update_ema(self, steps: int) -> None:
-        decay = min(self.recipe.average_decay, (steps + 1) / (steps + 10))
+        decay = min(self.recipe.ema_decay, (steps + 1) / (steps + 10))
         for name, value in self.network.state_dict().items():
             self.ema_weights[name].lerp_(value, 1 - decay)
 
@@ -244,7 +244,7 @@ def validate(
     """Computes the validation metrics of a network. Pairs are not resized. `map_` may be the `map` of a thread pool.
 
     Returns:
-        For each folder: gain_db_NAME, the mean PSNR gain over the input in dB; worse_NAME, the fraction of pairs whose
+        For each folder: psnr_gain_db_NAME, the mean PSNR gain over the input in dB; worse_NAME, the fraction of pairs whose
         prediction is worse than the input; tone_NAME, the mean `tone_ratio`, which is 1 if prediction and photo have the same
         exposure.
     """
@@ -257,7 +257,7 @@ def validate(
     metrics = {}
     for name, folder in filter(itemgetter(1), pairs.items()):
         gains, tones = zip(*map_(measure, folder), strict=True)
-        metrics[f"gain_db_{name}"] = sum(gains) / len(gains)
+        metrics[f"psnr_gain_db_{name}"] = sum(gains) / len(gains)
         metrics[f"worse_{name}"] = sum(gain < 0 for gain in gains) / len(gains)
         metrics[f"tone_{name}"] = sum(tones) / len(tones)
     return metrics

@@ -133,7 +133,7 @@ class LoraTrainer:
         gains, rows = {}, []
         for name, samples in self._validation_samples.items():
             results = [self._validate_sample(layers) for layers in samples]
-            gains[f"gain_db_{name}"] = sum(gain for gain, _ in results) / len(results)
+            gains[f"psnr_gain_db_{name}"] = sum(gain for gain, _ in results) / len(results)
             rows += [
                 (f"{name} {number}: PSNR gain {gain:+.2f} dB", row.clamp(0, 1))
                 for number, (gain, row) in enumerate(results, start=1)
@@ -211,7 +211,7 @@ class LoraTrainer:
         if encoded.start is not None:
             return encoded.start, torch.ones(1)
         recipe, grid = self.recipe, encoded.composite
-        normal = recipe.logit_mean + recipe.logit_deviation * rng.normal(1)
+        normal = recipe.logit_mean + recipe.logit_std * rng.normal(1)
         sigma = self.backbone.shifted(normal.sigmoid(), grid.shape[2] * grid.shape[3])
         return rng.normal(*grid.shape), sigma
 
