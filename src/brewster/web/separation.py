@@ -8,6 +8,7 @@ The server fetches nothing by URL and writes nothing to the disk.
 
 from __future__ import annotations
 
+import gzip
 import io
 import time
 import zipfile
@@ -31,6 +32,7 @@ from brewster.web.model_cache import ModelCache, ModelRow
 from brewster.web.preview import preview
 from brewster.web.request_schema import SeparationRequest, form_schema, read_form
 
+_GZIP_LEVEL: Final = 1  # higher levels save little more and take several times longer
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)  # the earliest date of zip; a fixed date makes the archive reproducible
 
 
@@ -40,6 +42,8 @@ class ErrorResponse(BaseModel):
 
     error: str
     """What happened, what was expected, and what to do."""
+    kind: str | None = None
+    """The class of the error in `brewster.errors`, such as UnreadablePhoto, if it has one."""
 
 
 @final
@@ -159,7 +163,7 @@ def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: Pro
 def _preview(model_cache: ModelCache, form: SeparationRequest, on_progress: ProgressCallback) -> Response:
     photo = Photo.open(form.photo, max_pixels=form.options.max_pixels)
     maps = preview(model_cache.separator(form.options.model), photo, form.options, on_progress)
-    return Response(maps, media_type="application/octet-stream")
+    return Response(gzip.compress(maps, _GZIP_LEVEL, mtime=0), media_type="application/gzip")
 
 
 def _media_type(name: str) -> str:

@@ -13,9 +13,10 @@ function toEncoded(linear) {
   return linear <= 0.0031308 ? linear * 12.92 : 1.055 * linear ** (1 / 2.4) - 0.055;
 }
 
-// Parses the maps of a preview. `photo`, `reflection` and `confidence_map` are 8-bit codes; `change` is the transmission at
+// Parses the maps of a preview, a Blob that is compressed with gzip. `photo`, `reflection` and `confidence_map` are 8-bit codes; `change` is the transmission at
 // strength 1 minus the photo, in linear light.
-export function readMaps(buffer) {
+export async function readMaps(blob) {
+  const buffer = await new Response(blob.stream().pipeThrough(new DecompressionStream("gzip"))).arrayBuffer();
   const end = new Uint8Array(buffer).indexOf(10);
   const head = JSON.parse(new TextDecoder().decode(buffer.slice(0, end)));
   const count = head.width * head.height;
