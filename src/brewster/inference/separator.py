@@ -35,7 +35,7 @@ from brewster.inference.predictor import (
 from brewster.inference.tiles import Backend
 from brewster.models.zoo import find_model, is_large
 from brewster.options import Options, Quality, Quantisation, document_options
-from brewster.photo import Encoding, Photo, Source
+from brewster.photo import Encoding, Mask, Photo, Source
 
 if TYPE_CHECKING:
     from brewster.models.diffusion.pipeline import DecompositionPipeline
@@ -160,6 +160,7 @@ class Separator:
         *,
         strength: float = Options.strength,
         quality: Quality = Options.quality,
+        mask: Source | None = Options.mask,
         additive: bool = Options.additive,
         encoding: Encoding | None = None,
         max_pixels: int = Options.max_pixels,
@@ -174,12 +175,14 @@ class Separator:
 
         Raises:
             PhotoError: the source cannot be read, or is too large.
+            MaskError: the mask cannot be read, is not grey, or has another size than the photo.
             BrewsterError: strength or quality is out of range.
         """
         _check_options(strength, quality)
         seconds: dict[str, float] = {}
         with _timed(seconds, "decode"):
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
+            weights = None if mask is None else Mask.open(mask, photo.size)
             inputs = [photo.resized(*size) for size in self._predictor.input_sizes(photo.size, quality)]
             white = np.float32(max(1.0, float(np.percentile(inputs[-1], _WHITE_PERCENTILE))))
             inputs = [np.clip(scaled_input / white, 0, 1) for scaled_input in inputs]
@@ -189,7 +192,7 @@ class Separator:
         with _timed(seconds, "detail"):
             upsampler = _fit_upsampler(inputs[-1], prediction, strength, white)
             transmission, reflection, residual = _upsample(
-                photo, upsampler, additive=additive, on_progress=on_progress
+                photo, upsampler, weights, additive=additive, on_progress=on_progress
             )
         return Separation(
             photo,
@@ -213,6 +216,7 @@ def separate(
     device: str = Options.device,
     strength: float = Options.strength,
     quality: Quality = Options.quality,
+    mask: Source | None = Options.mask,
     additive: bool = Options.additive,
     encoding: Encoding | None = None,
     max_pixels: int = Options.max_pixels,
@@ -238,6 +242,7 @@ def separate(
         source,
         strength=strength,
         quality=quality,
+        mask=mask,
         additive=additive,
         encoding=encoding,
         max_pixels=max_pixels,
@@ -282,7 +287,12 @@ def _fit_upsampler(
 
 
 def _upsample(
-    photo: Photo, upsampler: GuidedUpsampler, *, additive: bool, on_progress: ProgressCallback
+    photo: Photo,
+    upsampler: GuidedUpsampler,
+    mask: Mask | None,
+    *,
+    additive: bool,
+    on_progress: ProgressCallback,
 ) -> tuple[Photo, Photo, float]:
     """Returns transmission, reflection and the mean residual. The layers are encoded like the photo, or as exact floats."""
     template = _float_template(photo) if additive else photo
@@ -290,7 +300,8 @@ def _upsample(
 
     def fill(rows: slice) -> float:
         linear = photo.linear_rows(rows.start, rows.stop)
-        layers = upsampler.apply(linear, rows.start, photo.size[1])
+        weights = None if mask is None else mask.rows(rows.start, rows.stop)
+        layers = upsampler.apply(linear, rows.start, photo.size[1], weights)
         stored = [template.stored_rows(layer, rows.start) for layer in layers]
         if additive:
             stored = _exact_sum_layers(template.stored_rows(linear, rows.start), stored[0])

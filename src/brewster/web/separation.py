@@ -134,7 +134,7 @@ def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: Pro
     started = time.perf_counter()
     options = form.options
     separation = model_cache.separator(options.model)(
-        form.photo, on_progress=on_progress, **options.call_options()
+        form.photo, on_progress=on_progress, **options.call_options() | {"mask": form.mask}
     )
     files = {}
     for layer in options.layers:
