@@ -183,9 +183,7 @@ class Separator:
         with _timed(seconds, "decode"):
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
             weights = None if mask is None else Mask.open(mask, photo.size)
-            inputs = [photo.resized(*size) for size in self._predictor.input_sizes(photo.size, quality)]
-            white = np.float32(max(1.0, float(np.percentile(inputs[-1], _WHITE_PERCENTILE))))
-            inputs = [np.clip(scaled_input / white, 0, 1) for scaled_input in inputs]
+            inputs, white = self._inputs(photo, quality)
         on_progress(0.0)
         with _timed(seconds, "network"):
             prediction = self._predictor(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
@@ -206,6 +204,37 @@ class Separator:
             self.device,
             seconds,
         )
+
+    def fit(
+        self,
+        photo: Photo,
+        *,
+        quality: Quality = Options.quality,
+        on_progress: ProgressCallback = lambda _fraction: None,
+    ) -> tuple[GuidedUpsampler, Prediction]:
+        """Predicts the layers of a photo, without computing them at full size.
+
+        Args:
+            photo: the photo.
+            quality: as in a call.
+            on_progress: as in a call.
+
+        Returns:
+            The upsampler at strength 1, which computes the layers of any rows of the photo, and the prediction.
+
+        Raises:
+            BrewsterError: quality is out of range.
+        """
+        _check_options(Options.strength, quality)
+        inputs, white = self._inputs(photo, quality)
+        prediction = self._predictor(inputs, quality, on_progress)
+        return _fit_upsampler(inputs[-1], prediction, Options.strength, white), prediction
+
+    def _inputs(self, photo: Photo, quality: Quality) -> tuple[list[Floats], np.float32]:
+        """Returns the inputs of the model in 0..1, smallest first, and the white level by which they are divided."""
+        inputs = [photo.resized(*size) for size in self._predictor.input_sizes(photo.size, quality)]
+        white = np.float32(max(1.0, float(np.percentile(inputs[-1], _WHITE_PERCENTILE))))
+        return [np.clip(scaled_input / white, 0, 1) for scaled_input in inputs], white
 
 
 @document_options

@@ -12,17 +12,22 @@ const MEANINGS = {
   MissingExtra: "The server cannot read this format, because a part of brewster is not installed.",
 };
 
-// Sends a photo with options to a path. Returns {blob, fileName}. Until then, it calls `onProgress` repeatedly with one of
+// Sends a photo with options to a path. Returns {blob, fileName, header(name)}. Until then, it calls `onProgress` repeatedly with one of
 //   {phase: "upload" | "download", loaded, total} in bytes, {phase: "waiting", ahead}, {phase: "working", share}
 // where `ahead` is the number of photos before this one, and `share` the completed fraction.
 export async function send(path, file, options, { signal, onProgress }) {
   const form = new FormData();
-  for (const [name, value] of Object.entries(options)) if (value !== null) form.append(name, value);
+  for (const [name, value] of Object.entries(options)) {
+    if (value instanceof Blob) form.append(name, value, `${name}.png`);
+    else if (value !== null) form.append(name, value);
+  }
   form.append("photo", file, file.name);
   for (let tries = 0; ; tries++) {
     const job = randomJobName();
     const request = await post(`${path}?job=${job}`, job, form, signal, onProgress);
-    if (request.status === 200) return { blob: request.response, fileName: fileNameOf(request) };
+    if (request.status === 200) {
+      return { blob: request.response, fileName: fileNameOf(request), header: (name) => request.getResponseHeader(name) };
+    }
     if (request.status === 0) throw await connectionError(file);
     if (request.status !== 503 || tries === MAX_RETRIES) throw await serverError(request, file);
     onProgress({ phase: "waiting", ahead: 0 });

@@ -1,24 +1,27 @@
 // The page that separates photos: its controls, and the view of the current photo.
 
 import "./compare.js";
-import { models } from "./api.js";
+import { models, send } from "./api.js";
 import { MAX_PHOTOS, describeAdded, readList, readTransfer } from "./drop.js";
 import { exportAll, exportLayer, save } from "./export.js";
-import { draw, readMaps } from "./light.js";
+import { Layers, draw, readPreview } from "./light.js";
 import { SeparationQueue } from "./queue.js";
+import { maskCodes, maskFile } from "./regions.js";
 import { createRow, fraction, progressText, setBar, showFile, statusText, summarise, updateRow, watchScrolling } from "./strip.js";
+import { TileSet } from "./tiles.js";
+import { createTools } from "./tools.js";
 
 const LAYER_DESCRIPTIONS = {
   transmission: "The scene behind the glass.",
   reflection: "The light that the glass reflects.",
-  confidence: "White: the separation is certain. Black: it is uncertain.",
+  confidence: "How certain the separation is. The file that you download is grey: white is certain.",
 };
 const EXAMPLE = "page/example.jpg";
 const RETRY_MODELS_MS = 3000;
 
 const byId = (id) => document.getElementById(id);
 const compare = byId("compare");
-let shown = null; // the maps of the current photo
+let shown = null; // the current photo: {preview, layers, mask: {list, codes}}
 let removed = null; // {photo, index} of the photo that was removed last
 let isPaintScheduled = false;
 let exporting = null; // the AbortController of the running download
@@ -28,6 +31,8 @@ let exporting = null; // the AbortController of the running download
 const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).value;
 const settings = () => ({ quality: chosen("quality"), model: byId("model").value });
 const queue = new SeparationQueue(settings, { onChange: refresh, onEnd: finish });
+const tools = createTools({ onEdit, onPaint: () => compare.paint(), saveMask, announce });
+compare.editor = tools.editor;
 
 function applySettings() {
   queue.applySettings();
@@ -39,6 +44,16 @@ function applySettings() {
 function change(photo, values) {
   Object.assign(photo, values, { isSaved: false });
   if (photo === queue.current) byId("strength").value = photo.strength;
+}
+
+function onEdit() {
+  change(queue.current, {});
+  paint();
+}
+
+async function saveMask() {
+  const { file, regions, size } = queue.current;
+  save(`${file.name.replace(/\.[^.]*$/, "")}.mask.png`, await maskFile(regions.list, ...size));
 }
 
 // Repeats the request until the server responds: nothing can be separated before.
@@ -140,7 +155,7 @@ function announceResult(message) {
 
 function select(photo) {
   queue.current = photo;
-  shown = null;
+  close();
   for (const other of queue.photos) other.row.querySelector(".pick").removeAttribute("aria-current");
   if (photo) {
     photo.row.querySelector(".pick").setAttribute("aria-current", "true");
@@ -155,27 +170,66 @@ function select(photo) {
   queue.startNext();
 }
 
+// Shows no photo.
+function close() {
+  shown = null;
+  compare.tiles?.close();
+  compare.tiles = null;
+  compare.isBefore = false;
+  byId("before").setAttribute("aria-pressed", false);
+  tools.show(null);
+}
+
 async function show() {
   const photo = queue.current;
   if (photo?.state !== "done") return;
-  const maps = await readMaps(photo.maps);
-  if (photo !== queue.current) return; // another photo was selected in the meantime
-  shown = maps;
-  draw(compare.left, maps, "photo");
+  const preview = await readPreview(photo.preview);
+  if (photo !== queue.current || photo.state !== "done") return; // another photo was selected in the meantime
+  close();
+  shown = { preview, layers: Layers.ofPreview(preview), mask: { list: null, codes: null } };
+  draw(compare.left, shown.layers, "photo");
+  compare.fullSize = preview.full;
+  if (preview.full[0] > preview.width) compare.tiles = tilesOf(photo, preview);
+  tools.show(photo.regions, preview.full);
   refresh();
   paint();
+}
+
+// The tiles of a photo. If the server has dropped the photo, it is sent again, once for all tiles.
+function tilesOf(photo, preview) {
+  let sending = null;
+  const context = { signal: new AbortController().signal, onProgress() {} };
+  return new TileSet(preview, photo.key, {
+    resend: () => (sending ??= send("photo", photo.file, {}, context).finally(() => (sending = null))),
+    drawPhoto: (canvas, layers) => draw(canvas, layers, "photo"),
+    drawRight(canvas, layers, part) {
+      const [width, height] = preview.full.map((side) => side / 2 ** part.level);
+      draw(canvas, layers, chosen("view"), photo.strength, maskCodes(photo.regions.list, width, height, part));
+    },
+    onChange: () => compare.paint(),
+  });
+}
+
+// The mask of the regions at the size of the reduced photo.
+function currentMask() {
+  const { list } = queue.current.regions;
+  const { width, height } = shown.preview;
+  if (shown.mask.list !== list) shown.mask = { list, codes: maskCodes(list, width, height) };
+  return shown.mask.codes;
 }
 
 function paint() {
   byId("amount").textContent = `${Math.round(100 * byId("strength").value)} %`;
   byId("layer-description").textContent = LAYER_DESCRIPTIONS[chosen("view")];
+  byId("legend").hidden = chosen("view") !== "confidence";
   byId("download").textContent = `Download ${chosen("view")}`;
   if (!shown || isPaintScheduled) return;
   isPaintScheduled = true;
   requestAnimationFrame(() => {
     isPaintScheduled = false;
     if (!shown) return;
-    draw(compare.right, shown, chosen("view"), queue.current.strength);
+    draw(compare.right, shown.layers, chosen("view"), queue.current.strength, currentMask());
+    compare.version = `${chosen("view")} ${queue.current.strength} ${JSON.stringify(queue.current.regions.list)}`;
     compare.show(queue.current.file.name, chosen("view"));
   });
 }
@@ -193,7 +247,7 @@ function refresh(photo = null) {
   if (!hasPhoto) return;
   const isReady = current.state === "done" && shown !== null;
   const focusedPart = [byId("waiting"), byId("error")].find((part) => part.contains(document.activeElement));
-  compare.hidden = !isReady;
+  compare.hidden = byId("modes").hidden = !isReady;
   byId("error").hidden = current.state !== "failed";
   byId("waiting").hidden = isReady || current.state === "failed";
   if (focusedPart?.hidden) (isReady ? compare : byId(current.state === "failed" ? "retry" : "cancel")).focus();
@@ -205,7 +259,7 @@ function refresh(photo = null) {
   byId("error-text").textContent = current.error?.message ?? "";
   byId("error-details").hidden = !current.error?.details;
   byId("error-message").textContent = current.error?.details ?? "";
-  byId("facts").textContent = isReady ? describeMaps(shown) : "";
+  byId("facts").textContent = isReady ? describePreview(shown.preview) : "";
 }
 
 // Uses aria-disabled: a button with the attribute `disabled` would lose the focus.
@@ -215,10 +269,8 @@ function enable(id, isEnabled) {
 
 const isEnabled = (button) => button.getAttribute("aria-disabled") !== "true";
 
-function describeMaps({ full, width, height, doubtful }) {
-  const size = `${full.join(" × ")} pixels`;
-  const preview = full[0] === width ? "." : `, shown at ${width} × ${height}.`;
-  return size + preview + (doubtful ? " The model has changed the photo so much that the layers may be wrong. Check them." : "");
+function describePreview({ full, doubtful }) {
+  return `${full.join(" × ")} pixels.` + (doubtful ? " The model has changed the photo so much that the layers may be wrong. Check them." : "");
 }
 
 // --- downloads
@@ -283,13 +335,27 @@ byId("strength").addEventListener("input", () => {
 });
 byId("copy").addEventListener("click", (event) => {
   if (!isEnabled(event.currentTarget)) return;
-  const { strength } = queue.current;
-  for (const photo of queue.photos) if (photo !== queue.current) change(photo, { strength });
+  const { strength, regions } = queue.current;
+  for (const photo of queue.photos) {
+    if (photo === queue.current) continue;
+    change(photo, { strength });
+    tools.copy(regions, photo.regions);
+  }
   announce("The settings were copied to all photos.");
 });
 byId("reset").addEventListener("click", () => {
   change(queue.current, { strength: 1 });
+  queue.current.regions.clear();
+  tools.update();
   paint();
+});
+for (const input of document.querySelectorAll("input[name=mode]")) {
+  input.addEventListener("change", () => (compare.mode = chosen("mode")));
+}
+byId("before").addEventListener("click", toggleBefore);
+document.addEventListener("keydown", (event) => {
+  const isShortcut = event.key.toLowerCase() === "b" && !event.ctrlKey && !event.metaKey && !event.altKey;
+  if (isShortcut && shown && !event.target.closest("select")) toggleBefore();
 });
 for (const input of document.querySelectorAll("input[name=view]")) input.addEventListener("change", paint);
 for (const input of document.querySelectorAll("input[name=quality], #model")) input.addEventListener("change", applySettings);
@@ -301,6 +367,12 @@ byId("download").addEventListener("click", (event) => runExport(event.currentTar
 byId("all").addEventListener("click", (event) => runExport(event.currentTarget, downloadAll));
 byId("stop-export").addEventListener("click", () => exporting?.abort());
 byId("panel").addEventListener("submit", (event) => event.preventDefault());
+
+// Switches between the photo and the comparison.
+function toggleBefore() {
+  compare.isBefore = !compare.isBefore;
+  byId("before").setAttribute("aria-pressed", compare.isBefore);
+}
 
 async function addTransfer(transfer) {
   try {

@@ -1,14 +1,17 @@
 // Downloads at full size, equal to the files of the command line, and the report in the zip of all photos.
 
 import { send } from "./api.js";
+import { maskFile } from "./regions.js";
 import { createZip, crc32, readZip, withUniqueNames } from "./zip.js";
 
 const ZIP_LAYERS = "transmission,reflection"; // the layers in the zip of all photos
 const REPORT_NAME = "brewster-report.txt";
 
 // Requests layers of a photo at full size. Returns {blob, fileName}, as `send`.
-const requestLayers = (photo, layers, settings, context) =>
-  send("separate", photo.file, { layers, strength: photo.strength, ...settings }, context);
+async function requestLayers(photo, layers, settings, context) {
+  const mask = await maskFile(photo.regions.list, ...photo.size);
+  return send("separate", photo.file, { layers, strength: photo.strength, mask, ...settings }, context);
+}
 
 // Creates one layer of a photo. Returns {name, blob, problem, saved}; `saved` are the photos whose results it contains.
 export async function exportLayer(photo, layer, settings, context) {
@@ -48,7 +51,8 @@ const problemOf = ({ error }) => (error ? `${error.message} ${error.details ?? "
 function describeResults(results, files, { model, quality }) {
   const names = files.map(({ name }) => name);
   const lines = results.map(({ photo, files: own, error }) => {
-    if (own.length) return `${photo.file.name} -> ${names.splice(0, own.length).join(", ")} (strength ${Math.round(100 * photo.strength)} %)`;
+    const strength = `strength ${Math.round(100 * photo.strength)} %${photo.regions.list.length ? ", with regions" : ""}`;
+    if (own.length) return `${photo.file.name} -> ${names.splice(0, own.length).join(", ")} (${strength})`;
     return `${photo.file.name}: ${error ? `failed. ${error}` : "not separated yet"}`;
   });
   const done = results.filter((result) => result.files.length).length;

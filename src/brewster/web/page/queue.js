@@ -1,6 +1,7 @@
 // The photos of the page and their separation: a few at a time, the current one first.
 
 import { send } from "./api.js";
+import { Regions } from "./regions.js";
 
 const MAX_CONCURRENT = 2; // one photo is separated while the next one is uploaded
 
@@ -16,7 +17,7 @@ export class SeparationQueue {
   }
 
   add(file) {
-    const photo = { file, state: "waiting", progress: null, error: null, strength: 1, controller: null, isSaved: false };
+    const photo = { file, state: "waiting", progress: null, error: null, strength: 1, regions: new Regions(), controller: null, isSaved: false };
     this.photos.push(photo);
     return photo;
   }
@@ -87,8 +88,10 @@ export class SeparationQueue {
       this.onChange(photo);
     };
     try {
-      const { blob } = await send("preview", photo.file, requestSettings, { signal, onProgress });
-      photo.maps = blob;
+      const { blob, header } = await send("preview", photo.file, requestSettings, { signal, onProgress });
+      photo.preview = blob;
+      photo.key = header("Brewster-Photo"); // of the photo on the server, for its tiles
+      photo.size = header("Brewster-Size").split("x").map(Number);
       Object.assign(photo, { state: "done", mapSettings: JSON.stringify(requestSettings), isSaved: false });
     } catch (error) {
       const isStopped = error.name === "AbortError";
