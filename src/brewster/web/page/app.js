@@ -2,7 +2,7 @@
 
 import "./compare.js";
 import { models, send } from "./api.js";
-import { MAX_PHOTOS, describeAdded, readList, readTransfer } from "./drop.js";
+import { MAX_PHOTOS, describeAdded, readList, readTransfer, watchTransfers } from "./drop.js";
 import { exportAll, exportLayer, save } from "./export.js";
 import { Layers, draw, readPreview } from "./light.js";
 import { SeparationQueue } from "./queue.js";
@@ -374,7 +374,7 @@ function toggleBefore() {
   byId("before").setAttribute("aria-pressed", compare.isBefore);
 }
 
-async function addTransfer(transfer) {
+watchTransfers(async (transfer) => {
   try {
     add(await readTransfer(transfer, isImage, room()));
   } catch (error) {
@@ -382,20 +382,6 @@ async function addTransfer(transfer) {
     showNote(byId("announcement").textContent);
     refresh();
   }
-}
-
-document.addEventListener("paste", (event) => addTransfer(event.clipboardData));
-document.addEventListener("dragover", (event) => {
-  event.preventDefault();
-  document.body.classList.add("drag-over");
-});
-document.addEventListener("dragleave", (event) => {
-  if (!event.relatedTarget) document.body.classList.remove("drag-over");
-});
-document.addEventListener("drop", (event) => {
-  event.preventDefault();
-  document.body.classList.remove("drag-over");
-  addTransfer(event.dataTransfer);
 });
 
 // Asks before the page is left with results that were not downloaded, or with photos that are being separated.

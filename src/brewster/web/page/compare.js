@@ -18,6 +18,7 @@ class GlassCompare extends HTMLElement {
   #split = 0.5; // position of the line as a fraction of the visible width of the image
   #zoom = 1; // 1 shows the whole image
   #centre = { x: 0.5, y: 0.5 }; // the image point in the middle of the view, as fractions of width and height
+  #missingTiles = 0; // visible parts that are shown reduced until their tiles arrive
   #pointers = new Map();
   #dragged = null; // what the pointer drags: "line", "image" or "region"
 
@@ -157,6 +158,7 @@ class GlassCompare extends HTMLElement {
     context.imageSmoothingEnabled = this.#pixelSize < SHARP_PIXEL_SIZE;
     context.imageSmoothingQuality = "high";
     const isSlider = this.#mode === "slider" && !this.#isBefore;
+    this.#missingTiles = 0;
     for (const pane of this.#panes()) {
       const side = this.#isBefore ? "left" : pane.side;
       if (isSlider) {
@@ -184,7 +186,9 @@ class GlassCompare extends HTMLElement {
         left: (from - placement.left) * density / pixel, right: (to - placement.left) * density / pixel,
         top: -placement.top * density / pixel, bottom: (pane.height - placement.top) * density / pixel,
       };
-      for (const tile of this.tiles.visible(side, this.tiles.levelFor(pixel), area, this.version)) {
+      const { tiles, missing } = this.tiles.visible(side, this.tiles.levelFor(pixel), area, this.version);
+      this.#missingTiles += missing;
+      for (const tile of tiles) {
         const [left, top] = [Math.round(origin.x + tile.left * pixel), Math.round(origin.y + tile.top * pixel)];
         const [right, bottom] = [Math.round(origin.x + tile.right * pixel), Math.round(origin.y + tile.bottom * pixel)];
         context.drawImage(tile.canvas, left, top, right - left, bottom - top);
@@ -205,6 +209,7 @@ class GlassCompare extends HTMLElement {
     second.hidden = this.#isBefore;
     second.style.top = isSide && this.clientWidth < this.clientHeight ? `calc(50% + 0.75rem)` : "";
     this.querySelector("output").textContent = `${Math.round(100 * this.#pixelSize)} %`;
+    this.setAttribute("aria-busy", this.#missingTiles > 0);
     this.classList.toggle("zoomed", this.#zoom > 1);
     this.classList.toggle("editing", Boolean(this.editor?.isActive));
   }

@@ -54,3 +54,20 @@ export function describeAdded({ files, others, surplus }) {
   if (surplus) parts.push(`${surplus} more photos were left out, because the list holds at most ${MAX_PHOTOS}; use the command line for them`);
   return `${parts.join("; ")}.`;
 }
+
+// Calls `onTransfer(transfer)` for files that are dropped on the page or pasted.
+export function watchTransfers(onTransfer) {
+  document.addEventListener("paste", (event) => onTransfer(event.clipboardData));
+  document.addEventListener("dragover", (event) => {
+    event.preventDefault();
+    document.body.classList.add("drag-over");
+  });
+  document.addEventListener("dragleave", (event) => {
+    if (!event.relatedTarget) document.body.classList.remove("drag-over");
+  });
+  document.addEventListener("drop", (event) => {
+    event.preventDefault();
+    document.body.classList.remove("drag-over");
+    onTransfer(event.dataTransfer);
+  });
+}

@@ -17,10 +17,6 @@ export class TileSet {
     Object.assign(this, { preview, key, resend, drawPhoto, drawRight, onChange });
   }
 
-  get isBusy() {
-    return [...this.#tiles.values()].some((tile) => tile.isLoading);
-  }
-
   close() {
     this.#isClosed = true;
     this.#tiles.clear();
@@ -32,21 +28,26 @@ export class TileSet {
   }
 
   // The loaded tiles in an area of the photo, {left, top, right, bottom} in pixels of the photo, and requests for the others.
-  // Returns [{canvas, left, top, right, bottom}]. A tile that is not drawn with the current `version` within DRAW_MS is left out.
+  // Returns {tiles: [{canvas, left, top, right, bottom}], missing}, where `missing` is the number of the others. A tile that is not
+  // drawn with the current `version` within DRAW_MS is missing, too.
   visible(side, level, area, version) {
     const step = TILE_PX << level;
     const [width, height] = this.preview.full;
     const started = performance.now();
-    const found = [];
+    const tiles = [];
+    let missing = 0;
     for (let row = Math.floor(Math.max(0, area.top) / step); row * step < Math.min(area.bottom, height); row++) {
       for (let column = Math.floor(Math.max(0, area.left) / step); column * step < Math.min(area.right, width); column++) {
         const tile = this.#tile(level, column, row);
-        if (!tile.layers || !this.#draw(tile, side, version, started)) continue;
+        if (!tile.layers || !this.#draw(tile, side, version, started)) {
+          missing++;
+          continue;
+        }
         const [left, top] = [column * step, row * step];
-        found.push({ canvas: tile[side], left, top, right: Math.min(width, left + step), bottom: Math.min(height, top + step) });
+        tiles.push({ canvas: tile[side], left, top, right: Math.min(width, left + step), bottom: Math.min(height, top + step) });
       }
     }
-    return found;
+    return { tiles, missing };
   }
 
   #draw(tile, side, version, started) {
