@@ -36,7 +36,7 @@ def test_a_photo_is_uploaded_compared_and_downloaded_with_the_bytes_of_the_comma
     page.mouse.up()
     assert share(page) < 40
 
-    page.get_by_label("Strength").fill("0.6")
+    page.get_by_label("Strength", exact=True).fill("0.6")
     settle(page)
     assert page.locator("#amount").inner_text() == "60 %"
     run_without_model(photo, "--strength", "0.6", "--device", "cpu", "--layers", "transmission,confidence")
@@ -44,8 +44,9 @@ def test_a_photo_is_uploaded_compared_and_downloaded_with_the_bytes_of_the_comma
         page.get_by_label(layer.capitalize(), exact=True).check()
         settle(page)
         (made,) = tmp_path.glob(f"*.{layer}.*")
-        shown = Photo.open(made).srgb_8bit()
-        assert np.median(difference(canvas(page, "right"), shown)) <= 1  # JPEG differs more at edges
+        if layer == "transmission":  # the confidence is shown in colours
+            shown = Photo.open(made).srgb_8bit()
+            assert np.median(difference(canvas(page, "right"), shown)) <= 1  # JPEG differs more at edges
         name, data = downloaded(page, page.get_by_role("button", name=f"Download {layer}").click)
         assert (name, data) == (made.name, made.read_bytes())
 
@@ -55,7 +56,7 @@ def test_the_layers_on_the_page_are_those_of_the_server_to_two_code_values(open_
     page = open_page()
     upload(page, ("window.png", data))
     for strength in (0.3, 1):
-        page.get_by_label("Strength").fill(str(strength))
+        page.get_by_label("Strength", exact=True).fill(str(strength))
         for layer in ("transmission", "reflection"):
             page.get_by_label(layer.capitalize(), exact=True).check()
             settle(page)
@@ -142,12 +143,38 @@ def test_a_phone_shows_everything_without_horizontal_scrolling(open_page):
     assert share(page) > before + 20
 
 
+def test_the_confidence_is_shown_as_colours_over_the_grey_photo_with_a_legend(open_page):
+    page = open_page()
+    upload(page, ("window.png", image_bytes(90, 60, "png")))
+    assert not page.locator("#legend").is_visible()
+    page.get_by_label("Confidence", exact=True).check()
+    settle(page)
+    assert page.locator("#legend").inner_text().split() == ["certain", "uncertain"]
+    shown = canvas(page, "right")
+    assert (
+        np.ptp(shown.astype(int), axis=2).max() <= 2
+    )  # the pane is certain everywhere, so the photo is grey
+    colours = page.evaluate("""async () => {
+        const { Layers, draw } = await import("/page/light.js");
+        const map = { width: 3, height: 1, channels: 1, values: Float32Array.of(1, 0.5, 0) };
+        const preview = { full: [3, 1], width: 3, height: 1, photo: new Uint8Array(9).fill(128), maps: { confidence: map } };
+        const canvas = document.createElement("canvas");
+        draw(canvas, Layers.ofPreview(preview), "confidence", 1);
+        return Array.from(canvas.getContext("2d").getImageData(0, 0, 3, 1).data);
+    }""")
+    certain, middle, unknown = np.reshape(colours, (3, 4))[:, :3].astype(int)
+    assert list(certain) == [128, 128, 128]
+    assert np.ptp(middle) > 60
+    assert np.ptp(unknown) > 60
+    assert middle @ [2, 7, 1] > unknown @ [2, 7, 1] + 100  # the order is visible without colours
+
+
 def test_zoom_and_pan_move_both_sides_together(open_page):
     """At strength 0 both sides show the same ramp, so an offset between the sides would be visible as a step."""
     page = open_page()
     ramp = np.repeat(np.linspace(20, 220, 240).astype(np.uint8)[None, :, None], 120, axis=0)
     upload(page, ("a.png", file_of(ramp, "png")))
-    page.get_by_label("Strength").fill("0")
+    page.get_by_label("Strength", exact=True).fill("0")
     page.get_by_role("button", name="Zoom in").click()
     before = row(page)
     stage = page.locator("glass-compare").bounding_box()
@@ -309,7 +336,7 @@ def test_the_focus_moves_to_the_next_button_when_its_button_disappears(open_page
 def test_a_photo_that_is_not_done_shows_its_own_strength(open_page):
     page = open_page()
     upload(page, ("a.png", image_bytes(90, 60, "png")))
-    page.get_by_label("Strength").fill("0.3")
+    page.get_by_label("Strength", exact=True).fill("0.3")
     hold_requests(page, "**/preview?*")
     page.set_input_files("#files", [{"name": "b.png", "mimeType": "", "buffer": image_bytes(90, 60, "png")}])
     page.locator(".pick").nth(1).click()

@@ -92,7 +92,7 @@ def test_a_removed_photo_comes_back_to_its_place_with_its_result_and_strength(op
     page = open_page()
     upload(page, *((name, image_bytes(90, 60, "png")) for name in ("a.png", "b.png", "c.png")))
     page.locator(".pick").nth(1).click()
-    page.get_by_label("Strength").fill("0.4")
+    page.get_by_label("Strength", exact=True).fill("0.4")
     page.get_by_role("button", name="Remove b.png").click()
     assert names_in_list(page) == ["a.png", "c.png"]
     page.get_by_role("button", name="Undo removal").click()
@@ -116,7 +116,7 @@ def test_leaving_with_results_that_were_not_downloaded_asks(open_page):
 
     page.on("dialog", answer)
     upload(page, ("a.png", image_bytes(90, 60, "png")))
-    page.get_by_label("Strength").fill("0.9")  # the browser asks only after the page was used
+    page.get_by_label("Strength", exact=True).fill("0.9")  # the browser asks only after the page was used
     page.evaluate("location.reload()")
     page.wait_for_timeout(300)
     assert asked == ["beforeunload"]
@@ -169,7 +169,7 @@ def test_a_file_that_was_deleted_after_it_was_added_is_named_as_the_cause(open_p
 def test_the_settings_of_one_photo_are_copied_to_all_and_reset(open_page):
     page = open_page()
     upload(page, *((name, image_bytes(90, 60, "png")) for name in ("a.png", "b.png")))
-    page.get_by_label("Strength").fill("0.3")
+    page.get_by_label("Strength", exact=True).fill("0.3")
     page.get_by_role("button", name="Copy to all photos").click()
     page.locator(".pick").nth(1).click()
     assert page.locator("#amount").inner_text() == "30 %"

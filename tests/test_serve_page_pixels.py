@@ -40,8 +40,8 @@ def middle(pixels, shape):
 
 def test_at_one_to_one_each_screen_pixel_is_a_pixel_of_the_result(large_page, run):
     page, data = large_page
-    page.get_by_label("Result").check()
-    page.get_by_label("Strength").fill("0.7")
+    page.get_by_label("Result", exact=True).check()
+    page.get_by_label("Strength", exact=True).fill("0.7")
     for layer in ("transmission", "reflection"):
         page.get_by_label(layer.capitalize(), exact=True).check()
         settle(page)
@@ -58,7 +58,7 @@ def test_the_key_b_shows_the_photo_in_place_of_the_result(large_page):
     before = view(page)
     assert (before == middle(photo, before.shape)).all()
     page.keyboard.press("b")
-    page.get_by_label("Result").check()
+    page.get_by_label("Result", exact=True).check()
     after = view(page)
     assert difference(before, after).max() > 10
 
@@ -78,7 +78,7 @@ def test_side_by_side_shows_the_same_part_of_both(large_page, run):
 
 def test_beyond_one_to_one_a_photo_pixel_is_a_square(large_page):
     page, data = large_page
-    page.get_by_label("Result").check()
+    page.get_by_label("Result", exact=True).check()
     page.keyboard.press("b")
     for _ in range(2):
         page.get_by_role("button", name="Zoom in").click()

@@ -49,7 +49,7 @@ function post(url, job, form, signal, onProgress) {
   let watcher = null;
   const stopWatching = () => watcher?.stop();
   return new Promise((resolve, reject) => {
-    const abort = () => (request.abort(), reject(signal.reason));
+    const abort = () => (reject(signal.reason), request.abort()); // in this order: abort() fires loadend at once
     if (signal.aborted) return abort();
     signal.addEventListener("abort", abort, { once: true });
     request.open("POST", url);

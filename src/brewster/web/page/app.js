@@ -83,7 +83,7 @@ function add(found) {
   for (const file of found.files) insert(queue.add(file));
   if (!found.files.length && !found.others && !found.surplus) return;
   announce(describeAdded(found));
-  showNote(found.others || found.surplus ? describeAdded(found) : "");
+  if (found.others || found.surplus) showNote(describeAdded(found));
   if (!found.files.length) return refresh();
   if (queue.current === null) {
     select(queue.photos[0]);
@@ -121,11 +121,11 @@ function undoRemove() {
   announce(`${photo.file.name} was added again`);
 }
 
-// A note above the list, with a button to undo while a photo can be restored.
+// A note above the list, with a button while the photo that was removed last can be restored.
 function showNote(text) {
   byId("removed-text").textContent = text;
-  byId("removed").hidden = !text;
-  byId("undo-remove").hidden = removed === null || !text.startsWith(removed.photo.file.name);
+  byId("removed").hidden = !text && removed === null;
+  byId("undo-remove").hidden = removed === null;
 }
 
 async function addExample() {

@@ -7,10 +7,10 @@ const CODES = Uint8Array.from({ length: STEPS + 1 }, (_, step) => Math.round(255
 
 // The colours of the confidence: the opacity over the grey photo, red, green and blue, from certain to unknown.
 const HEAT_STOPS = [[0, 250, 204, 70], [0.55, 250, 190, 60], [0.75, 226, 84, 48], [0.88, 128, 20, 100]];
-const HEAT = Array.from({ length: 256 }, (_, confidence) => {
-  const at = ((255 - confidence) / 255) * (HEAT_STOPS.length - 1);
+const HEAT = Float32Array.from({ length: 4 * 256 }, (_, i) => {
+  const at = ((255 - (i >> 2)) / 255) * (HEAT_STOPS.length - 1);
   const index = Math.min(Math.floor(at), HEAT_STOPS.length - 2);
-  return HEAT_STOPS[index].map((value, i) => value + (at - index) * (HEAT_STOPS[index + 1][i] - value));
+  return HEAT_STOPS[index][i & 3] + (at - index) * (HEAT_STOPS[index + 1][i & 3] - HEAT_STOPS[index][i & 3]);
 });
 
 // The sRGB curve, IEC 61966-2-1.
@@ -104,13 +104,13 @@ export class Layers {
     const across = positions(width, this.width, left, stepX, this.preview.full[0]);
     const down = positions(height, this.height, top, stepY, this.preview.full[1]);
     const out = new Float32Array(this.width * this.height * channels);
+    const source = stored === channels ? values : Float32Array.from({ length: width * height * channels }, (_, i) => values[(i / channels) | 0]);
     const line = new Float32Array(width * channels); // the map at the height of one row of the result
     for (let row = 0, at = 0; row < this.height; row++) {
-      const [upper, lower] = [down.lower[row] * width, Math.min(down.lower[row] + 1, height - 1) * width];
+      const upper = down.lower[row] * line.length;
+      const lower = Math.min(down.lower[row] + 1, height - 1) * line.length;
       for (let i = 0; i < line.length; i++) {
-        const [column, channel] = stored === channels ? [0, i] : [((i / channels) | 0) * stored, 0];
-        const one = values[upper * stored + column + channel];
-        line[i] = one + down.fraction[row] * (values[lower * stored + column + channel] - one);
+        line[i] = source[upper + i] + down.fraction[row] * (source[lower + i] - source[upper + i]);
       }
       for (let column = 0; column < this.width; column++) {
         const from = across.lower[column] * channels;
@@ -151,9 +151,9 @@ const VIEWS = {
   confidence({ photo, confidence }) {
     return (i) => {
       const pixel = i - (i % 3);
-      const [opacity, ...colour] = HEAT[confidence[pixel / 3]];
+      const heat = 4 * confidence[pixel / 3];
       const grey = 0.2126 * photo[pixel] + 0.7152 * photo[pixel + 1] + 0.0722 * photo[pixel + 2];
-      return grey + opacity * (colour[i - pixel] - grey);
+      return grey + HEAT[heat] * (HEAT[heat + 1 + i - pixel] - grey);
     };
   },
 };

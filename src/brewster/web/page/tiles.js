@@ -10,6 +10,7 @@ const DRAW_MS = 40; // time for drawing tiles before the page reacts again
 export class TileSet {
   #tiles = new Map(); // by address; the last used is the last
   #isClosed = false;
+  #isScheduled = false;
 
   // `preview`: of `readPreview`; `key`: of the photo on the server; `resend()`: sends the photo again if the server has dropped it;
   // `drawRight(canvas, layers, part)`: draws the layer that is compared; `onChange()`: called when a tile has arrived.
@@ -54,13 +55,22 @@ export class TileSet {
     const wanted = side === "left" ? "" : version;
     if (tile[`${side}Version`] === wanted) return true;
     if (performance.now() - started > DRAW_MS) {
-      requestAnimationFrame(this.onChange);
+      this.#drawLater();
       return false;
     }
     tile[side] ??= document.createElement("canvas");
     (side === "left" ? this.drawPhoto : this.drawRight)(tile[side], tile.layers, tile.part);
     tile[`${side}Version`] = wanted;
     return true;
+  }
+
+  #drawLater() {
+    if (this.#isScheduled) return;
+    this.#isScheduled = true;
+    requestAnimationFrame(() => {
+      this.#isScheduled = false;
+      if (!this.#isClosed) this.onChange();
+    });
   }
 
   #tile(level, column, row) {
