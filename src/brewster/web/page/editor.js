@@ -1,18 +1,19 @@
-// Draws regions on <glass-compare> with a pointer or with the keyboard, and shows them as a tint.
+// Draws regions on <glass-compare> with a pointer or with the keyboard, and hatches what stays as it is.
 
 import { maskCodes } from "./regions.js";
 
 const KEY_STEP = 0.01; // of the longer side of the photo; five times as much with Shift
-const PROTECTED_TINT = [226, 60, 48]; // red, green and blue where the photo is not separated
-const TINT_OPACITY = 0.45;
+const HATCH_PX = 8; // width of the dark and light stripes where the photo is not separated: visible on any photo
+const HATCH_OPACITY = 0.45;
+const HATCH_MAX_PX = 800; // longer side of the image of the hatching
 const MIN_STEP = 0.2; // distance of the points of a stroke, as a fraction of the brush radius
 
 export class RegionEditor {
   isActive = false;
   #drawn = null; // the region that is being drawn
   #cursor = null; // position of the pointer or of the keyboard cursor, in fractions of the longer side
-  #tint = document.createElement("canvas");
-  #tintOf = null; // the list of regions and the size of the tint
+  #hatching = document.createElement("canvas");
+  #hatchingOf = null; // the regions and the size of the hatching
 
   // `tool()`: {shape, value, radius, feather} of the next region; `onChange(isDrawing)`: called when `list` has changed;
   // `onAdd(region)`: called with each finished region; `announce(text)`: for screen readers.
@@ -82,11 +83,11 @@ export class RegionEditor {
     return true;
   }
 
-  // Draws the tint and the cursor above an image at `origin` with `size`, in screen pixels.
+  // Draws the hatching and the cursor above an image at `origin` with `size`, in screen pixels.
   paint(context, origin, size) {
     if (!this.isActive) return;
-    this.#updateTint();
-    if (this.list.length) context.drawImage(this.#tint, origin.x, origin.y, size.width, size.height);
+    this.#updateHatching();
+    if (this.list.length) context.drawImage(this.#hatching, origin.x, origin.y, size.width, size.height);
     if (!this.#cursor) return;
     const longer = Math.max(size.width, size.height);
     const [x, y] = [origin.x + this.#cursor[0] * longer, origin.y + this.#cursor[1] * longer];
@@ -104,21 +105,22 @@ export class RegionEditor {
     }
   }
 
-  #updateTint() {
+  #updateHatching() {
     const { list } = this;
-    const scale = Math.min(1, 800 / Math.max(...this.size));
+    const scale = Math.min(1, HATCH_MAX_PX / Math.max(...this.size));
     const [width, height] = this.size.map((side) => Math.max(1, Math.round(side * scale)));
     const key = JSON.stringify([list, width, height]);
-    if (key === this.#tintOf) return;
-    this.#tintOf = key;
-    Object.assign(this.#tint, { width, height });
+    if (key === this.#hatchingOf) return;
+    this.#hatchingOf = key;
+    Object.assign(this.#hatching, { width, height });
     const codes = maskCodes(list, width, height);
     if (!codes) return;
-    const context = this.#tint.getContext("2d");
+    const context = this.#hatching.getContext("2d");
     const image = context.createImageData(width, height);
     for (let i = 0; i < codes.length; i++) {
-      image.data.set(PROTECTED_TINT, 4 * i);
-      image.data[4 * i + 3] = TINT_OPACITY * (255 - codes[i]);
+      const isLight = (((i % width) + Math.floor(i / width)) / HATCH_PX) & 1;
+      image.data.fill(isLight ? 255 : 0, 4 * i, 4 * i + 3);
+      image.data[4 * i + 3] = HATCH_OPACITY * (255 - codes[i]);
     }
     context.putImageData(image, 0, 0);
   }

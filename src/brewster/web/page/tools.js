@@ -7,7 +7,7 @@ const byId = (id) => document.getElementById(id);
 const chosen = (name) => document.querySelector(`input[name=${name}]:checked`).value;
 const DESCRIPTIONS = {
   move: "Mark where the photo is separated, or where it stays as it is.",
-  here: "Only the marked regions are separated, if this is the first region. Tinted parts stay as they are.",
+  here: "Only the marked regions are separated, if this is the first region. Hatched parts stay as they are.",
   protect: "The marked regions stay as they are.",
   erase: "The eraser removes marks.",
 };
