@@ -30,6 +30,7 @@ RECIPES = Path(__file__).parents[1] / "recipes"
 hypothesis.settings.register_profile("shared machine", deadline=None)
 hypothesis.settings.load_profile("shared machine")
 
+BROWSER_TIMEOUT_MS = 120_000  # long, because the machine may be slow
 SLOW_SECONDS = 1800
 """The time limit of a test marked as slow; that of the others is in pyproject.toml."""
 
@@ -115,6 +116,46 @@ def chromium():
         browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
         yield browser
         browser.close()
+
+
+@pytest.fixture(scope="module")
+def page_link(model):
+    """The link to a server of the page with two models."""
+    from web_servers import serve_process  # noqa: PLC0415  (imports FastAPI)
+
+    with serve_process("--model", model, "--token", "auto") as link:
+        yield link
+
+
+@pytest.fixture
+def open_page(chromium, page_link):
+    """Opens the page; an error in its scripts, or a request to another server, fails the test."""
+    contexts, failures, requested = [], [], []
+
+    def open_page(**kwargs):
+        context = chromium.new_context(
+            **{"viewport": {"width": 1100, "height": 760}, "accept_downloads": True, **kwargs}
+        )
+        contexts.append(context)
+        context.set_default_timeout(BROWSER_TIMEOUT_MS)
+        page = context.new_page()
+        page.on("pageerror", lambda error: failures.append(str(error)))
+        page.on(
+            "console",
+            lambda message: failures.append(message.text) if "Content Security" in message.text else None,
+        )
+        page.on("request", lambda request: requested.append(request.url))
+        page.goto(page_link)
+        page.wait_for_selector("#model option", state="attached")  # the scripts have run
+        assert "token" not in page.url
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert not failures
+    here = page_link.partition("?")[0]
+    assert [url for url in requested if not url.startswith((here, "blob:"))] == []
 
 
 @pytest.fixture(scope="session")

@@ -29,6 +29,8 @@ Quantisation = Literal["int8", "float8", "nf4"]
 DIFFUSION_OPTIONS: Final = ("base", "quantise", "steps", "average", "plain")
 """The options of diffusion models only."""
 
+_CALL_OPTIONS: Final = ("strength", "quality", "mask", "additive", "max_pixels")
+
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
@@ -62,6 +64,12 @@ class Options:
     quality: Quality = field(
         default="standard",
         metadata=_field_metadata("Number and size of the input scales: draft is fastest, best is slowest."),
+    )
+    mask: Path | None = field(
+        default=None,
+        metadata=_field_metadata(
+            "A grey image of the size of the photo that scales the strength: white is separated, black stays unchanged."
+        ),
     )
     additive: bool = field(
         default=False,
@@ -133,7 +141,7 @@ class Options:
 
     def call_options(self) -> dict[str, Any]:
         """Returns the keywords for calling a `Separator`."""
-        return {name: getattr(self, name) for name in ("strength", "quality", "additive", "max_pixels")}
+        return {name: getattr(self, name) for name in _CALL_OPTIONS}
 
     def container(self, layer: str, source_format: str) -> str:
         """Returns the file format of a layer. `source_format` is the format of the photo. Confidence is always PNG."""

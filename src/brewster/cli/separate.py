@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from pathlib import Path
 from types import NoneType
-from typing import Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
+from typing import Any, Final, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import click
 from click.core import ParameterSource
@@ -16,6 +17,8 @@ from brewster.cli.batch import BatchCommand, is_single_output, plan
 from brewster.cli.terminal import standard_output
 from brewster.errors import BrewsterError
 from brewster.options import Options
+
+_METAVARS: Final[dict[object, str]] = {int: "NUMBER", float: "NUMBER", Path | None: "FILE"}
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -80,7 +83,7 @@ def _option(field: dataclasses.Field[Any], hint: object) -> Callable[[_Command],
         type=_param_type(hint, field),
         default=default,
         show_default=default is not None,
-        metavar="NUMBER" if hint in (int, float) else None,
+        metavar=_METAVARS.get(hint),
         help=description,
     )
 
@@ -91,6 +94,8 @@ def _param_type(hint: object, field: dataclasses.Field[Any]) -> click.ParamType[
         return _param_type(get_args(hint)[0], field)
     if hint is float:
         return _RangedNumber(low, high)
+    if hint is Path:
+        return click.Path(exists=True, dir_okay=False, path_type=Path)
     if hint is int:
         return click.IntRange(low, high)
     if get_origin(hint) is tuple:

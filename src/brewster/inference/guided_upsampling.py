@@ -109,7 +109,9 @@ class GuidedUpsampler:
 
         return cls(fit_layer(change), fit_layer(reflection), override)
 
-    def apply(self, photo: Floats, top: int, height: int) -> tuple[Floats, Floats]:
+    def apply(
+        self, photo: Floats, top: int, height: int, weights: Floats | None = None
+    ) -> tuple[Floats, Floats]:
         """Returns transmission and reflection, each (n, W, 3), for n rows of the full photo.
 
         Negative values of the photo (colours outside Rec.709) limit the transmission from below: it is at least
@@ -119,6 +121,7 @@ class GuidedUpsampler:
             photo: the n rows of the photo, (n, W, 3) linear light.
             top: the index of the first of these rows.
             height: the number of rows of the full photo.
+            weights: a factor of the strength for each pixel, (n, W, 1) in 0..1; where it is 0, the transmission is the photo.
         """
         transmission = self.change.apply(photo, top, height)
         if self.override:
@@ -128,9 +131,13 @@ class GuidedUpsampler:
                 for map_ in (self.override.transmission, self.override.weight)
             )
             transmission += weight * (np.float32(self.override.strength) * (generated - photo) - transmission)
+        if weights is not None:
+            transmission *= weights
         transmission += photo
         np.maximum(transmission, np.minimum(photo, 0), out=transmission)
         reflection = self.reflection.apply(photo, top, height)
+        if weights is not None:
+            reflection *= weights
         return transmission, np.clip(reflection, 0, np.maximum(photo, 0), out=reflection)
 
 
