@@ -87,6 +87,8 @@ class FileResult:
     """See `Separation.reconstruction_error`."""
     doubtful: bool = False
     """See `Separation.doubtful`."""
+    reflection_is_derived: bool = False
+    """See `Separation.reflection_is_derived`."""
     error: str | None = None
     """The error message, or None."""
 
@@ -269,6 +271,7 @@ class _Batch:
         separation = separator(photo, on_progress=on_progress, **self._options.call_options())
         result.seconds, result.residual = dict(separation.seconds), separation.residual
         result.reconstruction_error, result.doubtful = separation.reconstruction_error, separation.doubtful
+        result.reflection_is_derived = separation.reflection_is_derived
         started = time.perf_counter()
         for layer, target in task.targets.items():
             target_format = format_of(target) if isinstance(target, Path) else None

@@ -148,6 +148,8 @@ def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: Pro
         "Brewster-Residual": f"{separation.residual:.6f}",
         "Brewster-Seconds": f"{time.perf_counter() - started:.4f}",
     }
+    if separation.reflection_is_derived:
+        headers["Brewster-Reflection"] = "derived"
     if separation.reconstruction_error is not None:
         headers |= {
             "Brewster-Reconstruction-Error": f"{separation.reconstruction_error:.6f}",
