@@ -13,10 +13,11 @@ from safetensors.torch import load_file, save_file
 
 from brewster import Photo, Separator
 from brewster.errors import ModelError
+from brewster.inference.diffusion_predictor import DiffusionPredictor
 from brewster.models.diffusion.adapter.windowseat import CONFIG_FILE, INDEX_FILE, PROMPT_FILE, WEIGHTS_FILE
 from brewster.models.diffusion.backbones import load_backbone
 from brewster.models.diffusion.pipeline import fingerprint, load_pipeline
-from brewster.models.zoo import PUBLISHED
+from brewster.models.large_models import LARGE
 from brewster.srgb import to_encoded
 from published_models import SIDE, write_qwen_edit_plus, write_windowseat
 
@@ -135,8 +136,6 @@ def test_photos_of_any_shape_are_divided_into_squares_of_the_published_side(mode
 
 
 def test_best_quality_adds_an_input_of_twice_the_size(model):
-    from brewster.inference.diffusion_predictor import DiffusionPredictor
-
     predictor = DiffusionPredictor(load_pipeline(str(model)))
     assert predictor.input_sizes((640, 320), "standard") == [(128, 64)]
     assert predictor.input_sizes((640, 320), "best") == [(128, 64), (256, 128)]
@@ -151,7 +150,7 @@ def test_steps_and_averages_are_refused(model):
 def test_the_name_is_opened_from_the_hub_and_only_its_subfolders_are_fetched(
     model, base, tmp_path, monkeypatch
 ):
-    repository = tmp_path / f"models--{PUBLISHED['windowseat'].replace('/', '--')}"
+    repository = tmp_path / f"models--{LARGE['windowseat'].hub_id.replace('/', '--')}"
     shutil.copytree(model, repository / "snapshots" / ("1" * 40))
     (repository / "refs").mkdir()
     (repository / "refs" / "main").write_text("1" * 40)

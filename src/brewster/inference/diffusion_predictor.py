@@ -25,7 +25,6 @@ from brewster.inference.predictor import Prediction, Predictor, ProgressCallback
 from brewster.inference.tiles import run_tiled, tile_slices
 from brewster.models.diffusion.panels import PanelFit
 from brewster.models.diffusion.pipeline import DecompositionPipeline
-from brewster.models.diffusion.sampling import STEPS
 from brewster.options import Quality
 from brewster.srgb import to_encoded, to_linear
 
@@ -46,7 +45,7 @@ class DiffusionPredictor(Predictor):
 
     Args:
         pipeline: the model.
-        steps: the number of sampling steps; by default 20 as in the paper, and 4 for "draft".
+        steps: the number of sampling steps; by default those of the task (20 as in the paper), and 4 for "draft".
         average: the number of samples with different seeds whose mean is the prediction; the mean has less invented detail.
         plain: whether the transmission is the upsampled generated one, without the detail of the photo.
 
@@ -103,7 +102,7 @@ class DiffusionPredictor(Predictor):
             len(tile_slices(scaled_input.shape[:2], **tiling))
             for scaled_input, tiling in zip(inputs, tilings, strict=True)
         ]
-        steps = self._steps or (_DRAFT_STEPS if quality == "draft" else STEPS)
+        steps = self._steps or (_DRAFT_STEPS if quality == "draft" else self._pipeline.task.steps)
         progress = _ProgressCounter(on_progress, sum(tiles))
         predictions = []
         with self._lock:  # two predictions at the same time would need twice the GPU memory

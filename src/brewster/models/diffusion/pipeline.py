@@ -31,10 +31,11 @@ from brewster.models.diffusion.backbones import (
 from brewster.models.diffusion.families.family import Backbone
 from brewster.models.diffusion.lazy_imports import explain_out_of_memory, fetch
 from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_image, split
-from brewster.models.diffusion.prompt import PROMPTS, PromptEmbedding
-from brewster.models.diffusion.sampling import STEPS, euler, sample
-from brewster.models.diffusion.task import DecompositionTask
-from brewster.models.zoo import PUBLISHED, TINY_PREFIX, model_name
+from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding, load_prompt
+from brewster.models.diffusion.sampling import euler, sample
+from brewster.models.diffusion.task import TASK_FILE, DecompositionTask, load_task
+from brewster.models.large_models import LARGE
+from brewster.models.zoo import TINY_PREFIX, model_name
 from brewster.options import Quantisation
 
 if TYPE_CHECKING:
@@ -61,11 +62,11 @@ class DecompositionPipeline:
         self,
         photo: Float[Tensor, "1 3 h w"],
         *,
-        steps: int = STEPS,
+        steps: int | None = None,
         seeds: Sequence[int] = (0,),
         on_progress: Callable[[int, int], None] | None = None,
     ) -> Mapping[str, Float[Tensor, "seeds 3 h w"]]:
-        """Generates the panels for a photo in [-1, 1].
+        """Generates the panels for a photo in [-1, 1], by default with the steps of the task.
 
         With the objectives "one_step" and "direct", `steps` and `seeds` have no effect, and there is one prediction.
         `on_progress(done, total)` is called after each step.
@@ -88,8 +89,9 @@ class DecompositionPipeline:
             conditioning_image(photo, layout),
             self.prompt,
             size=layout.composite_size((width, height)),
-            steps=steps,
+            steps=self.task.steps if steps is None else steps,
             guidance=self.task.guidance,
+            last_sigma=self.task.last_sigma,
             seeds=seeds,
             on_progress=on_progress,
         )
@@ -151,7 +153,8 @@ def load_pipeline(
         device: "auto" uses an NVIDIA or AMD GPU if torch finds one, otherwise the CPU.
         base: the folder or hub id of the LoRA's base; by default the one used in training. Only for a LoRA.
         quantise: the quantisation of the base; by default the one used in training, and none on the CPU.
-        prompt: for a backbone without a LoRA: a name in `PROMPTS`, or the text itself.
+        prompt: for a backbone without a LoRA: a name in `PROMPTS`, or the text itself. A finetuned backbone with a
+            stored prompt uses that one.
 
     Raises:
         DownloadError: no access to a gated model, an invalid token, or no network connection.
@@ -170,12 +173,23 @@ def load_pipeline(
             "leave the base out",
         )
     # The prompt is encoded before the backbone is loaded, because memory may be too small for both.
-    embedding = encode_prompt(model, PROMPTS.get(prompt, prompt), device=device_name)
+    embedding, task = _prompt_and_task(model, PROMPTS.get(prompt, prompt), device_name)
     backbone = load_backbone(model, device=device_name, quantise=quantise)
     digest = fingerprint(model, device=device, quantise=quantise, prompt=prompt)
-    return DecompositionPipeline(
-        backbone, embedding, DecompositionTask(PanelLayout(("T",))), model_name(model), digest
-    )
+    return DecompositionPipeline(backbone, embedding, task, model_name(model), digest)
+
+
+def _prompt_and_task(model: str, text: str, device: str) -> tuple[PromptEmbedding, DecompositionTask]:
+    """Those stored with a finetuned base, which has no text encoder; otherwise the encoded text, and panel T only."""
+    task = DecompositionTask(PanelLayout(("T",)))
+    if model in BACKBONES or model.startswith(TINY_PREFIX):
+        return encode_prompt(model, text, device=device), task
+    folder = fetch(model, [INDEX_FILE, PROMPT_FILE, TASK_FILE])
+    if (folder / TASK_FILE).is_file():
+        task = load_task(folder / TASK_FILE)
+    if (folder / PROMPT_FILE).is_file():
+        return load_prompt(folder / PROMPT_FILE, family_of(model).name), task
+    return encode_prompt(model, text, device=device), task
 
 
 def fingerprint(
@@ -247,14 +261,15 @@ def _find_lora(model: str) -> tuple[LoraLayout, Path] | None:
     """The layout and the folder of a LoRA, downloaded if it is on the hub; None for a backbone."""
     if model in BACKBONES or model.startswith(TINY_PREFIX):
         return None
-    folder = fetch(PUBLISHED.get(model, model), [name for layout in LAYOUTS for name in layout.files])
+    source = LARGE[model].hub_id if model in LARGE else model
+    folder = fetch(source, [name for layout in LAYOUTS for name in layout.files])
     if layout := layout_of(folder):
         return layout, folder
-    if Path(model).is_dir() and not (folder / INDEX_FILE).is_file():
+    if not (folder / INDEX_FILE).is_file():
         raise ModelError(
             f"{model} contains no model",
-            f"expected a LoRA ({LORA_FILE}) or a backbone in diffusers' layout (model_index.json)",
-            "pass the folder lora/ that brewster train wrote",
+            f"expected a LoRA ({LORA_FILE}) or a backbone in diffusers' layout ({INDEX_FILE})",
+            "pass the folder lora/ that brewster train wrote, or convert a LoRA with: brewster models import",
         )
     return None
 

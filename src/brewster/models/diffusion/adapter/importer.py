@@ -30,7 +30,6 @@ from brewster.models.diffusion.tensors import read_tensors
 from brewster.models.zoo import TINY_PREFIX
 
 _PEFT_CONFIG_FILE: Final = "adapter_config.json"
-_PEFT_WEIGHTS_FILE: Final = "adapter_model.safetensors"
 _DIFFUSERS_KEY: Final = "lora_adapter_metadata"
 _PREFIX: Final = "transformer."
 

@@ -205,14 +205,17 @@ class Backbone(ABC):
             return shifted
         return scheduler.shift * sigma / (1 + (scheduler.shift - 1) * sigma)  # type: ignore[no-any-return]
 
-    def schedule(self, tokens: int, steps: int) -> Float[Tensor, " sigmas"]:
-        """The sigmas of the scheduler of diffusers: steps + 1 decreasing values from 1 to 0."""
+    def schedule(self, tokens: int, steps: int, last_sigma: float | None = None) -> Float[Tensor, " sigmas"]:
+        """The sigmas of the scheduler of diffusers: steps + 1 decreasing values from 1 to 0.
+
+        Before the shift, the last one before 0 is `last_sigma`, by default 1 / steps.
+        """
         # A shift does not change sigma 1, but stretching to `shift_terminal` would divide 0 by 0.
         if steps == 1:
             return torch.tensor([1.0, 0.0])
         scheduler = type(self.scheduler).from_config(self.scheduler.config)
         dynamic = {"mu": self.shift(tokens, steps)} if scheduler.config.use_dynamic_shifting else {}
-        scheduler.set_timesteps(sigmas=np.linspace(1.0, 1 / steps, steps), **dynamic)
+        scheduler.set_timesteps(sigmas=np.linspace(1.0, last_sigma or 1 / steps, steps), **dynamic)
         sigmas = scheduler.sigmas
         assert isinstance(sigmas, Tensor)
         return sigmas
