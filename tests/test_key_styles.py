@@ -90,7 +90,11 @@ def peft(pairs, prefix, adapter=""):
 STYLES = {
     "diffusers": lambda name: peft(weights(name, original=False), "transformer."),
     "kohya": lambda name: kohya(weights(name, original=True)),
-    "ComfyUI": lambda name: kohya(weights(name, original=True), "diffusion_model.", flat=False),
+    "ComfyUI": lambda name: (
+        peft(weights(name, original=True), "diffusion_model.")
+        if name == "klein"  # stock diffusers ignores the other spelling
+        else kohya(weights(name, original=True), "diffusion_model.", flat=False)
+    ),
 }
 
 
@@ -262,3 +266,20 @@ def test_the_base_may_be_a_folder(tmp_path, monkeypatch):
         str(tmp_path / "lora.safetensors"), tmp_path / "out", base=base, prompt="x", panels=("T",)
     )
     assert (metadata.backbone, metadata.base) == ("qwen", base)
+
+
+def test_a_lora_and_a_checkpoint_are_imported(run_without_model, tmp_path):
+    matrices = {"A": torch.ones(2, 32), "B": torch.ones(32, 2)}
+    tensors = {
+        f"transformer.transformer_blocks.0.attn.to_q.lora_{part}.weight": m for part, m in matrices.items()
+    }
+    save_file(tensors, tmp_path / "lora.safetensors")
+    arguments = ("models", "import", "lora.safetensors", "imported", "--base", "tiny:kontext")
+    code, _, err = run_without_model(*arguments)
+    assert (code, "A LoRA needs --prompt" in err) == (2, True)
+    code, _, err = run_without_model(*arguments, "--prompt", "remove the reflection", "--panels", "T,R")
+    assert (code, "use it with: --model imported" in err) == (0, True)
+    assert read_lora_metadata(tmp_path / "imported").task.layout.panels == ("T", "R")
+    (tmp_path / "model.pt").write_bytes(b"nothing")
+    code, _, err = run_without_model("models", "import", "model.pt", "out")
+    assert (code, err.startswith("error: model.pt cannot be read")) == (1, True)

@@ -165,8 +165,9 @@ class DiffusionPredictor(Predictor):
         short_side = self._pipeline.task.short_side_px
         if short_side and min(height, width) < short_side:
             size = tuple(round(side * short_side / min(height, width)) for side in (height, width))
-            maps = self._predict_tile(_resize(tile, size), steps, progress)
-            return tuple(_resize(map_, (height, width)) for map_ in maps)
+            enlarged = np.clip(_resize(tile, size, "bicubic"), 0, 1)
+            maps = self._predict_tile(enlarged, steps, progress)
+            return tuple(_resize(map_, (height, width), "bilinear") for map_ in maps)
         panel_fit = PanelFit((width, height), _round_up((width, height), self._pipeline.backbone.multiple))
         panel_input = torch.from_numpy(2 * to_encoded(tile) - 1).permute(2, 0, 1)[None]
         panels = self._pipeline(
@@ -226,10 +227,10 @@ def _to_linear_light(panels: torch.Tensor) -> NDArray[np.float32]:
     return light
 
 
-def _resize(image: Floats, size: tuple[int, ...]) -> Floats:
-    """Resizes an image (h, w, 3) to this (height, width) by bicubic interpolation, with low-pass filter if it is reduced."""
+def _resize(image: Floats, size: tuple[int, ...], mode: str) -> Floats:
+    """Resizes an image (h, w, 3) to this (height, width), with a low-pass filter if it is reduced."""
     tensor = torch.from_numpy(image).permute(2, 0, 1)[None]
-    resized = functional.interpolate(tensor, size, mode="bicubic", antialias=True, align_corners=False)
+    resized = functional.interpolate(tensor, size, mode=mode, antialias=True, align_corners=False)
     result: Floats = resized[0].permute(1, 2, 0).numpy()
     return result
 

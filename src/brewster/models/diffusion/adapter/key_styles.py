@@ -175,6 +175,8 @@ def _parse(
             alphas[name] = float(tensor)
         else:
             matrices.setdefault(name, {})["down" if match["matrix"] in _DOWN else "up"] = tensor
+    if unused := sorted(alphas.keys() - matrices.keys()):
+        raise _unknown(f"{unused[0]}.alpha", tensors, backbone)
     if not matrices:
         raise ModelError(
             "the file contains no LoRA",
@@ -236,11 +238,10 @@ def check_shape(name: str, layer: LowRankLayer, module: Any) -> None:  # noqa: A
         ModelError: the module is not a linear layer, or has another shape.
     """
     expected = (module.out_features, module.in_features) if hasattr(module, "out_features") else None
-    actual = (len(layer.up), layer.down.shape[-1])
-    if actual != expected or layer.up.shape[1] != layer.rank:
-        shapes = f"{tuple(layer.up.shape)} and {tuple(layer.down.shape)}"
+    up, down = tuple(layer.up.shape), tuple(layer.down.shape)
+    if expected is None or up != (expected[0], layer.rank) or down != (layer.rank, expected[1]):
         raise ModelError(
-            f"the LoRA of {name} has matrices of {shapes}",
+            f"the LoRA of {name} has matrices of {up} and {down}",
             f"expected a layer with {' x '.join(map(str, expected))} weights"
             if expected
             else "expected a linear layer",

@@ -45,7 +45,7 @@ def read_metadata(folder: Path) -> LoraMetadata:
     """
     index, config = _read_json(folder / INDEX_FILE), _read_json(folder / CONFIG_FILE)
     try:
-        base, side = str(index["base_model"]), int(index["processing_resolution"])
+        base, side = index["base_model"], int(index["processing_resolution"])
         rank, alpha = int(config["r"]), int(config["lora_alpha"])
     except (KeyError, TypeError, ValueError) as error:
         raise ModelError(
@@ -53,6 +53,12 @@ def read_metadata(folder: Path) -> LoraMetadata:
             f"expected base_model and processing_resolution in {INDEX_FILE}, and r and lora_alpha in {CONFIG_FILE}",
             "download the model again",
         ) from error
+    if not isinstance(base, str):
+        raise ModelError(
+            f"base_model in {folder / INDEX_FILE} is {base!r}",
+            "expected a hub id",
+            "download the model again",
+        )
     if side < Qwen.multiple or side % Qwen.multiple:
         raise ModelError(
             f"processing_resolution in {folder / INDEX_FILE} is {side}",
