@@ -61,7 +61,7 @@ def convert(
     prompt.save(folder / PROMPT_FILE)
     task = DecompositionTask(
         PanelLayout(("T",)),
-        short_side_px**2,
+        budget_px=short_side_px**2,
         guidance=3.5,
         steps=28,
         last_sigma=0.001,

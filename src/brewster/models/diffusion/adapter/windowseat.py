@@ -67,7 +67,13 @@ def read_metadata(folder: Path) -> LoraMetadata:
         )
     # Panel I is the encoded photo, decoded again. It separates the errors of the VAE from the change by the model.
     task = DecompositionTask(
-        PanelLayout(("I", "T")), side**2, "direct", 1.0, _TIME, short_side_px=side, square_tiles=True
+        PanelLayout(("I", "T")),
+        budget_px=2 * side**2,
+        objective="direct",
+        guidance=1.0,
+        time=_TIME,
+        short_side_px=side,
+        square_tiles=True,
     )
     return LoraMetadata(Qwen.name, base, "nf4", rank, alpha, task, _read_prompt(folder).sha256)
 
