@@ -211,7 +211,7 @@ def _layer_names(transformer: nn.Module, backbone: str) -> dict[str, tuple[str, 
 def _split(
     name: str, layer: LowRankLayer, targets: tuple[str, ...], transformer: nn.Module
 ) -> dict[str, LowRankLayer]:
-    """Divides a layer of the original code into its layers in diffusers, which share the matrix `down`."""
+    """Divides a layer of the original code into its layers in diffusers, which have equal matrices `down`."""
     sizes = [int(transformer.get_submodule(target).out_features) for target in targets]  # type: ignore[arg-type]
     if sum(sizes) != len(layer.up):
         raise ModelError(
@@ -223,7 +223,7 @@ def _split(
     if targets == (_SWAPPED,) and not name.startswith("norm_out"):
         parts = (layer.up.roll(len(layer.up) // 2, dims=0),)
     layers = {
-        target: LowRankLayer(layer.down, part.contiguous())
+        target: LowRankLayer(layer.down.clone(), part.clone())  # safetensors refuses shared memory
         for target, part in zip(targets, parts, strict=True)
     }
     for target, part in layers.items():
