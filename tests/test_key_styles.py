@@ -115,7 +115,7 @@ def test_each_style_predicts_as_in_stock_diffusers(name, style, tmp_path):
     save_file(STYLES[style](name), path)
     backbone.pipeline().load_lora_weights(str(path))
     expected = velocity(backbone, prompt)
-    assert (expected - plain).abs().max() > 1e-2
+    assert (expected - plain).abs().max() > 1e-3
     found = velocity(imported(path, name, tmp_path / "imported"), prompt)
     torch.testing.assert_close(found, expected, atol=1e-5, rtol=0)
 
