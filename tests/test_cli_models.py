@@ -10,6 +10,7 @@ import pytest
 from brewster import Photo, Separator
 from brewster.cli.extras import CORE, EXTRAS
 from brewster.models import zoo
+from brewster.models.large_models import LARGE
 from cli_helpers import image_bytes
 
 ROOT = Path(__file__).parents[1]
@@ -31,11 +32,24 @@ def model_zoo(model, monkeypatch, tmp_path):
 def test_models_are_listed_with_licence_and_damage(run_without_model, model_zoo):
     code, out, _ = run_without_model("models", "list")
     assert code == 0
-    assert [line.split()[0] for line in out.decode().splitlines()] == ["compact", "research"]
+    lines = [line for line in out.decode().splitlines() if not line.startswith(" ")]
+    assert [line.split()[0] for line in lines] == ["compact", "research", *LARGE]
     assert b"damaged" in out
     rows = json.loads(run_without_model("models", "list", "--json")[1])
     assert rows[0]["licence"] == "Apache-2.0"
     assert rows[1]["error"]
+    assert [row["name"] for row in rows[2:]] == list(LARGE)
+
+
+def test_large_models_are_listed_with_size_memory_licence_and_access(run_without_model, model_zoo):
+    text = run_without_model("models", "list")[1].decode()
+    windowseat, kontext = (
+        text.split(f"\n{name} ")[1].split("\nklein")[0] for name in ("windowseat", "kontext")
+    )
+    assert "41 GB  Apache-2.0\n" in windowseat
+    assert "reflection derived; 24 GiB GPU memory (nf4)" in windowseat
+    assert "Non-Commercial License (not for commercial use)" in kontext
+    assert "gated: accept the licence" in kontext
 
 
 def test_a_model_has_a_card_and_a_path(run_without_model, model_zoo, model):

@@ -102,6 +102,8 @@ class FileResult:
     """See `Separation.reconstruction_error`."""
     assessment: Assessment | None = None
     """See `Separation.assessment`."""
+    reflection_is_derived: bool = False
+    """See `Separation.reflection_is_derived`."""
     error: str | None = None
     """The error message, or None."""
 
@@ -306,6 +308,7 @@ class BatchRunner:
         result.seconds, result.residual = dict(separation.seconds), separation.residual
         result.assessment = separation.assessment
         result.reconstruction_error = separation.reconstruction_error
+        result.reflection_is_derived = separation.reflection_is_derived
         started = time.perf_counter()
         for layer, target in task.targets.items():
             target_format = format_of(target) if isinstance(target, Location) else None

@@ -82,12 +82,17 @@ class GuidedUpsampler:
     """A separation fitted at low resolution. It is applied to the full photo in strips of rows."""
 
     change: _LocalLinearModel
-    reflection: _LocalLinearModel
+    reflection: _LocalLinearModel | None
+    """None: the reflection is photo - transmission."""
     override: GeneratedOverride | None = None
 
     @classmethod
     def fit(
-        cls, photo: Floats, change: Floats, reflection: Floats, override: GeneratedOverride | None = None
+        cls,
+        photo: Floats,
+        change: Floats,
+        reflection: Floats | None,
+        override: GeneratedOverride | None = None,
     ) -> GuidedUpsampler:
         """Fits change and reflection as local linear functions of the photo.
 
@@ -96,7 +101,7 @@ class GuidedUpsampler:
         Args:
             photo: the photo.
             change: transmission - photo.
-            reflection: the reflection.
+            reflection: the reflection; None if it is photo - transmission.
             override: where a generated transmission replaces the fitted one.
         """
         mean = _box_mean(photo)
@@ -107,7 +112,7 @@ class GuidedUpsampler:
             slope = _box_mean((_box_mean(photo * layer) - mean * _box_mean(layer)) / variance)
             return _LocalLinearModel(slope, layer - slope * photo)
 
-        return cls(fit_layer(change), fit_layer(reflection), override)
+        return cls(fit_layer(change), None if reflection is None else fit_layer(reflection), override)
 
     def apply(
         self, photo: Floats, top: int, height: int, weights: Floats | None = None
@@ -135,9 +140,12 @@ class GuidedUpsampler:
             transmission *= weights
         transmission += photo
         np.maximum(transmission, np.minimum(photo, 0), out=transmission)
-        reflection = self.reflection.apply(photo, top, height)
-        if weights is not None:
-            reflection *= weights
+        if self.reflection is None:
+            reflection = photo - transmission
+        else:
+            reflection = self.reflection.apply(photo, top, height)
+            if weights is not None:
+                reflection *= weights
         return transmission, np.clip(reflection, 0, np.maximum(photo, 0), out=reflection)
 
 

@@ -69,6 +69,8 @@ class Separation:
     device: str
     seconds: dict[str, float] = field(compare=False)
     """Wall time of the steps `decode`, `network` and `detail`."""
+    reflection_is_derived: bool = False
+    """Whether the reflection is photo - transmission in linear light, because the model predicts no reflection."""
 
     @cached_property
     def confidence(self) -> Photo:
@@ -197,6 +199,7 @@ class Separator:
             self.sha256,
             self.device,
             seconds,
+            prediction.reflection_is_derived,
         )
 
     def fit(
@@ -311,9 +314,8 @@ def _fit_upsampler(
     scale, override = np.float32(strength) * white, prediction.override
     if override:
         override = replace(override, transmission=white * override.transmission, strength=strength)
-    return GuidedUpsampler.fit(
-        white * largest_input, scale * prediction.change, scale * prediction.reflection, override
-    )
+    reflection = None if prediction.reflection_is_derived else scale * prediction.reflection
+    return GuidedUpsampler.fit(white * largest_input, scale * prediction.change, reflection, override)
 
 
 def _upsample(

@@ -57,10 +57,13 @@ def preview(
     maps = {
         "change_slope": upsampler.change.slope,
         "change_offset": upsampler.change.offset,
-        "reflection_slope": upsampler.reflection.slope,
-        "reflection_offset": upsampler.reflection.offset,
         "confidence": prediction.confidence_map,
     }
+    if upsampler.reflection:
+        maps |= {
+            "reflection_slope": upsampler.reflection.slope,
+            "reflection_offset": upsampler.reflection.offset,
+        }
     if upsampler.override:
         maps |= {"generated": upsampler.override.transmission, "weight": upsampler.override.weight}
     if photo.pixels.shape[2] == 1:  # the layers of a grey photo are grey

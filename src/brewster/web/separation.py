@@ -177,6 +177,8 @@ def _separate(model_cache: ModelCache, form: SeparationRequest, on_progress: Pro
         "Brewster-Verdict": separation.assessment.verdict,
         "Brewster-Seconds": f"{time.perf_counter() - started:.4f}",
     }
+    if separation.reflection_is_derived:
+        headers["Brewster-Reflection"] = "derived"
     if separation.reconstruction_error is not None:
         headers["Brewster-Reconstruction-Error"] = f"{separation.reconstruction_error:.6f}"
     return Response(data, headers=headers, media_type=_media_type(name))

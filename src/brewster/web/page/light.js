@@ -72,9 +72,10 @@ export class Layers {
     return this.#change;
   }
 
-  // The reflection at strength 1, in linear light.
+  // The reflection at strength 1, in linear light: photo - transmission if the model gives no reflection.
   get reflection() {
     const { reflection_slope, reflection_offset } = this.preview.maps;
+    if (!reflection_slope) return (this.#reflection ??= this.change.map((value) => -value));
     return (this.#reflection ??= this.#apply(reflection_slope, reflection_offset));
   }
 
