@@ -43,8 +43,9 @@ def test_tables_go_to_standard_output_and_all_results_into_a_folder(
     )
     assert code == 0, err
     text = out.decode()
-    assert text.count("| input (unprocessed)") == 2
-    assert "theirs \N{MINUS SIGN} input (unprocessed)" in text
+    assert text.count("input (unprocessed)") == text.count("\ntheirs") == 1
+    assert "Real20 (3 images)" in text
+    assert "theirs \N{MINUS SIGN} input (unprocessed)" in (tmp_path / "out" / "tables.md").read_text()
     assert "found 3 images, expected 20" in err
     assert (tmp_path / "out" / "report.html").is_file()
     assert (tmp_path / "out" / "predictions" / "pane" / "real20" / "3.reflection.png").is_file()

@@ -226,7 +226,7 @@ def test_a_mirrored_prediction_gives_a_remark(tmp_path, random):
 
 def test_scores_csv_has_a_line_for_each_image_method_and_metric(real20, methods, tmp_path):
     results = evaluate(real20, methods, QUICK, tmp_path / "out")
-    rows = list(csv.DictReader((tmp_path / "out" / "scores.csv").open()))
+    rows = list(csv.DictReader((tmp_path / "out" / "scores.csv").read_text().splitlines()))
     assert len({(row["image"], row["method"], row["metric"]) for row in rows}) == len(rows) == 2 * 3 * 3
     (row,) = (row for row in rows if (row["image"], row["method"], row["metric"]) == ("2", "pane", "psnr"))
     assert float(row["value"]) == results["pictures"][1]["scores"]["pane"]["psnr"]

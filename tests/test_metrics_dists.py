@@ -17,6 +17,11 @@ from file_server import loopback_only, unused_address
 CHANNELS = (3, 64, 64, 128, 128, 256, 256, 256, 512, 512, 512, 512, 512, 512)
 
 
+@pytest.fixture(autouse=True)
+def _network_off(monkeypatch):
+    loopback_only(monkeypatch)
+
+
 @pytest.fixture(scope="module")
 def metric():
     """The published weights of the channels and random convolutions, for properties that hold for any weights."""
@@ -96,7 +101,6 @@ def test_images_that_are_too_small_or_differ_in_size_are_an_error(metric, images
 @pytest.fixture
 def folder(monkeypatch, tmp_path):
     """The folder of weights in BREWSTER_DATA; the cache is empty."""
-    loopback_only(monkeypatch)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
     (tmp_path / "weights").mkdir()

@@ -287,7 +287,9 @@ class _EvaluateCommand:
             write_out(f"{json.dumps(results)}\n".encode())
         elif not self.quiet:
             print_tables(results, intervals=self.intervals)
-            print_status(f"the results are in {self.out}; {self.out / REPORT_FILE} shows the images")
+            print_status(
+                f"the results are in {self.out}; {self.out / REPORT_FILE} shows the images, and tables.md has intervals and differences"
+            )
         if self.export:
             self._export(methods)
         return print_failures(results, quiet=self.quiet) and is_complete

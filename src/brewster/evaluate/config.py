@@ -93,7 +93,7 @@ class EvaluationConfig:
     def describe(self) -> list[str]:
         """Returns one or more sentences for each setting."""
         size = (
-            "Images are compared at the size of the ground truth."
+            f"Images are compared at the size of the ground truth{'' if self.resizes else '; nothing is resized'}."
             if self.size is None
             else f"If the shorter side is longer than {self.size} px, photo and ground truth are downscaled to it before any "
             "method runs, by area means in linear light. Smaller images keep their size."

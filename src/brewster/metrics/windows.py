@@ -65,7 +65,7 @@ def mean_inside(values: NDArray[Any], region: Region | None = None) -> float:
     check_region(region, values.shape[:2])
     # Sums over the channels first: indexing (H, W, 3) with a mask of pixels takes ten times as long.
     sums = values[..., 0] + values[..., 1] + values[..., 2]
-    return float(np.mean(sums[region], dtype=np.float64) / 3)
+    return float(np.sum(sums[region], dtype=np.float64) / (3 * np.count_nonzero(region)))
 
 
 def box_sums(values: _Values) -> _Values:
