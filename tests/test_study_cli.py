@@ -97,7 +97,7 @@ def test_progress_lists_participants_without_results(run_without_model, study, r
         "2 participants, 2 complete, 0 excluded by the rule so far; 8 answers, 2 to 2 for each comparison."
     )
     assert "8 of 8" in text
-    assert not re.search("win|lose|ours|RDNet", text)
+    assert not re.search(r"\b(win|lose|ours|RDNet)\b", text)
     found = json.loads(run_without_model("study", "progress", "study", "--json")[1])
     assert [row["median_seconds"] for row in found["rows"]] == [4, 4]
 
