@@ -73,7 +73,7 @@ that the pane lets through: photo = T + R in linear light."""
 class MixRecipe(FrozenModel):
     """Distributions of mixtures of photos: a background behind glass plus a reflection, in linear light.
 
-    `recipes/train/compact-stage1.toml` uses the defaults. Luminances are linear. Lengths in pixels refer to an image of 256 px
+    `recipes/train/compact-stage5.toml` uses the defaults, except for the crop. Luminances are linear. Lengths in pixels refer to an image of 256 px
     and scale with the size of the training images.
     """
 
@@ -91,9 +91,9 @@ class MixRecipe(FrozenModel):
     """White parts of a photo are multiplied by up to 1 + this value, because their true luminance was clipped."""
     shadow_probability: Share = 0.15
     """Probability of a hard shadow on the background."""
-    background_blur_probability: Share = 0.2
+    background_blur_probability: Share = 0.08
     """Probability of a background that is out of focus. Without such backgrounds, a network takes all blur for a reflection."""
-    background_blur_px: LogRange = (0.5, 5.0)
+    background_blur_px: LogRange = (0.5, 3.0)
     """Standard deviation of the defocus blur of these backgrounds."""
 
     no_glass_probability: Share = 0.15
@@ -117,7 +117,7 @@ class MixRecipe(FrozenModel):
     """Probability of small lamps in the reflection."""
     sign_probability: Share = 0.08
     """Probability of a sign with letters in the reflection."""
-    sharp_probability: Share = 0.45
+    sharp_probability: Share = 0.35
     """Probability of a reflection without defocus blur."""
     blur_px: LogRange = (0.3, 9.0)
     """Standard deviation of the defocus blur of the other reflections."""
@@ -132,9 +132,9 @@ class MixRecipe(FrozenModel):
     edge_probability: Share = 0.3
     """Probability of a reflection that ends at a straight edge, such as a frame."""
 
-    softness_probability: Share = 0.6
+    softness_probability: Share = 0.5
     """Probability of a soft photo: background and reflection are both blurred by the lens, or enlarged from a smaller photo."""
-    softness_px: LogRange = (0.3, 1.6)
+    softness_px: LogRange = (0.3, 1.3)
     """Standard deviation of this blur, in pixels of the training image at any size."""
     target_luminance: Range = (0.2, 0.55)
     """Mean luminance of the photo after exposure. A photo with a smaller mean is not brightened."""
