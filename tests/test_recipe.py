@@ -158,10 +158,10 @@ def test_the_path_of_a_scene_recipe_is_relative_to_the_recipe(tmp_path):
         (("[mix]", "[mix]\nsparkle = 1"), r"no key mix\.sparkle"),
         (("[mix]", "[mix]\ncrop = [1, 0.45]"), r"mix\.crop is \[1, 0.45\]; expected low <= high"),
         (
-            ("[mix]", "[mix]\nreflection_ratio_log = [0, 2]"),
+            ("[mix]", "[mix]\nreflection_ratio = [0, 2]"),
             r"mix\.reflection_ratio\.0 is 0; .* above 0",
         ),
-        (("[mix]", "[mix]\ngamma_log = [1.2, 0.8]"), r"mix\.gamma is .* expected low <= high"),
+        (("[mix]", "[mix]\ngamma = [1.2, 0.8]"), r"mix\.gamma is .* expected low <= high"),
         (("[mix]", "[mix]\nnoise = [0, nan]"), r"mix\.noise"),
         (("[mix]", "[mix]\nno_glass_probability = 1.5"), r"mix\.no_glass_probability"),
         (("[mix]", "[mix]\nveil_probability = -0.1"), r"mix\.veil_probability"),
