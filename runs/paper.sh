@@ -23,11 +23,11 @@ real20=${REAL20:-$BREWSTER_DATA/real20} nature20=${NATURE20:-$BREWSTER_DATA/natu
 # 1. Download environment maps: 170 HDR maps of Poly Haven, CC0, 4k.   est. 4 GB
 brewster assets pull polyhaven "$BREWSTER_DATA/hdri" --indoor 140 --outdoor 30 --resolution 4k
 
-# 2. Render 1,000 samples with the paper's orders of reflection (T is the path without any reflection).
+# 2. Render 1,000 samples with truncated orders of reflection, as in the paper (T is the path without any reflection).
 #    5 MB per sample, measured with the built-in environments, 5 GB in total; est. 2.5-4 CPU-seconds per sample
 #    (docs/rendering.md, scaled to this size): an hour on one core, 10 minutes on eight. Your own photos in front of the maps
 #    improve the data: --photos FOLDER.
-brewster render "$BREWSTER_DATA/sets/window" --recipe window --count 1000 --size 640x480 --orders paper --seed 10 \
+brewster render "$BREWSTER_DATA/sets/window" --recipe window --count 1000 --size 640x480 --orders truncated --seed 10 \
     --maps "$BREWSTER_DATA/hdri"
 
 # 3. Estimate memory and time before anything is downloaded. The script stops here if training does not fit the card.
@@ -43,7 +43,7 @@ brewster tests/pictures/mixture-coffee-rocket.jpg --model "$out/lora" -o "$out/s
 
 # 6. Evaluate on 540 photos, est. 5-6 hours, with the unprocessed input and the compact model for comparison.
 brewster evaluate --benchmark "real20=$real20" --benchmark "nature20=$nature20" --benchmark "sir2=$sir2" \
-    --model compact --model "lora=$out/lora" --paper -o "$out/evaluate"
+    --model compact --model "lora=$out/lora" --protocol paper -o "$out/evaluate"
 
 # 7. Write the model card with these scores, and list the files for the hub, 350 MB. Without --dry-run, the command uploads
 #    them as a private repository; with --public the repository is public, under the licence of the base.

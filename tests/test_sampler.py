@@ -97,31 +97,33 @@ def test_a_picture_behind_the_glass_fills_the_view():
     recipe = changed(
         "vitrine",
         camera={"width": 24, "height": 16, "pinhole_probability": 1.0},
-        behind={"relative_width": (1.05, 1.5), "turn_deg": (0.0, 0.0)},
+        behind={"relative_width": (1.05, 1.5), "heading_deg": (0.0, 0.0)},
     )
     for index in range(12):
         scene = drawn(recipe, index)
         white = SyntheticAssets(**{scene.behind.plane.source.file: ASSETS.pictures["white"][:, :24]})
-        scene = scene.model_copy(update={"front": Scene().front, "samples": 4})
+        scene = scene.model_copy(update={"front": Scene().front, "samples_per_pixel": 4})
         sample = render(scene, white)
         assert float(sample.background.min()) > 0.99 * scene.behind.plane.luminance
         assert float(sample.transmission.min()) > 0.4 * scene.behind.plane.luminance
 
 
 def test_the_camera_distance_is_within_the_range_of_the_recipe(fifty):
-    nearest, farthest = read_scene_recipe("window").camera.distance_mm_log
+    nearest, farthest = read_scene_recipe("window").camera.distance_mm
     for scene in fifty["window"]:
         assert 0.9 * nearest < scene.camera_above_glass_mm < 1.1 * farthest
 
 
 def test_rough_glass_gets_more_rays():
-    asked = changed("tiny", glass={"rough_probability": 1.0}).model_copy(update={"rough_samples": 77})
-    assert drawn(asked, 0).samples == 77
+    asked = changed("tiny", glass={"rough_probability": 1.0}).model_copy(
+        update={"rough_samples_per_pixel": 77}
+    )
+    assert drawn(asked, 0).samples_per_pixel == 77
     assert drawn(asked, 0).glass.is_rough
 
 
 def test_categories_are_respected_and_a_map_without_one_fits_everywhere():
-    asked = changed("window", behind={"map_probability": 1.0, "maps": ("indoor",)})
+    asked = changed("window", behind={"map_probability": 1.0, "map_categories": ("indoor",)})
     rooms = {drawn(asked, index).behind.map.source.file for index in range(20)}
     assert rooms <= {f"builtin:room:{number}" for number in range(8)}
     plain = Catalog(maps=(Asset(source=AssetSource(file="a.hdr"), width=4096, height=2048),))
@@ -134,7 +136,7 @@ def test_a_recipe_of_pictures_needs_pictures():
 
 
 def test_a_recipe_of_maps_needs_maps_that_are_sharp_enough():
-    asked = changed("window", behind={"map_probability": 1.0, "picture_probability": 0.0})
+    asked = changed("window", behind={"map_probability": 1.0, "plane_probability": 0.0})
     for catalog in (
         Catalog(pictures=BUILTIN_CATALOG.pictures),
         Catalog(maps=(Asset(source=AssetSource(file="a.hdr"), width=64, height=32),)),
@@ -167,8 +169,8 @@ def test_panes_pinholes_and_focus_come_as_often_as_their_probabilities_say(share
         "window",
         glass={"double_probability": share},
         camera={"pinhole_probability": share, "focus_on_front_probability": share},
-        behind={"map_probability": 1.0, "dome_probability": 0.0, "picture_probability": 0.0},
-        front={"picture_probability": 1.0},
+        behind={"map_probability": 1.0, "dome_probability": 0.0, "plane_probability": 0.0},
+        front={"plane_probability": 1.0},
     )
     scenes = [drawn(recipe, index) for index in range(12)]
     assert {len(scene.glass.panes) for scene in scenes} == {1 + share}

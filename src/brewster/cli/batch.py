@@ -33,6 +33,7 @@ from brewster.files import LAYER_FORMATS, find_videos
 from brewster.image_formats import WRITABLE, ImageFormat, format_of
 from brewster.models import zoo
 from brewster.options import Options
+from brewster.remote_path import location
 
 if TYPE_CHECKING:
     from brewster.inference import FileResult, SeparationTask
@@ -59,7 +60,7 @@ def local_path(text: str) -> str:
 
 def skipped_videos(photos: Sequence[str]) -> str | None:
     """Returns a line about the videos in the folders, or None if there is none."""
-    videos = find_videos(map(Path, photos))
+    videos = find_videos(map(location, photos))
     if not videos:
         return None
     return f"{_counted(videos, 'video')} skipped: brewster separates photos; extract single images first, for example with ffmpeg"
@@ -105,8 +106,8 @@ def _plan_single_output(photos: Sequence[str], output: str | None, options: Opti
         )
     if output not in (None, "-"):
         _check_format(format_of(Path(output)), options)
-    source = _StandardStream() if photos[0] == "-" else Path(photos[0])
-    target = _StandardStream() if output in (None, "-") else Path(output)
+    source = _StandardStream() if photos[0] == "-" else location(photos[0])
+    target = _StandardStream() if output in (None, "-") else location(output)
     return SeparationTask(source, {options.layers[0]: target})
 
 
@@ -229,10 +230,11 @@ class BatchCommand:
                 if result.error:
                     interrupts.raise_pending()  # a Ctrl-C that Python dropped may have caused the error
                 results.append(result)
-                self._print_result(result)
+                self.print_result(result)
                 interrupts.raise_pending()
 
-    def _print_result(self, result: FileResult) -> None:
+    def print_result(self, result: FileResult) -> None:
+        """Prints the line of a result: JSON on standard output, or a status line on standard error."""
         outputs = ", ".join(result.outputs.values())
         if self.as_json:
             write_out(_json_line(result))
@@ -247,12 +249,10 @@ class BatchCommand:
                 f"{result.source}: skipped, all of its layers exist{made} (--overwrite replaces them)"
             )
         elif result.status == "separated":
-            print_status(f"{result.source} -> {outputs} ({sum(result.seconds.values()):.1f} s)")
-            if result.doubtful:
-                print_status(
-                    f"{result.source}: doubtful, the generated photo differs from the input "
-                    f"(reconstruction error {result.reconstruction_error:.2f}): check the layers"
-                )
+            verdict = result.assessment.verdict if result.assessment else ""
+            hint = ": check the layers" if verdict == "doubtful" else ""
+            seconds = sum(result.seconds.values())
+            print_status(f"{result.source} -> {outputs} ({seconds:.1f} s, {verdict}{hint})")
 
     def _other_options(self, result: FileResult) -> str:
         """Returns the options with which the existing layers were made, where they differ from those of this batch."""
@@ -313,6 +313,12 @@ def _duration(seconds: float) -> str:
     return f"{minutes} min {rest} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60} min"
 
 
+def error_text(result: FileResult) -> str:
+    """Returns the error message of a photo, which begins with its path."""
+    has_source = str(result.error).startswith(f"{result.source} ")
+    return str(result.error) if has_source else f"{result.source}: {result.error}"
+
+
 def _error_messages(results: Iterable[FileResult]) -> list[str]:
     """Returns a message for each failed photo. Photos that need the same missing extra share a message."""
     messages, without_extra = [], defaultdict(list)
@@ -320,8 +326,7 @@ def _error_messages(results: Iterable[FileResult]) -> list[str]:
         if result.error and "pip install 'brewster[" in result.error:
             without_extra[result.error].append(result.source)
         elif result.error:
-            has_source = result.error.startswith(f"{result.source} ")
-            messages.append(result.error if has_source else f"{result.source}: {result.error}")
+            messages.append(error_text(result))
     grouped = (
         f"{sources[0] if len(sources) == 1 else _counted(sources, 'photo')}: {error}"
         for error, sources in without_extra.items()

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Final, final
+from typing import final
 
 import numpy as np
 
+from brewster.inference.assessment import Assessment
 from brewster.inference.guided_upsampling import Floats, upsample_rows
 from brewster.photo import Photo
 from brewster.photo.contact_sheet import side_by_side
 from brewster.photo.open_raster import LayeredImage
-
-RECONSTRUCTION_ERROR_LIMIT: Final = 0.06
-"""A separation with a larger reconstruction error is doubtful. The value is chosen, not measured: about three times the
-error of encoding and decoding with the VAE of a diffusion model."""
 
 
 @final
@@ -32,18 +29,15 @@ class Separation:
     """Mean of |photo - transmission - reflection| in linear light."""
     reconstruction_error: float | None
     """Mean of |generated input - input|, sRGB-encoded, or None if the model does not generate the input."""
+    assessment: Assessment
+    """What the model found in the photo, at strength 1, and how reliable the result is."""
     model: str
     sha256: str | None
     device: str
     seconds: dict[str, float] = field(compare=False)
     """Wall time of the steps `decode`, `network` and `detail`."""
-
-    @property
-    def doubtful(self) -> bool:
-        """Whether the generated input differs so much from the photo that the layers may show another scene."""
-        return (
-            self.reconstruction_error is not None and self.reconstruction_error > RECONSTRUCTION_ERROR_LIMIT
-        )
+    reflection_is_derived: bool = False
+    """Whether the reflection is photo - transmission in linear light, because the model predicts no reflection."""
 
     def _repr_png_(self) -> bytes:
         """For notebooks: photo, transmission and reflection side by side, as a PNG."""

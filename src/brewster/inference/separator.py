@@ -25,6 +25,7 @@ import numpy as np
 
 import brewster
 from brewster.errors import BrewsterError, MissingExtra, ModelError
+from brewster.inference.assessment import Assessment, assess
 from brewster.inference.guided_upsampling import Floats, GuidedUpsampler
 from brewster.inference.onnx_backend import OnnxBackend
 from brewster.inference.predictor import (
@@ -38,7 +39,7 @@ from brewster.inference.separation import Separation
 from brewster.inference.tiles import Backend
 from brewster.models.zoo import find_model, is_large
 from brewster.options import Options, Quality, Quantisation, document_options
-from brewster.photo import Encoding, Photo, Source
+from brewster.photo import Encoding, Mask, Photo, Source
 from brewster.photo.history import with_history
 
 if TYPE_CHECKING:
@@ -174,6 +175,7 @@ class Separator:
         *,
         strength: float = Options.strength,
         quality: Quality = Options.quality,
+        mask: Source | None = Options.mask,
         additive: bool = Options.additive,
         encoding: Encoding | None = None,
         max_pixels: int = Options.max_pixels,
@@ -191,22 +193,22 @@ class Separator:
             PhotoError: the source cannot be read, or is too large.
             TypeError: the source has another type.
             ModelError: the model returns an invalid output.
+            MaskError: the mask cannot be read, is not grey, or has another size than the photo.
             BrewsterError: strength or quality is out of range.
         """
         _check_options(strength, quality)
         seconds: dict[str, float] = {}
         with _timed(seconds, "decode"):
             photo = Photo.open(source, encoding=encoding, max_pixels=max_pixels)
-            inputs = [photo.resized(*size) for size in self._predictor.input_sizes(photo.size, quality)]
-            white = np.float32(max(1.0, float(np.percentile(inputs[-1], _WHITE_PERCENTILE))))
-            inputs = [np.clip(scaled_input / white, 0, 1) for scaled_input in inputs]
+            weights = None if mask is None else Mask.open(mask, photo.size)
+            inputs, white = self._inputs(photo, quality)
         on_progress(0.0)
         with _timed(seconds, "network"):
             prediction = self._predictor(inputs, quality, lambda done: on_progress(_NETWORK_SHARE * done))
         with _timed(seconds, "detail"):
             upsampler = _fit_upsampler(inputs[-1], prediction, strength, white)
             transmission, reflection, residual = _upsample(
-                photo, upsampler, additive=additive, on_progress=on_progress
+                photo, upsampler, weights, additive=additive, on_progress=on_progress
             )
         step = history_step(self.name, strength=strength, quality=quality, additive=additive)
         step |= {"sha256": self.sha256[:12]} if self.sha256 else {}
@@ -217,11 +219,46 @@ class Separator:
             prediction.confidence_map,
             residual,
             prediction.reconstruction_error,
+            _assess(inputs[-1], prediction),
             self.name,
             self.sha256,
             self.device,
             seconds,
+            prediction.reflection_is_derived,
         )
+
+    def fit(
+        self,
+        photo: Photo,
+        *,
+        quality: Quality = Options.quality,
+        on_progress: ProgressCallback = lambda _fraction: None,
+    ) -> tuple[GuidedUpsampler, Prediction, Assessment]:
+        """Predicts the layers of a photo, without computing them at full size.
+
+        Args:
+            photo: the photo.
+            quality: as in a call.
+            on_progress: as in a call.
+
+        Returns:
+            The upsampler at strength 1, which computes the layers of any rows of the photo; the prediction; and its
+            assessment.
+
+        Raises:
+            BrewsterError: quality is out of range.
+        """
+        _check_options(Options.strength, quality)
+        inputs, white = self._inputs(photo, quality)
+        prediction = self._predictor(inputs, quality, on_progress)
+        upsampler = _fit_upsampler(inputs[-1], prediction, Options.strength, white)
+        return upsampler, prediction, _assess(inputs[-1], prediction)
+
+    def _inputs(self, photo: Photo, quality: Quality) -> tuple[list[Floats], np.float32]:
+        """Returns the inputs of the model in 0..1, smallest first, and the white level by which they are divided."""
+        inputs = [photo.resized(*size) for size in self._predictor.input_sizes(photo.size, quality)]
+        white = np.float32(max(1.0, float(np.percentile(inputs[-1], _WHITE_PERCENTILE))))
+        return [np.clip(scaled_input / white, 0, 1) for scaled_input in inputs], white
 
 
 @document_options
@@ -232,6 +269,7 @@ def separate(
     device: str = Options.device,
     strength: float = Options.strength,
     quality: Quality = Options.quality,
+    mask: Source | None = Options.mask,
     additive: bool = Options.additive,
     encoding: Encoding | None = None,
     max_pixels: int = Options.max_pixels,
@@ -257,6 +295,7 @@ def separate(
         source,
         strength=strength,
         quality=quality,
+        mask=mask,
         additive=additive,
         encoding=encoding,
         max_pixels=max_pixels,
@@ -303,6 +342,11 @@ def _check_options(strength: float, quality: str) -> None:
         )
 
 
+def _assess(largest_input: Floats, prediction: Prediction) -> Assessment:
+    transmission = np.clip(largest_input + prediction.change, 0, 1)
+    return assess(largest_input, transmission, prediction.confidence_map, prediction.reconstruction_error)
+
+
 def _fit_upsampler(
     largest_input: Floats, prediction: Prediction, strength: float, white: np.float32
 ) -> GuidedUpsampler:
@@ -310,13 +354,17 @@ def _fit_upsampler(
     scale, override = np.float32(strength) * white, prediction.override
     if override:
         override = replace(override, transmission=white * override.transmission, strength=strength)
-    return GuidedUpsampler.fit(
-        white * largest_input, scale * prediction.change, scale * prediction.reflection, override
-    )
+    reflection = None if prediction.reflection_is_derived else scale * prediction.reflection
+    return GuidedUpsampler.fit(white * largest_input, scale * prediction.change, reflection, override)
 
 
 def _upsample(
-    photo: Photo, upsampler: GuidedUpsampler, *, additive: bool, on_progress: ProgressCallback
+    photo: Photo,
+    upsampler: GuidedUpsampler,
+    mask: Mask | None,
+    *,
+    additive: bool,
+    on_progress: ProgressCallback,
 ) -> tuple[Photo, Photo, float]:
     """Returns transmission, reflection and the mean residual. The layers are encoded like the photo, or as exact floats."""
     template = _float_template(photo) if additive else photo
@@ -324,7 +372,8 @@ def _upsample(
 
     def fill(rows: slice) -> float:
         linear = photo.linear_rows(rows.start, rows.stop)
-        layers = upsampler.apply(linear, rows.start, photo.size[1])
+        weights = None if mask is None else mask.rows(rows.start, rows.stop)
+        layers = upsampler.apply(linear, rows.start, photo.size[1], weights)
         stored = [template.stored_rows(layer, rows.start) for layer in layers]
         if additive:
             stored = _exact_sum_layers(template.stored_rows(linear, rows.start), stored[0])

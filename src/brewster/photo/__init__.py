@@ -11,12 +11,14 @@ from brewster.photo.decode import read_size
 from brewster.photo.file_info import FileInfo
 from brewster.photo.hdr_formats import read_layers, write_layers
 from brewster.photo.in_memory import Encoding
+from brewster.photo.mask import Mask
 from brewster.photo.photo import Photo, Source
 
 __all__ = [
     "DEFAULT_MAX_PIXELS",
     "Encoding",
     "FileInfo",
+    "Mask",
     "Photo",
     "Source",
     "read_layers",

@@ -59,7 +59,7 @@ def _known_network(name: str) -> str:
 
 
 Side = Annotated[int, Field(gt=0, multiple_of=MAX_STRIDE)]
-Sizes = Annotated[
+ImageSizeSchedule = Annotated[
     list[tuple[Share, Side]],
     Field(min_length=1),
     AfterValidator(_ascending_from_0),
@@ -101,12 +101,12 @@ class CompactRecipe(TrainingRecipe):
         str, AfterValidator(_known_network), KeyNote(allowed=f"one of {', '.join(NETWORKS)}")
     ] = DEFAULT_NETWORK
     """Name of the network in the table `NETWORKS` of `brewster.models.networks`."""
-    sizes: Sizes
+    image_size_schedule: ImageSizeSchedule
     """Side of the training images. Each entry is valid from the given share of the steps: `[0.5, 160]` sets sides of 160 px
     from half of the steps. Smaller images at the beginning make training faster."""
     encoder_learning_rate: PositiveFloat
     """Peak learning rate of the pretrained encoder."""
-    average_decay: Share
+    ema_decay: Share
     """Decay per step of the exponential moving average (EMA) of the weights. The exported model has the averaged weights."""
     decay_share: Share = 1.0
     """Share of the steps, at the end, in which the learning rate falls to zero along a cosine. Before, it is constant."""
@@ -124,7 +124,7 @@ class CompactRecipe(TrainingRecipe):
 
     def size_at(self, step: int) -> int:
         """Returns the side of the training images at this step in px, a multiple of 32."""
-        return [size for start, size in self.sizes if step >= start * self.steps][-1]
+        return [size for start, size in self.image_size_schedule if step >= start * self.steps][-1]
 
 
 class LoraRecipe(TrainingRecipe):
@@ -162,7 +162,7 @@ class LoraRecipe(TrainingRecipe):
     """Guidance scale during training. For backbones with classifier-free guidance, 1 means no guidance."""
     logit_mean: float = 0.0
     """Mean of the logit-normal distribution of training times (Esser et al. 2024), before the resolution shift."""
-    logit_deviation: PositiveFloat = 1.0
+    logit_std: PositiveFloat = 1.0
     """Standard deviation of the logit-normal distribution of training times."""
     flip: bool = True
     """Whether each sample is also used with left and right exchanged."""
@@ -194,9 +194,9 @@ class LoraRecipe(TrainingRecipe):
                 " remove photos, maps and rendered.recipe"
             )
         if "T" not in self.panels or len(set(self.panels)) < len(self.panels):
-            raise ValueError(f"panels is {list(self.panels)}; each panel may occur once, and T is required")
+            raise ValueError(f"expected panels with T, each at most once, but panels is {list(self.panels)}")
         if self.quantise and self.backbone.startswith(TINY_PREFIX):
-            raise ValueError("a toy backbone (tiny:) cannot be quantised; remove quantise")
+            raise ValueError("expected no quantise: a toy backbone (tiny:) cannot be quantised")
         if self.prompt not in PROMPTS and not self.prompt.endswith(ENCODED_SUFFIX):
             raise ValueError(
                 f"expected one of the prompts {', '.join(PROMPTS)}, or a {ENCODED_SUFFIX} file,"

@@ -39,13 +39,14 @@ def sample(
     size: tuple[int, int],
     steps: int = STEPS,
     guidance: float = GUIDANCE,
+    last_sigma: float | None = None,
     seeds: Sequence[int] = (0,),
     batch: int = 1,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> Float[Tensor, "seeds 3 h w"]:
     """Generates one composite per seed, of this (width, height) in pixels.
 
-    The noise is drawn on the CPU, so a seed gives the same noise on every device. `batch` is the number of seeds that
+    For `last_sigma`, see `Backbone.schedule`. The noise is drawn on the CPU, so a seed gives the same noise on every device. `batch` is the number of seeds that
     are computed at once; the result depends on it only by rounding. `on_progress(done, total)` is called after
     each step.
 
@@ -79,6 +80,7 @@ def sample(
                 prompt,
                 steps=steps,
                 guidance=guidance,
+                last_sigma=last_sigma,
                 on_progress=report_step,
             )
             images.append(backbone.decode(latents).clamp(-1, 1).cpu())
@@ -93,17 +95,18 @@ def euler(
     *,
     steps: int,
     guidance: float,
+    last_sigma: float | None = None,
     on_progress: Callable[[], None] | None = None,
 ) -> Float[Tensor, "n c h w"]:
     """Integrates the flow from sigma 1 to 0: x(next sigma) = x(sigma) + (next sigma - sigma) velocity, in float32.
 
-    `condition` is the encoded conditioning image. `on_progress()` is called after each step.
+    `condition` is the encoded conditioning image. For `last_sigma`, see `Backbone.schedule`. `on_progress()` is called after each step.
 
     Returns:
         The latents at sigma 0.
     """
     latents = noise.to(backbone.device)
-    sigmas = backbone.schedule(latents.shape[2] * latents.shape[3], steps).to(latents.device)
+    sigmas = backbone.schedule(latents.shape[2] * latents.shape[3], steps, last_sigma).to(latents.device)
     for sigma, next_sigma in itertools.pairwise(sigmas):
         velocity = backbone.predict(latents, condition, sigma.expand(len(latents)), prompt, guidance)
         latents = latents + (next_sigma - sigma) * velocity

@@ -33,7 +33,7 @@ from brewster.models.diffusion.prompt import PROMPTS, PromptEmbedding, load_prom
 from brewster.models.diffusion.sampling import STEPS
 from brewster.training import distributed
 from brewster.training.data.sample_rng import SampleRng
-from brewster.training.loop import read_last_metrics
+from brewster.training.loop import read_log
 from brewster.training.lora.latents import (
     EncodedSample,
     LatentEncoder,
@@ -44,6 +44,7 @@ from brewster.training.lora.latents import (
 )
 from brewster.training.lora.model_card import write_card
 from brewster.training.losses import check_finite, psnr_gain_db
+from brewster.training.plots import sample_sheet
 from brewster.training.recipe import ENCODED_SUFFIX, LoraRecipe
 from brewster.training.streams import validation_pairs
 
@@ -105,7 +106,7 @@ class LoraTrainer:
         self._prompt = PromptEmbedding(self.backbone.name, **state["prompt"])
 
     def training_step(self, step: int) -> dict[str, float]:
-        """Runs one step of AdamW on one batch. Returns the loss and the part of each panel.
+        """Runs one step of AdamW on one batch. Returns `loss` and the term of each panel, `loss_panel_NAME`.
 
         Raises:
             ModelError: the loss is NaN or infinite. The last checkpoint is still valid.
@@ -124,7 +125,7 @@ class LoraTrainer:
         for group in self._optimizer.param_groups:
             group["lr"] = self.recipe.learning_rate * min(1.0, (step + 1) / self.recipe.warmup_steps)
         self._optimizer.step()
-        return {"loss": loss.item(), **{name: part.item() for name, part in parts.items()}}
+        return {"loss": loss.item(), **{f"loss_{name}": part.item() for name, part in parts.items()}}
 
     @torch.no_grad()
     def validate(self) -> tuple[dict[str, float], Tensor]:
@@ -132,9 +133,13 @@ class LoraTrainer:
         gains, rows = {}, []
         for name, samples in self._validation_samples.items():
             results = [self._validate_sample(layers) for layers in samples]
-            gains[f"gain_db_{name}"] = sum(gain for gain, _ in results) / len(results)
-            rows += [row for _, row in results]
-        return gains, torch.cat(rows, dim=1).clamp(0, 1).permute(1, 2, 0)
+            gains[f"psnr_gain_db_{name}"] = sum(gain for gain, _ in results) / len(results)
+            rows += [
+                (f"{name} {number}: PSNR gain {gain:+.2f} dB", row.clamp(0, 1))
+                for number, (gain, row) in enumerate(results, start=1)
+            ]
+        columns = [f"ground truth {panel}" for panel in "ITR"]
+        return gains, sample_sheet([*columns, *(f"generated {panel}" for panel in self.recipe.panels)], rows)
 
     def export(self, folder: Path) -> Path:
         """Writes LoRA, prompt, recipe and model card to `lora` in `folder`. Returns the path. diffusers can load the LoRA.
@@ -149,7 +154,8 @@ class LoraTrainer:
         save_lora(target, self.backbone, self.prompt, self.recipe.task, base=base, quantise=quantise)
         text = json.dumps(self.recipe.model_dump(mode="json"), indent=2)
         write_atomically(target / RECIPE_FILE, f"{text}\n".encode(), overwrite=True)
-        write_card(target, self.recipe, read_last_metrics(folder), type(self.backbone))
+        scores = read_log(folder)[-1:]
+        write_card(target, self.recipe, scores[0] if scores else {}, type(self.backbone))
         return target
 
     def separate(self, photo: Tensor, *, steps: int = STEPS, seed: int = 0) -> Mapping[str, Tensor]:
@@ -205,7 +211,7 @@ class LoraTrainer:
         if encoded.start is not None:
             return encoded.start, torch.ones(1)
         recipe, grid = self.recipe, encoded.composite
-        normal = recipe.logit_mean + recipe.logit_deviation * rng.normal(1)
+        normal = recipe.logit_mean + recipe.logit_std * rng.normal(1)
         sigma = self.backbone.shifted(normal.sigmoid(), grid.shape[2] * grid.shape[3])
         return rng.normal(*grid.shape), sigma
 

@@ -78,6 +78,10 @@ class Backbone(ABC):
     tiny: ClassVar[Architecture]
     guided_by_embedding: ClassVar[bool]
     """True if the guidance scale is an input of the transformer; False for classifier-free guidance."""
+    other_pipelines: ClassVar[tuple[str, ...]] = ()
+    """Class names in diffusers of other pipelines for the same transformer, VAE and scheduler."""
+    unquantised: ClassVar[tuple[str, ...]] = ()
+    """Layers that stay in full precision with nf4."""
     text_encoder_requirements: ClassVar[tuple[str, ...]] = ()
     """Libraries that the text encoders need in addition to the extra `large`."""
     multiple: ClassVar[int] = 16
@@ -145,6 +149,8 @@ class Backbone(ABC):
     ) -> Float[Tensor, "n c h w"]:
         """The velocity (noise - latents of the image) at time sigma, float32; differentiable.
 
+        `condition` may be `no_condition()`.
+
         Raises:
             ModelError: the prompt lacks an embedding that this guidance needs.
         """
@@ -162,6 +168,10 @@ class Backbone(ABC):
     @abstractmethod
     def random_prompt(cls, transformer: Any, seed: int) -> PromptEmbedding:  # noqa: ANN401 - a transformer of diffusers
         """A random embedding with the shapes of a prompt, for tiny versions, which have no text encoder."""
+
+    def no_condition(self) -> Float[Tensor, "1 c 0 0"]:
+        """An encoded conditioning image without tokens, for `predict`."""
+        return torch.empty(1, self.channels, 0, 0, device=self.device)
 
     def noise(self, size: tuple[int, int], seed: int) -> Float[Tensor, "1 c h w"]:
         """The noise from which the diffusers pipeline starts for a composite of this (width, height) and seed.
@@ -195,14 +205,17 @@ class Backbone(ABC):
             return shifted
         return scheduler.shift * sigma / (1 + (scheduler.shift - 1) * sigma)  # type: ignore[no-any-return]
 
-    def schedule(self, tokens: int, steps: int) -> Float[Tensor, " sigmas"]:
-        """The sigmas of the scheduler of diffusers: steps + 1 decreasing values from 1 to 0."""
+    def schedule(self, tokens: int, steps: int, last_sigma: float | None = None) -> Float[Tensor, " sigmas"]:
+        """The sigmas of the scheduler of diffusers: steps + 1 decreasing values from 1 to 0.
+
+        Before the shift, the last one before 0 is `last_sigma`, by default 1 / steps.
+        """
         # A shift does not change sigma 1, but stretching to `shift_terminal` would divide 0 by 0.
         if steps == 1:
             return torch.tensor([1.0, 0.0])
         scheduler = type(self.scheduler).from_config(self.scheduler.config)
         dynamic = {"mu": self.shift(tokens, steps)} if scheduler.config.use_dynamic_shifting else {}
-        scheduler.set_timesteps(sigmas=np.linspace(1.0, 1 / steps, steps), **dynamic)
+        scheduler.set_timesteps(sigmas=np.linspace(1.0, last_sigma or 1 / steps, steps), **dynamic)
         sigmas = scheduler.sigmas
         assert isinstance(sigmas, Tensor)
         return sigmas
