@@ -73,6 +73,13 @@ MODELS: Final = {
 }
 
 
+LARGE_MODELS: Final = {
+    "kontext": "brewster.models.diffusion.families.kontext:Kontext",
+    "klein": "brewster.models.diffusion.families.klein:Klein",
+    "qwen": "brewster.models.diffusion.families.qwen:Qwen",
+}
+"""Large models: name -> import path of the `Backbone` class. The path is text, because the import needs torch."""
+
 MODEL_FILE: Final = "model.onnx"
 """The name of the exported model in the folder of a training run."""
 LARGE_NAMES: Final = [name for name, model in LARGE.items() if model.is_opened_by_name]
