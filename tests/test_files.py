@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import platformdirs
 import pytest
@@ -281,3 +282,18 @@ def test_ctrl_c_just_after_the_rename_leaves_nothing_else(tmp_path, monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         write_atomically(tmp_path / "a", b"whole")
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
+def test_a_path_too_long_for_windows_is_named_as_such(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path, data: bytes) -> None:
+        raise FileNotFoundError(errno.ENOENT, "No such file or directory")  # what Windows reports
+
+    monkeypatch.setattr(files, "_write_synced", refuse)
+    monkeypatch.setattr(files, "sys", SimpleNamespace(platform="win32"))
+    with pytest.raises(TargetError, match=r"fewer than 260 characters.* enable long paths"):
+        write_atomically(tmp_path / ("a" * 240) / "b.jpg", b"layer")
+    with pytest.raises(TargetError, match=r"b\.jpg was not written \(No such file") as raised:
+        write_atomically(tmp_path / "b.jpg", b"layer")
+    assert "260" not in str(raised.value)

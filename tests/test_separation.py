@@ -78,7 +78,7 @@ def test_one_layer_is_an_image_and_several_are_a_zip(app, fields, kind, name):
     assert response.headers["content-type"] == kind
     assert f'filename="{name}"' in response.headers["content-disposition"]
     if kind != "application/zip":
-        expected = Separator(pane)(SMALL, additive="additive" in fields)
+        expected = Separator(pane, name="pane", sha256="0" * 64)(SMALL, additive="additive" in fields)
         layer = fields["layers"]
         assert response.content == getattr(expected, layer).encode(kind.removeprefix("image/"))
 

@@ -374,11 +374,15 @@ _REMEDIES = {
     errno.EROFS: ("expected a writable folder", "choose another folder with -o"),
     errno.ENAMETOOLONG: ("expected a shorter name", "rename the image"),
 }
+_MAX_WINDOWS_PATH = 260
 _DEFAULT_REMEDY = ("expected a writable file", "choose another folder with -o")
 
 
 def _target_error(path: Location, error: OSError) -> TargetError:
     expected, cure = _REMEDIES.get(error.errno or 0, _DEFAULT_REMEDY)
+    if sys.platform == "win32" and len(_absolute(path)) >= _MAX_WINDOWS_PATH and error.errno == errno.ENOENT:
+        expected = f"expected a path of fewer than {_MAX_WINDOWS_PATH} characters, because Windows allows no longer ones by default"
+        cure = "choose a shorter folder with -o, or enable long paths in the settings of Windows"
     return TargetError(f"{path} was not written ({error.strerror or error})", expected, cure)
 
 
