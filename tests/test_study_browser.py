@@ -15,6 +15,7 @@ from file_server import loopback_only
 from small_studies import copy_without_answers, make_study
 from web_servers import served_port
 
+expect.set_options(timeout=60_000)  # for slow machines
 READY = "#trial:not(.waiting):not([hidden])"
 
 ACCESSIBLE_NAMES = {
@@ -87,7 +88,7 @@ def begin(page):
 def test_the_whole_study_works_with_the_keyboard_only(open_page, url, store):
     page = open_page(url)
     page.wait_for_selector("#invitation:not([hidden])")
-    for key in ("Tab", "Space", "Tab", "Enter"):
+    for key in ("Tab", "Tab", "Space", "Tab", "Enter"):  # the first is the link to the privacy page
         page.keyboard.press(key)
     press(page, "2")  # the practice pair
     for trial, key in enumerate(["1", "2", "3", "ArrowLeft"]):
