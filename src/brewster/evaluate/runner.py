@@ -24,7 +24,8 @@ from brewster.errors import BrewsterError, TargetError
 from brewster.evaluate.config import EvaluationConfig
 from brewster.evaluate.methods import Method, MethodOutput, check_names
 from brewster.evaluate.scoring import CaseFiles, GroundTruth, Scorer
-from brewster.worker_setup import exit_with_parent, single_torch_thread
+from brewster.executors import exit_with_parent
+from brewster.worker_setup import single_torch_thread
 
 SCORES_FILE: Final = "scores.jsonl"
 SCORE_FORMAT_VERSION: Final = 3
