@@ -104,9 +104,7 @@ def add_lora(backbone: Backbone, *, rank: int = 16, alpha: int = 16, seed: int =
     config = peft.LoraConfig(r=rank, lora_alpha=alpha, target_modules=backbone.lora_targets())
     with torch.random.fork_rng(devices=_cuda_devices(backbone)):
         torch.manual_seed(seed)
-        backbone.transformer.add_adapter(config, adapter_name=_ADAPTER_NAME)
-    # peft creates the LoRA in the dtype of the base, which may be bf16.
-    import_library("diffusers.training_utils").cast_training_params(backbone.transformer, torch.float32)
+        _add_adapter(backbone, config)
     return lora_parameters(backbone)
 
 
@@ -126,8 +124,7 @@ def attach_layers(backbone: Backbone, layers: Mapping[str, LowRankLayer]) -> Non
         check_shape(name, layer, modules.get(name))
     peft = import_library("peft")
     config = peft.LoraConfig(**_layer_settings(layers))
-    backbone.transformer.add_adapter(config, adapter_name=_ADAPTER_NAME)
-    import_library("diffusers.training_utils").cast_training_params(backbone.transformer, torch.float32)
+    _add_adapter(backbone, config)
     peft.set_peft_model_state_dict(backbone.transformer, to_state(layers), adapter_name=_ADAPTER_NAME)
 
 
@@ -323,6 +320,12 @@ def _peft_settings(config: Any) -> str:  # noqa: ANN401 - peft's configuration
         "target_modules": sorted(config.target_modules),
     }
     return json.dumps({_PREFIX + name: value for name, value in settings.items()}, sort_keys=True)
+
+
+def _add_adapter(backbone: Backbone, config: Any) -> None:  # noqa: ANN401 - peft's configuration
+    """Adds a LoRA with random A matrices, float32. peft creates it in the dtype of the base, which may be bf16."""
+    backbone.transformer.add_adapter(config, adapter_name=_ADAPTER_NAME)
+    import_library("diffusers.training_utils").cast_training_params(backbone.transformer, torch.float32)
 
 
 def _layer_settings(layers: Mapping[str, LowRankLayer]) -> dict[str, Any]:
