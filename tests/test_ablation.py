@@ -4,6 +4,7 @@ import io
 import os
 import shutil
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,10 @@ from PIL import Image
 
 from benchmark_folders import paint
 from brewster.benchmarks.registry import read_benchmark
-from brewster.errors import RecipeError
+from brewster.errors import DownloadError, RecipeError
 from brewster.evaluate import ablation as module
 from brewster.evaluate.ablation import ablate, read_study
+from brewster.metrics import METRICS
 from brewster.training.recipe import read_recipe, with_value
 from cli_helpers import run_process
 
@@ -102,6 +104,20 @@ def test_values_are_compared_with_the_first_and_numbers_are_plotted(
     plot = np.asarray(Image.open(io.BytesIO((tmp_path / "out" / "plot.png").read_bytes())).convert("L"))
     assert plot.shape[1] > plot.shape[0] > 300
     assert 0.005 < (plot < 128).mean() < 0.5
+
+
+def test_missing_weights_of_a_metric_are_reported_before_training(pairs, data, tmp_path, monkeypatch):
+    def refuse():
+        raise DownloadError("LPIPS has no weights", "expected a network connection", "connect")
+
+    def train(*_):
+        raise AssertionError("training started without the weights of LPIPS")
+
+    monkeypatch.setattr(module, "_train", train)
+    monkeypatch.setenv("BREWSTER_DATA", str(data))
+    monkeypatch.setitem(METRICS, "lpips", replace(METRICS["lpips"], prepare=refuse))
+    with pytest.raises(DownloadError, match="LPIPS has no weights"):
+        ablate(read_study(RECIPES / "size.toml"), pairs, tmp_path / "out")
 
 
 def test_values_that_are_not_numbers_are_not_plotted(without_training, pairs, data, tmp_path, monkeypatch):

@@ -115,6 +115,11 @@ def ablate(
         RecipeError: the base recipe, the key or a value is invalid, or data is missing.
         BrewsterError: as raised by training and `evaluate`.
     """
+    for metric in EvaluationConfig().columns().values():
+        if (
+            metric.prepare
+        ):  # loads the weights of LPIPS: a download that fails must not fail after hours of training
+            metric.prepare()
     base = read_recipe(study.base)
     recipes = {study.label(value): with_value(base, study.key, value) for value in study.values}
     models = []

@@ -24,7 +24,6 @@ from brewster.inference.predictor import Prediction, Predictor, ProgressCallback
 from brewster.inference.tiles import run_tiled, tile_slices
 from brewster.models.diffusion.panels import PanelFit
 from brewster.models.diffusion.pipeline import DecompositionPipeline
-from brewster.models.diffusion.sampling import STEPS
 from brewster.options import Quality
 from brewster.srgb import to_encoded, to_linear
 
@@ -43,7 +42,7 @@ class DiffusionPredictor(Predictor):
 
     Args:
         pipeline: the model.
-        steps: the number of sampling steps; by default 20 as in the paper, and 4 for "draft".
+        steps: the number of sampling steps; by default those of the task (20 in the paper), and at most 4 for "draft".
         average: the number of samples with different seeds whose mean is the prediction; the mean has less invented detail.
         plain: whether the transmission is the upsampled generated one, without the detail of the photo.
 
@@ -94,13 +93,13 @@ class DiffusionPredictor(Predictor):
         self, inputs: Sequence[Floats], quality: Quality, on_progress: ProgressCallback
     ) -> Prediction:
         """Returns the mean prediction over the inputs. The reconstruction error is that of the first input."""
-        size = inputs[-1].shape[:2]
+        size, task_steps = inputs[-1].shape[:2], self._pipeline.task.steps
         tile_sides = [max(inputs[0].shape), *(self._tile_px for _ in inputs[1:])]
         tiles = [
             len(tile_slices(scaled_input.shape[:2], **_tiling(side)))
             for scaled_input, side in zip(inputs, tile_sides, strict=True)
         ]
-        steps = self._steps or (_DRAFT_STEPS if quality == "draft" else STEPS)
+        steps = self._steps or (min(_DRAFT_STEPS, task_steps) if quality == "draft" else task_steps)
         progress = _ProgressCounter(on_progress, sum(tiles))
         predictions = []
         with self._lock:  # two predictions at the same time would need twice the GPU memory

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import gc
 import importlib.util
 import json
 import pkgutil
@@ -48,6 +49,8 @@ _CONFIG_FILES: Final = {
 }
 _BACKBONE_PATTERNS: Final = [_INDEX_FILE, *(f"{part}/*" for part in _CONFIG_FILES)]
 _TEXT_ENCODER_PATTERNS: Final = [_INDEX_FILE, "scheduler/*", "text_encoder*/*", "tokenizer*/*", "processor/*"]
+_TEXT_ENCODER_OVERHEAD_BYTES: Final = 2 << 30
+"""GPU memory for the activations of the text encoders and the CUDA context."""
 _STATISTICS_SPREAD: Final = 0.2
 """The spread of a tiny version's latent statistics around 0 and 1, so that tests detect code without normalisation."""
 
@@ -84,7 +87,7 @@ def load_backbone(
         vae = _load_part(folder, family, "vae", dtype=dtype, **_device_map(device))
         transformer = _load_part(folder, family, "transformer", dtype=dtype, **_device_map(device), **options)
     scheduler = _load_part(folder, family, "scheduler")
-    backbone = family(transformer, vae, scheduler, distilled=bool(index.get("is_distilled")))
+    backbone = family(transformer, vae, scheduler, distilled=bool(index.get("is_distilled")), dtype=dtype)
     _check_channels(backbone, folder)
     if quantise:
         _check_quantised(backbone, quantise)
@@ -96,8 +99,11 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
 
     For `source`, see `load_backbone`. A tiny version has no text encoder: its embedding is random, seeded by the text.
 
+    They are loaded in bfloat16, on `device` if its free memory suffices, otherwise on the CPU. Call this before
+    `load_backbone`: together with the base, most text encoders fit no consumer GPU.
+
     Returns:
-        The embedding on the CPU.
+        The embedding on the CPU, bfloat16; float32 for a tiny version.
 
     Raises:
         DownloadError, ModelError, DeviceError, MissingExtra: see `load_backbone`.
@@ -116,14 +122,23 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
     disable_progress_bars_in_pipes()
     folder = _fetch_folder(source, _TEXT_ENCODER_PATTERNS)
     family, _ = _family_in(folder)
-    dtype = torch.float32 if device == "cpu" else torch.bfloat16
+    _check_text_encoders(folder)
+    dtype, device = torch.bfloat16, _text_encoder_device(folder, device)
     pipeline_class = diffusers_class(family.classes["pipeline"])
-    with explain_out_of_memory('encode the prompt with device="cpu"'), _translate_load_errors(folder):
+    with (
+        explain_out_of_memory("close other programs, or pass an encoded prompt"),
+        _translate_load_errors(folder),
+    ):
         pipeline = pipeline_class.from_pretrained(
             folder, transformer=None, vae=None, dtype=dtype, local_files_only=True
         ).to(device)
         with torch.no_grad():
-            return family.embed(pipeline, text).to("cpu", dtype)
+            embedding = family.embed(pipeline, text).to("cpu", dtype)
+    del pipeline
+    gc.collect()  # modules refer to each other, so the text encoders would stay in memory while the base is loaded
+    if device != "cpu":
+        torch.cuda.empty_cache()
+    return embedding
 
 
 def tiny(name: str, seed: int = 0) -> tuple[Backbone, PromptEmbedding]:
@@ -192,6 +207,28 @@ def family_of(source: str) -> type[Backbone]:
     if source in BACKBONES or source.startswith(TINY_PREFIX):
         return find_family(source.removeprefix(TINY_PREFIX))
     return _family_in(fetch(source, [_INDEX_FILE]))[0]
+
+
+def _check_text_encoders(folder: Path) -> None:
+    """Checks that all text encoders and tokenizers of the index are in the folder."""
+    index = _read_json(folder / _INDEX_FILE)
+    names = [name for name in index if name.startswith(("text_encoder", "tokenizer", "processor"))]
+    missing = [name for name in names if not (folder / name).is_dir()]
+    if missing or not names:
+        raise ModelError(
+            f"{folder} has no {', '.join(missing) or 'text_encoder'}",
+            "expected the text encoders of the model, because the prompt must be encoded",
+            "copy the complete model, or set prompt to an encoded prompt, such as the prompt.safetensors of a LoRA",
+        )
+
+
+def _text_encoder_device(folder: Path, device: str) -> str:
+    """The device for the text encoders: `device` if their weights fit into its free memory, otherwise the CPU."""
+    if not device.startswith("cuda"):
+        return "cpu"
+    size = sum(path.stat().st_size for path in folder.glob("text_encoder*/*.safetensors"))
+    free, _ = torch.cuda.mem_get_info(device)
+    return device if size + _TEXT_ENCODER_OVERHEAD_BYTES < free else "cpu"
 
 
 def _load_tiny(source: str, device: str, quantise: str | None) -> Backbone:

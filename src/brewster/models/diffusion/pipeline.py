@@ -23,9 +23,10 @@ from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata, load
 from brewster.models.diffusion.backbones import BACKBONES, encode_prompt, family_of, load_backbone
 from brewster.models.diffusion.families.family import Backbone
 from brewster.models.diffusion.lazy_imports import explain_out_of_memory, fetch
+from brewster.models.diffusion.memory import check_machine
 from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_image, split
 from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding
-from brewster.models.diffusion.sampling import STEPS, euler, sample
+from brewster.models.diffusion.sampling import euler, sample
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.zoo import TINY_PREFIX, model_name
 from brewster.options import Quantisation
@@ -54,13 +55,14 @@ class DecompositionPipeline:
         self,
         photo: Float[Tensor, "1 3 h w"],
         *,
-        steps: int = STEPS,
+        steps: int | None = None,
         seeds: Sequence[int] = (0,),
         on_progress: Callable[[int, int], None] | None = None,
     ) -> Mapping[str, Float[Tensor, "seeds 3 h w"]]:
         """Generates the panels for a photo in [-1, 1].
 
-        With the objective "one_step", `steps` and `seeds` have no effect, and there is one prediction.
+        The default of `steps` is that of the task. With the objective "one_step", `steps` and `seeds` have no effect, and
+        there is one prediction.
         `on_progress(done, total)` is called after each step.
 
         Returns:
@@ -79,8 +81,10 @@ class DecompositionPipeline:
             conditioning_image(photo, layout),
             self.prompt,
             size=layout.composite_size((width, height)),
-            steps=steps,
+            steps=self.task.steps if steps is None else steps,
             guidance=self.task.guidance,
+            timestep_shift=self.task.timestep_shift,
+            last_sigma=self.task.last_sigma,
             seeds=seeds,
             on_progress=on_progress,
         )
@@ -95,7 +99,7 @@ class DecompositionPipeline:
                 one_step_latents(photo, backbone, layout),
                 backbone.encode(conditioning_image(photo, layout)),
                 self.prompt,
-                steps=1,
+                sigmas=torch.tensor([1.0, 0.0]),
                 guidance=self.task.guidance,
             )
             image = backbone.decode(latents).clamp(-1, 1).cpu()
@@ -137,13 +141,14 @@ def load_pipeline(
     device_name = torch_device(device)
     folder = _lora_folder(model)
     if folder:
-        return _load_with_lora(model, folder, device_name, base, quantise)
+        return _load_with_lora(model, folder, device, base, quantise)
     if base:
         raise ModelError(
             f"{model} is a backbone, and the base {base} was given for it",
             f"expected a base only for a LoRA, which is a folder with {LORA_FILE}",
             "leave the base out",
         )
+    check_machine(model, requested=device, device=device_name, quantise=quantise, with_text_encoders=True)
     # The prompt is encoded before the backbone is loaded, because memory may be too small for both.
     embedding = encode_prompt(model, PROMPTS.get(prompt, prompt), device=device_name)
     backbone = load_backbone(model, device=device_name, quantise=quantise)
@@ -234,9 +239,9 @@ def _lora_folder(model: str) -> Path | None:
 
 
 def _load_with_lora(
-    model: str, folder: Path, device: str, base: str | None, quantise: Quantisation | None
+    model: str, folder: Path, requested: str, base: str | None, quantise: Quantisation | None
 ) -> DecompositionPipeline:
-    metadata = read_lora_metadata(folder)
+    metadata, device = read_lora_metadata(folder), torch_device(requested)
     source = base or metadata.base
     if base is None and _is_local(source) and not Path(source).is_dir():
         raise ModelError(
@@ -251,10 +256,11 @@ def _load_with_lora(
             f"expected a base of {metadata.backbone}, not of {family.name}",
             "choose another base",
         )
-    backbone = load_backbone(source, device=device, quantise=_base_quantisation(metadata, device, quantise))
+    quantisation = _base_quantisation(metadata, device, quantise)
+    check_machine(source, requested=requested, device=device, quantise=quantisation)
+    backbone = load_backbone(source, device=device, quantise=quantisation)
     metadata, prompt = load_lora(folder, backbone)
-    device_name = "cpu" if device == "cpu" else "cuda"
-    digest = fingerprint(model, device=device_name, base=base, quantise=quantise)
+    digest = fingerprint(model, device=requested, base=base, quantise=quantise)
     return DecompositionPipeline(backbone, prompt, metadata.task, model_name(model), digest)
 
 

@@ -9,7 +9,7 @@ from typing import Final, Literal, final
 
 from brewster.errors import PhotoError, RecipeError
 from brewster.models.diffusion.panels import PanelFit, PanelLayout, fit_panel
-from brewster.models.diffusion.sampling import GUIDANCE
+from brewster.models.diffusion.sampling import GUIDANCE, STEPS
 
 Objective = Literal["flow", "one_step"]
 
@@ -23,19 +23,30 @@ class DecompositionTask:
     """Which panels to generate, and how. All panels together have at most `budget_px` pixels.
 
     `objective` is "flow" (from noise, in many steps) or "one_step" (from the photo, in one step). `guidance` is used
-    for separation; training may use another value.
+    for separation; training may use another value. `steps`, `timestep_shift` and `last_sigma` define the sampling
+    schedule, see `Backbone.schedule`.
     """
 
     layout: PanelLayout = field(default_factory=PanelLayout)
     budget_px: int = PAPER_PX
     objective: Objective = "flow"
     guidance: float = GUIDANCE
+    steps: int = STEPS
+    timestep_shift: float | None = None
+    last_sigma: float | None = None
 
     def __post_init__(self) -> None:
-        """Raises RecipeError for a task without T, because every separation needs a transmission."""
+        """Raises RecipeError for a task without T, because every separation needs a transmission, or for invalid numbers."""
         if "T" not in self.layout.panels:
             raise RecipeError(
                 f"the panels are {list(self.layout.panels)}", "expected a list with T", "add T to the panels"
+            )
+        shift_is_valid = self.timestep_shift is None or self.timestep_shift > 0
+        if self.steps < 1 or not shift_is_valid or not 0 < (self.last_sigma or 1) <= 1:
+            raise RecipeError(
+                f"the task has steps = {self.steps}, timestep_shift = {self.timestep_shift}, last_sigma = {self.last_sigma}",
+                "expected at least 1 step, a shift above 0, and a last_sigma above 0 and at most 1",
+                "correct these values",
             )
 
     def fit(self, size: tuple[int, int], multiple: int) -> PanelFit:
