@@ -67,15 +67,15 @@ def test_a_toy_is_marked_as_one_and_names_no_base():
 
 
 def test_sets_are_listed_with_their_scenes_and_without_local_paths(tmp_path, monkeypatch):
-    render_set(tmp_path / "sets" / "window", count=3)
+    render_set(tmp_path / "sets" / "paper", count=3)
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path))
-    listed = "`sets/window` (3 samples of the scenes `tiny`, orders all)"
+    listed = "`sets/paper` (3 samples of the scenes `tiny`, orders all)"
     assert listed in card()
-    elsewhere = {"rendered": {"sets": [str(tmp_path / "sets" / "window")]}}
-    assert "`window` (3 samples" in card(data=elsewhere)
+    elsewhere = {"rendered": {"sets": [str(tmp_path / "sets" / "paper")]}}
+    assert "`paper` (3 samples" in card(data=elsewhere)
     assert str(tmp_path) not in card(data=elsewhere)
     monkeypatch.setenv("BREWSTER_DATA", str(tmp_path / "sets"))
-    assert "of the samples: `sets/window`." in card()
+    assert "of the samples: the first 1000 samples of `sets/paper`." in card()
 
 
 def test_pairs_and_their_share_are_listed():

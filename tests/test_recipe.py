@@ -221,7 +221,7 @@ def test_the_path_of_a_prompt_is_relative_to_the_recipe(tmp_path):
             "inconsistent; expected a weight above 0",
         ),
         (
-            ('sets = ["sets/window"]', 'recipe = "window"'),
+            ('sets = ["sets/paper"]', 'recipe = "window"'),
             "inconsistent; expected rendered sets and pairs only",
         ),
         (

@@ -110,7 +110,7 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
     """
     _check_device(device)
     if source.startswith(TINY_PREFIX):
-        seed = 0 if text == PROMPT else zlib.crc32(text.encode())
+        seed = 0 if text == PROMPT else zlib.crc32(text.encode()) or 1  # the sum of "" is 0
         return replace(tiny(source.removeprefix(TINY_PREFIX), seed)[1], text=text)
     for name in family_of(source).text_encoder_requirements:  # before the download, which may take an hour
         if importlib.util.find_spec(name) is None:
