@@ -20,8 +20,9 @@ from brewster.models.diffusion.adapter.lora import (
     remove_lora,
     save_lora,
 )
-from brewster.models.diffusion.backbones import BACKBONES, build, tiny
+from brewster.models.diffusion.backbones import BACKBONES, build, load_backbone, tiny
 from brewster.models.diffusion.panels import PanelLayout
+from brewster.models.diffusion.prompt import load_prompt
 from brewster.models.diffusion.task import DecompositionTask
 from brewster.models.diffusion.tensors import read_tensors, write_tensors
 
@@ -266,6 +267,41 @@ def test_a_second_lora_and_saving_without_a_lora_are_refused(kontext, tmp_path):
         add_lora(backbone)
     with pytest.raises(ModelError, match="encoded for klein"):
         save_lora(tmp_path, backbone, tiny("klein")[1], DecompositionTask())
+
+
+@pytest.mark.parametrize("alpha", [4, 16])
+def test_an_exported_lora_gives_the_same_prediction_merged_and_from_the_file_for_comfyui(
+    tiny_model, tmp_path, run_without_model, alpha
+):
+    backbone, prompt = tiny_model
+    backbone.save(tmp_path / "base")
+    add_trained_lora(backbone, alpha=alpha)
+    save_lora(tmp_path / "lora", backbone, prompt, DecompositionTask(), base=str(tmp_path / "base"))
+    expected = velocity(backbone, prompt)
+    remove_lora(backbone)
+
+    file = tmp_path / "glass.safetensors"
+    assert run_without_model("models", "export", tmp_path / "lora", "-o", file)[0] == 0
+    tensors, _ = read_tensors(file)
+    for name, up in tensors.items():  # as ComfyUI reads it: W + alpha / rank * up @ down
+        layer, is_up, _ = name.partition(".lora_B.weight")
+        if is_up:
+            scale = tensors[f"{layer}.alpha"] / len(up[0])
+            target = backbone.transformer.get_submodule(layer.removeprefix("transformer."))
+            target.weight.data += scale * up @ tensors[f"{layer}.lora_A.weight"]
+    torch.testing.assert_close(velocity(backbone, prompt), expected, atol=1e-5, rtol=0)
+
+    merged = tmp_path / "merged"
+    assert (
+        run_without_model("models", "export", tmp_path / "lora", "--format", "merged", "-o", merged)[0] == 0
+    )
+    weights = load_backbone(str(merged)).transformer.state_dict()
+    for name, weight in backbone.transformer.state_dict().items():
+        torch.testing.assert_close(weights[name], weight.bfloat16().float(), atol=1e-2, rtol=1e-2)
+    assert load_prompt(merged / "prompt.safetensors", backbone.name).sha256 == prompt.sha256
+    code, _, err = run_without_model("models", "export", tmp_path / "lora", "-o", file)
+    assert code == 1
+    assert "exists already" in err
 
 
 def test_metadata_survives_a_round_trip_through_json():
