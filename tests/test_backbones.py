@@ -1,6 +1,7 @@
 """The table of large backbones: loading of tiny versions from folders, and all errors for damaged or wrong folders."""
 
 import gc
+import importlib.util
 import json
 import shutil
 from types import SimpleNamespace
@@ -16,7 +17,7 @@ from brewster.errors import DeviceError, DownloadError, ModelError
 from brewster.models.diffusion import backbones, lazy_imports
 from brewster.models.diffusion.adapter.lora import add_lora
 from brewster.models.diffusion.backbones import BACKBONES, build, encode_prompt, load_backbone, tiny
-from brewster.models.diffusion.memory import check_machine
+from brewster.models.diffusion.memory import check_machine, choose_quantisation
 from brewster.models.diffusion.prompt import PROMPT
 
 
@@ -245,7 +246,7 @@ def machine(monkeypatch, tmp_path):
     monkeypatch.setattr(
         shutil, "disk_usage", lambda folder: SimpleNamespace(free=int(available["disk"] * gib))
     )
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (int(available["memory"] * gib), 0))
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: [int(available["memory"] * gib)] * 2)
     return available
 
 
@@ -255,6 +256,21 @@ def test_a_large_base_needs_a_gpu_unless_the_cpu_is_chosen(machine, tiny_folders
     check_machine("kontext", requested="cpu", device="cpu")
     for small in ("tiny:kontext", str(tiny_folders / "kontext")):
         check_machine(small, requested="auto", device="cpu")
+
+
+def test_the_quantisation_is_chosen_by_the_memory_of_the_gpu(machine, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    chosen = {}
+    for machine["memory"] in (40, 24, 16, 12, 8):
+        chosen[machine["memory"]] = choose_quantisation("kontext", "cuda")
+    assert chosen == {40: None, 24: "int8", 16: "int8", 12: "nf4", 8: None}
+    machine["memory"] = 24
+    assert choose_quantisation("kontext", "cuda", "float8") == "float8"
+    assert choose_quantisation("klein", "cuda") is None
+    assert choose_quantisation("kontext", "cpu", "int8") is None
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    machine["memory"] = 12
+    assert choose_quantisation("kontext", "cuda") is None
 
 
 def test_memory_and_disk_are_checked_before_the_download(machine):

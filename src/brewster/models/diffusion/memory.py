@@ -5,6 +5,7 @@ check_machine("kontext", requested="auto", device="cuda", quantise="int8")
 
 from __future__ import annotations
 
+import importlib.util
 import shutil
 from pathlib import Path
 from typing import Final
@@ -72,6 +73,30 @@ def check_machine(
     hub_id = BACKBONES[source].hub_id if source in BACKBONES else source
     if not Path(source).is_dir() and not is_cached(hub_id):
         _check_disk(hub_id, weights + _VAE_PARAMETERS + with_text_encoders * family.text_encoder_parameters)
+
+
+def choose_quantisation(
+    source: str, device: str, preferred: Quantisation | None = None
+) -> Quantisation | None:
+    """The first quantisation of (`preferred`, int8, nf4) whose weights fit into the GPU; `preferred` if none fits.
+
+    The total memory of the GPU decides, not the free one: the same machine always gives the same result. Then
+    `check_machine` compares the choice with the free memory. On a CPU the result is None, because int8 is slower there.
+
+    Raises:
+        DownloadError, ModelError: see `check_machine`.
+    """
+    if not device.startswith("cuda") or source.startswith(TINY_PREFIX):
+        return preferred if device != "cpu" else None
+    weights, total = (
+        _count_weights(source, family_of(source)),
+        torch.cuda.mem_get_info(device)[1] / GIB,
+    )
+    candidates: list[Quantisation | None] = [preferred, "int8"]
+    if importlib.util.find_spec("bitsandbytes"):
+        candidates.append("nf4")
+    fitting = (each for each in candidates if weights_gib(weights, each) + INFERENCE_OVERHEAD_GIB <= total)
+    return next(fitting, preferred)
 
 
 def weights_gib(parameters: int, quantise: Quantisation | None) -> float:

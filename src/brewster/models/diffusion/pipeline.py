@@ -23,7 +23,7 @@ from brewster.models.diffusion.adapter.lora import LORA_FILE, LoraMetadata, load
 from brewster.models.diffusion.backbones import BACKBONES, encode_prompt, family_of, load_backbone
 from brewster.models.diffusion.families.family import Backbone
 from brewster.models.diffusion.lazy_imports import explain_out_of_memory, fetch
-from brewster.models.diffusion.memory import check_machine
+from brewster.models.diffusion.memory import check_machine, choose_quantisation
 from brewster.models.diffusion.panels import PanelLayout, compose, conditioning_image, split
 from brewster.models.diffusion.prompt import PROMPT_FILE, PROMPTS, PromptEmbedding
 from brewster.models.diffusion.sampling import euler, sample
@@ -129,7 +129,8 @@ def load_pipeline(
         model: a LoRA by its folder or hub id, or a backbone by its name, folder or hub id.
         device: "auto" uses an NVIDIA or AMD GPU if torch finds one, otherwise the CPU.
         base: the folder or hub id of the LoRA's base; by default the one used in training. Only for a LoRA.
-        quantise: the quantisation of the base; by default the one used in training, and none on the CPU.
+        quantise: the quantisation of the base; by default the one used in training, or int8 or nf4 if only these fit into
+            the GPU, and none on the CPU.
         prompt: for a backbone without a LoRA: a name in `PROMPTS`, or the text itself.
 
     Raises:
@@ -148,11 +149,12 @@ def load_pipeline(
             f"expected a base only for a LoRA, which is a folder with {LORA_FILE}",
             "leave the base out",
         )
+    digest = fingerprint(model, device=device, quantise=quantise, prompt=prompt)
+    quantise = quantise or choose_quantisation(model, device_name)
     check_machine(model, requested=device, device=device_name, quantise=quantise, with_text_encoders=True)
     # The prompt is encoded before the backbone is loaded, because memory may be too small for both.
     embedding = encode_prompt(model, PROMPTS.get(prompt, prompt), device=device_name)
     backbone = load_backbone(model, device=device_name, quantise=quantise)
-    digest = fingerprint(model, device=device, quantise=quantise, prompt=prompt)
     return DecompositionPipeline(
         backbone, embedding, DecompositionTask(PanelLayout(("T",))), model_name(model), digest
     )
@@ -177,12 +179,14 @@ def fingerprint(
     """
     folder = _lora_folder(model)
     if folder is None:
-        parts = [_source_id(model), str(quantise), PROMPTS.get(prompt, prompt)]
+        quantisation = quantise or choose_quantisation(model, torch_device(device))
+        parts = [_source_id(model), str(quantisation), PROMPTS.get(prompt, prompt)]
     else:
         metadata = read_lora_metadata(folder)
         weights = hashlib.sha256((folder / LORA_FILE).read_bytes()).hexdigest()
-        quantisation = _base_quantisation(metadata, torch_device(device), quantise)
-        parts = [weights, metadata.prompt_sha256, _source_id(base or metadata.base), str(quantisation)]
+        source = base or metadata.base
+        quantisation = _base_quantisation(metadata, source, torch_device(device), quantise)
+        parts = [weights, metadata.prompt_sha256, _source_id(source), str(quantisation)]
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()
 
 
@@ -201,10 +205,10 @@ def _source_id(source: str) -> str:
 
 
 def _base_quantisation(
-    metadata: LoraMetadata, device: str, quantise: Quantisation | None
+    metadata: LoraMetadata, base: str, device: str, quantise: Quantisation | None
 ) -> Quantisation | None:
-    """The requested quantisation; by default the one used in training, and none on the CPU."""
-    return quantise or (metadata.quantise if device != "cpu" else None)
+    """The requested quantisation; by default the one used in training, or a smaller one that fits; none on the CPU."""
+    return quantise or choose_quantisation(base, device, metadata.quantise)
 
 
 def torch_device(device: str) -> str:
@@ -256,7 +260,7 @@ def _load_with_lora(
             f"expected a base of {metadata.backbone}, not of {family.name}",
             "choose another base",
         )
-    quantisation = _base_quantisation(metadata, device, quantise)
+    quantisation = _base_quantisation(metadata, source, device, quantise)
     check_machine(source, requested=requested, device=device, quantise=quantisation)
     backbone = load_backbone(source, device=device, quantise=quantisation)
     metadata, prompt = load_lora(folder, backbone)
