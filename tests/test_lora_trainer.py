@@ -229,6 +229,7 @@ def test_data_and_machine_are_checked_before_anything_is_loaded(recipe, tmp_path
         monkeypatch.setattr(trainer_module, name, refuse)
     with pytest.raises(RecipeError, match="gone"):
         LoraTrainer(recipe(data={"rendered": {"sets": [tmp_path / "gone"]}}))
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(DeviceError, match=r'optimizer = "adamw8bit" was requested on cpu'):
         LoraTrainer(recipe(optimizer="adamw8bit"))
     with pytest.raises(DeviceError, match="torch finds no GPU, and kontext has"):

@@ -33,6 +33,7 @@ from brewster.models.diffusion.lazy_imports import (
     import_library,
 )
 from brewster.models.diffusion.prompt import PROMPT, PromptEmbedding
+from brewster.models.diffusion.text_encoders import check_text_encoders, text_encoder_device
 from brewster.models.zoo import LARGE_MODELS, TINY_PREFIX
 from brewster.options import Quantisation
 
@@ -49,8 +50,6 @@ _CONFIG_FILES: Final = {
 }
 _BACKBONE_PATTERNS: Final = [_INDEX_FILE, *(f"{part}/*" for part in _CONFIG_FILES)]
 _TEXT_ENCODER_PATTERNS: Final = [_INDEX_FILE, "scheduler/*", "text_encoder*/*", "tokenizer*/*", "processor/*"]
-_TEXT_ENCODER_OVERHEAD_BYTES: Final = 2 << 30
-"""GPU memory for the activations of the text encoders and the CUDA context."""
 _STATISTICS_SPREAD: Final = 0.2
 """The spread of a tiny version's latent statistics around 0 and 1, so that tests detect code without normalisation."""
 
@@ -122,8 +121,8 @@ def encode_prompt(source: str, text: str = PROMPT, *, device: str = "cpu") -> Pr
     disable_progress_bars_in_pipes()
     folder = _fetch_folder(source, _TEXT_ENCODER_PATTERNS)
     family, _ = _family_in(folder)
-    _check_text_encoders(folder)
-    dtype, device = torch.bfloat16, _text_encoder_device(folder, device)
+    check_text_encoders(folder, _read_json(folder / _INDEX_FILE))
+    dtype, device = torch.bfloat16, text_encoder_device(folder, device)
     pipeline_class = diffusers_class(family.classes["pipeline"])
     with (
         explain_out_of_memory("close other programs, or pass an encoded prompt"),
@@ -207,28 +206,6 @@ def family_of(source: str) -> type[Backbone]:
     if source in BACKBONES or source.startswith(TINY_PREFIX):
         return find_family(source.removeprefix(TINY_PREFIX))
     return _family_in(fetch(source, [_INDEX_FILE]))[0]
-
-
-def _check_text_encoders(folder: Path) -> None:
-    """Checks that all text encoders and tokenizers of the index are in the folder."""
-    index = _read_json(folder / _INDEX_FILE)
-    names = [name for name in index if name.startswith(("text_encoder", "tokenizer", "processor"))]
-    missing = [name for name in names if not (folder / name).is_dir()]
-    if missing or not names:
-        raise ModelError(
-            f"{folder} has no {', '.join(missing) or 'text_encoder'}",
-            "expected the text encoders of the model, because the prompt must be encoded",
-            "copy the complete model, or set prompt to an encoded prompt, such as the prompt.safetensors of a LoRA",
-        )
-
-
-def _text_encoder_device(folder: Path, device: str) -> str:
-    """The device for the text encoders: `device` if their weights fit into its free memory, otherwise the CPU."""
-    if not device.startswith("cuda"):
-        return "cpu"
-    size = sum(path.stat().st_size for path in folder.glob("text_encoder*/*.safetensors"))
-    free, _ = torch.cuda.mem_get_info(device)
-    return device if size + _TEXT_ENCODER_OVERHEAD_BYTES < free else "cpu"
 
 
 def _load_tiny(source: str, device: str, quantise: str | None) -> Backbone:
