@@ -104,10 +104,10 @@ def test_the_plan_reads_the_data(run_without_model, tmp_path, monkeypatch):
     code, _, err = run_without_model("train", RECIPES / "large-tiny.toml", "--plan")
     assert code == 1
     assert "sets/tiny" in err
-    render_set(tmp_path / "sets" / "tiny", count=2)
+    render_set(tmp_path / "sets" / "tiny", count=4)
     code, out, _ = run_without_model("train", RECIPES / "large-tiny.toml", "--plan")
     assert code == 0
-    assert re.search(rb"^data +2 rendered samples; panels of 32 x 16$", out, re.MULTILINE)
+    assert re.search(rb"^data +4 rendered samples; panels of 32 x 16$", out, re.MULTILINE)
 
 
 def test_the_plan_lists_download_and_host_memory(klein):
