@@ -33,9 +33,10 @@ def export_comfyui(folder: Path, target: Path) -> None:
     """
     _check_target(target)
     metadata, tensors = read_lora_metadata(folder), read_tensors(folder / LORA_FILE)[0]
-    alpha = torch.tensor(float(metadata.alpha))
     layers = [name.removesuffix(_UP) for name in tensors if name.endswith(_UP)]
-    write_tensors(target, tensors | {f"{layer}{_ALPHA}": alpha for layer in layers}, {})
+    # safetensors refuses tensors that share memory, so each layer gets its own.
+    alphas = {layer + _ALPHA: torch.tensor(float(metadata.alpha)) for layer in layers}
+    write_tensors(target, tensors | alphas, {})
 
 
 def export_merged(folder: Path, target: Path, base: str | None = None) -> None:
